@@ -1,0 +1,1 @@
+"""What the bytes on the bus mean: database, codecs and end-to-end protection."""

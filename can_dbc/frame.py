@@ -1,0 +1,25 @@
+"""A CAN frame as a value."""
+
+from typing import NamedTuple
+
+
+class Frame(NamedTuple):
+    """One CAN or CAN FD frame.
+
+    Attributes:
+        t_ns: Time of reception or transmission on the run's clock, in ns.
+        arbitration_id: 11-bit id, or 29-bit if `is_extended`.
+        data: Payload, 0 to 8 bytes (0 to 64 with `is_fd`).
+        is_extended: Whether the id has 29 bits.
+        is_fd: Whether this is a CAN FD frame.
+        bitrate_switch: Whether the payload of a CAN FD frame was sent at the data bit rate.
+        is_error: Whether this is an error frame, which carries no payload of the bus.
+    """
+
+    t_ns: int
+    arbitration_id: int
+    data: bytes
+    is_extended: bool = False
+    is_fd: bool = False
+    bitrate_switch: bool = False
+    is_error: bool = False

@@ -1,0 +1,1 @@
+"""The simulated bench: its own equations of motion, curves and integrator."""

@@ -1,0 +1,1 @@
+"""From a logged run to the effect that the model lacks."""
