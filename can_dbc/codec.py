@@ -1,0 +1,497 @@
+"""Encoders and decoders, compiled from a DBC's messages.
+
+Everything that does not depend on the payload (bit positions, scaling, unit conversion,
+multiplexing) is worked out once. Values are SI, in the unit of the `Dimension` asked for.
+"""
+
+import math
+import struct
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from can_dbc.database import Message, Signal
+from can_dbc.errors import DatabaseError
+from can_dbc.units import Dimension, si_conversion
+
+Decoder = Callable[[bytes | bytearray], tuple[float, ...] | None]
+"""Payload to SI values, or None if the payload has another length or lacks one of the signals."""
+
+Encoder = Callable[[Sequence[float]], tuple[bytearray, bool]]
+"""SI values to a payload, and whether one of them was out of range and held at its limit."""
+
+_FD_LENGTHS = frozenset({*range(9), 12, 16, 20, 24, 32, 48, 64})
+_RAW_BITS_MAX = 64
+_FLOAT_FORMATS = {32: "<f", 64: "<d"}
+
+
+class _Field(NamedTuple):
+    """Where the raw value of a signal stands and what it means.
+
+    Attributes:
+        name: Name of the signal.
+        is_big_endian: Whether `shift` counts in the payload read as a big-endian integer.
+        shift: Bits below the value in that integer.
+        mask: Ones for the bits of the value.
+        sign: The sign bit, 0 if unsigned.
+        float_format: `struct` format of an IEEE value, empty for integers.
+        scale: SI value of one raw step.
+        offset: SI value of raw 0.
+        minimum: Smallest SI value of the DBC's range, or None.
+        maximum: Largest SI value of the DBC's range, or None.
+    """
+
+    name: str
+    is_big_endian: bool
+    shift: int
+    mask: int
+    sign: int
+    float_format: str
+    scale: float
+    offset: float
+    minimum: float | None
+    maximum: float | None
+
+
+class _Condition(NamedTuple):
+    """A multiplexer and the raw values under which a signal is in the frame."""
+
+    selector: _Field
+    raw_values: frozenset[int]
+
+
+def compile_decoder(
+    message: Message, signal_names: Sequence[str], dimensions: Sequence[Dimension]
+) -> Decoder:
+    """Build the decoder of some signals of a message.
+
+    Args:
+        message: Message of a database.
+        signal_names: Signals to decode, at least one.
+        dimensions: What each of them has to measure.
+
+    Returns:
+        A function from a payload to a tuple of SI values in the order of `signal_names`. It
+        returns None if the payload is not `message.length_bytes` long, or if a multiplexed
+        signal is not in this frame. It never raises for a payload.
+
+    Raises:
+        DatabaseError: A signal is unknown, its unit is missing, unknown or of another dimension,
+            or its layout cannot be decoded.
+    """
+    fields = _fields(message, signal_names, dimensions)
+    conditions = _all_conditions(message, signal_names)
+    length = message.length_bytes
+    if conditions or any(field.float_format for field in fields):
+        return _general_decoder(fields, conditions, length)
+    return _integer_decoder(fields, length)
+
+
+def compile_encoder(
+    message: Message, signal_names: Sequence[str], dimensions: Sequence[Dimension]
+) -> Encoder:
+    """Build the encoder of some signals of a message.
+
+    A value beyond the DBC's range, or beyond what its bits can hold, is sent as the nearest
+    value that is allowed. NaN is sent as the allowed value nearest to zero. Both are reported.
+    Multiplexers of the signals are set as the signals need it; all other bits are zero.
+
+    Args:
+        message: Message of a database.
+        signal_names: Signals to encode, at least one.
+        dimensions: What each of them measures.
+
+    Returns:
+        A function from SI values in the order of `signal_names` to the payload and whether a
+        value was held at its limit. It raises `ValueError` for another number of values.
+
+    Raises:
+        DatabaseError: As for `compile_decoder`; besides, signals that are never in one frame,
+            a multiplexer that is itself among the signals, or a range that holds no raw value.
+    """
+    fields = _fields(message, signal_names, dimensions)
+    base = _selected(message, signal_names)
+    little = tuple(
+        (index, _packer(message, field), field.shift)
+        for index, field in enumerate(fields)
+        if not field.is_big_endian
+    )
+    big = tuple(
+        (index, _packer(message, field), field.shift)
+        for index, field in enumerate(fields)
+        if field.is_big_endian
+    )
+    return _join_encoder(little, big, base, len(fields), message.length_bytes)
+
+
+def decode_log(
+    message: Message,
+    signal_names: Sequence[str],
+    dimensions: Sequence[Dimension],
+    data: NDArray[np.uint8],
+) -> dict[str, NDArray[np.float64]]:
+    """Decode all frames of a log at once.
+
+    Args:
+        message: Message of a database.
+        signal_names: Signals to decode.
+        dimensions: What each of them has to measure.
+        data: Payloads, shape (n, `message.length_bytes`).
+
+    Returns:
+        SI values by signal name, each of shape (n,), the same to the last bit as the decoder's;
+        NaN where a multiplexed signal is not in the frame.
+
+    Raises:
+        DatabaseError: As for `compile_decoder`.
+        ValueError: `data` has another shape.
+    """
+    fields = _fields(message, signal_names, dimensions)
+    if data.ndim != 2 or data.shape[1] != message.length_bytes:
+        raise ValueError(
+            f"payloads of {message.name}: shape {data.shape}, expected (n, {message.length_bytes})"
+        )
+    decoded: dict[str, NDArray[np.float64]] = {}
+    for field in fields:
+        values = _values_of_log(field, data)
+        for condition in _conditions(message, message.signal(field.name)):
+            allowed = np.array(sorted(condition.raw_values), dtype=np.uint64)
+            present = np.isin(_raw_of_log(condition.selector, data), allowed)
+            values = np.where(present, values, np.nan)
+        decoded[field.name] = values
+    return decoded
+
+
+def _fields(
+    message: Message, signal_names: Sequence[str], dimensions: Sequence[Dimension]
+) -> tuple[_Field, ...]:
+    if message.length_bytes not in _FD_LENGTHS:
+        raise DatabaseError(
+            f"{message.path}: message {message.name}: {message.length_bytes} bytes, "
+            "expected 0 to 8, 12, 16, 20, 24, 32, 48 or 64"
+        )
+    if not signal_names or len(set(signal_names)) != len(signal_names):
+        raise DatabaseError(
+            f"{message.path}: message {message.name}: signals {list(signal_names)}, "
+            "expected at least one and none twice"
+        )
+    return tuple(
+        _field(message, message.signal(name), dimension)
+        for name, dimension in zip(signal_names, dimensions, strict=True)
+    )
+
+
+def _field(message: Message, signal: Signal, dimension: Dimension) -> _Field:
+    place = f"{message.path}: message {message.name}: signal {signal.name}"
+    if signal.length_bits > _RAW_BITS_MAX:
+        raise DatabaseError(f"{place}: {signal.length_bits} bits, expected at most 64")
+    if signal.is_float and signal.length_bits not in _FLOAT_FORMATS:
+        raise DatabaseError(f"{place}: float of {signal.length_bits} bits, expected 32 or 64")
+    try:
+        unit = si_conversion(signal.unit, dimension)
+    except DatabaseError as error:
+        raise DatabaseError(f"{place}: {error}") from None
+    raw = _raw_field(message, signal)
+    field = raw._replace(
+        float_format=_FLOAT_FORMATS[signal.length_bits] if signal.is_float else "",
+        sign=1 << signal.length_bits - 1 if signal.is_signed and not signal.is_float else 0,
+        scale=signal.scale * unit.factor,
+        offset=signal.offset * unit.factor + unit.offset,
+        minimum=None if signal.minimum is None else signal.minimum * unit.factor + unit.offset,
+        maximum=None if signal.maximum is None else signal.maximum * unit.factor + unit.offset,
+    )
+    largest = abs(field.scale) * 2.0**64 + abs(field.offset)
+    if field.scale == 0.0 or not math.isfinite(largest):
+        raise DatabaseError(
+            f"{place}: scale {signal.scale}, offset {signal.offset}, expected a scale other than 0"
+            " and numbers of ordinary size"
+        )
+    return field
+
+
+def _raw_field(message: Message, signal: Signal) -> _Field:
+    """Place of a signal's bits; scaling left at identity."""
+    if signal.is_big_endian:
+        # The DBC numbers bits upwards in a byte and bytes as they are sent; the start is the
+        # highest bit, from where the value runs downwards.
+        byte, bit = divmod(signal.start, 8)
+        highest = 8 * (message.length_bytes - 1 - byte) + bit
+        shift = highest - signal.length_bits + 1
+    else:
+        shift = signal.start
+    return _Field(
+        name=signal.name,
+        is_big_endian=signal.is_big_endian,
+        shift=shift,
+        mask=(1 << signal.length_bits) - 1,
+        sign=0,
+        float_format="",
+        scale=1.0,
+        offset=0.0,
+        minimum=None,
+        maximum=None,
+    )
+
+
+def _conditions(message: Message, signal: Signal) -> tuple[_Condition, ...]:
+    """What has to be selected for a signal to be in a frame, along nested multiplexers."""
+    conditions: list[_Condition] = []
+    seen = {signal.name}
+    while signal.multiplexer is not None:
+        selector = message.signal(signal.multiplexer)
+        if selector.name in seen or selector.length_bits > _RAW_BITS_MAX:
+            raise DatabaseError(
+                f"{message.path}: message {message.name}: signal {signal.name}: "
+                f"multiplexer {selector.name} cannot select it"
+            )
+        seen.add(selector.name)
+        conditions.append(_Condition(_raw_field(message, selector), signal.multiplexer_ids))
+        signal = selector
+    return tuple(conditions)
+
+
+def _all_conditions(message: Message, signal_names: Sequence[str]) -> tuple[_Condition, ...]:
+    found: dict[str, _Condition] = {}
+    for name in signal_names:
+        for condition in _conditions(message, message.signal(name)):
+            selector = condition.selector
+            known = found.get(selector.name, condition)
+            found[selector.name] = _Condition(selector, known.raw_values & condition.raw_values)
+    return tuple(found.values())
+
+
+# ------------------------------------------------------------------------------------ one frame
+
+
+def _integer_decoder(fields: tuple[_Field, ...], length: int) -> Decoder:
+    """Decoder of integers that are in every frame: the case of the loop, unrolled up to two."""
+    order = "big" if fields[0].is_big_endian else "little"
+    if len(fields) > 2 or fields[0].is_big_endian != fields[-1].is_big_endian:
+        return _general_decoder(fields, (), length)
+    from_bytes = int.from_bytes
+    _, _, shift_a, mask_a, sign_a, _, scale_a, offset_a, _, _ = fields[0]
+    _, _, shift_b, mask_b, sign_b, _, scale_b, offset_b, _, _ = fields[-1]
+
+    def decode_one(data: bytes | bytearray) -> tuple[float, ...] | None:
+        if len(data) != length:
+            return None
+        raw = from_bytes(data, order)
+        return ((((raw >> shift_a) & mask_a ^ sign_a) - sign_a) * scale_a + offset_a,)
+
+    def decode_two(data: bytes | bytearray) -> tuple[float, ...] | None:
+        if len(data) != length:
+            return None
+        raw = from_bytes(data, order)
+        return (
+            (((raw >> shift_a) & mask_a ^ sign_a) - sign_a) * scale_a + offset_a,
+            (((raw >> shift_b) & mask_b ^ sign_b) - sign_b) * scale_b + offset_b,
+        )
+
+    return decode_one if len(fields) == 1 else decode_two
+
+
+def _general_decoder(
+    fields: tuple[_Field, ...], conditions: tuple[_Condition, ...], length: int
+) -> Decoder:
+    def decode(data: bytes | bytearray) -> tuple[float, ...] | None:
+        if len(data) != length:
+            return None
+        little = int.from_bytes(data, "little")
+        big = int.from_bytes(data, "big")
+        for selector, raw_values in conditions:
+            raw = (big if selector.is_big_endian else little) >> selector.shift & selector.mask
+            if raw not in raw_values:
+                return None
+        return tuple(
+            [
+                _value(field, (big if field.is_big_endian else little) >> field.shift & field.mask)
+                for field in fields
+            ]
+        )
+
+    return decode
+
+
+def _value(field: _Field, raw: int) -> float:
+    if field.float_format:
+        size = struct.calcsize(field.float_format)
+        number: float = struct.unpack(field.float_format, raw.to_bytes(size, "little"))[0]
+        return number * field.scale + field.offset
+    return ((raw ^ field.sign) - field.sign) * field.scale + field.offset
+
+
+# Raw value (unsigned, ready to be shifted into place) of an SI value, and whether it was held.
+_Packer = Callable[[float], tuple[int, bool]]
+
+
+def _packer(message: Message, field: _Field) -> _Packer:
+    return _float_packer(field) if field.float_format else _integer_packer(message, field)
+
+
+def _integer_packer(message: Message, field: _Field) -> _Packer:
+    scale, offset, mask = field.scale, field.offset, field.mask
+    low, high = _raw_limits(message, field)
+    # Strictly between these a number rounds into the limits (to even, at a half).
+    below, above = _half_step_beyond(low, high)
+
+    def pack(value: float) -> tuple[int, bool]:
+        steps = (value - offset) / scale
+        if below < steps < above:
+            return round(steps) & mask, False
+        if steps != steps:  # noqa: PLR0124 - the test for NaN without a call
+            steps = (0.0 - offset) / scale
+            return round(min(max(steps, low), high)) & mask, True
+        held = low if steps <= low else high
+        return held & mask, steps != held
+
+    return pack
+
+
+def _raw_limits(message: Message, field: _Field) -> tuple[int, int]:
+    """Smallest and largest raw value that the bits hold and the DBC's range allows."""
+    low, high = -field.sign, field.mask - field.sign
+    bounds = [
+        (bound - field.offset) / field.scale
+        for bound in (field.minimum, field.maximum)
+        if bound is not None
+    ]
+    # A limit that is a whole number of steps must survive its rounding in floating point.
+    if field.minimum is not None:
+        edge = bounds[0]
+        slack = 1e-9 * max(1.0, abs(edge))
+        if field.scale > 0:
+            low = max(low, math.ceil(edge - slack))
+        else:
+            high = min(high, math.floor(edge + slack))
+    if field.maximum is not None:
+        edge = bounds[-1]
+        slack = 1e-9 * max(1.0, abs(edge))
+        if field.scale > 0:
+            high = min(high, math.floor(edge + slack))
+        else:
+            low = max(low, math.ceil(edge - slack))
+    if low > high:
+        raise DatabaseError(
+            f"{message.path}: message {message.name}: signal {field.name}: "
+            "no raw value lies within the signal's range"
+        )
+    return low, high
+
+
+def _half_step_beyond(low: int, high: int) -> tuple[float, float]:
+    below, above = low - 0.5, high + 0.5
+    # Beyond 52 bits a half is lost; there every float is a whole number.
+    if below == low:
+        below = math.nextafter(float(low), -math.inf) if float(low) >= low else float(low)
+    if above == high:
+        above = math.nextafter(float(high), math.inf) if float(high) <= high else float(high)
+    return below, above
+
+
+def _float_packer(field: _Field) -> _Packer:
+    form = field.float_format
+    size = struct.calcsize(form)
+    largest = 3.4028234663852886e38 if size == 4 else 1.7976931348623157e308
+    edges = [
+        largest if bound is None else (bound - field.offset) / field.scale
+        for bound in (field.minimum, field.maximum)
+    ]
+    if field.minimum is None:
+        edges[0] = -largest
+    low = max(min(edges), -largest)
+    high = min(max(edges), largest)
+
+    def pack(value: float) -> tuple[int, bool]:
+        number = (value - field.offset) / field.scale
+        if math.isnan(number):
+            number = (0.0 - field.offset) / field.scale
+            held = min(max(number, low), high)
+            return int.from_bytes(struct.pack(form, held), "little"), True
+        held = min(max(number, low), high)
+        return int.from_bytes(struct.pack(form, held), "little"), held != number
+
+    return pack
+
+
+def _join_encoder(
+    little: tuple[tuple[int, _Packer, int], ...],
+    big: tuple[tuple[int, _Packer, int], ...],
+    base: int,
+    count: int,
+    length: int,
+) -> Encoder:
+    def encode(values: Sequence[float]) -> tuple[bytearray, bool]:
+        if len(values) != count:
+            raise ValueError(f"{len(values)} values, expected {count}")
+        joined = base
+        saturated = False
+        for index, pack, shift in little:
+            raw, held = pack(values[index])
+            joined |= raw << shift
+            saturated |= held
+        if not big:
+            return bytearray(joined.to_bytes(length, "little")), saturated
+        mirrored = 0
+        for index, pack, shift in big:
+            raw, held = pack(values[index])
+            mirrored |= raw << shift
+            saturated |= held
+        joined |= int.from_bytes(mirrored.to_bytes(length, "big"), "little")
+        return bytearray(joined.to_bytes(length, "little")), saturated
+
+    return encode
+
+
+def _selected(message: Message, signal_names: Sequence[str]) -> int:
+    """Payload, as a little-endian integer, in which only the needed multiplexers are set."""
+    place = f"{message.path}: message {message.name}"
+    joined = 0
+    for selector, raw_values in _all_conditions(message, signal_names):
+        allowed = [raw for raw in raw_values if 0 <= raw <= selector.mask]
+        if not allowed:
+            raise DatabaseError(
+                f"{place}: signals {list(signal_names)} are never in one frame "
+                f"(multiplexer {selector.name})"
+            )
+        if selector.name in signal_names:
+            raise DatabaseError(
+                f"{place}: multiplexer {selector.name} is set by the signals that it selects, "
+                "expected only these"
+            )
+        placed = min(allowed) << selector.shift
+        order = "big" if selector.is_big_endian else "little"
+        joined |= int.from_bytes(placed.to_bytes(message.length_bytes, order), "little")
+    return joined
+
+
+# --------------------------------------------------------------------------------- a whole log
+
+
+def _values_of_log(field: _Field, data: NDArray[np.uint8]) -> NDArray[np.float64]:
+    raw = _raw_of_log(field, data)
+    if field.float_format:
+        narrow = field.float_format == "<f"
+        numbers = raw.astype(np.uint32).view(np.float32) if narrow else raw.view(np.float64)
+        # A signalling NaN in a payload is data, not a fault of this program.
+        with np.errstate(invalid="ignore", over="ignore"):
+            return numbers.astype(np.float64) * field.scale + field.offset
+    if field.sign:
+        sign = np.uint64(field.sign)
+        return ((raw ^ sign) - sign).view(np.int64).astype(np.float64) * field.scale + field.offset
+    return raw.astype(np.float64) * field.scale + field.offset
+
+
+def _raw_of_log(field: _Field, data: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """Raw values of one field, unsigned, shape (n,)."""
+    # From here on bytes count from the lowest one, whichever end is sent first.
+    ordered = data[:, ::-1] if field.is_big_endian else data
+    first, shift = divmod(field.shift, 8)
+    covering = (shift + field.mask.bit_length() + 7) // 8
+    window = np.zeros((len(data), 8), dtype=np.uint8)
+    window[:, : min(covering, 8)] = ordered[:, first : first + min(covering, 8)]
+    raw = window.view("<u8")[:, 0].astype(np.uint64) >> np.uint64(shift)
+    if covering > 8:
+        raw |= ordered[:, first + 8].astype(np.uint64) << np.uint64(64 - shift)
+    return raw & np.uint64(field.mask)

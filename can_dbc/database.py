@@ -1,0 +1,451 @@
+"""A DBC file as frozen messages and signals.
+
+The DBC is read by cantools. What this package needs beyond the usual content stands in message
+attributes: `E2EProfile` (`P01` or `P02`, empty for none), `E2EDataIds` (hex: 16 bytes for P02,
+2 bytes for P01), `E2ECrcSignal`, `E2ECounterSignal` and `E2EMaxDeltaCounter`. The cycle time is
+the usual `GenMsgCycleTime`, in ms.
+"""
+
+import difflib
+import hashlib
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import cast
+
+import cantools.database
+from cantools.database.can import Message as CantoolsMessage
+from cantools.database.can import Signal as CantoolsSignal
+
+from can_dbc.errors import DatabaseError
+from can_dbc.protection import Identity, Profile, Protection
+
+__all__ = ["DEFAULT_DATABASE", "Database", "DatabaseError", "Message", "Signal", "load_database"]
+
+DEFAULT_DATABASE = Path(__file__).with_name("rig.dbc")
+"""The bus of the bench and the bridge."""
+
+SIZE_MAX_BYTES = 16 * 1024 * 1024
+"""Largest DBC file that is read."""
+
+_LENGTH_MAX_BYTES = 1785  # the longest J1939 transport message; larger ones cannot be meant
+_MULTIPLEXER_IDS_MAX = 1_000_000
+_STANDARD_ID_MAX = 0x7FF
+_EXTENDED_ID_MAX = 0x1FFF_FFFF
+_MAX_DELTA_DEFAULT = 7  # half of the counter's round: less is a loss, more went backwards
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """One signal of a message, as the DBC has it.
+
+    Attributes:
+        name: Name in the DBC.
+        start: Start bit in the DBC's numbering (of the lowest bit if little-endian, of the
+            highest if big-endian).
+        length_bits: Number of bits.
+        is_big_endian: Byte order (Motorola if true, Intel if not).
+        is_signed: Whether the raw integer is in two's complement.
+        is_float: Whether the raw value is an IEEE 754 number.
+        scale: Physical value of one raw step, in `unit`.
+        offset: Physical value of raw 0, in `unit`.
+        minimum: Smallest physical value, in `unit`, or None if the DBC gives no range.
+        maximum: Largest physical value, in `unit`, or None if the DBC gives no range.
+        unit: Unit as written in the DBC, empty if none.
+        choices: Names of raw values.
+        is_multiplexer: Whether its raw value selects other signals.
+        multiplexer: Name of the signal that selects this one, or None if it is always there.
+        multiplexer_ids: Raw values of the multiplexer under which the signal is there.
+    """
+
+    name: str
+    start: int
+    length_bits: int
+    is_big_endian: bool
+    is_signed: bool
+    is_float: bool
+    scale: float
+    offset: float
+    minimum: float | None
+    maximum: float | None
+    unit: str
+    choices: Mapping[int, str]
+    is_multiplexer: bool
+    multiplexer: str | None
+    multiplexer_ids: frozenset[int]
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message of a database.
+
+    Attributes:
+        path: The DBC file, for error messages.
+        name: Name in the DBC.
+        arbitration_id: 11-bit id, or 29-bit if `is_extended`.
+        is_extended: Whether the id has 29 bits.
+        is_fd: Whether the frame is CAN FD.
+        length_bytes: Payload length.
+        cycle_time_ns: Time between two frames, in ns, or None if the DBC gives none.
+        sender: Node that sends it, or None if the DBC gives none.
+        signals: Signals by name.
+        protection: How its frames are protected, or None.
+    """
+
+    path: Path
+    name: str
+    arbitration_id: int
+    is_extended: bool
+    is_fd: bool
+    length_bytes: int
+    cycle_time_ns: int | None
+    sender: str | None
+    signals: Mapping[str, Signal]
+    protection: Protection | None
+
+    def signal(self, name: str) -> Signal:
+        """Return the signal of a name.
+
+        Raises:
+            DatabaseError: There is none; the message lists names that come near.
+        """
+        try:
+            return self.signals[name]
+        except KeyError:
+            hint = _near(name, self.signals)
+            raise DatabaseError(
+                f"{self.path}: message {self.name}: no signal {name!r}, {hint}"
+            ) from None
+
+
+@dataclass(frozen=True, slots=True)
+class Database:
+    """The messages of one DBC file.
+
+    Attributes:
+        path: The file.
+        sha256: SHA-256 of the file's bytes, in hex.
+        messages: Messages by name.
+    """
+
+    path: Path
+    sha256: str
+    messages: Mapping[str, Message]
+
+    def message(self, name: str) -> Message:
+        """Return the message of a name.
+
+        Raises:
+            DatabaseError: There is none; the message lists names that come near.
+        """
+        try:
+            return self.messages[name]
+        except KeyError:
+            hint = _near(name, self.messages)
+            raise DatabaseError(f"{self.path}: no message {name!r}, {hint}") from None
+
+
+def load_database(path: Path) -> Database:
+    """Read a DBC file.
+
+    Args:
+        path: A DBC file of at most 16 MiB, in UTF-8 or Windows-1252.
+
+    Returns:
+        Its messages. Units are kept as written; a codec converts them.
+
+    Raises:
+        DatabaseError: The file cannot be read, is no DBC, has signals that overlap or do not fit,
+            an id, name or data id twice, or a protection that cannot work.
+    """
+    content = _read(path)
+    parsed = _parse(path, _decode(path, content))
+    messages = [_message(path, message) for message in parsed]
+    _refuse_twins(path, messages)
+    return Database(
+        path=path,
+        sha256=hashlib.sha256(content).hexdigest(),
+        messages=MappingProxyType({m.name: m for m in _know_each_other(messages)}),
+    )
+
+
+def _near(name: str, names: Iterable[str]) -> str:
+    known = list(names)
+    folded = {entry.casefold(): entry for entry in known}
+    found = difflib.get_close_matches(name.casefold(), folded, n=3, cutoff=0.5)
+    if found:
+        return "did you mean " + " or ".join(folded[entry] for entry in found) + "?"
+    return "expected one of " + ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
+
+
+def _read(path: Path) -> bytes:
+    try:
+        if not path.is_file():
+            raise DatabaseError(f"{path}: no such file, expected a DBC file")
+        with path.open("rb") as file:
+            content = file.read(SIZE_MAX_BYTES + 1)
+    except OSError as error:
+        raise DatabaseError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError:
+        raise DatabaseError(f"{str(path)!r}: not a file name, expected a DBC file") from None
+    if len(content) > SIZE_MAX_BYTES:
+        raise DatabaseError(f"{path}: larger than {SIZE_MAX_BYTES} bytes, expected a DBC file")
+    return content
+
+
+def _decode(path: Path, content: bytes) -> str:
+    # The format names no encoding. Editors write Windows-1252, newer tools UTF-8; text of the
+    # first with a sign beyond ASCII is hardly ever valid in the second.
+    for encoding in ("utf-8-sig", "cp1252"):
+        try:
+            return content.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+    raise DatabaseError(f"{path}: not text, expected a DBC file")
+
+
+_MESSAGE_LENGTH = re.compile(r"\bBO_\s+\d+\s+\w+\s*:\s*(\d+)")
+_SIGNAL_POSITION = re.compile(r":\s*(\d+)\s*\|\s*(\d+)\s*@")
+_MULTIPLEXER_RANGES = re.compile(r"\bSG_MUL_VAL_\b[^;]*")
+_RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
+
+
+def _refuse_excess(path: Path, text: str) -> None:
+    """Refuse sizes for which cantools would build lists of any length."""
+    limit = _LENGTH_MAX_BYTES
+    for match in _MESSAGE_LENGTH.finditer(text):
+        if len(match[1]) > 6 or int(match[1]) > limit:
+            raise DatabaseError(f"{path}: message of {match[1][:20]} bytes, expected at most 64")
+    for match in _SIGNAL_POSITION.finditer(text):
+        if any(len(part) > 6 or int(part) > 8 * limit for part in match.groups()):
+            raise DatabaseError(f"{path}: signal at {match[0][1:40]} does not fit in any message")
+    total = 0
+    for statement in _MULTIPLEXER_RANGES.finditer(text):
+        for first, last in _RANGE.findall(statement[0]):
+            long = len(first) > 18 or len(last) > 18
+            total += _MULTIPLEXER_IDS_MAX + 1 if long else max(int(last) - int(first), 0)
+    if total > _MULTIPLEXER_IDS_MAX:
+        raise DatabaseError(
+            f"{path}: SG_MUL_VAL_ ranges hold more than {_MULTIPLEXER_IDS_MAX} multiplexer values"
+        )
+
+
+def _parse(path: Path, text: str) -> list[CantoolsMessage]:
+    _refuse_excess(path, text)
+    try:
+        parsed = cantools.database.load_string(text, database_format="dbc", strict=True)
+    except (cantools.database.Error, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise DatabaseError(f"{path}: not a usable DBC: {reason[:300]}") from None
+    return cast("list[CantoolsMessage]", parsed.messages)
+
+
+def _message(path: Path, message: CantoolsMessage) -> Message:
+    place = f"{path}: message {message.name}"
+    is_extended = bool(message.is_extended_frame)
+    id_max = _EXTENDED_ID_MAX if is_extended else _STANDARD_ID_MAX
+    if not 0 <= message.frame_id <= id_max:
+        raise DatabaseError(f"{place}: id {message.frame_id:#x}, expected at most {id_max:#x}")
+    signals = {signal.name: _signal(place, signal) for signal in message.signals}
+    if len(signals) != len(message.signals):
+        raise DatabaseError(f"{place}: a signal name is given twice")
+    for signal in signals.values():
+        _check_fit(place, signal, message.length)
+    cycle_time_ns = _cycle_time_ns(place, message)
+    return Message(
+        path=path,
+        name=message.name,
+        arbitration_id=message.frame_id,
+        is_extended=is_extended,
+        is_fd=bool(message.is_fd) or message.length > 8,
+        length_bytes=message.length,
+        cycle_time_ns=cycle_time_ns,
+        sender=message.senders[0] if message.senders else None,
+        signals=MappingProxyType(signals),
+        protection=_protection(place, message, signals, cycle_time_ns),
+    )
+
+
+def _signal(place: str, signal: CantoolsSignal) -> Signal:
+    return Signal(
+        name=signal.name,
+        start=signal.start,
+        length_bits=signal.length,
+        is_big_endian=signal.byte_order == "big_endian",
+        is_signed=bool(signal.is_signed),
+        is_float=bool(signal.is_float),
+        scale=_number(place, signal.name, "scale", signal.scale),
+        offset=_number(place, signal.name, "offset", signal.offset),
+        minimum=_bound(place, signal.name, "minimum", signal.minimum),
+        maximum=_bound(place, signal.name, "maximum", signal.maximum),
+        unit=signal.unit or "",
+        choices=MappingProxyType(
+            {int(raw): str(name) for raw, name in (signal.choices or {}).items()}
+        ),
+        is_multiplexer=bool(signal.is_multiplexer),
+        multiplexer=signal.multiplexer_signal,
+        multiplexer_ids=frozenset(signal.multiplexer_ids or ()),
+    )
+
+
+def _number(place: str, signal: str, what: str, value: float) -> float:
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise DatabaseError(f"{place}: signal {signal}: {what} {number}, expected a finite number")
+    return number
+
+
+def _bound(place: str, signal: str, what: str, value: float | None) -> float | None:
+    return None if value is None else _number(place, signal, what, value)
+
+
+def _check_fit(place: str, signal: Signal, length_bytes: int) -> None:
+    # cantools checks only signals that it reaches through their multiplexers.
+    if signal.is_big_endian:
+        first = 8 * (signal.start // 8) + 7 - signal.start % 8
+    else:
+        first = signal.start
+    if first + signal.length_bits > 8 * length_bytes:
+        raise DatabaseError(
+            f"{place}: signal {signal.name}: does not fit in {length_bytes} bytes"
+        )
+
+
+def _attribute(message: CantoolsMessage, name: str) -> str | int | float | None:
+    specifics = message.dbc
+    if specifics is None:
+        return None
+    found = specifics.attributes.get(name)
+    if found is not None:
+        return cast("str | int | float | None", found.value)
+    definition = specifics.attribute_definitions.get(name)
+    return None if definition is None else cast("str | None", definition.default_value)
+
+
+def _cycle_time_ns(place: str, message: CantoolsMessage) -> int | None:
+    value = _attribute(message, "GenMsgCycleTime")
+    if value is None or value == "":
+        return None
+    try:
+        cycle_ms = float(value)
+        cycle_ns = round(cycle_ms * 1e6)
+    except (ValueError, OverflowError):
+        cycle_ns = -1
+    if cycle_ns < 0:
+        raise DatabaseError(f"{place}: GenMsgCycleTime {value!r}, expected ms, 0 or more")
+    return cycle_ns or None
+
+
+def _protection(
+    place: str, message: CantoolsMessage, signals: Mapping[str, Signal], cycle_time_ns: int | None
+) -> Protection | None:
+    value = str(_attribute(message, "E2EProfile") or "").strip()
+    if value.casefold() in {"", "none"}:
+        return None
+    names = {profile.value: profile for profile in Profile}
+    if value not in names:
+        supported = ", ".join(names)
+        raise DatabaseError(f"{place}: E2EProfile {value!r}, supported are {supported}")
+    profile = names[value]
+    crc_signal = str(_attribute(message, "E2ECrcSignal") or "CRC")
+    counter_signal = str(_attribute(message, "E2ECounterSignal") or "COUNTER")
+    _check_place(place, signals, "E2ECrcSignal", crc_signal, (0, 8))
+    _check_place(place, signals, "E2ECounterSignal", counter_signal, (8, 4))
+    return Protection(
+        identity=Identity(profile, _data_ids(place, message, profile)),
+        length_bytes=message.length,
+        crc_signal=crc_signal,
+        counter_signal=counter_signal,
+        counter_modulus=profile.counter_modulus,
+        max_delta_counter=_max_delta(place, message, profile),
+        cycle_time_ns=cycle_time_ns,
+        silence_ns=profile.counter_modulus * (cycle_time_ns or 0),
+        foreign=(),
+    )
+
+
+def _check_place(
+    place: str,
+    signals: Mapping[str, Signal],
+    attribute: str,
+    name: str,
+    bits: tuple[int, int],
+) -> None:
+    signal = signals.get(name)
+    if signal is None:
+        raise DatabaseError(f"{place}: {attribute} {name!r}: the message has no such signal")
+    first, length = bits
+    start = first + length - 1 if signal.is_big_endian else first
+    if (signal.start, signal.length_bits) != (start, length) or signal.multiplexer is not None:
+        raise DatabaseError(
+            f"{place}: {attribute} {name!r}: expected {length} bits from bit {first} on, "
+            "as profiles P01 and P02 have it"
+        )
+
+
+def _data_ids(place: str, message: CantoolsMessage, profile: Profile) -> bytes:
+    text = str(_attribute(message, "E2EDataIds") or "").strip()
+    expected = f"expected {profile.data_id_bytes} bytes in hex for {profile.value}"
+    try:
+        data_ids = bytes.fromhex(text)
+    except ValueError:
+        raise DatabaseError(f"{place}: E2EDataIds {text[:80]!r}, {expected}") from None
+    if len(data_ids) != profile.data_id_bytes:
+        raise DatabaseError(f"{place}: E2EDataIds {text[:80]!r}, {expected}")
+    return data_ids
+
+
+def _max_delta(place: str, message: CantoolsMessage, profile: Profile) -> int:
+    value = _attribute(message, "E2EMaxDeltaCounter")
+    if value is None or value == "":
+        return _MAX_DELTA_DEFAULT
+    limit = profile.counter_modulus - 1
+    if not isinstance(value, int) or not 1 <= value <= limit:
+        raise DatabaseError(f"{place}: E2EMaxDeltaCounter {value!r}, expected 1 to {limit}")
+    return value
+
+
+def _refuse_twins(path: Path, messages: list[Message]) -> None:
+    names: dict[str, str] = {}
+    ids: dict[tuple[bool, int], str] = {}
+    identities: dict[Identity, str] = {}
+    for message in messages:
+        if message.name in names:
+            raise DatabaseError(f"{path}: message {message.name} is given twice")
+        names[message.name] = message.name
+        other = ids.setdefault((message.is_extended, message.arbitration_id), message.name)
+        if other != message.name:
+            raise DatabaseError(
+                f"{path}: messages {other} and {message.name} have the same id "
+                f"{message.arbitration_id:#x}"
+            )
+        if message.protection is None:
+            continue
+        other = identities.setdefault(message.protection.identity, message.name)
+        if other != message.name:
+            raise DatabaseError(
+                f"{path}: messages {other} and {message.name} have the same E2EDataIds"
+            )
+
+
+def _know_each_other(messages: list[Message]) -> list[Message]:
+    """Give every protection the identities of the others, to recognise their frames."""
+    identities = [m.protection.identity for m in messages if m.protection is not None]
+    return [
+        message
+        if message.protection is None
+        else replace(
+            message,
+            protection=replace(
+                message.protection,
+                foreign=tuple(i for i in identities if i != message.protection.identity),
+            ),
+        )
+        for message in messages
+    ]

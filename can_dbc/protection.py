@@ -1,0 +1,304 @@
+"""End-to-end protection of frames: alive counter, CRC and data id, after AUTOSAR E2E.
+
+The CRC of one frame is computed by the `e2e` package. What a sequence of frames means (lost,
+repeated, out of order, another message's frame under this id) is decided here, one frame at a
+time, by a state that is passed in and returned.
+
+Reference: AUTOSAR, "Specification of SW-C End-to-End Communication Protection Library",
+profiles 1 (variant 1A) and 2.
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+from e2e.p01 import e2e_p01_check, e2e_p01_protect
+from e2e.p02 import e2e_p02_check, e2e_p02_protect
+from numpy.typing import NDArray
+
+
+class Profile(Enum):
+    """A layout of counter and CRC; the value is what the DBC attribute `E2EProfile` says.
+
+    Both have the CRC in byte 0 and the counter in the low nibble of byte 1. P01 (variant 1A) has
+    one 16-bit data id, polynomial 0x1D and counts 0 to 14; P02 has one 8-bit data id for each
+    counter value, polynomial 0x2F and counts 0 to 15.
+    """
+
+    P01 = "P01"
+    P02 = "P02"
+
+    @property
+    def counter_modulus(self) -> int:
+        """Number of counter values."""
+        return 15 if self is Profile.P01 else 16
+
+    @property
+    def data_id_bytes(self) -> int:
+        """Length of the data id, or of the list of data ids, in bytes."""
+        return 2 if self is Profile.P01 else 16
+
+
+class Identity(NamedTuple):
+    """What the CRC of a message covers beside its payload.
+
+    Attributes:
+        profile: Layout and polynomial.
+        data_ids: P02: 16 ids, the one of counter value i at index i. P01: the id, high byte first.
+    """
+
+    profile: Profile
+    data_ids: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Protection:
+    """How the frames of one message are protected.
+
+    Attributes:
+        identity: Profile and data ids of the message.
+        length_bytes: Payload length; a frame of any other length is refused.
+        crc_signal: Name of the signal that holds the CRC.
+        counter_signal: Name of the signal that holds the counter.
+        counter_modulus: Number of counter values.
+        max_delta_counter: Largest step of the counter that is read as lost frames.
+        cycle_time_ns: Time between two frames, in ns, or None where the DBC gives none.
+        silence_ns: Silence after which the counter may have gone round, in ns (0: unknown).
+        foreign: Identities of the database's other messages, for recognising their frames here.
+    """
+
+    identity: Identity
+    length_bytes: int
+    crc_signal: str
+    counter_signal: str
+    counter_modulus: int
+    max_delta_counter: int
+    cycle_time_ns: int | None
+    silence_ns: int
+    foreign: tuple[Identity, ...]
+
+
+class Verdict(Enum):
+    """What a frame is; only the first three may be used, the others are refused whole."""
+
+    OK = "ok"
+    FIRST = "first"
+    LOST = "lost"
+    WRONG_CRC = "wrong_crc"
+    WRONG_LENGTH = "wrong_length"
+    REPEATED = "repeated"
+    OUT_OF_SEQUENCE = "out_of_sequence"
+    MASQUERADE = "masquerade"
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the frame's values may be used."""
+        return self in _ACCEPTED
+
+
+_ACCEPTED = frozenset({Verdict.OK, Verdict.FIRST, Verdict.LOST})
+
+RESYNC_FRAMES = 2
+"""Frames in a row, after an out-of-sequence one, that make a restarted sequence believable."""
+
+
+class SequenceState(NamedTuple):
+    """What a receiver remembers of one message.
+
+    Attributes:
+        counter: Counter of the last accepted frame, -1 before the first.
+        t_ns: Time of the last frame with a right CRC, in ns.
+        lost: Frames missing before the frame just accepted with verdict LOST, else 0.
+        candidate: Counter of the last out-of-sequence frame, -1 if there is none pending.
+        run: Frames that followed the candidate in sequence.
+    """
+
+    counter: int = -1
+    t_ns: int = 0
+    lost: int = 0
+    candidate: int = -1
+    run: int = 0
+
+
+INITIAL = SequenceState()
+
+
+def read_counter(data: bytes | bytearray) -> int:
+    """Read the alive counter of a protected frame of at least two bytes."""
+    return data[1] & 0x0F
+
+
+def check_crc(data: bytes | bytearray, protection: Protection) -> bool:
+    """Check CRC and data id of one frame; a frame of wrong length fails."""
+    return len(data) == protection.length_bytes and _crc_fits(data, protection.identity)
+
+
+def protect(data: bytes | bytearray, counter: int, protection: Protection) -> bytes:
+    """Put counter and CRC into a frame.
+
+    Args:
+        data: Payload, `protection.length_bytes` long; not changed.
+        counter: Number of the frame, any integer of at least 0; it is sent modulo the profile's
+            number of counter values.
+        protection: Protection of the frame's message.
+
+    Returns:
+        The payload to send.
+
+    Raises:
+        ValueError: The payload has another length.
+    """
+    if len(data) != protection.length_bytes:
+        raise ValueError(f"payload: {len(data)} bytes, expected {protection.length_bytes}")
+    frame = bytearray(data)
+    frame[1] = frame[1] & 0xF0 | counter % protection.counter_modulus
+    profile, data_ids = protection.identity
+    if profile is Profile.P02:
+        e2e_p02_protect(frame, data_ids, increment_counter=False)
+    else:
+        e2e_p01_protect(frame, int.from_bytes(data_ids, "big"), increment_counter=False)
+    return bytes(frame)
+
+
+def check(
+    state: SequenceState, data: bytes | bytearray, t_ns: int, protection: Protection
+) -> tuple[SequenceState, Verdict]:
+    """Judge one received frame.
+
+    A counter that went up by 1 to `max_delta_counter` (more where more cycle times have passed
+    since the last frame) is accepted, with the number of lost frames in the new state. After a
+    silence as long as the counter's full round the counter alone cannot say how many were lost;
+    then the time says it. A counter that went backwards is refused. A sender that started anew
+    is believed when `RESYNC_FRAMES` further frames came in sequence.
+
+    A corrupted frame may by chance carry the CRC of another message; it is then called
+    MASQUERADE and not WRONG_CRC. Both are refused.
+
+    Args:
+        state: What is remembered of this message; start with `INITIAL`.
+        data: Payload.
+        t_ns: Time of reception, in ns.
+        protection: Protection of the message.
+
+    Returns:
+        New state and verdict.
+    """
+    if len(data) != protection.length_bytes:
+        return state, Verdict.WRONG_LENGTH
+    if not _crc_fits(data, protection.identity):
+        return state, _wrong_crc(data, protection)
+    counter = data[1] & 0x0F
+    modulus = protection.counter_modulus
+    last, last_ns, _, _, _ = state
+    # The frequent case first: next in sequence and in time.
+    if (
+        (counter - last) % modulus == 1
+        and last >= 0
+        and counter < modulus
+        and (t_ns - last_ns < protection.silence_ns or protection.silence_ns == 0)
+    ):
+        return SequenceState(counter, t_ns), Verdict.OK
+    return _judge_sequence(state, counter, t_ns, protection)
+
+
+def check_crc_log(data: NDArray[np.uint8], protection: Protection) -> NDArray[np.bool_]:
+    """Check CRC and data id of all frames of a log at once.
+
+    Args:
+        data: Payloads, shape (n, length).
+        protection: Protection of the message.
+
+    Returns:
+        Whether each frame passes, shape (n,); the same as `check_crc` frame by frame.
+    """
+    if data.ndim != 2 or data.shape[1] != protection.length_bytes:
+        return np.zeros(len(data), dtype=np.bool_)
+    profile, data_ids = protection.identity
+    ids = np.frombuffer(data_ids, dtype=np.uint8)
+    if profile is Profile.P02:
+        crc = _crc_over_columns(np.full(len(data), 0xFF, dtype=np.uint8), data[:, 1:], _TABLE_2F)
+        crc = _TABLE_2F[crc ^ ids[data[:, 1] & 0x0F]] ^ np.uint8(0xFF)
+    else:
+        head = np.broadcast_to(ids[::-1], (len(data), 2))
+        crc = _crc_over_columns(np.zeros(len(data), dtype=np.uint8), head, _TABLE_1D)
+        crc = _crc_over_columns(crc, data[:, 1:], _TABLE_1D)
+    return crc == data[:, 0]
+
+
+def _crc_fits(data: bytes | bytearray, identity: Identity) -> bool:
+    profile, data_ids = identity
+    if profile is Profile.P02:
+        return e2e_p02_check(data, data_ids)
+    return e2e_p01_check(data, int.from_bytes(data_ids, "big"))
+
+
+def _wrong_crc(data: bytes | bytearray, protection: Protection) -> Verdict:
+    if any(_crc_fits(data, other) for other in protection.foreign):
+        return Verdict.MASQUERADE
+    return Verdict.WRONG_CRC
+
+
+def _judge_sequence(
+    state: SequenceState, counter: int, t_ns: int, protection: Protection
+) -> tuple[SequenceState, Verdict]:
+    modulus = protection.counter_modulus
+    if counter >= modulus:
+        return state, Verdict.OUT_OF_SEQUENCE
+    if state.counter < 0:
+        return SequenceState(counter, t_ns), Verdict.FIRST
+    delta = (counter - state.counter) % modulus
+    cycles = _cycles_since(state.t_ns, t_ns, protection)
+    if cycles >= modulus:
+        lost = _lost_in_silence(delta, cycles, modulus)
+        return SequenceState(counter, t_ns, lost), Verdict.LOST if lost else Verdict.OK
+    if delta == 0:
+        return state._replace(t_ns=t_ns, lost=0), Verdict.REPEATED
+    if delta == 1:
+        return SequenceState(counter, t_ns), Verdict.OK
+    if delta <= max(protection.max_delta_counter, cycles + 1):
+        return SequenceState(counter, t_ns, delta - 1), Verdict.LOST
+    return _resynchronise(state, counter, t_ns, modulus)
+
+
+def _resynchronise(
+    state: SequenceState, counter: int, t_ns: int, modulus: int
+) -> tuple[SequenceState, Verdict]:
+    follows = state.candidate >= 0 and (counter - state.candidate) % modulus == 1
+    run = state.run + 1 if follows else 0
+    if run >= RESYNC_FRAMES:
+        return SequenceState(counter, t_ns), Verdict.FIRST
+    refused = SequenceState(state.counter, t_ns, candidate=counter, run=run)
+    return refused, Verdict.OUT_OF_SEQUENCE
+
+
+def _cycles_since(last_ns: int, t_ns: int, protection: Protection) -> int:
+    if not protection.cycle_time_ns:
+        return 0
+    return (t_ns - last_ns) // protection.cycle_time_ns
+
+
+def _lost_in_silence(delta: int, cycles: int, modulus: int) -> int:
+    """Frames missing: the number that fits the counter and comes nearest to the time."""
+    rounds = max(0, (cycles - delta + modulus // 2) // modulus)
+    sent = delta + rounds * modulus
+    return max(sent - 1, 0)
+
+
+def _crc_over_columns(
+    crc: NDArray[np.uint8], data: NDArray[np.uint8], table: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    for column in range(data.shape[1]):
+        crc = table[crc ^ data[:, column]]
+    return crc
+
+
+def _crc_table(polynomial: int) -> NDArray[np.uint8]:
+    table = np.arange(256, dtype=np.uint16)
+    for _ in range(8):
+        table = np.where(table & 0x80, table << 1 ^ polynomial, table << 1) & 0xFF
+    return table.astype(np.uint8)
+
+
+_TABLE_2F = _crc_table(0x2F)
+_TABLE_1D = _crc_table(0x1D)
