@@ -1,0 +1,240 @@
+"""From the bench's configuration to its equations of motion and its state at the start."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from scipy import interpolate, optimize
+
+from rig.bench.effects import EFFECT_KINDS, PARAMETER_COUNT, Law, parameter_values
+from rig.bench.mechanics import (
+    SINE_COLUMNS,
+    SWEEP_COLUMNS,
+    Curves,
+    Drive,
+    Effects,
+    Floats,
+    Mechanics,
+    Thermal,
+    derivatives,
+)
+from rig.bench.schema import (
+    WORLD,
+    AppliedForce,
+    BenchConfig,
+    BenchConfigError,
+    Effect,
+    ForceFile,
+    Multisine,
+    Sine,
+    Sweep,
+)
+
+EQUILIBRIUM_TOLERANCE_M_PER_S2 = 1e-9
+"""Largest acceleration that counts as rest."""
+
+
+class Assembly(NamedTuple):
+    """A bench ready to run.
+
+    Attributes:
+        mechanics: Its equations of motion.
+        start: State at time zero, shape (states,).
+    """
+
+    mechanics: Mechanics
+    start: Floats
+
+
+def assemble(config: BenchConfig) -> Assembly:
+    """Build the equations of motion and the state at the start.
+
+    Args:
+        config: The bench.
+
+    Returns:
+        The bench ready to run.
+
+    Raises:
+        BenchConfigError: It has no static equilibrium to start from, or a body has no mass left.
+    """
+    mechanics = _mechanics(config)
+    return Assembly(mechanics, _start(config, mechanics))
+
+
+def _mechanics(config: BenchConfig) -> Mechanics:
+    uppers = [strut.between[1] for strut in config.struts]
+    lowers = [strut.between[0] for strut in config.struts]
+    thermal = config.temperature
+    return Mechanics(
+        gravity_m_per_s2=config.gravity_m_per_s2,
+        mass_kg=_masses(config, uppers),
+        lower=np.array([-1 if name == WORLD else uppers.index(name) for name in lowers]),
+        free_length_m=np.array([strut.free_length_m for strut in config.struts]),
+        springs=_curves([(s.spring.height_m, s.spring.force_n) for s in config.struts]),
+        dampers=_curves([(s.damper.velocity_m_per_s, s.damper.force_n) for s in config.struts]),
+        drive=_drive(config.applied_force, uppers, config.undeclared_effects),
+        effects=_effects(config),
+        thermal=Thermal(
+            warming_k_per_j=1.0 / (thermal.heat_capacity_j_per_k or math.inf),
+            cooling_per_s=1.0 / (thermal.cooling_time_s or math.inf),
+            ambient_c=thermal.ambient_c,
+        ),
+    )
+
+
+def _masses(config: BenchConfig, uppers: list[str]) -> Floats:
+    by_name = {mass.name: mass.mass_kg for mass in config.masses}
+    mass_kg = np.array([by_name[name] for name in uppers], dtype=np.float64)
+    for index, effect in enumerate(config.undeclared_effects):
+        if EFFECT_KINDS[effect.name].law == Law.ADDED_MASS:
+            body = _strut_index(config, effect)
+            mass_kg[body] += parameter_values(effect.name, effect.parameters)[0]
+            if mass_kg[body] <= 0.0:
+                raise BenchConfigError(
+                    f"undeclared_effects.{index}.parameters.mass_kg leaves {uppers[body]} "
+                    f"{mass_kg[body]:g} kg, expected more than 0"
+                )
+    return mass_kg
+
+
+def _strut_index(config: BenchConfig, effect: Effect) -> int:
+    return [strut.name for strut in config.struts].index(effect.strut)
+
+
+def _curves(points: Sequence[tuple[Sequence[float], Sequence[float]]]) -> Curves:
+    cubics = [_monotone_cubic(at, force_n) for at, force_n in points]
+    return Curves(
+        first=np.cumsum([0, *(len(cubic) for cubic in cubics)]),
+        start=np.concatenate([np.asarray(at[:-1], dtype=np.float64) for at, _ in points]),
+        width=np.concatenate([np.diff(np.asarray(at, dtype=np.float64)) for at, _ in points]),
+        cubic=np.concatenate(cubics),
+    )
+
+
+def _monotone_cubic(at: Sequence[float], force_n: Sequence[float]) -> Floats:
+    """Coefficients of a curve through points without overshoot, shape (segments, 4)."""
+    pchip = cast("Any", interpolate).PchipInterpolator(np.array(at), np.array(force_n))
+    return np.ascontiguousarray(np.asarray(pchip.c, dtype=np.float64).T)
+
+
+def _drive(force: AppliedForce, uppers: list[str], effects: tuple[Effect, ...]) -> Drive:
+    sines: list[tuple[float, ...]] = []
+    sweeps: list[tuple[float, ...]] = []
+    files = [part.record for part in force.components if isinstance(part, ForceFile)]
+    for part in force.components:
+        if isinstance(part, Sine):
+            sines.append((part.amplitude_n, part.rate_rad_per_s, part.phase_rad))
+        elif isinstance(part, Multisine):
+            sines.extend(_multisine(part))
+        elif isinstance(part, Sweep):
+            logarithmic = float(part.spacing == "logarithmic")
+            sweeps.append(
+                (part.amplitude_n, part.start_hz, part.end_hz, part.duration_s, logarithmic)
+            )
+    return Drive(
+        body=uppers.index(force.body),
+        gain=math.prod(_values(effects, Law.INPUT_GAIN)),
+        delay_s=math.fsum(_values(effects, Law.DELAY)),
+        sines=np.array(sines, dtype=np.float64).reshape(-1, SINE_COLUMNS),
+        sweeps=np.array(sweeps, dtype=np.float64).reshape(-1, SWEEP_COLUMNS),
+        file_first=np.cumsum([0, *(len(record.t_s) for record in files)]),
+        file_t_s=np.concatenate([np.empty(0), *(record.t_s for record in files)]),
+        file_force_n=np.concatenate([np.empty(0), *(record.force_n for record in files)]),
+    )
+
+
+def _multisine(part: Multisine) -> list[tuple[float, ...]]:
+    rates = 2.0 * math.pi * np.linspace(part.low_hz, part.high_hz, part.lines)
+    phases = np.random.default_rng(part.seed).uniform(0.0, 2.0 * math.pi, part.lines)
+    amplitude_n = part.rms_n * math.sqrt(2.0 / part.lines)
+    return [
+        (amplitude_n, float(rate), float(phase)) for rate, phase in zip(rates, phases, strict=True)
+    ]
+
+
+def _values(effects: tuple[Effect, ...], law: Law) -> list[float]:
+    return [
+        parameter_values(effect.name, effect.parameters)[0]
+        for effect in effects
+        if EFFECT_KINDS[effect.name].law == law
+    ]
+
+
+def _effects(config: BenchConfig) -> Effects:
+    acting = config.undeclared_effects
+    kinds = [EFFECT_KINDS[effect.name] for effect in acting]
+    parameters = np.zeros((len(acting), PARAMETER_COUNT))
+    for row, effect in zip(parameters, acting, strict=True):
+        values = parameter_values(effect.name, effect.parameters)
+        row[: len(values)] = values
+    first_state = 2 * len(config.struts) + 1
+    states = np.cumsum([first_state, *(kind.states for kind in kinds)])
+    return Effects(
+        law=np.array([int(kind.law) for kind in kinds], dtype=np.int64),
+        strut=np.array([_strut_index(config, effect) for effect in acting], dtype=np.int64),
+        state=states[:-1].astype(np.int64),
+        parameters=parameters,
+    )
+
+
+def _start(config: BenchConfig, mechanics: Mechanics) -> Floats:
+    n = len(config.struts)
+    states = 2 * n + 1 + sum(EFFECT_KINDS[e.name].states for e in config.undeclared_effects)
+    y = np.zeros(states)
+    y[2 * n] = config.temperature.initial_c
+    effects = mechanics.effects
+    for law, state, values in zip(effects.law, effects.state, effects.parameters, strict=True):
+        if law == Law.HIDDEN_MASS:
+            mass_kg, stiffness_n_per_m = values[0], values[1]
+            y[state] = -mass_kg * mechanics.gravity_m_per_s2 / stiffness_n_per_m
+    given = [strut.initial_height_m for strut in config.struts]
+    y[:n] = _positions(mechanics, _heights(mechanics, y, given))
+    return y
+
+
+def _positions(mechanics: Mechanics, heights_m: Floats) -> Floats:
+    positions_m = np.array(heights_m, dtype=np.float64)
+    for i, lower in enumerate(mechanics.lower):
+        if lower >= 0:
+            positions_m[i] += positions_m[lower]
+    return positions_m
+
+
+def _heights(mechanics: Mechanics, y: Floats, given: Sequence[float | None]) -> Floats:
+    """Heights at the start: those given, and those at which the other bodies rest, shape (n,)."""
+    n = len(given)
+    free = [i for i in range(n) if given[i] is None]
+    heights_m = np.array(
+        [
+            length if h is None else h
+            for h, length in zip(given, mechanics.free_length_m, strict=True)
+        ]
+    )
+    if not free:
+        return heights_m
+    rates = np.zeros_like(y)
+
+    def accelerations(unknown: Floats) -> Floats:
+        heights_m[free] = unknown
+        state = y.copy()
+        state[:n] = _positions(mechanics, heights_m)
+        derivatives(mechanics, 0.0, 0.0, state, rates)
+        return rates[n : 2 * n][free]
+
+    found = _root(accelerations, heights_m[free])
+    left = float(np.max(np.abs(accelerations(found))))
+    if not left <= EQUILIBRIUM_TOLERANCE_M_PER_S2:
+        raise BenchConfigError(
+            f"struts.{free[0]}.initial_height_m is missing and there is no static equilibrium "
+            "to start from, expected a height"
+        )
+    heights_m[free] = found
+    return heights_m
+
+
+def _root(function: Callable[[Floats], Floats], start: Floats) -> Floats:
+    """Solve `function(x) = 0` near `start`, shape as `start`."""
+    solution = cast("Any", optimize).root(function, start.copy(), tol=1e-13)
+    return np.asarray(solution.x, dtype=np.float64)

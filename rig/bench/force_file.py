@@ -1,0 +1,93 @@
+"""An applied force from a CSV file."""
+
+import csv
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_FILE_BYTES = 200_000_000
+"""Largest file that is read."""
+
+COLUMNS = ("t_s", "applied_force_n")
+"""Columns that the file must have; others are ignored."""
+
+
+class ForceRecord(NamedTuple):
+    """Samples of an applied force.
+
+    Attributes:
+        t_s: Times in s, shape (samples,), increasing.
+        force_n: Force at each time in N, shape (samples,).
+    """
+
+    t_s: NDArray[np.float64]
+    force_n: NDArray[np.float64]
+
+
+def read_force_file(folder: Path, name: str) -> ForceRecord:
+    """Read an applied force.
+
+    Args:
+        folder: Folder of the configuration; the file must lie in it or below.
+        name: Path of the file relative to `folder`.
+
+    Returns:
+        The samples.
+
+    Raises:
+        ValueError: The file is outside the folder, missing, too large, or not such a table; one
+            line naming line, column and expectation.
+    """
+    path = (folder / name).resolve()
+    if not path.is_relative_to(folder.resolve()):
+        raise ValueError(f"path = {name!r}, expected a file in the configuration's folder")
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise ValueError(f"path = {name!r}, expected at most {MAX_FILE_BYTES} bytes")
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(_rows(csv.reader(file), name))
+    except OSError as error:
+        raise ValueError(f"path = {name!r} cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"path = {name!r}, expected CSV in UTF-8") from error
+    if len(rows) < 2:
+        raise ValueError(f"path = {name!r} has {len(rows)} samples, expected at least 2")
+    table = np.array(rows, dtype=np.float64)
+    steps_s = np.diff(table[:, 0])
+    if not bool(np.all(steps_s > 0.0)):
+        line = int(np.argmin(steps_s > 0.0)) + 3
+        raise ValueError(f"path = {name!r}, line {line}: t_s does not increase")
+    return ForceRecord(np.ascontiguousarray(table[:, 0]), np.ascontiguousarray(table[:, 1]))
+
+
+def _rows(reader: Iterator[list[str]], name: str) -> Iterator[tuple[float, float]]:
+    empty: list[str] = []
+    header = [cell.strip() for cell in next(reader, empty)]
+    for column in COLUMNS:
+        if header.count(column) != 1:
+            raise ValueError(f"path = {name!r}, line 1: expected one column {column}")
+    where = [header.index(column) for column in COLUMNS]
+    for line, row in enumerate(reader, start=2):
+        if len(row) != len(header):
+            raise ValueError(f"path = {name!r}, line {line}: expected {len(header)} columns")
+        t_s, force_n = (
+            _number(row[index], name, line, column)
+            for index, column in zip(where, COLUMNS, strict=True)
+        )
+        yield t_s, force_n
+
+
+def _number(text: str, name: str, line: int, column: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(
+            f"path = {name!r}, line {line}: {column} = {text[:40]!r}, expected a finite number"
+        )
+    return value
