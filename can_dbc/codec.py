@@ -84,9 +84,12 @@ def compile_decoder(
     fields = _fields(message, signal_names, dimensions)
     conditions = _all_conditions(message, signal_names)
     length = message.length_bytes
-    if conditions or any(field.float_format for field in fields):
-        return _general_decoder(fields, conditions, length)
-    return _integer_decoder(fields, length)
+    byte_orders = {field.is_big_endian for field in fields}
+    plain = not conditions and not any(field.float_format for field in fields)
+    count = len(fields)
+    if plain and len(byte_orders) == 1 and count <= 2:
+        return _integer_decoder(fields[0], fields[-1], count, length)
+    return _general_decoder(fields, conditions, length)
 
 
 def compile_encoder(
@@ -265,14 +268,12 @@ def _all_conditions(message: Message, signal_names: Sequence[str]) -> tuple[_Con
 # ------------------------------------------------------------------------------------ one frame
 
 
-def _integer_decoder(fields: tuple[_Field, ...], length: int) -> Decoder:
-    """Decoder of integers that are in every frame: the case of the loop, unrolled up to two."""
-    order = "big" if fields[0].is_big_endian else "little"
-    if len(fields) > 2 or fields[0].is_big_endian != fields[-1].is_big_endian:
-        return _general_decoder(fields, (), length)
+def _integer_decoder(first: _Field, last: _Field, count: int, length: int) -> Decoder:
+    """Decoder of one or two integers that are in every frame: the case of the loop."""
+    order = "big" if first.is_big_endian else "little"
     from_bytes = int.from_bytes
-    _, _, shift_a, mask_a, sign_a, _, scale_a, offset_a, _, _ = fields[0]
-    _, _, shift_b, mask_b, sign_b, _, scale_b, offset_b, _, _ = fields[-1]
+    _, _, shift_a, mask_a, sign_a, _, scale_a, offset_a, _, _ = first
+    _, _, shift_b, mask_b, sign_b, _, scale_b, offset_b, _, _ = last
 
     def decode_one(data: bytes | bytearray) -> tuple[float, ...] | None:
         if len(data) != length:
@@ -289,7 +290,7 @@ def _integer_decoder(fields: tuple[_Field, ...], length: int) -> Decoder:
             (((raw >> shift_b) & mask_b ^ sign_b) - sign_b) * scale_b + offset_b,
         )
 
-    return decode_one if len(fields) == 1 else decode_two
+    return decode_one if count == 1 else decode_two
 
 
 def _general_decoder(
@@ -333,84 +334,62 @@ def _packer(message: Message, field: _Field) -> _Packer:
 def _integer_packer(message: Message, field: _Field) -> _Packer:
     scale, offset, mask = field.scale, field.offset, field.mask
     low, high = _raw_limits(message, field)
-    # Strictly between these a number rounds into the limits (to even, at a half).
-    below, above = _half_step_beyond(low, high)
+    # Strictly between these a number rounds into the limits. Where floats have no halves the
+    # limits themselves take the slow way, which is exact.
+    below, above = low - 0.5, high + 0.5
+    unknown = min(max(round(-offset / scale), low), high)
 
     def pack(value: float) -> tuple[int, bool]:
         steps = (value - offset) / scale
         if below < steps < above:
             return round(steps) & mask, False
-        if steps != steps:  # noqa: PLR0124 - the test for NaN without a call
-            steps = (0.0 - offset) / scale
-            return round(min(max(steps, low), high)) & mask, True
-        held = low if steps <= low else high
-        return held & mask, steps != held
+        if math.isfinite(steps):
+            wanted = round(steps)
+            held = min(max(wanted, low), high)
+            return held & mask, held != wanted
+        return (unknown if math.isnan(steps) else low if steps < low else high) & mask, True
 
     return pack
 
 
 def _raw_limits(message: Message, field: _Field) -> tuple[int, int]:
     """Smallest and largest raw value that the bits hold and the DBC's range allows."""
-    low, high = -field.sign, field.mask - field.sign
-    bounds = [
-        (bound - field.offset) / field.scale
-        for bound in (field.minimum, field.maximum)
-        if bound is not None
-    ]
+    lowest, highest = -field.sign, field.mask - field.sign
+    low, high = _range_in_steps(field, float(lowest), float(highest))
     # A limit that is a whole number of steps must survive its rounding in floating point.
-    if field.minimum is not None:
-        edge = bounds[0]
-        slack = 1e-9 * max(1.0, abs(edge))
-        if field.scale > 0:
-            low = max(low, math.ceil(edge - slack))
-        else:
-            high = min(high, math.floor(edge + slack))
-    if field.maximum is not None:
-        edge = bounds[-1]
-        slack = 1e-9 * max(1.0, abs(edge))
-        if field.scale > 0:
-            high = min(high, math.floor(edge + slack))
-        else:
-            low = max(low, math.ceil(edge - slack))
-    if low > high:
+    low_raw = max(lowest, math.ceil(low - 1e-9 * max(1.0, abs(low))))
+    high_raw = min(highest, math.floor(high + 1e-9 * max(1.0, abs(high))))
+    if low_raw > high_raw:
         raise DatabaseError(
             f"{message.path}: message {message.name}: signal {field.name}: "
             "no raw value lies within the signal's range"
         )
-    return low, high
+    return low_raw, high_raw
 
 
-def _half_step_beyond(low: int, high: int) -> tuple[float, float]:
-    below, above = low - 0.5, high + 0.5
-    # Beyond 52 bits a half is lost; there every float is a whole number.
-    if below == low:
-        below = math.nextafter(float(low), -math.inf) if float(low) >= low else float(low)
-    if above == high:
-        above = math.nextafter(float(high), math.inf) if float(high) <= high else float(high)
-    return below, above
+def _range_in_steps(field: _Field, lowest: float, highest: float) -> tuple[float, float]:
+    """The DBC's range in raw steps, with the given limits where it leaves one open."""
+    minimum, maximum = field.minimum, field.maximum
+    bounds = (
+        None if minimum is None else (minimum - field.offset) / field.scale,
+        None if maximum is None else (maximum - field.offset) / field.scale,
+    )
+    low, high = bounds if field.scale > 0.0 else bounds[::-1]
+    return lowest if low is None else low, highest if high is None else high
 
 
 def _float_packer(field: _Field) -> _Packer:
     form = field.float_format
     size = struct.calcsize(form)
     largest = 3.4028234663852886e38 if size == 4 else 1.7976931348623157e308
-    edges = [
-        largest if bound is None else (bound - field.offset) / field.scale
-        for bound in (field.minimum, field.maximum)
-    ]
-    if field.minimum is None:
-        edges[0] = -largest
-    low = max(min(edges), -largest)
-    high = min(max(edges), largest)
+    low, high = _range_in_steps(field, -largest, largest)
+    low, high = max(low, -largest), min(high, largest)
+    unknown = min(max(-field.offset / field.scale, low), high)
 
     def pack(value: float) -> tuple[int, bool]:
-        number = (value - field.offset) / field.scale
-        if math.isnan(number):
-            number = (0.0 - field.offset) / field.scale
-            held = min(max(number, low), high)
-            return int.from_bytes(struct.pack(form, held), "little"), True
-        held = min(max(number, low), high)
-        return int.from_bytes(struct.pack(form, held), "little"), held != number
+        wanted = (value - field.offset) / field.scale
+        held = unknown if math.isnan(wanted) else min(max(wanted, low), high)
+        return int.from_bytes(struct.pack(form, held), "little"), held != wanted
 
     return pack
 

@@ -17,11 +17,13 @@ from types import MappingProxyType
 from typing import cast
 
 import cantools.database
+from cantools.database.can import Database as CantoolsDatabase
 from cantools.database.can import Message as CantoolsMessage
 from cantools.database.can import Signal as CantoolsSignal
+from cantools.database.errors import Error as CantoolsError
 
 from can_dbc.errors import DatabaseError
-from can_dbc.protection import Identity, Profile, Protection
+from can_dbc.protection import NEVER_NS, Identity, Profile, Protection
 
 __all__ = ["DEFAULT_DATABASE", "Database", "DatabaseError", "Message", "Signal", "load_database"]
 
@@ -237,10 +239,10 @@ def _parse(path: Path, text: str) -> list[CantoolsMessage]:
     _refuse_excess(path, text)
     try:
         parsed = cantools.database.load_string(text, database_format="dbc", strict=True)
-    except (cantools.database.Error, ValueError) as error:
+    except (CantoolsError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise DatabaseError(f"{path}: not a usable DBC: {reason[:300]}") from None
-    return cast("list[CantoolsMessage]", parsed.messages)
+    return cast("CantoolsDatabase", parsed).messages
 
 
 def _message(path: Path, message: CantoolsMessage) -> Message:
@@ -307,14 +309,10 @@ def _bound(place: str, signal: str, what: str, value: float | None) -> float | N
 
 def _check_fit(place: str, signal: Signal, length_bytes: int) -> None:
     # cantools checks only signals that it reaches through their multiplexers.
-    if signal.is_big_endian:
-        first = 8 * (signal.start // 8) + 7 - signal.start % 8
-    else:
-        first = signal.start
+    byte, bit = divmod(signal.start, 8)
+    first = 8 * byte + 7 - bit if signal.is_big_endian else signal.start
     if first + signal.length_bits > 8 * length_bytes:
-        raise DatabaseError(
-            f"{place}: signal {signal.name}: does not fit in {length_bytes} bytes"
-        )
+        raise DatabaseError(f"{place}: signal {signal.name}: does not fit in {length_bytes} bytes")
 
 
 def _attribute(message: CantoolsMessage, name: str) -> str | int | float | None:
@@ -365,7 +363,7 @@ def _protection(
         counter_modulus=profile.counter_modulus,
         max_delta_counter=_max_delta(place, message, profile),
         cycle_time_ns=cycle_time_ns,
-        silence_ns=profile.counter_modulus * (cycle_time_ns or 0),
+        silence_ns=profile.counter_modulus * cycle_time_ns if cycle_time_ns else NEVER_NS,
         foreign=(),
     )
 

@@ -64,7 +64,8 @@ class Protection:
         counter_modulus: Number of counter values.
         max_delta_counter: Largest step of the counter that is read as lost frames.
         cycle_time_ns: Time between two frames, in ns, or None where the DBC gives none.
-        silence_ns: Silence after which the counter may have gone round, in ns (0: unknown).
+        silence_ns: Silence after which the counter may have gone round, in ns (`NEVER_NS` where
+            the DBC gives no cycle time).
         foreign: Identities of the database's other messages, for recognising their frames here.
     """
 
@@ -77,6 +78,10 @@ class Protection:
     cycle_time_ns: int | None
     silence_ns: int
     foreign: tuple[Identity, ...]
+
+
+NEVER_NS = 2**63 - 1
+"""A time that no run reaches, in ns."""
 
 
 class Verdict(Enum):
@@ -98,6 +103,10 @@ class Verdict(Enum):
 
 
 _ACCEPTED = frozenset({Verdict.OK, Verdict.FIRST, Verdict.LOST})
+
+# Looking up a member of an enum costs as much as the CRC of a frame.
+_P02 = Profile.P02
+_OK = Verdict.OK
 
 RESYNC_FRAMES = 2
 """Frames in a row, after an out-of-sequence one, that make a restarted sequence believable."""
@@ -154,7 +163,7 @@ def protect(data: bytes | bytearray, counter: int, protection: Protection) -> by
     frame = bytearray(data)
     frame[1] = frame[1] & 0xF0 | counter % protection.counter_modulus
     profile, data_ids = protection.identity
-    if profile is Profile.P02:
+    if profile is _P02:
         e2e_p02_protect(frame, data_ids, increment_counter=False)
     else:
         e2e_p01_protect(frame, int.from_bytes(data_ids, "big"), increment_counter=False)
@@ -189,16 +198,12 @@ def check(
     if not _crc_fits(data, protection.identity):
         return state, _wrong_crc(data, protection)
     counter = data[1] & 0x0F
-    modulus = protection.counter_modulus
     last, last_ns, _, _, _ = state
+    modulus = protection.counter_modulus
     # The frequent case first: next in sequence and in time.
-    if (
-        (counter - last) % modulus == 1
-        and last >= 0
-        and counter < modulus
-        and (t_ns - last_ns < protection.silence_ns or protection.silence_ns == 0)
-    ):
-        return SequenceState(counter, t_ns), Verdict.OK
+    next_in_sequence = (counter - last) % modulus == 1 and last >= 0 and counter < modulus
+    if next_in_sequence and t_ns - last_ns < protection.silence_ns:
+        return SequenceState(counter, t_ns), _OK
     return _judge_sequence(state, counter, t_ns, protection)
 
 
@@ -228,7 +233,7 @@ def check_crc_log(data: NDArray[np.uint8], protection: Protection) -> NDArray[np
 
 def _crc_fits(data: bytes | bytearray, identity: Identity) -> bool:
     profile, data_ids = identity
-    if profile is Profile.P02:
+    if profile is _P02:
         return e2e_p02_check(data, data_ids)
     return e2e_p01_check(data, int.from_bytes(data_ids, "big"))
 
@@ -249,16 +254,13 @@ def _judge_sequence(
         return SequenceState(counter, t_ns), Verdict.FIRST
     delta = (counter - state.counter) % modulus
     cycles = _cycles_since(state.t_ns, t_ns, protection)
-    if cycles >= modulus:
-        lost = _lost_in_silence(delta, cycles, modulus)
-        return SequenceState(counter, t_ns, lost), Verdict.LOST if lost else Verdict.OK
-    if delta == 0:
+    silent = cycles >= modulus
+    if delta == 0 and not silent:
         return state._replace(t_ns=t_ns, lost=0), Verdict.REPEATED
-    if delta == 1:
-        return SequenceState(counter, t_ns), Verdict.OK
-    if delta <= max(protection.max_delta_counter, cycles + 1):
-        return SequenceState(counter, t_ns, delta - 1), Verdict.LOST
-    return _resynchronise(state, counter, t_ns, modulus)
+    if not silent and delta > max(protection.max_delta_counter, cycles + 1):
+        return _resynchronise(state, counter, t_ns, modulus)
+    lost = _lost_in_silence(delta, cycles, modulus) if silent else delta - 1
+    return SequenceState(counter, t_ns, lost), Verdict.LOST if lost else _OK
 
 
 def _resynchronise(

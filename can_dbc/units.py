@@ -1,6 +1,8 @@
 """Units of a DBC's signals, converted to SI once when a codec is compiled."""
 
+import math
 import re
+import tokenize
 from enum import Enum
 from functools import cache
 from typing import Any, NamedTuple, cast
@@ -81,10 +83,15 @@ def si_conversion(unit: str, dimension: Dimension) -> SiConversion:
         # Two points give an affine map, and the zero of every unit but temperatures is exact.
         offset = _to_si(0.0, text, dimension)
         factor = _to_si(1.0, text, dimension) - offset
+        probe = _to_si(100.0, text, dimension)
     except pint.DimensionalityError:
         raise DatabaseError(f"unit {unit!r} is of another dimension, {expected}") from None
-    except (pint.PintError, AssertionError, ArithmeticError, LookupError, TypeError, ValueError):
+    except (pint.PintError, tokenize.TokenError, ArithmeticError, TypeError, ValueError):
         raise DatabaseError(f"unit {unit!r} is not known, {expected}") from None
+    except AssertionError:  # how pint refuses products of logarithmic units
+        raise DatabaseError(f"unit {unit!r} is logarithmic, {expected}") from None
+    if not math.isclose(probe, 100.0 * factor + offset, rel_tol=1e-9):
+        raise DatabaseError(f"unit {unit!r} is not linear, {expected}")
     return SiConversion(factor, offset)
 
 
