@@ -1,0 +1,776 @@
+"""DART as a black box: state in, forces in, state out.
+
+DART's own `World.step` is semi-implicit Euler, first order, with the forces held over the step. Here
+DART only answers "what is the acceleration in this state under these forces?"
+(`computeForwardDynamics`, a sixth of the cost of a step), and Kutta's third-order method asks it
+three times a sub-step. That keeps the error of the seed case far below the height's resolution at
+one sub-step a millisecond, where a second-order method would need four.
+
+Reference: Kutta, "Beitrag zur näherungsweisen Integration totaler Differentialgleichungen" (1901);
+for the use in multibody dynamics: Featherstone, "Rigid Body Dynamics Algorithms" (2008).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import dartpy
+import numpy as np
+from numpy.typing import NDArray
+
+from dart_model.effects import Effect, effect
+from dart_model.spec import WORLD, BodySpec, FileSkeleton, InlineSkeleton, ModelSpec, StrutSpec
+from dart_model.yaml_file import InputError
+
+# dartpy ships no types: it is untyped here, and nowhere else.
+_dart = cast("Any", dartpy)
+
+DEFAULT_STEP_S = 1e-3
+"""Longest sub-step of a smooth model; shorter where an effect is stiff."""
+
+_MAX_SUBSTEPS = 10_000
+_STABLE_PRODUCT = 1.0
+"""Largest |eigenvalue| * step; Kutta's method is stable up to 2.5."""
+
+
+class PlantState(NamedTuple):
+    """State of the model.
+
+    Attributes:
+        positions: Joint coordinates, in m or rad, as DART orders them.
+        velocities: Joint velocities, in m/s or rad/s.
+        memory: Memory of all effects, strut after strut.
+        t_s: Time, for effects that depend on it.
+    """
+
+    positions: tuple[float, ...]
+    velocities: tuple[float, ...]
+    memory: tuple[float, ...]
+    t_s: float
+
+
+class Loaded(NamedTuple):
+    """A state under the forces that act from it on.
+
+    Attributes:
+        state: The state.
+        virtual_forces_n: Virtual force in each strut, held until the next state.
+        applied_force_n: Applied force at the state.
+        temperature_c: Damper temperature.
+        acceleration: Joint accelerations under these forces.
+        memory_rates: Derivative of the memory.
+    """
+
+    state: PlantState
+    virtual_forces_n: Sequence[float]
+    applied_force_n: float
+    temperature_c: float
+    acceleration: "_Value"
+    memory_rates: list[float]
+
+
+class Motion(NamedTuple):
+    """What one strut does in a state.
+
+    Attributes:
+        height_m: Length of the strut.
+        velocity_m_per_s: Its rate; positive is rebound.
+        force_n: Spring-damper force with effects, without the virtual force.
+    """
+
+    height_m: float
+    velocity_m_per_s: float
+    force_n: float
+
+
+@dataclass(frozen=True)
+class GuidedModel:
+    """A model whose struts move on straight guides, as matrices that DART gave.
+
+    Mass matrix, gravity and strut directions are then constant, and the equations of motion are
+    ``mass @ acceleration = gravity + strut_rows.T @ strut_forces + applied_row * applied_force``.
+
+    Attributes:
+        mass_kg: Generalised mass matrix, shape (n, n).
+        gravity_n: Generalised gravity force, shape (n,).
+        strut_rows: Derivative of strut heights by coordinates, shape (struts, n).
+        heights_m: Strut heights at zero coordinates, shape (struts,).
+        applied_row: Generalised force per newton of applied force, shape (n,).
+    """
+
+    mass_kg: NDArray[np.float64]
+    gravity_n: NDArray[np.float64]
+    strut_rows: NDArray[np.float64]
+    heights_m: NDArray[np.float64]
+    applied_row: NDArray[np.float64]
+
+
+_Value = Any
+"""Joint coordinates: a float where there is one, else an array. The integrator's formulas hold for
+both, and a bench with one guided body, the usual one, is spared the cost of arrays."""
+
+_Surroundings = tuple[float, float, float]
+"""Time (s), applied force (N), temperature (°C)."""
+
+_Acceleration = Callable[
+    [_Value, _Value, _Value, Sequence[float], _Surroundings, list[float]], _Value
+]
+"""Position, velocity, held forces, memory, surroundings -> acceleration; writes memory rates."""
+
+
+class _Strut:
+    """A strut ready to be evaluated: constants and laws in the form that is read fastest."""
+
+    __slots__ = ("constants", "damping", "free_length", "laws", "memory_size", "stiffness")
+
+    def __init__(self, spec: StrutSpec, first_memory: int) -> None:
+        self.free_length = spec.free_length_m
+        self.stiffness = spec.stiffness_n_per_m
+        self.damping = spec.damping_n_s_per_m
+        self.constants = (self.free_length, self.stiffness, self.damping)
+        laws: list[tuple[Effect, list[float], int, int]] = []
+        start = first_memory
+        for item in spec.effects:
+            law = effect(item.name)
+            laws.append((law, item.values(), start, start + law.state_size))
+            start += law.state_size
+        self.laws = tuple(laws)
+        self.memory_size = start - first_memory
+
+    def effects_n(
+        self,
+        height_m: float,
+        velocity_m_per_s: float,
+        memory: Sequence[float],
+        surroundings: _Surroundings,
+        memory_rates: list[float],
+    ) -> float:
+        """Force of all effects; writes the derivative of their memory.
+
+        Args:
+            height_m: Height.
+            velocity_m_per_s: Velocity.
+            memory: Memory of the whole model.
+            surroundings: Time (s), applied force (N), temperature (°C).
+            memory_rates: Derivative of the memory of the whole model, written in this strut's part.
+        """
+        t_s, applied_n, temperature_c = surroundings
+        constants = self.constants
+        force = 0.0
+        for law, parameters, start, stop in self.laws:
+            own = memory[start:stop]
+            force += law.force(
+                t_s, height_m, velocity_m_per_s, applied_n, temperature_c, own, parameters, constants
+            )  # fmt: skip
+            if law.rate is not None:
+                out = [0.0] * (stop - start)
+                law.rate(
+                    t_s, height_m, velocity_m_per_s, applied_n, temperature_c, own, parameters,
+                    constants, out,
+                )  # fmt: skip
+                memory_rates[start:stop] = out
+        return force
+
+
+class _Coordinate:
+    """The only coordinate of a guided model, as a float."""
+
+    adds_up = True
+
+    def __init__(self, skeleton: Any, struts: Sequence[_Strut], rows: "_Rows") -> None:
+        self._struts: list[tuple[_Strut, float, float]] = list(
+            zip(struts, rows.offsets_m.tolist(), rows.struts[:, 0].tolist(), strict=True)
+        )
+        self._at_zero = sum(
+            strut.stiffness * (strut.free_length - offset) * row
+            for strut, offset, row in self._struts
+        )
+        self.acceleration = self._acceleration(skeleton.getDof(0), skeleton, float(rows.applied[0]))
+
+    def values(self, numbers: tuple[float, ...]) -> float:
+        return numbers[0]
+
+    def numbers(self, value: float) -> tuple[float, ...]:
+        return (value,)
+
+    def moved(self, q: float, v: float, h: float) -> float:
+        return q + h * v
+
+    def motions(self, q: float, v: float) -> list[tuple[float, float]]:
+        return [(offset + row * q, row * v) for _, offset, row in self._struts]
+
+    def held(self, virtual_forces_n: Sequence[float]) -> float:
+        total = self._at_zero
+        for index, (_, _, row) in enumerate(self._struts):
+            total += row * virtual_forces_n[index]
+        return total
+
+    def _acceleration(self, dof: Any, skeleton: Any, applied_row: float) -> "_Acceleration":
+        # A closure over locals: this is called three times a tick, and attributes cost.
+        put_position: Callable[[float], None] = dof.setPosition
+        put_velocity: Callable[[float], None] = dof.setVelocity
+        put_force: Callable[[float], None] = dof.setForce
+        get_acceleration: Callable[[], float] = dof.getAcceleration
+        solve: Callable[[], None] = skeleton.computeForwardDynamics
+        stiffness = sum(strut.stiffness * row * row for strut, _, row in self._struts)
+        damping = sum(strut.damping * row * row for strut, _, row in self._struts)
+        with_effects = tuple(entry for entry in self._struts if entry[0].laws)
+
+        def acceleration(
+            q: float,
+            v: float,
+            held: float,
+            memory: Sequence[float],
+            surroundings: _Surroundings,
+            memory_rates: list[float],
+        ) -> float:
+            force = held - stiffness * q - damping * v + applied_row * surroundings[1]
+            for strut, offset, row in with_effects:
+                force += row * strut.effects_n(
+                    offset + row * q, row * v, memory, surroundings, memory_rates
+                )
+            put_position(q)
+            put_velocity(v)
+            put_force(force)
+            solve()
+            return get_acceleration()
+
+        return acceleration
+
+
+class _Coordinates:
+    """All coordinates of a model, as arrays."""
+
+    def __init__(
+        self,
+        skeleton: Any,
+        struts: Sequence[_Strut],
+        rows_at: "Callable[[NDArray[np.float64]], _Rows]",
+        constant: "_Rows | None",
+    ) -> None:
+        self._skeleton = skeleton
+        self._struts = struts
+        self._rows_at = rows_at
+        self._constant = constant
+        self.adds_up = _coordinates_add_up(skeleton)
+
+    def values(self, numbers: tuple[float, ...]) -> NDArray[np.float64]:
+        return np.array(numbers)
+
+    def numbers(self, value: NDArray[np.float64]) -> tuple[float, ...]:
+        return tuple(value.tolist())
+
+    def moved(
+        self, q: NDArray[np.float64], v: NDArray[np.float64], h: float
+    ) -> NDArray[np.float64]:
+        self._skeleton.setPositions(q)
+        self._skeleton.setVelocities(v)
+        self._skeleton.integratePositions(h)
+        return np.array(self._skeleton.getPositions())
+
+    def motions(
+        self, q: NDArray[np.float64], v: NDArray[np.float64]
+    ) -> list[tuple[float, float]]:
+        rows = self._constant or self._rows_at(q)
+        heights = (rows.offsets_m + rows.struts @ q).tolist()
+        return list(zip(heights, (rows.struts @ v).tolist(), strict=True))
+
+    def held(self, virtual_forces_n: Sequence[float]) -> Sequence[float]:
+        return virtual_forces_n
+
+    def acceleration(
+        self,
+        q: NDArray[np.float64],
+        v: NDArray[np.float64],
+        held: Sequence[float],
+        memory: Sequence[float],
+        surroundings: _Surroundings,
+        memory_rates: list[float],
+    ) -> NDArray[np.float64]:
+        rows = self._constant or self._rows_at(q)
+        forces = list(held)
+        heights = (rows.offsets_m + rows.struts @ q).tolist()
+        velocities = (rows.struts @ v).tolist()
+        for index, strut in enumerate(self._struts):
+            height, velocity = heights[index], velocities[index]
+            forces[index] -= (
+                strut.stiffness * (height - strut.free_length) + strut.damping * velocity
+            )
+            if strut.laws:
+                forces[index] += strut.effects_n(
+                    height, velocity, memory, surroundings, memory_rates
+                )
+        self._skeleton.setPositions(q)
+        self._skeleton.setVelocities(v)
+        self._skeleton.setForces(forces @ rows.struts + surroundings[1] * rows.applied)
+        self._skeleton.computeForwardDynamics()
+        return np.array(self._skeleton.getAccelerations())
+
+
+class DartPlant:
+    """A model in DART.
+
+    The skeleton inside is scratch paper: every call writes the whole state first, so that results
+    depend on the arguments alone. One plant must not be used from two threads at once.
+
+    Args:
+        spec: The model.
+
+    Raises:
+        InputError: A skeleton file is wrong, or a body that a strut names is not in it.
+    """
+
+    def __init__(self, spec: ModelSpec) -> None:
+        self.spec = spec
+        self._skeleton, self._bodies = _build(spec)
+        self._skeleton.setGravity([0.0, 0.0, -spec.gravity_m_per_s2])
+        _add_masses(spec, self._bodies)
+        self.coordinates = int(self._skeleton.getNumDofs())
+        self._struts = _struts(spec)
+        self.memory_size = sum(strut.memory_size for strut in self._struts)
+        self._directions = _guides(spec, self._skeleton, self._bodies)
+        rows = self._constant_rows()
+        self._rows = rows
+        self._joints: _Coordinate | _Coordinates = (
+            _Coordinate(self._skeleton, self._struts, rows)
+            if rows is not None and self.coordinates == 1
+            else _Coordinates(self._skeleton, self._struts, self._rows_at, rows)
+        )
+        self._acceleration = self._joints.acceleration
+        lightest_kg = min(float(body.getMass()) for body in self._bodies.values())
+        self.step_s = _stable_step_s(self._struts, lightest_kg)
+
+    def initial(
+        self, heights_m: Sequence[float], velocities_m_per_s: Sequence[float] | None = None
+    ) -> PlantState:
+        """State with the given strut heights and velocities, found by Newton's method.
+
+        Args:
+            heights_m: One height a strut.
+            velocities_m_per_s: One velocity a strut; at rest if absent.
+
+        Raises:
+            InputError: The joints cannot reach the heights.
+        """
+        target = np.asarray(heights_m, dtype=np.float64)
+        q = np.zeros(self.coordinates)
+        for _ in range(50):
+            rows = self._rows_at(q)
+            error = target - rows.offsets_m - rows.struts @ q
+            if float(np.max(np.abs(error))) < 1e-13:
+                break
+            q = q + np.linalg.lstsq(rows.struts, error, rcond=None)[0]
+        rows = self._rows_at(q)
+        if not np.allclose(rows.offsets_m + rows.struts @ q, target, rtol=0.0, atol=1e-9):
+            raise InputError(
+                f"model {self.spec.name}: heights {target.tolist()} m: out of the joints' reach"
+            )
+        v = np.zeros(self.coordinates)
+        if velocities_m_per_s is not None:
+            v = np.linalg.lstsq(rows.struts, np.asarray(velocities_m_per_s), rcond=None)[0]
+        memory = (0.0,) * self.memory_size
+        return PlantState(tuple(q.tolist()), tuple(v.tolist()), memory, 0.0)
+
+    def load(
+        self,
+        state: PlantState,
+        virtual_forces_n: Sequence[float],
+        applied_force_n: float,
+        temperature_c: float,
+    ) -> Loaded:
+        """Let forces act on a state.
+
+        Args:
+            state: The state.
+            virtual_forces_n: Virtual force in each strut.
+            applied_force_n: Applied force.
+            temperature_c: Damper temperature.
+        """
+        joints = self._joints
+        memory_rates = [0.0] * self.memory_size
+        acceleration = self._acceleration(
+            joints.values(state.positions),
+            joints.values(state.velocities),
+            joints.held(virtual_forces_n),
+            state.memory,
+            (state.t_s, applied_force_n, temperature_c),
+            memory_rates,
+        )
+        return Loaded(
+            state, virtual_forces_n, applied_force_n, temperature_c, acceleration, memory_rates
+        )
+
+    def step(self, loaded: Loaded, dt_s: float, applied_force_end_n: float) -> PlantState:
+        """Advance the model.
+
+        Args:
+            loaded: State at the beginning and the forces on it; virtual forces are held.
+            dt_s: Length of the step; divided into sub-steps of at most `step_s`.
+            applied_force_end_n: Applied force at the end; it is linear in between.
+
+        Returns:
+            State at the end.
+        """
+        if dt_s <= 0.0:
+            return loaded.state
+        count = 1
+        if dt_s > self.step_s * (1.0 + 1e-9):
+            count = min(math.ceil(dt_s / self.step_s - 1e-9), _MAX_SUBSTEPS)
+        h = dt_s / count
+        state, virtual, applied, temperature_c, a, rates = loaded
+        rise = (applied_force_end_n - applied) / count
+        joints = self._joints
+        held = joints.held(virtual)
+        positions, velocities, memory, t_s = state
+        q, v = joints.values(positions), joints.values(velocities)
+        for index in range(count):
+            if index > 0:
+                rates = [0.0] * len(memory)
+                a = self._acceleration(q, v, held, memory, (t_s, applied, temperature_c), rates)
+            middle = (t_s + 0.5 * h, applied + 0.5 * rise, temperature_c)
+            applied += rise
+            t_s += h
+            end = (t_s, applied, temperature_c)
+            q, v, memory = self._substep(q, v, a, held, memory, rates, h, middle, end)
+        return PlantState(joints.numbers(q), joints.numbers(v), memory, t_s)
+
+    def _substep(
+        self,
+        q: _Value,
+        v: _Value,
+        a1: _Value,
+        held: _Value,
+        memory: tuple[float, ...],
+        s1: list[float],
+        h: float,
+        middle: _Surroundings,
+        end: _Surroundings,
+    ) -> tuple[_Value, _Value, tuple[float, ...]]:
+        # Kutta's third-order method, in which the stages' velocities drive the positions.
+        joints, acceleration = self._joints, self._acceleration
+        # Rotations in space do not add up; DART composes them.
+        moved = None if joints.adds_up else joints.moved
+        half, sixth = 0.5 * h, h / 6.0
+        m2 = m3 = memory
+        s2, s3 = s1, s1
+        if memory:
+            s2, s3 = [0.0] * len(memory), [0.0] * len(memory)
+            m2 = _advanced(memory, half, s1)
+        q2 = moved(q, v, half) if moved else q + half * v
+        a2 = acceleration(q2, v + half * a1, held, m2, middle, s2)
+        if memory:
+            m3 = _advanced(_advanced(memory, 2.0 * h, s2), -h, s1)
+        v3 = v + h * a1
+        q3 = moved(q, v3, h) if moved else q + h * v3
+        a3 = acceleration(q3, v + h * (2.0 * a2 - a1), held, m3, end, s3)
+        if memory:
+            memory = tuple(
+                [
+                    m + sixth * (a + 4.0 * b + c)
+                    for m, a, b, c in zip(memory, s1, s2, s3, strict=True)
+                ]
+            )
+        mean = v + sixth * (a1 + 2.0 * a2)
+        q_end = moved(q, mean, h) if moved else q + h * mean
+        return q_end, v + sixth * (a1 + 4.0 * a2 + a3), memory
+
+    def motions(
+        self, state: PlantState, applied_force_n: float, temperature_c: float
+    ) -> list[Motion]:
+        """Height, velocity and force of every strut in a state.
+
+        Args:
+            state: The state.
+            applied_force_n: Applied force, for effects that depend on it.
+            temperature_c: Damper temperature.
+        """
+        joints = self._joints
+        positions, velocities, memory, t_s = state
+        result: list[Motion] = []
+        motions = joints.motions(joints.values(positions), joints.values(velocities))
+        for index, (height, velocity) in enumerate(motions):
+            strut = self._struts[index]
+            force = -strut.stiffness * (height - strut.free_length) - strut.damping * velocity
+            if strut.laws:
+                surroundings = (t_s, applied_force_n, temperature_c)
+                force += strut.effects_n(
+                    height, velocity, memory, surroundings, [0.0] * len(memory)
+                )
+            result.append(Motion(height, velocity, force))
+        return result
+
+    def accelerations(self, loaded: Loaded) -> tuple[float, ...]:
+        """Second derivative of every strut's height, in m/s², under the forces in `loaded`."""
+        state = loaded.state
+        joints = self._joints
+        if self._rows is not None:
+            zero = joints.values((0.0,) * self.coordinates)
+            return tuple([a for _, a in joints.motions(zero, loaded.acceleration)])
+        v = np.array(state.velocities)
+        h = 1e-6
+        turning = (
+            self._rows_at(joints.moved(joints.values(state.positions), v, h)).struts
+            - self._rows_at(joints.moved(joints.values(state.positions), v, -h)).struts
+        ) / (2.0 * h)
+        rows = self._rows_at(np.array(state.positions)).struts
+        return tuple((rows @ loaded.acceleration + turning @ v).tolist())
+
+    def guided(self) -> GuidedModel | None:
+        """The model as constant matrices, or None if its struts do not move on straight guides."""
+        if self._rows is None:
+            return None
+        zero = np.zeros(self.coordinates)
+        self._skeleton.setPositions(zero)
+        self._skeleton.setVelocities(zero)
+        mass = np.array(self._skeleton.getMassMatrix(), dtype=np.float64)
+        gravity = -np.array(self._skeleton.getGravityForces(), dtype=np.float64)
+        return GuidedModel(
+            mass, gravity, self._rows.struts, self._rows.offsets_m, self._rows.applied
+        )
+
+    def _constant_rows(self) -> "_Rows | None":
+        """The struts' rows if they are the same in every configuration, else None."""
+        first, *others = [self._rows_at(q) for q in _sample_positions(self.coordinates)]
+        same = all(
+            np.allclose(a, b, rtol=1e-9, atol=1e-12)
+            for other in others
+            for a, b in zip(first, other, strict=True)
+        )
+        return first if same else None
+
+    def _rows_at(self, q: NDArray[np.float64]) -> "_Rows":
+        """Struts linearised at `q`: ``height = offset + row @ q`` holds exactly at `q`."""
+        self._skeleton.setPositions(q)
+        heights = np.empty(len(self._directions))
+        rows = np.empty((len(self._directions), self.coordinates))
+        for index, (strut, guide) in enumerate(zip(self.spec.struts, self._directions, strict=True)):
+            gap, jacobian = _gap(strut, self._skeleton, self._bodies)
+            direction = gap / max(float(np.linalg.norm(gap)), 1e-12) if guide is None else guide
+            heights[index] = direction @ gap
+            rows[index] = direction @ jacobian
+        body = self._bodies[_applied_force_body(self.spec, self._bodies)]
+        applied = np.array(self._skeleton.getLinearJacobian(body), dtype=np.float64)[2]
+        return _Rows(heights - rows @ q, rows, applied)
+
+
+class _Rows(NamedTuple):
+    """Struts linearised in a configuration.
+
+    Attributes:
+        offsets_m: Heights less `struts @ coordinates`, shape (struts,).
+        struts: Derivative of the heights by the coordinates, shape (struts, n).
+        applied: Generalised force per newton of applied force, shape (n,).
+    """
+
+    offsets_m: NDArray[np.float64]
+    struts: NDArray[np.float64]
+    applied: NDArray[np.float64]
+
+
+def _advanced(memory: tuple[float, ...], h: float, rates: list[float]) -> tuple[float, ...]:
+    if not memory:
+        return memory
+    return tuple([m + h * rate for m, rate in zip(memory, rates, strict=True)])
+
+
+def _struts(spec: ModelSpec) -> tuple[_Strut, ...]:
+    struts: list[_Strut] = []
+    first_memory = 0
+    for item in spec.struts:
+        strut = _Strut(item, first_memory)
+        first_memory += strut.memory_size
+        struts.append(strut)
+    return tuple(struts)
+
+
+def _gap(
+    spec: StrutSpec, skeleton: Any, bodies: dict[str, Any]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Vector from a strut's lower to its upper end, shape (3,), and its Jacobian, shape (3, n)."""
+    ends: list[NDArray[np.float64]] = []
+    jacobians: list[NDArray[np.float64]] = []
+    for name, attachment in zip(spec.between, spec.attachments_m, strict=True):
+        local = np.array(attachment)
+        if name == WORLD:
+            ends.append(local)
+            jacobians.append(np.zeros((3, skeleton.getNumDofs())))
+        else:
+            transform = np.array(bodies[name].getWorldTransform().matrix())
+            ends.append(transform[:3, :3] @ local + transform[:3, 3])
+            jacobians.append(np.array(skeleton.getLinearJacobian(bodies[name], local)))
+    return ends[1] - ends[0], jacobians[1] - jacobians[0]
+
+
+def _sample_positions(coordinates: int) -> list[NDArray[np.float64]]:
+    """Fixed generic configurations at which it is tested what is constant."""
+    return [0.3 * np.sin(1.0 + (k + 0.7) * np.arange(1, coordinates + 1)) for k in range(4)]
+
+
+def _guides(
+    spec: ModelSpec, skeleton: Any, bodies: dict[str, Any]
+) -> tuple[NDArray[np.float64] | None, ...]:
+    """Direction of each strut whose ends move along one straight line, else None.
+
+    The height of a guided strut is measured upwards along its guide and has a sign, so that a bench
+    may be given about its rest position; the height of any other strut is the distance of its ends.
+    """
+    guides: list[NDArray[np.float64] | None] = []
+    for strut in spec.struts:
+        columns: list[NDArray[np.float64]] = []
+        for q in _sample_positions(int(skeleton.getNumDofs())):
+            skeleton.setPositions(q)
+            columns.append(_gap(strut, skeleton, bodies)[1])
+        left, singular, _ = np.linalg.svd(np.hstack(columns))
+        if singular[0] < 1e-9:
+            raise InputError(
+                f"model {spec.name}: strut {strut.name}: no joint lets {strut.between[0]} and "
+                f"{strut.between[1]} move, expected one that does"
+            )
+        if len(singular) > 1 and singular[1] > 1e-9 * singular[0]:
+            guides.append(None)
+            continue
+        direction = np.round(left[:, 0], 14)  # exact for guides along an axis
+        largest = direction[2] if direction[2] != 0.0 else direction[np.argmax(np.abs(direction))]
+        guides.append(direction * math.copysign(1.0, largest))
+    return tuple(guides)
+
+
+def _coordinates_add_up(skeleton: Any) -> bool:
+    """Whether joint coordinates add up, as they do for everything but rotations in space."""
+    for q in _sample_positions(int(skeleton.getNumDofs())):
+        v = np.roll(q, 1) + 1.0
+        skeleton.setPositions(q)
+        skeleton.setVelocities(v)
+        skeleton.integratePositions(0.5)
+        if not np.allclose(np.array(skeleton.getPositions()), q + 0.5 * v, rtol=0.0, atol=1e-12):
+            return False
+    return True
+
+
+def _applied_force_body(spec: ModelSpec, bodies: dict[str, Any]) -> str:
+    name = spec.applied_force_body or spec.struts[-1].between[1]
+    if name == WORLD:
+        name = spec.struts[-1].between[0]
+    if name not in bodies:
+        raise InputError(
+            f"model {spec.name}: applied_force_body {name!r}: expected one of {', '.join(bodies)}"
+        )
+    return name
+
+
+def _add_masses(spec: ModelSpec, bodies: dict[str, Any]) -> None:
+    """Give DART the masses that effects add, so that it carries their weight and inertia."""
+    for strut in spec.struts:
+        for item in strut.effects:
+            if not effect(item.name).adds_mass:
+                continue
+            end = strut.between[1] if strut.between[1] != WORLD else strut.between[0]
+            mass = float(bodies[end].getMass()) + item.values()[0]
+            if mass <= 0.0:
+                raise InputError(
+                    f"model {spec.name}: strut {strut.name}: effect {item.name} leaves {end} "
+                    f"a mass of {mass} kg, expected more than zero"
+                )
+            bodies[end].setMass(mass)
+
+
+def _stable_step_s(struts: Sequence[_Strut], lightest_kg: float) -> float:
+    """Longest sub-step with which the stiffest strut is still integrated stably.
+
+    The steepest slopes of each law are sampled over heights and velocities that a bench can reach.
+    """
+    if not any(strut.laws for strut in struts):
+        return DEFAULT_STEP_S
+    heights = np.linspace(-0.5, 0.5, 501)
+    speeds = np.concatenate([-np.logspace(-6, 0.5, 60)[::-1], np.logspace(-6, 0.5, 60)])
+    size = sum(strut.memory_size for strut in struts)
+    memory, unused, surroundings = [0.0] * size, [0.0] * size, (0.0, 0.0, 20.0)
+    fastest = 0.0
+    for strut in struts:
+        rest = strut.free_length
+        by_height = [
+            strut.effects_n(rest + x, 0.0, memory, surroundings, unused) for x in heights.tolist()
+        ]
+        by_speed = [
+            strut.effects_n(rest, v, memory, surroundings, unused) for v in speeds.tolist()
+        ]
+        stiffness = strut.stiffness + float(np.max(np.abs(np.diff(by_height) / np.diff(heights))))
+        damping = strut.damping + float(np.max(np.abs(np.diff(by_speed) / np.diff(speeds))))
+        fastest = max(fastest, damping / lightest_kg, math.sqrt(stiffness / lightest_kg))
+    return min(DEFAULT_STEP_S, max(_STABLE_PRODUCT / max(fastest, 1e-9), 1e-6))
+
+
+def _build(spec: ModelSpec) -> tuple[Any, dict[str, Any]]:
+    """DART skeleton of the model and its bodies by name."""
+    if isinstance(spec.skeleton, FileSkeleton):
+        skeleton = _read_skeleton(spec.skeleton, spec.folder)
+    else:
+        skeleton = _inline_skeleton(spec.name, spec.skeleton)
+    bodies = {str(body.getName()): body for body in skeleton.getBodyNodes()}
+    for strut in spec.struts:
+        for end in strut.between:
+            if end != WORLD and end not in bodies:
+                raise InputError(
+                    f"model {spec.name}: strut {strut.name}: between {end!r}: expected one of "
+                    f"{', '.join([WORLD, *bodies])}"
+                )
+    if int(skeleton.getNumDofs()) == 0:
+        raise InputError(f"model {spec.name}: skeleton has no joint that moves, expected one")
+    return skeleton, bodies
+
+
+def _inline_skeleton(name: str, spec: InlineSkeleton) -> Any:
+    skeleton = _dart.dynamics.Skeleton(name)
+    bodies: dict[str, Any] = {}
+    for body in spec.bodies:
+        create, properties = _joint(body, skeleton)
+        _, node = create(bodies.get(body.joint.parent), properties)
+        node.setName(body.name)
+        moments = body.inertia_kg_m2 or (body.mass_kg,) * 3
+        inertia = _dart.dynamics.Inertia(body.mass_kg, np.zeros(3), np.diag(moments))
+        node.setInertia(inertia)
+        bodies[body.name] = node
+    return skeleton
+
+
+def _joint(body: BodySpec, skeleton: Any) -> tuple[Callable[..., Any], Any]:
+    kinds = {
+        "prismatic": (_dart.dynamics.PrismaticJointProperties, "Prismatic"),
+        "revolute": (_dart.dynamics.RevoluteJointProperties, "Revolute"),
+        "free": (_dart.dynamics.FreeJointProperties, "Free"),
+        "ball": (_dart.dynamics.BallJointProperties, "Ball"),
+    }
+    make, kind = kinds[body.joint.type]
+    properties = make()
+    properties.mName = f"{body.name}_joint"
+    if body.joint.type in ("prismatic", "revolute"):
+        axis = np.array(body.joint.axis)
+        properties.mAxis = axis / np.linalg.norm(axis)
+    offset = _dart.math.Isometry3()
+    offset.set_translation(np.array(body.joint.offset_m))
+    properties.mT_ParentBodyToJoint = offset
+    return getattr(skeleton, f"create{kind}JointAndBodyNodePair"), properties
+
+
+def _read_skeleton(spec: FileSkeleton, folder: Path) -> Any:
+    path = (folder / spec.file).resolve()
+    if not path.is_file():
+        raise InputError(f"{path}: skeleton.file: no such file, expected URDF, SDF, SKEL or MJCF")
+    uri, suffix = str(path), path.suffix.lower()
+    skeleton = None
+    if suffix == ".urdf":
+        skeleton = _dart.utils.DartLoader().parseSkeleton(uri)
+    elif suffix == ".sdf":
+        skeleton = _dart.utils.SdfParser.readSkeleton(uri)
+    elif suffix in (".skel", ".xml", ".mjcf"):
+        parser = _dart.utils.SkelParser if suffix == ".skel" else _dart.utils.MjcfParser
+        world = parser.readWorld(uri)
+        if world is not None and int(world.getNumSkeletons()) > 0:
+            skeleton = world.getSkeleton(0)
+    else:
+        raise InputError(f"{path}: suffix {suffix!r}: expected .urdf, .sdf, .skel, .xml or .mjcf")
+    if skeleton is None:
+        raise InputError(f"{path}: DART finds no skeleton in it, expected a valid {suffix} file")
+    return skeleton

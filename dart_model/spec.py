@@ -1,0 +1,242 @@
+"""What a model is: bodies, joints and struts, as a frozen value read from YAML and written to it."""
+
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from dart_model.effects import CATALOGUE, effect
+from dart_model.yaml_file import InputError, parse_mapping, read_text, validated
+
+MODELS = Path(__file__).parent / "models"
+"""Folder of the models that come with the package."""
+
+WORLD = "world"
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_.-]{0,63}$")]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Vector = tuple[Finite, Finite, Finite]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class JointSpec(_Frozen):
+    """Joint between a body and its parent.
+
+    Attributes:
+        type: ``prismatic``, ``revolute``, ``ball`` or ``free``.
+        axis: Unit direction for prismatic and revolute joints (normalised here if it is not).
+        parent: Name of the parent body, or ``world``.
+        offset_m: Origin of the joint in the parent's frame.
+    """
+
+    type: Literal["prismatic", "revolute", "ball", "free"]
+    axis: Vector = (0.0, 0.0, 1.0)
+    parent: Name = WORLD
+    offset_m: Vector = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _axis_has_a_direction(self) -> "JointSpec":
+        if sum(x * x for x in self.axis) < 1e-12:
+            raise ValueError(f"axis {list(self.axis)}: expected a direction that is not zero")
+        return self
+
+
+class BodySpec(_Frozen):
+    """Rigid body.
+
+    Attributes:
+        name: Unique name.
+        mass_kg: Mass.
+        joint: How it is connected to its parent.
+        inertia_kg_m2: Principal moments of inertia about the centre of mass, which is the origin.
+    """
+
+    name: Name
+    mass_kg: Positive
+    joint: JointSpec
+    inertia_kg_m2: tuple[Positive, Positive, Positive] | None = None
+
+
+class InlineSkeleton(_Frozen):
+    """Bodies given in the model file itself, parents before children."""
+
+    bodies: Annotated[tuple[BodySpec, ...], Field(min_length=1, max_length=256)]
+
+
+class FileSkeleton(_Frozen):
+    """Bodies given by a URDF, SDF, SKEL or MJCF file beside the model file."""
+
+    file: Annotated[str, Field(min_length=1, max_length=255)]
+
+    @model_validator(mode="after")
+    def _stays_in_its_folder(self) -> "FileSkeleton":
+        path = Path(self.file)
+        if path.is_absolute() or ".." in path.parts:
+            raise ValueError(f"file {self.file!r}: expected a path inside the model's own folder")
+        return self
+
+
+class EffectSpec(_Frozen):
+    """An effect of the catalogue with its parameters."""
+
+    name: str
+    parameters: dict[str, Finite] = Field(default_factory=dict[str, float])
+
+    @model_validator(mode="after")
+    def _is_in_the_catalogue(self) -> "EffectSpec":
+        if self.name not in CATALOGUE:
+            raise ValueError(f"name {self.name!r}: expected one of {', '.join(sorted(CATALOGUE))}")
+        expected = [parameter.name for parameter in effect(self.name).parameters]
+        missing = [name for name in expected if name not in self.parameters]
+        unknown = [name for name in self.parameters if name not in expected]
+        if missing or unknown:
+            wrong = f"unknown {unknown[0]!r}" if unknown else f"{missing[0]!r} is missing"
+            raise ValueError(
+                f"parameters of {self.name}: {wrong}, expected {', '.join(expected) or 'none'}"
+            )
+        return self
+
+    def values(self) -> list[float]:
+        """Parameters in the order in which the law reads them."""
+        return [self.parameters[parameter.name] for parameter in effect(self.name).parameters]
+
+
+class StrutSpec(_Frozen):
+    """Spring-damper between two bodies: force = -stiffness * (height - free length) - damping * velocity.
+
+    Attributes:
+        name: Unique name.
+        between: Lower and upper body; ``world`` is a body.
+        free_length_m: Height at which the spring carries nothing.
+        stiffness_n_per_m: Linear stiffness.
+        damping_n_s_per_m: Linear damping.
+        attachments_m: Where the strut is fixed, in the frame of each body.
+        effects: What the law has beyond spring and damper.
+    """
+
+    name: Name
+    between: tuple[Name, Name]
+    free_length_m: Finite
+    stiffness_n_per_m: NotNegative
+    damping_n_s_per_m: NotNegative
+    attachments_m: tuple[Vector, Vector] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    effects: tuple[EffectSpec, ...] = ()
+
+    @model_validator(mode="after")
+    def _has_two_ends(self) -> "StrutSpec":
+        if self.between[0] == self.between[1]:
+            raise ValueError(f"between {list(self.between)}: expected two different bodies")
+        return self
+
+
+class ModelSpec(_Frozen):
+    """A multibody model of the bench.
+
+    Attributes:
+        name: Name of the model.
+        gravity_m_per_s2: Standard gravity along -z.
+        skeleton: Bodies and joints, inline or in a file.
+        struts: Spring-dampers; one observer may act on each.
+        applied_force_body: Body on which the applied force acts; the last strut's upper body if absent.
+        folder: Folder of the model file, where a skeleton file is looked for; not part of the YAML.
+    """
+
+    name: Name
+    gravity_m_per_s2: Finite = 9.81
+    skeleton: InlineSkeleton | FileSkeleton
+    struts: Annotated[tuple[StrutSpec, ...], Field(min_length=1, max_length=64)]
+    applied_force_body: Name | None = None
+    folder: Annotated[Path, Field(exclude=True)] = Path()
+
+    @model_validator(mode="after")
+    def _names_fit(self) -> "ModelSpec":
+        _refuse_repeated("strut", (strut.name for strut in self.struts))
+        if isinstance(self.skeleton, InlineSkeleton):
+            self._check_bodies(self.skeleton)
+        return self
+
+    def _check_bodies(self, skeleton: InlineSkeleton) -> None:
+        _refuse_repeated("body", (body.name for body in skeleton.bodies))
+        known = [WORLD]
+        for body in skeleton.bodies:
+            if body.name == WORLD:
+                raise ValueError(f"body {WORLD!r}: expected another name, this one is taken")
+            if body.joint.parent not in known:
+                raise ValueError(
+                    f"body {body.name}: joint.parent {body.joint.parent!r}: "
+                    f"expected one of {', '.join(known)} (parents stand before children)"
+                )
+            known.append(body.name)
+        for strut in self.struts:
+            for end in strut.between:
+                if end not in known:
+                    raise ValueError(
+                        f"strut {strut.name}: between {end!r}: expected one of {', '.join(known)}"
+                    )
+        body_name = self.applied_force_body
+        if body_name is not None and body_name not in known[1:]:
+            raise ValueError(
+                f"applied_force_body {body_name!r}: expected one of {', '.join(known[1:])}"
+            )
+
+    def strut(self, name: str) -> StrutSpec:
+        """The strut called `name`.
+
+        Raises:
+            InputError: There is none.
+        """
+        for strut in self.struts:
+            if strut.name == name:
+                return strut
+        choices = ", ".join(strut.name for strut in self.struts)
+        raise InputError(f"model {self.name}: strut {name!r}: expected one of {choices}")
+
+    def with_effects(self, strut_name: str, effects: Iterable[EffectSpec]) -> "ModelSpec":
+        """The same model with `effects` as all the effects of one strut."""
+        changed = self.strut(strut_name).model_copy(update={"effects": tuple(effects)})
+        struts = tuple(changed if strut.name == strut_name else strut for strut in self.struts)
+        return self.model_copy(update={"struts": struts})
+
+
+def parse_model(text: str, source: str, folder: Path = Path()) -> ModelSpec:
+    """Model from YAML text.
+
+    Args:
+        text: YAML as documented in the README.
+        source: What to call the text in an error.
+        folder: Where a skeleton file is looked for.
+
+    Raises:
+        InputError: One line that names file, key, value and what was expected.
+    """
+    spec = validated(ModelSpec, parse_mapping(text, source), source)
+    return spec.model_copy(update={"folder": folder})
+
+
+def load_model(path: Path) -> ModelSpec:
+    """Model from a YAML file.
+
+    Raises:
+        InputError: One line that names file, key, value and what was expected.
+    """
+    return parse_model(read_text(path), str(path), path.parent)
+
+
+def dump_model(spec: ModelSpec) -> str:
+    """YAML text that `parse_model` reads back to an equal value."""
+    data = spec.model_dump(mode="json", exclude_none=True)
+    return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
+
+
+def _refuse_repeated(what: str, names: Iterable[str]) -> None:
+    name, count = Counter(names).most_common(1)[0]
+    if count > 1:
+        raise ValueError(f"{what} {name!r} stands {count} times, expected unique names")

@@ -1,0 +1,352 @@
+"""Configuration of the bridge: YAML -> frozen values, validated once."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from can_dbc.database import DEFAULT_DATABASE, Database, load_database
+from dart_model.spec import MODELS, ModelSpec, load_model
+from dart_model.yaml_file import InputError, load_validated
+from dart_model.plant import DartPlant
+from rig.core.bridge import Bridge
+from rig.core.messages import Outgoing, Quantity, Target, estimate, incoming, kinematics, status
+from rig.core.observer import ObserverGains
+from rig.core.step import RigCore
+from rig.core.supervisor import Supervision
+from rig.io.bus import BusConfig
+
+__all__ = ["CONFIGS", "InputError", "RunConfig", "Setup", "build_bridge", "load_setup", "setup"]
+
+CONFIGS = Path(__file__).parent / "configs"
+"""Folder of the configurations that come with the package."""
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Text = Annotated[str, Field(min_length=1, max_length=255)]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class SignalName(_Frozen):
+    """Where a value stands on the bus.
+
+    Attributes:
+        message: Message of the DBC.
+        signal: Signal of the message; its unit is converted.
+    """
+
+    message: Text
+    signal: Text
+
+
+class Signals(_Frozen):
+    """What is read from the bus.
+
+    Attributes:
+        height: Measured height of each strut, by strut name.
+        applied_force: Applied force, if the bench sends it.
+        load_cell_force: Force of a load cell, logged with the run.
+        temperature: Damper temperature.
+    """
+
+    height: Annotated[dict[str, SignalName], Field(min_length=1)]
+    applied_force: SignalName | None = None
+    load_cell_force: SignalName | None = None
+    temperature: SignalName | None = None
+
+
+class ObserverConfig(_Frozen):
+    """Gains of one strut's observer; the defaults are the seed's."""
+
+    proportional_n_per_m: NotNegative = 1.0e5
+    integral_n_per_m_s: NotNegative = 1.0e4
+    force_limit_n: Positive = 1.0e4
+
+    def gains(self) -> ObserverGains:
+        """As the observer takes them."""
+        return ObserverGains(
+            self.proportional_n_per_m, self.integral_n_per_m_s, self.force_limit_n
+        )
+
+
+class Published(_Frozen):
+    """Messages that carry one strut's results."""
+
+    estimate: Text = "RIG_ESTIMATE"
+    kinematics: Text | None = "RIG_KINEMATICS"
+
+
+class SupervisionConfig(_Frozen):
+    """Ages of the measurement, and the output of the safe state."""
+
+    stale_after_s: Positive = 0.01
+    safe_after_s: Positive = 0.5
+    safe_output: Literal["zero", "last"] = "zero"
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "SupervisionConfig":
+        if self.safe_after_s < self.stale_after_s:
+            raise ValueError(
+                f"safe_after_s {self.safe_after_s}: expected at least stale_after_s "
+                f"({self.stale_after_s})"
+            )
+        return self
+
+    def supervision(self) -> Supervision:
+        """As the core takes it."""
+        return Supervision(
+            round(self.stale_after_s * 1e9),
+            round(self.safe_after_s * 1e9),
+            self.safe_output == "last",
+        )
+
+
+class BusSettings(_Frozen):
+    """How to open the bus; `options` go to python-can's interface as they are."""
+
+    interface: Text = "virtual"
+    channel: Text = "rig"
+    bitrate: Annotated[int, Field(gt=0)] = 1_000_000
+    data_bitrate: Annotated[int, Field(gt=0)] | None = None
+    options: dict[str, Any] = Field(default_factory=dict[str, Any])
+
+    def config(self) -> BusConfig:
+        """As the bus takes it."""
+        return BusConfig(
+            self.interface, self.channel, self.bitrate, self.data_bitrate, self.options
+        )
+
+
+class Realtime(_Frozen):
+    """What is asked of the machine; every key works without being granted.
+
+    Attributes:
+        fifo_priority: Priority under SCHED_FIFO; 0 asks for none.
+        lock_memory: Keep all pages in memory.
+        cpu: Core on which the loop runs.
+        spin_s: How long to spin before a deadline where SCHED_FIFO was granted.
+        freeze_garbage: Collect garbage before the run and not during it.
+    """
+
+    fifo_priority: Annotated[int, Field(ge=0, le=99)] = 50
+    lock_memory: bool = True
+    cpu: Annotated[int, Field(ge=0)] | None = None
+    spin_s: Annotated[float, Field(ge=0, le=0.01)] = 0.0002
+    freeze_garbage: bool = True
+
+
+class RunConfig(_Frozen):
+    """All of a run's configuration.
+
+    Attributes:
+        rate_hz: Ticks a second.
+        duration_s: Length of the run; until Ctrl-C if absent.
+        model: Model file, beside the configuration, or the name of one that comes with the package.
+        dbc: DBC file beside the configuration; the package's own if absent.
+        bus: How to open the bus.
+        signals: What is read from it.
+        observers: One for each strut of the model, by strut name.
+        publish: Messages for each strut, by strut name; by default RIG_ESTIMATE and RIG_KINEMATICS
+            for the first strut, and the same with _2, _3, ... for the next ones.
+        status: Message that carries the state; null sends none.
+        supervision: Ages and safe state.
+        realtime: What is asked of the machine.
+    """
+
+    rate_hz: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] = 1000.0
+    duration_s: Positive | None = None
+    model: Text = "seed"
+    dbc: Text | None = None
+    bus: BusSettings = BusSettings()
+    signals: Signals
+    observers: dict[str, ObserverConfig] = Field(default_factory=dict[str, ObserverConfig])
+    publish: dict[str, Published] = Field(default_factory=dict[str, Published])
+    status: Text | None = "RIG_STATUS"
+    supervision: SupervisionConfig = SupervisionConfig()
+    realtime: Realtime = Realtime()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_height(cls, data: Any) -> Any:
+        """Let a model of one strut say `height: {message, signal}` without the strut's name."""
+        match data:
+            case {"signals": {"height": {"message": _, "signal": _} as height, **others}, **rest}:
+                return {**rest, "signals": {**others, "height": {"": height}}}
+            case _:
+                return data
+
+    @property
+    def period_ns(self) -> int:
+        """Time between two ticks."""
+        return round(1e9 / self.rate_hz)
+
+
+class Setup(BaseModel):
+    """A configuration with the files it names, read and checked against each other.
+
+    Attributes:
+        config: The configuration, with every strut named.
+        source: File it came from.
+        model: The model.
+        database: The DBC.
+    """
+
+    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
+
+    config: RunConfig
+    source: Path
+    model: ModelSpec
+    database: Database
+
+
+def load_setup(path: Path) -> Setup:
+    """A configuration and all files it names.
+
+    Args:
+        path: YAML file.
+
+    Raises:
+        InputError: One line that names file, key, value and what was expected.
+        DatabaseError: The same, of the DBC.
+    """
+    return setup(load_validated(RunConfig, path), path)
+
+
+def setup(config: RunConfig, source: Path) -> Setup:
+    """A configuration with the files it names.
+
+    Raises:
+        InputError: One line that names file, key, value and what was expected.
+        DatabaseError: The same, of the DBC.
+    """
+    model = load_model(_model_path(config.model, source))
+    database = load_database(
+        DEFAULT_DATABASE if config.dbc is None else source.parent / config.dbc
+    )
+    named = _with_strut_names(config, model, source)
+    _check_messages(named, database, source)
+    return Setup(config=named, source=source, model=model, database=database)
+
+
+def build_bridge(ready: Setup, model: ModelSpec | None = None) -> Bridge:
+    """The bridge that a configuration describes.
+
+    Args:
+        ready: Configuration, model and DBC.
+        model: Another model with the same struts, e.g. a corrected one.
+
+    Raises:
+        InputError: The model cannot be built.
+        DatabaseError: A signal does not fit what it is for.
+    """
+    config, database = ready.config, ready.database
+    targets: dict[str, list[Target]] = {}
+    for index, entry in enumerate(config.signals.height.values()):
+        target = Target(entry.signal, Quantity.HEIGHT, index)
+        targets.setdefault(entry.message, []).append(target)
+    for quantity, entry in (
+        (Quantity.APPLIED_FORCE, config.signals.applied_force),
+        (Quantity.LOAD_CELL_FORCE, config.signals.load_cell_force),
+        (Quantity.TEMPERATURE, config.signals.temperature),
+    ):
+        if entry is not None:
+            targets.setdefault(entry.message, []).append(Target(entry.signal, quantity, 0))
+    outgoing: list[Outgoing] = []
+    for index, entry in enumerate(config.publish.values()):
+        outgoing.append(estimate(database.message(entry.estimate), index))
+        if entry.kinematics is not None:
+            outgoing.append(kinematics(database.message(entry.kinematics), index))
+    if config.status is not None:
+        outgoing.append(status(database.message(config.status)))
+    gains = tuple(observer.gains() for observer in config.observers.values())
+    core = RigCore(DartPlant(model or ready.model), gains, config.supervision.supervision())
+    received = [incoming(database.message(name), found) for name, found in targets.items()]
+    return Bridge(core, received, outgoing)
+
+
+def _model_path(name: str, source: Path) -> Path:
+    beside = source.parent / name
+    if beside.is_file():
+        return beside
+    shipped = MODELS / f"{name}.yaml"
+    if shipped.is_file():
+        return shipped
+    choices = ", ".join(sorted(path.stem for path in MODELS.glob("*.yaml")))
+    raise InputError(f"{source}: model {name!r}: expected a file beside it, or one of {choices}")
+
+
+def _with_strut_names(config: RunConfig, model: ModelSpec, source: Path) -> RunConfig:
+    struts = [strut.name for strut in model.struts]
+    heights = config.signals.height
+    if list(heights) == [""]:
+        if len(struts) > 1:
+            raise InputError(
+                f"{source}: signals.height: the model has {len(struts)} struts, "
+                f"expected one entry for each of {', '.join(struts)}"
+            )
+        heights = {struts[0]: heights[""]}
+    for key, names in (
+        ("signals.height", heights),
+        ("observers", config.observers),
+        ("publish", config.publish),
+    ):
+        for name in names:
+            if name not in struts:
+                raise InputError(
+                    f"{source}: {key}.{name}: no such strut, expected {', '.join(struts)}"
+                )
+    for name in struts:
+        if name not in heights:
+            raise InputError(f"{source}: signals.height.{name}: is missing, expected its signal")
+    observers = {name: config.observers.get(name, ObserverConfig()) for name in struts}
+    publish = {
+        name: config.publish.get(name, _default_messages(index))
+        for index, name in enumerate(struts)
+    }
+    return config.model_copy(
+        update={
+            "signals": config.signals.model_copy(
+                update={"height": {name: heights[name] for name in struts}}
+            ),
+            "observers": observers,
+            "publish": publish,
+        }
+    )
+
+
+def _default_messages(index: int) -> Published:
+    ending = "" if index == 0 else f"_{index + 1}"
+    return Published(estimate=f"RIG_ESTIMATE{ending}", kinematics=f"RIG_KINEMATICS{ending}")
+
+
+def _check_messages(config: RunConfig, database: Database, source: Path) -> None:
+    inputs = [*config.signals.height.values()]
+    for entry in (
+        config.signals.applied_force,
+        config.signals.load_cell_force,
+        config.signals.temperature,
+    ):
+        if entry is not None:
+            inputs.append(entry)
+    outputs: list[str] = []
+    for entry in config.publish.values():
+        outputs += [entry.estimate] if entry.kinematics is None else [entry.estimate, entry.kinematics]
+    if config.status is not None:
+        outputs.append(config.status)
+    for entry in inputs:
+        database.message(entry.message).signal(entry.signal)
+        if entry.message in outputs:
+            raise InputError(
+                f"{source}: signals: {entry.message} is also published, "
+                "expected a message of the bench"
+            )
+    repeated = {name for name in outputs if outputs.count(name) > 1}
+    if repeated:
+        raise InputError(
+            f"{source}: publish: {sorted(repeated)[0]} stands twice, expected one message each"
+        )
+    for name in outputs:
+        database.message(name)

@@ -1,0 +1,198 @@
+"""Frames in, frames out: one tick of the bridge, without bus, clock or file.
+
+A refused frame is counted and never used in part; values come from accepted frames alone.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from can_dbc.frame import Frame
+from can_dbc.protection import INITIAL, SequenceState, Verdict, check, protect
+from rig.core.messages import Conditions, Counts, Incoming, Outgoing, Quantity, Report
+from rig.core.step import RigCore
+from rig.core.types import Measurement, Mode, RigState, StepInput, StepOutput
+
+_NO_CONDITIONS = Conditions()
+
+
+class BridgeState(NamedTuple):
+    """State of the bridge between two ticks.
+
+    Attributes:
+        rig: State of the core.
+        sequences: Counter state of each incoming message.
+        counters: Frames sent so far of each outgoing message.
+        due_ns: When each of them is sent next.
+        counts: What has been counted.
+        told_saturated: How many saturated frames the last status knew of.
+    """
+
+    rig: RigState
+    sequences: tuple[SequenceState, ...]
+    counters: tuple[int, ...]
+    due_ns: tuple[int, ...]
+    counts: Counts
+    told_saturated: int
+
+
+class TickResult(NamedTuple):
+    """What a tick did.
+
+    Attributes:
+        frames: Frames to send, stamped with the tick's time.
+        step_input: What the core was given.
+        output: What the core said.
+    """
+
+    frames: list[Frame]
+    step_input: StepInput
+    output: StepOutput
+
+
+class Bridge:
+    """The whole of a tick.
+
+    Args:
+        core: The arithmetic.
+        incoming: Messages of the bench.
+        outgoing: Messages of the bridge.
+    """
+
+    def __init__(
+        self, core: RigCore, incoming: Sequence[Incoming], outgoing: Sequence[Outgoing]
+    ) -> None:
+        self._core = core
+        self._incoming = tuple(incoming)
+        self._outgoing = tuple(outgoing)
+        self._index = {
+            (item.message.arbitration_id, item.message.is_extended): index
+            for index, item in enumerate(incoming)
+        }
+
+    @property
+    def heard(self) -> frozenset[tuple[int, bool]]:
+        """The (arbitration id, is extended) that the bridge listens to."""
+        return frozenset(self._index)
+
+    @property
+    def struts(self) -> int:
+        """Number of struts."""
+        return self._core.struts
+
+    def init(self, t_ns: int) -> BridgeState:
+        """State before the first tick."""
+        count = len(self._outgoing)
+        sequences = (INITIAL,) * len(self._incoming)
+        return BridgeState(
+            self._core.init(t_ns), sequences, (0,) * count, (t_ns,) * count, Counts(), 0
+        )
+
+    def tick(
+        self,
+        state: BridgeState,
+        t_ns: int,
+        frames: Sequence[Frame],
+        conditions: Conditions = _NO_CONDITIONS,
+    ) -> tuple[BridgeState, TickResult]:
+        """One tick.
+
+        Args:
+            state: State after the last tick.
+            t_ns: Time of this one.
+            frames: Frames that have arrived since then; those of other ids are passed over.
+            conditions: What the loop knows.
+
+        Returns:
+            State after the tick, and what it did.
+        """
+        sequences, counts = state.sequences, state.counts
+        heights: list[Measurement | None] = [None] * self._core.struts
+        applied_n = temperature_c = None
+        for frame in frames:
+            index = self._index.get((frame.arbitration_id, frame.is_extended))
+            if index is None or frame.is_error:
+                continue
+            sequence, verdict, values = _accepted(self._incoming[index], sequences[index], frame)
+            sequences = (*sequences[:index], sequence, *sequences[index + 1 :])
+            if verdict is not Verdict.OK:
+                counts = _counted(counts, verdict, sequence)
+            for target, value in zip(self._incoming[index].targets, values, strict=False):
+                if target.quantity is Quantity.HEIGHT:
+                    heights[target.strut] = Measurement(value, min(frame.t_ns, t_ns))
+                elif target.quantity is Quantity.APPLIED_FORCE:
+                    applied_n = value
+                elif target.quantity is Quantity.TEMPERATURE:
+                    temperature_c = value
+        step_input = StepInput(
+            t_ns, tuple(heights), applied_n, temperature_c, conditions.acknowledged
+        )
+        rig, output = self._core.step(state.rig, step_input)
+        if conditions.overruns or output.mode is Mode.HOLD:
+            counts = counts._replace(
+                overruns=counts.overruns + conditions.overruns,
+                stale=counts.stale + (output.mode is Mode.HOLD),
+            )
+        state = state._replace(rig=rig, sequences=sequences, counts=counts)
+        state, sent = self._sent(state, t_ns, output, conditions)
+        return state, TickResult(sent, step_input, output)
+
+    def _sent(
+        self, state: BridgeState, t_ns: int, output: StepOutput, conditions: Conditions
+    ) -> tuple[BridgeState, list[Frame]]:
+        """Frames that are due; none before the first valid measurement."""
+        frames: list[Frame] = []
+        if not output.struts:
+            return state, frames
+        counters, due_ns = list(state.counters), list(state.due_ns)
+        counts, told = state.counts, state.told_saturated
+        for index, item in enumerate(self._outgoing):
+            if t_ns < due_ns[index]:
+                continue
+            report = Report(output, counts, conditions, counts.saturated > told)
+            payload, saturated = item.encode(item.values(report))
+            if item.protection is None:
+                data = bytes(payload)
+            else:
+                data = protect(payload, counters[index], item.protection)
+            message = item.message
+            frames.append(
+                Frame(t_ns, message.arbitration_id, data, message.is_extended, message.is_fd)
+            )
+            counters[index] += 1
+            due_ns[index] = _next_due_ns(due_ns[index], t_ns, item.period_ns)
+            if item.is_status:
+                told = counts.saturated
+            elif saturated:
+                counts = counts._replace(saturated=counts.saturated + 1)
+        return state._replace(
+            counters=tuple(counters), due_ns=tuple(due_ns), counts=counts, told_saturated=told
+        ), frames
+
+
+def _next_due_ns(due_ns: int, t_ns: int, period_ns: int) -> int:
+    """On the message's own grid; what was missed is not made up for."""
+    late = (t_ns - due_ns) // period_ns if period_ns else 0
+    return due_ns + (late + 1) * period_ns if period_ns else t_ns
+
+
+def _accepted(
+    item: Incoming, sequence: SequenceState, frame: Frame
+) -> tuple[SequenceState, Verdict, tuple[float, ...]]:
+    """State, verdict and values of a frame; no values unless it is accepted whole."""
+    verdict = Verdict.OK
+    if item.protection is not None:
+        sequence, verdict = check(sequence, frame.data, frame.t_ns, item.protection)
+        if not verdict.accepted:
+            return sequence, verdict, ()
+    values = item.decode(frame.data)
+    if values is None:
+        # Unprotected: a multiplexed frame without these signals is no fault, a short one is.
+        right_length = len(frame.data) == item.message.length_bytes
+        return sequence, verdict if right_length else Verdict.WRONG_LENGTH, ()
+    return sequence, verdict, values
+
+
+def _counted(counts: Counts, verdict: Verdict, sequence: SequenceState) -> Counts:
+    if verdict.accepted:
+        return counts._replace(lost=counts.lost + sequence.lost)
+    return counts._replace(refused=counts.refused + 1)

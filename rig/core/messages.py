@@ -1,0 +1,241 @@
+"""Messages as the bridge needs them: compiled from the DBC, and tied to what their values mean."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+from can_dbc.codec import Decoder, Encoder, compile_decoder, compile_encoder
+from can_dbc.database import Message
+from can_dbc.protection import Protection
+from can_dbc.units import Dimension
+from rig.core.types import Mode, StepOutput
+
+
+class Quantity(Enum):
+    """What a signal of the bench means to the bridge; the value is what it measures."""
+
+    HEIGHT = "height"
+    APPLIED_FORCE = "applied_force"
+    LOAD_CELL_FORCE = "load_cell_force"
+    TEMPERATURE = "temperature"
+
+    @property
+    def dimension(self) -> Dimension:
+        """Dimension its signal must have."""
+        if self is Quantity.HEIGHT:
+            return Dimension.LENGTH
+        return Dimension.TEMPERATURE if self is Quantity.TEMPERATURE else Dimension.FORCE
+
+
+class Target(NamedTuple):
+    """What one signal of an incoming message is for.
+
+    Attributes:
+        signal: Name of the signal.
+        quantity: What it means.
+        strut: Index of the strut of a height, else 0.
+    """
+
+    signal: str
+    quantity: Quantity
+    strut: int
+
+
+@dataclass(frozen=True)
+class Incoming:
+    """A message of the bench.
+
+    Attributes:
+        message: Its definition.
+        decode: Payload -> values in SI, in the order of `targets`.
+        targets: Where the values go.
+        protection: How its frames are checked; None for an unprotected message.
+    """
+
+    message: Message
+    decode: Decoder
+    targets: tuple[Target, ...]
+    protection: Protection | None
+
+
+class Counts(NamedTuple):
+    """What has been counted since the start.
+
+    Attributes:
+        lost: Frames missing in the counters' sequences.
+        refused: Frames not accepted.
+        stale: Ticks without a fresh measurement.
+        overruns: Ticks that were missed.
+        saturated: Frames sent with a value at the limit of its range.
+    """
+
+    lost: int = 0
+    refused: int = 0
+    stale: int = 0
+    overruns: int = 0
+    saturated: int = 0
+
+
+class Conditions(NamedTuple):
+    """What the loop knows and a tick is told.
+
+    Attributes:
+        overruns: Ticks missed since the last one.
+        acknowledged: Somebody acknowledged the safe state.
+        bus_fault: The bus could not be read or written.
+        log_fault: The log could not be written.
+    """
+
+    overruns: int = 0
+    acknowledged: bool = False
+    bus_fault: bool = False
+    log_fault: bool = False
+
+
+class Report(NamedTuple):
+    """All that an outgoing message can speak of.
+
+    Attributes:
+        output: What the core said.
+        counts: What has been counted.
+        conditions: What the loop knows.
+        saturated: A frame saturated since the last status.
+    """
+
+    output: StepOutput
+    counts: Counts
+    conditions: Conditions
+    saturated: bool
+
+
+@dataclass(frozen=True)
+class Outgoing:
+    """A message of the bridge.
+
+    Attributes:
+        message: Its definition.
+        encode: Values in SI -> payload, and whether one saturated.
+        values: What is sent, in the order of `encode`.
+        period_ns: Time between two frames.
+        protection: Counter and CRC; None for an unprotected message.
+        is_status: Whether it tells of saturation, and so clears the flag.
+    """
+
+    message: Message
+    encode: Encoder
+    values: Callable[[Report], Sequence[float]]
+    period_ns: int
+    protection: Protection | None
+    is_status: bool = False
+
+
+def incoming(message: Message, targets: Sequence[Target]) -> Incoming:
+    """An incoming message, compiled.
+
+    Args:
+        message: Message of the bench.
+        targets: What its signals are for.
+
+    Raises:
+        DatabaseError: A signal is missing, or its unit does not fit what it is for.
+    """
+    names = [target.signal for target in targets]
+    decode = compile_decoder(message, names, [target.quantity.dimension for target in targets])
+    return Incoming(message, decode, tuple(targets), message.protection)
+
+
+_ESTIMATE = {
+    "SPRING_DAMPER_FORCE": Dimension.FORCE,
+    "VIRTUAL_FORCE": Dimension.FORCE,
+    "VALID": Dimension.NUMBER,
+}
+_KINEMATICS = {
+    "MODEL_HEIGHT": Dimension.LENGTH,
+    "MODEL_VELOCITY": Dimension.VELOCITY,
+    "MODEL_ACCELERATION": Dimension.ACCELERATION,
+    "INNOVATION": Dimension.LENGTH,
+}
+_STATUS = {
+    "STATE": Dimension.NUMBER,
+    "ENCODING_SATURATED": Dimension.NUMBER,
+    "OVERRUNS": Dimension.NUMBER,
+    "LOST_FRAMES": Dimension.NUMBER,
+    "REFUSED_FRAMES": Dimension.NUMBER,
+    "STALE_FRAMES": Dimension.NUMBER,
+    "MEASUREMENT_FAULT": Dimension.NUMBER,
+    "BUS_FAULT": Dimension.NUMBER,
+    "LOG_FAULT": Dimension.NUMBER,
+}
+
+
+def estimate(message: Message, strut: int) -> Outgoing:
+    """The message with a strut's estimated force.
+
+    Raises:
+        DatabaseError: One of its signals is missing or has the wrong unit.
+    """
+
+    def values(report: Report) -> Sequence[float]:
+        output = report.output.struts[strut]
+        return output.force_n, output.virtual_force_n, output.valid
+
+    return _outgoing(message, _ESTIMATE, values)
+
+
+def kinematics(message: Message, strut: int) -> Outgoing:
+    """The message with the motion of the corrected model at a strut.
+
+    Raises:
+        DatabaseError: One of its signals is missing or has the wrong unit.
+    """
+
+    def values(report: Report) -> Sequence[float]:
+        output = report.output.struts[strut]
+        return (
+            output.height_m,
+            output.velocity_m_per_s,
+            output.acceleration_m_per_s2,
+            output.innovation_m,
+        )
+
+    return _outgoing(message, _KINEMATICS, values)
+
+
+def status(message: Message) -> Outgoing:
+    """The message with the bridge's state. Its counts stop at the ends of their ranges.
+
+    Raises:
+        DatabaseError: One of its signals is missing.
+    """
+    most = {name: message.signal(name).maximum for name in _STATUS}
+    limits = [float("inf") if value is None else value for value in most.values()]
+
+    def values(report: Report) -> Sequence[float]:
+        counts, conditions = report.counts, report.conditions
+        raw = (
+            float(report.output.mode),
+            float(report.saturated),
+            float(counts.overruns),
+            float(counts.lost),
+            float(counts.refused),
+            float(counts.stale),
+            float(report.output.mode is not Mode.RUNNING),
+            float(conditions.bus_fault),
+            float(conditions.log_fault),
+        )
+        return [min(value, limit) for value, limit in zip(raw, limits, strict=True)]
+
+    return _outgoing(message, _STATUS, values, is_status=True)
+
+
+def _outgoing(
+    message: Message,
+    signals: dict[str, Dimension],
+    values: Callable[[Report], Sequence[float]],
+    *,
+    is_status: bool = False,
+) -> Outgoing:
+    encode = compile_encoder(message, list(signals), list(signals.values()))
+    period_ns = message.cycle_time_ns or 0
+    return Outgoing(message, encode, values, period_ns, message.protection, is_status)

@@ -1,0 +1,67 @@
+"""When ticks come: a real clock with absolute deadlines, or a virtual one that never waits."""
+
+import time
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """Time of a run, in ns since its start."""
+
+    @property
+    def epoch_ns(self) -> int:
+        """Unix time of the run's start."""
+        ...
+
+    def now_ns(self) -> int:
+        """Time of the run."""
+        ...
+
+    def wait_until(self, t_ns: int) -> int:
+        """Wait for a time of the run; returns the time at which it woke up."""
+        ...
+
+
+class RealClock:
+    """Monotonic time, immune to steps of the system's clock.
+
+    Args:
+        spin_ns: How long before a deadline to stop sleeping and spin. Only a thread with a
+            real-time priority may spin: any other is punished for it by the scheduler.
+    """
+
+    def __init__(self, spin_ns: int = 0) -> None:
+        self._start_ns = time.monotonic_ns()
+        self.epoch_ns = time.time_ns()
+        self._spin_ns = spin_ns
+
+    def now_ns(self) -> int:
+        """Time since the start of the run."""
+        return time.monotonic_ns() - self._start_ns
+
+    def wait_until(self, t_ns: int) -> int:
+        """Sleep (on Linux against an absolute deadline), then spin if asked to."""
+        now = self.now_ns()
+        if t_ns - now > self._spin_ns:
+            time.sleep((t_ns - now - self._spin_ns) * 1e-9)
+            now = self.now_ns()
+        while now < t_ns:
+            now = self.now_ns()
+        return now
+
+
+class VirtualClock:
+    """Time that jumps to where it is awaited: a simulation as fast as the machine allows."""
+
+    epoch_ns = 0
+
+    def __init__(self) -> None:
+        self._now_ns = 0
+
+    def now_ns(self) -> int:
+        """Last awaited time."""
+        return self._now_ns
+
+    def wait_until(self, t_ns: int) -> int:
+        """Jump to `t_ns`, never back."""
+        self._now_ns = max(self._now_ns, t_ns)
+        return self._now_ns

@@ -1,0 +1,122 @@
+"""What a fixed rate asks of the machine: priority, memory, core, timer and garbage collection.
+
+Everything is asked for and nothing is needed: what the machine refuses is written down, and the run
+goes on without it.
+"""
+
+import contextlib
+import ctypes
+import ctypes.util
+import gc
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+
+_MCL_CURRENT_AND_FUTURE = 3
+_PR_SET_TIMERSLACK = 29
+_SWITCH_INTERVAL_S = 1e-4
+"""How long another thread (the log's) may hold the interpreter when the loop wants it."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked for.
+
+    Attributes:
+        fifo_priority: Priority under SCHED_FIFO; 0 asks for none.
+        lock_memory: Keep all pages in memory.
+        cpu: Core for the loop; None leaves the choice to the scheduler.
+        freeze_garbage: No garbage collection during the run.
+    """
+
+    fifo_priority: int
+    lock_memory: bool
+    cpu: int | None
+    freeze_garbage: bool
+
+
+@dataclass(frozen=True)
+class Granted:
+    """What the machine granted.
+
+    Attributes:
+        fifo: SCHED_FIFO.
+        locked_memory: Pages locked.
+        cpu: Core, or None if not pinned.
+        timer_slack: Timer slack of 1 ns.
+        frozen_garbage: Garbage collection frozen.
+    """
+
+    fifo: bool
+    locked_memory: bool
+    cpu: int | None
+    timer_slack: bool
+    frozen_garbage: bool
+
+    def as_dict(self) -> dict[str, object]:
+        """For `run.yaml`."""
+        return asdict(self)
+
+
+@contextlib.contextmanager
+def realtime(request: Request) -> Iterator[Granted]:
+    """Ask for it, and give it back at the end.
+
+    Args:
+        request: What is asked for.
+
+    Yields:
+        What was granted.
+    """
+    libc = ctypes.CDLL(ctypes.util.find_library("c"), use_errno=True)
+    affinity = os.sched_getaffinity(0)
+    switch_interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    granted = Granted(
+        fifo=_fifo(request.fifo_priority),
+        locked_memory=request.lock_memory and libc.mlockall(_MCL_CURRENT_AND_FUTURE) == 0,
+        cpu=_pinned(request.cpu),
+        timer_slack=libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0) == 0,
+        frozen_garbage=request.freeze_garbage,
+    )
+    if request.freeze_garbage:
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+    try:
+        yield granted
+    finally:
+        if request.freeze_garbage:
+            gc.enable()
+            gc.unfreeze()
+        if granted.locked_memory:
+            libc.munlockall()
+        if granted.fifo:
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        if granted.cpu is not None:
+            os.sched_setaffinity(0, affinity)
+        libc.prctl(_PR_SET_TIMERSLACK, 0, 0, 0, 0)
+        sys.setswitchinterval(switch_interval_s)
+
+
+def _fifo(priority: int) -> bool:
+    if priority == 0:
+        return False
+    try:
+        # Threads started later (the log's) must not inherit it.
+        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
+    except (OSError, AttributeError):
+        return False
+    return True
+
+
+def _pinned(cpu: int | None) -> int | None:
+    if cpu is None:
+        return None
+    try:
+        os.sched_setaffinity(0, {cpu})
+    except (OSError, AttributeError):
+        return None
+    return cpu

@@ -1,0 +1,171 @@
+"""The one loop: live, simulated and replayed runs differ only in ticks, source and sink."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from can_dbc.frame import Frame
+from rig.core.bridge import Bridge, BridgeState, TickResult
+from rig.core.messages import Conditions
+from rig.io.clock import Clock
+from rig.io.run_log import Step
+
+
+class Tick(NamedTuple):
+    """A tick that is due.
+
+    Attributes:
+        t_ns: Its time.
+        overruns: Ticks missed before it.
+    """
+
+    t_ns: int
+    overruns: int
+
+
+class Port(Protocol):
+    """Where frames come from and go to."""
+
+    def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
+        """Frames that have come up to a tick, and what is known of the bus."""
+        ...
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Send the frames of a tick."""
+        ...
+
+
+Sink = Callable[[Sequence[Frame], TickResult, Step], None]
+"""What a tick received, what it did, and the record of it."""
+
+_BINS = 20_000
+"""Histograms have bins of 1 µs; the last one takes all that is longer than 20 ms."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How well the rate was kept; histograms have bins of 1 µs.
+
+    Attributes:
+        lateness: Ticks by lateness of the wake-up.
+        work: Ticks by time from wake-up to the end of the tick's work.
+        extremes_ns: Largest lateness, work and gap between two ticks, in ns.
+    """
+
+    lateness: NDArray[np.int64]
+    work: NDArray[np.int64]
+    extremes_ns: NDArray[np.int64]
+
+    @staticmethod
+    def empty() -> "Timing":
+        """Before the first tick; written in place from then on."""
+        bins = np.zeros((2, _BINS), dtype=np.int64)
+        return Timing(bins[0], bins[1], np.zeros(3, dtype=np.int64))
+
+    def summary(self) -> dict[str, object]:
+        """Percentiles in µs, for `run.yaml` and the final table."""
+        late_ns, work_ns, gap_ns = self.extremes_ns.tolist()
+        return {
+            "lateness_us": _percentiles(self.lateness, late_ns),
+            "work_us": _percentiles(self.work, work_ns),
+            "longest_gap_us": gap_ns / 1000,
+        }
+
+
+def _percentiles(histogram: NDArray[np.int64], largest_ns: int) -> dict[str, float]:
+    total = int(histogram.sum())
+    if total == 0:
+        return {}
+    cumulated = np.cumsum(histogram)
+    levels = {"p50": 0.5, "p99": 0.99, "p99_9": 0.999}
+    result = {
+        name: float(np.searchsorted(cumulated, level * total) + 1) for name, level in levels.items()
+    }
+    return {**result, "max": largest_ns / 1000}
+
+
+def regular_ticks(
+    clock: Clock, period_ns: int, count: int | None, stop: Callable[[], bool], timing: Timing
+) -> Iterator[Tick]:
+    """Ticks on a grid of absolute deadlines; missed ones are skipped and counted.
+
+    Args:
+        clock: The clock.
+        period_ns: Time between two ticks.
+        count: Number of ticks of the grid; without end if None.
+        stop: Asked before each tick whether to end.
+        timing: Where lateness and work are written.
+    """
+    lateness, work, extremes = timing.lateness, timing.work, timing.extremes_ns
+    last = _BINS - 1
+    index, woke_ns = 0, clock.now_ns()
+    overruns = 0
+    while (count is None or index < count) and not stop():
+        deadline_ns = index * period_ns
+        before_ns, woke_ns = woke_ns, clock.wait_until(deadline_ns)
+        late_ns = woke_ns - deadline_ns
+        missed = late_ns // period_ns
+        if missed > 0:
+            index += missed
+            overruns += missed
+            if count is not None and index >= count:
+                return
+        lateness[min(late_ns // 1000, last)] += 1
+        extremes[0] = max(extremes[0], late_ns)
+        extremes[2] = max(extremes[2], woke_ns - before_ns)
+        yield Tick(index * period_ns, overruns)
+        overruns = 0
+        work_ns = clock.now_ns() - woke_ns
+        work[min(work_ns // 1000, last)] += 1
+        extremes[1] = max(extremes[1], work_ns)
+        index += 1
+
+
+def run(
+    bridge: Bridge, state: BridgeState, ticks: Iterator[Tick], port: Port, sink: Sink
+) -> BridgeState:
+    """Run the bridge over ticks.
+
+    Args:
+        bridge: The bridge.
+        state: Where it starts.
+        ticks: When.
+        port: Where frames come from and go to.
+        sink: Where the record of every tick goes.
+
+    Returns:
+        The state at the end.
+    """
+    for tick in ticks:
+        frames, conditions = port.receive(tick.t_ns)
+        if tick.overruns:
+            conditions = conditions._replace(overruns=tick.overruns)
+        state, result = bridge.tick(state, tick.t_ns, frames, conditions)
+        port.send(result.frames)
+        sink(frames, result, _step(tick, conditions, result))
+    return state
+
+
+_NAN = math.nan
+
+
+def _step(tick: Tick, conditions: Conditions, result: TickResult) -> Step:
+    given, output = result.step_input, result.output
+    numbers: list[float] = []
+    for index, measured in enumerate(given.heights):
+        numbers += (_NAN, _NAN) if measured is None else (measured.height_m, measured.t_ns)
+        numbers += output.struts[index] if output.struts else (_NAN,) * 7
+    flags = conditions.acknowledged + 2 * conditions.bus_fault + 4 * conditions.log_fault
+    return Step(
+        tick.t_ns,
+        tick.overruns,
+        output.mode,
+        flags,
+        _NAN if given.applied_force_n is None else given.applied_force_n,
+        _NAN if given.temperature_c is None else given.temperature_c,
+        tuple(numbers),
+    )

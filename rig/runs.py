@@ -1,0 +1,428 @@
+"""A run of each kind, put together: on a bus, with a simulated bench, and again from its log."""
+
+import contextlib
+import hashlib
+import platform
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from can_dbc.database import load_database
+from can_dbc.frame import Frame
+from dart_model.spec import FileSkeleton, dump_model, load_model
+from dart_model.yaml_file import InputError, validated
+from rig.bench.schema import BenchConfig
+from rig.bench.simulated import Bench
+from rig.config import RunConfig, Setup, build_bridge
+from rig.core.bridge import Bridge, BridgeState, TickResult
+from rig.core.messages import Conditions
+from rig.core.types import Mode
+from rig.io.bus import Bus, BusError
+from rig.io.clock import Clock, RealClock, VirtualClock
+from rig.io.realtime import Granted, Request, realtime
+from rig.io.run_log import RUN_FILE, RunFolder, RunLog, Step, read_run, step_table
+from rig.loop import Port, Sink, Tick, Timing, regular_ticks, run
+
+MODEL_FILE, DBC_FILE = "model.yaml", "bus.dbc"
+_PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "autosar-e2e")
+_NO_CONDITIONS = Conditions()
+
+Progress = Callable[[int, Mode], None]
+"""Called with the time and mode of every tick."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a run ended.
+
+    Attributes:
+        folder: Its folder.
+        state: Last state of the bridge.
+        timing: How well the rate was kept.
+        granted: What the machine granted.
+        log_fault: What went wrong with the log, if anything.
+        ticks: Number of ticks.
+    """
+
+    folder: Path
+    state: BridgeState
+    timing: Timing
+    granted: Granted | None
+    log_fault: str | None
+    ticks: int
+
+
+class BusPort:
+    """A port on an open bus. A fault of the bus is kept and told; it does not stop the loop."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self.fault: str | None = None
+        self._acknowledged = False
+
+    def acknowledge(self) -> None:
+        """Acknowledge the safe state at the next tick."""
+        self._acknowledged = True
+
+    def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
+        """Frames that have come; their time is that of arrival, at the latest this tick's."""
+        failed = False
+        frames: list[Frame] = []
+        try:
+            frames = self._bus.receive()
+        except BusError as error:
+            self.fault, failed = str(error), True
+        frames = [frame if frame.t_ns <= t_ns else frame._replace(t_ns=t_ns) for frame in frames]
+        acknowledged, self._acknowledged = self._acknowledged, False
+        if failed or acknowledged:
+            return frames, Conditions(acknowledged=acknowledged, bus_fault=failed)
+        return frames, _NO_CONDITIONS
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Send; a frame that cannot be sent is a fault of the bus."""
+        for frame in frames:
+            try:
+                self._bus.send(frame)
+            except BusError as error:
+                self.fault = str(error)
+
+
+class BenchPort:
+    """A bus port with a simulated bench at the other end of the bus, in step with the ticks."""
+
+    def __init__(self, port: BusPort, bench: Bench, bench_bus: Bus) -> None:
+        self._port = port
+        self._bench = bench
+        self._bench_bus = bench_bus
+        self.truth: list[tuple[float, ...]] = []
+
+    def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
+        """Let the bench send what it has up to the tick, then receive it."""
+        for frame in self._bench.update(t_ns)[0]:
+            self._bench_bus.send(frame)
+        truth = self._bench.truth(t_ns)
+        self.truth.append(tuple(number for strut in truth.struts for number in strut))
+        return self._port.receive(t_ns)
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Send to the bench, which has no use for it."""
+        self._port.send(frames)
+        self._bench_bus.receive()
+
+
+def _header(ready: Setup, epoch_ns: int, granted: Granted | None, folder: Path) -> dict[str, object]:
+    files = {
+        name: hashlib.sha256((folder / name).read_bytes()).hexdigest()
+        for name in (MODEL_FILE, DBC_FILE)
+    }
+    return {
+        "schema": 1,
+        "epoch_ns": epoch_ns,
+        "config": ready.config.model_dump(mode="json"),
+        "config_source": str(ready.source),
+        "files_sha256": files,
+        "versions": {
+            **{name: version(name) for name in _PACKAGES},
+            "python": platform.python_version(),
+            "system": platform.platform(),
+        },
+        "granted": None if granted is None else granted.as_dict(),
+    }
+
+
+def _copy_inputs(ready: Setup, folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / MODEL_FILE).write_text(dump_model(ready.model), "utf-8")
+        shutil.copyfile(ready.database.path, folder / DBC_FILE)
+        if isinstance(ready.model.skeleton, FileSkeleton):
+            target = folder / ready.model.skeleton.file
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(ready.model.folder / ready.model.skeleton.file, target)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
+
+
+def logged(
+    ready: Setup,
+    bridge: Bridge,
+    port: Port,
+    clock: Clock,
+    folder: Path,
+    *,
+    granted: Granted | None = None,
+    stop: Callable[[], bool],
+    progress: Progress,
+) -> Ended:
+    """Run on a port and log it.
+
+    Args:
+        ready: Configuration, model and DBC.
+        bridge: The bridge built from them.
+        port: Where frames come from and go to.
+        clock: When ticks come.
+        folder: Folder of the run; absent or empty.
+        granted: What the machine granted; None for simulated time, which then waits for the disk.
+        stop: Asked before each tick whether to end.
+        progress: Told of every tick.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    config = ready.config
+    if (folder / RUN_FILE).exists():
+        raise InputError(f"{folder}: holds a run already, expected an empty folder")
+    _copy_inputs(ready, folder)
+    header = _header(ready, clock.epoch_ns, granted, folder)
+    log = RunLog(
+        folder,
+        header,
+        list(config.observers),
+        clock.epoch_ns,
+        config.bus.channel,
+        paced=granted is not None,
+    )
+    count = None if config.duration_s is None else round(config.duration_s * config.rate_hz)
+    timing, ticks, status = Timing.empty(), 0, "failed"
+    state = bridge.init(0)
+
+    def sink(frames: Sequence[Frame], result: TickResult, step: Step) -> None:
+        nonlocal ticks
+        log.add(frames, result.frames, step)
+        ticks += 1
+        progress(step.t_ns, result.output.mode)
+
+    try:
+        due = regular_ticks(clock, config.period_ns, count, stop, timing)
+        state = run(bridge, state, due, port, sink)
+        status = "safe" if state.rig.mode is Mode.SAFE else "done"
+    finally:
+        log.close(
+            {
+                "ending": {
+                    "status": status,
+                    "ticks": ticks,
+                    "counts": state.counts._asdict(),
+                    "timing": timing.summary(),
+                    "log_fault": log.fault,
+                    "dropped_steps": log.dropped,
+                }
+            }
+        )
+    return Ended(folder, state, timing, granted, log.fault, ticks)
+
+
+def live(
+    ready: Setup,
+    folder: Path,
+    *,
+    listen_only: bool = False,
+    stop: Callable[[], bool],
+    progress: Progress,
+) -> Ended:
+    """Run on the configured bus in real time.
+
+    Raises:
+        InputError: Something of the configuration is wrong, or the folder cannot be written.
+        BusError: The bus cannot be opened.
+    """
+    bridge = build_bridge(ready)
+    with realtime(_request(ready.config)) as granted:
+        clock = _real_clock(ready.config, granted)
+        bus = Bus(
+            ready.config.bus.config(),
+            bridge.heard,
+            listen_only=listen_only,
+            epoch_ns=clock.epoch_ns,
+        )
+        try:
+            return logged(
+                ready,
+                bridge,
+                BusPort(bus),
+                clock,
+                folder,
+                granted=granted,
+                stop=stop,
+                progress=progress,
+            )
+        finally:
+            bus.close()
+
+
+@dataclass(frozen=True)
+class WithBench:
+    """A run with a simulated bench.
+
+    Attributes:
+        ended: How the run ended.
+        truth: What the struts really did at each tick, shape (ticks, struts, 3): height in m,
+            velocity in m/s, strut force in N.
+    """
+
+    ended: Ended
+    truth: NDArray[np.float64]
+
+
+def with_bench(
+    ready: Setup,
+    bench_config: BenchConfig,
+    folder: Path,
+    *,
+    lockstep: bool,
+    stop: Callable[[], bool],
+    progress: Progress,
+) -> WithBench:
+    """Run with a simulated bench at the other end of the configured bus.
+
+    Args:
+        ready: Configuration, model and DBC.
+        bench_config: The bench.
+        folder: Folder of the run.
+        lockstep: Simulated time, as fast as the machine allows; otherwise real time.
+        stop: Asked before each tick whether to end.
+        progress: Told of every tick.
+
+    Raises:
+        InputError: Something of the configuration is wrong, or the folder cannot be written.
+        BusError: The bus cannot be opened.
+    """
+    bridge = build_bridge(ready)
+    bench = Bench(bench_config, ready.database)
+    with contextlib.ExitStack() as stack:
+        granted = None if lockstep else stack.enter_context(realtime(_request(ready.config)))
+        clock = VirtualClock() if granted is None else _real_clock(ready.config, granted)
+        config = ready.config.bus.config()
+        bus = Bus(config, bridge.heard, epoch_ns=clock.epoch_ns)
+        stack.callback(bus.close)
+        bench_bus = Bus(config, epoch_ns=clock.epoch_ns)
+        stack.callback(bench_bus.close)
+        port = BenchPort(BusPort(bus), bench, bench_bus)
+        ended = logged(
+            ready, bridge, port, clock, folder, granted=granted, stop=stop, progress=progress
+        )
+    truth = np.array(port.truth).reshape(len(port.truth), bridge.struts, 3)
+    return WithBench(ended, truth)
+
+
+def _request(config: RunConfig) -> Request:
+    asked = config.realtime
+    return Request(asked.fifo_priority, asked.lock_memory, asked.cpu, asked.freeze_garbage)
+
+
+def _real_clock(config: RunConfig, granted: Granted) -> RealClock:
+    return RealClock(round(config.realtime.spin_s * 1e9) if granted.fifo else 0)
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """A run computed again from its log.
+
+    Attributes:
+        steps: Every step, as it would be logged.
+        logged: How many steps the log holds.
+        different: How many of them differ from the steps computed here in any bit.
+        first_different_ns: Time of the first that differs.
+        refused_frames: Frames refused in the replay.
+    """
+
+    steps: list[Step]
+    logged: int
+    different: int
+    first_different_ns: int | None
+    refused_frames: int
+
+
+def setup_of_run(folder: Path) -> tuple[RunFolder, Setup]:
+    """A logged run and the configuration it ran with.
+
+    Raises:
+        InputError: A file of the run is missing or damaged.
+        DatabaseError: Its DBC is.
+    """
+    found = read_run(folder)
+    config = validated(RunConfig, found.header.get("config"), f"{folder / RUN_FILE}: config")
+    model = load_model(folder / MODEL_FILE)
+    database = load_database(folder / DBC_FILE)
+    ready = Setup(config=config, source=folder / RUN_FILE, model=model, database=database)
+    return found, ready
+
+
+class _LogPort:
+    """Frames of a log, tick by tick. What the bridge sends goes nowhere."""
+
+    def __init__(self, frames: Iterator[tuple[Frame, str]], conditions: dict[int, Conditions]) -> None:
+        self._received = (frame for frame, direction in frames if direction == "R")
+        self._next = next(self._received, None)
+        self._conditions = conditions
+
+    def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
+        frames: list[Frame] = []
+        while self._next is not None and self._next.t_ns <= t_ns:
+            frames.append(self._next)
+            self._next = next(self._received, None)
+        return frames, self._conditions.get(t_ns, _NO_CONDITIONS)
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        del frames
+
+
+def replay(
+    folder: Path, *, ready: Setup | None = None, progress: Progress = lambda _t, _mode: None
+) -> Replayed:
+    """Compute a run again from its frames, and compare it with its steps.
+
+    Ticks whose steps a kill took are those of the rate, up to the last frame.
+
+    Args:
+        folder: Folder of the run.
+        ready: Another configuration to replay with, e.g. with a corrected model or other gains.
+        progress: Told of every tick.
+
+    Raises:
+        InputError: The run is damaged.
+    """
+    found, own = setup_of_run(folder)
+    ready = ready or own
+    bridge = build_bridge(ready)
+    times, overruns, flags = (found.steps.column(name).to_pylist() if found.steps.num_rows else [] for name in ("t_ns", "overruns", "flags"))
+    last_ns = max((frame.t_ns for frame, _ in found.frames()), default=-1)
+    ticks = [Tick(t, n) for t, n in zip(times, overruns, strict=True)]
+    next_ns = times[-1] + ready.config.period_ns if times else 0
+    lost = range(next_ns, last_ns + 1, ready.config.period_ns)
+    ticks += [Tick(t, 0) for t in lost]
+    conditions = {
+        t: Conditions(0, bool(flag & 1), bool(flag & 2), bool(flag & 4))
+        for t, flag in zip(times, flags, strict=True)
+        if flag
+    }
+    steps: list[Step] = []
+
+    def sink(_frames: Sequence[Frame], result: TickResult, step: Step) -> None:
+        steps.append(step)
+        progress(step.t_ns, result.output.mode)
+
+    state = run(bridge, bridge.init(0), iter(ticks), _LogPort(found.frames(), conditions), sink)
+    different = _different(found, steps)
+    return Replayed(
+        steps,
+        len(times),
+        len(different),
+        steps[different[0]].t_ns if len(different) else None,
+        state.counts.refused,
+    )
+
+
+def _different(found: RunFolder, steps: list[Step]) -> NDArray[np.intp]:
+    """Indices of logged steps that are not the same bit for bit."""
+    again = step_table(steps[: found.steps.num_rows], found.steps.schema)
+    unequal = np.zeros(found.steps.num_rows, dtype=bool)
+    for name in found.steps.schema.names:
+        a, b = (table.column(name).to_numpy() for table in (found.steps, again))
+        unequal |= a.view(f"V{a.itemsize}") != b.view(f"V{b.itemsize}")
+    return np.flatnonzero(unequal)
