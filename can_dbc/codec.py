@@ -458,19 +458,31 @@ def _values_of_log(field: _Field, data: NDArray[np.uint8]) -> NDArray[np.float64
             return numbers.astype(np.float64) * field.scale + field.offset
     if field.sign:
         sign = np.uint64(field.sign)
-        return ((raw ^ sign) - sign).view(np.int64).astype(np.float64) * field.scale + field.offset
-    return raw.astype(np.float64) * field.scale + field.offset
+        values = ((raw ^ sign) - sign).view(np.int64).astype(np.float64)
+    else:
+        values = raw.astype(np.float64)
+    values *= field.scale
+    values += field.offset
+    return values
 
 
 def _raw_of_log(field: _Field, data: NDArray[np.uint8]) -> NDArray[np.uint64]:
     """Raw values of one field, unsigned, shape (n,)."""
-    # From here on bytes count from the lowest one, whichever end is sent first.
-    ordered = data[:, ::-1] if field.is_big_endian else data
-    first, shift = divmod(field.shift, 8)
-    covering = (shift + field.mask.bit_length() + 7) // 8
-    window = np.zeros((len(data), 8), dtype=np.uint8)
-    window[:, : min(covering, 8)] = ordered[:, first : first + min(covering, 8)]
-    raw = window.view("<u8")[:, 0].astype(np.uint64) >> np.uint64(shift)
-    if covering > 8:
+    padded = _at_least_eight_bytes(data, at_front=field.is_big_endian)
+    # Bytes count from the lowest one, whichever end is sent first.
+    ordered = padded[:, ::-1] if field.is_big_endian else padded
+    first = min(field.shift // 8, padded.shape[1] - 8)
+    shift = field.shift - 8 * first
+    window = np.ascontiguousarray(ordered[:, first : first + 8])
+    raw = window.view("<u8")[:, 0] >> np.uint64(shift)
+    if shift + field.mask.bit_length() > 64:
         raw |= ordered[:, first + 8].astype(np.uint64) << np.uint64(64 - shift)
     return raw & np.uint64(field.mask)
+
+
+def _at_least_eight_bytes(data: NDArray[np.uint8], *, at_front: bool) -> NDArray[np.uint8]:
+    """The payloads with zeros above their highest byte, so that eight can be read at once."""
+    missing = 8 - data.shape[1]
+    if missing <= 0:
+        return data
+    return np.pad(data, ((0, 0), (missing, 0) if at_front else (0, missing)))

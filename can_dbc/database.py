@@ -185,14 +185,16 @@ def _near(name: str, names: Iterable[str]) -> str:
 
 def _read(path: Path) -> bytes:
     try:
-        if not path.is_file():
-            raise DatabaseError(f"{path}: no such file, expected a DBC file")
+        is_file = path.is_file()
+    except (OSError, ValueError):  # a name that no file can have
+        is_file = False
+    if not is_file:
+        raise DatabaseError(f"{ascii(str(path))[1:-1]}: no such file, expected a DBC file")
+    try:
         with path.open("rb") as file:
             content = file.read(SIZE_MAX_BYTES + 1)
     except OSError as error:
         raise DatabaseError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError:
-        raise DatabaseError(f"{str(path)!r}: not a file name, expected a DBC file") from None
     if len(content) > SIZE_MAX_BYTES:
         raise DatabaseError(f"{path}: larger than {SIZE_MAX_BYTES} bytes, expected a DBC file")
     return content

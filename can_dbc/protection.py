@@ -235,7 +235,8 @@ def _crc_fits(data: bytes | bytearray, identity: Identity) -> bool:
     profile, data_ids = identity
     if profile is _P02:
         return e2e_p02_check(data, data_ids)
-    return e2e_p01_check(data, int.from_bytes(data_ids, "big"))
+    # The package checks this profile only in a mutable buffer.
+    return e2e_p01_check(bytearray(data), int.from_bytes(data_ids, "big"))
 
 
 def _wrong_crc(data: bytes | bytearray, protection: Protection) -> Verdict:
