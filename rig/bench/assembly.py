@@ -40,10 +40,12 @@ class Assembly(NamedTuple):
 
     Attributes:
         mechanics: Its equations of motion.
+        drive: Its applied force.
         start: State at time zero, shape (states,).
     """
 
     mechanics: Mechanics
+    drive: Drive
     start: Floats
 
 
@@ -60,7 +62,8 @@ def assemble(config: BenchConfig) -> Assembly:
         BenchConfigError: It has no static equilibrium to start from, or a body has no mass left.
     """
     mechanics = _mechanics(config)
-    return Assembly(mechanics, _start(config, mechanics))
+    drive = _drive(config.applied_force, config.undeclared_effects)
+    return Assembly(mechanics, drive, _start(config, mechanics))
 
 
 def _mechanics(config: BenchConfig) -> Mechanics:
@@ -71,10 +74,10 @@ def _mechanics(config: BenchConfig) -> Mechanics:
         gravity_m_per_s2=config.gravity_m_per_s2,
         mass_kg=_masses(config, uppers),
         lower=np.array([-1 if name == WORLD else uppers.index(name) for name in lowers]),
+        driven=uppers.index(config.applied_force.body),
         free_length_m=np.array([strut.free_length_m for strut in config.struts]),
         springs=_curves([(s.spring.height_m, s.spring.force_n) for s in config.struts]),
         dampers=_curves([(s.damper.velocity_m_per_s, s.damper.force_n) for s in config.struts]),
-        drive=_drive(config.applied_force, uppers, config.undeclared_effects),
         effects=_effects(config),
         thermal=Thermal(
             warming_k_per_j=1.0 / (thermal.heat_capacity_j_per_k or math.inf),
@@ -104,22 +107,20 @@ def _strut_index(config: BenchConfig, effect: Effect) -> int:
 
 
 def _curves(points: Sequence[tuple[Sequence[float], Sequence[float]]]) -> Curves:
-    cubics = [_monotone_cubic(at, force_n) for at, force_n in points]
+    segments = [_segments(np.array(at), np.array(force_n)) for at, force_n in points]
     return Curves(
-        first=np.cumsum([0, *(len(cubic) for cubic in cubics)]),
-        start=np.concatenate([np.asarray(at[:-1], dtype=np.float64) for at, _ in points]),
-        width=np.concatenate([np.diff(np.asarray(at, dtype=np.float64)) for at, _ in points]),
-        cubic=np.concatenate(cubics),
+        first=np.cumsum([0, *(len(part) for part in segments)]), segments=np.concatenate(segments)
     )
 
 
-def _monotone_cubic(at: Sequence[float], force_n: Sequence[float]) -> Floats:
-    """Coefficients of a curve through points without overshoot, shape (segments, 4)."""
-    pchip = cast("Any", interpolate).PchipInterpolator(np.array(at), np.array(force_n))
-    return np.ascontiguousarray(np.asarray(pchip.c, dtype=np.float64).T)
+def _segments(at: Floats, force_n: Floats) -> Floats:
+    """Segments of a curve through points without overshoot, shape (segments, 6)."""
+    pchip = cast("Any", interpolate).PchipInterpolator(at, force_n)
+    cubic = np.asarray(pchip.c, dtype=np.float64).T
+    return np.column_stack([at[:-1], np.diff(at), cubic])
 
 
-def _drive(force: AppliedForce, uppers: list[str], effects: tuple[Effect, ...]) -> Drive:
+def _drive(force: AppliedForce, effects: tuple[Effect, ...]) -> Drive:
     sines: list[tuple[float, ...]] = []
     sweeps: list[tuple[float, ...]] = []
     files = [part.record for part in force.components if isinstance(part, ForceFile)]
@@ -134,7 +135,6 @@ def _drive(force: AppliedForce, uppers: list[str], effects: tuple[Effect, ...]) 
                 (part.amplitude_n, part.start_hz, part.end_hz, part.duration_s, logarithmic)
             )
     return Drive(
-        body=uppers.index(force.body),
         gain=math.prod(_values(effects, Law.INPUT_GAIN)),
         delay_s=math.fsum(_values(effects, Law.DELAY)),
         sines=np.array(sines, dtype=np.float64).reshape(-1, SINE_COLUMNS),
@@ -171,12 +171,9 @@ def _effects(config: BenchConfig) -> Effects:
         row[: len(values)] = values
     first_state = 2 * len(config.struts) + 1
     states = np.cumsum([first_state, *(kind.states for kind in kinds)])
-    return Effects(
-        law=np.array([int(kind.law) for kind in kinds], dtype=np.int64),
-        strut=np.array([_strut_index(config, effect) for effect in acting], dtype=np.int64),
-        state=states[:-1].astype(np.int64),
-        parameters=parameters,
-    )
+    struts = [_strut_index(config, effect) for effect in acting]
+    places = [[int(kind.law) for kind in kinds], struts, states[:-1]]
+    return Effects(np.array(places, dtype=np.int64).T.copy(), parameters)
 
 
 def _start(config: BenchConfig, mechanics: Mechanics) -> Floats:
@@ -184,8 +181,7 @@ def _start(config: BenchConfig, mechanics: Mechanics) -> Floats:
     states = 2 * n + 1 + sum(EFFECT_KINDS[e.name].states for e in config.undeclared_effects)
     y = np.zeros(states)
     y[2 * n] = config.temperature.initial_c
-    effects = mechanics.effects
-    for law, state, values in zip(effects.law, effects.state, effects.parameters, strict=True):
+    for (law, _, state), values in zip(*mechanics.effects, strict=True):
         if law == Law.HIDDEN_MASS:
             mass_kg, stiffness_n_per_m = values[0], values[1]
             y[state] = -mass_kg * mechanics.gravity_m_per_s2 / stiffness_n_per_m

@@ -55,6 +55,8 @@ TEMPERATURE_FADE = int(Law.TEMPERATURE_FADE)
 TIME_FADE = int(Law.TIME_FADE)
 HIDDEN_MASS = int(Law.HIDDEN_MASS)
 
+LAW, STRUT, STATE = 0, 1, 2
+"""Columns of `Effects.places`."""
 SINE_COLUMNS = 3
 """amplitude_n, rate_rad_per_s, phase_rad."""
 SWEEP_COLUMNS = 5
@@ -70,22 +72,18 @@ class Curves(NamedTuple):
 
     Attributes:
         first: First segment of each curve, and one past the last, shape (struts + 1,).
-        start: Where each segment begins, shape (segments,).
-        width: Length of each segment, shape (segments,).
-        cubic: Coefficients from the cube down to the constant, shape (segments, 4).
+        segments: Start and length of each segment, and its coefficients from the cube down to the
+            constant, shape (segments, 6).
     """
 
     first: Integers
-    start: Floats
-    width: Floats
-    cubic: Floats
+    segments: Floats
 
 
 class Drive(NamedTuple):
     """The applied force.
 
     Attributes:
-        body: Index of the driven body.
         gain: Undeclared factor between the force applied and the force that acts.
         delay_s: Undeclared delay between them.
         sines: Shape (sines, 3), see `SINE_COLUMNS`.
@@ -95,7 +93,6 @@ class Drive(NamedTuple):
         file_force_n: Forces of all files, shape (samples,).
     """
 
-    body: int
     gain: float
     delay_s: float
     sines: Floats
@@ -109,15 +106,12 @@ class Effects(NamedTuple):
     """The undeclared effects that are laws of force.
 
     Attributes:
-        law: Code of each law, shape (effects,).
-        strut: Strut of each, shape (effects,).
-        state: Index of each one's first internal state in the state vector, shape (effects,).
+        places: Code of each law, its strut, and the index of its first internal state in the state
+            vector, shape (effects, 3).
         parameters: Values in the order of `rig.bench.effects`, shape (effects, PARAMETER_COUNT).
     """
 
-    law: Integers
-    strut: Integers
-    state: Integers
+    places: Integers
     parameters: Floats
 
 
@@ -138,14 +132,16 @@ class Thermal(NamedTuple):
 class Mechanics(NamedTuple):
     """The bench as the equations of motion see it.
 
+    Few arrays, because compiled code counts references to each of them on every call.
+
     Attributes:
         gravity_m_per_s2: Acceleration of free fall.
         mass_kg: Mass of each body, shape (n,).
         lower: Body on which each strut stands, -1 for the world, shape (n,).
+        driven: Body on which the applied force acts.
         free_length_m: Free length of each strut, shape (n,).
         springs: Spring curves over height.
         dampers: Damper curves over rate of height.
-        drive: The applied force.
         effects: Undeclared effects.
         thermal: The damper's temperature.
     """
@@ -153,10 +149,10 @@ class Mechanics(NamedTuple):
     gravity_m_per_s2: float
     mass_kg: Floats
     lower: Integers
+    driven: int
     free_length_m: Floats
     springs: Curves
     dampers: Curves
-    drive: Drive
     effects: Effects
     thermal: Thermal
 
@@ -173,14 +169,16 @@ class Step(NamedTuple):
     length_s: float
 
 
-class Grid(NamedTuple):
-    """Times of the records.
+class Span(NamedTuple):
+    """A row of records.
 
     Attributes:
+        first: Number of the first record; record k is at `k * substeps * step_s`.
         substeps: Steps of the integrator between records.
         step_s: Length of a step in s.
     """
 
+    first: int
     substeps: int
     step_s: float
 
@@ -194,20 +192,21 @@ def _compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
 @_compiled
 def curve_force(curves: Curves, strut: int, at: float) -> float:
     """Force of a curve in N at a height in m or a rate in m/s."""
+    segments = curves.segments
     low = curves.first[strut]
     high = curves.first[strut + 1] - 1
     while low < high:
         middle = (low + high + 1) // 2
-        if curves.start[middle] <= at:
+        if segments[middle, 0] <= at:
             low = middle
         else:
             high = middle - 1
-    offset = at - curves.start[low]
-    inside = min(max(offset, 0.0), curves.width[low])
-    a = curves.cubic[low, 0]
-    b = curves.cubic[low, 1]
-    c = curves.cubic[low, 2]
-    force_n = ((a * inside + b) * inside + c) * inside + curves.cubic[low, 3]
+    offset = at - segments[low, 0]
+    inside = min(max(offset, 0.0), segments[low, 1])
+    a = segments[low, 2]
+    b = segments[low, 3]
+    c = segments[low, 4]
+    force_n = ((a * inside + b) * inside + c) * inside + segments[low, 5]
     slope = (3.0 * a * inside + 2.0 * b) * inside + c
     return force_n + slope * (offset - inside)
 
@@ -342,41 +341,41 @@ def memory_effect(law: int, p: Floats, state: float, state_rate: float) -> float
 def fade_factor(effects: Effects, strut: int, t_s: float, temperature_c: float) -> float:
     """Factor on the damper curve of a strut from all its fades."""
     factor = 1.0
-    for i in range(effects.law.shape[0]):
-        if effects.strut[i] != strut:
+    for i in range(effects.places.shape[0]):
+        if effects.places[i, STRUT] != strut:
             continue
         p = effects.parameters[i]
-        if effects.law[i] == TEMPERATURE_FADE:
+        if effects.places[i, LAW] == TEMPERATURE_FADE:
             factor *= math.exp(-p[0] * (temperature_c - p[1]))
-        elif effects.law[i] == TIME_FADE:
+        elif effects.places[i, LAW] == TIME_FADE:
             factor *= p[0] + (1.0 - p[0]) * math.exp(-t_s / p[1])
     return factor
 
 
 @_compiled
-def strut_height(mechanics: Mechanics, strut: int, y: Floats) -> float:
+def strut_height(lower: Integers, strut: int, y: Floats) -> float:
     """Height of a strut in m."""
-    lower = int(mechanics.lower[strut])
-    return float(y[strut]) - (float(y[lower]) if lower >= 0 else 0.0)
+    below = int(lower[strut])
+    return float(y[strut]) - (float(y[below]) if below >= 0 else 0.0)
 
 
 @_compiled
-def strut_rate(mechanics: Mechanics, strut: int, y: Floats) -> float:
+def strut_rate(lower: Integers, strut: int, y: Floats) -> float:
     """Rate of height of a strut in m/s."""
-    n = mechanics.mass_kg.shape[0]
-    lower = int(mechanics.lower[strut])
-    return float(y[n + strut]) - (float(y[n + lower]) if lower >= 0 else 0.0)
+    n = lower.shape[0]
+    below = int(lower[strut])
+    return float(y[n + strut]) - (float(y[n + below]) if below >= 0 else 0.0)
 
 
 @_compiled
 def effect_force(mechanics: Mechanics, effect: int, t_s: float, y: Floats, dy: Floats) -> float:
     """Strut force in N of one effect; the rate of its internal state goes into `dy`."""
     effects = mechanics.effects
-    law = effects.law[effect]
-    strut = int(effects.strut[effect])
+    law = effects.places[effect, LAW]
+    strut = int(effects.places[effect, STRUT])
     p = effects.parameters[effect]
-    height_m = strut_height(mechanics, strut, y)
-    velocity_m_per_s = strut_rate(mechanics, strut, y)
+    height_m = strut_height(mechanics.lower, strut, y)
+    velocity_m_per_s = strut_rate(mechanics.lower, strut, y)
     deflection_m = height_m - mechanics.free_length_m[strut]
     if law <= GAS_SPRING:
         return spring_effect(law, p, deflection_m)
@@ -385,7 +384,7 @@ def effect_force(mechanics: Mechanics, effect: int, t_s: float, y: Floats, dy: F
     if law <= POSITION_DEPENDENT_DAMPING:
         return damping_effect(law, p, deflection_m, velocity_m_per_s)
     if law <= MAXWELL:
-        at = int(effects.state[effect])
+        at = int(effects.places[effect, STATE])
         dy[at] = memory_rate(law, p, velocity_m_per_s, y[at])
         return memory_effect(law, p, y[at], dy[at])
     if law == PERIODIC_FORCE:
@@ -397,14 +396,16 @@ def effect_force(mechanics: Mechanics, effect: int, t_s: float, y: Floats, dy: F
 def strut_force(mechanics: Mechanics, strut: int, t_s: float, y: Floats, dy: Floats) -> float:
     """Total force of a strut in N; rates of temperature and internal states go into `dy`."""
     n = mechanics.mass_kg.shape[0]
-    height_m = strut_height(mechanics, strut, y)
-    velocity_m_per_s = strut_rate(mechanics, strut, y)
+    height_m = strut_height(mechanics.lower, strut, y)
+    velocity_m_per_s = strut_rate(mechanics.lower, strut, y)
     damper_n = curve_force(mechanics.dampers, strut, velocity_m_per_s)
-    damper_n *= fade_factor(mechanics.effects, strut, t_s, float(y[2 * n]))
+    effects = mechanics.effects.places.shape[0]
+    if effects > 0:
+        damper_n *= fade_factor(mechanics.effects, strut, t_s, float(y[2 * n]))
     dy[2 * n] -= mechanics.thermal.warming_k_per_j * damper_n * velocity_m_per_s
     force_n = curve_force(mechanics.springs, strut, height_m) + damper_n
-    for effect in range(mechanics.effects.law.shape[0]):
-        if mechanics.effects.strut[effect] == strut:
+    for effect in range(effects):
+        if mechanics.effects.places[effect, STRUT] == strut:
             force_n += effect_force(mechanics, effect, t_s, y, dy)
     return force_n
 
@@ -421,21 +422,20 @@ def derivatives(mechanics: Mechanics, t_s: float, acting_n: float, y: Floats, dy
         dy: Receives the rates, shape (states,).
     """
     n = mechanics.mass_kg.shape[0]
-    effects = mechanics.effects
     thermal = mechanics.thermal
     dy[2 * n] = thermal.cooling_per_s * (thermal.ambient_c - y[2 * n])
     for i in range(n):
         dy[i] = y[n + i]
         dy[n + i] = 0.0
-    dy[n + mechanics.drive.body] = acting_n
+    dy[n + mechanics.driven] = acting_n
     for i in range(n):
         force_n = strut_force(mechanics, i, t_s, y, dy)
         dy[n + i] += force_n
         if mechanics.lower[i] >= 0:
             dy[n + mechanics.lower[i]] -= force_n
-    for i in range(effects.law.shape[0]):
-        if effects.law[i] == HIDDEN_MASS:
-            dy[n + effects.strut[i]] += hidden_mass_force(mechanics, i, y, dy)
+    for i in range(mechanics.effects.places.shape[0]):
+        if mechanics.effects.places[i, LAW] == HIDDEN_MASS:
+            dy[n + mechanics.effects.places[i, STRUT]] += hidden_mass_force(mechanics, i, y, dy)
     for i in range(n):
         dy[n + i] = dy[n + i] / mechanics.mass_kg[i] - mechanics.gravity_m_per_s2
 
@@ -448,8 +448,8 @@ def hidden_mass_force(mechanics: Mechanics, effect: int, y: Floats, dy: Floats) 
     """
     n = mechanics.mass_kg.shape[0]
     mass_kg = mechanics.effects.parameters[effect, 0]
-    at = int(mechanics.effects.state[effect])
-    stretch_rate_m_per_s = y[at + 1] - y[n + mechanics.effects.strut[effect]]
+    at = int(mechanics.effects.places[effect, STATE])
+    stretch_rate_m_per_s = y[at + 1] - y[n + mechanics.effects.places[effect, STRUT]]
     force_n = mechanics.effects.parameters[effect, 1] * y[at]
     force_n += mechanics.effects.parameters[effect, 2] * stretch_rate_m_per_s
     dy[at] = stretch_rate_m_per_s
@@ -489,47 +489,52 @@ def runge_kutta_step(
 
 
 @_compiled
-def observe(mechanics: Mechanics, t_s: float, y: Floats, work: Floats, record: Floats) -> None:
+def observe(
+    mechanics: Mechanics, drive: Drive, t_s: float, y: Floats, record: Floats
+) -> None:
     """Write what can be known of the bench at one time.
 
     Args:
         mechanics: The bench.
+        drive: The applied force.
         t_s: Time in s.
         y: State, shape (states,).
-        work: Scratch, shape (5, states).
         record: Receives height, rate of height and force of each strut, then applied force, acting
             force and temperature, shape (RECORD_COLUMNS * n + RECORD_EXTRA,).
     """
     n = mechanics.mass_kg.shape[0]
+    rates = np.zeros(y.shape[0])
     for i in range(n):
-        record[3 * i] = strut_height(mechanics, i, y)
-        record[3 * i + 1] = strut_rate(mechanics, i, y)
-        record[3 * i + 2] = strut_force(mechanics, i, t_s, y, work[0])
-    record[3 * n] = applied_force(mechanics.drive, t_s)
-    record[3 * n + 1] = acting_force(mechanics.drive, t_s)
+        record[3 * i] = strut_height(mechanics.lower, i, y)
+        record[3 * i + 1] = strut_rate(mechanics.lower, i, y)
+        record[3 * i + 2] = strut_force(mechanics, i, t_s, y, rates)
+    record[3 * n] = applied_force(drive, t_s)
+    record[3 * n + 1] = acting_force(drive, t_s)
     record[3 * n + 2] = y[2 * n]
 
 
 @_compiled
-def advance(mechanics: Mechanics, grid: Grid, first: int, y: Floats, records: Floats) -> None:
+def advance(
+    mechanics: Mechanics, drive: Drive, span: Span, y: Floats, records: Floats
+) -> None:
     """Write records at equal times, advancing the state to the time after the last one.
 
     Args:
         mechanics: The bench.
-        grid: Times of the records.
-        first: Number of the first record; record k is at `k * grid.substeps * grid.step_s`.
+        drive: The applied force.
+        span: Which records, and the steps between them.
         y: State at the first record, shape (states,); changed in place.
         records: Receives the records, shape (records, RECORD_COLUMNS * n + RECORD_EXTRA).
     """
     work = np.zeros((5, y.shape[0]))
     acting_n = np.empty(3)
-    step_s = grid.step_s
+    step_s = span.step_s
     for row in range(records.shape[0]):
-        start = (first + row) * grid.substeps
-        observe(mechanics, start * step_s, y, work, records[row])
-        acting_n[2] = acting_force(mechanics.drive, start * step_s)
-        for i in range(start, start + grid.substeps):
+        start = (span.first + row) * span.substeps
+        observe(mechanics, drive, start * step_s, y, records[row])
+        acting_n[2] = acting_force(drive, start * step_s)
+        for i in range(start, start + span.substeps):
             acting_n[0] = acting_n[2]
-            acting_n[1] = acting_force(mechanics.drive, (i + 0.5) * step_s)
-            acting_n[2] = acting_force(mechanics.drive, (i + 1) * step_s)
+            acting_n[1] = acting_force(drive, (i + 0.5) * step_s)
+            acting_n[2] = acting_force(drive, (i + 1) * step_s)
             runge_kutta_step(mechanics, Step(i * step_s, step_s), acting_n, y, work)

@@ -21,7 +21,7 @@ from rig.bench.mechanics import RECORD_COLUMNS, RECORD_EXTRA
 from rig.bench.schema import BenchConfig, BenchConfigError, Transmission
 from rig.bench.trajectory import Motion, advanced, regular_grid
 
-RECORDS_AHEAD = 16
+RECORDS_AHEAD = 4
 """Records computed in one go: few enough not to delay a loop, enough to share the overhead."""
 
 RECORDS_KEPT = 4096

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rig.bench.assembly import Assembly, assemble
-from rig.bench.mechanics import RECORD_COLUMNS, RECORD_EXTRA, Floats, Grid, Integers, advance
+from rig.bench.mechanics import RECORD_COLUMNS, RECORD_EXTRA, Floats, Integers, Span, advance
 from rig.bench.schema import BenchConfig, BenchConfigError
 
 NANOSECONDS = 1e-9
@@ -51,6 +51,18 @@ class Trajectory(NamedTuple):
     temperature_c: Floats
 
 
+class Grid(NamedTuple):
+    """Times of the records.
+
+    Attributes:
+        substeps: Steps of the integrator between records.
+        step_s: Length of a step in s.
+    """
+
+    substeps: int
+    step_s: float
+
+
 def regular_grid(config: BenchConfig, period_ns: int) -> Grid:
     """Divide a period into steps no longer than the configured one."""
     substeps = -(-period_ns // config.step_ns)
@@ -76,7 +88,8 @@ def advanced(assembly: Assembly, grid: Grid, motion: Motion, count: int) -> tupl
     struts = len(assembly.mechanics.mass_kg)
     records = np.empty((count, RECORD_COLUMNS * struts + RECORD_EXTRA))
     y = motion.y.copy()
-    advance(assembly.mechanics, grid, motion.records, y, records)
+    span = Span(motion.records, grid.substeps, grid.step_s)
+    advance(assembly.mechanics, assembly.drive, span, y, records)
     if not np.isfinite(records).all():
         raise BenchDivergedError(
             f"the motion is not finite after {motion.records * grid.substeps * grid.step_s:g} s, "

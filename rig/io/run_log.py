@@ -4,18 +4,17 @@
     frames.log    every frame, received (R) and sent (T), in candump's format with ns
     steps.arrow   one record a tick, as an Arrow IPC stream
 
-A thread of its own writes, so that a slow disk does not delay a tick. Frames are written as they
-come and unbuffered, so a killed run loses none that was handed over; steps are flushed in batches,
-and what a kill takes of them is computed again from the frames.
+A thread of its own writes, so that a slow disk does not delay a tick. Frames are written unbuffered,
+at most 10 ms after they came; steps are flushed in batches, and what a kill takes of them is
+computed again from the frames.
 """
 
-import queue
 import threading
-import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import pyarrow as pa
 import yaml
@@ -23,13 +22,14 @@ import yaml
 from can_dbc.frame import Frame
 from dart_model.yaml_file import InputError, parse_mapping, read_text
 
-FLUSH_S = 0.2
-"""Longest time that a step waits for its batch."""
+FLUSH_NS = 190_000_000
+"""Time of the run that a batch of steps spans; with `POLL_S` at most 0.2 s are lost to a kill."""
+
+POLL_S = 0.01
+"""How often the writing thread looks for what was handed over."""
 
 _MOST_WAITING = 200_000
 """Ticks that may wait for a slow disk before they are dropped, and counted."""
-
-_MOST_BATCH = 8192
 
 RUN_FILE, FRAMES_FILE, STEPS_FILE = "run.yaml", "frames.log", "steps.arrow"
 
@@ -70,6 +70,9 @@ STRUT_COLUMNS = (
     "innovation_m",
 )
 """Columns of each strut, prefixed with its name and a dot; NaN where there is nothing."""
+
+
+_Entry = tuple[Sequence[Frame], Sequence[Frame], Step]
 
 
 def step_schema(struts: Sequence[str]) -> Any:
@@ -148,8 +151,8 @@ class RunLog:
         struts: Names of the struts.
         epoch_ns: Unix time of the run's start.
         channel: Name of the bus in `frames.log`.
-        paced: The run waits for the clock: steps that the disk cannot take are then dropped and
-            counted. Otherwise the run waits for the disk.
+        paced: The run waits for a clock, so a thread of its own writes; otherwise the run waits for
+            the disk.
 
     Raises:
         InputError: The folder cannot be created, or holds another run.
@@ -166,99 +169,83 @@ class RunLog:
         paced: bool,
     ) -> None:
         self.folder = folder
+        self.fault: str | None = None
+        """What went wrong with the disk, if anything; the run goes on."""
+        self.dropped = 0
+        """Ticks that a slow disk could not take."""
         self._header = header
         self._epoch_ns = epoch_ns
         self._channel = channel
-        self._paced = paced
         self._schema = step_schema(struts)
-        self._fault: str | None = None
-        self.dropped = 0
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if (folder / RUN_FILE).exists():
                 raise InputError(f"{folder}: holds a run already, expected an empty folder")
             _write_yaml(folder / RUN_FILE, header)
-            self._frames: BinaryIO = (folder / FRAMES_FILE).open("wb", buffering=0)
-            self._steps: BinaryIO = (folder / STEPS_FILE).open("wb", buffering=0)
+            self._frames = (folder / FRAMES_FILE).open("wb", buffering=0)
+            self._steps = (folder / STEPS_FILE).open("wb", buffering=0)
         except OSError as error:
             raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
-        self._queue: queue.Queue[tuple[str, Step] | None] = queue.Queue(_MOST_WAITING)
-        self._thread = threading.Thread(target=self._write_all, name="run-log", daemon=True)
-        self._thread.start()
-
-    @property
-    def fault(self) -> str | None:
-        """What went wrong with the disk, if anything; the run goes on."""
-        return self._fault
+        self._stream = _pa.ipc.new_stream(self._steps, self._schema)
+        self._waiting: deque[_Entry] = deque()
+        self._batch: list[Step] = []
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._write_until_closed, name="run-log")
+        if paced:
+            self._thread.start()
 
     def add(self, received: Sequence[Frame], sent: Sequence[Frame], step: Step) -> None:
         """Hand over what a tick received, sent and computed."""
-        lines = "".join(
-            [format_frame(frame, self._epoch_ns, self._channel, "R") for frame in received]
-            + [format_frame(frame, self._epoch_ns, self._channel, "T") for frame in sent]
-        )
-        if not self._paced:
-            self._queue.put((lines, step))
-            return
-        try:
-            self._queue.put_nowait((lines, step))
-        except queue.Full:
+        if len(self._waiting) >= _MOST_WAITING:
             self.dropped += 1
-            self._fault = "the disk is too slow"
+            self.fault = "the disk is too slow"
+            return
+        self._waiting.append((received, sent, step))
+        if not self._thread.is_alive():
+            self._write_waiting()
 
     def close(self, ending: dict[str, object]) -> None:
         """Write what is waiting, and how the run ended."""
-        self._queue.put(None)
-        self._thread.join()
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._write_waiting()
+        self._flush()
         try:
+            self._stream.close()
+            self._steps.close()
+            self._frames.close()
             _write_yaml(self.folder / RUN_FILE, {**self._header, **ending})
         except OSError as error:
-            self._fault = str(error.strerror)
+            self.fault = str(error.strerror)
 
-    def _write_all(self) -> None:
-        with _pa.ipc.new_stream(self._steps, self._schema) as stream:
-            steps: list[Step] = []
-            flushed_s = time.monotonic()
-            while True:
-                entry = self._next(steps, flushed_s)
-                if isinstance(entry, tuple):
-                    lines, step = entry
-                    self._write(self._frames, lines.encode("ascii"))
-                    steps.append(step)
-                due = time.monotonic() - flushed_s >= FLUSH_S or len(steps) >= _MOST_BATCH
-                if steps and (due or entry is None):
-                    self._flush(stream, steps)
-                    steps = []
-                if due:
-                    flushed_s = time.monotonic()
-                if entry is None:
-                    break
-        self._frames.close()
-        self._steps.close()
+    def _write_until_closed(self) -> None:
+        # The loop only appends: waking this thread at every tick would cost the loop more.
+        while not self._closing.wait(POLL_S):
+            self._write_waiting()
 
-    def _next(self, steps: list[Step], flushed_s: float) -> tuple[str, Step] | str | None:
-        """Next entry; None at the end; a word if the batch is due before an entry comes."""
-        if not steps:
-            return self._queue.get()
+    def _write_waiting(self) -> None:
+        lines: list[str] = []
+        while self._waiting:
+            received, sent, step = self._waiting.popleft()
+            for frames, direction in ((received, "R"), (sent, "T")):
+                for frame in frames:
+                    lines.append(format_frame(frame, self._epoch_ns, self._channel, direction))
+            self._batch.append(step)
         try:
-            left_s = FLUSH_S - (time.monotonic() - flushed_s)
-            return self._queue.get(timeout=max(left_s, 0.0))
-        except queue.Empty:
-            return "due"
-
-    def _write(self, file: BinaryIO, data: bytes) -> None:
-        try:
-            file.write(data)
+            self._frames.write("".join(lines).encode("ascii"))
         except OSError as error:
-            self._fault = str(error.strerror)
+            self.fault = str(error.strerror)
+        if self._batch and self._batch[-1].t_ns - self._batch[0].t_ns >= FLUSH_NS:
+            self._flush()
 
-    def _flush(self, stream: Any, steps: list[Step]) -> None:
-        batch = step_table(steps, self._schema).combine_chunks().to_batches()
+    def _flush(self) -> None:
+        batch, self._batch = self._batch, []
         try:
-            for part in batch:
-                stream.write_batch(part)
+            for part in step_table(batch, self._schema).combine_chunks().to_batches():
+                self._stream.write_batch(part)
         except OSError as error:
-            self._fault = str(error.strerror)
+            self.fault = str(error.strerror)
 
 
 @dataclass(frozen=True)
