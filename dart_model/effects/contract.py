@@ -3,6 +3,9 @@
 from collections.abc import Callable, MutableSequence, Sequence
 from dataclasses import dataclass
 
+Floats = Sequence[float]
+Writable = MutableSequence[float]
+
 Force = Callable[
     [
         float,  # t_s
@@ -12,7 +15,7 @@ Force = Callable[
         float,  # temperature_c
         Sequence[float],  # state
         Sequence[float],  # parameters, in the order of Effect.parameters
-        Sequence[float],  # strut: free length (m), stiffness (N/m), damping (N·s/m)
+        Sequence[float],  # strut: free length (m), stiffness (N/m), damping (N·s/m), gravity (m/s²)
     ],
     float,
 ]
@@ -69,7 +72,9 @@ class Effect:
         rate: Derivative of the memory, or None for a law without memory.
         state_size: Number of memory states; they start at zero.
         adds_mass: The first parameter is a mass in kg which is added to the strut's second body
-            (DART carries it, with its weight); `force` is then zero.
+            (DART carries it, with its weight); `force` is what acts beyond that.
+        scaled: Indices of the parameters which, multiplied together by a factor, multiply the
+            force by it; empty where there are none.
         excitation: What a run must contain for the effect to be seen.
         reference: Literature.
     """
@@ -83,3 +88,4 @@ class Effect:
     rate: Rate | None = None
     state_size: int = 0
     adds_mass: bool = False
+    scaled: tuple[int, ...] = (0,)

@@ -1,0 +1,26 @@
+"""Linear damping beside the strut's own."""
+
+from dart_model.effects.contract import Effect, Floats, Parameter
+
+
+def _force(
+    _t_s: float,
+    _height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    return -p[0] * velocity_m_per_s
+
+
+LINEAR_DAMPING = Effect(
+    name="linear_damping",
+    family="damping",
+    parameters=(Parameter("damping_n_s_per_m", "N·s/m", -1e5, 1e6, "viscous damping"),),
+    force=_force,
+    excitation="velocities at more than one frequency",
+    reference="Rao, Mechanical Vibrations (2017), 1.9",
+)

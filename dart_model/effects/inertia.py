@@ -1,0 +1,54 @@
+"""Inertia the model lacks: a mass with its weight, or an inerter, which has none."""
+
+from dart_model.effects.contract import Effect, Floats, Parameter
+
+
+def _mass(
+    _t_s: float,
+    _height_m: float,
+    _velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    _p: Floats,
+    _strut: Floats,
+) -> float:
+    # DART carries mass and weight.
+    return 0.0
+
+
+def _inerter(
+    _t_s: float,
+    _height_m: float,
+    _velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    strut: Floats,
+) -> float:
+    # DART carries the mass with its weight, which an inerter does not have.
+    return p[0] * strut[3]
+
+
+ADDED_MASS = Effect(
+    name="added_mass",
+    family="inertia",
+    parameters=(Parameter("mass_kg", "kg", -1e3, 1e4, "mass that moves with the upper body"),),
+    force=_mass,
+    excitation="frequencies above and below the resonance, so that mass and stiffness differ",
+    reference="Featherstone, Rigid Body Dynamics Algorithms (2008), 2.13",
+    adds_mass=True,
+)
+
+INERTER = Effect(
+    name="inerter",
+    family="inertia",
+    parameters=(
+        Parameter("inertance_kg", "kg", -1e3, 1e4, "force per acceleration, without weight"),
+    ),
+    force=_inerter,
+    excitation="frequencies above and below the resonance, so that mass and stiffness differ",
+    reference="Smith, Synthesis of mechanical networks: the inerter, IEEE TAC 47 (2002)",
+    adds_mass=True,
+)

@@ -1,0 +1,282 @@
+"""Dampers whose force is not proportional to velocity."""
+
+import math
+
+from dart_model.effects.contract import Effect, Floats, Parameter
+
+_FAMILY = "nonlinear_damping"
+_SPEEDS = "velocities that differ by a factor of three or more, in both directions"
+_PLACES = "the same velocities at different heights"
+_DAMPING = Parameter("damping_n_s_per_m", "N·s/m", -1e5, 1e6, "damping")
+_KNEE = Parameter("knee_velocity_m_per_s", "m/s", 1e-3, 10.0, "velocity of the knee")
+
+
+def _quadratic(
+    _t_s: float,
+    _height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    return -p[0] * abs(velocity_m_per_s) * velocity_m_per_s
+
+
+def _power(
+    _t_s: float,
+    _height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    return -p[0] * math.copysign(abs(velocity_m_per_s) ** p[1], velocity_m_per_s)
+
+
+def _asymmetric(
+    _t_s: float,
+    _height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    return -(p[1] if velocity_m_per_s > 0.0 else p[0]) * velocity_m_per_s
+
+
+def _digressive(
+    _t_s: float,
+    _height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    ratio = velocity_m_per_s / p[1]
+    return -p[0] * velocity_m_per_s / math.sqrt(1.0 + ratio * ratio)
+
+
+def _saturating(
+    _t_s: float,
+    _height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    return -p[0] * p[1] * math.tanh(velocity_m_per_s / p[1])
+
+
+def _blow_off(
+    _t_s: float,
+    _height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    return p[0] * math.copysign(max(abs(velocity_m_per_s) - p[1], 0.0), velocity_m_per_s)
+
+
+def _smooth_blow_off(
+    _t_s: float,
+    _height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    ratio = velocity_m_per_s / p[1]
+    return p[0] * velocity_m_per_s * (1.0 - 1.0 / math.sqrt(1.0 + ratio * ratio))
+
+
+def _over_stroke(
+    _t_s: float,
+    height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    strut: Floats,
+) -> float:
+    return -p[0] * (height_m - strut[0]) * velocity_m_per_s
+
+
+def _over_squared_stroke(
+    _t_s: float,
+    height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    strut: Floats,
+) -> float:
+    x = height_m - strut[0]
+    return -p[0] * x * x * velocity_m_per_s
+
+
+def _zone(
+    _t_s: float,
+    height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    ratio = (height_m - p[1]) / p[2]
+    return -p[0] * math.exp(-ratio * ratio) * velocity_m_per_s
+
+
+def _end_zone(
+    _t_s: float,
+    height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    return -p[0] * max(p[1] - height_m, 0.0) * velocity_m_per_s
+
+
+QUADRATIC_DAMPING = Effect(
+    name="quadratic_damping",
+    family=_FAMILY,
+    parameters=(
+        Parameter("damping_n_s2_per_m2", "N·s²/m²", -1e6, 1e7, "force per squared velocity"),
+    ),
+    force=_quadratic,
+    excitation=_SPEEDS,
+    reference="Dixon, The Shock Absorber Handbook (2007), 6.9, orifice flow",
+)
+
+POWER_DAMPING = Effect(
+    name="power_damping",
+    family=_FAMILY,
+    parameters=(
+        Parameter("force_at_1_m_per_s_n", "N", -1e6, 1e7, "force at 1 m/s"),
+        Parameter("exponent", "", 0.3, 4.0, "exponent of the velocity"),
+    ),
+    force=_power,
+    excitation=_SPEEDS,
+    reference="Symans and Constantinou, Eng. Struct. 20 (1998), fractional velocity damper",
+)
+
+ASYMMETRIC_DAMPING = Effect(
+    name="asymmetric_damping",
+    family=_FAMILY,
+    parameters=(
+        Parameter("compression_n_s_per_m", "N·s/m", -1e5, 1e6, "damping while heights fall"),
+        Parameter("rebound_n_s_per_m", "N·s/m", -1e5, 1e6, "damping while heights rise"),
+    ),
+    force=_asymmetric,
+    excitation=_SPEEDS,
+    reference="Dixon, The Shock Absorber Handbook (2007), 7.2",
+    scaled=(0, 1),
+)
+
+DIGRESSIVE_DAMPING = Effect(
+    name="digressive_damping",
+    family=_FAMILY,
+    parameters=(_DAMPING, _KNEE),
+    force=_digressive,
+    excitation=_SPEEDS,
+    reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
+)
+
+SATURATING_DAMPING = Effect(
+    name="saturating_damping",
+    family=_FAMILY,
+    parameters=(_DAMPING, _KNEE),
+    force=_saturating,
+    excitation=_SPEEDS,
+    reference="Kwok et al., Sens. Actuators A 132 (2006), hyperbolic tangent",
+)
+
+BLOW_OFF_DAMPING = Effect(
+    name="blow_off_damping",
+    family=_FAMILY,
+    parameters=(
+        Parameter("lost_damping_n_s_per_m", "N·s/m", -1e5, 1e6, "slope lost beyond the knee"),
+        _KNEE,
+    ),
+    force=_blow_off,
+    excitation=_SPEEDS,
+    reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
+)
+
+SMOOTH_BLOW_OFF_DAMPING = Effect(
+    name="smooth_blow_off_damping",
+    family=_FAMILY,
+    parameters=(
+        Parameter("lost_damping_n_s_per_m", "N·s/m", -1e5, 1e6, "slope lost beyond the knee"),
+        _KNEE,
+    ),
+    force=_smooth_blow_off,
+    excitation=_SPEEDS,
+    reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
+)
+
+STROKE_DAMPING = Effect(
+    name="stroke_damping",
+    family=_FAMILY,
+    parameters=(Parameter("damping_n_s_per_m2", "N·s/m²", -1e6, 1e7, "damping per deflection"),),
+    force=_over_stroke,
+    excitation=_PLACES,
+    reference="Dixon, The Shock Absorber Handbook (2007), 8.3, position-dependent damping",
+)
+
+POSITION_DEPENDENT_DAMPING = Effect(
+    name="position_dependent_damping",
+    family=_FAMILY,
+    parameters=(
+        Parameter("damping_n_s_per_m3", "N·s/m³", -1e7, 1e8, "damping per squared deflection"),
+    ),
+    force=_over_squared_stroke,
+    excitation=_PLACES,
+    reference="van der Pol, Phil. Mag. 2 (1926); Dixon (2007), 8.3",
+)
+
+ZONE_DAMPING = Effect(
+    name="zone_damping",
+    family=_FAMILY,
+    parameters=(
+        _DAMPING,
+        Parameter("centre_height_m", "m", -10.0, 10.0, "middle of the zone"),
+        Parameter("width_m", "m", 1e-3, 10.0, "half width of the zone"),
+    ),
+    force=_zone,
+    excitation=_PLACES,
+    reference="Dixon, The Shock Absorber Handbook (2007), 8.3, position-dependent damping",
+)
+
+END_ZONE_DAMPING = Effect(
+    name="end_zone_damping",
+    family=_FAMILY,
+    parameters=(
+        Parameter("damping_n_s_per_m2", "N·s/m²", -1e6, 1e7, "damping per depth in the zone"),
+        Parameter("zone_height_m", "m", -10.0, 10.0, "height below which the zone begins"),
+    ),
+    force=_end_zone,
+    excitation=_PLACES,
+    reference="Dixon, The Shock Absorber Handbook (2007), 8.3, hydraulic bump stop",
+)

@@ -1,0 +1,57 @@
+"""A table of force over height and velocity, for what has no name."""
+
+from dart_model.effects.contract import Effect, Floats, Parameter
+
+HEIGHTS = 9
+"""Rows of the table."""
+
+VELOCITIES = 7
+"""Columns of the table."""
+
+FIRST_FORCE = 4
+"""Parameters before the table: lowest and highest height, lowest and highest velocity."""
+
+
+def _force(
+    _t_s: float,
+    height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    row = (height_m - p[0]) / (p[1] - p[0]) * (HEIGHTS - 1)
+    column = (velocity_m_per_s - p[2]) / (p[3] - p[2]) * (VELOCITIES - 1)
+    row = min(max(row, 0.0), HEIGHTS - 1.000001)
+    column = min(max(column, 0.0), VELOCITIES - 1.000001)
+    i = int(row)
+    j = int(column)
+    x = row - i
+    y = column - j
+    at = FIRST_FORCE + i * VELOCITIES + j
+    low = p[at] * (1.0 - y) + p[at + 1] * y
+    high = p[at + VELOCITIES] * (1.0 - y) + p[at + VELOCITIES + 1] * y
+    return low * (1.0 - x) + high * x
+
+
+RESTORING_SURFACE = Effect(
+    name="restoring_surface",
+    family="restoring_surface",
+    parameters=(
+        Parameter("lowest_height_m", "m", -100.0, 100.0, "height of the first row"),
+        Parameter("highest_height_m", "m", -100.0, 100.0, "height of the last row"),
+        Parameter("lowest_velocity_m_per_s", "m/s", -100.0, 100.0, "velocity of the first column"),
+        Parameter("highest_velocity_m_per_s", "m/s", -100.0, 100.0, "velocity of the last column"),
+        *(
+            Parameter(f"force_{i}_{j}_n", "N", -1e6, 1e6, f"force in row {i}, column {j}")
+            for i in range(HEIGHTS)
+            for j in range(VELOCITIES)
+        ),
+    ),
+    force=_force,
+    excitation="all combinations of height and velocity that matter",
+    reference="Masri and Caughey, J. Appl. Mech. 46 (1979), restoring force surface",
+    scaled=tuple(range(FIRST_FORCE, FIRST_FORCE + HEIGHTS * VELOCITIES)),
+)
