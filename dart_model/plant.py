@@ -125,11 +125,11 @@ class _Strut:
 
     __slots__ = ("constants", "damping", "free_length", "laws", "memory_size", "stiffness")
 
-    def __init__(self, spec: StrutSpec, first_memory: int) -> None:
+    def __init__(self, spec: StrutSpec, first_memory: int, gravity_m_per_s2: float) -> None:
         self.free_length = spec.free_length_m
         self.stiffness = spec.stiffness_n_per_m
         self.damping = spec.damping_n_s_per_m
-        self.constants = (self.free_length, self.stiffness, self.damping)
+        self.constants = (self.free_length, self.stiffness, self.damping, gravity_m_per_s2)
         laws: list[tuple[Effect, list[float], int, int]] = []
         start = first_memory
         for item in spec.effects:
@@ -579,7 +579,7 @@ def _struts(spec: ModelSpec) -> tuple[_Strut, ...]:
     struts: list[_Strut] = []
     first_memory = 0
     for item in spec.struts:
-        strut = _Strut(item, first_memory)
+        strut = _Strut(item, first_memory, spec.gravity_m_per_s2)
         first_memory += strut.memory_size
         struts.append(strut)
     return tuple(struts)
