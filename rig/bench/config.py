@@ -82,7 +82,7 @@ def _parse(content: bytes) -> object:
 def _first_error(error: ValidationError) -> str:
     errors = error.errors(include_url=False)
     # A list with a wrong entry is also reported as too short.
-    errors = [e for e in errors if e["type"] != "too_short" or not _has_wrong_part(e, errors)]
+    errors = [part for part in errors if part["type"] != "too_short"] or errors
     first = errors[0]
     key = ".".join(str(part) for part in first["loc"])
     expected = first["msg"].removeprefix("Value error, ")

@@ -489,9 +489,7 @@ def runge_kutta_step(
 
 
 @_compiled
-def observe(
-    mechanics: Mechanics, drive: Drive, t_s: float, y: Floats, record: Floats
-) -> None:
+def observe(mechanics: Mechanics, drive: Drive, t_s: float, y: Floats, record: Floats) -> None:
     """Write what can be known of the bench at one time.
 
     Args:
@@ -514,9 +512,7 @@ def observe(
 
 
 @_compiled
-def advance(
-    mechanics: Mechanics, drive: Drive, span: Span, y: Floats, records: Floats
-) -> None:
+def advance(mechanics: Mechanics, drive: Drive, span: Span, y: Floats, records: Floats) -> None:
     """Write records at equal times, advancing the state to the time after the last one.
 
     Args:

@@ -72,6 +72,13 @@ class _Channel(NamedTuple):
     noise_std: float
     noise: np.random.Generator
 
+    def measure(self, record: list[float]) -> float:
+        """Read the quantity, with noise."""
+        value = record[self.column]
+        if self.noise_std > 0.0:
+            value += self.noise_std * self.noise.standard_normal()
+        return value
+
 
 class _Sender:
     """One message: its sensors, its counter, and how its frames travel."""
@@ -95,10 +102,7 @@ class _Sender:
 
     def send(self, record: list[float], start_ns: int) -> Frame | None:
         """Build the frame of one sample; None if it is lost on the way."""
-        values = [
-            record[channel.column] + channel.noise_std * channel.noise.standard_normal()
-            for channel in self._channels
-        ]
+        values = [channel.measure(record) for channel in self._channels]
         data, saturated = self._encode(values)
         self.saturated_frames += bool(saturated)
         if self.message.protection is not None:
