@@ -67,9 +67,7 @@ class ObserverConfig(_Frozen):
 
     def gains(self) -> ObserverGains:
         """As the observer takes them."""
-        return ObserverGains(
-            self.proportional_n_per_m, self.integral_n_per_m_s, self.force_limit_n
-        )
+        return ObserverGains(self.proportional_n_per_m, self.integral_n_per_m_s, self.force_limit_n)
 
 
 class Published(_Frozen):
@@ -202,30 +200,38 @@ class Setup(BaseModel):
     database: Database
 
 
-def load_setup(path: Path) -> Setup:
+def load_setup(path: Path, *, model: Path | None = None, duration_s: float | None = None) -> Setup:
     """A configuration and all files it names.
 
     Args:
         path: YAML file.
+        model: A model to use instead of the configuration's.
+        duration_s: A length to use instead of the configuration's.
 
     Raises:
         InputError: One line that names file, key, value and what was expected.
         DatabaseError: The same, of the DBC.
     """
-    return setup(load_validated(RunConfig, path), path)
+    config = load_validated(RunConfig, path)
+    if duration_s is not None:
+        config = config.model_copy(update={"duration_s": duration_s})
+    return setup(config, path, model)
 
 
-def setup(config: RunConfig, source: Path) -> Setup:
+def setup(config: RunConfig, source: Path, model_path: Path | None = None) -> Setup:
     """A configuration with the files it names.
 
+    Args:
+        config: The configuration.
+        source: File it came from; what it names lies beside it.
+        model_path: A model to use instead of the configuration's.
+
     Raises:
         InputError: One line that names file, key, value and what was expected.
         DatabaseError: The same, of the DBC.
     """
-    model = load_model(_model_path(config.model, source))
-    database = load_database(
-        DEFAULT_DATABASE if config.dbc is None else source.parent / config.dbc
-    )
+    model = load_model(model_path or _model_path(config.model, source))
+    database = load_database(DEFAULT_DATABASE if config.dbc is None else source.parent / config.dbc)
     named = _with_strut_names(config, model, source)
     _check_messages(named, database, source)
     return Setup(config=named, source=source, model=model, database=database)
@@ -333,7 +339,9 @@ def _check_messages(config: RunConfig, database: Database, source: Path) -> None
             inputs.append(entry)
     outputs: list[str] = []
     for entry in config.publish.values():
-        outputs += [entry.estimate] if entry.kinematics is None else [entry.estimate, entry.kinematics]
+        outputs += (
+            [entry.estimate] if entry.kinematics is None else [entry.estimate, entry.kinematics]
+        )
     if config.status is not None:
         outputs.append(config.status)
     for entry in inputs:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from can_dbc.database import load_database
+from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.frame import Frame
 from dart_model.spec import FileSkeleton, dump_model, load_model
 from dart_model.yaml_file import InputError, validated
@@ -22,7 +22,7 @@ from rig.config import RunConfig, Setup, build_bridge
 from rig.core.bridge import Bridge, BridgeState, TickResult
 from rig.core.messages import Conditions
 from rig.core.types import Mode
-from rig.io.bus import Bus, BusError
+from rig.io.bus import Bus, BusConfig, BusError
 from rig.io.clock import Clock, RealClock, VirtualClock
 from rig.io.realtime import Granted, Request, realtime
 from rig.io.run_log import RUN_FILE, RunFolder, RunLog, Step, read_run, step_table
@@ -55,6 +55,17 @@ class Ended:
     granted: Granted | None
     log_fault: str | None
     ticks: int
+
+    def summary(self) -> dict[str, object]:
+        """Every figure, for `summary.json`."""
+        return {
+            "mode": self.state.rig.mode.name,
+            "ticks": self.ticks,
+            "counts": self.state.counts._asdict(),
+            "timing": self.timing.summary(),
+            "granted": None if self.granted is None else self.granted.as_dict(),
+            "log_fault": self.log_fault,
+        }
 
 
 class BusPort:
@@ -115,7 +126,9 @@ class BenchPort:
         self._bench_bus.receive()
 
 
-def _header(ready: Setup, epoch_ns: int, granted: Granted | None, folder: Path) -> dict[str, object]:
+def _header(
+    ready: Setup, epoch_ns: int, granted: Granted | None, folder: Path
+) -> dict[str, object]:
     files = {
         name: hashlib.sha256((folder / name).read_bytes()).hexdigest()
         for name in (MODEL_FILE, DBC_FILE)
@@ -310,6 +323,51 @@ def with_bench(
     return WithBench(ended, truth)
 
 
+def run_bench(
+    bench_config: BenchConfig,
+    bus_config: BusConfig,
+    dbc: Path | None,
+    *,
+    duration_s: float | None,
+    stop: Callable[[], bool],
+    progress: Progress,
+) -> int:
+    """Run a simulated bench on a bus in real time.
+
+    Args:
+        bench_config: The bench.
+        bus_config: The bus.
+        dbc: What its messages mean; the package's own if None.
+        duration_s: Length; until asked to stop if None.
+        stop: Asked before each frame whether to end.
+        progress: Told of the time.
+
+    Returns:
+        Number of frames sent.
+
+    Raises:
+        BusError: The bus cannot be opened or a frame cannot be sent.
+        DatabaseError: The DBC is wrong.
+    """
+    bench = Bench(bench_config, load_database(dbc or DEFAULT_DATABASE))
+    end_ns = None if duration_s is None else round(duration_s * 1e9)
+    sent, due_ns = 0, 0
+    clock = RealClock()
+    bus = Bus(bus_config, (), epoch_ns=clock.epoch_ns)
+    try:
+        while not stop() and (end_ns is None or due_ns < end_ns):
+            # Woken at least every 0.1 s, so that Ctrl-C is heard between slow frames.
+            now_ns = clock.wait_until(min(due_ns, clock.now_ns() + 100_000_000))
+            frames, due_ns = bench.update(now_ns)
+            for frame in frames:
+                bus.send(frame)
+            sent += len(frames)
+            progress(now_ns, Mode.RUNNING)
+    finally:
+        bus.close()
+    return sent
+
+
 def _request(config: RunConfig) -> Request:
     asked = config.realtime
     return Request(asked.fifo_priority, asked.lock_memory, asked.cpu, asked.freeze_garbage)
@@ -356,7 +414,9 @@ def setup_of_run(folder: Path) -> tuple[RunFolder, Setup]:
 class _LogPort:
     """Frames of a log, tick by tick. What the bridge sends goes nowhere."""
 
-    def __init__(self, frames: Iterator[tuple[Frame, str]], conditions: dict[int, Conditions]) -> None:
+    def __init__(
+        self, frames: Iterator[tuple[Frame, str]], conditions: dict[int, Conditions]
+    ) -> None:
         self._received = (frame for frame, direction in frames if direction == "R")
         self._next = next(self._received, None)
         self._conditions = conditions
@@ -390,7 +450,10 @@ def replay(
     found, own = setup_of_run(folder)
     ready = ready or own
     bridge = build_bridge(ready)
-    times, overruns, flags = (found.steps.column(name).to_pylist() if found.steps.num_rows else [] for name in ("t_ns", "overruns", "flags"))
+    times, overruns, flags = (
+        found.steps.column(name).to_pylist() if found.steps.num_rows else []
+        for name in ("t_ns", "overruns", "flags")
+    )
     last_ns = max((frame.t_ns for frame, _ in found.frames()), default=-1)
     ticks = [Tick(t, n) for t, n in zip(times, overruns, strict=True)]
     next_ns = times[-1] + ready.config.period_ns if times else 0

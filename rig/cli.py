@@ -1,0 +1,289 @@
+"""The `rig` command: arguments, printing and exit codes."""
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from can_dbc.errors import DatabaseError
+from rig.bench.config import load_bench_config
+from rig.bench.schema import BenchConfigError
+from rig.check import Finding, Severity, check
+from rig.config import InputError, load_setup
+from rig.core.types import Mode
+from rig.demo import CASES, Case, run_case
+from rig.io.bus import BusConfig, BusError
+from rig.runs import Ended, live, replay, run_bench
+
+OK, FAILED, WRONG_INPUT = 0, 1, 2
+_INPUT_ERRORS = (InputError, DatabaseError, BenchConfigError, BusError)
+_REFRESH_NS = 200_000_000
+
+app = typer.Typer(
+    name="rig",
+    help="Bridge between a shock-absorber bench on CAN and a DART multibody model.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+)
+console = Console()
+
+ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file.")]
+OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")]
+
+
+def main() -> None:
+    """Run the command; a wrong input is one line on standard error and exit code 2."""
+    try:
+        app()
+    except _INPUT_ERRORS as error:
+        Console(stderr=True).print(f"rig: {error}", style="red", markup=False, soft_wrap=True)
+        sys.exit(WRONG_INPUT)
+
+
+@app.command(epilog="Examples: `rig demo` · `rig demo --case seed --lockstep --out /tmp/seed`")
+def demo(
+    case: Annotated[str, typer.Option(help=f"Which case: {', '.join(CASES)}.")] = "seed",
+    out: OutFolder = Path("rig-demo"),
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="Simulated time, as fast as the machine allows.")
+    ] = False,
+    duration_s: Annotated[
+        float | None, typer.Option("--duration-s", min=1.0, help="Length of the run in s.")
+    ] = None,
+) -> None:
+    """Run a simulated bench and the bridge on this machine, over virtual CAN."""
+    if case not in CASES:
+        raise InputError(f"--case {case!r}: expected one of {', '.join(CASES)}")
+    _refuse_full(out)
+    with _stoppable() as stop, _progress(duration_s) as progress:
+        done = run_case(
+            case, out, lockstep=lockstep, duration_s=duration_s, stop=stop, progress=progress
+        )
+    _print_case(done)
+    _print_ended(done.run.ended, with_timing=not lockstep)
+    console.print(
+        f"Written: {out / 'summary.json'}, a picture of each strut, and the run {out / 'run'}"
+    )
+
+
+@app.command(epilog="Examples: `rig run rig.yaml` · `rig run rig.yaml --out runs/7 --listen-only`")
+def run(
+    config: ConfigFile,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="DIR", help="Folder of the run; by default runs/ and the time."
+        ),
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            "--model",
+            metavar="FILE",
+            help="Another model than the configuration's, e.g. a corrected one.",
+        ),
+    ] = None,
+    duration_s: Annotated[
+        float | None,
+        typer.Option(
+            "--duration-s",
+            min=0.001,
+            help="Length of the run in s; else the configuration's, or until Ctrl-C.",
+        ),
+    ] = None,
+    listen_only: Annotated[bool, typer.Option("--listen-only", help="Send nothing.")] = False,
+) -> None:
+    """Run the bridge on a bus; Ctrl-C ends it in order."""
+    ready = load_setup(config, model=model, duration_s=duration_s)
+    folder = out or Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
+    with _stoppable() as stop, _progress(ready.config.duration_s) as progress:
+        ended = live(ready, folder, listen_only=listen_only, stop=stop, progress=progress)
+    _print_ended(ended, with_timing=True)
+    (folder / "summary.json").write_text(json.dumps(ended.summary(), indent=2) + "\n", "utf-8")
+    console.print(f"Run: {folder}")
+    if ended.state.rig.mode is Mode.SAFE:
+        console.print("The run ended in its safe state.", style="red")
+        raise typer.Exit(FAILED)
+
+
+@app.command(epilog="Example: `rig bench seed_bench.yaml --interface socketcan --channel vcan0`")
+def bench(
+    config: ConfigFile,
+    interface: Annotated[
+        str, typer.Option(help="python-can's name of the interface.")
+    ] = "socketcan",
+    channel: Annotated[str, typer.Option(help="Channel of the interface.")] = "vcan0",
+    bitrate: Annotated[int, typer.Option(min=1, help="Bit rate in bit/s.")] = 1_000_000,
+    dbc: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="DBC; the package's own by default.")
+    ] = None,
+    duration_s: Annotated[
+        float | None,
+        typer.Option("--duration-s", min=0.001, help="Length in s; until Ctrl-C by default."),
+    ] = None,
+) -> None:
+    """Run a simulated bench on a bus, in real time."""
+    bench_config = load_bench_config(config)
+    with _stoppable() as stop, _progress(duration_s) as progress:
+        sent = run_bench(
+            bench_config,
+            BusConfig(interface, channel, bitrate),
+            dbc,
+            duration_s=duration_s,
+            stop=stop,
+            progress=progress,
+        )
+    console.print(f"Sent {sent} frames.")
+
+
+@app.command(name="check", epilog="Example: `rig check rig.yaml`")
+def check_command(
+    config: ConfigFile,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Write summary.json there.")
+    ] = None,
+) -> None:
+    """Say what is wrong before a bench moves: signals, units, rate, bus load, poles."""
+    findings = check(load_setup(config))
+    table = Table("", "What", "Finding", title=f"Check of {config}")
+    styles = {Severity.OK: "green", Severity.WARNING: "yellow", Severity.ERROR: "red"}
+    for finding in findings:
+        style = styles[finding.severity]
+        table.add_row(f"[{style}]{finding.severity.value}[/]", finding.what, finding.text)
+    console.print(table)
+    if out is not None:
+        _write_summary(out, {"findings": [finding.as_dict() for finding in findings]})
+    if any(finding.severity is Severity.ERROR for finding in findings):
+        raise typer.Exit(FAILED)
+
+
+@app.command(name="replay", epilog="Example: `rig replay rig-demo/run`")
+def replay_command(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Write summary.json there.")
+    ] = None,
+) -> None:
+    """Compute a run again from its frames and compare it with its log, bit for bit."""
+    with _progress(None) as progress:
+        result = replay(folder, progress=progress)
+    summary = {
+        "ticks": len(result.steps),
+        "logged_ticks": result.logged,
+        "different_ticks": result.different,
+        "first_different_ns": result.first_different_ns,
+        "refused_frames": result.refused_frames,
+    }
+    table = Table("Replay", str(folder))
+    for name, value in summary.items():
+        table.add_row(name.replace("_", " "), "-" if value is None else str(value))
+    console.print(table)
+    if out is not None:
+        _write_summary(out, summary)
+    if result.different:
+        console.print("The replay differs from the log.", style="red")
+        raise typer.Exit(FAILED)
+
+
+@contextlib.contextmanager
+def _stoppable() -> Iterator[Callable[[], bool]]:
+    """Ctrl-C and SIGTERM ask the loop to end in order instead of breaking it off."""
+    asked = False
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _progress(duration_s: float | None) -> Iterator[Callable[[int, Mode], None]]:
+    """One line that is rewritten; a single write, because the loop itself calls it."""
+    shown = sys.stderr.isatty()
+    due_ns = 0
+    total = "" if duration_s is None else f" of {duration_s:g} s"
+
+    def show(t_ns: int, mode: Mode) -> None:
+        nonlocal due_ns
+        if shown and t_ns >= due_ns:
+            due_ns = t_ns + _REFRESH_NS
+            os.write(2, f"\r{t_ns * 1e-9:9.1f} s{total}  {mode.name:<8}".encode())
+
+    try:
+        yield show
+    finally:
+        if shown:
+            os.write(2, b"\r\x1b[K")
+
+
+def _refuse_full(folder: Path) -> None:
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"--out {folder}: is not empty, expected a new or an empty folder")
+
+
+def _write_summary(folder: Path, summary: dict[str, object]) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
+    except OSError as error:
+        raise InputError(f"--out {folder}: cannot be written: {error.strerror}") from error
+
+
+def _print_case(case: Case) -> None:
+    for strut in case.struts:
+        table = Table(
+            "after the first 0.5 s",
+            "model alone",
+            "with virtual force",
+            title=f"Bench and model, strut “{strut.name}”",
+        )
+        alone, observed = strut.figures(strut.defective), strut.figures(strut.observed)
+        table.add_row(
+            "height error, largest",
+            f"{alone.height_error_max_m * 1e3:.3f} mm",
+            f"{observed.height_error_max_m * 1e3:.3f} mm",
+        )
+        for name, label in (("force_error_rms_n", "RMS"), ("force_error_max_n", "largest")):
+            table.add_row(
+                f"force error, {label}",
+                *(
+                    f"{getattr(item, name):.2f} N ({getattr(item, name) / item.force_peak_n:.2%} of peak)"
+                    for item in (alone, observed)
+                ),
+            )
+        table.add_row("force of the bench, peak", f"{alone.force_peak_n:.1f} N", "")
+        console.print(table)
+
+
+def _print_ended(ended: Ended, *, with_timing: bool) -> None:
+    table = Table("Run", f"{ended.ticks} ticks, ended {ended.state.rig.mode.name}")
+    for name, value in ended.state.counts._asdict().items():
+        table.add_row(
+            f"{name} {'ticks' if name in ('stale', 'overruns') else 'frames'}", str(value)
+        )
+    if with_timing:
+        timing = ended.timing
+        for label, figures in (("lateness", timing.lateness_us()), ("work", timing.work_us())):
+            text = " · ".join(f"{level} {value:.0f}" for level, value in figures.items())
+            table.add_row(f"{label} of a tick, µs", text)
+    if ended.log_fault is not None:
+        table.add_row("log", f"[red]{ended.log_fault}[/]")
+    console.print(table)
