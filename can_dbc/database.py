@@ -10,6 +10,7 @@ import difflib
 import hashlib
 import math
 import re
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +35,8 @@ SIZE_MAX_BYTES = 16 * 1024 * 1024
 """Largest DBC file that is read."""
 
 _LENGTH_MAX_BYTES = 1785  # the longest J1939 transport message; larger ones cannot be meant
-_MULTIPLEXER_IDS_MAX = 1_000_000
+_LAYOUTS_MAX = 65_536  # a 16-bit multiplexer; cantools takes about 3 s for as many
+_RANGES_SUM_MAX = 2_000_000
 _STANDARD_ID_MAX = 0x7FF
 _EXTENDED_ID_MAX = 0x1FFF_FFFF
 _MAX_DELTA_DEFAULT = 7  # half of the counter's round: less is a loss, more went backwards
@@ -213,7 +215,7 @@ def _decode(path: Path, content: bytes) -> str:
 
 _MESSAGE_LENGTH = re.compile(r"\bBO_\s+\d+\s+\w+\s*:\s*(\d+)")
 _SIGNAL_POSITION = re.compile(r":\s*(\d+)\s*\|\s*(\d+)\s*@")
-_MULTIPLEXER_RANGES = re.compile(r"\bSG_MUL_VAL_\b[^;]*")
+_MULTIPLEXER_RANGES = re.compile(r"\bSG_MUL_VAL_\s+(\d+)\s+\w+\s+(\w+)([^;]*)")
 _RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
 
 
@@ -226,14 +228,25 @@ def _refuse_excess(path: Path, text: str) -> None:
     for match in _SIGNAL_POSITION.finditer(text):
         if any(len(part) > 6 or int(part) > 8 * limit for part in match.groups()):
             raise DatabaseError(f"{path}: signal at {match[0][1:40]} does not fit in any message")
+    _refuse_layouts(path, text)
+
+
+def _refuse_layouts(path: Path, text: str) -> None:
+    # cantools lists every value of every range, and builds a frame layout for every combination
+    # of the values of nested multiplexers.
+    largest: defaultdict[str, Counter[str]] = defaultdict(Counter)
     total = 0
-    for statement in _MULTIPLEXER_RANGES.finditer(text):
-        for first, last in _RANGE.findall(statement[0]):
-            long = len(first) > 18 or len(last) > 18
-            total += _MULTIPLEXER_IDS_MAX + 1 if long else max(int(last) - int(first), 0)
-    if total > _MULTIPLEXER_IDS_MAX:
+    for message, multiplexer, ranges in _MULTIPLEXER_RANGES.findall(text):
+        for first, last in _RANGE.findall(ranges):
+            # Values may be the same for many signals: the largest bounds how many there are.
+            digits = max(len(first), len(last))
+            end = _RANGES_SUM_MAX + 1 if digits > 9 else int(last) + 1
+            total += max(end - int(first[:9]), 0)
+            largest[message][multiplexer] = max(largest[message][multiplexer], end)
+    layouts = max((math.prod(ends.values()) for ends in largest.values()), default=0)
+    if layouts > _LAYOUTS_MAX or total > _RANGES_SUM_MAX:
         raise DatabaseError(
-            f"{path}: SG_MUL_VAL_ ranges hold more than {_MULTIPLEXER_IDS_MAX} multiplexer values"
+            f"{path}: SG_MUL_VAL_ asks for {layouts} frame layouts, expected at most {_LAYOUTS_MAX}"
         )
 
 

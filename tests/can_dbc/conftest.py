@@ -5,8 +5,13 @@ from itertools import count
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from can_dbc.database import DEFAULT_DATABASE, Database, load_database
+
+# The same examples in every run, on every machine.
+settings.register_profile("repeatable", derandomize=True, deadline=None)
+settings.load_profile("repeatable")
 
 HEADER = 'VERSION ""\nNS_ :\nBS_:\nBU_: BENCH RIG\n'
 ATTRIBUTES = """

@@ -118,6 +118,11 @@ SECOND = other(
         (INFINITE, "", ["signal A", "scale", "finite"]),
         ("BO_ what", "", ["not a usable DBC"]),
         (GOOD, "SG_MUL_VAL_ 291 TRAVEL CRC 0-4294967295;", ["SG_MUL_VAL_"]),
+        (
+            GOOD,
+            "SG_MUL_VAL_ 291 COUNTER CRC 0-9999;\nSG_MUL_VAL_ 291 TRAVEL COUNTER 0-9999;",
+            ["SG_MUL_VAL_", "100000000 frame layouts"],
+        ),
         (GOOD, 'BA_ "E2EProfile" BO_ 291 "P99";', ["FAST", "'P99'", "P01, P02"]),
         (GOOD, 'BA_ "E2EProfile" BO_ 291 "P02";', ["FAST", "E2EDataIds", "16 bytes in hex"]),
         (
