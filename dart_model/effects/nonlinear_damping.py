@@ -74,7 +74,23 @@ def _saturating(
     p: Floats,
     _strut: Floats,
 ) -> float:
-    return -p[0] * p[1] * math.tanh(velocity_m_per_s / p[1])
+    ratio = abs(velocity_m_per_s / p[1])
+    if ratio < 1e-9:
+        return -p[0] * velocity_m_per_s
+    return -p[0] * velocity_m_per_s * (1.0 + ratio ** p[2]) ** (-1.0 / p[2])
+
+
+def _arctan(
+    _t_s: float,
+    _height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    return -p[0] * p[1] * math.atan(velocity_m_per_s / p[1])
 
 
 def _blow_off(
@@ -206,10 +222,19 @@ DIGRESSIVE_DAMPING = Effect(
 SATURATING_DAMPING = Effect(
     name="saturating_damping",
     family=_FAMILY,
-    parameters=(_DAMPING, _KNEE),
+    parameters=(_DAMPING, _KNEE, Parameter("sharpness", "", 0.5, 12.0, "sharpness of the knee")),
     force=_saturating,
     excitation=_SPEEDS,
-    reference="Kwok et al., Sens. Actuators A 132 (2006), hyperbolic tangent",
+    reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
+)
+
+ARCTAN_DAMPING = Effect(
+    name="arctan_damping",
+    family=_FAMILY,
+    parameters=(_DAMPING, _KNEE),
+    force=_arctan,
+    excitation=_SPEEDS,
+    reference="Duym, Vehicle Syst. Dyn. 33 (2000), simulation tools for shock absorbers",
 )
 
 BLOW_OFF_DAMPING = Effect(
