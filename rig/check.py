@@ -113,19 +113,11 @@ def _staleness(ready: Setup, heights: list[Message]) -> Finding:
 
 def _load(ready: Setup) -> Finding:
     config, database = ready.config, ready.database
-    names = {entry.message for entry in config.signals.height.values()}
-    for entry in (
-        config.signals.applied_force,
-        config.signals.load_cell_force,
-        config.signals.temperature,
-    ):
-        if entry is not None:
-            names.add(entry.message)
-    sent = {config.status} | {entry.estimate for entry in config.publish.values()}
-    sent |= {entry.kinematics for entry in config.publish.values()}
+    sent = config.published_messages()
+    names = {entry.message for entry in config.signals.named()}.union(sent)
     period_ns = config.period_ns
     load = 0.0
-    for name in sorted(names | {name for name in sent if name is not None}):
+    for name in sorted(names):
         message = database.message(name)
         cycle_ns = message.cycle_time_ns or period_ns
         if name in sent:

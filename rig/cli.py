@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -18,7 +18,7 @@ from rich.table import Table
 from can_dbc.errors import DatabaseError
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfigError
-from rig.check import Finding, Severity, check
+from rig.check import Severity, check
 from rig.config import InputError, load_setup
 from rig.core.types import Mode
 from rig.demo import CASES, Case, run_case
@@ -179,7 +179,7 @@ def replay_command(
     """Compute a run again from its frames and compare it with its log, bit for bit."""
     with _progress(None) as progress:
         result = replay(folder, progress=progress)
-    summary = {
+    summary: dict[str, object] = {
         "ticks": len(result.steps),
         "logged_ticks": result.logged,
         "different_ticks": result.different,
@@ -198,7 +198,7 @@ def replay_command(
 
 
 @contextlib.contextmanager
-def _stoppable() -> Iterator[Callable[[], bool]]:
+def _stoppable() -> Generator[Callable[[], bool]]:
     """Ctrl-C and SIGTERM ask the loop to end in order instead of breaking it off."""
     asked = False
 
@@ -215,7 +215,7 @@ def _stoppable() -> Iterator[Callable[[], bool]]:
 
 
 @contextlib.contextmanager
-def _progress(duration_s: float | None) -> Iterator[Callable[[int, Mode], None]]:
+def _progress(duration_s: float | None) -> Generator[Callable[[int, Mode], None]]:
     """One line that is rewritten; a single write, because the loop itself calls it."""
     shown = sys.stderr.isatty()
     due_ns = 0
@@ -264,13 +264,14 @@ def _print_case(case: Case) -> None:
         for name, label in (("force_error_rms_n", "RMS"), ("force_error_max_n", "largest")):
             table.add_row(
                 f"force error, {label}",
-                *(
-                    f"{getattr(item, name):.2f} N ({getattr(item, name) / item.force_peak_n:.2%} of peak)"
-                    for item in (alone, observed)
-                ),
+                *(_share(getattr(item, name), item.force_peak_n) for item in (alone, observed)),
             )
         table.add_row("force of the bench, peak", f"{alone.force_peak_n:.1f} N", "")
         console.print(table)
+
+
+def _share(force_n: float, peak_n: float) -> str:
+    return f"{force_n:.2f} N ({force_n / peak_n:.2%} of peak)"
 
 
 def _print_ended(ended: Ended, *, with_timing: bool) -> None:

@@ -6,9 +6,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.database import DEFAULT_DATABASE, Database, load_database
+from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, ModelSpec, load_model
 from dart_model.yaml_file import InputError, load_validated
-from dart_model.plant import DartPlant
 from rig.core.bridge import Bridge
 from rig.core.messages import Outgoing, Quantity, Target, estimate, incoming, kinematics, status
 from rig.core.observer import ObserverGains
@@ -56,6 +56,11 @@ class Signals(_Frozen):
     applied_force: SignalName | None = None
     load_cell_force: SignalName | None = None
     temperature: SignalName | None = None
+
+    def named(self) -> list[SignalName]:
+        """All of them, heights first."""
+        others = (self.applied_force, self.load_cell_force, self.temperature)
+        return [*self.height.values(), *(entry for entry in others if entry is not None)]
 
 
 class ObserverConfig(_Frozen):
@@ -175,6 +180,13 @@ class RunConfig(_Frozen):
                 return {**rest, "signals": {**others, "height": {"": height}}}
             case _:
                 return data
+
+    def published_messages(self) -> list[str]:
+        """Names of all messages that the bridge sends."""
+        names = [self.status]
+        for entry in self.publish.values():
+            names += [entry.estimate, entry.kinematics]
+        return [name for name in names if name is not None]
 
     @property
     def period_ns(self) -> int:
@@ -329,22 +341,8 @@ def _default_messages(index: int) -> Published:
 
 
 def _check_messages(config: RunConfig, database: Database, source: Path) -> None:
-    inputs = [*config.signals.height.values()]
-    for entry in (
-        config.signals.applied_force,
-        config.signals.load_cell_force,
-        config.signals.temperature,
-    ):
-        if entry is not None:
-            inputs.append(entry)
-    outputs: list[str] = []
-    for entry in config.publish.values():
-        outputs += (
-            [entry.estimate] if entry.kinematics is None else [entry.estimate, entry.kinematics]
-        )
-    if config.status is not None:
-        outputs.append(config.status)
-    for entry in inputs:
+    outputs = config.published_messages()
+    for entry in config.signals.named():
         database.message(entry.message).signal(entry.signal)
         if entry.message in outputs:
             raise InputError(
@@ -354,7 +352,7 @@ def _check_messages(config: RunConfig, database: Database, source: Path) -> None
     repeated = {name for name in outputs if outputs.count(name) > 1}
     if repeated:
         raise InputError(
-            f"{source}: publish: {sorted(repeated)[0]} stands twice, expected one message each"
+            f"{source}: publish: {min(repeated)} stands twice, expected one message each"
         )
     for name in outputs:
         database.message(name)

@@ -146,7 +146,7 @@ def _compared(run: WithBench, ready: Setup) -> Case:
         replay(run.ended.folder, ready=ready.model_copy(update={"config": config})).steps,
         observed.schema,
     )
-    t_s = cast("NDArray[np.int64]", observed.column("t_ns").to_numpy()) * 1e-9
+    t_s = np.asarray(observed.column("t_ns").to_numpy() * 1e-9, dtype=np.float64)
     struts = tuple(
         StrutCase(
             name,
@@ -169,8 +169,9 @@ def draw(case: StrutCase, path: Path) -> None:
     """Draw height and force of bench and model, and their errors, over the last two seconds."""
     last = case.t_s >= case.t_s[-1] - 2.0
     t_s = case.t_s[last]
-    with mpl.rc_context({"axes.grid": True, "grid.alpha": 0.3, "legend.frameon": False}):
-        figure = Figure(figsize=(10, 7), layout="constrained")
+    style = {"axes.grid": True, "grid.alpha": 0.3, "legend.frameon": False}
+    with cast("Any", mpl).rc_context(style):
+        figure = cast("Any", Figure)(figsize=(10, 7), layout="constrained")
         panels = figure.subplots(2, 2, sharex=True)
         for column, (title, of_truth, of_model, scale, unit) in enumerate(
             (("Height", 0, 0, 1e3, "mm"), ("Spring-damper force", 2, 1, 1.0, "N"))
@@ -183,8 +184,9 @@ def draw(case: StrutCase, path: Path) -> None:
             upper.plot(t_s, defective, color="tab:red", label="model alone")
             upper.plot(t_s, observed, "--", color="tab:blue", label="model with virtual force")
             upper.set(title=title, ylabel=f"{title.lower()} / {unit}")
-            upper.legend(loc="best", fontsize="small")
             lower.plot(t_s, observed - truth, color="tab:blue")
             lower.set(title="Error with virtual force", xlabel="time / s", ylabel=f"error / {unit}")
+        lines, labels = panels[0, 0].get_legend_handles_labels()
+        figure.legend(lines, labels, loc="outside lower center", ncols=3)
         figure.suptitle(f"Strut “{case.name}”: bench and model over CAN")
         figure.savefig(path, dpi=110)

@@ -26,7 +26,7 @@ from rig.io.bus import Bus, BusConfig, BusError
 from rig.io.clock import Clock, RealClock, VirtualClock
 from rig.io.realtime import Granted, Request, realtime
 from rig.io.run_log import RUN_FILE, RunFolder, RunLog, Step, read_run, step_table
-from rig.loop import Port, Sink, Tick, Timing, regular_ticks, run
+from rig.loop import Port, Tick, Timing, regular_ticks, run
 
 MODEL_FILE, DBC_FILE = "model.yaml", "bus.dbc"
 _PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "autosar-e2e")
