@@ -1,6 +1,7 @@
 """The `rig` command: arguments, printing and exit codes."""
 
 import contextlib
+import itertools
 import json
 import os
 import signal
@@ -40,7 +41,6 @@ app = typer.Typer(
 console = Console()
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file.")]
-OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")]
 
 
 def main() -> None:
@@ -55,7 +55,10 @@ def main() -> None:
 @app.command(epilog="Examples: `rig demo` · `rig demo --case seed --lockstep --out /tmp/seed`")
 def demo(
     case: Annotated[str, typer.Option(help=f"Which case: {', '.join(CASES)}.")] = "seed",
-    out: OutFolder = Path("rig-demo"),
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder to write into; rig-demo by default."),
+    ] = None,
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Simulated time, as fast as the machine allows.")
     ] = False,
@@ -66,6 +69,7 @@ def demo(
     """Run a simulated bench and the bridge on this machine, over virtual CAN."""
     if case not in CASES:
         raise InputError(f"--case {case!r}: expected one of {', '.join(CASES)}")
+    out = out or _free_folder("rig-demo")
     _refuse_full(out)
     with _stoppable() as stop, _progress(duration_s) as progress:
         done = run_case(
@@ -232,6 +236,12 @@ def _progress(duration_s: float | None) -> Generator[Callable[[int, Mode], None]
     finally:
         if shown:
             os.write(2, b"\r\x1b[K")
+
+
+def _free_folder(name: str) -> Path:
+    """`name`, or with the first number that makes it new."""
+    numbered = (Path(f"{name}-{number}") for number in itertools.count(2))
+    return next(path for path in itertools.chain([Path(name)], numbered) if not path.exists())
 
 
 def _refuse_full(folder: Path) -> None:
