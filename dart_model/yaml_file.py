@@ -116,7 +116,8 @@ def load_validated(model: type[_Model], path: Path) -> _Model:
 
 def _one_line(error: ValidationError, source: str) -> str:
     errors = error.errors(include_url=False)
-    first = errors[0]
+    # A misspelt key is worth more than the key that it leaves missing.
+    first = min(errors, key=lambda item: item["type"] == "missing")
     key = ".".join(str(part) for part in first["loc"]) or "top level"
     more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
     cause = cast("dict[str, object]", first.get("ctx", {})).get("error")
