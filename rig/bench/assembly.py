@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from scipy import interpolate, optimize
 
-from rig.bench.effects import EFFECT_KINDS, PARAMETER_COUNT, Law, parameter_values
+from rig.bench.effects import EFFECT_KINDS, PARAMETER_COUNT, parameter_values
 from rig.bench.mechanics import (
     SINE_COLUMNS,
     SWEEP_COLUMNS,
@@ -15,6 +15,7 @@ from rig.bench.mechanics import (
     Drive,
     Effects,
     Floats,
+    Law,
     Mechanics,
     Thermal,
     derivatives,

@@ -5,42 +5,13 @@ which a law reads them.
 """
 
 import math
-from enum import IntEnum, unique
 from types import MappingProxyType
 from typing import NamedTuple
 
+from rig.bench.mechanics import Law
+
 POSITIVE_FLOOR = 1e-300
 """Smallest value of a parameter that has to be positive."""
-
-
-@unique
-class Law(IntEnum):
-    """Codes by which the compiled equations of motion tell the laws apart."""
-
-    PRELOAD = 0
-    LINEAR_STIFFNESS = 1
-    QUADRATIC_STIFFNESS = 2
-    CUBIC_STIFFNESS = 3
-    PROGRESSIVE_STIFFNESS = 4
-    GAS_SPRING = 5
-    BUMP_STOP = 6
-    REBOUND_STOP = 7
-    BACKLASH = 8
-    LINEAR_DAMPING = 9
-    QUADRATIC_DAMPING = 10
-    ASYMMETRIC_DAMPING = 11
-    DIGRESSIVE_DAMPING = 12
-    POSITION_DEPENDENT_DAMPING = 13
-    FRICTION = 14
-    BOUC_WEN = 15
-    MAXWELL = 16
-    PERIODIC_FORCE = 17
-    TEMPERATURE_FADE = 18
-    TIME_FADE = 19
-    HIDDEN_MASS = 20
-    ADDED_MASS = 21
-    INPUT_GAIN = 22
-    DELAY = 23
 
 
 class Parameter(NamedTuple):

@@ -19,13 +19,12 @@ References:
 
 import math
 from collections.abc import Callable
+from enum import IntEnum, unique
 from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
-
-from rig.bench.effects import Law
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -33,27 +32,36 @@ Integers = NDArray[np.int64]
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
-PRELOAD = int(Law.PRELOAD)
-LINEAR_STIFFNESS = int(Law.LINEAR_STIFFNESS)
-QUADRATIC_STIFFNESS = int(Law.QUADRATIC_STIFFNESS)
-CUBIC_STIFFNESS = int(Law.CUBIC_STIFFNESS)
-PROGRESSIVE_STIFFNESS = int(Law.PROGRESSIVE_STIFFNESS)
-GAS_SPRING = int(Law.GAS_SPRING)
-BUMP_STOP = int(Law.BUMP_STOP)
-REBOUND_STOP = int(Law.REBOUND_STOP)
-BACKLASH = int(Law.BACKLASH)
-LINEAR_DAMPING = int(Law.LINEAR_DAMPING)
-QUADRATIC_DAMPING = int(Law.QUADRATIC_DAMPING)
-ASYMMETRIC_DAMPING = int(Law.ASYMMETRIC_DAMPING)
-DIGRESSIVE_DAMPING = int(Law.DIGRESSIVE_DAMPING)
-POSITION_DEPENDENT_DAMPING = int(Law.POSITION_DEPENDENT_DAMPING)
-FRICTION = int(Law.FRICTION)
-BOUC_WEN = int(Law.BOUC_WEN)
-MAXWELL = int(Law.MAXWELL)
-PERIODIC_FORCE = int(Law.PERIODIC_FORCE)
-TEMPERATURE_FADE = int(Law.TEMPERATURE_FADE)
-TIME_FADE = int(Law.TIME_FADE)
-HIDDEN_MASS = int(Law.HIDDEN_MASS)
+
+@unique
+class Law(IntEnum):
+    """Codes by which the compiled equations of motion tell the laws apart."""
+
+    PRELOAD = 0
+    LINEAR_STIFFNESS = 1
+    QUADRATIC_STIFFNESS = 2
+    CUBIC_STIFFNESS = 3
+    PROGRESSIVE_STIFFNESS = 4
+    GAS_SPRING = 5
+    BUMP_STOP = 6
+    REBOUND_STOP = 7
+    BACKLASH = 8
+    LINEAR_DAMPING = 9
+    QUADRATIC_DAMPING = 10
+    ASYMMETRIC_DAMPING = 11
+    DIGRESSIVE_DAMPING = 12
+    POSITION_DEPENDENT_DAMPING = 13
+    FRICTION = 14
+    BOUC_WEN = 15
+    MAXWELL = 16
+    PERIODIC_FORCE = 17
+    TEMPERATURE_FADE = 18
+    TIME_FADE = 19
+    HIDDEN_MASS = 20
+    ADDED_MASS = 21
+    INPUT_GAIN = 22
+    DELAY = 23
+
 
 LAW, STRUT, STATE = 0, 1, 2
 """Columns of `Effects.places`."""
@@ -264,15 +272,15 @@ def acting_force(drive: Drive, t_s: float) -> float:
 @_compiled
 def spring_effect(law: int, p: Floats, deflection_m: float) -> float:
     """Force in N of an effect that depends on the deflection from the free length."""
-    if law == PRELOAD:
+    if law == Law.PRELOAD:
         return p[0]
-    if law == LINEAR_STIFFNESS:
+    if law == Law.LINEAR_STIFFNESS:
         return -p[0] * deflection_m
-    if law == QUADRATIC_STIFFNESS:
+    if law == Law.QUADRATIC_STIFFNESS:
         return -p[0] * deflection_m**2
-    if law == CUBIC_STIFFNESS:
+    if law == Law.CUBIC_STIFFNESS:
         return -p[0] * deflection_m**3
-    if law == PROGRESSIVE_STIFFNESS:
+    if law == Law.PROGRESSIVE_STIFFNESS:
         ratio = deflection_m / p[1]
         return -p[0] * (math.sinh(ratio) - ratio)
     gas_length_m = max(p[1] + deflection_m, 0.01 * p[1])
@@ -282,11 +290,11 @@ def spring_effect(law: int, p: Floats, deflection_m: float) -> float:
 @_compiled
 def contact_effect(law: int, p: Floats, height_m: float, velocity_m_per_s: float) -> float:
     """Force in N of a stop, which never pulls, or of a link with free play."""
-    if law == BACKLASH:
+    if law == Law.BACKLASH:
         off_centre_m = height_m - p[0]
         beyond_m = max(abs(off_centre_m) - 0.5 * p[1], 0.0)
         return -p[2] * math.copysign(beyond_m, off_centre_m)
-    outwards = 1.0 if law == BUMP_STOP else -1.0
+    outwards = 1.0 if law == Law.BUMP_STOP else -1.0
     depth_m = outwards * (p[0] - height_m)
     if depth_m <= 0.0:
         return 0.0
@@ -298,13 +306,13 @@ def contact_effect(law: int, p: Floats, height_m: float, velocity_m_per_s: float
 @_compiled
 def damping_effect(law: int, p: Floats, deflection_m: float, velocity_m_per_s: float) -> float:
     """Force in N of an effect that opposes the rate of height."""
-    if law == LINEAR_DAMPING:
+    if law == Law.LINEAR_DAMPING:
         return -p[0] * velocity_m_per_s
-    if law == QUADRATIC_DAMPING:
+    if law == Law.QUADRATIC_DAMPING:
         return -p[0] * abs(velocity_m_per_s) * velocity_m_per_s
-    if law == ASYMMETRIC_DAMPING:
+    if law == Law.ASYMMETRIC_DAMPING:
         return -(p[1] if velocity_m_per_s > 0.0 else p[0]) * velocity_m_per_s
-    if law == DIGRESSIVE_DAMPING:
+    if law == Law.DIGRESSIVE_DAMPING:
         return -p[0] * velocity_m_per_s / math.sqrt(1.0 + (velocity_m_per_s / p[1]) ** 2)
     return -p[0] * (deflection_m / p[1]) ** 2 * velocity_m_per_s
 
@@ -316,11 +324,11 @@ def memory_rate(law: int, p: Floats, velocity_m_per_s: float, state: float) -> f
     The state is the bristle's deflection in m (friction), the elastic deflection in m (Bouc-Wen) or
     the force in N (Maxwell).
     """
-    if law == FRICTION:
+    if law == Law.FRICTION:
         ratio = velocity_m_per_s / p[3]
         level = 1.0 + (p[2] - 1.0) * math.exp(-ratio * ratio)
         return velocity_m_per_s - abs(velocity_m_per_s) * state / (p[1] * level)
-    if law == BOUC_WEN:
+    if law == Law.BOUC_WEN:
         ratio = abs(state / p[1]) ** p[2]
         same_way = 1.0 if velocity_m_per_s * state > 0.0 else -1.0
         return velocity_m_per_s * (1.0 - ratio * (p[3] * same_way + 1.0 - p[3]))
@@ -330,9 +338,9 @@ def memory_rate(law: int, p: Floats, velocity_m_per_s: float, state: float) -> f
 @_compiled
 def memory_effect(law: int, p: Floats, state: float, state_rate: float) -> float:
     """Force in N of an effect with memory, from its internal state and the state's rate."""
-    if law == FRICTION:
+    if law == Law.FRICTION:
         return -(p[0] / p[1] * state + p[4] * state_rate)
-    if law == BOUC_WEN:
+    if law == Law.BOUC_WEN:
         return -p[0] * state
     return -state
 
@@ -345,9 +353,9 @@ def fade_factor(effects: Effects, strut: int, t_s: float, temperature_c: float) 
         if effects.places[i, STRUT] != strut:
             continue
         p = effects.parameters[i]
-        if effects.places[i, LAW] == TEMPERATURE_FADE:
+        if effects.places[i, LAW] == Law.TEMPERATURE_FADE:
             factor *= math.exp(-p[0] * (temperature_c - p[1]))
-        elif effects.places[i, LAW] == TIME_FADE:
+        elif effects.places[i, LAW] == Law.TIME_FADE:
             factor *= p[0] + (1.0 - p[0]) * math.exp(-t_s / p[1])
     return factor
 
@@ -377,17 +385,17 @@ def effect_force(mechanics: Mechanics, effect: int, t_s: float, y: Floats, dy: F
     height_m = strut_height(mechanics.lower, strut, y)
     velocity_m_per_s = strut_rate(mechanics.lower, strut, y)
     deflection_m = height_m - mechanics.free_length_m[strut]
-    if law <= GAS_SPRING:
+    if law <= Law.GAS_SPRING:
         return spring_effect(law, p, deflection_m)
-    if law <= BACKLASH:
+    if law <= Law.BACKLASH:
         return contact_effect(law, p, height_m, velocity_m_per_s)
-    if law <= POSITION_DEPENDENT_DAMPING:
+    if law <= Law.POSITION_DEPENDENT_DAMPING:
         return damping_effect(law, p, deflection_m, velocity_m_per_s)
-    if law <= MAXWELL:
+    if law <= Law.MAXWELL:
         at = int(effects.places[effect, STATE])
         dy[at] = memory_rate(law, p, velocity_m_per_s, y[at])
         return memory_effect(law, p, y[at], dy[at])
-    if law == PERIODIC_FORCE:
+    if law == Law.PERIODIC_FORCE:
         return p[0] * math.sin(2.0 * math.pi * p[1] * t_s + p[2])
     return 0.0
 
@@ -434,7 +442,7 @@ def derivatives(mechanics: Mechanics, t_s: float, acting_n: float, y: Floats, dy
         if mechanics.lower[i] >= 0:
             dy[n + mechanics.lower[i]] -= force_n
     for i in range(mechanics.effects.places.shape[0]):
-        if mechanics.effects.places[i, LAW] == HIDDEN_MASS:
+        if mechanics.effects.places[i, LAW] == Law.HIDDEN_MASS:
             dy[n + mechanics.effects.places[i, STRUT]] += hidden_mass_force(mechanics, i, y, dy)
     for i in range(n):
         dy[n + i] = dy[n + i] / mechanics.mass_kg[i] - mechanics.gravity_m_per_s2
