@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, cast
 
 import dartpy
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from dart_model.effects import Effect, effect
@@ -35,7 +36,7 @@ _STABLE_PRODUCT = 1.0
 """Largest |eigenvalue| * step; Kutta's method is stable up to 2.5."""
 
 
-class PlantState(NamedTuple):
+class PlantState(Struct, frozen=True):
     """State of the model.
 
     Attributes:
@@ -51,27 +52,7 @@ class PlantState(NamedTuple):
     t_s: float
 
 
-class Loaded(NamedTuple):
-    """A state under the forces that act from it on.
-
-    Attributes:
-        state: The state.
-        virtual_forces_n: Virtual force in each strut, held until the next state.
-        applied_force_n: Applied force at the state.
-        temperature_c: Damper temperature.
-        acceleration: Joint accelerations under these forces.
-        memory_rates: Derivative of the memory.
-    """
-
-    state: PlantState
-    virtual_forces_n: Sequence[float]
-    applied_force_n: float
-    temperature_c: float
-    acceleration: "_Value"
-    memory_rates: list[float]
-
-
-class Motion(NamedTuple):
+class Motion(Struct, frozen=True):
     """What one strut does in a state.
 
     Attributes:
@@ -83,6 +64,30 @@ class Motion(NamedTuple):
     height_m: float
     velocity_m_per_s: float
     force_n: float
+
+
+class Loaded(Struct, frozen=True):
+    """A state under the forces that act from it on.
+
+    Attributes:
+        state: The state.
+        motions: What each strut does in it.
+        accelerations_m_per_s2: Second derivative of each strut's height.
+        held: The virtual forces, held until the next state, as the integrator wants them.
+        applied_force_n: Applied force at the state.
+        temperature_c: Damper temperature.
+        acceleration: Joint acceleration, as the integrator wants it.
+        memory_rates: Derivative of the memory.
+    """
+
+    state: PlantState
+    motions: Sequence[Motion]
+    accelerations_m_per_s2: Sequence[float]
+    held: "_Value"
+    applied_force_n: float
+    temperature_c: float
+    acceleration: "_Value"
+    memory_rates: list[float]
 
 
 @dataclass(frozen=True)
@@ -139,6 +144,22 @@ class _Strut:
         self.laws = tuple(laws)
         self.memory_size = start - first_memory
 
+    def force_n(
+        self,
+        height_m: float,
+        velocity_m_per_s: float,
+        memory: Sequence[float],
+        surroundings: _Surroundings,
+        memory_rates: list[float],
+    ) -> float:
+        """Force of spring, damper and effects; arguments as of `effects_n`."""
+        force = self.stiffness * (self.free_length - height_m) - self.damping * velocity_m_per_s
+        if self.laws:
+            force += self.effects_n(
+                height_m, velocity_m_per_s, memory, surroundings, memory_rates
+            )
+        return force
+
     def effects_n(
         self,
         height_m: float,
@@ -180,43 +201,57 @@ class _Coordinate:
     adds_up = True
 
     def __init__(self, skeleton: Any, struts: Sequence[_Strut], rows: "_Rows") -> None:
-        self._struts: list[tuple[_Strut, float, float]] = list(
-            zip(struts, rows.offsets_m.tolist(), rows.struts[:, 0].tolist(), strict=True)
-        )
-        self._at_zero = sum(
-            strut.stiffness * (strut.free_length - offset) * row
-            for strut, offset, row in self._struts
-        )
-        self.acceleration = self._acceleration(skeleton.getDof(0), skeleton, float(rows.applied[0]))
+        numbered = zip(range(len(struts)), struts, rows.offsets_m, rows.struts[:, 0], strict=True)
+        self._struts = [
+            (index, strut, float(offset), float(row)) for index, strut, offset, row in numbered
+        ]
+        self._applied_row = float(rows.applied[0])
+        self._respond = _response(skeleton)
+        self.acceleration = self._acceleration()
 
-    def values(self, numbers: tuple[float, ...]) -> float:
-        return numbers[0]
+    def values(self, state: PlantState) -> tuple[float, float]:
+        return state.positions[0], state.velocities[0]
 
-    def numbers(self, value: float) -> tuple[float, ...]:
-        return (value,)
+    def state(self, q: float, v: float, memory: tuple[float, ...], t_s: float) -> PlantState:
+        return PlantState((q,), (v,), memory, t_s)
 
     def moved(self, q: float, v: float, h: float) -> float:
         return q + h * v
 
-    def motions(self, q: float, v: float) -> list[tuple[float, float]]:
-        return [(offset + row * q, row * v) for _, offset, row in self._struts]
+    def kinematics(self, q: float, v: float) -> list[tuple[float, float]]:
+        return [(offset + row * q, row * v) for _, _, offset, row in self._struts]
 
-    def held(self, virtual_forces_n: Sequence[float]) -> float:
-        total = self._at_zero
-        for index, (_, _, row) in enumerate(self._struts):
-            total += row * virtual_forces_n[index]
-        return total
+    def load(
+        self,
+        q: float,
+        v: float,
+        virtual_forces_n: Sequence[float],
+        memory: Sequence[float],
+        surroundings: _Surroundings,
+        memory_rates: list[float],
+    ) -> tuple[list[Motion], float, float, list[float]]:
+        motions: list[Motion] = []
+        held = own = 0.0
+        for index, strut, offset, row in self._struts:
+            height, velocity = offset + row * q, row * v
+            force = strut.force_n(height, velocity, memory, surroundings, memory_rates)
+            motions.append(Motion(height, velocity, force))
+            own += row * force
+            held += row * virtual_forces_n[index]
+        push = own + held + self._applied_row * surroundings[1]
+        acceleration = self._respond(q, v, push)
+        of_struts = [row * acceleration for _, _, _, row in self._struts]
+        return motions, held, acceleration, of_struts
 
-    def _acceleration(self, dof: Any, skeleton: Any, applied_row: float) -> "_Acceleration":
-        # A closure over locals: this is called three times a tick, and attributes cost.
-        put_position: Callable[[float], None] = dof.setPosition
-        put_velocity: Callable[[float], None] = dof.setVelocity
-        put_force: Callable[[float], None] = dof.setForce
-        get_acceleration: Callable[[], float] = dof.getAcceleration
-        solve: Callable[[], None] = skeleton.computeForwardDynamics
-        stiffness = sum(strut.stiffness * row * row for strut, _, row in self._struts)
-        damping = sum(strut.damping * row * row for strut, _, row in self._struts)
-        with_effects = tuple(entry for entry in self._struts if entry[0].laws)
+    def _acceleration(self) -> "_Acceleration":
+        # Springs and dampers of all struts are summed up once: this is called twice a tick.
+        preload = stiffness = damping = 0.0
+        for _, strut, offset, row in self._struts:
+            preload += row * strut.stiffness * (strut.free_length - offset)
+            stiffness += row * strut.stiffness * row
+            damping += row * strut.damping * row
+        with_effects = [entry for entry in self._struts if entry[1].laws]
+        respond, applied_row = self._respond, self._applied_row
 
         def acceleration(
             q: float,
@@ -226,18 +261,34 @@ class _Coordinate:
             surroundings: _Surroundings,
             memory_rates: list[float],
         ) -> float:
-            force = held - stiffness * q - damping * v + applied_row * surroundings[1]
-            for strut, offset, row in with_effects:
-                force += row * strut.effects_n(
+            push = preload + held - stiffness * q - damping * v + applied_row * surroundings[1]
+            for _, strut, offset, row in with_effects:
+                push += row * strut.effects_n(
                     offset + row * q, row * v, memory, surroundings, memory_rates
                 )
-            put_position(q)
-            put_velocity(v)
-            put_force(force)
-            solve()
-            return get_acceleration()
+            return respond(q, v, push)
 
         return acceleration
+
+
+def _response(skeleton: Any) -> Callable[[float, float, float], float]:
+    """DART's answer for one coordinate: position, velocity, force -> acceleration."""
+    # A closure over locals: it is called three times a tick, and attributes cost.
+    dof = skeleton.getDof(0)
+    put_position: Callable[[float], None] = dof.setPosition
+    put_velocity: Callable[[float], None] = dof.setVelocity
+    put_force: Callable[[float], None] = dof.setForce
+    get_acceleration: Callable[[], float] = dof.getAcceleration
+    solve: Callable[[], None] = skeleton.computeForwardDynamics
+
+    def respond(q: float, v: float, push: float) -> float:
+        put_position(q)
+        put_velocity(v)
+        put_force(push)
+        solve()
+        return get_acceleration()
+
+    return respond
 
 
 class _Coordinates:
@@ -256,11 +307,17 @@ class _Coordinates:
         self._constant = constant
         self.adds_up = _coordinates_add_up(skeleton)
 
-    def values(self, numbers: tuple[float, ...]) -> NDArray[np.float64]:
-        return np.array(numbers)
+    def values(self, state: PlantState) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return np.array(state.positions), np.array(state.velocities)
 
-    def numbers(self, value: NDArray[np.float64]) -> tuple[float, ...]:
-        return tuple(value.tolist())
+    def state(
+        self,
+        q: NDArray[np.float64],
+        v: NDArray[np.float64],
+        memory: tuple[float, ...],
+        t_s: float,
+    ) -> PlantState:
+        return PlantState(tuple(q.tolist()), tuple(v.tolist()), memory, t_s)
 
     def moved(
         self, q: NDArray[np.float64], v: NDArray[np.float64], h: float
@@ -270,15 +327,33 @@ class _Coordinates:
         self._skeleton.integratePositions(h)
         return np.array(self._skeleton.getPositions())
 
-    def motions(
+    def kinematics(
         self, q: NDArray[np.float64], v: NDArray[np.float64]
     ) -> list[tuple[float, float]]:
         rows = self._constant or self._rows_at(q)
         heights = (rows.offsets_m + rows.struts @ q).tolist()
         return list(zip(heights, (rows.struts @ v).tolist(), strict=True))
 
-    def held(self, virtual_forces_n: Sequence[float]) -> Sequence[float]:
-        return virtual_forces_n
+    def load(
+        self,
+        q: NDArray[np.float64],
+        v: NDArray[np.float64],
+        virtual_forces_n: Sequence[float],
+        memory: Sequence[float],
+        surroundings: _Surroundings,
+        memory_rates: list[float],
+    ) -> tuple[list[Motion], Sequence[float], NDArray[np.float64], list[float]]:
+        rows = self._constant or self._rows_at(q)
+        motions = self._motions(rows, q, v, memory, surroundings, memory_rates)
+        forces = [
+            motion.force_n + virtual
+            for motion, virtual in zip(motions, virtual_forces_n, strict=True)
+        ]
+        acceleration = self._respond(q, v, rows, forces, surroundings[1])
+        of_struts = rows.struts @ acceleration
+        if not self._constant:
+            of_struts += self._turning(q, v) @ v
+        return motions, virtual_forces_n, acceleration, of_struts.tolist()
 
     def acceleration(
         self,
@@ -290,23 +365,53 @@ class _Coordinates:
         memory_rates: list[float],
     ) -> NDArray[np.float64]:
         rows = self._constant or self._rows_at(q)
-        forces = list(held)
-        heights = (rows.offsets_m + rows.struts @ q).tolist()
-        velocities = (rows.struts @ v).tolist()
-        for index, strut in enumerate(self._struts):
-            height, velocity = heights[index], velocities[index]
-            forces[index] -= (
-                strut.stiffness * (height - strut.free_length) + strut.damping * velocity
+        motions = self._motions(rows, q, v, memory, surroundings, memory_rates)
+        forces = [motion.force_n + virtual for motion, virtual in zip(motions, held, strict=True)]
+        return self._respond(q, v, rows, forces, surroundings[1])
+
+    def _motions(
+        self,
+        rows: "_Rows",
+        q: NDArray[np.float64],
+        v: NDArray[np.float64],
+        memory: Sequence[float],
+        surroundings: _Surroundings,
+        memory_rates: list[float],
+    ) -> list[Motion]:
+        heights: list[float] = (rows.offsets_m + rows.struts @ q).tolist()
+        velocities: list[float] = (rows.struts @ v).tolist()
+        return [
+            Motion(
+                height,
+                velocity,
+                strut.force_n(height, velocity, memory, surroundings, memory_rates),
             )
-            if strut.laws:
-                forces[index] += strut.effects_n(
-                    height, velocity, memory, surroundings, memory_rates
-                )
-        self._skeleton.setPositions(q)
-        self._skeleton.setVelocities(v)
-        self._skeleton.setForces(forces @ rows.struts + surroundings[1] * rows.applied)
-        self._skeleton.computeForwardDynamics()
-        return np.array(self._skeleton.getAccelerations())
+            for strut, height, velocity in zip(self._struts, heights, velocities, strict=True)
+        ]
+
+    def _respond(
+        self,
+        q: NDArray[np.float64],
+        v: NDArray[np.float64],
+        rows: "_Rows",
+        forces_n: Sequence[float],
+        applied_n: float,
+    ) -> NDArray[np.float64]:
+        push = np.array(forces_n) @ rows.struts + applied_n * rows.applied
+        skeleton = self._skeleton
+        skeleton.setPositions(q)
+        skeleton.setVelocities(v)
+        skeleton.setForces(push)
+        skeleton.computeForwardDynamics()
+        return np.array(skeleton.getAccelerations())
+
+    def _turning(
+        self, q: NDArray[np.float64], v: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Time derivative of the struts' rows."""
+        h = 1e-6
+        ahead, behind = self._rows_at(self.moved(q, v, h)), self._rows_at(self.moved(q, v, -h))
+        return (ahead.struts - behind.struts) / (2.0 * h)
 
 
 class DartPlant:
@@ -338,7 +443,6 @@ class DartPlant:
             if rows is not None and self.coordinates == 1
             else _Coordinates(self._skeleton, self._struts, self._rows_at, rows)
         )
-        self._acceleration = self._joints.acceleration
         lightest_kg = min(float(body.getMass()) for body in self._bodies.values())
         self.step_s = _stable_step_s(self._struts, lightest_kg)
 
@@ -373,6 +477,10 @@ class DartPlant:
         memory = (0.0,) * self.memory_size
         return PlantState(tuple(q.tolist()), tuple(v.tolist()), memory, 0.0)
 
+    def kinematics(self, state: PlantState) -> list[tuple[float, float]]:
+        """Height (m) and velocity (m/s) of every strut in a state."""
+        return self._joints.kinematics(*self._joints.values(state))
+
     def load(
         self,
         state: PlantState,
@@ -388,18 +496,14 @@ class DartPlant:
             applied_force_n: Applied force.
             temperature_c: Damper temperature.
         """
-        joints = self._joints
-        memory_rates = [0.0] * self.memory_size
-        acceleration = self._acceleration(
-            joints.values(state.positions),
-            joints.values(state.velocities),
-            joints.held(virtual_forces_n),
-            state.memory,
-            (state.t_s, applied_force_n, temperature_c),
-            memory_rates,
+        joints, memory = self._joints, state.memory
+        rates = [0.0] * len(memory)
+        q, v = joints.values(state)
+        motions, held, acceleration, of_struts = joints.load(
+            q, v, virtual_forces_n, memory, (state.t_s, applied_force_n, temperature_c), rates
         )
         return Loaded(
-            state, virtual_forces_n, applied_force_n, temperature_c, acceleration, memory_rates
+            state, motions, of_struts, held, applied_force_n, temperature_c, acceleration, rates
         )
 
     def step(self, loaded: Loaded, dt_s: float, applied_force_end_n: float) -> PlantState:
@@ -413,72 +517,59 @@ class DartPlant:
         Returns:
             State at the end.
         """
+        state = loaded.state
         if dt_s <= 0.0:
-            return loaded.state
+            return state
         count = 1
         if dt_s > self.step_s * (1.0 + 1e-9):
             count = min(math.ceil(dt_s / self.step_s - 1e-9), _MAX_SUBSTEPS)
         h = dt_s / count
-        state, virtual, applied, temperature_c, a, rates = loaded
-        rise = (applied_force_end_n - applied) / count
-        joints = self._joints
-        held = joints.held(virtual)
-        positions, velocities, memory, t_s = state
-        q, v = joints.values(positions), joints.values(velocities)
-        for index in range(count):
-            if index > 0:
-                rates = [0.0] * len(memory)
-                a = self._acceleration(q, v, held, memory, (t_s, applied, temperature_c), rates)
-            middle = (t_s + 0.5 * h, applied + 0.5 * rise, temperature_c)
-            applied += rise
-            t_s += h
-            end = (t_s, applied, temperature_c)
-            q, v, memory = self._substep(q, v, a, held, memory, rates, h, middle, end)
-        return PlantState(joints.numbers(q), joints.numbers(v), memory, t_s)
-
-    def _substep(
-        self,
-        q: _Value,
-        v: _Value,
-        a1: _Value,
-        held: _Value,
-        memory: tuple[float, ...],
-        s1: list[float],
-        h: float,
-        middle: _Surroundings,
-        end: _Surroundings,
-    ) -> tuple[_Value, _Value, tuple[float, ...]]:
-        # Kutta's third-order method, in which the stages' velocities drive the positions.
-        joints, acceleration = self._joints, self._acceleration
+        half, sixth = 0.5 * h, h / 6.0
+        joints, acceleration = self._joints, self._joints.acceleration
         # Rotations in space do not add up; DART composes them.
         moved = None if joints.adds_up else joints.moved
-        half, sixth = 0.5 * h, h / 6.0
-        m2 = m3 = memory
-        s2, s3 = s1, s1
-        if memory:
-            s2, s3 = [0.0] * len(memory), [0.0] * len(memory)
-            m2 = _advanced(memory, half, s1)
-        q2 = moved(q, v, half) if moved else q + half * v
-        a2 = acceleration(q2, v + half * a1, held, m2, middle, s2)
-        if memory:
-            m3 = _advanced(_advanced(memory, 2.0 * h, s2), -h, s1)
-        v3 = v + h * a1
-        q3 = moved(q, v3, h) if moved else q + h * v3
-        a3 = acceleration(q3, v + h * (2.0 * a2 - a1), held, m3, end, s3)
-        if memory:
-            memory = tuple(
-                [
-                    m + sixth * (a + 4.0 * b + c)
-                    for m, a, b, c in zip(memory, s1, s2, s3, strict=True)
-                ]
-            )
-        mean = v + sixth * (a1 + 2.0 * a2)
-        q_end = moved(q, mean, h) if moved else q + h * mean
-        return q_end, v + sixth * (a1 + 4.0 * a2 + a3), memory
+        held = loaded.held
+        q, v = joints.values(state)
+        memory, t_s = state.memory, state.t_s
+        applied, temperature_c = loaded.applied_force_n, loaded.temperature_c
+        half_rise = 0.5 * (applied_force_end_n - applied) / count
+        a1, s1 = loaded.acceleration, loaded.memory_rates
+        for index in range(count):
+            if index > 0:
+                s1 = [0.0] * len(memory)
+                a1 = acceleration(q, v, held, memory, (t_s, applied, temperature_c), s1)
+            # Kutta's third-order method, in which the stages' velocities drive the positions.
+            m2 = m3 = memory
+            s2 = s3 = s1
+            if memory:
+                s2, s3 = [0.0] * len(memory), [0.0] * len(memory)
+                m2 = _advanced(memory, half, s1)
+            q2 = moved(q, v, half) if moved else q + half * v
+            now = (t_s + half, applied + half_rise, temperature_c)
+            a2 = acceleration(q2, v + half * a1, held, m2, now, s2)
+            if memory:
+                m3 = _advanced(_advanced(memory, 2.0 * h, s2), -h, s1)
+            v3 = v + h * a1
+            q3 = moved(q, v3, h) if moved else q + h * v3
+            t_s += h
+            applied += 2.0 * half_rise
+            now = (t_s, applied, temperature_c)
+            a3 = acceleration(q3, v + h * (2.0 * a2 - a1), held, m3, now, s3)
+            mean = v + sixth * (a1 + 2.0 * a2)
+            q = moved(q, mean, h) if moved else q + h * mean
+            v = v + sixth * (a1 + 4.0 * a2 + a3)
+            if memory:
+                memory = tuple(
+                    [
+                        m + sixth * (a + 4.0 * b + c)
+                        for m, a, b, c in zip(memory, s1, s2, s3, strict=True)
+                    ]
+                )
+        return joints.state(q, v, memory, t_s)
 
     def motions(
         self, state: PlantState, applied_force_n: float, temperature_c: float
-    ) -> list[Motion]:
+    ) -> Sequence[Motion]:
         """Height, velocity and force of every strut in a state.
 
         Args:
@@ -486,36 +577,8 @@ class DartPlant:
             applied_force_n: Applied force, for effects that depend on it.
             temperature_c: Damper temperature.
         """
-        joints = self._joints
-        positions, velocities, memory, t_s = state
-        result: list[Motion] = []
-        motions = joints.motions(joints.values(positions), joints.values(velocities))
-        for index, (height, velocity) in enumerate(motions):
-            strut = self._struts[index]
-            force = -strut.stiffness * (height - strut.free_length) - strut.damping * velocity
-            if strut.laws:
-                surroundings = (t_s, applied_force_n, temperature_c)
-                force += strut.effects_n(
-                    height, velocity, memory, surroundings, [0.0] * len(memory)
-                )
-            result.append(Motion(height, velocity, force))
-        return result
-
-    def accelerations(self, loaded: Loaded) -> tuple[float, ...]:
-        """Second derivative of every strut's height, in m/s², under the forces in `loaded`."""
-        state = loaded.state
-        joints = self._joints
-        if self._rows is not None:
-            zero = joints.values((0.0,) * self.coordinates)
-            return tuple([a for _, a in joints.motions(zero, loaded.acceleration)])
-        v = np.array(state.velocities)
-        h = 1e-6
-        turning = (
-            self._rows_at(joints.moved(joints.values(state.positions), v, h)).struts
-            - self._rows_at(joints.moved(joints.values(state.positions), v, -h)).struts
-        ) / (2.0 * h)
-        rows = self._rows_at(np.array(state.positions)).struts
-        return tuple((rows @ loaded.acceleration + turning @ v).tolist())
+        without = (0.0,) * len(self._struts)
+        return self.load(state, without, applied_force_n, temperature_c).motions
 
     def guided(self) -> GuidedModel | None:
         """The model as constant matrices, or None if its struts do not move on straight guides."""
@@ -570,8 +633,6 @@ class _Rows(NamedTuple):
 
 
 def _advanced(memory: tuple[float, ...], h: float, rates: list[float]) -> tuple[float, ...]:
-    if not memory:
-        return memory
     return tuple([m + h * rate for m, rate in zip(memory, rates, strict=True)])
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from msgspec.structs import astuple
 from numpy.typing import NDArray
 
 from can_dbc.frame import Frame
@@ -165,7 +166,7 @@ def _step(tick: Tick, conditions: Conditions, result: TickResult) -> Step:
     numbers: list[float] = []
     for index, measured in enumerate(given.heights):
         numbers += (_NAN, _NAN) if measured is None else (measured.height_m, measured.t_ns)
-        numbers += output.struts[index] if output.struts else (_NAN,) * 7
+        numbers += astuple(output.struts[index]) if output.struts else (_NAN,) * 7
     flags = conditions.acknowledged + 2 * conditions.bus_fault + 4 * conditions.log_fault
     return Step(
         tick.t_ns,

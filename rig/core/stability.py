@@ -74,7 +74,7 @@ def closed_loop_poles(
         past = rest[2 * count :]
         for _ in range(measured_every):
             state = plant.step(plant.load(state, forces, 0.0, 20.0), period_ns * 1e-9, 0.0)
-        now = [motion.height_m for motion in plant.motions(state, 0.0, 20.0)]
+        now = [height_m for height_m, _ in plant.kinematics(state)]
         seen = past[-count:] if delay else now
         updated = [
             update(gain, ObserverState(integral, 0.0, 0.0, 0), height - model, interval_ns)

@@ -1,7 +1,8 @@
 """What goes into a step, what comes out, and the state in between."""
 
 from enum import IntEnum
-from typing import NamedTuple
+
+from msgspec import Struct
 
 from dart_model.plant import Loaded
 
@@ -17,7 +18,7 @@ class Mode(IntEnum):
     STOPPED = 5
 
 
-class Measurement(NamedTuple):
+class Measurement(Struct, frozen=True):
     """A height that arrived.
 
     Attributes:
@@ -29,7 +30,7 @@ class Measurement(NamedTuple):
     t_ns: int
 
 
-class StepInput(NamedTuple):
+class StepInput(Struct, frozen=True):
     """All that one tick is given.
 
     Attributes:
@@ -47,7 +48,7 @@ class StepInput(NamedTuple):
     acknowledged: bool = False
 
 
-class ObserverState(NamedTuple):
+class ObserverState(Struct, frozen=True):
     """Memory of one observer.
 
     Attributes:
@@ -63,7 +64,7 @@ class ObserverState(NamedTuple):
     measured_ns: int
 
 
-class RigState(NamedTuple):
+class RigState(Struct, frozen=True):
     """State between two ticks; a run can be restarted from any.
 
     Attributes:
@@ -73,7 +74,7 @@ class RigState(NamedTuple):
         first: Measurements that came before every strut had one.
         model: The model under its forces; None before the first measurements.
         temperature_c: Last damper temperature.
-        published_n: Estimated forces last published as valid, one a strut.
+        last_valid: What was last published as valid; empty before.
     """
 
     t_ns: int
@@ -82,10 +83,10 @@ class RigState(NamedTuple):
     first: tuple[Measurement | None, ...]
     model: Loaded | None
     temperature_c: float
-    published_n: tuple[float, ...]
+    last_valid: tuple["StrutOutput", ...]
 
 
-class StrutOutput(NamedTuple):
+class StrutOutput(Struct, frozen=True):
     """What a tick says of one strut.
 
     Attributes:
@@ -107,7 +108,7 @@ class StrutOutput(NamedTuple):
     innovation_m: float
 
 
-class StepOutput(NamedTuple):
+class StepOutput(Struct, frozen=True):
     """What a tick publishes.
 
     Attributes:
