@@ -36,7 +36,7 @@ _STABLE_PRODUCT = 1.0
 """Largest |eigenvalue| * step; Kutta's method is stable up to 2.5."""
 
 
-class PlantState(Struct, frozen=True):
+class PlantState(Struct, frozen=True, gc=False):
     """State of the model.
 
     Attributes:
@@ -52,7 +52,7 @@ class PlantState(Struct, frozen=True):
     t_s: float
 
 
-class Motion(Struct, frozen=True):
+class Motion(Struct, frozen=True, gc=False):
     """What one strut does in a state.
 
     Attributes:
@@ -66,7 +66,7 @@ class Motion(Struct, frozen=True):
     force_n: float
 
 
-class Loaded(Struct, frozen=True):
+class Loaded(Struct, frozen=True, gc=False):
     """A state under the forces that act from it on.
 
     Attributes:
@@ -445,6 +445,10 @@ class DartPlant:
         )
         lightest_kg = min(float(body.getMass()) for body in self._bodies.values())
         self.step_s = _stable_step_s(self._struts, lightest_kg)
+        self._longest_s = self.step_s * (1.0 + 1e-9)
+        self._acceleration = self._joints.acceleration
+        # Rotations in space do not add up; DART composes them.
+        self._moved = None if self._joints.adds_up else self._joints.moved
 
     def initial(
         self, heights_m: Sequence[float], velocities_m_per_s: Sequence[float] | None = None
@@ -517,21 +521,16 @@ class DartPlant:
         Returns:
             State at the end.
         """
-        state = loaded.state
-        if dt_s <= 0.0:
-            return state
-        count = 1
-        if dt_s > self.step_s * (1.0 + 1e-9):
-            count = min(math.ceil(dt_s / self.step_s - 1e-9), _MAX_SUBSTEPS)
+        state, count = loaded.state, 1
+        if dt_s > self._longest_s:
+            count = min(math.ceil(dt_s / self._longest_s), _MAX_SUBSTEPS)
         h = dt_s / count
         half, sixth = 0.5 * h, h / 6.0
-        joints, acceleration = self._joints, self._joints.acceleration
-        # Rotations in space do not add up; DART composes them.
-        moved = None if joints.adds_up else joints.moved
-        held = loaded.held
+        joints, moved, acceleration = self._joints, self._moved, self._acceleration
         q, v = joints.values(state)
         memory, t_s = state.memory, state.t_s
-        applied, temperature_c = loaded.applied_force_n, loaded.temperature_c
+        held, temperature_c = loaded.held, loaded.temperature_c
+        applied = loaded.applied_force_n
         half_rise = 0.5 * (applied_force_end_n - applied) / count
         a1, s1 = loaded.acceleration, loaded.memory_rates
         for index in range(count):

@@ -4,18 +4,27 @@ A refused frame is counted and never used in part; values come from accepted fra
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from can_dbc.frame import Frame
 from can_dbc.protection import INITIAL, SequenceState, Verdict, check, protect
-from rig.core.messages import Conditions, Counts, Incoming, Outgoing, Quantity, Report
+from rig.core.messages import Conditions, Counts, Incoming, Outgoing, Quantity, Report, Target
 from rig.core.step import RigCore
 from rig.core.types import Measurement, Mode, RigState, StepInput, StepOutput
 
 _NO_CONDITIONS = Conditions()
 
+# Looking up a member of an enum costs as much as the CRC of a frame.
+_OK, _HOLD = Verdict.OK, Mode.HOLD
 
-class BridgeState(NamedTuple):
+_OTHERS = (Quantity.APPLIED_FORCE, Quantity.TEMPERATURE, Quantity.LOAD_CELL_FORCE)
+"""What comes beside heights; the core is given the first two."""
+
+
+class BridgeState(Struct, frozen=True, gc=False):
     """State of the bridge between two ticks.
 
     Attributes:
@@ -35,7 +44,7 @@ class BridgeState(NamedTuple):
     told_saturated: int
 
 
-class TickResult(NamedTuple):
+class TickResult(Struct, frozen=True, gc=False):
     """What a tick did.
 
     Attributes:
@@ -64,6 +73,7 @@ class Bridge:
         self._core = core
         self._incoming = tuple(incoming)
         self._outgoing = tuple(outgoing)
+        self._places = [[self._place(target) for target in item.targets] for item in incoming]
         self._index = {
             (item.message.arbitration_id, item.message.is_extended): index
             for index, item in enumerate(incoming)
@@ -105,44 +115,54 @@ class Bridge:
         Returns:
             State after the tick, and what it did.
         """
-        sequences, counts = state.sequences, state.counts
-        heights: list[Measurement | None] = [None] * self._core.struts
-        applied_n = temperature_c = None
+        counts, sequences = state.counts, list(state.sequences)
+        struts = self._core.struts
+        # What came: the struts' heights, then the other quantities in the order of `_OTHERS`.
+        given: list[Any] = [None] * (struts + len(_OTHERS))
         for frame in frames:
             index = self._index.get((frame.arbitration_id, frame.is_extended))
             if index is None or frame.is_error:
                 continue
             sequence, verdict, values = _accepted(self._incoming[index], sequences[index], frame)
-            sequences = (*sequences[:index], sequence, *sequences[index + 1 :])
-            if verdict is not Verdict.OK:
+            sequences[index] = sequence
+            if verdict is not _OK:
                 counts = _counted(counts, verdict, sequence)
-            for target, value in zip(self._incoming[index].targets, values, strict=False):
-                if target.quantity is Quantity.HEIGHT:
-                    heights[target.strut] = Measurement(value, min(frame.t_ns, t_ns))
-                elif target.quantity is Quantity.APPLIED_FORCE:
-                    applied_n = value
-                elif target.quantity is Quantity.TEMPERATURE:
-                    temperature_c = value
+            if values:
+                arrived_ns = frame.t_ns if frame.t_ns < t_ns else t_ns
+                for number, place in enumerate(self._places[index]):
+                    value = values[number]
+                    given[place] = Measurement(value, arrived_ns) if place < struts else value
         step_input = StepInput(
-            t_ns, tuple(heights), applied_n, temperature_c, conditions.acknowledged
+            t_ns,
+            tuple(given[:struts]),
+            given[struts],
+            given[struts + 1],
+            conditions.acknowledged,
         )
         rig, output = self._core.step(state.rig, step_input)
-        if conditions.overruns or output.mode is Mode.HOLD:
+        if conditions.overruns or output.mode is _HOLD:
             counts = counts._replace(
                 overruns=counts.overruns + conditions.overruns,
-                stale=counts.stale + (output.mode is Mode.HOLD),
+                stale=counts.stale + (output.mode is _HOLD),
             )
-        state = state._replace(rig=rig, sequences=sequences, counts=counts)
+        state = BridgeState(
+            rig, tuple(sequences), state.counters, state.due_ns, counts, state.told_saturated
+        )
+        if not output.struts:
+            return state, TickResult([], step_input, output)
         state, sent = self._sent(state, t_ns, output, conditions)
         return state, TickResult(sent, step_input, output)
+
+    def _place(self, target: Target) -> int:
+        if target.quantity is Quantity.HEIGHT:
+            return target.strut
+        return self._core.struts + _OTHERS.index(target.quantity)
 
     def _sent(
         self, state: BridgeState, t_ns: int, output: StepOutput, conditions: Conditions
     ) -> tuple[BridgeState, list[Frame]]:
         """Frames that are due; none before the first valid measurement."""
         frames: list[Frame] = []
-        if not output.struts:
-            return state, frames
         counters, due_ns = list(state.counters), list(state.due_ns)
         counts, told = state.counts, state.told_saturated
         for index, item in enumerate(self._outgoing):
@@ -164,13 +184,15 @@ class Bridge:
                 told = counts.saturated
             elif saturated:
                 counts = counts._replace(saturated=counts.saturated + 1)
-        return state._replace(
-            counters=tuple(counters), due_ns=tuple(due_ns), counts=counts, told_saturated=told
+        return BridgeState(
+            state.rig, state.sequences, tuple(counters), tuple(due_ns), counts, told
         ), frames
 
 
 def _next_due_ns(due_ns: int, t_ns: int, period_ns: int) -> int:
     """On the message's own grid; what was missed is not made up for."""
+    if due_ns == t_ns:
+        return t_ns + period_ns
     late = (t_ns - due_ns) // period_ns if period_ns else 0
     return due_ns + (late + 1) * period_ns if period_ns else t_ns
 
@@ -179,10 +201,10 @@ def _accepted(
     item: Incoming, sequence: SequenceState, frame: Frame
 ) -> tuple[SequenceState, Verdict, tuple[float, ...]]:
     """State, verdict and values of a frame; no values unless it is accepted whole."""
-    verdict = Verdict.OK
+    verdict = _OK
     if item.protection is not None:
         sequence, verdict = check(sequence, frame.data, frame.t_ns, item.protection)
-        if not verdict.accepted:
+        if verdict is not _OK and not verdict.accepted:
             return sequence, verdict, ()
     values = item.decode(frame.data)
     if values is None:

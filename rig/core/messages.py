@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
+from msgspec import Struct
+
 from can_dbc.codec import Decoder, Encoder, compile_decoder, compile_encoder
 from can_dbc.database import Message
 from can_dbc.protection import Protection
@@ -93,7 +95,7 @@ class Conditions(NamedTuple):
     log_fault: bool = False
 
 
-class Report(NamedTuple):
+class Report(Struct, frozen=True, gc=False):
     """All that an outgoing message can speak of.
 
     Attributes:

@@ -19,6 +19,9 @@ from rig.core.types import (
 
 _AMBIENT_C = 20.0
 
+# Looking up a member of an enum costs as much as the observer.
+_RUNNING, _WAITING, _SAFE, _FRESH = Mode.RUNNING, Mode.WAITING, Mode.SAFE, Event.FRESH
+
 
 class RigCore:
     """The bridge's arithmetic, without bus, clock or file.
@@ -64,12 +67,12 @@ class RigCore:
         Returns:
             State after this tick, and what it publishes.
         """
-        if state.mode is Mode.SAFE and step_input.acknowledged:
+        if state.mode is _SAFE and step_input.acknowledged:
             mode = next_mode(state.mode, Event.ACKNOWLEDGED)
             state = replace(state, mode=mode, first=(None,) * len(self._gains))
-        if state.mode is Mode.WAITING:
+        if state.mode is _WAITING:
             return self._try_to_start(state, step_input)
-        if state.model is None or state.mode is Mode.SAFE:
+        if state.model is None or state.mode is _SAFE:
             state = replace(state, t_ns=step_input.t_ns)
             return state, self._safe_output(state)
         return self._observe(state, state.model, step_input)
@@ -120,7 +123,9 @@ class RigCore:
             oldest_ns = min(oldest_ns, observer.measured_ns)
         virtual = [observer.virtual_force_n for observer in observers]
         loaded = plant.load(plant_state, virtual, applied_n, temperature_c)
-        mode = next_mode(state.mode, age_event(self._supervision, t_ns - oldest_ns))
+        mode, event = state.mode, age_event(self._supervision, t_ns - oldest_ns)
+        if mode is not _RUNNING or event is not _FRESH:
+            mode = next_mode(mode, event)
         return self._published(state, t_ns, mode, tuple(observers), loaded)
 
     def _published(
@@ -132,7 +137,7 @@ class RigCore:
         loaded: Loaded,
     ) -> tuple[RigState, StepOutput]:
         """State and output at the end of a tick."""
-        valid, finite = mode is Mode.RUNNING, True
+        valid, finite = mode is _RUNNING, True
         published: list[StrutOutput] = []
         for index, motion in enumerate(loaded.motions):
             observer = observers[index]
@@ -151,7 +156,7 @@ class RigCore:
                 )
             )
         # A model that has diverged says nothing of use, and would not come back by itself.
-        if mode is Mode.SAFE or not finite:
+        if mode is _SAFE or not finite:
             state = replace(before, t_ns=t_ns, mode=Mode.SAFE, observers=observers)
             return state, self._safe_output(state)
         struts = tuple(published)

@@ -18,7 +18,7 @@ class Mode(IntEnum):
     STOPPED = 5
 
 
-class Measurement(Struct, frozen=True):
+class Measurement(Struct, frozen=True, gc=False):
     """A height that arrived.
 
     Attributes:
@@ -30,7 +30,7 @@ class Measurement(Struct, frozen=True):
     t_ns: int
 
 
-class StepInput(Struct, frozen=True):
+class StepInput(Struct, frozen=True, gc=False):
     """All that one tick is given.
 
     Attributes:
@@ -48,7 +48,7 @@ class StepInput(Struct, frozen=True):
     acknowledged: bool = False
 
 
-class ObserverState(Struct, frozen=True):
+class ObserverState(Struct, frozen=True, gc=False):
     """Memory of one observer.
 
     Attributes:
@@ -64,7 +64,7 @@ class ObserverState(Struct, frozen=True):
     measured_ns: int
 
 
-class RigState(Struct, frozen=True):
+class RigState(Struct, frozen=True, gc=False):
     """State between two ticks; a run can be restarted from any.
 
     Attributes:
@@ -86,7 +86,7 @@ class RigState(Struct, frozen=True):
     last_valid: tuple["StrutOutput", ...]
 
 
-class StrutOutput(Struct, frozen=True):
+class StrutOutput(Struct, frozen=True, gc=False):
     """What a tick says of one strut.
 
     Attributes:
@@ -108,7 +108,7 @@ class StrutOutput(Struct, frozen=True):
     innovation_m: float
 
 
-class StepOutput(Struct, frozen=True):
+class StepOutput(Struct, frozen=True, gc=False):
     """What a tick publishes.
 
     Attributes:
