@@ -76,7 +76,7 @@ def demo(
             case, out, lockstep=lockstep, duration_s=duration_s, stop=stop, progress=progress
         )
     _print_case(done)
-    _print_ended(done.run.ended, with_timing=not lockstep)
+    _print_ended(done.run, with_timing=not lockstep)
     console.print(
         f"Written: {out / 'summary.json'}, a picture of each strut, and the run {out / 'run'}"
     )

@@ -12,10 +12,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from rig.bench.config import load_bench_config
+from rig.bench.schema import BenchConfig
+from rig.bench.trajectory import simulate
 from rig.config import CONFIGS, ObserverConfig, Setup, load_setup
 from rig.core.types import Mode
 from rig.io.run_log import read_run, step_table
-from rig.runs import WithBench, replay, with_bench
+from rig.runs import Ended, replay, with_bench
 
 SETTLED_NS = 500_000_000
 """Figures are taken after this time."""
@@ -81,7 +83,7 @@ class Case:
         struts: What each strut did.
     """
 
-    run: WithBench
+    run: Ended
     struts: tuple[StrutCase, ...]
 
     def summary(self) -> dict[str, object]:
@@ -93,7 +95,7 @@ class Case:
             }
             for strut in self.struts
         }
-        ended = self.run.ended
+        ended = self.run
         return {
             **next(iter(by_strut.values())),
             "struts": by_strut,
@@ -127,37 +129,47 @@ def run_case(
     """
     ready = load_setup(CONFIGS / f"{name}.yaml", duration_s=duration_s)
     bench = load_bench_config(CONFIGS / f"{name}_bench.yaml")
-    run = with_bench(ready, bench, folder / "run", lockstep=lockstep, stop=stop, progress=progress)
-    case = _compared(run, ready)
+    ended = with_bench(
+        ready, bench, folder / "run", lockstep=lockstep, stop=stop, progress=progress
+    )
+    case = _compared(ended, ready, bench)
     (folder / "summary.json").write_text(json.dumps(case.summary(), indent=2) + "\n", "utf-8")
     for strut in case.struts:
         draw(strut, folder / f"{strut.name}.png")
     return case
 
 
-def _compared(run: WithBench, ready: Setup) -> Case:
+def _compared(ended: Ended, ready: Setup, bench: BenchConfig) -> Case:
     alone = {
         name: ObserverConfig(proportional_n_per_m=0.0, integral_n_per_m_s=0.0)
         for name in ready.config.observers
     }
     config = ready.config.model_copy(update={"observers": alone})
-    observed = read_run(run.ended.folder).steps
+    observed = read_run(ended.folder).steps
     defective = step_table(
-        replay(run.ended.folder, ready=ready.model_copy(update={"config": config})).steps,
+        replay(ended.folder, ready=ready.model_copy(update={"config": config})).steps,
         observed.schema,
     )
-    t_s = np.asarray(observed.column("t_ns").to_numpy() * 1e-9, dtype=np.float64)
+    t_ns = np.asarray(observed.column("t_ns").to_numpy(), dtype=np.int64)
+    period_ns = ready.config.period_ns
+    truth = simulate(bench, int(t_ns[-1]) + period_ns, period_ns)
+    at = t_ns // period_ns
     struts = tuple(
         StrutCase(
             name,
-            t_s,
-            run.truth[: len(t_s), index],
+            t_ns * 1e-9,
+            np.column_stack(
+                [
+                    column[at, index]
+                    for column in (truth.height_m, truth.velocity_m_per_s, truth.strut_force_n)
+                ]
+            ),
             _height_and_force(defective, name),
             _height_and_force(observed, name),
         )
         for index, name in enumerate(ready.config.observers)
     )
-    return Case(run, struts)
+    return Case(ended, struts)
 
 
 def _height_and_force(steps: Any, strut: str) -> NDArray[np.float64]:

@@ -103,27 +103,41 @@ class BusPort:
                 self.fault = str(error)
 
 
-class BenchPort:
-    """A bus port with a simulated bench at the other end of the bus, in step with the ticks."""
+class _BenchOnBus:
+    """A simulated bench at the other end of the bus. It works while the loop waits.
 
-    def __init__(self, port: BusPort, bench: Bench, bench_bus: Bus) -> None:
-        self._port = port
+    It is the clock that the loop waits on and the port that it reads: before the wait the bench
+    sends what is due at the tick that is awaited, so that its own work delays no tick.
+    """
+
+    def __init__(self, bench: Bench, bench_bus: Bus, clock: Clock, port: BusPort) -> None:
         self._bench = bench
         self._bench_bus = bench_bus
-        self.truth: list[tuple[float, ...]] = []
+        self._clock = clock
+        self._port = port
 
-    def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
-        """Let the bench send what it has up to the tick, then receive it."""
+    @property
+    def epoch_ns(self) -> int:
+        return self._clock.epoch_ns
+
+    def now_ns(self) -> int:
+        return self._clock.now_ns()
+
+    def wait_until(self, t_ns: int) -> int:
+        self._send_up_to(t_ns)
+        return self._clock.wait_until(t_ns)
+
+    def _send_up_to(self, t_ns: int) -> None:
         for frame in self._bench.update(t_ns)[0]:
             self._bench_bus.send(frame)
-        truth = self._bench.truth(t_ns)
-        self.truth.append(tuple(number for strut in truth.struts for number in strut))
+        self._bench_bus.receive()  # the bench has no use for what the bridge says
+
+    def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
+        self._send_up_to(t_ns)  # ticks that were missed
         return self._port.receive(t_ns)
 
     def send(self, frames: Sequence[Frame]) -> None:
-        """Send to the bench, which has no use for it."""
         self._port.send(frames)
-        self._bench_bus.receive()
 
 
 def _header(
@@ -268,20 +282,6 @@ def live(
             bus.close()
 
 
-@dataclass(frozen=True)
-class WithBench:
-    """A run with a simulated bench.
-
-    Attributes:
-        ended: How the run ended.
-        truth: What the struts really did at each tick, shape (ticks, struts, 3): height in m,
-            velocity in m/s, strut force in N.
-    """
-
-    ended: Ended
-    truth: NDArray[np.float64]
-
-
 def with_bench(
     ready: Setup,
     bench_config: BenchConfig,
@@ -290,7 +290,7 @@ def with_bench(
     lockstep: bool,
     stop: Callable[[], bool],
     progress: Progress,
-) -> WithBench:
+) -> Ended:
     """Run with a simulated bench at the other end of the configured bus.
 
     Args:
@@ -315,12 +315,10 @@ def with_bench(
         stack.callback(bus.close)
         bench_bus = Bus(config, epoch_ns=clock.epoch_ns)
         stack.callback(bench_bus.close)
-        port = BenchPort(BusPort(bus), bench, bench_bus)
-        ended = logged(
-            ready, bridge, port, clock, folder, granted=granted, stop=stop, progress=progress
+        on_bus = _BenchOnBus(bench, bench_bus, clock, BusPort(bus))
+        return logged(
+            ready, bridge, on_bus, on_bus, folder, granted=granted, stop=stop, progress=progress
         )
-    truth = np.array(port.truth).reshape(len(port.truth), bridge.struts, 3)
-    return WithBench(ended, truth)
 
 
 def run_bench(
