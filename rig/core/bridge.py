@@ -115,7 +115,7 @@ class Bridge:
         Returns:
             State after the tick, and what it did.
         """
-        counts, sequences = state.counts, list(state.sequences)
+        rig, counts, sequences = state.rig, state.counts, list(state.sequences)
         struts = self._core.struts
         # What came: the struts' heights, then the other quantities in the order of `_OTHERS`.
         given: list[Any] = [None] * (struts + len(_OTHERS))
@@ -129,6 +129,10 @@ class Bridge:
                 counts = _counted(counts, verdict, sequence)
             if values:
                 arrived_ns = frame.t_ns if frame.t_ns < t_ns else t_ns
+                if any([place < struts and given[place] for place in self._places[index]]):
+                    # A late tick finds several measurements: each is used at its own time, or the
+                    # model would run away under a force that was held for the whole gap.
+                    rig, given = self._caught_up(rig, given), [None] * len(given)
                 for number, place in enumerate(self._places[index]):
                     value = values[number]
                     given[place] = Measurement(value, arrived_ns) if place < struts else value
@@ -139,7 +143,7 @@ class Bridge:
             given[struts + 1],
             conditions.acknowledged,
         )
-        rig, output = self._core.step(state.rig, step_input)
+        rig, output = self._core.step(rig, step_input)
         if conditions.overruns or output.mode is _HOLD:
             counts = counts._replace(
                 overruns=counts.overruns + conditions.overruns,
@@ -152,6 +156,14 @@ class Bridge:
             return state, TickResult([], step_input, output)
         state, sent = self._sent(state, t_ns, output, conditions)
         return state, TickResult(sent, step_input, output)
+
+    def _caught_up(self, rig: RigState, given: list[Any]) -> RigState:
+        """The core after measurements that newer ones have followed before the tick."""
+        struts = self._core.struts
+        heights = tuple(given[:struts])
+        t_ns = max(rig.t_ns, *[item.t_ns for item in heights if item])
+        step_input = StepInput(t_ns, heights, given[struts], given[struts + 1])
+        return self._core.step(rig, step_input)[0]
 
     def _place(self, target: Target) -> int:
         if target.quantity is Quantity.HEIGHT:
