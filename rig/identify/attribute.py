@@ -1,0 +1,324 @@
+"""From what the model misses to named effects: laws compete, one after another, then together.
+
+Each round tries every law of the catalogue along the measured motion, and simulates the best of
+them open loop together with what was found before. Blocks of the run that take no part in a fit
+decide between them. An effect that later ones made needless is dropped again.
+
+References:
+    Hastie, Tibshirani, Friedman, The Elements of Statistical Learning (2009), 7.10, cross-validation.
+    Diebold and Mariano, J. Bus. Econ. Stat. 13 (1995), comparing rivals on coloured errors by blocks.
+"""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dart_model.effects import effect
+from rig.identify import screen
+from rig.identify.output_error import Fit, colour, fit
+from rig.identify.reduced import Grid, Model, Trajectory, planted, run, start_of
+from rig.identify.smoother import Noise, Smoothed, estimate_noise, smooth
+from rig.identify.starts import CANDIDATES
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+MOST_EFFECTS = 4
+WORKERS = 2
+_SIMULATED = 7
+_BLOCKS = 40
+_LEAST_GAIN = 0.004
+_LEAST_LIKELIHOOD_GAIN = 25.0
+_LEAST_T = 2.5
+_WHITE = 0.1
+
+
+class Candidate(NamedTuple):
+    """An effect in the competition of one round.
+
+    Attributes:
+        strut: Index of the strut.
+        name: Effect.
+        tried: Sum of squares left along the motion.
+        fit: Joint open-loop fit with the effects chosen before, or None if it was not simulated.
+        score: Deviance with a penalty for parameters; lower is better; infinite without a fit.
+        why: Why it was not chosen; empty for the winner.
+    """
+
+    strut: int
+    name: str
+    tried: float
+    fit: Fit | None
+    score: float
+    why: str
+
+
+class Round(NamedTuple):
+    """One round of the competition.
+
+    Attributes:
+        before: Fit without the new effect.
+        candidates: Best first.
+        smoothed: Smoothed missing height of each run and strut.
+    """
+
+    before: Fit
+    candidates: tuple[Candidate, ...]
+
+
+class Attribution(NamedTuple):
+    """What was found.
+
+    Attributes:
+        base: The model as given, initial states fitted.
+        final: The model with all effects found.
+        rounds: The competition.
+        noise_m2: Noise variance of each height, shape (struts,).
+        ambiguous_with: Rivals that this run cannot tell from what was found.
+    """
+
+    base: Fit
+    final: Fit
+    rounds: tuple[Round, ...]
+    noise_m2: Array
+    ambiguous_with: tuple[Candidate, ...]
+
+
+def first_fit(model: Model, grids: Sequence[Grid]) -> tuple[Fit, Array]:
+    """The model as it is, its initial states fitted, and the sensor's noise.
+
+    Returns:
+        The fit, and the noise variance of each height, shape (struts,).
+    """
+    nothing = planted(())
+    starts: list[Array] = []
+    for grid in grids:
+        heights, velocities = _first_motion(grid)
+        starts.append(start_of(model, heights, velocities, 0))
+    runs = [_required(run(model, nothing, np.zeros(0), g, s)) for g, s in zip(grids, starts, strict=True)]
+    noises = [_noise(g, r) for g, r in zip(grids, runs, strict=True)]
+    noise = np.median(np.array(noises), axis=0)
+    result = fit(model, nothing, np.zeros(0), starts, grids, noise, (), 8)
+    assert result is not None
+    return result, noise
+
+
+def _required(value: Trajectory | None) -> Trajectory:
+    assert value is not None
+    return value
+
+
+def _first_motion(grid: Grid) -> tuple[Array, Array]:
+    count = min(len(grid.t_s), max(20, int(0.05 / grid.step_s)))
+    heights: list[float] = []
+    velocities: list[float] = []
+    t = grid.t_s[:count] - grid.t_s[0]
+    for column in grid.heights_m[:count].T:
+        there = np.isfinite(column)
+        polynomial = np.polynomial.Polynomial.fit(t[there], column[there], 2)
+        heights.append(float(polynomial(0.0)))
+        velocities.append(float(polynomial.deriv()(0.0)))
+    return np.array(heights), np.array(velocities)
+
+
+def _noise(grid: Grid, motion: Trajectory) -> Array:
+    difference = grid.heights_m - motion.heights_m
+    return np.array([estimate_noise(grid.t_s, column).variance for column in difference.T])
+
+
+def smoothed_misses(grids: Sequence[Grid], result: Fit) -> list[list[Smoothed]]:
+    """Measured less simulated heights, smoothed: one list a run, one entry a strut."""
+    found: list[list[Smoothed]] = []
+    for grid, trajectory in zip(grids, result.trajectories, strict=True):
+        difference = grid.heights_m - trajectory.heights_m
+        columns: list[Smoothed] = []
+        for column in difference.T:
+            noise: Noise = estimate_noise(grid.t_s, column)
+            columns.append(smooth(grid.t_s, column, noise))
+        found.append(columns)
+    return found
+
+
+class Judge(NamedTuple):
+    """Data and settings of a competition.
+
+    Attributes:
+        model: The bench.
+        grids: Runs.
+        noise_m2: Noise variance of each height, shape (struts,).
+        every: Thinning of the trials.
+    """
+
+    model: Model
+    grids: tuple[Grid, ...]
+    noise_m2: Array
+    every: int
+
+
+def attribute(model: Model, grids: Sequence[Grid], progress: Progress) -> Attribution:
+    """Find the effects that a model lacks.
+
+    Args:
+        model: The bench.
+        grids: Runs to learn from.
+        progress: Told what is being done and the share that is done.
+    """
+    base, noise = first_fit(model, grids)
+    samples = sum(len(grid.t_s) for grid in grids)
+    judge = Judge(model, tuple(grids), noise, max(1, round(samples / screen.MOST_SAMPLES)))
+    current, rounds = base, []
+    with ThreadPoolExecutor(WORKERS) as pool:
+        for number in range(MOST_EFFECTS):
+            progress(f"round {number + 1}: trying {len(CANDIDATES)} laws", 0.1 + 0.18 * number)
+            this, motions = _round(judge, base, current, pool)
+            rounds.append(this)
+            winner = this.candidates[0] if this.candidates else None
+            if winner is None or winner.fit is None:
+                break
+            if not significant(current, winner.fit, judge):
+                break
+            current = winner.fit
+            current = _pruned(judge, current, motions)
+            if at_floor(current):
+                break
+    return Attribution(base, current, tuple(rounds), noise, ())
+
+
+def at_floor(result: Fit) -> bool:
+    """Whether nothing is left but white noise."""
+    return all(
+        colour(column) < 0.01 for residual in result.residuals for column in residual.T
+    )
+
+
+def _round(
+    judge: Judge, base: Fit, current: Fit, pool: ThreadPoolExecutor
+) -> tuple[Round, tuple[screen.Motion, ...]]:
+    model, grids = judge.model, judge.grids
+    misses = smoothed_misses(grids, current)
+    pieces = [
+        screen.thinned(model, grid, now, first, columns, judge.every)
+        for grid, now, first, columns in zip(
+            grids, current.trajectories, base.trajectories, misses, strict=True
+        )
+    ]
+    chosen = [
+        (strut, name, current.values[slice(*current.planted.slots.index[row, 1:3])])
+        for row, (strut, name) in enumerate(current.planted.effects)
+    ]
+    weight = judge.every / float(np.mean(judge.noise_m2))
+    shared = screen.stage(model, pieces, chosen, weight)
+    keys = [(strut, name) for strut in range(len(model.struts)) for name in CANDIDATES]
+    trials = [t for t in pool.map(lambda key: screen.try_law(shared, *key), keys) if t is not None]
+    trials.sort(key=lambda t: t.cost)
+    fits = list(pool.map(lambda t: _joint(judge, current, t, shared.motions), _finalists(trials)))
+    simulated = {(t.strut, t.name): f for t, f in zip(_finalists(trials), fits, strict=True)}
+    candidates = _ranked(trials, simulated)
+    return Round(current, candidates), shared.motions
+
+
+def _finalists(trials: Sequence[screen.Trial]) -> list[screen.Trial]:
+    """The best of each family, and the best of all, as long as they are not hopeless."""
+    found: list[screen.Trial] = []
+    families: dict[str, int] = {}
+    for trial in trials:
+        family = effect(trial.name).family
+        if families.get(family, 0) < 2 and len(found) < _SIMULATED:
+            families[family] = families.get(family, 0) + 1
+            found.append(trial)
+    return found
+
+
+def _joint(
+    judge: Judge, current: Fit, trial: screen.Trial, motions: Sequence[screen.Motion]
+) -> Fit | None:
+    what = planted((*current.planted.effects, (trial.strut, trial.name)))
+    values = np.concatenate([current.values, trial.values])
+    return fit(
+        judge.model, what, values, current.starts, judge.grids, judge.noise_m2, motions, 10, False, 1e-3
+    )
+
+
+def score(result: Fit, effective: float) -> float:
+    """Deviance with a penalty for parameters (BIC), on an effective number of samples."""
+    k = result.planted.parameter_count
+    return effective * float(np.log(result.mean_square)) + k * float(np.log(effective))
+
+
+def effective_samples(result: Fit) -> float:
+    """How many independent samples a coloured residual is worth (first-order)."""
+    shares = [
+        colour(column) for residual in result.residuals for column in residual.T
+    ]
+    rho = float(np.clip(np.mean(shares), 0.0, 0.9999))
+    return float(np.clip(result.count * (1.0 - rho) / (1.0 + rho), 60.0, result.count))
+
+
+def _ranked(
+    trials: Sequence[screen.Trial], simulated: dict[tuple[int, str], Fit | None]
+) -> tuple[Candidate, ...]:
+    fits = [f for f in simulated.values() if f is not None]
+    if not fits:
+        return ()
+    best = min(fits, key=lambda f: f.cost)
+    effective = effective_samples(best)
+    listed: list[Candidate] = []
+    for trial in trials:
+        result = simulated.get((trial.strut, trial.name))
+        value = score(result, effective) if result is not None else float("inf")
+        listed.append(Candidate(trial.strut, trial.name, trial.cost, result, value, ""))
+    listed.sort(key=lambda c: (c.score, c.tried))
+    return tuple(listed)
+
+
+def _block_sums(result: Fit) -> Array:
+    sums: list[float] = []
+    for residual in result.residuals:
+        for part in np.array_split(residual, max(4, _BLOCKS // len(result.residuals))):
+            sums.append(float(np.nansum(part**2)))
+    return np.array(sums)
+
+
+def significant(before: Fit, after: Fit, judge: Judge) -> bool:
+    """Whether an effect's gain is more than chance, given the colour of what remains."""
+    gain = _block_sums(before) - _block_sums(after)
+    spread = float(np.std(gain, ddof=1)) * np.sqrt(len(gain))
+    t = float(gain.sum()) / max(spread, 1e-300)
+    share = 1.0 - after.cost / before.cost
+    added = after.planted.parameter_count - before.planted.parameter_count
+    likelihood = effective_samples(after) * float(np.log(before.cost / after.cost))
+    need = _LEAST_LIKELIHOOD_GAIN + 5.0 * max(added, 0)
+    return share > _LEAST_GAIN and likelihood > need and t > _LEAST_T
+
+
+def _pruned(judge: Judge, current: Fit, motions: Sequence[screen.Motion]) -> Fit:
+    """Without the effects that the others made needless."""
+    while len(current.planted.effects) > 1:
+        rows = range(len(current.planted.effects) - 1)
+        dropped: Fit | None = None
+        for row in rows:
+            less = without(judge, current, row, motions)
+            if less is not None and not significant(less, current, judge):
+                dropped = less
+                break
+        if dropped is None:
+            return current
+        current = dropped
+    return current
+
+
+def without(
+    judge: Judge, current: Fit, row: int, motions: Sequence[screen.Motion]
+) -> Fit | None:
+    """The fit without one effect, the others fitted again."""
+    effects = tuple(e for i, e in enumerate(current.planted.effects) if i != row)
+    index = current.planted.slots.index
+    values = np.concatenate(
+        [current.values[slice(*index[i, 1:3])] for i in range(len(current.planted.effects)) if i != row]
+    )
+    n = 2 * judge.model.coordinates
+    starts = [start[:n] for start in current.starts]
+    return fit(judge.model, planted(effects), values, starts, judge.grids, judge.noise_m2, motions, 8, False, 1e-3)

@@ -1,0 +1,242 @@
+"""Fit of a model that runs alone: parameters and initial states, from the height it misses.
+
+References:
+    Ljung, System Identification (1999), 7.2 and 9.4, output error and its covariance.
+    White, Maximum likelihood estimation of misspecified models, Econometrica 50 (1982), for
+    intervals where what remains is coloured.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dart_model.effects import effect
+from rig.identify.least_squares import Solution, Space, solve
+from rig.identify.reduced import Grid, Model, Planted, Trajectory, run
+from rig.identify.starts import Motion, space
+
+Array = NDArray[np.float64]
+
+_BLOCK_S = 1.0
+_MEMORY_FITTED = frozenset(
+    {"bouc_wen", "dahl", "maxwell", "presliding_friction", "elastoplastic_friction",
+     "lugre_friction", "hidden_mass"}
+)  # fmt: skip
+_MEMORY_SCALE = {"maxwell": 0.01, "hidden_mass": 0.01}
+
+
+class Fit(NamedTuple):
+    """A fitted model.
+
+    Attributes:
+        planted: Its effects.
+        values: Parameters of all effects, one after another, shape (k,).
+        starts: Start vector of each run.
+        trajectories: Motion of each run.
+        residuals: Measured less simulated heights, NaN where not measured, (N, struts) each.
+        solution: The fit itself, or None if nothing was fitted.
+        cost: Sum of squares over the noise variances.
+        count: Number of measured heights.
+        kept: Which search variables are parameters, shape (all variables,).
+    """
+
+    planted: Planted
+    values: Array
+    starts: tuple[Array, ...]
+    trajectories: tuple[Trajectory, ...]
+    residuals: tuple[Array, ...]
+    solution: Solution | None
+    space: Space | None
+    cost: float
+    count: int
+
+    @property
+    def mean_square(self) -> float:
+        """Mean square of the residual over the noise variance; 1 at the noise floor."""
+        return self.cost / max(self.count, 1)
+
+
+def _unpack(
+    model: Model, what: Planted, grids: Sequence[Grid], x: Array, memory: list[int]
+) -> tuple[Array, list[Array]]:
+    k = what.parameter_count
+    n = model.coordinates
+    size = 2 * n + len(memory)
+    starts: list[Array] = []
+    for i in range(len(grids)):
+        part = x[k + i * size : k + (i + 1) * size]
+        start = np.zeros(2 * n + what.slots.memory_size)
+        start[: 2 * n] = part[: 2 * n]
+        start[[2 * n + m for m in memory]] = part[2 * n :]
+        starts.append(start)
+    return x[:k], starts
+
+
+def _fitted_memory(what: Planted) -> tuple[list[int], list[float]]:
+    index: list[int] = []
+    scales: list[float] = []
+    for row, (_, name) in enumerate(what.effects):
+        if name in _MEMORY_FITTED:
+            first, last = what.slots.index[row, 3:5]
+            index.extend(range(int(first), int(last)))
+            scales.extend([_MEMORY_SCALE.get(name, 1.0)] * int(last - first))
+    return index, scales
+
+
+def fit(
+    model: Model,
+    what: Planted,
+    values: Array,
+    starts: Sequence[Array],
+    grids: Sequence[Grid],
+    noise_m2: Array,
+    motions: Sequence[Motion],
+    iterations: int = 12,
+    fixed: bool = False,
+    tolerance: float = 1e-4,
+) -> Fit | None:
+    """Fit parameters and initial states on the reduced model.
+
+    Args:
+        model: The bench.
+        what: Its effects.
+        values: First parameters, shape (k,).
+        starts: First start vectors, one a run, each of shape (2 n + memory,); extra memory is
+            taken as zero.
+        grids: The runs.
+        noise_m2: Noise variance of each height, shape (struts,).
+        motions: What each strut did, for the bounds.
+        iterations: Most steps.
+        fixed: Only the initial states are fitted.
+        tolerance: Relative gain below which the fit ends.
+
+    Returns:
+        The fit, or None if the model runs away at the start.
+    """
+    memory, memory_scales = _fitted_memory(what)
+    n = model.coordinates
+    weights = 1.0 / np.sqrt(noise_m2)
+    spaces = [
+        space(name, motions[strut], values[slice(*what.slots.index[row, 1:3])])
+        for row, (strut, name) in enumerate(what.effects)
+    ]
+    low = [s.low for s in spaces]
+    high = [s.high for s in spaces]
+    scale = [s.scale for s in spaces]
+    logarithmic = [s.logarithmic for s in spaces]
+    x = [values]
+    for start in starts:
+        full = np.zeros(2 * n + what.slots.memory_size)
+        full[: len(start)] = start[: len(full)]
+        part = np.concatenate([full[: 2 * n], full[[2 * n + m for m in memory]]])
+        size = len(part)
+        x.append(part)
+        low.append(np.full(size, -np.inf))
+        high.append(np.full(size, np.inf))
+        scale.append(np.concatenate([np.full(n, 1e-3), np.full(n, 1e-2), np.array(memory_scales)]))
+        logarithmic.append(np.zeros(size, dtype=np.bool_))
+    whole = Space(*(np.concatenate(part) for part in (low, high, scale, logarithmic)))
+    first = np.concatenate(x)
+    free = np.ones(len(first), dtype=np.bool_)
+    if fixed:
+        free[: len(values)] = False
+    partial = Space(*(part[free] for part in whole))
+
+    def motions_of(trial: Array) -> list[Trajectory] | None:
+        full = first.copy()
+        full[free] = trial
+        p, begin = _unpack(model, what, grids, full, memory)
+        runs = [
+            run(model, what, np.ascontiguousarray(p), grid, start)
+            for grid, start in zip(grids, begin, strict=True)
+        ]
+        done = [r for r in runs if r is not None]
+        return done if len(done) == len(runs) else None
+
+    def residual_of(trial: Array) -> Array | None:
+        done = motions_of(trial)
+        if done is None:
+            return None
+        parts = [
+            ((grid.heights_m - r.heights_m)[grid.measured] * weights).ravel()
+            for grid, r in zip(grids, done, strict=True)
+        ]
+        return np.concatenate(parts)
+
+    solution = solve(residual_of, first[free], partial, iterations, tolerance)
+    if solution is None or not np.isfinite(solution.cost):
+        return None
+    full = first.copy()
+    full[free] = solution.values
+    p, begin = _unpack(model, what, grids, full, memory)
+    done = motions_of(solution.values)
+    if done is None:
+        return None
+    residuals = tuple(
+        np.where(grid.measured[:, np.newaxis], grid.heights_m - r.heights_m, np.nan)
+        for grid, r in zip(grids, done, strict=True)
+    )
+    return Fit(
+        what, p, tuple(begin), tuple(done), residuals, solution, partial,
+        solution.cost, len(solution.residual),
+    )  # fmt: skip
+
+
+def colour(residual: Array) -> float:
+    """Share of a residual's mean square that is not white: 1 less von Neumann's ratio over two.
+
+    Args:
+        residual: One column, NaN where not measured, shape (N,).
+
+    Reference:
+        von Neumann, Ann. Math. Stat. 12 (1941).
+    """
+    steps = np.diff(residual)
+    both = np.isfinite(steps)
+    square = float(np.nanmean(residual**2))
+    if square <= 0.0 or not np.any(both):
+        return 0.0
+    return 1.0 - float(np.mean(steps[both] ** 2)) / (2.0 * square)
+
+
+def intervals(result: Fit, grids: Sequence[Grid]) -> tuple[Array, Array, Array]:
+    """95 % intervals of the parameters.
+
+    The covariance takes what remains as it is: block sums of the score stand for its colour
+    (White's sandwich), and the smaller white-noise covariance is a lower limit.
+
+    Returns:
+        Covariance of the parameters (k, k), and the intervals' ends, each of shape (k,).
+    """
+    solution, bounds = result.solution, result.space
+    assert solution is not None
+    assert bounds is not None
+    jacobian, residual = solution.jacobian, solution.residual
+    gram = jacobian.T @ jacobian
+    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    inverse = np.linalg.pinv(gram / np.outer(size, size), rcond=1e-12) / np.outer(size, size)
+    white = inverse * max(1.0, float(residual @ residual) / max(len(residual) - len(size), 1))
+    blocks = np.zeros_like(gram)
+    first = 0
+    count = 0
+    for grid in grids:
+        samples = int(grid.measured.sum()) * grid.heights_m.shape[1]
+        length = max(8, int(_BLOCK_S / grid.step_s) * grid.heights_m.shape[1])
+        for at in range(first, first + samples, length):
+            part = slice(at, min(at + length, first + samples))
+            score = jacobian[part].T @ residual[part]
+            blocks += np.outer(score, score)
+            count += 1
+        first += samples
+    robust = inverse @ blocks @ inverse * (count / max(count - len(size), 1))
+    k = len(result.values)
+    variance = np.maximum(np.diag(white), np.diag(robust))[:k]
+    deviation = np.sqrt(variance)
+    logarithmic = bounds.logarithmic[:k]
+    reach = 2.0 * deviation
+    growth = np.exp(np.minimum(reach, 50.0))
+    low = np.where(logarithmic, result.values / growth, result.values - reach * bounds.scale[:k])
+    high = np.where(logarithmic, result.values * growth, result.values + reach * bounds.scale[:k])
+    return robust[:k, :k], np.maximum(low, bounds.low[:k]), np.minimum(high, bounds.high[:k])

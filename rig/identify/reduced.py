@@ -1,0 +1,282 @@
+"""The model as matrices that DART gave, and its simulation in machine code.
+
+A bench on straight guides has a constant mass matrix and constant strut directions. DART is asked
+for them once; then a run of a minute takes milliseconds, fast enough to fit many rival laws.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from dart_model.effects import effect
+from dart_model.plant import DartPlant
+from dart_model.spec import EffectSpec, ModelSpec
+from rig.identify.compiled import Slots, simulate, slots
+from rig.identify.records import Record, RecordError
+
+Array = NDArray[np.float64]
+
+LONGEST_STEP_S = 1.25e-3
+"""Longest step of the reduced simulation."""
+
+
+class Model(NamedTuple):
+    """A bench on straight guides.
+
+    Attributes:
+        spec: The model it was made from.
+        mass_kg: Generalised mass matrix, shape (n, n).
+        gravity_n: Generalised gravity force, shape (n,).
+        rows: Derivative of heights by coordinates, shape (struts, n).
+        offsets_m: Heights at zero coordinates, shape (struts,).
+        applied_row: Generalised force per applied newton, shape (n,).
+        struts: Free length, stiffness, damping and gravity of each strut, shape (struts, 4).
+        mass_by_strut: Change of the mass matrix per kg added to a strut, shape (struts, n, n).
+        gravity_by_strut: The same of the gravity force, shape (struts, n).
+    """
+
+    spec: ModelSpec
+    mass_kg: Array
+    gravity_n: Array
+    rows: Array
+    offsets_m: Array
+    applied_row: Array
+    struts: Array
+    mass_by_strut: Array
+    gravity_by_strut: Array
+
+    @property
+    def coordinates(self) -> int:
+        """Number of coordinates."""
+        return self.mass_kg.shape[0]
+
+
+def reduced_model(spec: ModelSpec) -> Model:
+    """The model's matrices, asked of DART.
+
+    Args:
+        spec: The model; effects that it already has are kept apart, see `known_effects`.
+
+    Raises:
+        RecordError: The model does not move on straight guides, or has a coordinate without height.
+    """
+    plain = spec
+    for strut in spec.struts:
+        plain = plain.with_effects(strut.name, ())
+    guided = DartPlant(plain).guided()
+    if guided is None or guided.strut_rows.shape[0] != guided.mass_kg.shape[0]:
+        raise RecordError(
+            f"model {spec.name}: expected struts on straight guides, one for each coordinate, "
+            "so that the measured heights give the motion"
+        )
+    masses: list[Array] = []
+    weights: list[Array] = []
+    one_kg = EffectSpec(name="added_mass", parameters={"mass_kg": 1.0})
+    for strut in spec.struts:
+        heavier = DartPlant(plain.with_effects(strut.name, (one_kg,))).guided()
+        assert heavier is not None
+        masses.append(heavier.mass_kg - guided.mass_kg)
+        weights.append(heavier.gravity_n - guided.gravity_n)
+    constants = [
+        (s.free_length_m, s.stiffness_n_per_m, s.damping_n_s_per_m, spec.gravity_m_per_s2)
+        for s in spec.struts
+    ]
+    return Model(
+        spec,
+        np.ascontiguousarray(guided.mass_kg),
+        np.ascontiguousarray(guided.gravity_n),
+        np.ascontiguousarray(guided.strut_rows),
+        np.ascontiguousarray(guided.heights_m),
+        np.ascontiguousarray(guided.applied_row),
+        np.array(constants),
+        np.array(masses),
+        np.array(weights),
+    )
+
+
+class Grid(NamedTuple):
+    """A record on the nodes of the simulation.
+
+    Attributes:
+        name: Name of the record.
+        t_s: Times of the nodes; measured times and, in gaps, times between, shape (N,).
+        measured: Whether a node's heights were measured, shape (N,).
+        heights_m: Measured heights, NaN elsewhere, shape (N, struts).
+        applied_n: Applied force at the nodes, shape (N,).
+        fine_n: Applied force at half sub-steps, shape (2 * substeps * (N - 1) + 1,).
+        temperature_c: Temperature at the nodes, shape (N,).
+        has_temperature: Whether it was measured.
+        substeps: Steps of the integrator between nodes.
+    """
+
+    name: str
+    t_s: Array
+    measured: NDArray[np.bool_]
+    heights_m: Array
+    applied_n: Array
+    fine_n: Array
+    temperature_c: Array
+    has_temperature: bool
+    substeps: int
+
+    @property
+    def step_s(self) -> float:
+        """Usual time between nodes."""
+        return float(self.t_s[-1] - self.t_s[0]) / (len(self.t_s) - 1)
+
+    def rows(self, first: int, last: int) -> "Grid":
+        """Nodes `first` to `last`, the last one excluded."""
+        fine = slice(2 * self.substeps * first, 2 * self.substeps * (last - 1) + 1)
+        cut = slice(first, last)
+        return self._replace(
+            t_s=self.t_s[cut],
+            measured=self.measured[cut],
+            heights_m=self.heights_m[cut],
+            applied_n=self.applied_n[cut],
+            fine_n=self.fine_n[fine],
+            temperature_c=self.temperature_c[cut],
+        )
+
+
+NO_TEMPERATURE_C = 20.0
+"""Temperature of a record that has none."""
+
+
+def grid_of(record: Record, *, held: bool = False) -> Grid:
+    """The record on simulation nodes; the applied force as a cubic spline, or held.
+
+    Args:
+        record: A record with an applied force.
+        held: The force is held between samples instead.
+    """
+    assert record.applied_force_n is not None
+    steps = np.diff(record.t_s)
+    usual = float(np.median(steps))
+    pieces = np.maximum(1, np.rint(steps / usual)).astype(np.int64)
+    first = np.repeat(record.t_s[:-1], pieces)
+    part = np.concatenate([np.arange(n) for n in pieces]) if pieces.max() > 1 else 0.0
+    t_s = np.append(first + part * np.repeat(steps / pieces, pieces), record.t_s[-1])
+    at = np.concatenate([[0], np.cumsum(pieces)])
+    heights = np.full((len(t_s), record.heights_m.shape[1]), np.nan)
+    heights[at] = record.heights_m
+    measured = np.all(np.isfinite(heights), axis=1)
+    substeps = max(1, int(np.ceil(usual / LONGEST_STEP_S - 1e-9)))
+    fine_t = _fine_times(t_s, substeps)
+    if held:
+        rank = np.clip(np.searchsorted(record.t_s, fine_t, side="right") - 1, 0, None)
+        fine_n = record.applied_force_n[rank]
+    else:
+        fine_n = CubicSpline(record.t_s, record.applied_force_n)(fine_t)
+    temperature = np.full(len(t_s), NO_TEMPERATURE_C)
+    if record.temperature_c is not None:
+        temperature = np.interp(t_s, record.t_s, record.temperature_c)
+    return Grid(
+        record.name,
+        t_s,
+        measured,
+        heights,
+        np.ascontiguousarray(fine_n[:: 2 * substeps]),
+        np.ascontiguousarray(fine_n),
+        temperature,
+        record.temperature_c is not None,
+        substeps,
+    )
+
+
+def _fine_times(t_s: Array, substeps: int) -> Array:
+    share = np.arange(2 * substeps) / (2.0 * substeps)
+    fine = t_s[:-1, np.newaxis] + np.diff(t_s)[:, np.newaxis] * share
+    return np.append(fine.ravel(), t_s[-1])
+
+
+class Planted(NamedTuple):
+    """Effects of a model, ready to be simulated.
+
+    Attributes:
+        effects: Strut index and name of each.
+        slots: The same for the compiled loops.
+    """
+
+    effects: tuple[tuple[int, str], ...]
+    slots: Slots
+
+    @property
+    def parameter_count(self) -> int:
+        """Number of parameters of all effects."""
+        return sum(len(effect(name).parameters) for _, name in self.effects)
+
+
+def planted(effects: tuple[tuple[int, str], ...]) -> Planted:
+    """Effects given by strut index and name."""
+    return Planted(effects, slots(effects))
+
+
+class Trajectory(NamedTuple):
+    """Strut motions at the nodes, each of shape (N, struts)."""
+
+    heights_m: Array
+    velocities_m_per_s: Array
+    accelerations_m_per_s2: Array
+
+
+def run(
+    model: Model, what: Planted, parameters: Array, grid: Grid, start: Array
+) -> Trajectory | None:
+    """Simulate open loop.
+
+    Args:
+        model: The bench.
+        what: Its effects.
+        parameters: Parameters of all effects, one after another.
+        grid: The applied force.
+        start: Coordinates, velocities and memory at the first node, shape (2 n + memory,).
+
+    Returns:
+        The motion, or None if it runs away.
+    """
+    mass, gravity = mass_and_gravity(model, what, parameters)
+    if float(np.linalg.eigvalsh(mass)[0]) <= 0.0:
+        return None
+    shape = (len(grid.t_s), model.rows.shape[0])
+    heights, velocities, accelerations = np.empty(shape), np.empty(shape), np.empty(shape)
+    functions = [function for item in what.slots.laws for function in item]
+    finite = simulate(
+        *functions,
+        what.slots.index,
+        parameters,
+        model.struts,
+        model.rows,
+        model.offsets_m,
+        np.ascontiguousarray(np.linalg.inv(mass)),
+        gravity,
+        model.applied_row,
+        grid.t_s,
+        grid.fine_n,
+        grid.temperature_c,
+        grid.substeps,
+        start,
+        heights,
+        velocities,
+        accelerations,
+    )
+    return Trajectory(heights, velocities, accelerations) if finite else None
+
+
+def mass_and_gravity(model: Model, what: Planted, parameters: Array) -> tuple[Array, Array]:
+    """Mass matrix and gravity force with the masses that effects add."""
+    mass, gravity = model.mass_kg, model.gravity_n
+    for row, (strut, name) in enumerate(what.effects):
+        if effect(name).adds_mass:
+            added = parameters[what.slots.index[row, 1]]
+            mass = mass + added * model.mass_by_strut[strut]
+            gravity = gravity + added * model.gravity_by_strut[strut]
+    return mass, gravity
+
+
+def start_of(model: Model, heights_m: Array, velocities_m_per_s: Array, memory: int) -> Array:
+    """Start vector with the given strut heights and velocities, and memory at zero."""
+    q = np.linalg.solve(model.rows, heights_m - model.offsets_m)
+    v = np.linalg.solve(model.rows, velocities_m_per_s)
+    return np.concatenate([q, v, np.zeros(memory)])

@@ -1,0 +1,414 @@
+"""Fast trial of every law along the measured motion.
+
+A law's force along the smoothed motion, passed through the linear model, gives the height it would
+have added. Compared with the height that the model misses, this is a regression whose noise is the
+sensor's, not its second derivative's, and it needs no simulation of the law.
+
+References:
+    Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973), for parameters that enter linearly.
+    Ljung, System Identification (1999), 4.3 and 16.4, output error and residual analysis.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from dart_model.effects import effect
+from rig.identify.compiled import along, law, respond
+from rig.identify.least_squares import Space, solve
+from rig.identify.reduced import Grid, Model, Trajectory
+from rig.identify.smoother import Smoothed
+from rig.identify.starts import Motion, space, starts
+
+Array = NDArray[np.float64]
+
+MOST_SAMPLES = 12_000
+"""Samples of all runs together that a trial looks at."""
+
+_POLISHED = 2
+_LONGEST_MEMORY_STEP_S = 1.0e-3
+_TONES = 4
+
+
+class Segment(NamedTuple):
+    """One run, thinned out.
+
+    Attributes:
+        t_s: Times, shape (N,).
+        heights_m: Smoothed heights, shape (N, struts).
+        velocities_m_per_s: Their rates.
+        accelerations_m_per_s2: Their second derivatives.
+        applied_n: Applied force, shape (N,).
+        temperature_c: Temperature, shape (N,).
+        missing_m: Height that the linear model misses, shape (N, struts).
+        substeps: Steps for a law's memory between samples.
+    """
+
+    t_s: Array
+    heights_m: Array
+    velocities_m_per_s: Array
+    accelerations_m_per_s2: Array
+    applied_n: Array
+    temperature_c: Array
+    missing_m: Array
+    substeps: int
+
+
+class Linear(NamedTuple):
+    """The linear model, discretised for forces that are linear between samples."""
+
+    transition: Array
+    early: Array
+    late: Array
+    output: Array
+
+
+class Stage(NamedTuple):
+    """All that the trials of one round share.
+
+    Attributes:
+        model: The bench.
+        segments: Runs, thinned out.
+        linear: The linear model on each run's grid.
+        basis: Orthonormal columns that no law may claim: free motion, and small changes of the
+            effects already chosen, shape (m, columns).
+        target: Missing height with those taken out, shape (m,).
+        weight: Samples that one thinned sample stands for, over the noise variance.
+        motions: What each strut did.
+    """
+
+    model: Model
+    segments: tuple[Segment, ...]
+    linear: tuple[Linear, ...]
+    basis: Array
+    target: Array
+    weight: float
+    motions: tuple[Motion, ...]
+
+
+class Trial(NamedTuple):
+    """How well a law does along the motion.
+
+    Attributes:
+        strut: Index of the strut.
+        name: Name of the effect.
+        values: Its parameters, shape (k,).
+        cost: Sum of squares that it leaves, over the noise variance.
+    """
+
+    strut: int
+    name: str
+    values: Array
+    cost: float
+
+
+def linear_model(model: Model, step_s: float, duration_s: float) -> tuple[Linear, Array, Array]:
+    """The linear model on a grid, and the stiffness and damping added to keep it settled.
+
+    Returns:
+        The discretisation; added stiffness and damping, each of shape (n, n).
+    """
+    n = model.coordinates
+    rows, mass = model.rows, model.mass_kg
+    stiffness = rows.T @ np.diag(model.struts[:, 1]) @ rows
+    damping = rows.T @ np.diag(model.struts[:, 2]) @ rows
+    more_stiffness, more_damping = np.zeros((n, n)), np.zeros((n, n))
+    slowest = 6.0 * np.pi / duration_s
+    if float(np.min(np.linalg.eigvals(np.linalg.solve(mass, stiffness)).real)) < slowest**2:
+        more_stiffness = mass * slowest**2
+    a = _system(mass, stiffness + more_stiffness, damping)
+    if float(np.max(np.linalg.eigvals(a).real)) > -8.0 / duration_s:
+        more_damping = mass * (16.0 / duration_s)
+        a = _system(mass, stiffness + more_stiffness, damping + more_damping)
+    b = np.vstack([np.zeros((n, n)), np.linalg.inv(mass)])
+    m = 2 * n
+    augmented = np.zeros((m + 2 * n, m + 2 * n))
+    augmented[:m, :m] = a * step_s
+    augmented[:m, m : m + n] = b * step_s
+    augmented[m : m + n, m + n :] = np.eye(n)
+    e = expm(augmented)
+    late = e[:m, m + n :]
+    early = e[:m, m : m + n] - late
+    output = np.hstack([rows, np.zeros_like(rows)])
+    parts = (e[:m, :m], early, late, output)
+    return Linear(*(np.ascontiguousarray(p) for p in parts)), more_stiffness, more_damping
+
+
+def _system(mass: Array, stiffness: Array, damping: Array) -> Array:
+    n = len(mass)
+    lower = -np.linalg.solve(mass, np.hstack([stiffness, damping]))
+    return np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
+
+
+def _response(linear: Linear, forces_n: Array) -> Array:
+    heights = np.empty((len(forces_n), linear.output.shape[0]))
+    respond(*linear, np.ascontiguousarray(forces_n), heights)
+    return heights
+
+
+def thinned(
+    model: Model,
+    grid: Grid,
+    reference: Trajectory,
+    base: Trajectory,
+    smoothed: list[Smoothed],
+    every: int,
+) -> tuple[Segment, Linear]:
+    """A run thinned out, and the linear model on its grid.
+
+    Args:
+        model: The bench.
+        grid: The run.
+        reference: Simulated motion to which the smoothed difference belongs.
+        base: Motion of the model without effects.
+        smoothed: Measured less `reference` heights, smoothed, one a strut.
+        every: Which nodes to keep.
+    """
+    # Times may be uneven: everything is put on an even grid first.
+    count = (len(grid.t_s) - 1) // every + 1
+    even = grid.t_s[0] + np.arange(count) * ((grid.t_s[-1] - grid.t_s[0]) / (count - 1))
+
+    def put(values: Array) -> Array:
+        if values.ndim == 1:
+            return np.interp(even, grid.t_s, values)
+        return np.column_stack([np.interp(even, grid.t_s, column) for column in values.T])
+
+    parts = [np.column_stack([s.states[:, k] for s in smoothed]) for k in range(3)]
+    heights = put(reference.heights_m + parts[0])
+    velocities = put(reference.velocities_m_per_s + parts[1])
+    accelerations = put(reference.accelerations_m_per_s2 + parts[2])
+    missing = put(reference.heights_m + parts[0] - base.heights_m)
+    missing_rate = put(reference.velocities_m_per_s + parts[1] - base.velocities_m_per_s)
+    step_s = float(even[1] - even[0])
+    linear, stiffness, damping = linear_model(model, step_s, float(even[-1] - even[0]))
+    if np.any(stiffness) or np.any(damping):
+        inverse = np.linalg.inv(model.rows).T
+        held = (missing @ inverse) @ stiffness + (missing_rate @ inverse) @ damping
+        missing = missing - _response(linear, held)
+    substeps = max(1, int(np.ceil(step_s / _LONGEST_MEMORY_STEP_S - 1e-9)))
+    segment = Segment(
+        even, heights, velocities, accelerations, put(grid.applied_n), put(grid.temperature_c),
+        missing, substeps,
+    )  # fmt: skip
+    return segment, linear
+
+
+def law_force(model: Model, segment: Segment, strut: int, name: str, values: Array) -> Array:
+    """Generalised force of an effect along the motion, shape (N, n)."""
+    item = effect(name)
+    force = np.empty(len(segment.t_s))
+    functions = law(name)
+    along(
+        functions.force,
+        functions.rate,
+        values,
+        model.struts[strut],
+        segment.t_s,
+        np.ascontiguousarray(segment.heights_m[:, strut]),
+        np.ascontiguousarray(segment.velocities_m_per_s[:, strut]),
+        segment.applied_n,
+        segment.temperature_c,
+        segment.substeps,
+        np.zeros(item.state_size),
+        force,
+    )
+    general = force[:, np.newaxis] * model.rows[strut]
+    if item.adds_mass:
+        q = np.linalg.solve(model.rows, segment.accelerations_m_per_s2.T).T
+        general = general + values[0] * (
+            model.gravity_by_strut[strut] - q @ model.mass_by_strut[strut]
+        )
+    return general
+
+
+def _heights(
+    model: Model,
+    segments: tuple[Segment, ...],
+    linear: tuple[Linear, ...],
+    strut: int,
+    name: str,
+    values: Array,
+) -> Array:
+    parts = [
+        _response(lin, law_force(model, seg, strut, name, values))[1:].ravel()
+        for seg, lin in zip(segments, linear, strict=True)
+    ]
+    return np.concatenate(parts)
+
+
+def stage(
+    model: Model,
+    pieces: list[tuple[Segment, Linear]],
+    chosen: list[tuple[int, str, Array]],
+    weight: float,
+) -> Stage:
+    """What the trials of a round share.
+
+    Args:
+        model: The bench.
+        pieces: Runs, thinned out.
+        chosen: Effects found so far: strut, name, parameters.
+        weight: See `Stage`.
+    """
+    segments = tuple(segment for segment, _ in pieces)
+    linear = tuple(lin for _, lin in pieces)
+    target = np.concatenate([segment.missing_m[1:].ravel() for segment in segments])
+    columns = _free_motion(segments, linear)
+    for strut, name, values in chosen:
+        there = _heights(model, segments, linear, strut, name, values)
+        target = target - there
+        for i, value in enumerate(values):
+            moved = values.copy()
+            moved[i] += 1e-4 * max(abs(value), 1e-6)
+            change = _heights(model, segments, linear, strut, name, moved) - there
+            columns.append(change)
+    kept = [c / np.linalg.norm(c) for c in columns if float(np.linalg.norm(c)) > 0.0]
+    basis = np.linalg.qr(np.column_stack(kept))[0]
+    target = target - basis @ (basis.T @ target)
+    motions = tuple(_motion(model, segments, linear, i, target) for i in range(len(model.struts)))
+    return Stage(model, segments, linear, basis, target, weight, motions)
+
+
+def _free_motion(segments: tuple[Segment, ...], linear: tuple[Linear, ...]) -> list[Array]:
+    columns: list[Array] = []
+    sizes = [segment.missing_m[1:].size for segment in segments]
+    for k, (segment, lin) in enumerate(zip(segments, linear, strict=True)):
+        size = lin.transition.shape[0]
+        for i in range(size):
+            impulse = np.zeros((len(segment.t_s), size))
+            impulse[0, i] = 1.0
+            free = np.empty_like(segment.missing_m)
+            respond(lin.transition, np.eye(size), np.zeros((size, size)), lin.output, impulse, free)
+            whole = np.zeros(sum(sizes))
+            whole[sum(sizes[:k]) : sum(sizes[: k + 1])] = free[1:].ravel()
+            columns.append(whole)
+    return columns
+
+
+def _motion(
+    model: Model,
+    segments: tuple[Segment, ...],
+    linear: tuple[Linear, ...],
+    strut: int,
+    target: Array,
+) -> Motion:
+    z = np.concatenate([s.heights_m[:, strut] for s in segments])
+    v = np.concatenate([s.velocities_m_per_s[:, strut] for s in segments])
+    temperature = np.concatenate([s.temperature_c for s in segments])
+    free_length, stiffness, damping, _ = (float(x) for x in model.struts[strut])
+    return Motion(
+        z,
+        v,
+        free_length,
+        stiffness,
+        damping,
+        max(float(s.t_s[-1] - s.t_s[0]) for s in segments),
+        (float(temperature.min()), float(temperature.max())),
+        tuple(_tones(model, segments, linear, strut, target)),
+        float(np.trace(model.mass_by_strut[strut] @ model.mass_kg)
+              / max(float(np.trace(model.mass_by_strut[strut])), 1e-12)),
+    )  # fmt: skip
+
+
+def _tones(
+    model: Model,
+    segments: tuple[Segment, ...],
+    linear: tuple[Linear, ...],
+    strut: int,
+    target: Array,
+) -> list[tuple[float, float]]:
+    """Frequency and phase of the lines that explain most of the target's longest run."""
+    longest = int(np.argmax([len(s.t_s) for s in segments]))
+    segment = segments[longest]
+    struts = segment.missing_m.shape[1]
+    first = sum(s.missing_m[1:].size for s in segments[:longest])
+    y = target[first : first + segment.missing_m[1:].size].reshape(-1, struts)[:, strut]
+    n = len(y)
+    step = float(segment.t_s[1] - segment.t_s[0])
+    spectrum = np.abs(np.fft.rfft(y * np.hanning(n), 4 * n)) ** 2
+    frequencies = np.fft.rfftfreq(4 * n, step)
+    spectrum[frequencies < 1.5 / (n * step)] = 0.0
+    # A line stands out of its own neighbourhood, whatever the model's resonance does to both.
+    around = _moving_mean(spectrum, 4 * 12) + 1e-3 * float(spectrum.mean()) + 1e-300
+    found: list[tuple[float, float]] = []
+    for ranking in (spectrum, spectrum / around):
+        left = ranking.copy()
+        for _ in range(_TONES):
+            peak = int(np.argmax(left))
+            frequency = float(frequencies[peak])
+            left[max(0, peak - 16) : peak + 17] = 0.0
+            if all(abs(frequency - f) > 0.3 / (n * step) for f, _ in found):
+                found.append((frequency, _phase(segment, linear[longest], y, frequency, strut, model)))
+    return found
+
+
+def _moving_mean(values: Array, half: int) -> Array:
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    index = np.arange(len(values))
+    low, high = np.maximum(index - half, 0), np.minimum(index + half + 1, len(values))
+    return (sums[high] - sums[low]) / (high - low)
+
+
+def _phase(
+    segment: Segment, linear: Linear, y: Array, frequency: float, strut: int, model: Model
+) -> float:
+    angle = 2.0 * np.pi * frequency * segment.t_s
+    columns = [
+        _response(linear, f(angle)[:, np.newaxis] * model.rows[strut])[1:, strut]
+        for f in (np.sin, np.cos)
+    ]
+    sine, cosine = np.linalg.lstsq(np.column_stack(columns), y, rcond=None)[0]
+    return float(np.arctan2(cosine, sine))
+
+
+def try_law(shared: Stage, strut: int, name: str) -> Trial | None:
+    """The best that a law does along the motion, or None where it cannot be seen.
+
+    Args:
+        shared: The round.
+        strut: Index of the strut.
+        name: Name of the effect.
+    """
+    motion = shared.motions[strut]
+    item = effect(name)
+    scaled = list(item.scaled)
+    basis, target = shared.basis, shared.target
+
+    def response(values: Array) -> Array:
+        h = _heights(shared.model, shared.segments, shared.linear, strut, name, values)
+        return h - basis @ (basis.T @ h)
+
+    begun: list[tuple[float, Array]] = []
+    for start in starts(name, motion):
+        values = np.array(start, dtype=np.float64)
+        bounds = space(name, motion, values)
+        h = response(values)
+        power = float(h @ h)
+        if not np.isfinite(power) or power <= 0.0:
+            continue
+        if scaled:
+            size = float(h @ target) / power
+            values[scaled] *= size
+            values = np.clip(values, bounds.low, bounds.high)
+            h = response(values)
+        left = target - h
+        begun.append((float(left @ left), values))
+    if not begun:
+        return None
+    begun.sort(key=lambda item: item[0])
+    best: Trial | None = None
+    for _, values in begun[:_POLISHED]:
+        solution = solve(
+            lambda p: target - response(p), values, _space(name, motion, values), 12, 1e-3
+        )
+        if solution is None or not np.isfinite(solution.cost):
+            continue
+        if best is None or solution.cost * shared.weight < best.cost:
+            best = Trial(strut, name, solution.values, solution.cost * shared.weight)
+    return best
+
+
+def _space(name: str, motion: Motion, values: Array) -> Space:
+    return space(name, motion, values)
