@@ -1,0 +1,221 @@
+"""Which parameter of a diagnosis means the same as which one of the truth."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+from tests.truth.laws import REFERENCE_C
+from tests.truth.plant import Bench, Planted
+
+Truth = dict[str, float]
+
+
+class Same(NamedTuple):
+    """A parameter that two formulas share.
+
+    Attributes:
+        effect: Name of the effect in the diagnosis.
+        parameter: Its parameter.
+        value: The true value, from the planted parameters and the bench.
+    """
+
+    effect: str
+    parameter: str
+    value: Callable[[Truth, Bench], float]
+
+
+def _of(effect: str, parameter: str, planted: str, factor: float = 1.0) -> Same:
+    return Same(effect, parameter, lambda truth, _: factor * truth[planted])
+
+
+def _kept(truth: Truth, _: Bench) -> float:
+    return 1.0 - truth["lost_fraction"]
+
+
+def _hung_stiffness(truth: Truth, _: Bench) -> float:
+    return truth["mass_kg"] * (2 * math.pi * truth["frequency_hz"]) ** 2
+
+
+def _hung_damping(truth: Truth, _: Bench) -> float:
+    omega = 2 * math.pi * truth["frequency_hz"]
+    return 2 * truth["damping_ratio"] * omega * truth["mass_kg"]
+
+
+def _yield_travel(truth: Truth, _: Bench) -> float:
+    return truth["yield_n"] / truth["stiffness_n_per_m"]
+
+
+_FRICTION = tuple(
+    _of(f"{name}_friction", "coulomb_force_n", "coulomb_n")
+    for name in ("coulomb", "stribeck", "presliding", "elastoplastic", "lugre")
+)
+_CONTACTS = tuple(
+    _of(f"{law}{side}_stop", "contact_height_m", height)
+    for law in ("", "hertz_", "power_")
+    for side, height in (("bump", "low_m"), ("rebound", "high_m"))
+)
+_SIDES = ("bump_stop", "rebound_stop")
+
+COMPARABLE: dict[str, tuple[Same, ...]] = {
+    "constant": (_of("preload", "force_n", "force_n"),),
+    "stiffness_error": (_of("linear_stiffness", "stiffness_n_per_m", "stiffness_n_per_m"),),
+    "damping_error": (_of("linear_damping", "damping_n_s_per_m", "damping_n_s_per_m"),),
+    "rigid_mass": (_of("added_mass", "mass_kg", "mass_kg"),),
+    "load_scale": (_of("input_gain", "gain", "fraction"),),
+    "late_load": (_of("delay", "delay_s", "lag_s"),),
+    "tone": (
+        _of("periodic_force", "amplitude_n", "force_n"),
+        _of("periodic_force", "frequency_hz", "frequency_hz"),
+    ),
+    "square_spring": (_of("quadratic_stiffness", "stiffness_n_per_m2", "stiffness_n_per_m2"),),
+    "cube_spring": (_of("cubic_stiffness", "stiffness_n_per_m3", "stiffness_n_per_m3"),),
+    "power_spring": (
+        _of("power_stiffness", "force_at_100_mm_n", "force_at_reach_n"),
+        _of("power_stiffness", "exponent", "exponent"),
+    ),
+    "exponential_spring": (
+        _of("exponential_stiffness", "force_n", "force_n"),
+        _of("exponential_stiffness", "length_m", "length_m"),
+    ),
+    "gas_column": tuple(
+        _of(name, theirs, ours)
+        for name in ("gas_spring", "balanced_gas_spring")
+        for theirs, ours in (("gas_length_m", "column_m"), ("polytropic_exponent", "exponent"))
+    ),
+    "hertz_bumper": (
+        *_CONTACTS,
+        *(
+            _of(f"hertz_{side}", "contact_stiffness_n_per_m1_5", "stiffness_n_per_m15")
+            for side in _SIDES
+        ),
+        *(
+            _of(f"hertz_{side}", "dissipation_s_per_m", "dissipation_s_per_m", 1.5)
+            for side in _SIDES
+        ),
+    ),
+    "linear_bumper": (
+        *_CONTACTS,
+        *(_of(side, "stiffness_n_per_m", "stiffness_n_per_m") for side in _SIDES),
+        *(_of(side, "damping_n_s_per_m", "damping_n_s_per_m") for side in _SIDES),
+    ),
+    "free_play": (
+        _of("free_play", "gap_m", "half_gap_m", 2.0),
+        _of("backlash", "gap_m", "half_gap_m", 2.0),
+        Same("free_play", "centre_height_m", lambda _, bench: bench.free_length_m),
+        Same("backlash", "centre_height_m", lambda _, bench: bench.free_length_m),
+    ),
+    "stick": _FRICTION,
+    "bristle": _FRICTION,
+    "orifice": (
+        _of("power_damping", "force_at_1_m_per_s_n", "force_at_1_m_per_s_n"),
+        _of("power_damping", "exponent", "exponent"),
+        _of("quadratic_damping", "damping_n_s2_per_m2", "force_at_1_m_per_s_n"),
+    ),
+    "one_way": (
+        Same(
+            "asymmetric_damping",
+            "compression_n_s_per_m",
+            lambda truth, _: truth["damping_n_s_per_m"] * (truth["side"] < 0),
+        ),
+        Same(
+            "asymmetric_damping",
+            "rebound_n_s_per_m",
+            lambda truth, _: truth["damping_n_s_per_m"] * (truth["side"] > 0),
+        ),
+    ),
+    "arctan_damper": (
+        _of("arctan_damping", "knee_velocity_m_per_s", "velocity_m_per_s"),
+        Same(
+            "arctan_damping",
+            "damping_n_s_per_m",
+            lambda truth, _: 2 * truth["force_n"] / (math.pi * truth["velocity_m_per_s"]),
+        ),
+    ),
+    "blow_off": (
+        _of("blow_off_damping", "lost_damping_n_s_per_m", "damping_drop_n_s_per_m"),
+        _of("blow_off_damping", "knee_velocity_m_per_s", "knee_m_per_s"),
+    ),
+    "taper": (
+        _of("end_zone_damping", "damping_n_s_per_m2", "damping_n_s_per_m2"),
+        Same("end_zone_damping", "zone_height_m", lambda _, bench: bench.free_length_m),
+    ),
+    "groove": (_of("position_dependent_damping", "damping_n_s_per_m3", "damping_n_s_per_m3"),),
+    "yielding": (
+        _of("bouc_wen", "yield_force_n", "yield_n"),
+        Same("bouc_wen", "yield_displacement_m", _yield_travel),
+    ),
+    "dahl": (
+        _of("dahl", "yield_force_n", "yield_n"),
+        Same("dahl", "yield_displacement_m", _yield_travel),
+        _of("dahl", "exponent", "exponent"),
+    ),
+    "slip_elements": (_of("iwan", "yield_force_n", "yield_n"),),
+    "relaxing_branch": (
+        _of("maxwell", "stiffness_n_per_m", "stiffness_n_per_m"),
+        _of("maxwell", "relaxation_time_s", "relaxation_s"),
+    ),
+    "thin_oil": (
+        _of("temperature_fade", "fraction_per_k", "per_k"),
+        Same("temperature_fade", "reference_c", lambda *_: REFERENCE_C),
+    ),
+    "time_fade": (
+        Same("time_fade", "final_fraction", _kept),
+        _of("time_fade", "time_constant_s", "time_s"),
+    ),
+    "work_fade": (
+        Same("energy_fade", "final_fraction", _kept),
+        _of("energy_fade", "energy_j", "energy_j"),
+    ),
+    "hung_mass": (
+        _of("hidden_mass", "mass_kg", "mass_kg"),
+        Same("hidden_mass", "stiffness_n_per_m", _hung_stiffness),
+        Same("hidden_mass", "damping_n_s_per_m", _hung_damping),
+        Same("hidden_mass", "weight_n", lambda t, b: t["mass_kg"] * b.gravity_m_per_s2),
+    ),
+}
+"""Planted law -> the parameters of a diagnosis that can be held against it."""
+
+
+class Interval(NamedTuple):
+    """One parameter with its interval, and whether the truth lies inside."""
+
+    law: str
+    parameter: str
+    truth: float
+    value: float
+    low: float
+    high: float
+
+    @property
+    def holds(self) -> bool:
+        return self.low <= self.truth <= self.high
+
+
+def intervals(
+    planted: tuple[Planted, ...], bench: Bench, found: list[dict[str, object]]
+) -> list[Interval]:
+    """Every interval of a diagnosis that the truth can be held against.
+
+    Args:
+        planted: What is in the bench.
+        bench: The bench.
+        found: ``effects`` of the diagnosis.
+    """
+    named = {str(effect["name"]): effect["parameters"] for effect in found}
+    held = []
+    for effect in planted:
+        for same in COMPARABLE.get(effect.law, ()):
+            given = named.get(same.effect, {}).get(same.parameter)
+            if given is None or given["low"] is None or given["high"] is None:
+                continue
+            held.append(
+                Interval(
+                    effect.law,
+                    f"{same.effect}.{same.parameter}",
+                    same.value(effect.truth, bench),
+                    given["value"],
+                    given["low"],
+                    given["high"],
+                )
+            )
+    return held
