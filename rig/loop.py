@@ -35,13 +35,13 @@ class Port(Protocol):
         """Frames that have come up to a tick, and what is known of the bus."""
         ...
 
-    def send(self, frames: Sequence[Frame]) -> None:
-        """Send the frames of a tick."""
+    def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
+        """Send the frames of a tick; returns those that were sent."""
         ...
 
 
-Sink = Callable[[Sequence[Frame], TickResult, Step], None]
-"""What a tick received, what it did, and the record of it."""
+Sink = Callable[[Sequence[Frame], Sequence[Frame], TickResult, Step], None]
+"""What a tick received and sent, what it did, and the record of it."""
 
 _BINS = 20_000
 """Histograms have bins of 1 µs; the last one takes all that is longer than 20 ms."""
@@ -153,8 +153,8 @@ def run(
         if tick.overruns:
             conditions = conditions._replace(overruns=tick.overruns)
         state, result = bridge.tick(state, tick.t_ns, frames, conditions)
-        port.send(result.frames)
-        sink(frames, result, _step(tick, conditions, result))
+        sent = port.send(result.frames)
+        sink(frames, sent, result, _step(tick, conditions, result))
     return state
 
 

@@ -4,6 +4,8 @@ import contextlib
 import hashlib
 import platform
 import shutil
+import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -22,8 +24,9 @@ from rig.config import RunConfig, Setup, build_bridge
 from rig.core.bridge import Bridge, BridgeState, TickResult
 from rig.core.messages import Conditions
 from rig.core.types import Mode
-from rig.io.bus import Bus, BusConfig, BusError
+from rig.io.bus import FRAMES_A_MS, Bus, BusConfig
 from rig.io.clock import Clock, RealClock, VirtualClock
+from rig.io.link import Link
 from rig.io.realtime import Granted, Request, realtime
 from rig.io.run_log import RUN_FILE, RunFolder, RunLog, Step, read_run, step_table
 from rig.loop import Port, Tick, Timing, regular_ticks, run
@@ -69,11 +72,10 @@ class Ended:
 
 
 class BusPort:
-    """A port on an open bus. A fault of the bus is kept and told; it does not stop the loop."""
+    """A port on a bus. A fault of the bus is told with every tick; it does not stop the loop."""
 
-    def __init__(self, bus: Bus) -> None:
-        self._bus = bus
-        self.fault: str | None = None
+    def __init__(self, link: Link) -> None:
+        self.link = link
         self._acknowledged = False
 
     def acknowledge(self) -> None:
@@ -81,26 +83,31 @@ class BusPort:
         self._acknowledged = True
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
-        """Frames that have come; their time is that of arrival, at the latest this tick's."""
-        failed = False
-        frames: list[Frame] = []
-        try:
-            frames = self._bus.receive()
-        except BusError as error:
-            self.fault, failed = str(error), True
-        frames = [frame if frame.t_ns <= t_ns else frame._replace(t_ns=t_ns) for frame in frames]
+        """Frames that have come since the last tick."""
+        frames = self.link.receive(t_ns)
+        if self.link.fault is None and not self._acknowledged:
+            return frames, _NO_CONDITIONS
         acknowledged, self._acknowledged = self._acknowledged, False
-        if failed or acknowledged:
-            return frames, Conditions(acknowledged=acknowledged, bus_fault=failed)
-        return frames, _NO_CONDITIONS
+        return frames, Conditions(acknowledged=acknowledged, bus_fault=self.link.fault is not None)
 
-    def send(self, frames: Sequence[Frame]) -> None:
-        """Send; a frame that cannot be sent is a fault of the bus."""
-        for frame in frames:
-            try:
-                self._bus.send(frame)
-            except BusError as error:
-                self.fault = str(error)
+    def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
+        """Send; returns what was sent."""
+        return self.link.send(frames)
+
+
+class _ToldOfLog:
+    """A port whose conditions tell of the log too."""
+
+    def __init__(self, port: Port, log: RunLog) -> None:
+        self._port = port
+        self._log = log
+        self.send = port.send
+
+    def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
+        frames, conditions = self._port.receive(t_ns)
+        if self._log.fault is not None:
+            conditions = conditions._replace(log_fault=True)
+        return frames, conditions
 
 
 class _BenchOnBus:
@@ -120,6 +127,9 @@ class _BenchOnBus:
     def epoch_ns(self) -> int:
         return self._clock.epoch_ns
 
+    def epoch_now_ns(self) -> int:
+        return self._clock.epoch_now_ns()
+
     def now_ns(self) -> int:
         return self._clock.now_ns()
 
@@ -136,8 +146,8 @@ class _BenchOnBus:
         self._send_up_to(t_ns)  # ticks that were missed
         return self._port.receive(t_ns)
 
-    def send(self, frames: Sequence[Frame]) -> None:
-        self._port.send(frames)
+    def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
+        return self._port.send(frames)
 
 
 def _header(
@@ -182,6 +192,7 @@ def logged(
     clock: Clock,
     folder: Path,
     *,
+    link: Link,
     granted: Granted | None = None,
     stop: Callable[[], bool],
     progress: Progress,
@@ -194,6 +205,7 @@ def logged(
         port: Where frames come from and go to.
         clock: When ticks come.
         folder: Folder of the run; absent or empty.
+        link: The bus behind the port, for the figures of `run.yaml`.
         granted: What the machine granted; None for simulated time, which then waits for the disk.
         stop: Asked before each tick whether to end.
         progress: Told of every tick.
@@ -218,15 +230,17 @@ def logged(
     timing, ticks, status = Timing.empty(), 0, "failed"
     state = bridge.init(0)
 
-    def sink(frames: Sequence[Frame], result: TickResult, step: Step) -> None:
+    def sink(
+        received: Sequence[Frame], sent: Sequence[Frame], result: TickResult, step: Step
+    ) -> None:
         nonlocal ticks
-        log.add(frames, result.frames, step)
+        log.add(received, sent, step)
         ticks += 1
         progress(step.t_ns, result.output.mode)
 
     try:
         due = regular_ticks(clock, config.period_ns, count, stop, timing)
-        state = run(bridge, state, due, port, sink)
+        state = run(bridge, state, due, _ToldOfLog(port, log), sink)
         status = "safe" if state.rig.mode is Mode.SAFE else "done"
     finally:
         log.close(
@@ -236,6 +250,7 @@ def logged(
                     "ticks": ticks,
                     "counts": state.counts._asdict(),
                     "timing": timing.summary(),
+                    "bus": link.figures.as_dict(),
                     "log_fault": log.fault,
                     "dropped_steps": log.dropped,
                 }
@@ -261,25 +276,52 @@ def live(
     bridge = build_bridge(ready)
     with realtime(_request(ready.config)) as granted:
         clock = _real_clock(ready.config, granted)
-        bus = Bus(
-            ready.config.bus.config(),
+        link = _link(ready, bridge, clock, listen_only=listen_only)
+        port = BusPort(link)
+        try:
+            with _acknowledged_by_signal(port):
+                return logged(
+                    ready,
+                    bridge,
+                    port,
+                    clock,
+                    folder,
+                    link=link,
+                    granted=granted,
+                    stop=stop,
+                    progress=progress,
+                )
+        finally:
+            link.close()
+
+
+@contextlib.contextmanager
+def _acknowledged_by_signal(port: BusPort) -> Iterator[None]:
+    """SIGUSR1 acknowledges the safe state, where this thread can be told of signals."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGUSR1, lambda _number, _frame: port.acknowledge())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+
+
+def _link(ready: Setup, bridge: Bridge, clock: Clock, *, listen_only: bool = False) -> Link:
+    config = ready.config
+    most_frames = FRAMES_A_MS * max(1, round(config.period_ns * 1e-6))
+
+    def open_bus() -> Bus:
+        return Bus(
+            config.bus.config(),
             bridge.heard,
             listen_only=listen_only,
             epoch_ns=clock.epoch_ns,
+            most_frames=most_frames,
         )
-        try:
-            return logged(
-                ready,
-                bridge,
-                BusPort(bus),
-                clock,
-                folder,
-                granted=granted,
-                stop=stop,
-                progress=progress,
-            )
-        finally:
-            bus.close()
+
+    return Link(open_bus, clock.epoch_now_ns)
 
 
 def with_bench(
@@ -310,14 +352,21 @@ def with_bench(
     with contextlib.ExitStack() as stack:
         granted = None if lockstep else stack.enter_context(realtime(_request(ready.config)))
         clock = VirtualClock() if granted is None else _real_clock(ready.config, granted)
-        config = ready.config.bus.config()
-        bus = Bus(config, bridge.heard, epoch_ns=clock.epoch_ns)
-        stack.callback(bus.close)
-        bench_bus = Bus(config, epoch_ns=clock.epoch_ns)
+        link = _link(ready, bridge, clock)
+        stack.callback(link.close)
+        bench_bus = Bus(ready.config.bus.config(), epoch_ns=clock.epoch_ns)
         stack.callback(bench_bus.close)
-        on_bus = _BenchOnBus(bench, bench_bus, clock, BusPort(bus))
+        on_bus = _BenchOnBus(bench, bench_bus, clock, BusPort(link))
         return logged(
-            ready, bridge, on_bus, on_bus, folder, granted=granted, stop=stop, progress=progress
+            ready,
+            bridge,
+            on_bus,
+            on_bus,
+            folder,
+            link=link,
+            granted=granted,
+            stop=stop,
+            progress=progress,
         )
 
 
@@ -426,8 +475,8 @@ class _LogPort:
             self._next = next(self._received, None)
         return frames, self._conditions.get(t_ns, _NO_CONDITIONS)
 
-    def send(self, frames: Sequence[Frame]) -> None:
-        del frames
+    def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
+        return frames
 
 
 def replay(
@@ -464,7 +513,9 @@ def replay(
     }
     steps: list[Step] = []
 
-    def sink(_frames: Sequence[Frame], result: TickResult, step: Step) -> None:
+    def sink(
+        _received: Sequence[Frame], _sent: Sequence[Frame], result: TickResult, step: Step
+    ) -> None:
         steps.append(step)
         progress(step.t_ns, result.output.mode)
 

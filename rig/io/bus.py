@@ -1,6 +1,7 @@
 """CAN through python-can, whatever the interface: frames as values, faults as errors of our own."""
 
 import contextlib
+import errno
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -9,12 +10,25 @@ import can
 
 from can_dbc.frame import Frame
 
-_MAX_FRAMES_A_POLL = 4096
-"""Bound on one poll, so that a flood of frames cannot hold up a tick for ever."""
+FRAMES_A_MS = 64
+"""Bound on the frames read per ms of a tick, so that a flood cannot hold the tick up. It is three
+times what CAN FD at 1 and 8 Mbit/s can carry, so no bus reaches it; what is beyond waits."""
+
+_LISTEN_ONLY_OPTIONS: dict[str, dict[str, Any]] = {
+    "pcan": {"state": can.BusState.PASSIVE},
+    "slcan": {"listen_only": True},
+    "vector": {"listen_only": True},
+    "kvaser": {"driver_mode": False},
+}
+"""What keeps a controller from acknowledging frames too. SocketCAN leaves this to `ip link`."""
 
 
 class BusError(OSError):
     """The bus cannot be opened, or a frame cannot be sent or received."""
+
+
+class BusFullError(BusError):
+    """A frame cannot be sent now, because the interface's queue is full; it may be later."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +56,10 @@ class Bus:
     Args:
         config: How to open it.
         heard: The only (arbitration id, is extended) that are let in; None lets all in.
-        listen_only: Send nothing. Most interfaces swallow such a request silently, so it is kept here.
+        listen_only: Send nothing. Most interfaces swallow such a request silently, so it is kept
+            here: the interface's way of sending is not even looked up.
         epoch_ns: Unix time of the run's start; time stamps are given relative to it.
+        most_frames: Bound on one poll.
 
     Raises:
         BusError: The interface cannot be opened.
@@ -56,16 +72,18 @@ class Bus:
         *,
         listen_only: bool = False,
         epoch_ns: int = 0,
+        most_frames: int = 10 * FRAMES_A_MS,
     ) -> None:
         self._heard = None if heard is None else frozenset(heard)
-        self._listen_only = listen_only
-        self._epoch_ns = epoch_ns
-        self._epoch_s = epoch_ns * 1e-9
-        self._bus = _open(config, self._heard)
+        self.epoch_ns = epoch_ns
+        """Unix time that stamps are relative to; to be set anew when the system's clock was."""
+        self._most_frames = most_frames
+        self._bus = _open(config, self._heard, listen_only=listen_only)
         self._receive = self._bus.recv
+        self._send = None if listen_only else self._bus.send
 
     def receive(self) -> list[Frame]:
-        """All frames that have arrived, in order, without waiting.
+        """The frames that have arrived, in order, without waiting; error frames among them.
 
         Raises:
             BusError: The interface is gone.
@@ -73,7 +91,7 @@ class Bus:
         frames: list[Frame] = []
         receive, heard = self._receive, self._heard
         try:
-            for _ in range(_MAX_FRAMES_A_POLL):
+            for _ in range(self._most_frames):
                 message = receive(0)
                 if message is None:
                     break
@@ -86,7 +104,7 @@ class Bus:
 
     def _frame(self, message: can.Message) -> Frame:
         return Frame(
-            round(message.timestamp * 1e9) - self._epoch_ns,
+            round(message.timestamp * 1e9) - self.epoch_ns,
             message.arbitration_id,
             bytes(message.data),
             message.is_extended_id,
@@ -95,16 +113,22 @@ class Bus:
             message.is_error_frame,
         )
 
+    @property
+    def listens_only(self) -> bool:
+        """Whether nothing is ever sent."""
+        return self._send is None
+
     def send(self, frame: Frame) -> None:
         """Send one frame; nothing if the bus only listens.
 
         Raises:
+            BusFullError: The interface's queue is full.
             BusError: The frame cannot be sent.
         """
-        if self._listen_only:
+        if self._send is None:
             return
         message = can.Message(
-            timestamp=frame.t_ns * 1e-9 + self._epoch_s,
+            timestamp=(frame.t_ns + self.epoch_ns) * 1e-9,
             arbitration_id=frame.arbitration_id,
             is_extended_id=frame.is_extended,
             data=frame.data,
@@ -112,9 +136,9 @@ class Bus:
             bitrate_switch=frame.bitrate_switch,
         )
         try:
-            self._bus.send(message)
+            self._send(message)
         except (can.CanError, OSError, ValueError) as error:
-            raise BusError(f"sending failed: {error}") from error
+            raise _sending_failed(error) from error
 
     def close(self) -> None:
         """Close the interface; an interface that is gone already is closed."""
@@ -122,8 +146,22 @@ class Bus:
             self._bus.shutdown()
 
 
-def _open(config: BusConfig, heard: frozenset[tuple[int, bool]] | None) -> can.BusABC:
+_OPENING_ERRORS = (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError)
+
+
+def _sending_failed(error: Exception) -> BusError:
+    code = getattr(error, "error_code", None) or getattr(error, "errno", None)
+    text = " ".join(str(error).split())
+    full = code == errno.ENOBUFS or "buffer full" in text.lower()
+    return (BusFullError if full else BusError)(f"sending failed: {text}")
+
+
+def _open(
+    config: BusConfig, heard: frozenset[tuple[int, bool]] | None, *, listen_only: bool
+) -> can.BusABC:
     options: dict[str, Any] = dict(config.options)
+    if listen_only:
+        options |= _LISTEN_ONLY_OPTIONS.get(config.interface, {})
     if config.interface == "virtual":
         # Simulated time would otherwise be overwritten by the time of sending.
         options.setdefault("preserve_timestamps", True)
@@ -131,7 +169,9 @@ def _open(config: BusConfig, heard: frozenset[tuple[int, bool]] | None) -> can.B
         options.setdefault("fd", True)
         options.setdefault("data_bitrate", config.data_bitrate)
     filters = None
-    if heard is not None:
+    if heard is not None and config.interface == "socketcan":
+        # The kernel's filters let error frames pass. python-can's own, which stand in for them at
+        # other interfaces, do not, and end a poll at the first foreign frame.
         filters = [
             {"can_id": key, "can_mask": 0x1FFFFFFF if extended else 0x7FF, "extended": extended}
             for key, extended in sorted(heard)
@@ -144,7 +184,14 @@ def _open(config: BusConfig, heard: frozenset[tuple[int, bool]] | None) -> can.B
             can_filters=filters,
             **options,
         )
-    except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as error:
+    except (
+        can.CanError,
+        OSError,
+        ValueError,
+        TypeError,
+        ImportError,
+        NotImplementedError,
+    ) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise BusError(
             f"bus.interface {config.interface!r}, bus.channel {config.channel!r}: "

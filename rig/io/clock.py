@@ -12,6 +12,10 @@ class Clock(Protocol):
         """Unix time of the run's start."""
         ...
 
+    def epoch_now_ns(self) -> int:
+        """The same by the system's clock as it is set now: it differs after the clock was set."""
+        ...
+
     def now_ns(self) -> int:
         """Time of the run."""
         ...
@@ -33,6 +37,10 @@ class RealClock:
         self._start_ns = time.monotonic_ns()
         self.epoch_ns = time.time_ns()
         self._spin_ns = spin_ns
+
+    def epoch_now_ns(self) -> int:
+        """Unix time of the run's start by the system's clock as it is set now."""
+        return time.time_ns() - self.now_ns()
 
     def now_ns(self) -> int:
         """Time since the start of the run."""
@@ -56,6 +64,10 @@ class VirtualClock:
 
     def __init__(self) -> None:
         self._now_ns = 0
+
+    def epoch_now_ns(self) -> int:
+        """The same: nobody sets a simulated clock."""
+        return self.epoch_ns
 
     def now_ns(self) -> int:
         """Last awaited time."""

@@ -136,9 +136,7 @@ def parse_frame(line: str, epoch_ns: int) -> tuple[Frame, str]:
         raise ValueError(f"payload of {len(data)} bytes")
     is_error = len(identifier) == 8 and bool(number & 0x20000000)
     is_extended = len(identifier) == 8 and not is_error
-    frame = Frame(
-        t_ns, number & 0x1FFFFFFF, data, is_extended, is_fd, bool(flags & 1), is_error
-    )
+    frame = Frame(t_ns, number & 0x1FFFFFFF, data, is_extended, is_fd, bool(flags & 1), is_error)
     return frame, direction if direction in ("R", "T") else "R"
 
 

@@ -1,0 +1,50 @@
+"""What the error frames of a CAN controller say of its state.
+
+python-can reports a state for few interfaces (SocketCAN's is always "active"), but SocketCAN passes
+on what the controller says of itself, as frames with a payload of their own.
+
+Reference: Linux kernel, include/uapi/linux/can/error.h; ISO 11898-1, fault confinement.
+"""
+
+from enum import IntEnum
+
+from can_dbc.frame import Frame
+
+_CONTROLLER_PROBLEM, _BUS_OFF, _RESTARTED = 0x004, 0x040, 0x100
+
+
+class Controller(IntEnum):
+    """State of a controller, the gravest last."""
+
+    ACTIVE = 0
+    WARNING = 1
+    PASSIVE = 2
+    BUS_OFF = 3
+
+
+_DETAILS = ((0x30, Controller.PASSIVE), (0x0C, Controller.WARNING), (0x40, Controller.ACTIVE))
+"""Bits of the second byte of a controller problem, the gravest first, and the state they tell."""
+
+
+def state_after(state: Controller, frame: Frame) -> Controller:
+    """State of the controller after a frame.
+
+    Args:
+        state: State before it.
+        frame: An error frame, or one of the bus, which only a controller that is on it receives.
+
+    Returns:
+        The new state; an error frame that tells nothing of it (a bit error, a lost arbitration)
+        leaves it as it was.
+    """
+    if not frame.is_error:
+        return Controller.ACTIVE if state is Controller.BUS_OFF else state
+    error = frame.arbitration_id
+    if error & _BUS_OFF:
+        return Controller.BUS_OFF
+    if error & _RESTARTED:
+        return Controller.ACTIVE
+    if error & _CONTROLLER_PROBLEM and len(frame.data) >= 2:
+        detail = frame.data[1]
+        return next((after for bits, after in _DETAILS if detail & bits), state)
+    return state

@@ -1,0 +1,100 @@
+"""A bus through python-can's `virtual` interface."""
+
+import can
+import pytest
+
+from can_dbc.frame import Frame
+from rig.io.bus import Bus, BusConfig, BusError
+
+
+@pytest.fixture
+def config(request):
+    return BusConfig("virtual", request.node.name, 500_000)
+
+
+@pytest.fixture
+def peer(config):
+    bus = Bus(config)
+    yield bus
+    bus.close()
+
+
+@pytest.fixture
+def opened(config):
+    """Open a bus that is closed after the test."""
+    buses = []
+
+    def open_bus(heard=None, **options):
+        buses.append(Bus(config, heard, **options))
+        return buses[-1]
+
+    yield open_bus
+    for bus in buses:
+        bus.close()
+
+
+def test_only_configured_ids_are_heard_and_foreign_ones_do_not_end_the_poll(opened, peer):
+    bus = opened({(0x100, False), (0x18FF0001, True)})
+    wanted = [Frame(7, 0x100, b"\1"), Frame(8, 0x18FF0001, b"\2", is_extended=True)]
+    foreign = [Frame(7, 0x101, b""), Frame(7, 0x100, b"", is_extended=True), Frame(7, 0x7FF, b"")]
+    for frame in (*foreign, wanted[0], *foreign, wanted[1], *foreign):
+        peer.send(frame)
+    assert bus.receive() == wanted
+
+
+def test_a_flood_is_read_in_portions_and_none_of_it_is_lost(opened, peer):
+    bus = opened({(0x100, False)}, most_frames=64)
+    for number in range(200):
+        peer.send(Frame(number, 0x100, bytes([number])))
+    portions = [bus.receive() for _ in range(5)]
+    assert [len(portion) for portion in portions] == [64, 64, 64, 8, 0]
+    assert [frame.data[0] for portion in portions for frame in portion] == list(range(200))
+
+
+def test_error_frames_come_whatever_is_heard(opened, config):
+    bus = opened({(0x100, False)})
+    raw = can.Bus(interface="virtual", channel=config.channel)
+    try:
+        raw.send(can.Message(arbitration_id=0x40, is_error_frame=True, is_extended_id=False))
+    finally:
+        raw.shutdown()
+    (frame,) = bus.receive()
+    assert frame.is_error
+    assert frame.arbitration_id == 0x40
+
+
+def test_listen_only_never_calls_the_interface(opened, peer, monkeypatch):
+    sent = []
+    monkeypatch.setattr(can.interfaces.virtual.VirtualBus, "send", lambda *args: sent.append(args))
+    bus = opened(listen_only=True)
+    bus.send(Frame(0, 0x110, b"\1"))
+    assert bus.listens_only
+    assert sent == []
+    assert peer.receive() == []
+
+
+def test_an_interface_that_does_not_exist_is_one_line():
+    with pytest.raises(BusError, match=r"bus\.interface 'nosuch'.*cannot be opened") as caught:
+        Bus(BusConfig("nosuch", "x", 500_000))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_closed_bus_is_an_error_of_the_bus(config):
+    bus = Bus(config)
+    bus.close()
+    with pytest.raises(BusError, match="receiving failed"):
+        bus.receive()
+    with pytest.raises(BusError, match="sending failed"):
+        bus.send(Frame(0, 1, b""))
+
+
+def test_all_that_a_frame_has_goes_through(opened, peer):
+    bus = opened()
+    frames = [
+        Frame(1_000, 0x100, bytes(range(8))),
+        Frame(2_000, 0x1ABCDEF, b"", is_extended=True),
+        Frame(3_000, 0x100, bytes(64), is_fd=True, bitrate_switch=True),
+    ]
+    for frame in frames:
+        peer.send(frame)
+    assert bus.receive() == frames
