@@ -32,8 +32,7 @@ def diagnose(folder: Path) -> dict:
     path = out / "diagnosis.json"
     if path.exists():
         return json.loads(path.read_text(encoding="utf-8"))
-    message = repr(outcome.exception) if outcome.exception else outcome.output[-300:]
-    return FAILED | {"message": message}
+    return FAILED | {"message": f"{outcome.exception!r} {outcome.output[-300:]}"}
 
 
 def result_path(out: Path, slot: Slot) -> Path:

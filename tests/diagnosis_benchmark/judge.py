@@ -65,10 +65,13 @@ def is_right(planted: tuple[str, ...], diagnosis: dict) -> bool:
 
     Nothing planted: it says so. One effect: its family comes first, or, where the verdict is
     ``ambiguous``, is among the named rivals. Several: all families are named. A force that no
-    catalogue holds: anything but a claim that a law explains it.
+    catalogue holds: anything but a claim that a law explains it, or that nothing is there. No
+    answer at all is never right.
     """
     verdict = diagnosis["verdict"]
     families = [effect["family"] for effect in diagnosis["effects"]]
+    if verdict == "failed":
+        return False
     if not planted:
         return verdict == "nothing_missing"
     if planted == ("outside",):

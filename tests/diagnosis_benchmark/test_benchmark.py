@@ -37,6 +37,8 @@ def diagnosis(verdict, *families, rivals=()):
         (("stop", "fade"), diagnosis("explained", "fade"), False),
         ((), diagnosis("nothing_missing"), True),
         ((), diagnosis("explained", "preload"), False),
+        (("outside",), diagnosis("failed"), False),
+        (("outside",), diagnosis("nothing_missing"), False),
         (("outside",), diagnosis("not_explained", "restoring_surface"), True),
         (("outside",), diagnosis("partly_explained", "stiffness"), True),
         (("outside",), diagnosis("explained", "stiffness"), False),
