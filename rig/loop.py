@@ -154,14 +154,14 @@ def run(
             conditions = conditions._replace(overruns=tick.overruns)
         state, result = bridge.tick(state, tick.t_ns, frames, conditions)
         sent = port.send(result.frames)
-        sink(frames, sent, result, _step(tick, conditions, result))
+        sink(frames, sent, result, _step(tick, len(frames), conditions, result))
     return state
 
 
 _NAN = math.nan
 
 
-def _step(tick: Tick, conditions: Conditions, result: TickResult) -> Step:
+def _step(tick: Tick, received: int, conditions: Conditions, result: TickResult) -> Step:
     given, output = result.step_input, result.output
     numbers: list[float] = []
     for index, measured in enumerate(given.heights):
@@ -171,6 +171,7 @@ def _step(tick: Tick, conditions: Conditions, result: TickResult) -> Step:
     return Step(
         tick.t_ns,
         tick.overruns,
+        received,
         output.mode,
         flags,
         _NAN if given.applied_force_n is None else given.applied_force_n,

@@ -24,6 +24,10 @@ _OTHERS = (Quantity.APPLIED_FORCE, Quantity.TEMPERATURE, Quantity.LOAD_CELL_FORC
 """What comes beside heights; the core is given the first two."""
 
 
+Accepted = tuple[int, int, tuple[float, ...]]
+"""Index of the message, time of arrival (ns) and values of a frame that was accepted."""
+
+
 class BridgeState(Struct, frozen=True, gc=False):
     """State of the bridge between two ticks.
 
@@ -74,6 +78,8 @@ class Bridge:
         self._incoming = tuple(incoming)
         self._outgoing = tuple(outgoing)
         self._places = [[self._place(target) for target in item.targets] for item in incoming]
+        # What came in a tick: the struts' heights, then the others in the order of `_OTHERS`.
+        self._nothing: list[Any] = [None] * (core.struts + len(_OTHERS))
         self._index = {
             (item.message.arbitration_id, item.message.is_extended): index
             for index, item in enumerate(incoming)
@@ -83,6 +89,16 @@ class Bridge:
     def heard(self) -> frozenset[tuple[int, bool]]:
         """The (arbitration id, is extended) that the bridge listens to."""
         return frozenset(self._index)
+
+    @property
+    def core(self) -> RigCore:
+        """The arithmetic."""
+        return self._core
+
+    @property
+    def incoming(self) -> tuple[Incoming, ...]:
+        """Messages of the bench; `Accepted` counts them from zero."""
+        return self._incoming
 
     @property
     def struts(self) -> int:
@@ -115,10 +131,8 @@ class Bridge:
         Returns:
             State after the tick, and what it did.
         """
-        rig, counts, sequences = state.rig, state.counts, list(state.sequences)
-        struts = self._core.struts
-        # What came: the struts' heights, then the other quantities in the order of `_OTHERS`.
-        given: list[Any] = [None] * (struts + len(_OTHERS))
+        counts, sequences = state.counts, list(state.sequences)
+        accepted: list[Accepted] = []
         for frame in frames:
             index = self._index.get((frame.arbitration_id, frame.is_extended))
             if index is None or frame.is_error:
@@ -128,21 +142,8 @@ class Bridge:
             if verdict is not _OK:
                 counts = _counted(counts, verdict, sequence)
             if values:
-                arrived_ns = frame.t_ns if frame.t_ns < t_ns else t_ns
-                if any([place < struts and given[place] for place in self._places[index]]):
-                    # A late tick finds several measurements: each is used at its own time, or the
-                    # model would run away under a force that was held for the whole gap.
-                    rig, given = self._caught_up(rig, given), [None] * len(given)
-                for number, place in enumerate(self._places[index]):
-                    value = values[number]
-                    given[place] = Measurement(value, arrived_ns) if place < struts else value
-        step_input = StepInput(
-            t_ns,
-            tuple(given[:struts]),
-            given[struts],
-            given[struts + 1],
-            conditions.acknowledged,
-        )
+                accepted.append((index, frame.t_ns, values))
+        rig, step_input = self.gathered(state.rig, t_ns, accepted, conditions.acknowledged)
         rig, output = self._core.step(rig, step_input)
         if conditions.overruns or output.mode is _HOLD:
             counts = counts._replace(
@@ -157,8 +158,41 @@ class Bridge:
         state, sent = self._sent(state, t_ns, output, conditions)
         return state, TickResult(sent, step_input, output)
 
+    def gathered(
+        self, rig: RigState, t_ns: int, accepted: Sequence[Accepted], acknowledged: bool
+    ) -> tuple[RigState, StepInput]:
+        """What a tick's accepted frames are to the core.
+
+        A late tick finds several measurements of one strut. Each is used at its own time, or the
+        model would run away under a force that was held for the whole gap.
+
+        Args:
+            rig: The core after the last tick.
+            t_ns: Time of this one.
+            accepted: Values of the frames that were accepted, in their order.
+            acknowledged: Somebody acknowledged the safe state.
+
+        Returns:
+            The core after all measurements that newer ones followed, and the input that is left.
+        """
+        struts, places = self._core.struts, self._places
+        given = self._nothing.copy()
+        measured: list[int] = []
+        for index, arrived_ns, values in accepted:
+            if index in measured:
+                rig = self._caught_up(rig, given)
+                given, measured = self._nothing.copy(), []
+            for number, place in enumerate(places[index]):
+                value = values[number]
+                if place < struts:
+                    given[place] = Measurement(value, arrived_ns if arrived_ns < t_ns else t_ns)
+                    measured.append(index)
+                else:
+                    given[place] = value
+        heights = tuple(given[:struts])
+        return rig, StepInput(t_ns, heights, given[struts], given[struts + 1], acknowledged)
+
     def _caught_up(self, rig: RigState, given: list[Any]) -> RigState:
-        """The core after measurements that newer ones have followed before the tick."""
         struts = self._core.struts
         heights = tuple(given[:struts])
         t_ns = max(rig.t_ns, *[item.t_ns for item in heights if item])

@@ -5,7 +5,7 @@ them together. A line of any other shape is read by `parse_frame`, which decides
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,8 +21,10 @@ _MOST_SHAPES = 16
 
 _LINE = re.compile(
     rb"\((?P<s>[0-9]{1,10})\.(?P<ns>[0-9]{9})\) [!-~]+ "
-    rb"(?P<id>[0-9A-F]{3}|[0-9A-F]{8})(?P<mark>##?)(?P<data>[0-9A-F]*) R"
+    rb"(?P<id>[0-9A-F]{3}|[0-9A-F]{8})(?P<mark>#|##[0-9A-F])(?P<data>[0-9A-F]*) R"
 )
+_MOST_DIGITS = {b"#": 16, b"##": 128}
+"""Of a payload, on classic CAN and on CAN FD."""
 _NEWLINE, _SENT = 10, ord("T")
 _NO_DIGIT = 255
 _NIBBLES = np.full(256, _NO_DIGIT, dtype=np.uint8)
@@ -50,18 +52,20 @@ class FrameColumns:
     payload: NDArray[np.uint8]
 
 
-def received_frames(path: Path, epoch_ns: int) -> FrameColumns:
+def received_frames(paths: Sequence[Path], epoch_ns: int) -> FrameColumns:
     """Every received frame of a log; a last line that a kill cut off is left out.
 
     Args:
-        path: Log in candump's format.
+        paths: Files of the log in candump's format, in their order.
         epoch_ns: Unix time of the run's start.
 
     Raises:
         InputError: The file cannot be read, or a line of it is no frame.
     """
     parts = [
-        _block(text, first_line, epoch_ns, path) for text, first_line in _whole_lines(path)
+        _block(text, first_line, epoch_ns, path)
+        for path in paths
+        for text, first_line in _whole_lines(path)
     ] or [_columns(0, 0)]
     width = max(part.payload.shape[1] for part in parts)
     return FrameColumns(
@@ -144,7 +148,7 @@ def _read_alike(
     """Read all lines of the first one's shape; says which they were."""
     first = lines[0].tobytes()
     shape = _LINE.fullmatch(first)
-    if shape is None or len(shape["data"]) % 2 or len(shape["data"]) > 16 or shape["mark"] != b"#":
+    if shape is None or len(shape["data"]) % 2 or len(shape["data"]) > _MOST_DIGITS[shape["mark"][:2]]:
         return np.zeros(len(lines), dtype=np.bool_)
     digits = [slice(*shape.span(name)) for name in ("s", "ns", "id", "data")]
     values = [_NIBBLES[lines[:, place]] for place in digits]

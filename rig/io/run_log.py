@@ -42,6 +42,7 @@ class Step(NamedTuple):
     Attributes:
         t_ns: Time of the tick.
         overruns: Ticks missed before it.
+        received: Frames received, so that a replay gives each tick the same ones.
         mode: State of the bridge.
         flags: Bit 0 acknowledged, bit 1 bus fault, bit 2 log fault.
         applied_force_n: New applied force, NaN where none came.
@@ -51,6 +52,7 @@ class Step(NamedTuple):
 
     t_ns: int
     overruns: int
+    received: int
     mode: int
     flags: int
     applied_force_n: float
@@ -80,6 +82,7 @@ def step_schema(struts: Sequence[str]) -> Any:
     fields = [
         ("t_ns", _pa.int64()),
         ("overruns", _pa.int32()),
+        ("received", _pa.int32()),
         ("mode", _pa.int8()),
         ("flags", _pa.int8()),
         ("applied_force_n", _pa.float64()),
