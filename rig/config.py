@@ -1,5 +1,6 @@
 """Configuration of the bridge: YAML -> frozen values, validated once."""
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,7 +14,7 @@ from rig.core.bridge import Bridge
 from rig.core.messages import Outgoing, Quantity, Target, estimate, incoming, kinematics, status
 from rig.core.observer import ObserverGains
 from rig.core.step import RigCore
-from rig.core.supervisor import Supervision
+from rig.core.supervisor import Action, Limit, Supervision, Watched
 from rig.io.bus import BusConfig
 
 __all__ = ["CONFIGS", "InputError", "RunConfig", "Setup", "build_bridge", "load_setup", "setup"]
@@ -22,6 +23,7 @@ CONFIGS = Path(__file__).parent / "configs"
 """Folder of the configurations that come with the package."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Text = Annotated[str, Field(min_length=1, max_length=255)]
 
@@ -82,12 +84,51 @@ class Published(_Frozen):
     kinematics: Text | None = "RIG_KINEMATICS"
 
 
+class LimitConfig(_Frozen):
+    """One row of the table of limits, for every strut.
+
+    Attributes:
+        value: What is limited, with its unit. Of the measurement: `measured_height_m`,
+            `measured_rate_m_per_s`, `unchanged_s` (how long it may stay exactly the same). Of the
+            estimate: `height_m`, `force_n`, `virtual_force_n`, `innovation_m`.
+        low: Smallest value within.
+        high: Largest value within.
+        action: `warn` tells of it in the status; `refuse` drops the measurement; `hold` marks the
+            estimate invalid as long as it lasts; `safe` enters the safe state.
+    """
+
+    value: Watched
+    low: Finite | None = None
+    high: Finite | None = None
+    action: Literal["warn", "refuse", "hold", "safe"]
+
+    @model_validator(mode="after")
+    def _sensible(self) -> "LimitConfig":
+        if self.low is None and self.high is None:
+            raise ValueError(f"{self.value.value}: expected low, high or both")
+        if self.low is not None and self.high is not None and self.low >= self.high:
+            raise ValueError(f"low {self.low}: expected less than high ({self.high})")
+        if self.action == "refuse" and not self.value.is_measured:
+            raise ValueError(
+                f"action refuse of {self.value.value}: expected warn, hold or safe, "
+                "because only a measurement can be refused"
+            )
+        return self
+
+    def limit(self) -> Limit:
+        """As the core takes it."""
+        low = -math.inf if self.low is None else self.low
+        high = math.inf if self.high is None else self.high
+        return Limit(self.value, low, high, Action[self.action.upper()])
+
+
 class SupervisionConfig(_Frozen):
-    """Ages of the measurement, and the output of the safe state."""
+    """Ages of the measurement, the output of the safe state, and the table of limits."""
 
     stale_after_s: Positive = 0.01
     safe_after_s: Positive = 0.5
     safe_output: Literal["zero", "last"] = "zero"
+    limits: Annotated[tuple[LimitConfig, ...], Field(max_length=100)] = ()
 
     @model_validator(mode="after")
     def _in_order(self) -> "SupervisionConfig":
@@ -104,6 +145,7 @@ class SupervisionConfig(_Frozen):
             round(self.stale_after_s * 1e9),
             round(self.safe_after_s * 1e9),
             self.safe_output == "last",
+            tuple(row.limit() for row in self.limits),
         )
 
 
@@ -280,9 +322,10 @@ def build_bridge(ready: Setup, model: ModelSpec | None = None) -> Bridge:
     if config.status is not None:
         outgoing.append(status(database.message(config.status)))
     gains = tuple(observer.gains() for observer in config.observers.values())
-    core = RigCore(DartPlant(model or ready.model), gains, config.supervision.supervision())
+    supervision = config.supervision.supervision()
+    core = RigCore(DartPlant(model or ready.model), gains, supervision)
     received = [incoming(database.message(name), found) for name, found in targets.items()]
-    return Bridge(core, received, outgoing)
+    return Bridge(core, received, outgoing, supervision.limits)
 
 
 def _model_path(name: str, source: Path) -> Path:

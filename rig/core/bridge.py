@@ -4,7 +4,7 @@ A refused frame is counted and never used in part; values come from accepted fra
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -13,6 +13,15 @@ from can_dbc.frame import Frame
 from can_dbc.protection import INITIAL, SequenceState, Verdict, check, protect
 from rig.core.messages import Conditions, Counts, Incoming, Outgoing, Quantity, Report, Target
 from rig.core.step import RigCore
+from rig.core.supervisor import (
+    EVENTS_BEYOND,
+    Action,
+    Limit,
+    Seen,
+    beyond,
+    judged,
+    next_mode,
+)
 from rig.core.types import Measurement, Mode, RigState, StepInput, StepOutput
 
 _NO_CONDITIONS = Conditions()
@@ -22,6 +31,24 @@ _OK, _HOLD = Verdict.OK, Mode.HOLD
 
 _OTHERS = (Quantity.APPLIED_FORCE, Quantity.TEMPERATURE, Quantity.LOAD_CELL_FORCE)
 """What comes beside heights; the core is given the first two."""
+
+RIVAL_FRAMES = 12
+"""Frames out of sequence, one hardly after the other, that only a second sender explains: a sender
+that starts anew is believed after three, and frames that overtake others come singly."""
+
+_RIVAL_CYCLES = 3
+
+
+class Strays(NamedTuple):
+    """Frames of a message that contradicted its counter, one hardly after the other.
+
+    Attributes:
+        frames: How many in a row.
+        t_ns: When the last one came.
+    """
+
+    frames: int = 0
+    t_ns: int = 0
 
 
 Accepted = tuple[int, int, tuple[float, ...]]
@@ -37,7 +64,9 @@ class BridgeState(Struct, frozen=True, gc=False):
         counters: Frames sent so far of each outgoing message.
         due_ns: When each of them is sent next.
         counts: What has been counted.
-        told_saturated: How many saturated frames the last status knew of.
+        told: What the last status knew of it.
+        seen: What plausibility remembers of each strut's measurements.
+        strays: Of each incoming message, the frames that contradicted its counter.
     """
 
     rig: RigState
@@ -45,7 +74,9 @@ class BridgeState(Struct, frozen=True, gc=False):
     counters: tuple[int, ...]
     due_ns: tuple[int, ...]
     counts: Counts
-    told_saturated: int
+    told: Counts
+    seen: tuple[Seen | None, ...]
+    strays: tuple[Strays, ...]
 
 
 class TickResult(Struct, frozen=True, gc=False):
@@ -69,12 +100,19 @@ class Bridge:
         core: The arithmetic.
         incoming: Messages of the bench.
         outgoing: Messages of the bridge.
+        limits: What is done beyond which values.
     """
 
     def __init__(
-        self, core: RigCore, incoming: Sequence[Incoming], outgoing: Sequence[Outgoing]
+        self,
+        core: RigCore,
+        incoming: Sequence[Incoming],
+        outgoing: Sequence[Outgoing],
+        limits: Sequence[Limit] = (),
     ) -> None:
         self._core = core
+        self._measured_limits = tuple(item for item in limits if item.watched.is_measured)
+        self._limits = tuple(item for item in limits if not item.watched.is_measured)
         self._incoming = tuple(incoming)
         self._outgoing = tuple(outgoing)
         self._places = [[self._place(target) for target in item.targets] for item in incoming]
@@ -84,11 +122,14 @@ class Bridge:
             (item.message.arbitration_id, item.message.is_extended): index
             for index, item in enumerate(incoming)
         }
+        self._own = frozenset(
+            (item.message.arbitration_id, item.message.is_extended) for item in outgoing
+        )
 
     @property
     def heard(self) -> frozenset[tuple[int, bool]]:
-        """The (arbitration id, is extended) that the bridge listens to."""
-        return frozenset(self._index)
+        """The (arbitration id, is extended) that the bridge listens to, its own among them."""
+        return self._own.union(self._index)
 
     @property
     def core(self) -> RigCore:
@@ -110,7 +151,14 @@ class Bridge:
         count = len(self._outgoing)
         sequences = (INITIAL,) * len(self._incoming)
         return BridgeState(
-            self._core.init(t_ns), sequences, (0,) * count, (t_ns,) * count, Counts(), 0
+            self._core.init(t_ns),
+            sequences,
+            (0,) * count,
+            (t_ns,) * count,
+            Counts(),
+            Counts(),
+            (None,) * self._core.struts,
+            (Strays(),) * len(self._incoming),
         )
 
     def tick(
@@ -131,18 +179,10 @@ class Bridge:
         Returns:
             State after the tick, and what it did.
         """
-        counts, sequences = state.counts, list(state.sequences)
-        accepted: list[Accepted] = []
-        for frame in frames:
-            index = self._index.get((frame.arbitration_id, frame.is_extended))
-            if index is None or frame.is_error:
-                continue
-            sequence, verdict, values = _accepted(self._incoming[index], sequences[index], frame)
-            sequences[index] = sequence
-            if verdict is not _OK:
-                counts = _counted(counts, verdict, sequence)
-            if values:
-                accepted.append((index, frame.t_ns, values))
+        accepted, sequences, counts, strays = self._received(state, frames)
+        seen, action = state.seen, 0
+        if self._measured_limits and accepted:
+            accepted, seen, counts, action = self._plausible(seen, counts, accepted)
         rig, step_input = self.gathered(state.rig, t_ns, accepted, conditions.acknowledged)
         rig, output = self._core.step(rig, step_input)
         if conditions.overruns or output.mode is _HOLD:
@@ -150,8 +190,22 @@ class Bridge:
                 overruns=counts.overruns + conditions.overruns,
                 stale=counts.stale + (output.mode is _HOLD),
             )
+        if self._limits or action:
+            rig, output, action = self._limited(state.rig, rig, output, action)
+        if action or conditions.bus_fault:
+            counts = counts._replace(
+                limited=counts.limited + (action > 0),
+                bus_faulty=counts.bus_faulty + conditions.bus_fault,
+            )
         state = BridgeState(
-            rig, tuple(sequences), state.counters, state.due_ns, counts, state.told_saturated
+            rig,
+            sequences,
+            state.counters,
+            state.due_ns,
+            counts,
+            state.told,
+            seen,
+            strays,
         )
         if not output.struts:
             return state, TickResult([], step_input, output)
@@ -199,6 +253,86 @@ class Bridge:
         step_input = StepInput(t_ns, heights, given[struts], given[struts + 1])
         return self._core.step(rig, step_input)[0]
 
+    def _received(
+        self, state: BridgeState, frames: Sequence[Frame]
+    ) -> tuple[list[Accepted], tuple[SequenceState, ...], Counts, tuple[Strays, ...]]:
+        """What the frames of a tick are worth."""
+        counts, sequences, strays = state.counts, list(state.sequences), state.strays
+        accepted: list[Accepted] = []
+        for frame in frames:
+            index = self._index.get((frame.arbitration_id, frame.is_extended))
+            if index is None or frame.is_error:
+                counts = self._foreign(counts, frame)
+                continue
+            sequence, verdict, values = _accepted(self._incoming[index], sequences[index], frame)
+            sequences[index] = sequence
+            if verdict is not _OK:
+                counts = _counted(counts, verdict, sequence)
+                if verdict is Verdict.OUT_OF_SEQUENCE:
+                    strays, rival = self._stray(strays, index, frame.t_ns)
+                    counts = counts._replace(second_sender=counts.second_sender + rival)
+            if values:
+                accepted.append((index, frame.t_ns, values))
+        return accepted, tuple(sequences), counts, strays
+
+    def _foreign(self, counts: Counts, frame: Frame) -> Counts:
+        """Counts after a frame of no incoming message: error frames, or somebody under our ids."""
+        if frame.is_error or (frame.arbitration_id, frame.is_extended) not in self._own:
+            return counts
+        return counts._replace(second_sender=counts.second_sender + 1)
+
+    def _stray(
+        self, strays: tuple[Strays, ...], index: int, t_ns: int
+    ) -> tuple[tuple[Strays, ...], bool]:
+        """Strays after another one, and whether only a second sender explains them."""
+        cycle_ns = self._incoming[index].message.cycle_time_ns or 0
+        before = strays[index]
+        follows = t_ns - before.t_ns <= _RIVAL_CYCLES * cycle_ns
+        stray = Strays(before.frames + 1 if follows else 1, t_ns)
+        return (*strays[:index], stray, *strays[index + 1 :]), stray.frames >= RIVAL_FRAMES
+
+    def _plausible(
+        self, seen: tuple[Seen | None, ...], counts: Counts, accepted: list[Accepted]
+    ) -> tuple[list[Accepted], tuple[Seen | None, ...], Counts, int]:
+        """What is left of the accepted frames; a frame is used whole or not at all."""
+        left: list[Accepted] = []
+        gravest = 0
+        for item in accepted:
+            index, arrived_ns, values = item
+            after, action = list(seen), 0
+            for place, value in zip(self._places[index], values, strict=True):
+                if place < len(seen):
+                    measured = Measurement(value, arrived_ns)
+                    after[place], asked = judged(self._measured_limits, seen[place], measured)
+                    action = max(action, asked)
+            gravest = max(gravest, action)
+            if action >= Action.REFUSE:
+                refused, implausible = counts.refused + 1, counts.implausible + 1
+                counts = counts._replace(refused=refused, implausible=implausible)
+            else:
+                seen = tuple(after)
+                left.append(item)
+        return left, seen, counts, gravest
+
+    def _limited(
+        self, before: RigState, rig: RigState, output: StepOutput, action: int
+    ) -> tuple[RigState, StepOutput, int]:
+        """State, output and action of a tick, with the limits on its estimates seen to."""
+        if output.mode in (Mode.RUNNING, Mode.HOLD):
+            action = max([action, *[beyond(self._limits, strut) for strut in output.struts]])
+        event = EVENTS_BEYOND.get(Action(action)) if action else None
+        if event is None:
+            return rig, output, action
+        mode = next_mode(rig.mode, event)
+        if mode is Mode.SAFE and rig.mode is not Mode.SAFE:
+            rig = replace(rig, mode=mode, last_valid=before.last_valid)
+            rig, output = self._core.step(rig, StepInput(rig.t_ns, (None,) * self._core.struts))
+        elif mode is Mode.HOLD:
+            rig = replace(rig, mode=mode, last_valid=before.last_valid)
+            struts = tuple([replace(strut, valid=False) for strut in output.struts])
+            output = StepOutput(mode, struts)
+        return rig, output, action
+
     def _place(self, target: Target) -> int:
         if target.quantity is Quantity.HEIGHT:
             return target.strut
@@ -210,11 +344,11 @@ class Bridge:
         """Frames that are due; none before the first valid measurement."""
         frames: list[Frame] = []
         counters, due_ns = list(state.counters), list(state.due_ns)
-        counts, told = state.counts, state.told_saturated
+        counts, told = state.counts, state.told
         for index, item in enumerate(self._outgoing):
             if t_ns < due_ns[index]:
                 continue
-            report = Report(output, counts, conditions, counts.saturated > told)
+            report = Report(output, counts, told, conditions)
             payload, saturated = item.encode(item.values(report))
             if item.protection is None:
                 data = bytes(payload)
@@ -227,11 +361,19 @@ class Bridge:
             counters[index] += 1
             due_ns[index] = _next_due_ns(due_ns[index], t_ns, item.period_ns)
             if item.is_status:
-                told = counts.saturated
+                # A status that cannot be sent tells nobody.
+                told = told if conditions.bus_fault else counts
             elif saturated:
                 counts = counts._replace(saturated=counts.saturated + 1)
         return BridgeState(
-            state.rig, state.sequences, tuple(counters), tuple(due_ns), counts, told
+            state.rig,
+            state.sequences,
+            tuple(counters),
+            tuple(due_ns),
+            counts,
+            told,
+            state.seen,
+            state.strays,
         ), frames
 
 
@@ -260,7 +402,20 @@ def _accepted(
     return sequence, verdict, values
 
 
+_CAUSES = {
+    Verdict.WRONG_CRC: "wrong_crc",
+    Verdict.WRONG_LENGTH: "wrong_length",
+    Verdict.REPEATED: "repeated",
+    Verdict.OUT_OF_SEQUENCE: "out_of_sequence",
+    Verdict.MASQUERADE: "masquerade",
+}
+"""Verdict of a refused frame -> what counts it."""
+
+
 def _counted(counts: Counts, verdict: Verdict, sequence: SequenceState) -> Counts:
+    if verdict is Verdict.FIRST:
+        return counts._replace(started=counts.started + 1)
     if verdict.accepted:
         return counts._replace(lost=counts.lost + sequence.lost)
-    return counts._replace(refused=counts.refused + 1)
+    cause = _CAUSES[verdict]
+    return counts._replace(**{"refused": counts.refused + 1, cause: getattr(counts, cause) + 1})

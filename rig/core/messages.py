@@ -70,6 +70,17 @@ class Counts(NamedTuple):
         stale: Ticks without a fresh measurement.
         overruns: Ticks that were missed.
         saturated: Frames sent with a value at the limit of its range.
+        wrong_crc: Frames refused for their CRC.
+        wrong_length: Frames refused for their length.
+        repeated: Frames refused because their counter had come already.
+        out_of_sequence: Frames refused because their counter went backwards or jumped.
+        masquerade: Frames refused because they carry another message's CRC.
+        implausible: Frames refused for a height that cannot be.
+        started: Sequences of a counter that began, the first one of each message among them.
+        second_sender: Frames of somebody else under an id of the bridge, and frames that
+            persistently contradict the counter of the bench's.
+        limited: Ticks beyond a limit.
+        bus_faulty: Ticks with a fault of the bus.
     """
 
     lost: int = 0
@@ -77,6 +88,16 @@ class Counts(NamedTuple):
     stale: int = 0
     overruns: int = 0
     saturated: int = 0
+    wrong_crc: int = 0
+    wrong_length: int = 0
+    repeated: int = 0
+    out_of_sequence: int = 0
+    masquerade: int = 0
+    implausible: int = 0
+    started: int = 0
+    second_sender: int = 0
+    limited: int = 0
+    bus_faulty: int = 0
 
 
 class Conditions(NamedTuple):
@@ -101,14 +122,14 @@ class Report(Struct, frozen=True, gc=False):
     Attributes:
         output: What the core said.
         counts: What has been counted.
+        told: What the last status that was sent knew of them.
         conditions: What the loop knows.
-        saturated: A frame saturated since the last status.
     """
 
     output: StepOutput
     counts: Counts
+    told: Counts
     conditions: Conditions
-    saturated: bool
 
 
 @dataclass(frozen=True)
@@ -121,7 +142,7 @@ class Outgoing:
         values: What is sent, in the order of `encode`.
         period_ns: Time between two frames.
         protection: Counter and CRC; None for an unprotected message.
-        is_status: Whether it tells of saturation, and so clears the flag.
+        is_status: Whether it tells of what has happened since the last one of its kind.
     """
 
     message: Message
@@ -166,6 +187,7 @@ _STATUS = {
     "REFUSED_FRAMES": Dimension.NUMBER,
     "STALE_FRAMES": Dimension.NUMBER,
     "MEASUREMENT_FAULT": Dimension.NUMBER,
+    "LIMIT_FAULT": Dimension.NUMBER,
     "BUS_FAULT": Dimension.NUMBER,
     "LOG_FAULT": Dimension.NUMBER,
 }
@@ -214,17 +236,19 @@ def status(message: Message) -> Outgoing:
     limits = [float("inf") if value is None else value for value in most.values()]
 
     def values(report: Report) -> Sequence[float]:
-        counts, conditions = report.counts, report.conditions
+        counts, told = report.counts, report.told
+        second_sender = counts.second_sender > told.second_sender
         raw = (
             float(report.output.mode),
-            float(report.saturated),
+            float(counts.saturated > told.saturated),
             float(counts.overruns),
             float(counts.lost),
             float(counts.refused),
             float(counts.stale),
             float(report.output.mode is not Mode.RUNNING),
-            float(conditions.bus_fault),
-            float(conditions.log_fault),
+            float(counts.limited > told.limited),
+            float(counts.bus_faulty > told.bus_faulty or second_sender),
+            float(report.conditions.log_fault),
         )
         return [min(value, limit) for value, limit in zip(raw, limits, strict=True)]
 

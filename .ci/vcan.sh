@@ -1,0 +1,82 @@
+#!/bin/bash
+# Boots a kernel that has virtual CAN interfaces and runs the tests marked `vcan` in it.
+#
+#   .ci/vcan.sh [PYTEST_ARGUMENT...]
+#
+# Wants Debian, root, and in $PYTHON (default: python3) an interpreter that has the project with its
+# `test` extra. The kernel is emulated, with this machine's own files under it, read-only; Python and
+# the project go onto a disk image, because reading them file by file would take minutes.
+set -euo pipefail
+
+project=$(cd "$(dirname "$0")/.." && pwd)
+python=$(command -v "${PYTHON:-python3}")
+limit_s=${VCAN_LIMIT_S:-900}
+# Not under /tmp or /var: the booted kernel has file systems of its own there.
+work=$(mktemp -d /opt/rig-vcan.XXXXXX)
+trap 'rm -rf "$work"' EXIT
+
+install_needed() {
+    local packages=(qemu-system-x86 linux-image-amd64 can-utils kmod iproute2 busybox-static squashfs-tools)
+    if ! dpkg -s "${packages[@]}" >/dev/null 2>&1; then
+        timeout 600 apt-get update -qq
+        DEBIAN_FRONTEND=noninteractive timeout 900 \
+            apt-get install -y -qq --no-install-recommends "${packages[@]}" >"$work/apt.log" 2>&1 ||
+            { tail -n 30 "$work/apt.log"; exit 1; }
+    fi
+    if [ ! -x /opt/rig-vng/bin/vng ]; then
+        "$python" -m venv /opt/rig-vng
+        timeout 300 /opt/rig-vng/bin/pip install -q virtme-ng
+    fi
+    export PATH=/opt/rig-vng/bin:$PATH
+}
+
+# An image of every folder that Python reads from, mounted inside where the folder is here.
+build_images() {
+    local index=0 folder
+    : >"$work/folders"
+    while read -r folder; do
+        mksquashfs "$folder" "$work/$index.img" -noI -noD -noF -noX -no-xattrs -quiet -no-progress -wildcards \
+            -e .git .hypothesis share include "lib/python3.*/test" "... *.a" \
+            >"$work/image.log" 2>&1 || { cat "$work/image.log"; exit 1; }
+        echo "$index $folder" >>"$work/folders"
+        disks+=(--disk "$work/$index.img")
+        index=$((index + 1))
+    done < <("$python" -c '
+import sys
+print(*dict.fromkeys([sys.base_prefix, sys.prefix]), sep="\n")
+' | grep -vx /usr; echo "$project")
+}
+
+# What runs inside; its exit code comes back in a file, since the emulator has its own.
+write_guest_script() {
+    cat >"$work/guest.sh" <<GUEST
+set -e
+# The disks come in the order of the folders.
+modprobe -a virtio_scsi sd_mod squashfs
+for _ in \$(seq 50); do [ \$(ls /dev/sd? 2>/dev/null | wc -l) = \$(wc -l <"$work/folders") ] || sleep 0.2; done
+ls /dev/sd? >/tmp/disks
+paste -d ' ' /tmp/disks "$work/folders" >/tmp/mounts
+while read -r disk _ folder; do mount -t squashfs -o ro "\$disk" "\$folder"; done </tmp/mounts
+modprobe vcan
+modprobe can-gw
+cd "$project"
+export HOME=/tmp PYTHONDONTWRITEBYTECODE=1 NUMBA_CACHE_DIR=/tmp/numba MPLCONFIGDIR=/tmp
+set +e
+"$python" -m pytest -m vcan -n 0 -p no:cacheprovider $(printf '%q ' "$@") tests/vcan
+echo \$? >"$work/out/exit_code"
+GUEST
+}
+
+install_needed
+disks=()
+build_images
+mkdir "$work/out"
+write_guest_script "$@"
+kernel=$(ls -v /boot/vmlinuz-*-amd64 | tail -n 1)
+timeout -k 10 "$limit_s" vng --run "$kernel" --user root --cpus 2 --memory 3G --force-9p --disable-kvm \
+    "${disks[@]}" --rwdir "$work/out" --exec "bash $work/guest.sh" </dev/null || true
+if [ ! -s "$work/out/exit_code" ]; then
+    echo "vcan: the booted kernel did not finish within $limit_s s" >&2
+    exit 1
+fi
+exit "$(cat "$work/out/exit_code")"
