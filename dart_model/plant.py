@@ -155,9 +155,7 @@ class _Strut:
         """Force of spring, damper and effects; arguments as of `effects_n`."""
         force = self.stiffness * (self.free_length - height_m) - self.damping * velocity_m_per_s
         if self.laws:
-            force += self.effects_n(
-                height_m, velocity_m_per_s, memory, surroundings, memory_rates
-            )
+            force += self.effects_n(height_m, velocity_m_per_s, memory, surroundings, memory_rates)
         return force
 
     def effects_n(
@@ -405,9 +403,7 @@ class _Coordinates:
         skeleton.computeForwardDynamics()
         return np.array(skeleton.getAccelerations())
 
-    def _turning(
-        self, q: NDArray[np.float64], v: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _turning(self, q: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
         """Time derivative of the struts' rows."""
         h = 1e-6
         ahead, behind = self._rows_at(self.moved(q, v, h)), self._rows_at(self.moved(q, v, -h))
@@ -607,7 +603,9 @@ class DartPlant:
         self._skeleton.setPositions(q)
         heights = np.empty(len(self._directions))
         rows = np.empty((len(self._directions), self.coordinates))
-        for index, (strut, guide) in enumerate(zip(self.spec.struts, self._directions, strict=True)):
+        for index, (strut, guide) in enumerate(
+            zip(self.spec.struts, self._directions, strict=True)
+        ):
             gap, jacobian = _gap(strut, self._skeleton, self._bodies)
             direction = gap / max(float(np.linalg.norm(gap)), 1e-12) if guide is None else guide
             heights[index] = direction @ gap
@@ -753,9 +751,7 @@ def _stable_step_s(struts: Sequence[_Strut], lightest_kg: float) -> float:
         by_height = [
             strut.effects_n(rest + x, 0.0, memory, surroundings, unused) for x in heights.tolist()
         ]
-        by_speed = [
-            strut.effects_n(rest, v, memory, surroundings, unused) for v in speeds.tolist()
-        ]
+        by_speed = [strut.effects_n(rest, v, memory, surroundings, unused) for v in speeds.tolist()]
         stiffness = strut.stiffness + float(np.max(np.abs(np.diff(by_height) / np.diff(heights))))
         damping = strut.damping + float(np.max(np.abs(np.diff(by_speed) / np.diff(speeds))))
         fastest = max(fastest, damping / lightest_kg, math.sqrt(stiffness / lightest_kg))

@@ -24,7 +24,8 @@ from rig.config import InputError, load_setup
 from rig.core.types import Mode
 from rig.demo import CASES, Case, run_case
 from rig.io.bus import BusConfig, BusError
-from rig.runs import Ended, live, replay, run_bench
+from rig.replay import replay
+from rig.runs import Ended, live, run_bench
 
 OK, FAILED, WRONG_INPUT = 0, 1, 2
 _INPUT_ERRORS = (InputError, DatabaseError, BenchConfigError, BusError)

@@ -16,8 +16,9 @@ from rig.bench.schema import BenchConfig
 from rig.bench.trajectory import simulate
 from rig.config import CONFIGS, ObserverConfig, Setup, load_setup
 from rig.core.types import Mode
-from rig.io.run_log import read_run, step_table
-from rig.runs import Ended, replay, with_bench
+from rig.io.run_log import read_run
+from rig.replay import replay
+from rig.runs import Ended, with_bench
 
 SETTLED_NS = 500_000_000
 """Figures are taken after this time."""
@@ -146,10 +147,7 @@ def _compared(ended: Ended, ready: Setup, bench: BenchConfig) -> Case:
     }
     config = ready.config.model_copy(update={"observers": alone})
     observed = read_run(ended.folder).steps
-    defective = step_table(
-        replay(ended.folder, ready=ready.model_copy(update={"config": config})).steps,
-        observed.schema,
-    )
+    defective = replay(ended.folder, ready=ready.model_copy(update={"config": config})).steps
     t_ns = np.asarray(observed.column("t_ns").to_numpy(), dtype=np.int64)
     period_ns = ready.config.period_ns
     truth = simulate(bench, int(t_ns[-1]) + period_ns, period_ns)

@@ -16,7 +16,7 @@ from rig.config import Setup, SignalName
 from rig.core.messages import Quantity
 from rig.identify.records import Record, checked, read_csv
 from rig.io.run_log import RunFolder
-from rig.runs import setup_of_run
+from rig.replay import setup_of_run
 
 _Array = NDArray[np.float64]
 

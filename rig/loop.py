@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from can_dbc.frame import Frame
 from rig.core.bridge import Bridge, BridgeState, TickResult
 from rig.core.messages import Conditions
+from rig.core.types import Mode
 from rig.io.clock import Clock
 from rig.io.run_log import Step
 
@@ -42,6 +43,9 @@ class Port(Protocol):
 
 Sink = Callable[[Sequence[Frame], Sequence[Frame], TickResult, Step], None]
 """What a tick received and sent, what it did, and the record of it."""
+
+Progress = Callable[[int, Mode], None]
+"""Told the time and mode of a tick."""
 
 _BINS = 20_000
 """Histograms have bins of 1 µs; the last one takes all that is longer than 20 ms."""

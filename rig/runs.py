@@ -1,4 +1,4 @@
-"""A run of each kind, put together: on a bus, with a simulated bench, and again from its log."""
+"""A run, put together: on a bus, or with a simulated bench."""
 
 import contextlib
 import hashlib
@@ -11,13 +11,10 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.frame import Frame
-from dart_model.spec import FileSkeleton, dump_model, load_model
-from dart_model.yaml_file import InputError, validated
+from dart_model.spec import FileSkeleton, dump_model
+from dart_model.yaml_file import InputError
 from rig.bench.schema import BenchConfig
 from rig.bench.simulated import Bench
 from rig.config import RunConfig, Setup, build_bridge
@@ -28,15 +25,11 @@ from rig.io.bus import FRAMES_A_MS, Bus, BusConfig
 from rig.io.clock import Clock, RealClock, VirtualClock
 from rig.io.link import Link
 from rig.io.realtime import Granted, Request, realtime
-from rig.io.run_log import RUN_FILE, RunFolder, RunLog, Step, read_run, step_table
-from rig.loop import Port, Tick, Timing, regular_ticks, run
+from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE, RunLog, Step
+from rig.loop import Port, Progress, Timing, regular_ticks, run
 
-MODEL_FILE, DBC_FILE = "model.yaml", "bus.dbc"
 _PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "autosar-e2e")
 _NO_CONDITIONS = Conditions()
-
-Progress = Callable[[int, Mode], None]
-"""Called with the time and mode of every tick."""
 
 
 @dataclass(frozen=True)
@@ -422,119 +415,3 @@ def _request(config: RunConfig) -> Request:
 
 def _real_clock(config: RunConfig, granted: Granted) -> RealClock:
     return RealClock(round(config.realtime.spin_s * 1e9) if granted.fifo else 0)
-
-
-@dataclass(frozen=True)
-class Replayed:
-    """A run computed again from its log.
-
-    Attributes:
-        steps: Every step, as it would be logged.
-        logged: How many steps the log holds.
-        different: How many of them differ from the steps computed here in any bit.
-        first_different_ns: Time of the first that differs.
-        refused_frames: Frames refused in the replay.
-    """
-
-    steps: list[Step]
-    logged: int
-    different: int
-    first_different_ns: int | None
-    refused_frames: int
-
-
-def setup_of_run(folder: Path) -> tuple[RunFolder, Setup]:
-    """A logged run and the configuration it ran with.
-
-    Raises:
-        InputError: A file of the run is missing or damaged.
-        DatabaseError: Its DBC is.
-    """
-    found = read_run(folder)
-    config = validated(RunConfig, found.header.get("config"), f"{folder / RUN_FILE}: config")
-    model = load_model(folder / MODEL_FILE)
-    database = load_database(folder / DBC_FILE)
-    ready = Setup(config=config, source=folder / RUN_FILE, model=model, database=database)
-    return found, ready
-
-
-class _LogPort:
-    """Frames of a log, tick by tick. What the bridge sends goes nowhere."""
-
-    def __init__(
-        self, frames: Iterator[tuple[Frame, str]], conditions: dict[int, Conditions]
-    ) -> None:
-        self._received = (frame for frame, direction in frames if direction == "R")
-        self._next = next(self._received, None)
-        self._conditions = conditions
-
-    def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
-        frames: list[Frame] = []
-        while self._next is not None and self._next.t_ns <= t_ns:
-            frames.append(self._next)
-            self._next = next(self._received, None)
-        return frames, self._conditions.get(t_ns, _NO_CONDITIONS)
-
-    def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
-        return frames
-
-
-def replay(
-    folder: Path, *, ready: Setup | None = None, progress: Progress = lambda _t, _mode: None
-) -> Replayed:
-    """Compute a run again from its frames, and compare it with its steps.
-
-    Ticks whose steps a kill took are those of the rate, up to the last frame.
-
-    Args:
-        folder: Folder of the run.
-        ready: Another configuration to replay with, e.g. with a corrected model or other gains.
-        progress: Told of every tick.
-
-    Raises:
-        InputError: The run is damaged.
-    """
-    found, own = setup_of_run(folder)
-    ready = ready or own
-    bridge = build_bridge(ready)
-    times, overruns, flags = (
-        found.steps.column(name).to_pylist() if found.steps.num_rows else []
-        for name in ("t_ns", "overruns", "flags")
-    )
-    last_ns = max((frame.t_ns for frame, _ in found.frames()), default=-1)
-    ticks = [Tick(t, n) for t, n in zip(times, overruns, strict=True)]
-    next_ns = times[-1] + ready.config.period_ns if times else 0
-    lost = range(next_ns, last_ns + 1, ready.config.period_ns)
-    ticks += [Tick(t, 0) for t in lost]
-    conditions = {
-        t: Conditions(0, bool(flag & 1), bool(flag & 2), bool(flag & 4))
-        for t, flag in zip(times, flags, strict=True)
-        if flag
-    }
-    steps: list[Step] = []
-
-    def sink(
-        _received: Sequence[Frame], _sent: Sequence[Frame], result: TickResult, step: Step
-    ) -> None:
-        steps.append(step)
-        progress(step.t_ns, result.output.mode)
-
-    state = run(bridge, bridge.init(0), iter(ticks), _LogPort(found.frames(), conditions), sink)
-    different = _different(found, steps)
-    return Replayed(
-        steps,
-        len(times),
-        len(different),
-        steps[different[0]].t_ns if len(different) else None,
-        state.counts.refused,
-    )
-
-
-def _different(found: RunFolder, steps: list[Step]) -> NDArray[np.intp]:
-    """Indices of logged steps that are not the same bit for bit."""
-    again = step_table(steps[: found.steps.num_rows], found.steps.schema)
-    unequal = np.zeros(found.steps.num_rows, dtype=bool)
-    for name in found.steps.schema.names:
-        a, b = (table.column(name).to_numpy() for table in (found.steps, again))
-        unequal |= a.view(f"V{a.itemsize}") != b.view(f"V{b.itemsize}")
-    return np.flatnonzero(unequal)

@@ -77,9 +77,7 @@ class RigCore:
             return state, self._safe_output(state)
         return self._observe(state, state.model, step_input)
 
-    def _try_to_start(
-        self, state: RigState, step_input: StepInput
-    ) -> tuple[RigState, StepOutput]:
+    def _try_to_start(self, state: RigState, step_input: StepInput) -> tuple[RigState, StepOutput]:
         """Start the model at rest at the first measured heights, once every strut has one."""
         t_ns = step_input.t_ns
         first = tuple(

@@ -148,7 +148,11 @@ def _read_alike(
     """Read all lines of the first one's shape; says which they were."""
     first = lines[0].tobytes()
     shape = _LINE.fullmatch(first)
-    if shape is None or len(shape["data"]) % 2 or len(shape["data"]) > _MOST_DIGITS[shape["mark"][:2]]:
+    if (
+        shape is None
+        or len(shape["data"]) % 2
+        or len(shape["data"]) > _MOST_DIGITS[shape["mark"][:2]]
+    ):
         return np.zeros(len(lines), dtype=np.bool_)
     digits = [slice(*shape.span(name)) for name in ("s", "ns", "id", "data")]
     values = [_NIBBLES[lines[:, place]] for place in digits]

@@ -9,6 +9,7 @@ at most 10 ms after they came; steps are flushed in batches, and what a kill tak
 computed again from the frames.
 """
 
+import contextlib
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -28,10 +29,14 @@ FLUSH_NS = 190_000_000
 POLL_S = 0.01
 """How often the writing thread looks for what was handed over."""
 
+_TAIL_BYTES = 4096
+"""More than the longest line of `frames.log`."""
+
 _MOST_WAITING = 200_000
 """Ticks that may wait for a slow disk before they are dropped, and counted."""
 
 RUN_FILE, FRAMES_FILE, STEPS_FILE = "run.yaml", "frames.log", "steps.arrow"
+MODEL_FILE, DBC_FILE = "model.yaml", "bus.dbc"
 
 _pa = cast("Any", pa)
 
@@ -308,6 +313,25 @@ def read_run(folder: Path) -> RunFolder:
     if not isinstance(epoch_ns, int):
         raise InputError(f"{path}: epoch_ns: {epoch_ns!r}: expected an integer")
     return RunFolder(folder, header, _read_steps(folder / STEPS_FILE), epoch_ns)
+
+
+def last_frame_ns(folder: Path, epoch_ns: int) -> int:
+    """Time of the last whole line of a run's `frames.log`, -1 if there is none.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    path = folder / FRAMES_FILE
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
+            lines = file.read().split(b"\n")[:-1]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    for line in reversed(lines):
+        with contextlib.suppress(ValueError, IndexError):
+            return parse_frame(line.decode("ascii", "replace"), epoch_ns)[0].t_ns
+    return -1
 
 
 def _read_steps(path: Path) -> Any:
