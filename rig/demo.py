@@ -155,7 +155,7 @@ def _compared(ended: Ended, ready: Setup, bench: BenchConfig) -> Case:
     struts = tuple(
         StrutCase(
             name,
-            t_ns * 1e-9,
+            np.asarray(t_ns * 1e-9, dtype=np.float64),
             np.column_stack(
                 [
                     column[at, index]

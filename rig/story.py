@@ -77,9 +77,7 @@ def draw_effect(seed: int) -> tuple[str, Effect]:
     name = sorted(_RANGES)[int(random.integers(len(_RANGES)))]
     family, ranges = _RANGES[name]
     parameters = {key: float(random.uniform(low, high)) for key, (low, high) in ranges.items()}
-    return family, Effect.model_validate(
-        {"name": name, "strut": _STRUT, "parameters": parameters}
-    )
+    return family, Effect.model_validate({"name": name, "strut": _STRUT, "parameters": parameters})
 
 
 def tell(
