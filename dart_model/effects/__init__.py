@@ -59,6 +59,8 @@ _ALL = (
     stop.HERTZ_REBOUND_STOP,
     stop.POWER_BUMP_STOP,
     stop.POWER_REBOUND_STOP,
+    stop.END_STOPS,
+    stop.HERTZ_END_STOPS,
     backlash.BACKLASH,
     backlash.FREE_PLAY,
     friction.COULOMB_FRICTION,

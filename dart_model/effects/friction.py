@@ -124,7 +124,8 @@ def _lugre(
     level = 1.0 + (p[1] - 1.0) * math.exp(-ratio * ratio)
     speed = min(abs(velocity_m_per_s) / p[3], _FASTEST_SETTLING_PER_S)
     bending = (math.copysign(speed, velocity_m_per_s) - speed * state[0] / level) * p[3]
-    return -p[0] * state[0] - p[4] * bending
+    # The bristle's damping fades with speed, else it would act like a viscous damper.
+    return -p[0] * state[0] - p[4] * math.exp(-ratio * ratio) * bending
 
 
 def _lugre_rate(

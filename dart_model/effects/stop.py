@@ -106,6 +106,49 @@ def _power_rebound(
     return -max(p[1] * (depth / 0.01) ** p[2] * (1.0 + p[3] * velocity_m_per_s), 0.0)
 
 
+def _ends(
+    _t_s: float,
+    height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    low = p[0] - height_m
+    high = height_m - p[1]
+    force = 0.0
+    if low > 0.0:
+        force += max(p[2] * low - p[3] * velocity_m_per_s, 0.0)
+    if high > 0.0:
+        force -= max(p[2] * high + p[3] * velocity_m_per_s, 0.0)
+    return force
+
+
+def _hertz_ends(
+    _t_s: float,
+    height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    low = p[0] - height_m
+    high = height_m - p[1]
+    force = 0.0
+    if low > 0.0:
+        force += max(p[2] * low**1.5 * (1.0 - p[3] * velocity_m_per_s), 0.0)
+    if high > 0.0:
+        force -= max(p[2] * high**1.5 * (1.0 + p[3] * velocity_m_per_s), 0.0)
+    return force
+
+
+_LOW = Parameter("low_contact_height_m", "m", -10.0, 10.0, "height of the bump stop")
+_HIGH = Parameter("high_contact_height_m", "m", -10.0, 10.0, "height of the rebound stop")
+
 _LINEAR = (
     _CONTACT,
     Parameter("stiffness_n_per_m", "N/m", 10.0, 1e8, "stiffness in contact"),
@@ -181,4 +224,24 @@ POWER_REBOUND_STOP = Effect(
     excitation=_REBOUND,
     reference=_HUNT_CROSSLEY,
     scaled=(1,),
+)
+
+END_STOPS = Effect(
+    name="end_stops",
+    family=_FAMILY,
+    parameters=(_LOW, _HIGH, *_LINEAR[1:]),
+    force=_ends,
+    excitation="heights beyond both stops, several times",
+    reference=_KELVIN_VOIGT,
+    scaled=(2, 3),
+)
+
+HERTZ_END_STOPS = Effect(
+    name="hertz_end_stops",
+    family=_FAMILY,
+    parameters=(_LOW, _HIGH, *_HERTZ[1:]),
+    force=_hertz_ends,
+    excitation="heights beyond both stops, several times",
+    reference=_HUNT_CROSSLEY,
+    scaled=(2,),
 )

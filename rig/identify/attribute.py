@@ -28,12 +28,13 @@ Progress = Callable[[str, float], None]
 
 MOST_EFFECTS = 4
 WORKERS = 2
-_SIMULATED = 7
+_SIMULATED = 6
+_HOPELESS = 30.0
 _BLOCKS = 40
 _LEAST_GAIN = 0.004
 _LEAST_LIKELIHOOD_GAIN = 25.0
 _LEAST_T = 2.5
-_WHITE = 0.1
+_INDISTINCT = 10.0
 
 
 class Candidate(NamedTuple):
@@ -62,7 +63,6 @@ class Round(NamedTuple):
     Attributes:
         before: Fit without the new effect.
         candidates: Best first.
-        smoothed: Smoothed missing height of each run and strut.
     """
 
     before: Fit
@@ -77,14 +77,14 @@ class Attribution(NamedTuple):
         final: The model with all effects found.
         rounds: The competition.
         noise_m2: Noise variance of each height, shape (struts,).
-        ambiguous_with: Rivals that this run cannot tell from what was found.
+        motions: What each strut did.
     """
 
     base: Fit
     final: Fit
     rounds: tuple[Round, ...]
     noise_m2: Array
-    ambiguous_with: tuple[Candidate, ...]
+    motions: tuple[screen.Motion, ...]
 
 
 def first_fit(model: Model, grids: Sequence[Grid]) -> tuple[Fit, Array]:
@@ -96,9 +96,12 @@ def first_fit(model: Model, grids: Sequence[Grid]) -> tuple[Fit, Array]:
     nothing = planted(())
     starts: list[Array] = []
     for grid in grids:
-        heights, velocities = _first_motion(grid)
+        heights, velocities = first_motion(grid)
         starts.append(start_of(model, heights, velocities, 0))
-    runs = [_required(run(model, nothing, np.zeros(0), g, s)) for g, s in zip(grids, starts, strict=True)]
+    runs = [
+        _required(run(model, nothing, np.zeros(0), g, s))
+        for g, s in zip(grids, starts, strict=True)
+    ]
     noises = [_noise(g, r) for g, r in zip(grids, runs, strict=True)]
     noise = np.median(np.array(noises), axis=0)
     result = fit(model, nothing, np.zeros(0), starts, grids, noise, (), 8)
@@ -111,7 +114,8 @@ def _required(value: Trajectory | None) -> Trajectory:
     return value
 
 
-def _first_motion(grid: Grid) -> tuple[Array, Array]:
+def first_motion(grid: Grid) -> tuple[Array, Array]:
+    """Heights and velocities at a run's start, by a parabola through its first samples."""
     count = min(len(grid.t_s), max(20, int(0.05 / grid.step_s)))
     heights: list[float] = []
     velocities: list[float] = []
@@ -169,7 +173,9 @@ def attribute(model: Model, grids: Sequence[Grid], progress: Progress) -> Attrib
     base, noise = first_fit(model, grids)
     samples = sum(len(grid.t_s) for grid in grids)
     judge = Judge(model, tuple(grids), noise, max(1, round(samples / screen.MOST_SAMPLES)))
-    current, rounds = base, []
+    current = base
+    rounds: list[Round] = []
+    motions: tuple[screen.Motion, ...] = ()
     with ThreadPoolExecutor(WORKERS) as pool:
         for number in range(MOST_EFFECTS):
             progress(f"round {number + 1}: trying {len(CANDIDATES)} laws", 0.1 + 0.18 * number)
@@ -184,14 +190,12 @@ def attribute(model: Model, grids: Sequence[Grid], progress: Progress) -> Attrib
             current = _pruned(judge, current, motions)
             if at_floor(current):
                 break
-    return Attribution(base, current, tuple(rounds), noise, ())
+    return Attribution(base, current, tuple(rounds), noise, motions)
 
 
 def at_floor(result: Fit) -> bool:
     """Whether nothing is left but white noise."""
-    return all(
-        colour(column) < 0.01 for residual in result.residuals for column in residual.T
-    )
+    return all(colour(column) < 0.01 for residual in result.residuals for column in residual.T)
 
 
 def _round(
@@ -212,12 +216,33 @@ def _round(
     weight = judge.every / float(np.mean(judge.noise_m2))
     shared = screen.stage(model, pieces, chosen, weight)
     keys = [(strut, name) for strut in range(len(model.struts)) for name in CANDIDATES]
-    trials = [t for t in pool.map(lambda key: screen.try_law(shared, *key), keys) if t is not None]
-    trials.sort(key=lambda t: t.cost)
-    fits = list(pool.map(lambda t: _joint(judge, current, t, shared.motions), _finalists(trials)))
-    simulated = {(t.strut, t.name): f for t, f in zip(_finalists(trials), fits, strict=True)}
+    trials = _tried(shared, keys, pool)
+    finalists = _finalists(trials)
+    fits = list(pool.map(lambda t: _joint(judge, current, t, shared.motions), finalists))
+    simulated = {(t.strut, t.name): f for t, f in zip(finalists, fits, strict=True)}
     candidates = _ranked(trials, simulated)
     return Round(current, candidates), shared.motions
+
+
+def _tried(
+    shared: screen.Stage, keys: Sequence[tuple[int, str]], pool: ThreadPoolExecutor
+) -> list[screen.Trial]:
+    """Every law's best along the motion, best law first; hopeless ones are not polished."""
+    begun = [b for b in pool.map(lambda key: screen.begin(shared, *key), keys) if b]
+    if not begun:
+        return []
+    first = min(b[0].cost for b in begun)
+    hopeful = [trial for b in begun for trial in b[:2] if trial.cost < _HOPELESS * first]
+    roughly = list(pool.map(lambda t: screen.polish(shared, t, 3), hopeful))
+    second = min(t.cost for t in roughly)
+    kept = [t for t in roughly if t.cost < _HOPELESS * second]
+    fully = list(pool.map(lambda t: screen.polish(shared, t, 12), kept))
+    best: dict[tuple[int, str], screen.Trial] = {}
+    for trial in [*(b[0] for b in begun), *roughly, *fully]:
+        key = (trial.strut, trial.name)
+        if key not in best or trial.cost < best[key].cost:
+            best[key] = trial
+    return sorted(best.values(), key=lambda t: t.cost)
 
 
 def _finalists(trials: Sequence[screen.Trial]) -> list[screen.Trial]:
@@ -225,6 +250,8 @@ def _finalists(trials: Sequence[screen.Trial]) -> list[screen.Trial]:
     found: list[screen.Trial] = []
     families: dict[str, int] = {}
     for trial in trials:
+        if trial.cost > _HOPELESS * trials[0].cost:
+            break
         family = effect(trial.name).family
         if families.get(family, 0) < 2 and len(found) < _SIMULATED:
             families[family] = families.get(family, 0) + 1
@@ -238,7 +265,16 @@ def _joint(
     what = planted((*current.planted.effects, (trial.strut, trial.name)))
     values = np.concatenate([current.values, trial.values])
     return fit(
-        judge.model, what, values, current.starts, judge.grids, judge.noise_m2, motions, 10, False, 1e-3
+        judge.model,
+        what,
+        values,
+        current.starts,
+        judge.grids,
+        judge.noise_m2,
+        motions,
+        10,
+        False,
+        1e-3,
     )
 
 
@@ -250,9 +286,7 @@ def score(result: Fit, effective: float) -> float:
 
 def effective_samples(result: Fit) -> float:
     """How many independent samples a coloured residual is worth (first-order)."""
-    shares = [
-        colour(column) for residual in result.residuals for column in residual.T
-    ]
+    shares = [colour(column) for residual in result.residuals for column in residual.T]
     rho = float(np.clip(np.mean(shares), 0.0, 0.9999))
     return float(np.clip(result.count * (1.0 - rho) / (1.0 + rho), 60.0, result.count))
 
@@ -310,15 +344,75 @@ def _pruned(judge: Judge, current: Fit, motions: Sequence[screen.Motion]) -> Fit
     return current
 
 
-def without(
-    judge: Judge, current: Fit, row: int, motions: Sequence[screen.Motion]
-) -> Fit | None:
+def without(judge: Judge, current: Fit, row: int, motions: Sequence[screen.Motion]) -> Fit | None:
     """The fit without one effect, the others fitted again."""
     effects = tuple(e for i, e in enumerate(current.planted.effects) if i != row)
     index = current.planted.slots.index
     values = np.concatenate(
-        [current.values[slice(*index[i, 1:3])] for i in range(len(current.planted.effects)) if i != row]
+        [
+            current.values[slice(*index[i, 1:3])]
+            for i in range(len(current.planted.effects))
+            if i != row
+        ]
     )
     n = 2 * judge.model.coordinates
     starts = [start[:n] for start in current.starts]
-    return fit(judge.model, planted(effects), values, starts, judge.grids, judge.noise_m2, motions, 8, False, 1e-3)
+    return fit(
+        judge.model,
+        planted(effects),
+        values,
+        starts,
+        judge.grids,
+        judge.noise_m2,
+        motions,
+        8,
+        False,
+        1e-3,
+    )
+
+
+class Settled(NamedTuple):
+    """The last word.
+
+    Attributes:
+        final: The model with all effects found, fitted to the end.
+        rivals: Candidates of other families that do as well with as few parameters.
+        motions: What each strut did.
+    """
+
+    final: Fit
+    rivals: tuple[Candidate, ...]
+    motions: tuple[screen.Motion, ...]
+
+
+def settle(model: Model, grids: Sequence[Grid], found: Attribution) -> Settled:
+    """Fit what was found to the end, and list the rivals that cannot be told from it."""
+    final = found.final
+    if not final.planted.effects:
+        return Settled(final, (), found.motions)
+    last = fit(
+        model, final.planted, final.values, final.starts, grids, found.noise_m2, found.motions,
+        20, False, 1e-7,
+    )  # fmt: skip
+    final = last if last is not None and last.cost <= final.cost else final
+    return Settled(final, _rivals(found, final), found.motions)
+
+
+def _rivals(found: Attribution, final: Fit) -> tuple[Candidate, ...]:
+    """Rivals of the round in which the last effect was chosen."""
+    for this in found.rounds:
+        if not this.candidates:
+            continue
+        winner = this.candidates[0]
+        if winner.fit is None or winner.fit.planted.effects != final.planted.effects:
+            continue
+        family = effect(winner.name).family
+        return tuple(
+            c
+            for c in this.candidates[1:]
+            if c.fit is not None
+            and effect(c.name).family != family
+            and len(effect(c.name).parameters) <= len(effect(winner.name).parameters)
+            and c.score - winner.score < _INDISTINCT
+        )
+    return ()

@@ -30,9 +30,7 @@ _MATRIX: Any = types.Array(types.float64, 2, "C")
 _INDEX: Any = types.Array(types.int64, 2, "C")
 _F8: Any = types.float64
 _FORCE_SIGNATURE: Any = _F8(_F8, _F8, _F8, _F8, _F8, _VECTOR, _VECTOR, _VECTOR)
-_RATE_SIGNATURE: Any = types.void(
-    _F8, _F8, _F8, _F8, _F8, _VECTOR, _VECTOR, _VECTOR, _VECTOR
-)
+_RATE_SIGNATURE: Any = types.void(_F8, _F8, _F8, _F8, _F8, _VECTOR, _VECTOR, _VECTOR, _VECTOR)
 _FORCE: Any = types.FunctionType(_FORCE_SIGNATURE)
 _RATE: Any = types.FunctionType(_RATE_SIGNATURE)
 
@@ -115,65 +113,25 @@ def slots(effects: tuple[tuple[int, str], ...]) -> Slots:
     return Slots(tuple(laws), index, memory)
 
 
-def _derivative(  # noqa: PLR0915
-    f0: Any, r0: Any, f1: Any, r1: Any, f2: Any, r2: Any, f3: Any, r3: Any, f4: Any, r4: Any,
-    index: Integers, p: Array, struts: Array, rows: Array, offsets: Array,
-    inverse_mass: Array, constant: Array, applied_row: Array,
-    t: float, applied: float, temperature: float,
-    x: Array, dx: Array, z: Array, w: Array, force: Array, general: Array,
-) -> None:  # fmt: skip
-    n = rows.shape[1]
-    for i in range(rows.shape[0]):
-        height = offsets[i]
-        velocity = 0.0
-        for j in range(n):
-            height += rows[i, j] * x[j]
-            velocity += rows[i, j] * x[n + j]
-        z[i] = height
-        w[i] = velocity
-        force[i] = -struts[i, 1] * (height - struts[i, 0]) - struts[i, 2] * velocity
-    m = 2 * n
-    for k in range(5):
-        if index[k, 2] == index[k, 1]:
-            continue
-        s = index[k, 0]
-        own = p[index[k, 1] : index[k, 2]]
-        memory = x[m + index[k, 3] : m + index[k, 4]]
-        rate = dx[m + index[k, 3] : m + index[k, 4]]
-        strut = struts[s]
-        if k == 0:
-            force[s] += f0(t, z[s], w[s], applied, temperature, memory, own, strut)
-            r0(t, z[s], w[s], applied, temperature, memory, own, strut, rate)
-        elif k == 1:
-            force[s] += f1(t, z[s], w[s], applied, temperature, memory, own, strut)
-            r1(t, z[s], w[s], applied, temperature, memory, own, strut, rate)
-        elif k == 2:
-            force[s] += f2(t, z[s], w[s], applied, temperature, memory, own, strut)
-            r2(t, z[s], w[s], applied, temperature, memory, own, strut, rate)
-        elif k == 3:
-            force[s] += f3(t, z[s], w[s], applied, temperature, memory, own, strut)
-            r3(t, z[s], w[s], applied, temperature, memory, own, strut, rate)
-        else:
-            force[s] += f4(t, z[s], w[s], applied, temperature, memory, own, strut)
-            r4(t, z[s], w[s], applied, temperature, memory, own, strut, rate)
-    for j in range(n):
-        total = constant[j] + applied_row[j] * applied
-        for i in range(rows.shape[0]):
-            total += rows[i, j] * force[i]
-        general[j] = total
-    for j in range(n):
-        acceleration = 0.0
-        for i in range(n):
-            acceleration += inverse_mass[j, i] * general[i]
-        dx[j] = x[n + j]
-        dx[n + j] = acceleration
-
-
 _SLOT_TYPES = (_FORCE, _RATE) * SLOTS
 _MODEL_TYPES = (_INDEX, _VECTOR, _MATRIX, _MATRIX, _VECTOR, _MATRIX, _VECTOR, _VECTOR)
-_derivative_c = compile_loop(
-    _derivative,
-    types.void(*_SLOT_TYPES, *_MODEL_TYPES, _F8, _F8, _F8, *(_VECTOR,) * 6),
+
+
+def _slot_force(
+    force: Any, rate: Any, t: float, z: float, w: float, applied: float, temperature: float,
+    memory: Array, p: Array, strut: Array, out: Array,
+) -> float:  # fmt: skip
+    if p.shape[0] == 0:
+        return 0.0
+    if memory.shape[0] > 0:
+        rate(t, z, w, applied, temperature, memory, p, strut, out)
+    value: float = force(t, z, w, applied, temperature, memory, p, strut)
+    return value
+
+
+_slot_force_c = compile_loop(
+    _slot_force,
+    _F8(_FORCE, _RATE, _F8, _F8, _F8, _F8, _F8, _VECTOR, _VECTOR, _VECTOR, _VECTOR),
 )
 
 
@@ -187,68 +145,119 @@ def _simulate(
     n = rows.shape[1]
     struts_count = rows.shape[0]
     size = start.shape[0]
+    m = 2 * n
+    # One state and one rate are evaluated again and again, so that the views below stay valid.
     x = start.copy()
-    y = np.empty(size)
-    k1 = np.zeros(size)
-    k2 = np.zeros(size)
-    k3 = np.zeros(size)
-    k4 = np.zeros(size)
+    y = start.copy()
+    dy = np.zeros(size)
+    total = np.zeros(size)
     z = np.zeros(struts_count)
     w = np.zeros(struts_count)
     force = np.zeros(struts_count)
     general = np.zeros(n)
+    p0 = p[index[0, 1] : index[0, 2]]
+    p1 = p[index[1, 1] : index[1, 2]]
+    p2 = p[index[2, 1] : index[2, 2]]
+    p3 = p[index[3, 1] : index[3, 2]]
+    p4 = p[index[4, 1] : index[4, 2]]
+    s0 = y[m + index[0, 3] : m + index[0, 4]]
+    s1 = y[m + index[1, 3] : m + index[1, 4]]
+    s2 = y[m + index[2, 3] : m + index[2, 4]]
+    s3 = y[m + index[3, 3] : m + index[3, 4]]
+    s4 = y[m + index[4, 3] : m + index[4, 4]]
+    d0 = dy[m + index[0, 3] : m + index[0, 4]]
+    d1 = dy[m + index[1, 3] : m + index[1, 4]]
+    d2 = dy[m + index[2, 3] : m + index[2, 4]]
+    d3 = dy[m + index[3, 3] : m + index[3, 4]]
+    d4 = dy[m + index[4, 3] : m + index[4, 4]]
+    i0, i1, i2, i3, i4 = index[0, 0], index[1, 0], index[2, 0], index[3, 0], index[4, 0]
+    k0, k1, k2, k3, k4 = struts[i0], struts[i1], struts[i2], struts[i3], struts[i4]
+    count = 0
+    for row in range(5):
+        if index[row, 2] > index[row, 1]:
+            count = row + 1
     for k in range(t.shape[0]):
-        at = 2 * substeps * k
-        _derivative_c(
-            f0, r0, f1, r1, f2, r2, f3, r3, f4, r4, index, p, struts, rows, offsets,
-            inverse_mass, constant, applied_row, t[k], fine[at], temperature[k],
-            x, k1, z, w, force, general,
-        )  # fmt: skip
-        for i in range(struts_count):
-            heights[k, i] = z[i]
-            velocities[k, i] = w[i]
-            total = 0.0
-            for j in range(n):
-                total += rows[i, j] * k1[n + j]
-            accelerations[k, i] = total
+        last = k + 1 == t.shape[0]
+        h = 0.0
+        rise = 0.0
+        if not last:
+            h = (t[k + 1] - t[k]) / substeps
+            rise = (temperature[k + 1] - temperature[k]) / substeps
+        for step in range(substeps):
+            for stage in range(4):
+                # Classical Runge-Kutta: nodes 0, 1/2, 1/2, 1; weights 1, 2, 2, 1.
+                half = (stage + 1) // 2
+                if stage == 0:
+                    for i in range(size):
+                        y[i] = x[i]
+                else:
+                    reach = h if stage == 3 else 0.5 * h
+                    for i in range(size):
+                        y[i] = x[i] + reach * dy[i]
+                now = t[k] + (step + 0.5 * half) * h
+                warm = temperature[k] + (step + 0.5 * half) * rise
+                applied = fine[min(2 * (substeps * k + step) + half, fine.shape[0] - 1)]
+                for i in range(struts_count):
+                    height = offsets[i]
+                    velocity = 0.0
+                    for j in range(n):
+                        height += rows[i, j] * y[j]
+                        velocity += rows[i, j] * y[n + j]
+                    z[i] = height
+                    w[i] = velocity
+                    force[i] = -struts[i, 1] * (height - struts[i, 0]) - struts[i, 2] * velocity
+                if count > 0:
+                    force[i0] += _slot_force_c(
+                        f0, r0, now, z[i0], w[i0], applied, warm, s0, p0, k0, d0
+                    )
+                if count > 1:
+                    force[i1] += _slot_force_c(
+                        f1, r1, now, z[i1], w[i1], applied, warm, s1, p1, k1, d1
+                    )
+                if count > 2:
+                    force[i2] += _slot_force_c(
+                        f2, r2, now, z[i2], w[i2], applied, warm, s2, p2, k2, d2
+                    )
+                if count > 3:
+                    force[i3] += _slot_force_c(
+                        f3, r3, now, z[i3], w[i3], applied, warm, s3, p3, k3, d3
+                    )
+                if count > 4:
+                    force[i4] += _slot_force_c(
+                        f4, r4, now, z[i4], w[i4], applied, warm, s4, p4, k4, d4
+                    )
+                for j in range(n):
+                    sum_n = constant[j] + applied_row[j] * applied
+                    for i in range(struts_count):
+                        sum_n += rows[i, j] * force[i]
+                    general[j] = sum_n
+                for j in range(n):
+                    acceleration = 0.0
+                    for i in range(n):
+                        acceleration += inverse_mass[j, i] * general[i]
+                    dy[j] = y[n + j]
+                    dy[n + j] = acceleration
+                if stage == 0:
+                    if step == 0:
+                        for i in range(struts_count):
+                            heights[k, i] = z[i]
+                            velocities[k, i] = w[i]
+                            along_strut = 0.0
+                            for j in range(n):
+                                along_strut += rows[i, j] * dy[n + j]
+                            accelerations[k, i] = along_strut
+                        if last:
+                            return True
+                    for i in range(size):
+                        total[i] = dy[i]
+                elif stage == 3:
+                    for i in range(size):
+                        x[i] += h / 6.0 * (total[i] + dy[i])
+                else:
+                    for i in range(size):
+                        total[i] += 2.0 * dy[i]
         if not abs(x[0]) < 1e6:
             return False
-        if k + 1 == t.shape[0]:
-            break
-        h = (t[k + 1] - t[k]) / substeps
-        rise = (temperature[k + 1] - temperature[k]) / substeps
-        for step in range(substeps):
-            now = t[k] + step * h
-            warm = temperature[k] + step * rise
-            if step > 0:
-                _derivative_c(
-                    f0, r0, f1, r1, f2, r2, f3, r3, f4, r4, index, p, struts, rows, offsets,
-                    inverse_mass, constant, applied_row, now, fine[at + 2 * step], warm,
-                    x, k1, z, w, force, general,
-                )  # fmt: skip
-            for i in range(size):
-                y[i] = x[i] + 0.5 * h * k1[i]
-            _derivative_c(
-                f0, r0, f1, r1, f2, r2, f3, r3, f4, r4, index, p, struts, rows, offsets,
-                inverse_mass, constant, applied_row, now + 0.5 * h, fine[at + 2 * step + 1],
-                warm + 0.5 * rise, y, k2, z, w, force, general,
-            )  # fmt: skip
-            for i in range(size):
-                y[i] = x[i] + 0.5 * h * k2[i]
-            _derivative_c(
-                f0, r0, f1, r1, f2, r2, f3, r3, f4, r4, index, p, struts, rows, offsets,
-                inverse_mass, constant, applied_row, now + 0.5 * h, fine[at + 2 * step + 1],
-                warm + 0.5 * rise, y, k3, z, w, force, general,
-            )  # fmt: skip
-            for i in range(size):
-                y[i] = x[i] + h * k3[i]
-            _derivative_c(
-                f0, r0, f1, r1, f2, r2, f3, r3, f4, r4, index, p, struts, rows, offsets,
-                inverse_mass, constant, applied_row, now + h, fine[at + 2 * step + 2],
-                warm + rise, y, k4, z, w, force, general,
-            )  # fmt: skip
-            for i in range(size):
-                x[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
     return True
 
 
@@ -319,6 +328,19 @@ def _respond(
     transition: Array, early: Array, late: Array, output: Array, forces: Array, heights: Array
 ) -> None:
     size = transition.shape[0]
+    if size == 2 and output.shape[0] == 1 and forces.shape[1] == 1:
+        a00, a01, a10, a11 = transition[0, 0], transition[0, 1], transition[1, 0], transition[1, 1]
+        b0, b1, c0, c1 = early[0, 0], early[1, 0], late[0, 0], late[1, 0]
+        g0, g1 = output[0, 0], output[0, 1]
+        u = 0.0
+        v = 0.0
+        for k in range(forces.shape[0]):
+            heights[k, 0] = g0 * u + g1 * v
+            if k + 1 < forces.shape[0]:
+                f = forces[k, 0]
+                g = forces[k + 1, 0]
+                u, v = a00 * u + a01 * v + b0 * f + c0 * g, a10 * u + a11 * v + b1 * f + c1 * g
+        return
     x = np.zeros(size)
     y = np.zeros(size)
     for k in range(forces.shape[0]):

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.effects import effect
 from rig.identify.least_squares import Solution, Space, solve
 from rig.identify.reduced import Grid, Model, Planted, Trajectory, run
 from rig.identify.starts import Motion, space
@@ -38,8 +37,8 @@ class Fit(NamedTuple):
         residuals: Measured less simulated heights, NaN where not measured, (N, struts) each.
         solution: The fit itself, or None if nothing was fitted.
         cost: Sum of squares over the noise variances.
+        space: Where it was searched.
         count: Number of measured heights.
-        kept: Which search variables are parameters, shape (all variables,).
     """
 
     planted: Planted
@@ -174,14 +173,49 @@ def fit(
     done = motions_of(solution.values)
     if done is None:
         return None
-    residuals = tuple(
-        np.where(grid.measured[:, np.newaxis], grid.heights_m - r.heights_m, np.nan)
-        for grid, r in zip(grids, done, strict=True)
-    )
+    residuals = _residuals(grids, done)
     return Fit(
         what, p, tuple(begin), tuple(done), residuals, solution, partial,
         solution.cost, len(solution.residual),
     )  # fmt: skip
+
+
+def _residuals(grids: Sequence[Grid], done: Sequence[Trajectory]) -> tuple[Array, ...]:
+    return tuple(
+        np.where(grid.measured[:, np.newaxis], grid.heights_m - r.heights_m, np.nan)
+        for grid, r in zip(grids, done, strict=True)
+    )
+
+
+def with_solution(model: Model, result: Fit, grids: Sequence[Grid], values: Array) -> Fit | None:
+    """A fit of all parameters and starts, moved to other values of its search.
+
+    Args:
+        model: The bench.
+        result: A fit in which nothing was fixed.
+        grids: Its runs.
+        values: Parameters and starts in the order of `Fit.solution`.
+
+    Returns:
+        The same fit there, with its sensitivities as they were; None if the model runs away.
+    """
+    assert result.solution is not None
+    memory, _ = _fitted_memory(result.planted)
+    p, begin = _unpack(model, result.planted, grids, values, memory)
+    runs = [
+        run(model, result.planted, np.ascontiguousarray(p), grid, start)
+        for grid, start in zip(grids, begin, strict=True)
+    ]
+    done = [r for r in runs if r is not None]
+    if len(done) < len(runs):
+        return None
+    return result._replace(
+        values=p,
+        starts=tuple(begin),
+        trajectories=tuple(done),
+        residuals=_residuals(grids, done),
+        solution=result.solution._replace(values=values),
+    )
 
 
 def colour(residual: Array) -> float:

@@ -116,9 +116,7 @@ def _read_rows(name: str, columns: list[str], lines: object) -> Array:
         if not row:
             continue
         if len(row) != len(columns):
-            raise RecordError(
-                f"{name}: line {number}: {len(row)} values, expected {len(columns)}"
-            )
+            raise RecordError(f"{name}: line {number}: {len(row)} values, expected {len(columns)}")
         rows.append(row)
         if len(rows) > _LARGEST_SAMPLES:
             raise RecordError(f"{name}: more than {_LARGEST_SAMPLES} samples, expected fewer")

@@ -17,17 +17,16 @@ from scipy.linalg import expm
 
 from dart_model.effects import effect
 from rig.identify.compiled import along, law, respond
-from rig.identify.least_squares import Space, solve
+from rig.identify.least_squares import solve
 from rig.identify.reduced import Grid, Model, Trajectory
 from rig.identify.smoother import Smoothed
 from rig.identify.starts import Motion, space, starts
 
 Array = NDArray[np.float64]
 
-MOST_SAMPLES = 12_000
+MOST_SAMPLES = 8_000
 """Samples of all runs together that a trial looks at."""
 
-_POLISHED = 2
 _LONGEST_MEMORY_STEP_S = 1.0e-3
 _TONES = 4
 
@@ -340,7 +339,9 @@ def _tones(
             frequency = float(frequencies[peak])
             left[max(0, peak - 16) : peak + 17] = 0.0
             if all(abs(frequency - f) > 0.3 / (n * step) for f, _ in found):
-                found.append((frequency, _phase(segment, linear[longest], y, frequency, strut, model)))
+                found.append(
+                    (frequency, _phase(segment, linear[longest], y, frequency, strut, model))
+                )
     return found
 
 
@@ -363,8 +364,8 @@ def _phase(
     return float(np.arctan2(cosine, sine))
 
 
-def try_law(shared: Stage, strut: int, name: str) -> Trial | None:
-    """The best that a law does along the motion, or None where it cannot be seen.
+def begin(shared: Stage, strut: int, name: str) -> list[Trial]:
+    """A law at its starts, best first; empty where the run cannot show it.
 
     Args:
         shared: The round.
@@ -372,43 +373,44 @@ def try_law(shared: Stage, strut: int, name: str) -> Trial | None:
         name: Name of the effect.
     """
     motion = shared.motions[strut]
-    item = effect(name)
-    scaled = list(item.scaled)
-    basis, target = shared.basis, shared.target
-
-    def response(values: Array) -> Array:
-        h = _heights(shared.model, shared.segments, shared.linear, strut, name, values)
-        return h - basis @ (basis.T @ h)
-
-    begun: list[tuple[float, Array]] = []
+    scaled = list(effect(name).scaled)
+    begun: list[Trial] = []
     for start in starts(name, motion):
         values = np.array(start, dtype=np.float64)
         bounds = space(name, motion, values)
-        h = response(values)
+        values = np.clip(values, bounds.low, bounds.high)
+        h = _claimed(shared, strut, name, values)
         power = float(h @ h)
         if not np.isfinite(power) or power <= 0.0:
             continue
         if scaled:
-            size = float(h @ target) / power
-            values[scaled] *= size
-            values = np.clip(values, bounds.low, bounds.high)
-            h = response(values)
-        left = target - h
-        begun.append((float(left @ left), values))
-    if not begun:
-        return None
-    begun.sort(key=lambda item: item[0])
-    best: Trial | None = None
-    for _, values in begun[:_POLISHED]:
-        solution = solve(
-            lambda p: target - response(p), values, _space(name, motion, values), 12, 1e-3
-        )
-        if solution is None or not np.isfinite(solution.cost):
-            continue
-        if best is None or solution.cost * shared.weight < best.cost:
-            best = Trial(strut, name, solution.values, solution.cost * shared.weight)
-    return best
+            factor = float(h @ shared.target) / power
+            values[scaled] *= factor
+            inside = np.clip(values, bounds.low, bounds.high)
+            h = h * factor
+            if not np.array_equal(inside, values):
+                values = inside
+                h = _claimed(shared, strut, name, values)
+        left = shared.target - h
+        begun.append(Trial(strut, name, values, float(left @ left) * shared.weight))
+    return sorted(begun, key=lambda trial: trial.cost)
 
 
-def _space(name: str, motion: Motion, values: Array) -> Space:
-    return space(name, motion, values)
+def polish(shared: Stage, trial: Trial, iterations: int) -> Trial:
+    """The best that a law does along the motion, from a start on."""
+    bounds = space(trial.name, shared.motions[trial.strut], trial.values)
+    solution = solve(
+        lambda p: shared.target - _claimed(shared, trial.strut, trial.name, p),
+        trial.values,
+        bounds,
+        iterations,
+        1e-3,
+    )
+    if solution is None or not np.isfinite(solution.cost):
+        return trial
+    return Trial(trial.strut, trial.name, solution.values, solution.cost * shared.weight)
+
+
+def _claimed(shared: Stage, strut: int, name: str, values: Array) -> Array:
+    h = _heights(shared.model, shared.segments, shared.linear, strut, name, values)
+    return h - shared.basis @ (shared.basis.T @ h)

@@ -219,12 +219,14 @@ def estimate_noise(t_s: Array, y: Array) -> Noise:
 
     # The smoother's time constant is about (1 / ratio) ** (1 / 7): from two steps to the whole run.
     slowest, fastest = float(t_s[-1] - t_s[0]), 1.0 * step
-    low, high = -8.0 * np.log(slowest) , -7.0 * np.log(fastest) - np.log(step)
+    low, high = -8.0 * np.log(slowest), -7.0 * np.log(fastest) - np.log(step)
     grid = np.linspace(low, high, 25)
     values = [deviance(x) for x in grid]
     best = int(np.argmin(values))
     left, right = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-    found: Any = minimize_scalar(deviance, bounds=(left, right), method="bounded", options={"xatol": 0.02})
+    found: Any = minimize_scalar(
+        deviance, bounds=(left, right), method="bounded", options={"xatol": 0.02}
+    )
     log_ratio = float(found.x)
     squares, _, count = sums(log_ratio)
     return Noise(squares / count, float(np.exp(log_ratio)))

@@ -75,11 +75,11 @@ def _grid(*axes: Sequence[float]) -> list[Start]:
 
 
 def _bump(m: Motion) -> list[Start]:
-    return _grid(m.heights(0.03, 0.07, 0.12, 0.18, 0.26, 0.36), [1.0], [0.0, 0.01])
+    return _grid(m.heights(0.03, 0.07, 0.12, 0.18, 0.26, 0.36), [1.0], [0.002, 0.02])
 
 
 def _rebound(m: Motion) -> list[Start]:
-    return _grid(m.heights(0.97, 0.93, 0.88, 0.82, 0.74, 0.64), [1.0], [0.0, 0.01])
+    return _grid(m.heights(0.97, 0.93, 0.88, 0.82, 0.74, 0.64), [1.0], [0.002, 0.02])
 
 
 def _hertz_bump(m: Motion) -> list[Start]:
@@ -88,6 +88,17 @@ def _hertz_bump(m: Motion) -> list[Start]:
 
 def _hertz_rebound(m: Motion) -> list[Start]:
     return _grid(m.heights(0.96, 0.9, 0.84, 0.76, 0.64), [1.0], [0.05, 0.3])
+
+
+def _ends(m: Motion) -> list[Start]:
+    return [
+        (low, high, 1.0, 0.005)
+        for low, high in zip(m.heights(0.04, 0.1, 0.18), m.heights(0.96, 0.9, 0.82), strict=True)
+    ]
+
+
+def _hertz_ends(m: Motion) -> list[Start]:
+    return [(low, high, k, 0.2) for low, high, k, _ in _ends(m)]
 
 
 def _power_bump(m: Motion) -> list[Start]:
@@ -101,10 +112,6 @@ def _power_rebound(m: Motion) -> list[Start]:
 def _gas(m: Motion) -> list[Start]:
     deepest = max(m.free_length_m - m.low, 0.25 * m.stroke)
     return _grid([1.0], [deepest * share for share in (1.15, 1.5, 2.0, 4.0)], [1.0, 1.4])
-
-
-def _gas_with_offset(m: Motion) -> list[Start]:
-    return _gas(m)
 
 
 def _backlash(m: Motion) -> list[Start]:
@@ -126,7 +133,9 @@ def _stribeck(m: Motion) -> list[Start]:
 
 
 def _lugre(m: Motion) -> list[Start]:
-    return _grid([1.0], [1.3], [0.02, 0.1 * m.speed, 0.3 * m.speed], _bristles(m)[:2], [0.0])
+    bristles = _bristles(m)[:2]
+    speeds = [0.02, 0.2 * m.speed]
+    return [(1.0, 1.2, speed, bristle, 0.002 / bristle) for speed in speeds for bristle in bristles]
 
 
 def _temperature(m: Motion) -> list[Start]:
@@ -195,13 +204,14 @@ _STARTS: Mapping[str, Callable[[Motion], list[Start]]] = MappingProxyType(
         "exponential_stiffness": lambda m: _grid([1.0], [m.stroke * s for s in (0.1, 0.25, 0.6)]),
         "gas_spring": _gas,
         "balanced_gas_spring": _gas,
-        "offset_gas_spring": lambda m: [(*s, 0.0) for s in _gas(m)],
         "bump_stop": _bump,
         "rebound_stop": _rebound,
         "hertz_bump_stop": _hertz_bump,
         "hertz_rebound_stop": _hertz_rebound,
         "power_bump_stop": _power_bump,
         "power_rebound_stop": _power_rebound,
+        "end_stops": _ends,
+        "hertz_end_stops": _hertz_ends,
         "backlash": _backlash,
         "free_play": _free_play,
         "coulomb_friction": lambda m: _grid([1.0], [1e-3, 0.02 * m.speed, 0.1 * m.speed]),
@@ -273,6 +283,10 @@ def space(name: str, motion: Motion, values: Array) -> Space:
 
 
 def _narrower(name: str, key: str, m: Motion) -> tuple[float, float] | None:
+    if key == "low_contact_height_m":
+        return m.low - 0.02 * m.stroke, m.low + 0.3 * m.stroke
+    if key == "high_contact_height_m":
+        return m.high - 0.3 * m.stroke, m.high + 0.02 * m.stroke
     if key in ("contact_height_m", "zone_height_m"):
         return m.low - 0.02 * m.stroke, m.high + 0.02 * m.stroke + max(
             0.0, m.free_length_m - m.high if key == "zone_height_m" else 0.0
@@ -280,7 +294,8 @@ def _narrower(name: str, key: str, m: Motion) -> tuple[float, float] | None:
     if key == "centre_height_m":
         return m.low - m.stroke, m.high + m.stroke
     if key == "gap_m":
-        return 1e-5, 1.5 * m.stroke
+        # Play that takes most of the stroke is a pair of stops.
+        return 1e-5, 0.6 * m.stroke
     if key == "rounding_velocity_m_per_s":
         return 1e-4, max(2e-4, 0.12 * m.speed)
     if key == "presliding_m":

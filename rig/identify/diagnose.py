@@ -1,0 +1,429 @@
+"""From records to a diagnosis."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dart_model.effects import effect
+from dart_model.spec import ModelSpec
+from rig.identify.attribute import Attribution, Candidate, Progress, Settled, attribute, settle
+from rig.identify.correct import corrected_model, fitted_on_dart
+from rig.identify.diagnosis import (
+    BeforeAfter,
+    Diagnosis,
+    Estimate,
+    FoundEffect,
+    HeldOut,
+    NoiseFloor,
+    RejectedEffect,
+    RunFigures,
+    Verdict,
+    White,
+)
+from rig.identify.evaluate import (
+    RunResult,
+    evaluate_run,
+    missing_force,
+    rms,
+    smoothed_motion,
+    strut_forces,
+)
+from rig.identify.output_error import Fit, colour, intervals
+from rig.identify.records import Record, RecordError
+from rig.identify.reduced import Grid, Model, grid_of, planted, reduced_model
+from rig.identify.report import FittedSeries, HeldOutSeries, Ranked
+
+Array = NDArray[np.float64]
+
+_KEPT_BACK = 0.2
+_LONGEST_DURATION_S = 600.0
+
+
+class Result(NamedTuple):
+    """All that a diagnosis gives.
+
+    Attributes:
+        diagnosis: What was found.
+        corrected: The corrected model.
+        fitted: Missing force along the runs that were learnt from, for the report.
+        held_out: Heights along the held-out runs, for the report.
+        ranking: Candidates, best first, for the report.
+        assumptions: What this diagnosis took for granted.
+    """
+
+    diagnosis: Diagnosis
+    corrected: ModelSpec
+    fitted: tuple[FittedSeries, ...]
+    held_out: tuple[HeldOutSeries, ...]
+    ranking: tuple[Ranked, ...]
+    assumptions: tuple[str, ...]
+
+
+def _quiet(_what: str, _share: float) -> None:
+    return
+
+
+def diagnose(
+    spec: ModelSpec,
+    runs: Sequence[Record],
+    held_out: Sequence[Record] = (),
+    progress: Progress = _quiet,
+) -> Result:
+    """Trace what a model lacks to named effects, correct it, and judge the correction.
+
+    Args:
+        spec: The model.
+        runs: Runs to learn from.
+        held_out: Runs to judge on; if there are none, the last fifth of the last run is kept back.
+        progress: Told what is being done and the share that is done.
+
+    Raises:
+        RecordError: A record or the model cannot be used; one line says why.
+    """
+    if not runs:
+        raise RecordError("no run given, expected at least one")
+    model = reduced_model(spec)
+    for record in (*runs, *held_out):
+        _check_fits(record, model)
+    progress("reading runs", 0.02)
+    grids = [grid_of(record) for record in runs]
+    judged = [(grid_of(record), record.strut_force_n) for record in held_out]
+    source = "runs"
+    if not judged:
+        grids, kept_back = _kept_back(grids)
+        judged = [(kept_back, None)]
+        source = "end of the run"
+    _check_excitation(model, grids)
+    found = attribute(model, grids, progress)
+    progress("comparing rivals", 0.8)
+    settled = settle(model, grids, found)
+    progress("fitting on DART", 0.85)
+    final, _ = fitted_on_dart(model, settled.final, grids, found.noise_m2)
+    settled = settled._replace(final=final)
+    progress("judging on held-out data", 0.92)
+    result = _written_up(spec, model, grids, judged, source, found, settled, runs)
+    progress("done", 1.0)
+    return result
+
+
+def _check_fits(record: Record, model: Model) -> None:
+    struts = model.rows.shape[0]
+    if record.heights_m.shape[1] != struts:
+        raise RecordError(
+            f"{record.name}: {record.heights_m.shape[1]} heights, model {model.spec.name} has "
+            f"{struts} struts, expected one height for each"
+        )
+    if record.applied_force_n is None:
+        raise RecordError(
+            f"{record.name}: no applied_force_n, expected one: with strut_force_n alone the motion "
+            "is imposed and says nothing of the model's own motion"
+        )
+    if record.duration_s > _LONGEST_DURATION_S:
+        raise RecordError(
+            f"{record.name}: {record.duration_s:.0f} s long, "
+            f"expected at most {_LONGEST_DURATION_S:.0f} s: cut it"
+        )
+
+
+def _kept_back(grids: Sequence[Grid]) -> tuple[list[Grid], Grid]:
+    last = grids[-1]
+    cut = int(len(last.t_s) * (1.0 - _KEPT_BACK))
+    kept = last.rows(cut, len(last.t_s))._replace(name=f"{last.name} (last fifth)")
+    return [*grids[:-1], last.rows(0, cut)], kept
+
+
+def _check_excitation(model: Model, grids: Sequence[Grid]) -> None:
+    """Refuse columns that cannot be what their names say."""
+    for grid in grids:
+        swing = float(np.nanmax(grid.heights_m) - np.nanmin(grid.heights_m))
+        steps = np.diff(grid.heights_m[:, 0])
+        noise = float(np.nanstd(steps)) / np.sqrt(2.0)
+        if float(np.nanstd(grid.heights_m)) < 3.0 * noise:
+            raise RecordError(
+                f"{grid.name}: height_m moves by {swing:.3g} m, no more than its own noise: "
+                "expected a stronger excitation"
+            )
+    del model
+
+
+def _written_up(
+    spec: ModelSpec,
+    model: Model,
+    grids: Sequence[Grid],
+    judged: Sequence[tuple[Grid, Array | None]],
+    source: str,
+    found: Attribution,
+    settled: Settled,
+    runs: Sequence[Record],
+) -> Result:
+    final, motions = settled.final, settled.motions
+    results: list[tuple[RunResult, Array | None]] = []
+    for grid, cell in judged:
+        guess = _guess(model, grid)
+        there = evaluate_run(model, final, grid, guess, found.noise_m2, motions)
+        if there is None:
+            raise RecordError(
+                f"{grid.name}: the model runs away on this run, expected one that stays near the "
+                "motion it was learnt from"
+            )
+        results.append((there, cell))
+    fitted, forces, missing = _fitted_series(model, grids, found, final)
+    effects = _effects(model, final, grids, forces, missing)
+    white = White(
+        all(colour(c) < 0.1 for r in found.base.residuals for c in r.T),
+        all(colour(c) < 0.1 for r in final.residuals for c in r.T),
+    )
+    floor = NoiseFloor(
+        float(np.sqrt(np.mean(found.noise_m2))),
+        rms(np.concatenate([s.residual_std_n for s in fitted])),
+    )
+    verdict = _verdict(found, settled)
+    families = tuple(dict.fromkeys(effect(c.name).family for c in settled.rivals))
+    diagnosis = Diagnosis(
+        verdict,
+        effects,
+        _rejected(model, found, settled),
+        families if verdict == "ambiguous" else (),
+        _suggestion(settled) if verdict == "ambiguous" else None,
+        _held_out(results, source),
+        floor,
+        white,
+        _sentence(verdict, effects, families),
+        tuple(record.name for record in runs),
+        spec.name,
+    )
+    return Result(
+        diagnosis,
+        corrected_model(model, final),
+        fitted,
+        tuple(_held_out_series(model, there) for there, _ in results for _ in (0,)),
+        _ranking(model, found, settled),
+        _assumptions(source),
+    )
+
+
+def _guess(model: Model, grid: Grid) -> Array:
+    from rig.identify.attribute import first_motion
+    from rig.identify.reduced import start_of
+
+    heights, velocities = first_motion(grid)
+    return start_of(model, heights, velocities, 0)
+
+
+def _fitted_series(
+    model: Model, grids: Sequence[Grid], found: Attribution, final: Fit
+) -> tuple[tuple[FittedSeries, ...], list[list[Array]], list[Array]]:
+    series: list[FittedSeries] = []
+    forces: list[list[Array]] = []
+    left: list[Array] = []
+    for k, grid in enumerate(grids):
+        wide = smoothed_motion(grid, found.base.trajectories[k], None)
+        nothing, none = planted(()), np.zeros(0)
+        before = missing_force(model, nothing, none, found.base.starts[k], grid, wide)
+        after = before
+        if final.planted.effects:
+            motion = smoothed_motion(grid, final.trajectories[k], None)
+            after = missing_force(model, final.planted, final.values, final.starts[k], grid, motion)
+            forces.append(
+                strut_forces(model, final.planted, final.values, final.starts[k], grid, motion)[1]
+            )
+        left.append(after.force_n)
+        for i, strut in enumerate(model.spec.struts):
+            series.append(
+                FittedSeries(
+                    grid.name,
+                    strut.name,
+                    grid.t_s,
+                    wide.heights_m[:, i],
+                    wide.velocities_m_per_s[:, i],
+                    before.force_n[:, i],
+                    after.force_n[:, i],
+                    before.deviation_n[:, i],
+                )  # fmt: skip
+            )
+    return tuple(series), forces, left
+
+
+def _effects(
+    model: Model,
+    final: Fit,
+    grids: Sequence[Grid],
+    forces: Sequence[Sequence[Array]],
+    missing: Sequence[Array],
+) -> tuple[FoundEffect, ...]:
+    if not final.planted.effects:
+        return ()
+    _, low, high = intervals(final, grids)
+    listed: list[FoundEffect] = []
+    for row, (strut, name) in enumerate(final.planted.effects):
+        item = effect(name)
+        force = np.concatenate([parts[row] for parts in forces])
+        left = np.concatenate([m[:, strut] for m in missing])
+        with_it, without_it = float(np.mean(left**2)), float(np.mean((left + force) ** 2))
+        first = int(final.planted.slots.index[row, 1])
+        estimates = {
+            parameter.name: Estimate(
+                float(final.values[first + i]), float(low[first + i]), float(high[first + i])
+            )
+            for i, parameter in enumerate(item.parameters)
+        }
+        listed.append(
+            FoundEffect(
+                item.family,
+                name,
+                model.spec.struts[strut].name,
+                float(np.clip(1.0 - with_it / max(without_it, 1e-300), 0.0, 1.0)),
+                estimates,
+                rms(force),
+            )
+        )
+    return tuple(sorted(listed, key=lambda e: -e.force_rms_n))
+
+
+def _verdict(found: Attribution, settled: Settled) -> Verdict:
+    final = settled.final
+    left = max(colour(c) for r in final.residuals for c in r.T)
+    if not final.planted.effects:
+        return "nothing_missing" if left < 0.1 else "not_explained"
+    gain = 1.0 - float(np.sqrt(final.mean_square / found.base.mean_square))
+    if left < 0.2:
+        return "ambiguous" if settled.rivals else "explained"
+    return "partly_explained" if gain > 0.7 else "not_explained"
+
+
+def _rejected(model: Model, found: Attribution, settled: Settled) -> tuple[RejectedEffect, ...]:
+    chosen = set(settled.final.planted.effects)
+    listed: dict[tuple[int, str], RejectedEffect] = {}
+    for this in found.rounds:
+        best = this.candidates[0] if this.candidates else None
+        for candidate in this.candidates:
+            key = (candidate.strut, candidate.name)
+            if key in chosen or key in listed:
+                continue
+            listed[key] = RejectedEffect(
+                effect(candidate.name).family,
+                candidate.name,
+                _why(this.before, best, candidate),
+                model.spec.struts[candidate.strut].name,
+            )
+    return tuple(listed.values())
+
+
+def _why(before: Fit, best: Candidate | None, candidate: Candidate) -> str:
+    assert best is not None
+    if candidate.fit is None:
+        tried = float(np.sqrt(candidate.tried / max(best.tried, 1e-300)))
+        return f"along the motion it leaves {tried:.3g} times as much as {best.name}"
+    if candidate is best:
+        share = 1.0 - candidate.fit.cost / before.cost
+        return f"lowers the open-loop error by {100.0 * share:.2g} %, no more than chance would"
+    ratio = float(np.sqrt(candidate.fit.cost / best.fit.cost)) if best.fit else 1.0
+    if ratio < 1.01:
+        return f"no better than {best.name}, which needs no more parameters"
+    return f"leaves {ratio:.3g} times the open-loop height error of {best.name}"
+
+
+def _ranking(model: Model, found: Attribution, settled: Settled) -> tuple[Ranked, ...]:
+    if not found.rounds:
+        return ()
+    chosen = set(settled.final.planted.effects)
+    first = found.rounds[0]
+    best = first.candidates[0] if first.candidates else None
+    ranked: list[Ranked] = []
+    for candidate in first.candidates:
+        share = None
+        if candidate.fit is not None:
+            share = float(np.clip(1.0 - candidate.fit.cost / first.before.cost, 0.0, 1.0))
+        why = ""
+        if (candidate.strut, candidate.name) not in chosen:
+            why = _why(first.before, best, candidate)
+        ranked.append(
+            Ranked(
+                candidate.name,
+                effect(candidate.name).family,
+                model.spec.struts[candidate.strut].name,
+                share,
+                why,
+            )
+        )
+    return tuple(ranked)
+
+
+def _held_out(results: Sequence[tuple[RunResult, Array | None]], source: str) -> HeldOut:
+    runs: list[RunFigures] = []
+    for there, cell in results:
+        measured = there.grid.heights_m
+        strut = None
+        if cell is not None and len(cell) == len(there.grid.t_s) and measured.shape[1] == 1:
+            strut = BeforeAfter(
+                rms(cell - there.strut_before_n[:, 0]), rms(cell - there.strut_after_n[:, 0])
+            )
+        runs.append(
+            RunFigures(
+                there.grid.name,
+                BeforeAfter(rms(measured - there.before_m), rms(measured - there.after_m)),
+                BeforeAfter(rms(there.missing_before.force_n), rms(there.missing_after.force_n)),
+                strut,
+            )
+        )
+    return HeldOut(
+        _mean([r.height_rmse_m for r in runs]),
+        _mean([r.residual_force_rmse_n for r in runs]),
+        _mean([r.strut_force_rmse_n for r in runs if r.strut_force_rmse_n])
+        if any(r.strut_force_rmse_n for r in runs)
+        else None,
+        tuple(runs),
+        source,
+    )
+
+
+def _mean(values: Sequence[BeforeAfter | None]) -> BeforeAfter:
+    there = [v for v in values if v is not None]
+    return BeforeAfter(
+        float(np.sqrt(np.mean([v.before**2 for v in there]))),
+        float(np.sqrt(np.mean([v.after**2 for v in there]))),
+    )
+
+
+def _held_out_series(model: Model, there: RunResult) -> HeldOutSeries:
+    return HeldOutSeries(
+        there.grid.name, model.spec.struts[0].name, there.grid.t_s, there.grid.heights_m[:, 0],
+        there.before_m[:, 0], there.after_m[:, 0],
+    )  # fmt: skip
+
+
+def _suggestion(settled: Settled) -> str:
+    names = [name for _, name in settled.final.planted.effects]
+    names += [c.name for c in settled.rivals]
+    wanted = dict.fromkeys(effect(name).excitation for name in names)
+    return "a run with " + "; and ".join(wanted)
+
+
+def _sentence(verdict: Verdict, effects: Sequence[FoundEffect], families: Sequence[str]) -> str:
+    if verdict == "nothing_missing":
+        return "The model lacks nothing that this run can show."
+    if not effects:
+        return "The model lacks a force, and no law of the catalogue explains it."
+    named = " and ".join(
+        f"{e.name.replace('_', ' ')} ({', '.join(f'{k} = {v.value:.4g}' for k, v in list(e.parameters.items())[:3])})"
+        for e in effects
+    )
+    if verdict == "explained":
+        return f"The model lacks {named}."
+    if verdict == "ambiguous":
+        return f"The model lacks {named}, or {' or '.join(families)}: this run cannot tell."
+    if verdict == "partly_explained":
+        return f"The model lacks {named}, and something more that no law explains."
+    return f"The model lacks a force that no law explains; the nearest is {named}."
+
+
+def _assumptions(source: str) -> tuple[str, ...]:
+    said = [
+        "Between samples the applied force is a cubic spline; between nodes DART takes it as linear.",
+        "The initial state of every run is fitted, for both models.",
+    ]
+    if source != "runs":
+        said.append("No run was held out: the last fifth of the last run was kept back instead.")
+    return tuple(said)
