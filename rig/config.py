@@ -16,6 +16,8 @@ from rig.core.observer import ObserverGains
 from rig.core.step import RigCore
 from rig.core.supervisor import Action, Limit, Supervision, Watched
 from rig.io.bus import BusConfig
+from rig.io.captures import Window
+from rig.io.run_writer import Rotation
 
 __all__ = ["CONFIGS", "InputError", "RunConfig", "Setup", "build_bridge", "load_setup", "setup"]
 
@@ -183,6 +185,37 @@ class Realtime(_Frozen):
     freeze_garbage: bool = True
 
 
+class LogConfig(_Frozen):
+    """How the log of a run is kept.
+
+    Attributes:
+        rotate_bytes: Size at which the log is continued in further files; never if absent.
+        rotate_s: Time after which it is.
+        capture_before_s: Time before a fault that is kept apart.
+        capture_after_s: Time after it.
+        most_captures: Windows kept apart in one run; 0 for none. A window is opened by HOLD, SAFE,
+            a fault of bus or log, and SIGUSR2.
+    """
+
+    rotate_bytes: Annotated[int, Field(ge=100_000)] | None = None
+    rotate_s: Annotated[float, Field(ge=1.0, allow_inf_nan=False)] | None = None
+    capture_before_s: Annotated[float, Field(ge=0.0, le=60.0)] = 2.0
+    capture_after_s: Annotated[float, Field(ge=0.0, le=60.0)] = 2.0
+    most_captures: Annotated[int, Field(ge=0, le=1000)] = 0
+
+    def rotation(self) -> Rotation:
+        """As the log takes it."""
+        time_ns = None if self.rotate_s is None else round(self.rotate_s * 1e9)
+        return Rotation(self.rotate_bytes, time_ns)
+
+    def window(self) -> Window | None:
+        """As the log takes it; None captures nothing."""
+        if self.most_captures == 0:
+            return None
+        before_ns, after_ns = round(self.capture_before_s * 1e9), round(self.capture_after_s * 1e9)
+        return Window(before_ns, after_ns, self.most_captures)
+
+
 class RunConfig(_Frozen):
     """All of a run's configuration.
 
@@ -199,6 +232,7 @@ class RunConfig(_Frozen):
         status: Message that carries the state; null sends none.
         supervision: Ages and safe state.
         realtime: What is asked of the machine.
+        log: Rotation, and windows that are kept apart.
     """
 
     rate_hz: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] = 1000.0
@@ -212,6 +246,7 @@ class RunConfig(_Frozen):
     status: Text | None = "RIG_STATUS"
     supervision: SupervisionConfig = SupervisionConfig()
     realtime: Realtime = Realtime()
+    log: LogConfig = LogConfig()
 
     @model_validator(mode="before")
     @classmethod

@@ -14,7 +14,7 @@ from rig.core.bridge import Bridge, BridgeState, TickResult
 from rig.core.messages import Conditions
 from rig.core.types import Mode
 from rig.io.clock import Clock
-from rig.io.run_log import Step
+from rig.io.steps import Step
 
 
 class Tick(NamedTuple):

@@ -29,14 +29,13 @@ from rig.core.types import Measurement, Mode, RigState, StepInput, StepOutput, S
 from rig.io.frame_columns import FrameColumns, received_frames
 from rig.io.run_log import (
     DBC_FILE,
-    FRAMES_FILE,
     MODEL_FILE,
     RUN_FILE,
     RunFolder,
     last_frame_ns,
     read_run,
-    step_schema,
 )
+from rig.io.steps import step_schema
 from rig.loop import Progress
 
 _CHUNK = 2048
@@ -119,7 +118,7 @@ def replay(
     found, own = setup_of_run(folder)
     ready = ready or own
     bridge = build_bridge(ready)
-    frames = received_frames([folder / FRAMES_FILE], found.epoch_ns)
+    frames = received_frames(found.frame_files, found.epoch_ns)
     ticks = _ticks(found, frames, ready.config.period_ns)
     log = _Log(bridge, frames, ticks)
     if ready.config.supervision.limits:

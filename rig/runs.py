@@ -6,14 +6,14 @@ import platform
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.frame import Frame
-from dart_model.spec import FileSkeleton, dump_model
+from dart_model.spec import copy_skeleton, dump_model
 from dart_model.yaml_file import InputError
 from rig.bench.schema import BenchConfig
 from rig.bench.simulated import Bench
@@ -21,11 +21,13 @@ from rig.config import RunConfig, Setup, build_bridge
 from rig.core.bridge import Bridge, BridgeState, TickResult
 from rig.core.messages import Conditions
 from rig.core.types import Mode
-from rig.io.bus import FRAMES_A_MS, Bus, BusConfig
+from rig.io.bus import Bus, BusConfig
 from rig.io.clock import Clock, RealClock, VirtualClock
-from rig.io.link import Link
+from rig.io.link import Link, LinkFigures
 from rig.io.realtime import Granted, Request, realtime
-from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE, RunLog, Step
+from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE
+from rig.io.run_writer import RunLog
+from rig.io.steps import Step
 from rig.loop import Port, Progress, Timing, regular_ticks, run
 
 _PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "autosar-e2e")
@@ -170,10 +172,7 @@ def _copy_inputs(ready: Setup, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / MODEL_FILE).write_text(dump_model(ready.model), "utf-8")
         shutil.copyfile(ready.database.path, folder / DBC_FILE)
-        if isinstance(ready.model.skeleton, FileSkeleton):
-            target = folder / ready.model.skeleton.file
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(ready.model.folder / ready.model.skeleton.file, target)
+        copy_skeleton(ready.model, folder)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
 
@@ -185,7 +184,7 @@ def logged(
     clock: Clock,
     folder: Path,
     *,
-    link: Link,
+    figures: LinkFigures,
     granted: Granted | None = None,
     stop: Callable[[], bool],
     progress: Progress,
@@ -198,7 +197,7 @@ def logged(
         port: Where frames come from and go to.
         clock: When ticks come.
         folder: Folder of the run; absent or empty.
-        link: The bus behind the port, for the figures of `run.yaml`.
+        figures: What becomes of the bus behind the port, for `run.yaml`.
         granted: What the machine granted; None for simulated time, which then waits for the disk.
         stop: Asked before each tick whether to end.
         progress: Told of every tick.
@@ -218,6 +217,9 @@ def logged(
         clock.epoch_ns,
         config.bus.channel,
         paced=granted is not None,
+        rotation=config.log.rotation(),
+        window=config.log.window(),
+        graver=_graver,
     )
     count = None if config.duration_s is None else round(config.duration_s * config.rate_hz)
     timing, ticks, status = Timing.empty(), 0, "failed"
@@ -233,23 +235,24 @@ def logged(
 
     try:
         due = regular_ticks(clock, config.period_ns, count, stop, timing)
-        state = run(bridge, state, due, _ToldOfLog(port, log), sink)
+        with _on_signal(signal.SIGUSR2, lambda: log.trigger("user")):
+            state = run(bridge, state, due, _ToldOfLog(port, log), sink)
         status = "safe" if state.rig.mode is Mode.SAFE else "done"
     finally:
         log.close(
-            {
+            lambda: {
                 "ending": {
                     "status": status,
                     "ticks": ticks,
                     "counts": state.counts._asdict(),
                     "timing": timing.summary(),
-                    "bus": link.figures.as_dict(),
-                    "log_fault": log.fault,
+                    "bus": figures.as_dict(),
+                    "log_fault": log.trouble,
                     "dropped_steps": log.dropped,
                 }
             }
         )
-    return Ended(folder, state, timing, granted, log.fault, ticks)
+    return Ended(folder, state, timing, granted, log.trouble, ticks)
 
 
 def live(
@@ -272,14 +275,14 @@ def live(
         link = _link(ready, bridge, clock, listen_only=listen_only)
         port = BusPort(link)
         try:
-            with _acknowledged_by_signal(port):
+            with _on_signal(signal.SIGUSR1, port.acknowledge):
                 return logged(
                     ready,
                     bridge,
                     port,
                     clock,
                     folder,
-                    link=link,
+                    figures=link.figures,
                     granted=granted,
                     stop=stop,
                     progress=progress,
@@ -289,21 +292,28 @@ def live(
 
 
 @contextlib.contextmanager
-def _acknowledged_by_signal(port: BusPort) -> Iterator[None]:
-    """SIGUSR1 acknowledges the safe state, where this thread can be told of signals."""
+def _on_signal(number: signal.Signals, action: Callable[[], None]) -> Generator[None]:
+    """Do something when a signal comes, where this thread can be told of signals.
+
+    SIGUSR1 acknowledges the safe state, SIGUSR2 captures a window of the log.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGUSR1, lambda _number, _frame: port.acknowledge())
+    before = signal.signal(number, lambda _number, _frame: action())
     try:
         yield
     finally:
-        signal.signal(signal.SIGUSR1, before)
+        signal.signal(number, before)
+
+
+def _graver(before: int, now: int) -> str | None:
+    """Name of a mode that the log captures a window around, when the bridge comes into it."""
+    return Mode(now).name.lower() if now != before and now in (Mode.HOLD, Mode.SAFE) else None
 
 
 def _link(ready: Setup, bridge: Bridge, clock: Clock, *, listen_only: bool = False) -> Link:
     config = ready.config
-    most_frames = FRAMES_A_MS * max(1, round(config.period_ns * 1e-6))
 
     def open_bus() -> Bus:
         return Bus(
@@ -311,7 +321,6 @@ def _link(ready: Setup, bridge: Bridge, clock: Clock, *, listen_only: bool = Fal
             bridge.heard,
             listen_only=listen_only,
             epoch_ns=clock.epoch_ns,
-            most_frames=most_frames,
         )
 
     return Link(open_bus, clock.epoch_now_ns)
@@ -356,7 +365,7 @@ def with_bench(
             on_bus,
             on_bus,
             folder,
-            link=link,
+            figures=link.figures,
             granted=granted,
             stop=stop,
             progress=progress,

@@ -11,8 +11,8 @@ import can
 from can_dbc.frame import Frame
 
 FRAMES_A_MS = 64
-"""Bound on the frames read per ms of a tick, so that a flood cannot hold the tick up. It is three
-times what CAN FD at 1 and 8 Mbit/s can carry, so no bus reaches it; what is beyond waits."""
+"""Bound on the frames read per ms since the last tick, so that a flood cannot hold the tick up. No bus
+reaches it (CAN FD at 1 and 8 Mbit/s carries a third); what is beyond waits."""
 
 _LISTEN_ONLY_OPTIONS: dict[str, dict[str, Any]] = {
     "pcan": {"state": can.BusState.PASSIVE},
@@ -59,7 +59,6 @@ class Bus:
         listen_only: Send nothing. Most interfaces swallow such a request silently, so it is kept
             here: the interface's way of sending is not even looked up.
         epoch_ns: Unix time of the run's start; time stamps are given relative to it.
-        most_frames: Bound on one poll.
 
     Raises:
         BusError: The interface cannot be opened.
@@ -72,18 +71,19 @@ class Bus:
         *,
         listen_only: bool = False,
         epoch_ns: int = 0,
-        most_frames: int = 10 * FRAMES_A_MS,
     ) -> None:
         self._heard = None if heard is None else frozenset(heard)
         self.epoch_ns = epoch_ns
         """Unix time that stamps are relative to; to be set anew when the system's clock was."""
-        self._most_frames = most_frames
         self._bus = _open(config, self._heard, listen_only=listen_only)
         self._receive = self._bus.recv
         self._send = None if listen_only else self._bus.send
 
-    def receive(self) -> list[Frame]:
+    def receive(self, elapsed_ns: int = 1_000_000_000) -> list[Frame]:
         """The frames that have arrived, in order, without waiting; error frames among them.
+
+        Args:
+            elapsed_ns: Time since the last poll, for which the number of frames is bounded.
 
         Raises:
             BusError: The interface is gone.
@@ -91,7 +91,7 @@ class Bus:
         frames: list[Frame] = []
         receive, heard = self._receive, self._heard
         try:
-            for _ in range(self._most_frames):
+            for _ in range(FRAMES_A_MS * (elapsed_ns // 1_000_000 + 1)):
                 message = receive(0)
                 if message is None:
                     break

@@ -124,7 +124,7 @@ class Link:
             self._last_ns = t_ns
             return ()
         try:
-            frames = bus.receive()
+            frames = bus.receive(t_ns - self._last_ns)
         except BusError as error:
             self._gone(t_ns, str(error))
             frames = []

@@ -10,7 +10,7 @@ import ctypes.util
 import gc
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import asdict, dataclass
 
 _MCL_CURRENT_AND_FUTURE = 3
@@ -60,7 +60,7 @@ class Granted:
 
 
 @contextlib.contextmanager
-def realtime(request: Request) -> Iterator[Granted]:
+def realtime(request: Request) -> Generator[Granted]:
     """Ask for it, and give it back at the end.
 
     Args:

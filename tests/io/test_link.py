@@ -25,7 +25,8 @@ class ScriptedBus:
         self.closed = False
         self._polls = list(polls)
 
-    def receive(self):
+    def receive(self, elapsed_ns):
+        assert elapsed_ns > 0
         answer = self._polls.pop(0) if self._polls else []
         if isinstance(answer, Exception):
             raise answer

@@ -1,0 +1,296 @@
+"""Writes the folder of a run while it runs, so that it can be read after a kill.
+
+A thread of its own writes, so that a slow disk does not delay a tick. Frames are written
+unbuffered, at most 10 ms after they came; steps are flushed in batches. While the disk takes
+nothing, ticks wait in memory, and what does not fit there is counted.
+"""
+
+import contextlib
+import shutil
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import pyarrow as pa
+import yaml
+
+from can_dbc.frame import Frame
+from dart_model.yaml_file import InputError
+from rig.io.captures import Capture, Captures, Entry, Window
+from rig.io.run_log import (
+    DBC_FILE,
+    FRAMES_FILE,
+    MODEL_FILE,
+    RUN_FILE,
+    STEPS_FILE,
+    format_frame,
+    part_name,
+)
+from rig.io.steps import Step, step_schema, step_table
+from rig.io.whole_file import WholeFile
+
+FLUSH_NS = 190_000_000
+"""Time of the run that a batch of steps spans; with `POLL_S` at most 0.2 s are lost to a kill."""
+
+POLL_S = 0.01
+"""How often the writing thread looks for what was handed over."""
+
+MOST_WAITING = 120_000
+"""Ticks that may wait for the disk before they are dropped, and counted: two minutes at 1 kHz."""
+
+MANY_WAITING = 2_000
+"""Ticks waiting that are a fault."""
+
+_CHUNK = 1000
+"""Ticks written in one go."""
+
+_CLOSING_S = 30.0
+"""How long the end of a run waits for a slow disk."""
+
+_RESERVE_FILE, _RESERVE_BYTES = "reserve.tmp", 65_536
+"""Space kept back, so that a full disk still takes how the run ended."""
+
+_END_OF_STREAM = b"\xff\xff\xff\xff\0\0\0\0"
+
+_pa = cast("Any", pa)
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """When a run is continued in further files; None for never.
+
+    Attributes:
+        size_bytes: Size of frames and steps together.
+        time_ns: Time of the run that they span.
+    """
+
+    size_bytes: int | None = None
+    time_ns: int | None = None
+
+
+class _Part:
+    """The two files that are written now."""
+
+    def __init__(self, folder: Path, number: int, schema: Any, begin_ns: int) -> None:
+        self.number = number
+        self.begin_ns = begin_ns
+        self.frames = WholeFile(folder / part_name(FRAMES_FILE, number))
+        self.steps = WholeFile(folder / part_name(STEPS_FILE, number))
+        self.steps.append(schema.serialize().to_pybytes())
+
+    @property
+    def size(self) -> int:
+        return self.frames.size + self.steps.size
+
+    def close(self) -> None:
+        self.steps.append(_END_OF_STREAM)
+        self.steps.close()
+        self.frames.close()
+
+
+class RunLog:
+    """Writer of a run's folder.
+
+    Args:
+        folder: Folder to create; it must be empty or absent.
+        header: What is known before the first tick, for `run.yaml`.
+        struts: Names of the struts.
+        epoch_ns: Unix time of the run's start.
+        channel: Name of the bus in `frames.log`.
+        paced: The run waits for a clock, so a thread of its own writes; otherwise the run waits for
+            the disk.
+        rotation: When the files are continued in others.
+        window: What is captured around faults; None captures nothing.
+        graver: Whether a change of mode is a trigger of a capture, and its name if so.
+
+    Raises:
+        InputError: The folder cannot be created, or holds another run.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        header: dict[str, object],
+        struts: Sequence[str],
+        epoch_ns: int,
+        channel: str,
+        *,
+        paced: bool,
+        rotation: Rotation = Rotation(),
+        window: Window | None = None,
+        graver: Callable[[int, int], str | None] = lambda _before, _now: None,
+    ) -> None:
+        self.folder = folder
+        self.fault: str | None = None
+        """What is wrong with the disk now, if anything; the run goes on."""
+        self.trouble: str | None = None
+        """What was wrong with it first, if ever anything was."""
+        self.dropped = 0
+        """Ticks that the disk did not take."""
+        self._header = header
+        self._epoch_ns = epoch_ns
+        self._channel = channel
+        self._schema = step_schema(struts)
+        self._rotation = rotation
+        self._captures = None if window is None else Captures(window, graver, self._write_capture)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if (folder / RUN_FILE).exists():
+                raise InputError(f"{folder}: holds a run already, expected an empty folder")
+            _write_yaml(folder / RUN_FILE, header)
+            (folder / _RESERVE_FILE).write_bytes(bytes(_RESERVE_BYTES))
+            self._part = _Part(folder, 0, self._schema, 0)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
+        self._waiting: deque[Entry] = deque()
+        self._lines = b""
+        self._batch: list[Step] = []
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._write_until_closed, name="run-log")
+        self._paced = paced
+        if paced:
+            self._thread.start()
+
+    def add(self, received: Sequence[Frame], sent: Sequence[Frame], step: Step) -> None:
+        """Hand over what a tick received, sent and computed."""
+        waiting = len(self._waiting)
+        if waiting >= MANY_WAITING:
+            self._failed("the disk is too slow")
+            if waiting >= MOST_WAITING:
+                self.dropped += 1
+                return
+        self._waiting.append(Entry(received, sent, step))
+        if not self._paced:
+            self._write_waiting()
+
+    def trigger(self, why: str) -> None:
+        """Capture a window around the next tick, if windows are captured at all.
+
+        Args:
+            why: One word, for the name of the window's folder.
+        """
+        if self._captures is not None:
+            self._captures.trigger(why)
+
+    def close(self, ending: Callable[[], dict[str, object]]) -> None:
+        """Write what is waiting, and how the run ended.
+
+        Args:
+            ending: Gives what is added to `run.yaml`, when all else is written.
+        """
+        self._closing.set()
+        if self._paced:
+            self._thread.join(_CLOSING_S)
+        if self._thread.is_alive():
+            self._failed("the disk is too slow")
+        else:
+            self._finish()
+        self.dropped += len(self._waiting) + len(self._batch)
+        with contextlib.suppress(OSError):
+            (self.folder / _RESERVE_FILE).unlink()
+        try:
+            _write_yaml(self.folder / RUN_FILE, {**self._header, **ending()})
+        except OSError as error:
+            self._failed(str(error.strerror))
+
+    def _finish(self) -> None:
+        self._write_waiting()
+        if self._captures is not None:
+            self._captures.finish()
+        try:
+            self._flush()
+            self._part.close()
+        except OSError as error:
+            self._failed(str(error.strerror))
+
+    def _failed(self, why: str) -> None:
+        self.fault = why
+        if self.trouble is None:
+            self.trouble = why
+
+    def _write_until_closed(self) -> None:
+        # The loop only appends: waking this thread at every tick would cost the loop more.
+        while not self._closing.wait(POLL_S):
+            self._write_waiting()
+
+    def _write_waiting(self) -> None:
+        """Write what waits; what the disk does not take is kept, and tried again the next time."""
+        try:
+            self._write_lines()
+            while self._waiting:
+                self._take(min(_CHUNK, len(self._waiting)))
+                self._write_lines()
+                last_ns = self._batch[-1].t_ns
+                if last_ns - self._batch[0].t_ns >= FLUSH_NS:
+                    self._flush()
+                    self._rotate(last_ns)
+        except OSError as error:
+            self._failed(str(error.strerror))
+        else:
+            self.fault = None
+
+    def _take(self, count: int) -> None:
+        lines: list[str] = []
+        for _ in range(count):
+            entry = self._waiting.popleft()
+            lines += [self._line(frame, "R") for frame in entry.received]
+            lines += [self._line(frame, "T") for frame in entry.sent]
+            self._batch.append(entry.step)
+            if self._captures is not None:
+                self._captures.take(entry)
+        self._lines = "".join(lines).encode("ascii")
+
+    def _line(self, frame: Frame, direction: str) -> str:
+        return format_frame(frame, self._epoch_ns, self._channel, direction)
+
+    def _write_lines(self) -> None:
+        self._part.frames.append(self._lines)
+        self._lines = b""
+
+    def _flush(self) -> None:
+        self._part.steps.append(_serialized(self._batch, self._schema))
+        self._batch = []
+
+    def _rotate(self, now_ns: int) -> None:
+        """Continue in new files, if it is time; frames and steps then end with the same tick."""
+        limit, part = self._rotation, self._part
+        is_full = limit.size_bytes is not None and part.size >= limit.size_bytes
+        is_long = limit.time_ns is not None and now_ns - part.begin_ns >= limit.time_ns
+        if is_full or is_long:
+            self._part = _Part(self.folder, part.number + 1, self._schema, now_ns)
+            part.close()
+
+    def _write_capture(self, capture: Capture) -> None:
+        folder = self.folder / "captures" / f"{capture.number:03d}_{capture.why}"
+        header = {**self._header, "capture": {"why": capture.why, "t_s": capture.t_ns * 1e-9}}
+        lines: list[str] = []
+        for entry in capture.entries:
+            lines += [self._line(frame, "R") for frame in entry.received]
+            lines += [self._line(frame, "T") for frame in entry.sent]
+        try:
+            folder.mkdir(parents=True)
+            part = _Part(folder, 0, self._schema, 0)
+            part.frames.append("".join(lines).encode("ascii"))
+            part.steps.append(_serialized([entry.step for entry in capture.entries], self._schema))
+            part.close()
+            for name in (MODEL_FILE, DBC_FILE):
+                if (self.folder / name).exists():
+                    shutil.copyfile(self.folder / name, folder / name)
+            _write_yaml(folder / RUN_FILE, header)
+        except OSError as error:
+            self._failed(f"capture {folder.name}: {error.strerror}")
+
+
+def _serialized(steps: Sequence[Step], schema: Any) -> bytes:
+    batches = step_table(steps, schema).combine_chunks().to_batches()
+    return b"".join(batch.serialize().to_pybytes() for batch in batches)
+
+
+def _write_yaml(path: Path, content: dict[str, object]) -> None:
+    # Written beside and moved, so that a kill leaves the old or the new file, never half of one.
+    beside = path.with_suffix(".tmp")
+    beside.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), "utf-8")
+    beside.replace(path)

@@ -1,0 +1,113 @@
+"""The seed case with a fault between bench and bridge, tick by tick and without a clock."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from can_dbc.frame import Frame
+from rig.bench.config import load_bench_config
+from rig.bench.simulated import Bench
+from rig.config import CONFIGS, build_bridge, load_setup
+from rig.core.bridge import Bridge, BridgeState, TickResult
+from rig.core.messages import Conditions, Counts
+from rig.core.types import Mode
+
+MS = 1_000_000
+BEGIN_NS = 300 * MS
+"""When a fault begins: the estimate has settled by then."""
+
+MEASUREMENT = 0x100
+
+Inject = Callable[[int, list[Frame]], list[Frame]]
+"""Time of a tick and the bench's frames up to it -> the frames that arrive."""
+
+
+class Tick(NamedTuple):
+    """What a tick did.
+
+    Attributes:
+        t_ns: Its time.
+        result: What the bridge did.
+        counts: What it has counted.
+        truth_n: Force of the strut at that time.
+    """
+
+    t_ns: int
+    result: TickResult
+    counts: Counts
+    truth_n: float
+
+    @property
+    def mode(self) -> Mode:
+        return self.result.output.mode
+
+    @property
+    def force_n(self) -> float:
+        return self.result.output.struts[0].force_n
+
+    @property
+    def is_valid(self) -> bool:
+        return bool(self.result.output.struts and self.result.output.struts[0].valid)
+
+
+class Trial:
+    """A bridge and a bench, joined tick by tick."""
+
+    def __init__(self, **supervision: object) -> None:
+        ready = load_setup(CONFIGS / "seed.yaml")
+        changed = ready.config.supervision.model_validate(
+            ready.config.supervision.model_dump() | supervision
+        )
+        config = ready.config.model_copy(update={"supervision": changed})
+        self.ready = ready.model_copy(update={"config": config})
+        self.bridge: Bridge = build_bridge(self.ready)
+        self.bench = Bench(load_bench_config(CONFIGS / "seed_bench.yaml"), ready.database)
+        self.state: BridgeState = self.bridge.init(0)
+        self.ticks: list[Tick] = []
+
+    def run(
+        self,
+        until_ms: int,
+        inject: Inject = lambda _t_ns, frames: frames,
+        conditions: Callable[[int], Conditions] = lambda _t_ns: Conditions(),
+    ) -> list[Tick]:
+        """Run up to a time; returns all ticks so far."""
+        first = len(self.ticks)
+        for index in range(first, until_ms):
+            t_ns = index * MS
+            frames = inject(t_ns, self.bench.update(t_ns)[0])
+            self.state, result = self.bridge.tick(self.state, t_ns, frames, conditions(t_ns))
+            truth_n = self.bench.truth(t_ns).struts[0].strut_force_n
+            self.ticks.append(Tick(t_ns, result, self.state.counts, truth_n))
+        return self.ticks
+
+
+def after(begin_ns: int, fault: Inject) -> Inject:
+    """A fault that begins at a time."""
+    return lambda t_ns, frames: fault(t_ns, frames) if t_ns >= begin_ns else frames
+
+
+def measurements_only(change: Callable[[Frame], list[Frame]]) -> Inject:
+    """A fault of single frames, of the measurement alone."""
+
+    def inject(_t_ns: int, frames: list[Frame]) -> list[Frame]:
+        arriving: list[Frame] = []
+        for frame in frames:
+            arriving += change(frame) if frame.arbitration_id == MEASUREMENT else [frame]
+        return arriving
+
+    return inject
+
+
+def first_ms(ticks: list[Tick], when: Callable[[Tick], bool], begin_ns: int = BEGIN_NS) -> float:
+    """Time from the beginning of the fault to the first tick that shows something, in ms."""
+    found = next((tick.t_ns for tick in ticks if tick.t_ns >= begin_ns and when(tick)), None)
+    assert found is not None, "the fault was not noticed"
+    return (found - begin_ns) / MS
+
+
+def force_error_n(ticks: list[Tick], begin_ns: int = BEGIN_NS) -> float:
+    """RMS error of the force where it was published as valid."""
+    errors = [tick.force_n - tick.truth_n for tick in ticks if tick.t_ns >= begin_ns and tick.is_valid]
+    return float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan")
