@@ -33,6 +33,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--triples", type=int, default=0, help="three effects")
     parser.add_argument("--complete", type=int, default=50, help="nothing planted")
     parser.add_argument("--outside", type=int, default=30, help="forces no catalogue holds")
+    parser.add_argument(
+        "--foreign", type=int, default=32, help="formulas kept back from catalogues"
+    )
     parser.add_argument("--faint", type=int, default=0, help="single effects below the floor's 5x")
     parser.add_argument("--jobs", type=int, default=2, help="cases at a time")
     parser.add_argument("--seed", type=int, default=0, help="another one gives other cases")
@@ -60,7 +63,9 @@ def main() -> None:
         kind, seed = args.write
         write_case(make_case(int(seed), kind), args.out)
         return
-    counts = Counts(args.cases, args.pairs, args.triples, args.complete, args.outside, args.faint)
+    counts = Counts(
+        args.cases, args.pairs, args.triples, args.complete, args.outside, args.foreign, args.faint
+    )
     todo = slots(counts, args.seed)
     results = []
     with Progress() as progress:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from tests.truth.laws import REFERENCE_C
+from tests.truth.compiled import REFERENCE_C
 from tests.truth.plant import Bench, Planted
 
 Truth = dict[str, float]

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tests.truth.cases import FAMILIES, make_case
+from tests.truth.cases import FAMILIES, FOREIGN_KINDS, make_case
 from tests.truth.plant import Case
 from tests.truth.simulation import floor_ratios, record
 
@@ -19,7 +19,8 @@ class Slot(NamedTuple):
     """One place in the benchmark; the first fit case drawn for it takes it.
 
     Attributes:
-        group: ``single``, ``pair``, ``triple``, ``complete``, ``outside``, ``faint``.
+        group: ``single``, ``pair``, ``triple``, ``complete``, ``outside``, ``foreign``,
+            ``faint``.
         kind: As for `make_case`.
         index: Within its group.
         seed: Of the benchmark.
@@ -43,6 +44,7 @@ class Counts(NamedTuple):
     triple: int
     complete: int
     outside: int
+    foreign: int
     faint: int
 
 
@@ -51,6 +53,7 @@ def slots(counts: Counts, seed: int) -> list[Slot]:
     kinds: dict[str, tuple[str, ...]] = {
         "single": FAMILIES,
         "faint": FAMILIES,
+        "foreign": tuple(FOREIGN_KINDS),
         # The pair that a first trial of such an attribution got wrong is every fifth.
         "pair": ("friction_and_cubic", "pair", "pair", "pair", "pair"),
     }

@@ -14,7 +14,7 @@ from tests.diagnosis_benchmark.judge import Result
 from tests.truth.cases import FAMILIES
 
 FIRST_COLUMNS = (*FAMILIES, "restoring_surface", "none")
-GROUPS = ("single", "pair", "triple", "complete", "outside", "faint")
+GROUPS = ("single", "pair", "triple", "complete", "outside", "foreign", "faint")
 TARGETS = {"single": 0.98, "pair": 0.90, "complete": 0.98, "outside": 1.0}
 
 

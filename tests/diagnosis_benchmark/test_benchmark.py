@@ -12,7 +12,7 @@ from tests.diagnosis_benchmark.judge import is_right
 from tests.diagnosis_benchmark.plan import Counts, Slot, fill, slots
 from tests.diagnosis_benchmark.summary import print_tables, summarise, write_tables
 from tests.truth.cases import FAMILIES
-from tests.truth.laws import CODES
+from tests.truth.compiled import CODES
 from tests.truth.plant import Bench, Planted
 
 BENCH = Bench(10.0, 1000.0, 20.0, 0.5)
@@ -74,7 +74,7 @@ def test_comparable_laws_exist():
 
 
 def test_slots_are_as_many_as_asked_and_cover_every_family():
-    counts = Counts(single=30, pair=10, triple=2, complete=5, outside=3, faint=0)
+    counts = Counts(single=30, pair=10, triple=2, complete=5, outside=3, foreign=0, faint=0)
     found = slots(counts, 0)
     assert len({slot.name for slot in found}) == 50
     kinds = [slot.kind for slot in found if slot.group == "single"]

@@ -1,7 +1,8 @@
 """Draws whole cases: `make_case(seed, kind)`.
 
 Kinds: ``single`` (families in turn), any family's name, ``pair``, ``triple``, ``complete``,
-``outside``, and ``friction_and_cubic``.
+``outside``, ``friction_and_cubic``, and ``foreign-FAMILY``: an effect of that family by a formula
+that no catalogue holds.
 """
 
 import zlib
@@ -12,10 +13,12 @@ import numpy as np
 from tests.truth.excitation import load_n
 from tests.truth.integrator import Motion
 from tests.truth.plant import Bench, Case, Excitation, Planted, RunPlan, Sensors
-from tests.truth.planting import DRAWS, OUTSIDE, START_C, Draw, Nominal, Rng, cubic_spring
+from tests.truth.planting import DRAWS, FOREIGN, OUTSIDE, START_C, Draw, Nominal, Rng, cubic_spring
 from tests.truth.simulation import true_motion
 
 FAMILIES = tuple(DRAWS)
+FOREIGN_KINDS = {f"foreign-{family}": family for family in FOREIGN}
+KINDS = ("single", "pair", "triple", "complete", "outside", "friction_and_cubic", *FOREIGN_KINDS)
 SHAPES = ("multisine", "sweep", "noise")
 LOAD_LIMIT_N = 600.0
 HEIGHT_LOW_M = 0.03
@@ -50,7 +53,8 @@ def make_case(seed: int, kind: str) -> Case:
 
 def _draw_case(rng: Rng, seed: int, kind: str) -> Case:
     families = _families(rng, seed, kind)
-    draws = [_pick(rng, family) for family in families]
+    laws = FOREIGN if kind in FOREIGN_KINDS else DRAWS | {"outside": OUTSIDE}
+    draws = [_pick(rng, laws[family]) for family in families]
     if kind == "friction_and_cubic":
         draws = [draws[0], cubic_spring]
     bench = _bench(rng, centred="backlash" in families)
@@ -65,8 +69,8 @@ def _draw_case(rng: Rng, seed: int, kind: str) -> Case:
     )
     for plan in (train, held_out):
         _refuse_unfit(bench, effects, plan)
-    laws = "+".join(effect.law for effect in effects) or "nothing"
-    name = f"{kind}-{seed:04d}-{laws}"
+    planted_laws = "+".join(effect.law for effect in effects) or "nothing"
+    name = f"{kind}-{seed:04d}-{planted_laws}"
     planted = tuple(effect.family for effect in effects)
     return Case(name, kind, planted, effects, bench, sensors, train, held_out, seed)
 
@@ -76,6 +80,8 @@ def _families(rng: Rng, seed: int, kind: str) -> tuple[str, ...]:
         return (kind,)
     if kind == "single":
         return (FAMILIES[seed % len(FAMILIES)],)
+    if kind in FOREIGN_KINDS:
+        return (FOREIGN_KINDS[kind],)
     if kind in {"pair", "triple"}:
         count = 2 if kind == "pair" else 3
         return tuple(str(f) for f in rng.choice(FAMILIES, count, replace=False))
@@ -85,12 +91,11 @@ def _families(rng: Rng, seed: int, kind: str) -> tuple[str, ...]:
         "friction_and_cubic": ("friction", "nonlinear_stiffness"),
     }
     if kind not in fixed:
-        raise ValueError(f"kind {kind!r}: expected one of {', '.join([*DRAWS, *fixed])} or single")
+        raise ValueError(f"kind {kind!r}: expected one of {', '.join([*KINDS, *DRAWS])}")
     return fixed[kind]
 
 
-def _pick(rng: Rng, family: str) -> Draw:
-    choices = OUTSIDE if family == "outside" else DRAWS[family]
+def _pick(rng: Rng, choices: tuple[Draw, ...]) -> Draw:
     return choices[int(rng.integers(len(choices)))]
 
 
@@ -158,9 +163,13 @@ def _held_out_plan(rng: Rng, bench: Bench, train: RunPlan) -> RunPlan:
     return RunPlan(_scaled(bench, unit, swing), offset, ambient, int(rng.integers(1_000_000)))
 
 
+def _dry(bristle: Planted) -> Planted:
+    return replace(bristle, law="stick", truth=bristle.truth | {"hyperbolic": 0.0})
+
+
 def _rough_motion(bench: Bench, effects: tuple[Planted, ...], plan: RunPlan) -> Motion:
     """The run in coarse steps, to plan with; stiff bristles are replaced by dry contact."""
-    coarse = tuple(replace(e, law="stick") if e.law == "bristle" else e for e in effects)
+    coarse = tuple(_dry(effect) if effect.law == "bristle" else effect for effect in effects)
     steps = (5000 if effects else 2500) // PLANNING_RATE_HZ
     return true_motion(bench, coarse, plan, PLANNING_RATE_HZ, steps)[1]
 

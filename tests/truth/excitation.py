@@ -76,8 +76,10 @@ def _noise(excitation: Excitation, bench: Bench, t_s: Samples) -> Samples:
 
 
 def tone_n(truth: dict[str, float], t_s: Samples) -> Samples:
-    """A sine of force, locked to the run's clock."""
-    return truth["force_n"] * np.sin(2.0 * np.pi * truth["frequency_hz"] * t_s + truth["phase_rad"])
+    """A sine of force, locked to the run's clock; some have a first overtone."""
+    phase = 2.0 * np.pi * truth["frequency_hz"] * t_s + truth["phase_rad"]
+    overtone = np.sin(2.0 * phase + truth.get("overtone_rad", 0.0))
+    return truth["force_n"] * (np.sin(phase) + truth.get("overtone", 0.0) * overtone)
 
 
 def wander_n(truth: dict[str, float], t_s: Samples) -> Samples:

@@ -41,7 +41,7 @@ class Planted:
 
     Attributes:
         family: Family as in a diagnosis, or ``outside`` for what no catalogue has.
-        law: Name of the formula, see `tests.truth.laws`.
+        law: Name of the formula, see `tests.truth.compiled`.
         truth: Its parameters in SI, the unit in each name.
     """
 

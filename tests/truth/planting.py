@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tests.truth.laws import REFERENCE_C
+from tests.truth.compiled import REFERENCE_C
 from tests.truth.plant import Bench, Excitation, Planted, Samples
 
 Rng = np.random.Generator
@@ -161,7 +161,7 @@ def _friction(rng: Rng, nominal: Nominal, strength: float) -> Planted:
         "stribeck_m_per_s": _log(rng, 0.01, 0.1),
     }
     if rng.random() < 0.5:
-        return Planted("friction", "stick", truth)
+        return Planted("friction", "stick", truth | {"hyperbolic": 0.0})
     return Planted("friction", "bristle", truth | {"bristle_m": _log(rng, 2e-5, 1e-4)})
 
 
@@ -225,7 +225,7 @@ def _hysteresis(rng: Rng, nominal: Nominal, strength: float) -> Planted:
         return Planted("hysteresis", "yielding", truth | more)
     if draw < 0.7:
         return Planted("hysteresis", "dahl", truth | {"exponent": float(rng.uniform(0.7, 1.6))})
-    return Planted("hysteresis", "slip_elements", truth)
+    return Planted("hysteresis", "slip_elements", truth | {"grading": 1.0})
 
 
 def _fade(rng: Rng, nominal: Nominal, strength: float) -> Planted:
@@ -242,7 +242,11 @@ def _fade(rng: Rng, nominal: Nominal, strength: float) -> Planted:
         }
         return Planted("fade", "thin_oil", truth)
     if draw < 0.7:
-        truth = {"lost_fraction": lost, "time_s": duration * _log(rng, 0.15, 0.7)}
+        truth = {
+            "lost_fraction": lost,
+            "time_s": duration * _log(rng, 0.15, 0.7),
+            "stretch": 1.0,
+        }
         return Planted("fade", "time_fade", truth)
     truth = {"lost_fraction": lost, "energy_j": energy * _log(rng, 0.15, 0.7)}
     return Planted("fade", "work_fade", truth)
@@ -352,6 +356,77 @@ def _detent(rng: Rng, nominal: Nominal, strength: float) -> Planted:
     return Planted("outside", "detent", truth)
 
 
+def _hyperbolic(rng: Rng, nominal: Nominal, strength: float) -> Planted:
+    coulomb = strength * nominal.load_rms_n
+    truth = {
+        "coulomb_n": coulomb,
+        "breakaway_n": coulomb * float(rng.uniform(1.2, 1.6)),
+        "stribeck_m_per_s": _log(rng, 0.02, 0.1),
+        "hyperbolic": 1.0,
+    }
+    return Planted("friction", "stick", truth)
+
+
+def _rubber(rng: Rng, nominal: Nominal, strength: float) -> Planted:
+    z = nominal.x_m + nominal.bench.free_length_m
+    swing = float(np.ptp(z)) / 2.0
+    truth = {
+        "low_m": float(np.median(z)) - swing * float(rng.uniform(0.5, 0.8)),
+        "high_m": 9.0,
+        "stiffness_n_per_m": nominal.bench.stiffness_n_per_m * (1.0 + 20.0 * strength),
+        "length_m": swing * float(rng.uniform(0.15, 0.4)),
+    }
+    return Planted("stop", "rubber_bumper", truth)
+
+
+def _soft_play(rng: Rng, nominal: Nominal, strength: float) -> Planted:
+    gap = _backlash(rng, nominal, strength).truth["half_gap_m"]
+    return Planted("backlash", "soft_play", {"half_gap_m": gap})
+
+
+def _tangent(rng: Rng, nominal: Nominal, strength: float) -> Planted:
+    limit = float(np.max(np.abs(nominal.x_m))) * float(rng.uniform(1.2, 1.6))
+    u = 0.5 * np.pi * nominal.x_m / limit
+    truth = {"force_n": nominal.coefficient(strength, np.tan(u) - u), "limit_m": limit}
+    return Planted("nonlinear_stiffness", "tangent_spring", truth)
+
+
+def _mixed(rng: Rng, nominal: Nominal, strength: float) -> Planted:
+    v = nominal.v_m_per_s
+    truth = {
+        "rebound_n": strength * nominal.load_rms_n * 1.4,
+        "knee_m_per_s": float(np.std(v)) * float(rng.uniform(0.3, 0.9)),
+        "compression_n_s2_per_m2": nominal.coefficient(strength, np.minimum(v, 0.0) ** 2),
+    }
+    return Planted("nonlinear_damping", "mixed_damper", truth)
+
+
+def _graded(rng: Rng, nominal: Nominal, strength: float) -> Planted:
+    limit = strength * nominal.load_rms_n
+    truth = {
+        "stiffness_n_per_m": limit / (float(np.std(nominal.x_m)) * _log(rng, 0.1, 0.5)),
+        "yield_n": limit,
+        "grading": 0.0 if rng.random() < 0.5 else 2.5,
+    }
+    return Planted("hysteresis", "slip_elements", truth)
+
+
+def _stretched(rng: Rng, nominal: Nominal, strength: float) -> Planted:
+    truth = {
+        "lost_fraction": min(0.75, 0.05 + 1.5 * strength),
+        "time_s": nominal.excitation.duration_s * _log(rng, 0.15, 0.5),
+        "stretch": float(rng.uniform(0.5, 0.7)),
+    }
+    return Planted("fade", "time_fade", truth)
+
+
+def _overtone(rng: Rng, nominal: Nominal, strength: float) -> Planted:
+    tone = _periodic(rng, nominal, strength)
+    truth = dict(tone.truth, frequency_hz=tone.truth["frequency_hz"] / 2.0)
+    truth |= {"overtone": float(rng.uniform(0.2, 0.5)), "overtone_rad": float(rng.uniform(0, 6))}
+    return Planted("periodic_force", "tone", truth)
+
+
 DRAWS: dict[str, tuple[Draw, ...]] = {
     "preload": (_preload,),
     "stiffness": (_stiffness,),
@@ -383,6 +458,21 @@ OUTSIDE: tuple[Draw, ...] = (
     _detent,
 )
 """Forces that no catalogue of strut effects holds."""
+
+FOREIGN: dict[str, tuple[Draw, ...]] = {
+    "nonlinear_stiffness": (_tangent,),
+    "stop": (_rubber,),
+    "backlash": (_soft_play,),
+    "friction": (_hyperbolic,),
+    "nonlinear_damping": (_mixed,),
+    "hysteresis": (_graded,),
+    "fade": (_stretched,),
+    "periodic_force": (_overtone,),
+}
+"""Family -> laws kept back from any catalogue, which must not be given them.
+
+They show whether a family is recognised when the strut follows no formula that was written down.
+"""
 
 START_C = REFERENCE_C
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from tests.truth import compiled
 from tests.truth import excitation as loads
-from tests.truth import laws
 from tests.truth.integrator import MINIMUM_RATE_HZ, Drive, Motion, integrate
 from tests.truth.plant import Bench, Case, Planted, Recording, RunPlan, Samples, Sensors
 
@@ -99,7 +99,7 @@ def _temperature_c(
     for effect in effects:
         if effect.law == "thin_oil":
             return plan.ambient_c + motion.memory[:, start]
-        start += laws.MEMORY.get(effect.law, 0) + 1
+        start += compiled.MEMORY.get(effect.law, 0) + 1
     # A hall that warms up has nothing to do with the strut.
     return plan.ambient_c + 3.0 * (1.0 - np.exp(-t_s / 9.0)) + 0.5 * np.sin(0.7 * t_s)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.truth.cases import FAMILIES, make_case
+from tests.truth.cases import FAMILIES, FOREIGN_KINDS, make_case
 from tests.truth.excitation import load_n
 from tests.truth.files import write_case
 from tests.truth.integrator import Drive, Motion, integrate
@@ -106,10 +106,27 @@ def test_smooth_laws_converge_with_fourth_order():
     np.testing.assert_allclose(np.log2(errors[:-1] / errors[1:]), 4.0, atol=0.1)
 
 
-@pytest.mark.parametrize("family", [*FAMILIES, "outside"])
-def test_forces_of_every_family_balance(family):
+def test_every_law_moves_the_body():
+    """A force of zero would balance, too."""
+    cases = [short_case(0, kind, 2.0) for kind in [*FAMILIES, *FOREIGN_KINDS]]
+    for case in cases:
+        run = record(case.bench, case.effects, case.train, case.sensors)
+        assert np.std(run.effect_force_n) > 0.0 or case.families == ("preload",), case.name
+        alone = record(case.bench, (), case.train, case.sensors)
+        assert np.ptp(run.true_height_m - alone.true_height_m) > 1e-6, case.name
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        *((family, 5) for family in FAMILIES),
+        *(("outside", seed) for seed in range(4)),
+        *((kind, 0) for kind in FOREIGN_KINDS),
+    ],
+)
+def test_forces_of_every_family_balance(kind, seed):
     """m z'' is the sum of all forces, and heights, velocities, accelerations belong together."""
-    case = short_case(5, family)
+    case = short_case(seed, kind)
     run = record(case.bench, case.effects, case.train, case.sensors)
     bench = case.bench
     forces = (
@@ -132,7 +149,9 @@ def test_forces_of_every_family_balance(family):
 
 def test_dry_contact_sticks_below_breakaway_and_slides_above():
     dry = Planted(
-        "friction", "stick", {"coulomb_n": 10.0, "breakaway_n": 15.0, "stribeck_m_per_s": 0.05}
+        "friction",
+        "stick",
+        {"coulomb_n": 10.0, "breakaway_n": 15.0, "stribeck_m_per_s": 0.05, "hyperbolic": 0.0},
     )
     _, held = driven((dry,), sine(14.0, 1.0), Rig())
     np.testing.assert_array_equal(held.velocity_m_per_s, 0.0)
@@ -164,6 +183,7 @@ def test_bristles_give_a_little_and_then_slide_with_coulomb_force():
     [
         ("hertz_bumper", {"stiffness_n_per_m15": 2e5, "dissipation_s_per_m": 2.0}),
         ("linear_bumper", {"stiffness_n_per_m": 2e4, "damping_n_s_per_m": 400.0}),
+        ("rubber_bumper", {"stiffness_n_per_m": 1e4, "length_m": 0.01}),
     ],
 )
 def test_stops_push_and_never_pull(law, more):
@@ -193,7 +213,7 @@ def test_spring_is_slack_inside_the_gap():
 MEMORY_LAWS = {
     "yielding": {"exponent": 2.0, "softness": 0.6},
     "dahl": {"exponent": 1.5},
-    "slip_elements": {},
+    "slip_elements": {"grading": 1.0},
 }
 
 
@@ -211,7 +231,7 @@ def test_hysteresis_takes_energy_and_is_bounded(law):
 
 def test_slip_elements_follow_masing_rules():
     """A loop's branch is the first loading curve at twice the scale."""
-    truth = {"stiffness_n_per_m": 2000.0, "yield_n": 12.0}
+    truth = {"stiffness_n_per_m": 2000.0, "yield_n": 12.0, "grading": 1.0}
     stiff = replace(BENCH, stiffness_n_per_m=1e6, damping_n_s_per_m=2e3)
     slips = (Planted("hysteresis", "slip_elements", truth),)
     _, motion = driven(slips, lambda t: 8000.0 * np.sin(np.pi * t), Rig(stiff))
@@ -267,7 +287,7 @@ def test_late_load_is_an_exact_shift():
     ("law", "truth"),
     [
         ("thin_oil", {"per_k": 0.02, "heat_capacity_j_per_k": 3.0, "cooling_s": 50.0}),
-        ("time_fade", {"lost_fraction": 0.5, "time_s": 2.0}),
+        ("time_fade", {"lost_fraction": 0.5, "time_s": 2.0, "stretch": 1.0}),
         ("work_fade", {"lost_fraction": 0.5, "energy_j": 20.0}),
     ],
 )
