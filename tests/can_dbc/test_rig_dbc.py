@@ -27,6 +27,8 @@ PHYSICAL = {
         ("BENCH_MEASUREMENT", "HEIGHT", 2e-6, (0.0, 1.0)),
         ("BENCH_MEASUREMENT", "APPLIED_FORCE", 0.02, (-600.0, 600.0)),
         ("BENCH_MEASUREMENT_2", "HEIGHT", 2e-6, (0.0, 1.0)),
+        ("DYNO_MEASUREMENT", "HEIGHT", 2e-7, (0.0, 1.5)),
+        ("DYNO_MEASUREMENT", "STRUT_FORCE", 0.005, (-40000.0, 40000.0)),
         ("BENCH_AUXILIARY", "LOAD_CELL_FORCE", 0.02, (-1000.0, 1000.0)),
         ("BENCH_AUXILIARY", "TEMPERATURE", 0.1, (-40.0, 200.0)),
         ("RIG_ESTIMATE", "SPRING_DAMPER_FORCE", 0.02, (-1000.0, 1000.0)),
@@ -53,6 +55,7 @@ def test_range_and_resolution(
     [
         ("BENCH_MEASUREMENT", 1, "BENCH"),
         ("BENCH_MEASUREMENT_2", 1, "BENCH"),
+        ("DYNO_MEASUREMENT", 1, "BENCH"),
         ("BENCH_AUXILIARY", 10, "BENCH"),
         ("RIG_ESTIMATE", 1, "RIG"),
         ("RIG_ESTIMATE_2", 1, "RIG"),
@@ -81,6 +84,7 @@ def test_urgent_messages_win_arbitration(rig: Database) -> None:
     kinds = [message.name.removesuffix("_2") for message in order]
     assert list(dict.fromkeys(kinds)) == [
         "BENCH_MEASUREMENT",
+        "DYNO_MEASUREMENT",
         "RIG_ESTIMATE",
         "RIG_KINEMATICS",
         "BENCH_AUXILIARY",
