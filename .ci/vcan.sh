@@ -62,7 +62,8 @@ cd "$project"
 export HOME=/tmp PYTHONDONTWRITEBYTECODE=1 NUMBA_CACHE_DIR=/tmp/numba MPLCONFIGDIR=/tmp
 set +e
 echo "vcan: \$(uname -r), up for \$(cut -d ' ' -f 1 /proc/uptime) s"
-"$python" -m pytest -m vcan -n 0 -p no:cacheprovider $(printf '%q ' "$@") tests/vcan
+"$python" -m pytest -m vcan -o addopts="-ra --import-mode=importlib" \
+    -p no:cacheprovider -p no:hypothesispytest -p no:xdist -p no:benchmark $(printf '%q ' "$@") tests/vcan
 echo \$? >"$work/out/exit_code"
 GUEST
 }

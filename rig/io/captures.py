@@ -89,6 +89,9 @@ class Captures:
         step = entry.step
         why = self._why(step)
         self._mode, self._flags = step.mode, step.flags
+        oldest_ns = step.t_ns - self._window.before_ns
+        while self._before and self._before[0].step.t_ns < oldest_ns:
+            self._before.popleft()
         if self._open is None and why is not None and self._count < self._window.most:
             self._count += 1
             self._open = Capture(self._count, why, step.t_ns, list(self._before))
@@ -97,9 +100,6 @@ class Captures:
             if step.t_ns - self._open.t_ns >= self._window.after_ns:
                 self.finish()
         self._before.append(entry)
-        oldest_ns = step.t_ns - self._window.before_ns
-        while self._before and self._before[0].step.t_ns < oldest_ns:
-            self._before.popleft()
 
     def finish(self) -> None:
         """End an open window now."""

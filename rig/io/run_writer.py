@@ -78,17 +78,27 @@ class _Part:
         self.number = number
         self.begin_ns = begin_ns
         self.frames = WholeFile(folder / part_name(FRAMES_FILE, number))
-        self.steps = WholeFile(folder / part_name(STEPS_FILE, number))
-        self.steps.append(schema.serialize().to_pybytes())
+        try:
+            self.steps = WholeFile(folder / part_name(STEPS_FILE, number))
+            try:
+                self.steps.append(schema.serialize().to_pybytes())
+            except OSError:
+                self.steps.close()
+                raise
+        except OSError:
+            self.frames.close()
+            raise
 
     @property
     def size(self) -> int:
         return self.frames.size + self.steps.size
 
     def close(self) -> None:
-        self.steps.append(_END_OF_STREAM)
-        self.steps.close()
-        self.frames.close()
+        try:
+            self.steps.append(_END_OF_STREAM)
+        finally:
+            self.steps.close()
+            self.frames.close()
 
 
 class RunLog:
@@ -201,8 +211,10 @@ class RunLog:
         if self._captures is not None:
             self._captures.finish()
         try:
-            self._flush()
-            self._part.close()
+            try:
+                self._flush()
+            finally:
+                self._part.close()
         except OSError as error:
             self._failed(str(error.strerror))
 
