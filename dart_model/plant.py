@@ -1,6 +1,6 @@
 """DART as a black box: state in, forces in, state out.
 
-DART's own `World.step` is semi-implicit Euler, first order, with the forces held over the step. Here
+DART's own `World.step` is semi-implicit Euler, first order, with forces held over the step. Here
 DART only answers "what is the acceleration in this state under these forces?"
 (`computeForwardDynamics`, a sixth of the cost of a step), and Kutta's third-order method asks it
 three times a sub-step. That keeps the error of the seed case far below the height's resolution at
@@ -181,14 +181,28 @@ class _Strut:
         for law, parameters, start, stop in self.laws:
             own = memory[start:stop]
             force += law.force(
-                t_s, height_m, velocity_m_per_s, applied_n, temperature_c, own, parameters, constants
-            )  # fmt: skip
+                t_s,
+                height_m,
+                velocity_m_per_s,
+                applied_n,
+                temperature_c,
+                own,
+                parameters,
+                constants,
+            )
             if law.rate is not None:
                 out = [0.0] * (stop - start)
                 law.rate(
-                    t_s, height_m, velocity_m_per_s, applied_n, temperature_c, own, parameters,
-                    constants, out,
-                )  # fmt: skip
+                    t_s,
+                    height_m,
+                    velocity_m_per_s,
+                    applied_n,
+                    temperature_c,
+                    own,
+                    parameters,
+                    constants,
+                    out,
+                )
                 memory_rates[start:stop] = out
         return force
 
@@ -814,19 +828,60 @@ def _read_skeleton(spec: FileSkeleton, folder: Path) -> Any:
     path = (folder / spec.file).resolve()
     if not path.is_file():
         raise InputError(f"{path}: skeleton.file: no such file, expected URDF, SDF, SKEL or MJCF")
-    uri, suffix = str(path), path.suffix.lower()
-    skeleton = None
-    if suffix == ".urdf":
-        skeleton = _dart.utils.DartLoader().parseSkeleton(uri)
-    elif suffix == ".sdf":
-        skeleton = _dart.utils.SdfParser.readSkeleton(uri)
-    elif suffix in (".skel", ".xml", ".mjcf"):
-        parser = _dart.utils.SkelParser if suffix == ".skel" else _dart.utils.MjcfParser
-        world = parser.readWorld(uri)
-        if world is not None and int(world.getNumSkeletons()) > 0:
-            skeleton = world.getSkeleton(0)
-    else:
-        raise InputError(f"{path}: suffix {suffix!r}: expected .urdf, .sdf, .skel, .xml or .mjcf")
+    suffix = path.suffix.lower()
+    if suffix not in _PARSERS:
+        raise InputError(f"{path}: suffix {suffix!r}: expected {', '.join(_PARSERS)}")
+    try:
+        skeleton = _PARSERS[suffix](str(path))
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: DART cannot read it: {reason}") from error
     if skeleton is None:
         raise InputError(f"{path}: DART finds no skeleton in it, expected a valid {suffix} file")
+    if suffix in _MJCF:
+        _refuse_bodies_without_shape(skeleton, path)
     return skeleton
+
+
+def _read_urdf(uri: str) -> Any:
+    loader = _dart.utils.DartLoader()
+    options = loader.getOptions()
+    # A bench stands on the ground; DART would let the root link fly.
+    options.mDefaultRootJointType = _dart.utils.DartLoaderRootJointType.FIXED
+    loader.setOptions(options)
+    return loader.parseSkeleton(uri)
+
+
+def _read_sdf(uri: str) -> Any:
+    return _dart.utils.SdfParser.readSkeleton(uri)
+
+
+def _read_skel(uri: str) -> Any:
+    return _first_skeleton(_dart.utils.SkelParser.readWorld(uri))
+
+
+def _read_mjcf(uri: str) -> Any:
+    return _first_skeleton(_dart.utils.MjcfParser.readWorld(uri))
+
+
+def _first_skeleton(world: Any) -> Any:
+    return world.getSkeleton(0) if world is not None and world.getNumSkeletons() > 0 else None
+
+
+_MJCF = (".xml", ".mjcf")
+_PARSERS: dict[str, Callable[[str], Any]] = {
+    ".urdf": _read_urdf,
+    ".sdf": _read_sdf,
+    ".skel": _read_skel,
+    **dict.fromkeys(_MJCF, _read_mjcf),
+}
+"""DART's parser for each suffix."""
+
+
+def _refuse_bodies_without_shape(skeleton: Any, path: Path) -> None:
+    """DART's MJCF parser gives a body without a geom 1 kg, whatever its inertial says."""
+    for body in skeleton.getBodyNodes():
+        if int(body.getNumShapeNodes()) == 0:
+            raise InputError(
+                f"{path}: body {body.getName()}: no geom, expected one: DART reads no mass without"
+            )

@@ -1,12 +1,13 @@
-"""What a model is: bodies, joints and struts, as a frozen value read from YAML and written to it."""
+"""What a model is: bodies, joints and struts, as a frozen value read from and written to YAML."""
 
+import shutil
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from dart_model.effects import CATALOGUE, effect
 from dart_model.yaml_file import InputError, parse_mapping, read_text, validated
@@ -84,6 +85,14 @@ class FileSkeleton(_Frozen):
         return self
 
 
+def _skeleton_kind(skeleton: object) -> str:
+    """Which kind is meant, so that an error speaks of that one alone."""
+    is_file = isinstance(skeleton, FileSkeleton) or (
+        isinstance(skeleton, dict) and "file" in skeleton
+    )
+    return "<file>" if is_file else "<bodies>"
+
+
 class EffectSpec(_Frozen):
     """An effect of the catalogue with its parameters."""
 
@@ -110,7 +119,7 @@ class EffectSpec(_Frozen):
 
 
 class StrutSpec(_Frozen):
-    """Spring-damper between two bodies: force = -stiffness * (height - free length) - damping * velocity.
+    """Spring-damper: force = -stiffness * (height - free length) - damping * velocity.
 
     Attributes:
         name: Unique name.
@@ -145,13 +154,16 @@ class ModelSpec(_Frozen):
         gravity_m_per_s2: Standard gravity along -z.
         skeleton: Bodies and joints, inline or in a file.
         struts: Spring-dampers; one observer may act on each.
-        applied_force_body: Body on which the applied force acts; the last strut's upper body if absent.
+        applied_force_body: Body on which the applied force acts; by default the last strut's upper.
         folder: Folder of the model file, where a skeleton file is looked for; not part of the YAML.
     """
 
     name: Name
     gravity_m_per_s2: Finite = 9.81
-    skeleton: InlineSkeleton | FileSkeleton
+    skeleton: Annotated[
+        Annotated[InlineSkeleton, Tag("<bodies>")] | Annotated[FileSkeleton, Tag("<file>")],
+        Discriminator(_skeleton_kind),
+    ]
     struts: Annotated[tuple[StrutSpec, ...], Field(min_length=1, max_length=64)]
     applied_force_body: Name | None = None
     folder: Annotated[Path, Field(exclude=True)] = Path()
@@ -234,6 +246,18 @@ def dump_model(spec: ModelSpec) -> str:
     """YAML text that `parse_model` reads back to an equal value."""
     data = spec.model_dump(mode="json", exclude_none=True)
     return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
+
+
+def copy_skeleton(spec: ModelSpec, folder: Path) -> None:
+    """Copy a model's skeleton file, if it has one, to where `dump_model`'s text will look for it.
+
+    Raises:
+        OSError: The folder cannot be written.
+    """
+    if isinstance(spec.skeleton, FileSkeleton):
+        target = folder / spec.skeleton.file
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(spec.folder / spec.skeleton.file, target)
 
 
 def _refuse_repeated(what: str, names: Iterable[str]) -> None:

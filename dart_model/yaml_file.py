@@ -1,4 +1,4 @@
-"""YAML from outside, read as data: bounded, without aliases, tags or repeated keys, then validated."""
+"""YAML from outside, read as data: bounded, without aliases or repeated keys, then validated."""
 
 from collections.abc import Hashable
 from pathlib import Path
@@ -25,7 +25,9 @@ class _PlainLoader(yaml.SafeLoader):
             )
         return super().compose_node(parent, index)
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, object]:  # noqa: FBT001, FBT002 - PyYAML's signature
+    def construct_mapping(
+        self, node: yaml.MappingNode, deep: bool = False
+    ) -> dict[Hashable, object]:
         seen: set[object] = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
@@ -58,7 +60,7 @@ def read_text(path: Path, max_bytes: int = _MAX_BYTES) -> str:
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.start} is not UTF-8, expected a text file") from error
+        raise InputError(f"{path}: byte {error.start} is not UTF-8, expected text") from error
 
 
 def parse_mapping(text: str, source: str) -> dict[str, object]:
@@ -118,7 +120,9 @@ def _one_line(error: ValidationError, source: str) -> str:
     errors = error.errors(include_url=False)
     # A misspelt key is worth more than the key that it leaves missing.
     first = min(errors, key=lambda item: item["type"] == "missing")
-    key = ".".join(str(part) for part in first["loc"]) or "top level"
+    # Parts in angle brackets are not keys: they tell apart what may stand under one.
+    parts = [str(part) for part in first["loc"] if not str(part).startswith("<")]
+    key = ".".join(parts) or "top level"
     more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
     cause = cast("dict[str, object]", first.get("ctx", {})).get("error")
     if cause is not None:

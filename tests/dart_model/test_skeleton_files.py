@@ -1,0 +1,152 @@
+"""Skeletons from URDF, SDF, SKEL and MJCF are the same model as the one written inline."""
+
+from pathlib import Path
+
+import pytest
+
+from dart_model.plant import DartPlant
+from dart_model.spec import ModelSpec, load_model
+from dart_model.yaml_file import InputError
+
+INERTIA = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+
+URDF = f"""<?xml version="1.0"?>
+<robot name="bench">
+  <link name="base"/>
+  <link name="body">
+    <inertial><origin xyz="0 0 0"/><mass value="10"/>{INERTIA}</inertial>
+  </link>
+  <joint name="guide" type="prismatic">
+    <parent link="base"/><child link="body"/><axis xyz="0 0 1"/>
+    <limit lower="-10" upper="10" effort="100000" velocity="100"/>
+  </joint>
+</robot>
+"""
+
+SDF = """<?xml version="1.0"?>
+<sdf version="1.4">
+  <model name="bench">
+    <link name="body">
+      <inertial><mass>10</mass>
+        <inertia><ixx>1</ixx><ixy>0</ixy><ixz>0</ixz><iyy>1</iyy><iyz>0</iyz><izz>1</izz></inertia>
+      </inertial>
+    </link>
+    <joint name="guide" type="prismatic">
+      <parent>world</parent><child>body</child>
+      <axis><xyz>0 0 1</xyz></axis>
+    </joint>
+  </model>
+</sdf>
+"""
+
+SKEL = """<?xml version="1.0"?>
+<skel version="1.0">
+  <world name="world">
+    <physics><time_step>0.001</time_step><gravity>0 0 -9.81</gravity></physics>
+    <skeleton name="bench">
+      <body name="body">
+        <transformation>0 0 0 0 0 0</transformation>
+        <inertia><mass>10</mass><offset>0 0 0</offset></inertia>
+      </body>
+      <joint type="prismatic" name="guide">
+        <parent>world</parent><child>body</child>
+        <axis><xyz>0 0 1</xyz></axis>
+      </joint>
+    </skeleton>
+  </world>
+</skel>
+"""
+
+MJCF = """<mujoco model="bench">
+  <compiler angle="radian"/>
+  <worldbody>
+    <body name="body" pos="0 0 0">
+      <joint name="guide" type="slide" axis="0 0 1"/>
+      <inertial pos="0 0 0" mass="10" diaginertia="1 1 1"/>
+      <geom type="sphere" size="0.1"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+FILES = {"bench.urdf": URDF, "bench.sdf": SDF, "bench.skel": SKEL, "bench.xml": MJCF}
+
+INLINE = "{bodies: [{name: body, mass_kg: 10, joint: {type: prismatic, parent: world}}]}"
+
+
+def model(folder: Path, skeleton: str) -> ModelSpec:
+    path = folder / "model.yaml"
+    path.write_text(
+        f"""
+name: bench
+skeleton: {skeleton}
+struts:
+  - name: strut
+    between: [world, body]
+    free_length_m: 0.5
+    stiffness_n_per_m: 500
+    damping_n_s_per_m: 100
+""",
+        "utf-8",
+    )
+    return load_model(path)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_gives_the_same_motion_as_the_inline_bodies(name, tmp_path):
+    (tmp_path / name).write_text(FILES[name], "utf-8")
+    plants = [DartPlant(model(tmp_path, text)) for text in (f"{{file: {name}}}", INLINE)]
+    after: list[list[tuple[float, float]]] = []
+    for plant in plants:
+        state = plant.initial([0.42])
+        for _ in range(50):
+            state = plant.step(plant.load(state, (20.0,), 30.0, 20.0), 1e-3, 30.0)
+        after.append(plant.kinematics(state))
+    assert after[0][0] == pytest.approx(after[1][0], abs=1e-12)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_that_dart_cannot_read_is_one_line(name, tmp_path):
+    (tmp_path / name).write_text(FILES[name][:60], "utf-8")
+    with pytest.raises(InputError) as caught:
+        DartPlant(model(tmp_path, f"{{file: {name}}}"))
+    assert str(tmp_path / name) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"bench\.urdf: skeleton\.file: no such file"):
+        DartPlant(model(tmp_path, "{file: bench.urdf}"))
+
+
+def test_an_unknown_format_is_named(tmp_path):
+    (tmp_path / "bench.obj").write_text("", "utf-8")
+    with pytest.raises(InputError, match=r"suffix '\.obj': expected \.urdf, \.sdf"):
+        DartPlant(model(tmp_path, "{file: bench.obj}"))
+
+
+@pytest.mark.parametrize("file", ["/etc/passwd", "../bench.urdf", "a/../../bench.urdf"])
+def test_a_file_outside_the_folder_is_refused(file, tmp_path):
+    with pytest.raises(
+        InputError, match=r"skeleton.*expected a path inside the model's own folder"
+    ):
+        model(tmp_path, f"{{file: {file}}}")
+
+
+def test_a_body_whose_mass_dart_would_not_read_is_refused(tmp_path):
+    text = MJCF.replace('<geom type="sphere" size="0.1"/>', "")
+    (tmp_path / "bench.xml").write_text(text, "utf-8")
+    with pytest.raises(InputError, match=r"bench\.xml: body body: no geom, expected one"):
+        DartPlant(model(tmp_path, "{file: bench.xml}"))
+
+
+def test_a_body_that_is_not_in_the_file_is_refused(tmp_path):
+    (tmp_path / "bench.urdf").write_text(URDF.replace('"body"', '"piston"'), "utf-8")
+    with pytest.raises(InputError, match=r"strut strut: between 'body': expected one of.*piston"):
+        DartPlant(model(tmp_path, "{file: bench.urdf}"))
+
+
+def test_a_skeleton_without_a_joint_that_moves_is_refused(tmp_path):
+    (tmp_path / "bench.urdf").write_text(URDF.replace('type="prismatic"', 'type="fixed"'), "utf-8")
+    with pytest.raises(InputError, match="no joint that moves"):
+        DartPlant(model(tmp_path, "{file: bench.urdf}"))
