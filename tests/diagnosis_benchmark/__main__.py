@@ -14,7 +14,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from tests.diagnosis_benchmark.execute import execute
+from tests.diagnosis_benchmark.execute import crashed, execute
 from tests.diagnosis_benchmark.judge import Result
 from tests.diagnosis_benchmark.plan import Counts, Slot, slots
 from tests.diagnosis_benchmark.summary import print_tables, summarise, write_tables
@@ -50,9 +50,10 @@ def _run_all(todo: list[Slot], out: Path, jobs: int) -> Iterator[Result]:
         os.environ.update({f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "NUMBA")})
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-        futures = [pool.submit(execute, slot, out) for slot in todo]
+        futures = {pool.submit(execute, slot, out): slot for slot in todo}
         for future in as_completed(futures):
-            yield future.result()
+            error = future.exception()
+            yield crashed(futures[future], error) if error else future.result()
 
 
 def main() -> None:

@@ -191,9 +191,7 @@ class Interval(NamedTuple):
         return self.low <= self.truth <= self.high
 
 
-def intervals(
-    planted: tuple[Planted, ...], bench: Bench, found: list[dict[str, object]]
-) -> list[Interval]:
+def intervals(planted: tuple[Planted, ...], bench: Bench, found: list[dict]) -> list[Interval]:
     """Every interval of a diagnosis that the truth can be held against.
 
     Args:
@@ -201,21 +199,23 @@ def intervals(
         bench: The bench.
         found: ``effects`` of the diagnosis.
     """
-    named = {str(effect["name"]): effect["parameters"] for effect in found}
     held = []
-    for effect in planted:
-        for same in COMPARABLE.get(effect.law, ()):
-            given = named.get(same.effect, {}).get(same.parameter)
-            if given is None or given["low"] is None or given["high"] is None:
-                continue
-            held.append(
-                Interval(
-                    effect.law,
-                    f"{same.effect}.{same.parameter}",
-                    same.value(effect.truth, bench),
-                    given["value"],
-                    given["low"],
-                    given["high"],
-                )
-            )
-    return held
+    for planted_effect in planted:
+        same = COMPARABLE.get(planted_effect.law, ())
+        comparable = {entry.effect for entry in same}
+        answers = [answer for answer in found if answer["name"] in comparable]
+        # Two stops may stand for one law with two ends; of all else the first answer counts.
+        for answer in answers if planted_effect.family == "stop" else answers[:1]:
+            held += [
+                _interval(planted_effect, entry, bench, answer["parameters"][entry.parameter])
+                for entry in same
+                if entry.effect == answer["name"] and entry.parameter in answer["parameters"]
+            ]
+    return [interval for interval in held if math.isfinite(interval.high - interval.low)]
+
+
+def _interval(planted: Planted, same: Same, bench: Bench, estimate: dict) -> Interval:
+    low, high = (math.nan if estimate[end] is None else estimate[end] for end in ("low", "high"))
+    truth = same.value(planted.truth, bench)
+    parameter = f"{same.effect}.{same.parameter}"
+    return Interval(planted.law, parameter, truth, estimate["value"], low, high)

@@ -1,4 +1,4 @@
-"""Fills a slot, diagnoses it with `rig diagnose` as a user would, and keeps the result."""
+"""Fills a slot, diagnoses it as `rig diagnose` does, and keeps the result."""
 
 import json
 import shutil
@@ -6,33 +6,36 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-from typer.testing import CliRunner
-
-from rig.cli import app
+from dart_model.spec import load_model
+from rig.identify.diagnose import diagnose as rig_diagnose
+from rig.identify.diagnosis import to_json
+from rig.identify.records import RecordError, read_csv
 from tests.diagnosis_benchmark.comparable import Interval
 from tests.diagnosis_benchmark.judge import Result, judge
 from tests.diagnosis_benchmark.plan import Slot, fill
 from tests.truth.files import write_case
 from tests.truth.simulation import floor_ratios
 
-FAILED = {"verdict": "failed", "effects": [], "ambiguous_with": []}
-
 
 def diagnose(folder: Path) -> dict:
-    """Run ``rig diagnose`` on a case's files.
+    """Diagnose a case's files through the same functions as ``rig diagnose``.
 
     Returns:
-        Its ``diagnosis.json``; with the verdict ``failed`` and a message if there is none.
+        What ``diagnosis.json`` holds; where the data were refused, the verdict ``failed``.
     """
-    out = folder / "diagnosis"
-    shutil.rmtree(out, ignore_errors=True)
-    arguments = ["diagnose", str(folder / "train.csv"), "--model", str(folder / "model.yaml")]
-    arguments += ["--held-out", str(folder / "test.csv"), "--out", str(out)]
-    outcome = CliRunner().invoke(app, arguments)
-    path = out / "diagnosis.json"
-    if path.exists():
-        return json.loads(path.read_text(encoding="utf-8"))
-    return FAILED | {"message": f"{outcome.exception!r} {outcome.output[-300:]}"}
+    model = load_model(folder / "model.yaml")
+    try:
+        found = rig_diagnose(
+            model, [read_csv(folder / "train.csv")], [read_csv(folder / "test.csv")]
+        )
+    except RecordError as error:
+        return failed(str(error))
+    return json.loads(to_json(found.diagnosis))
+
+
+def failed(message: str) -> dict:
+    """The answer of a diagnosis that gave none."""
+    return {"verdict": "failed", "effects": [], "ambiguous_with": [], "message": message}
 
 
 def result_path(out: Path, slot: Slot) -> Path:
@@ -46,6 +49,13 @@ def load_result(path: Path) -> Result:
     held = tuple(Interval(*entry) for entry in raw.pop("intervals"))
     lists = {key: tuple(value) for key, value in raw.items() if isinstance(value, list)}
     return Result(**(raw | lists), intervals=held)
+
+
+def crashed(slot: Slot, error: BaseException) -> Result:
+    """The result of a slot whose diagnosis broke off."""
+    case = fill(slot)
+    judged = judge(case, (), failed(repr(error)), slot.name, slot.group)
+    return Result(**judged, duration_s=float("nan"))
 
 
 def execute(slot: Slot, out: Path) -> Result:

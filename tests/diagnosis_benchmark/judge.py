@@ -83,6 +83,10 @@ def is_right(planted: tuple[str, ...], diagnosis: dict) -> bool:
     return set(planted) <= named
 
 
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
 def judge(case: Case, ratios: tuple[float, ...], diagnosis: dict, slot: str, group: str) -> dict:
     """All of a `Result` but its duration, as its fields."""
     found = diagnosis["effects"]
@@ -102,9 +106,9 @@ def judge(case: Case, ratios: tuple[float, ...], diagnosis: dict, slot: str, gro
         "names": tuple(effect["name"] for effect in found),
         "ambiguous_with": tuple(diagnosis["ambiguous_with"]),
         "right": is_right(case.families, diagnosis),
-        "rmse_before_m": error.get("before", float("nan")),
-        "rmse_after_m": error.get("after", float("nan")),
-        "own_floor_m": floor.get("height_rmse_m", float("nan")),
+        "rmse_before_m": _number(error.get("before")),
+        "rmse_after_m": _number(error.get("after")),
+        "own_floor_m": _number(floor.get("height_rmse_m")),
         "intervals": tuple(intervals(case.effects, case.bench, found)),
         "message": diagnosis.get("message", ""),
     }

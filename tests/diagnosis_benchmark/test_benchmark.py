@@ -7,7 +7,7 @@ from rich.console import Console
 
 from tests.diagnosis_benchmark import execute as execution
 from tests.diagnosis_benchmark.comparable import COMPARABLE, intervals
-from tests.diagnosis_benchmark.execute import execute, load_result, result_path
+from tests.diagnosis_benchmark.execute import crashed, execute, failed, load_result, result_path
 from tests.diagnosis_benchmark.judge import is_right
 from tests.diagnosis_benchmark.plan import Counts, Slot, fill, slots
 from tests.diagnosis_benchmark.summary import print_tables, summarise, write_tables
@@ -122,9 +122,14 @@ def test_results_are_kept_and_tabulated(tmp_path, monkeypatch):
 
 
 def test_failure_is_reported_and_tried_again(tmp_path, monkeypatch):
-    failed = execution.FAILED | {"message": "it broke"}
-    monkeypatch.setattr(execution, "diagnose", lambda _: failed)
+    monkeypatch.setattr(execution, "diagnose", lambda _: failed("it broke"))
     slot = Slot("complete", "complete", 0, 0)
     result = execute(slot, tmp_path)
     assert (result.verdict, result.right, result.message) == ("failed", False, "it broke")
     assert not result_path(tmp_path, slot).exists()
+
+
+def test_crash_is_a_wrong_answer():
+    result = crashed(Slot("outside", "outside", 0, 0), KeyError("x"))
+    assert (result.verdict, result.right) == ("failed", False)
+    assert "KeyError" in result.message
