@@ -14,21 +14,29 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from can_dbc.errors import DatabaseError
+from dart_model.spec import load_model
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfigError
 from rig.check import Severity, check
 from rig.config import InputError, load_setup
 from rig.core.types import Mode
 from rig.demo import CASES, Case, run_case
+from rig.diagnose import diagnose_runs
+from rig.identify.diagnosis import Diagnosis
+from rig.identify.records import RecordError
+from rig.identify.report import sentence
 from rig.io.bus import BusConfig, BusError
 from rig.replay import replay
 from rig.runs import Ended, live, run_bench
+from rig.story import tell
 
 OK, FAILED, WRONG_INPUT = 0, 1, 2
-_INPUT_ERRORS = (InputError, DatabaseError, BenchConfigError, BusError)
+_INPUT_ERRORS = (InputError, DatabaseError, BenchConfigError, BusError, RecordError)
+STORY = "story"
 _REFRESH_NS = 200_000_000
 
 app = typer.Typer(
@@ -53,9 +61,18 @@ def main() -> None:
         sys.exit(WRONG_INPUT)
 
 
-@app.command(epilog="Examples: `rig demo` · `rig demo --case seed --lockstep --out /tmp/seed`")
+@app.command(
+    epilog="Examples: `rig demo` · `rig demo --seed 7` · "
+    "`rig demo --case seed --lockstep --out /tmp/seed`"
+)
 def demo(
-    case: Annotated[str, typer.Option(help=f"Which case: {', '.join(CASES)}.")] = "seed",
+    case: Annotated[
+        str,
+        typer.Option(help=f"{STORY}: the whole story; or a plain case: {', '.join(CASES)}."),
+    ] = STORY,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Draws the effect that the story's bench carries.")
+    ] = 1,
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="DIR", help="Folder to write into; rig-demo by default."),
@@ -64,23 +81,75 @@ def demo(
         bool, typer.Option("--lockstep", help="Simulated time, as fast as the machine allows.")
     ] = False,
     duration_s: Annotated[
-        float | None, typer.Option("--duration-s", min=1.0, help="Length of the run in s.")
+        float | None, typer.Option("--duration-s", min=1.0, help="Length of a run in s.")
     ] = None,
 ) -> None:
-    """Run a simulated bench and the bridge on this machine, over virtual CAN."""
-    if case not in CASES:
-        raise InputError(f"--case {case!r}: expected one of {', '.join(CASES)}")
+    """Run a simulated bench and the bridge on this machine, over virtual CAN.
+
+    The story: a bench with an effect that nobody declared, logged by the bridge, diagnosed,
+    corrected, and run again.
+    """
+    if case not in (STORY, *CASES):
+        raise InputError(f"--case {case!r}: expected one of {', '.join((STORY, *CASES))}")
     out = out or _free_folder("rig-demo")
     _refuse_full(out)
+    if case == STORY:
+        _tell(seed, out, lockstep=lockstep, duration_s=duration_s)
+        return
     with _stoppable() as stop, _progress(duration_s) as progress:
         done = run_case(
             case, out, lockstep=lockstep, duration_s=duration_s, stop=stop, progress=progress
         )
     _print_case(done)
     _print_ended(done.run, with_timing=not lockstep)
+    console.print(f"Written: {out}/summary.json, a picture of each strut, and the run {out}/run")
+
+
+def _tell(seed: int, out: Path, *, lockstep: bool, duration_s: float | None) -> None:
+    with _stoppable() as stop, _progress(duration_s) as progress, _bar() as bar:
+        story = tell(
+            seed,
+            out,
+            duration_s=duration_s,
+            lockstep=lockstep,
+            stop=stop,
+            chapter=lambda text: console.print(f"- {text}"),
+            progress=progress,
+            diagnosis_progress=bar,
+        )
+    _print_ended(story.first_run, with_timing=not lockstep)
+    _print_diagnosis(story.diagnosis, struts=1)
+    before, after = story.virtual_force_rms_n
+    parameters = ", ".join(f"{key} {value:.4g}" for key, value in story.effect.parameters.items())
     console.print(
-        f"Written: {out / 'summary.json'}, a picture of each strut, and the run {out / 'run'}"
+        f"On a fresh run the virtual force falls from {before:.2f} N to {after:.2f} N RMS.\n"
+        f"What the bench carried, and nobody had told the diagnosis: {story.effect.name} "
+        f"(family {story.family}): {parameters}.\n"
+        f"Report: {out}/diagnosis/report.html"
     )
+
+
+@app.command(
+    name="diagnose",
+    epilog="Example: `rig diagnose runs/7 --model bench.yaml --held-out runs/8 --out found`",
+)
+def diagnose_command(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Folders of runs, or CSV files.")
+    ],
+    model: Annotated[Path, typer.Option("--model", metavar="MODEL", help="Model file.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
+    held_out: Annotated[
+        list[Path] | None,
+        typer.Option("--held-out", metavar="RUN", help="Run to judge on; once for each."),
+    ] = None,
+) -> None:
+    """Trace what the model lacks to named effects, correct it, and judge it on other data."""
+    spec = load_model(model)
+    with _bar() as bar:
+        diagnosis = diagnose_runs(runs, spec, held_out or [], out, bar)
+    _print_diagnosis(diagnosis, struts=len(spec.struts))
+    console.print(f"Written: {out}/diagnosis.json, {out}/corrected.yaml, {out}/report.html")
 
 
 @app.command(epilog="Examples: `rig run rig.yaml` · `rig run rig.yaml --out runs/7 --listen-only`")
@@ -185,7 +254,7 @@ def replay_command(
     with _progress(None) as progress:
         result = replay(folder, progress=progress)
     summary: dict[str, object] = {
-        "ticks": len(result.steps),
+        "ticks": result.steps.num_rows,
         "logged_ticks": result.logged,
         "different_ticks": result.different,
         "first_different_ns": result.first_different_ns,
@@ -217,6 +286,19 @@ def _stoppable() -> Generator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _bar() -> Generator[Callable[[str, float], None]]:
+    """A bar for the diagnosis, which has no tick to miss."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+        task = bars.add_task("diagnosis", total=1.0, visible=False)
+
+        def show(what: str, share: float) -> None:
+            bars.update(task, description=what, completed=share, visible=share < 1.0)
+
+        yield show
 
 
 @contextlib.contextmanager
@@ -281,6 +363,52 @@ def _print_case(case: Case) -> None:
         console.print(table)
 
 
+def _print_diagnosis(diagnosis: Diagnosis, *, struts: int) -> None:
+    console.print(f"\n[bold]{diagnosis.verdict.replace('_', ' ')}[/]: ", end="")
+    console.print(sentence(diagnosis, struts), markup=False)
+    if diagnosis.effects:
+        table = Table("effect", "parameter", "value", "95 % interval", title="What was found")
+        for found in diagnosis.effects:
+            for name, estimate in found.parameters.items():
+                table.add_row(
+                    f"{found.family}: {found.name}",
+                    name,
+                    f"{estimate.value:.5g}",
+                    f"{estimate.low:.5g} to {estimate.high:.5g}",
+                )
+        console.print(table)
+    held_out, floor = diagnosis.held_out, diagnosis.noise_floor
+    table = Table("on held-out data", "before", "after", "noise floor", title="RMS error")
+    table.add_row(
+        "height, model running open loop",
+        *(
+            f"{value * 1e3:.4f} mm"
+            for value in (
+                held_out.height_rmse_m.before,
+                held_out.height_rmse_m.after,
+                floor.height_rmse_m,
+            )
+        ),
+    )
+    table.add_row(
+        "force that the model lacks",
+        *(
+            f"{value:.3f} N"
+            for value in (
+                held_out.residual_force_rmse_n.before,
+                held_out.residual_force_rmse_n.after,
+                floor.residual_force_rmse_n,
+            )
+        ),
+    )
+    if held_out.strut_force_rmse_n is not None:
+        strut = held_out.strut_force_rmse_n
+        table.add_row(
+            "strut force against the load cell", f"{strut.before:.3f} N", f"{strut.after:.3f} N", ""
+        )
+    console.print(table)
+
+
 def _share(force_n: float, peak_n: float) -> str:
     return f"{force_n:.2f} N ({force_n / peak_n:.2%} of peak)"
 
@@ -288,9 +416,9 @@ def _share(force_n: float, peak_n: float) -> str:
 def _print_ended(ended: Ended, *, with_timing: bool) -> None:
     table = Table("Run", f"{ended.ticks} ticks, ended {ended.state.rig.mode.name}")
     for name, value in ended.state.counts._asdict().items():
-        table.add_row(
-            f"{name} {'ticks' if name in ('stale', 'overruns') else 'frames'}", str(value)
-        )
+        if value or name in ("lost", "refused", "overruns"):
+            what = "ticks" if name in ("stale", "overruns") else "frames"
+            table.add_row(f"{name.replace('_', ' ')} ({what})", str(value))
     if with_timing:
         timing = ended.timing
         for label, figures in (("lateness", timing.lateness_us()), ("work", timing.work_us())):

@@ -1,7 +1,6 @@
 """Runs in, diagnosis out: whatever a run is logged as becomes records, and results become files."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +9,14 @@ from numpy.typing import NDArray
 from can_dbc.codec import decode_log
 from can_dbc.database import Message
 from can_dbc.protection import check_crc_log
-from dart_model.spec import ModelSpec
+from dart_model.spec import ModelSpec, copy_skeleton
 from dart_model.yaml_file import InputError
 from rig.config import Setup, SignalName
 from rig.core.messages import Quantity
+from rig.identify.diagnose import diagnose
+from rig.identify.diagnosis import Diagnosis, write_results
 from rig.identify.records import Record, checked, read_csv
+from rig.identify.report import ReportInput, write_report
 from rig.io.run_log import RunFolder
 from rig.replay import setup_of_run
 
@@ -136,3 +138,45 @@ def _nearest(t_s: _Array, own_t_s: _Array, values: _Array, half_s: float) -> _Ar
     """Values at the times of another message; NaN where none is near."""
     at = np.clip(np.searchsorted(own_t_s, t_s - half_s), 0, len(own_t_s) - 1)
     return np.where(np.abs(own_t_s[at] - t_s) <= half_s, values[at], np.nan)
+
+
+DIAGNOSIS_FILE, CORRECTED_FILE, REPORT_FILE = "diagnosis.json", "corrected.yaml", "report.html"
+
+
+def diagnose_runs(
+    runs: Sequence[Path],
+    model: ModelSpec,
+    held_out: Sequence[Path],
+    out: Path,
+    progress: Callable[[str, float], None],
+) -> Diagnosis:
+    """Diagnose runs, and write the diagnosis, the corrected model and the report.
+
+    Args:
+        runs: Folders of runs, or CSV files.
+        model: The model.
+        held_out: Runs to judge on.
+        out: Folder to write into.
+        progress: Told what is being done, and the share that is done.
+
+    Raises:
+        InputError: A run cannot be read, or `out` cannot be written.
+        RecordError: A run holds nothing that can be diagnosed.
+    """
+    result = diagnose(
+        model,
+        [read_record(path) for path in runs],
+        [read_record(path) for path in held_out],
+        progress,
+    )
+    progress("writing the report", 1.0)
+    report = ReportInput(
+        result.diagnosis, result.fitted, result.held_out, result.ranking, result.assumptions
+    )
+    try:
+        write_results(result.diagnosis, result.corrected, out)
+        copy_skeleton(model, out)
+        write_report(report, out / REPORT_FILE)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror}") from error
+    return result.diagnosis
