@@ -126,11 +126,11 @@ def _sample_times_s(t_ns: NDArray[np.int64], message: Message) -> _Array:
     """Times of sampling: on the grid of the cycle time where arrivals say that there is one."""
     cycle_ns = message.cycle_time_ns
     if cycle_ns is None or len(t_ns) == 0:
-        return t_ns * 1e-9
+        return np.asarray(t_ns * 1e-9, dtype=np.float64)
     index = np.rint((t_ns - t_ns[0]) / cycle_ns)
     jitter_ns = t_ns - t_ns[0] - index * cycle_ns
     if float(np.max(np.abs(jitter_ns - np.median(jitter_ns)))) > 0.4 * cycle_ns:
-        return t_ns * 1e-9
+        return np.asarray(t_ns * 1e-9, dtype=np.float64)
     return (t_ns[0] + np.median(jitter_ns) + index * cycle_ns) * 1e-9
 
 

@@ -13,6 +13,7 @@ from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig, Effect
 from rig.config import CONFIGS, Setup, load_setup
 from rig.core.types import Mode
+from rig.demo import SETTLED_NS
 from rig.diagnose import CORRECTED_FILE, diagnose_runs
 from rig.identify.diagnosis import Diagnosis, to_json
 from rig.io.run_log import read_run
@@ -168,6 +169,7 @@ def _bench(effect: Effect, excitation: int) -> BenchConfig:
 
 def _virtual_force_rms_n(ended: Ended) -> float:
     steps: Any = read_run(ended.folder).steps
-    settled = steps.column("t_ns").to_numpy() >= 500_000_000
-    force = steps.column(f"{_STRUT}.virtual_force_n").to_numpy()[settled]
+    t_ns = np.asarray(steps.column("t_ns").to_numpy(), dtype=np.int64)
+    force = np.asarray(steps.column(f"{_STRUT}.virtual_force_n").to_numpy(), dtype=np.float64)
+    force = force[t_ns >= SETTLED_NS]
     return float(np.sqrt(np.mean(force**2)))
