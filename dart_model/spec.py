@@ -10,7 +10,15 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from dart_model.effects import CATALOGUE, effect
-from dart_model.yaml_file import InputError, parse_mapping, read_text, validated
+from dart_model.yaml_file import (
+    Finite,
+    InputError,
+    NotNegative,
+    Positive,
+    parse_mapping,
+    read_text,
+    validated,
+)
 
 MODELS = Path(__file__).parent / "models"
 """Folder of the models that come with the package."""
@@ -18,9 +26,6 @@ MODELS = Path(__file__).parent / "models"
 WORLD = "world"
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_.-]{0,63}$")]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
 
 

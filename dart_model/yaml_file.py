@@ -1,11 +1,12 @@
 """YAML from outside, read as data: bounded, without aliases or repeated keys, then validated."""
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
+from pydantic_core import PydanticCustomError
 
 _MAX_BYTES = 4 * 1024 * 1024
 _Model = TypeVar("_Model", bound=BaseModel)
@@ -13,6 +14,18 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 class InputError(ValueError):
     """An input from outside is wrong; the message is one line that names it."""
+
+
+def _no_truth_value(value: object) -> object:
+    """Refuse `true`, which would otherwise be read as 1."""
+    if isinstance(value, bool):
+        raise PydanticCustomError("number", "expected a number")
+    return value
+
+
+Finite = Annotated[float, BeforeValidator(_no_truth_value), Field(allow_inf_nan=False)]
+Positive = Annotated[Finite, Field(gt=0)]
+NotNegative = Annotated[Finite, Field(ge=0)]
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -73,9 +86,8 @@ def parse_mapping(text: str, source: str) -> dict[str, object]:
     Raises:
         InputError: The text is no YAML, or no mapping.
     """
-    loader = _PlainLoader(text)
     try:
-        data = cast("object", loader.get_single_data())
+        data = cast("object", yaml.load(text, _PlainLoader))  # noqa: S506 - it is a SafeLoader
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = f" line {mark.line + 1}" if mark else ""
@@ -83,8 +95,6 @@ def parse_mapping(text: str, source: str) -> dict[str, object]:
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{source}: is no valid YAML: {reason}") from error
-    finally:
-        loader.dispose()
     if not isinstance(data, dict):
         found = "nothing" if data is None else type(data).__name__
         raise InputError(f"{source}: expected keys and values at the top level, found {found}")
@@ -104,7 +114,7 @@ def validated(model: type[_Model], data: object, source: str) -> _Model:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise InputError(_one_line(error, source)) from error
+        raise InputError(_one_line(error, model, source)) from error
 
 
 def load_validated(model: type[_Model], path: Path) -> _Model:
@@ -116,13 +126,15 @@ def load_validated(model: type[_Model], path: Path) -> _Model:
     return validated(model, parse_mapping(read_text(path), str(path)), str(path))
 
 
-def _one_line(error: ValidationError, source: str) -> str:
+def _one_line(error: ValidationError, model: type[BaseModel], source: str) -> str:
     errors = error.errors(include_url=False)
-    # A misspelt key is worth more than the key that it leaves missing.
-    first = min(errors, key=lambda item: item["type"] == "missing")
+    # A list whose items are wrong is also called too short: that says nothing more.
+    deepest = max(len(item["loc"]) for item in errors)
+    errors = [item for item in errors if item["type"] != "too_short" or len(item["loc"]) == deepest]
+    first = max(errors, key=lambda item: (len(item["loc"]), item["type"] == "extra_forbidden"))
     # Parts in angle brackets are not keys: they tell apart what may stand under one.
-    parts = [str(part) for part in first["loc"] if not str(part).startswith("<")]
-    key = ".".join(parts) or "top level"
+    parts = [part for part in first["loc"] if not str(part).startswith("<")]
+    key = ".".join(str(part) for part in parts) or "top level"
     more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
     cause = cast("dict[str, object]", first.get("ctx", {})).get("error")
     if cause is not None:
@@ -131,7 +143,41 @@ def _one_line(error: ValidationError, source: str) -> str:
     if kind == "missing":
         return f"{source}: {key}: is missing, expected a value{more}"
     if kind == "extra_forbidden":
-        return f"{source}: {key}: unknown key, expected one of the documented ones{more}"
+        known = ", ".join(_keys(model.model_json_schema(), parts[:-1]))
+        return f"{source}: {key}: unknown key, expected one of {known}{more}"
     value = repr(cast("object", first["input"]))
     shown = value if len(value) <= 60 else value[:57] + "..."
     return f"{source}: {key}: {shown}: {first['msg'][0].lower()}{first['msg'][1:]}{more}"
+
+
+_Schema = dict[str, Any]
+
+
+def _keys(schema: _Schema, path: Sequence[int | str]) -> list[str]:
+    """Keys that a JSON schema has at a path of keys and indices."""
+    nodes = [schema]
+    for part in path:
+        nodes = [
+            child
+            for node in _alternatives(schema, nodes)
+            for child in (
+                node.get("properties", {}).get(part),
+                node.get("items"),
+                *node.get("prefixItems", []),
+                node.get("additionalProperties"),
+            )
+            if isinstance(child, dict)
+        ]
+    found = [key for node in _alternatives(schema, nodes) for key in node.get("properties", {})]
+    return list(dict.fromkeys(found))
+
+
+def _alternatives(schema: _Schema, nodes: Iterable[_Schema]) -> Iterator[_Schema]:
+    """Nodes with references followed and choices laid out."""
+    for node in nodes:
+        reference = str(node.get("$ref", "")).rpartition("/")[2]
+        if reference:
+            yield from _alternatives(schema, [schema["$defs"][reference]])
+        choices = [*node.get("anyOf", []), *node.get("oneOf", []), *node.get("allOf", [])]
+        yield from _alternatives(schema, choices)
+        yield node
