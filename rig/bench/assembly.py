@@ -9,16 +9,20 @@ from scipy import interpolate, optimize
 
 from rig.bench.effects import EFFECT_KINDS, PARAMETER_COUNT, parameter_values
 from rig.bench.mechanics import (
+    GIVEN,
     SINE_COLUMNS,
     SWEEP_COLUMNS,
+    Applied,
     Curves,
     Drive,
     Effects,
     Floats,
+    Imposed,
     Law,
     Mechanics,
     Thermal,
     derivatives,
+    give,
 )
 from rig.bench.schema import (
     WORLD,
@@ -27,6 +31,11 @@ from rig.bench.schema import (
     BenchConfigError,
     Effect,
     ForceFile,
+    HeightFile,
+    HeightMultisine,
+    HeightSine,
+    HeightSweep,
+    ImposedMotion,
     Multisine,
     Sine,
     Sweep,
@@ -41,7 +50,7 @@ class Assembly(NamedTuple):
 
     Attributes:
         mechanics: Its equations of motion.
-        drive: Its applied force.
+        drive: What drives it.
         start: State at time zero, shape (states,).
     """
 
@@ -63,8 +72,10 @@ def assemble(config: BenchConfig) -> Assembly:
         BenchConfigError: It has no static equilibrium to start from, or a body has no mass left.
     """
     mechanics = _mechanics(config)
-    drive = _drive(config.applied_force, config.undeclared_effects)
-    return Assembly(mechanics, drive, _start(config, mechanics))
+    drive = Drive(
+        _applied(config.applied_force, config.undeclared_effects), _imposed(config.imposed_motion)
+    )
+    return Assembly(mechanics, drive, _start(config, mechanics, drive))
 
 
 def _mechanics(config: BenchConfig) -> Mechanics:
@@ -75,7 +86,8 @@ def _mechanics(config: BenchConfig) -> Mechanics:
         gravity_m_per_s2=config.gravity_m_per_s2,
         mass_kg=_masses(config, uppers),
         lower=np.array([-1 if name == WORLD else uppers.index(name) for name in lowers]),
-        driven=uppers.index(config.applied_force.body),
+        driven=uppers.index(config.applied_force.body or uppers[0]),
+        imposed=_imposed_strut(config),
         free_length_m=np.array([strut.free_length_m for strut in config.struts]),
         springs=_curves([(s.spring.height_m, s.spring.force_n) for s in config.struts]),
         dampers=_curves([(s.damper.velocity_m_per_s, s.damper.force_n) for s in config.struts]),
@@ -86,6 +98,12 @@ def _mechanics(config: BenchConfig) -> Mechanics:
             ambient_c=thermal.ambient_c,
         ),
     )
+
+
+def _imposed_strut(config: BenchConfig) -> int:
+    if config.imposed_motion is None:
+        return -1
+    return [strut.name for strut in config.struts].index(config.imposed_motion.strut)
 
 
 def _masses(config: BenchConfig, uppers: list[str]) -> Floats:
@@ -121,37 +139,74 @@ def _segments(at: Floats, force_n: Floats) -> Floats:
     return np.column_stack([at[:-1], np.diff(at), cubic])
 
 
-def _drive(force: AppliedForce, effects: tuple[Effect, ...]) -> Drive:
+def _applied(force: AppliedForce, effects: tuple[Effect, ...]) -> Applied:
     sines: list[tuple[float, ...]] = []
     sweeps: list[tuple[float, ...]] = []
-    files = [part.record for part in force.components if isinstance(part, ForceFile)]
+    files = [part.samples for part in force.components if isinstance(part, ForceFile)]
     for part in force.components:
         if isinstance(part, Sine):
             sines.append((part.amplitude_n, part.rate_rad_per_s, part.phase_rad))
         elif isinstance(part, Multisine):
-            sines.extend(_multisine(part))
+            sines.extend(_multisine(part, part.rms_n))
         elif isinstance(part, Sweep):
-            logarithmic = float(part.spacing == "logarithmic")
-            sweeps.append(
-                (part.amplitude_n, part.start_hz, part.end_hz, part.duration_s, logarithmic)
-            )
-    return Drive(
+            sweeps.append(_sweep(part, part.amplitude_n))
+    return Applied(
         gain=math.prod(_values(effects, Law.INPUT_GAIN)),
         delay_s=math.fsum(_values(effects, Law.DELAY)),
-        sines=np.array(sines, dtype=np.float64).reshape(-1, SINE_COLUMNS),
-        sweeps=np.array(sweeps, dtype=np.float64).reshape(-1, SWEEP_COLUMNS),
-        file_first=np.cumsum([0, *(len(record.t_s) for record in files)]),
-        file_t_s=np.concatenate([np.empty(0), *(record.t_s for record in files)]),
-        file_force_n=np.concatenate([np.empty(0), *(record.force_n for record in files)]),
+        sines=_rows(sines, SINE_COLUMNS),
+        sweeps=_rows(sweeps, SWEEP_COLUMNS),
+        file_first=np.cumsum([0, *(len(samples.t_s) for samples in files)]),
+        file_t_s=np.concatenate([np.empty(0), *(samples.t_s for samples in files)]),
+        file_force_n=np.concatenate([np.empty(0), *(samples.values for samples in files)]),
     )
 
 
-def _multisine(part: Multisine) -> list[tuple[float, ...]]:
+def _imposed(motion: ImposedMotion | None) -> Imposed:
+    sines: list[tuple[float, ...]] = []
+    sweeps: list[tuple[float, ...]] = []
+    files: list[Floats] = []
+    for part in motion.components if motion is not None else ():
+        if isinstance(part, HeightSine):
+            sines.append((part.amplitude_m, part.rate_rad_per_s, part.phase_rad))
+        elif isinstance(part, HeightMultisine):
+            sines.extend(_multisine(part, part.rms_m))
+        elif isinstance(part, HeightSweep):
+            sweeps.append(_sweep(part, part.amplitude_m))
+        else:
+            files.append(_spline(part))
+    return Imposed(
+        mean_height_m=0.0 if motion is None else motion.mean_height_m,
+        sines=_rows(sines, SINE_COLUMNS),
+        sweeps=_rows(sweeps, SWEEP_COLUMNS),
+        files=Curves(
+            first=np.cumsum([0, *(len(part) for part in files)]),
+            segments=np.concatenate([np.empty((0, 6)), *files]),
+        ),
+    )
+
+
+def _spline(part: HeightFile) -> Floats:
+    """Segments of the cubic spline through the samples, shape (segments, 6)."""
+    t_s, height_m = part.samples
+    cubic = cast("Any", interpolate).CubicSpline(t_s, height_m)
+    return np.column_stack([t_s[:-1], np.diff(t_s), np.asarray(cubic.c, dtype=np.float64).T])
+
+
+def _rows(rows: list[tuple[float, ...]], columns: int) -> Floats:
+    return np.array(rows, dtype=np.float64).reshape(-1, columns)
+
+
+def _sweep(part: Sweep | HeightSweep, amplitude: float) -> tuple[float, ...]:
+    logarithmic = float(part.spacing == "logarithmic")
+    return amplitude, part.start_hz, part.end_hz, part.duration_s, logarithmic
+
+
+def _multisine(part: Multisine | HeightMultisine, rms: float) -> list[tuple[float, ...]]:
     rates = 2.0 * math.pi * np.linspace(part.low_hz, part.high_hz, part.lines)
     phases = np.random.default_rng(part.seed).uniform(0.0, 2.0 * math.pi, part.lines)
-    amplitude_n = part.rms_n * math.sqrt(2.0 / part.lines)
+    amplitude = rms * math.sqrt(2.0 / part.lines)
     return [
-        (amplitude_n, float(rate), float(phase)) for rate, phase in zip(rates, phases, strict=True)
+        (amplitude, float(rate), float(phase)) for rate, phase in zip(rates, phases, strict=True)
     ]
 
 
@@ -177,7 +232,7 @@ def _effects(config: BenchConfig) -> Effects:
     return Effects(np.array(places, dtype=np.int64).T.copy(), parameters)
 
 
-def _start(config: BenchConfig, mechanics: Mechanics) -> Floats:
+def _start(config: BenchConfig, mechanics: Mechanics, drive: Drive) -> Floats:
     n = len(config.struts)
     states = 2 * n + 1 + sum(EFFECT_KINDS[e.name].states for e in config.undeclared_effects)
     y = np.zeros(states)
@@ -186,8 +241,13 @@ def _start(config: BenchConfig, mechanics: Mechanics) -> Floats:
         if law == Law.HIDDEN_MASS:
             mass_kg, stiffness_n_per_m = values[0], values[1]
             y[state] = -mass_kg * mechanics.gravity_m_per_s2 / stiffness_n_per_m
-    given = [strut.initial_height_m for strut in config.struts]
-    y[:n] = _positions(mechanics, _heights(mechanics, y, given))
+    heights_m = [strut.initial_height_m for strut in config.struts]
+    at_start = np.zeros(GIVEN)
+    if mechanics.imposed >= 0:
+        give(mechanics, drive, 0.0, at_start)
+        heights_m[mechanics.imposed] = float(at_start[1])
+    at_start[[0, 2]] = 0.0  # the others rest before it starts
+    y[:n] = _positions(mechanics, _heights(mechanics, y, heights_m, at_start))
     return y
 
 
@@ -199,7 +259,9 @@ def _positions(mechanics: Mechanics, heights_m: Floats) -> Floats:
     return positions_m
 
 
-def _heights(mechanics: Mechanics, y: Floats, given: Sequence[float | None]) -> Floats:
+def _heights(
+    mechanics: Mechanics, y: Floats, given: Sequence[float | None], at_start: Floats
+) -> Floats:
     """Heights at the start: those given, and those at which the other bodies rest, shape (n,)."""
     n = len(given)
     free = [i for i in range(n) if given[i] is None]
@@ -217,7 +279,7 @@ def _heights(mechanics: Mechanics, y: Floats, given: Sequence[float | None]) -> 
         heights_m[free] = unknown
         state = y.copy()
         state[:n] = _positions(mechanics, heights_m)
-        derivatives(mechanics, 0.0, 0.0, state, rates)
+        derivatives(mechanics, 0.0, at_start, state, rates)
         return rates[n : 2 * n][free]
 
     found = _root(accelerations, heights_m[free])

@@ -69,6 +69,8 @@ SINE_COLUMNS = 3
 """amplitude_n, rate_rad_per_s, phase_rad."""
 SWEEP_COLUMNS = 5
 """amplitude_n, start_hz, end_hz, duration_s, 1 if the spacing is logarithmic else 0."""
+GIVEN = 3
+"""What the drive gives at a time: force on the driven body, imposed height, its rate."""
 RECORD_COLUMNS = 3
 """Columns of a record for each strut: height, rate of height, strut force."""
 RECORD_EXTRA = 3
@@ -88,7 +90,7 @@ class Curves(NamedTuple):
     segments: Floats
 
 
-class Drive(NamedTuple):
+class Applied(NamedTuple):
     """The applied force.
 
     Attributes:
@@ -108,6 +110,34 @@ class Drive(NamedTuple):
     file_first: Integers
     file_t_s: Floats
     file_force_n: Floats
+
+
+class Imposed(NamedTuple):
+    """The motion imposed on a strut.
+
+    Attributes:
+        mean_height_m: Height about which it moves.
+        sines: Shape (sines, 3), see `SINE_COLUMNS`, in m.
+        sweeps: Shape (sweeps, 5), see `SWEEP_COLUMNS`, in m.
+        files: Heights over time, as curves.
+    """
+
+    mean_height_m: float
+    sines: Floats
+    sweeps: Floats
+    files: Curves
+
+
+class Drive(NamedTuple):
+    """What drives the bench.
+
+    Attributes:
+        force: The applied force.
+        imposed: The imposed motion; not looked at where no strut's motion is imposed.
+    """
+
+    force: Applied
+    imposed: Imposed
 
 
 class Effects(NamedTuple):
@@ -147,6 +177,7 @@ class Mechanics(NamedTuple):
         mass_kg: Mass of each body, shape (n,).
         lower: Body on which each strut stands, -1 for the world, shape (n,).
         driven: Body on which the applied force acts.
+        imposed: Strut whose motion is imposed, -1 if there is none.
         free_length_m: Free length of each strut, shape (n,).
         springs: Spring curves over height.
         dampers: Damper curves over rate of height.
@@ -158,6 +189,7 @@ class Mechanics(NamedTuple):
     mass_kg: Floats
     lower: Integers
     driven: int
+    imposed: int
     free_length_m: Floats
     springs: Curves
     dampers: Curves
@@ -198,17 +230,24 @@ def _compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 @_compiled
-def curve_force(curves: Curves, strut: int, at: float) -> float:
-    """Force of a curve in N at a height in m or a rate in m/s."""
-    segments = curves.segments
-    low = curves.first[strut]
-    high = curves.first[strut + 1] - 1
+def curve_segment(curves: Curves, curve: int, at: float) -> int:
+    """Segment of a curve at, or nearest to, a place on it."""
+    low = int(curves.first[curve])
+    high = int(curves.first[curve + 1]) - 1
     while low < high:
         middle = (low + high + 1) // 2
-        if segments[middle, 0] <= at:
+        if curves.segments[middle, 0] <= at:
             low = middle
         else:
             high = middle - 1
+    return low
+
+
+@_compiled
+def curve_force(curves: Curves, strut: int, at: float) -> float:
+    """Force of a curve in N at a height in m or a rate in m/s."""
+    segments = curves.segments
+    low = curve_segment(curves, strut, at)
     offset = at - segments[low, 0]
     inside = min(max(offset, 0.0), segments[low, 1])
     a = segments[low, 2]
@@ -220,7 +259,7 @@ def curve_force(curves: Curves, strut: int, at: float) -> float:
 
 
 @_compiled
-def applied_force(drive: Drive, t_s: float) -> float:
+def applied_force(drive: Applied, t_s: float) -> float:
     """Applied force in N at a time, zero before time zero."""
     if t_s < 0.0:
         return 0.0
@@ -236,19 +275,25 @@ def applied_force(drive: Drive, t_s: float) -> float:
 
 @_compiled
 def _sweep(sweep: Floats, t_s: float) -> float:
-    amplitude_n, start_hz, end_hz, duration_s, logarithmic = sweep
-    if t_s > duration_s:
+    if t_s > sweep[3]:
         return 0.0
-    if logarithmic > 0.0 and start_hz != end_hz:
-        growth = math.log(end_hz / start_hz) / duration_s
-        turns = start_hz * math.expm1(growth * t_s) / growth
-    else:
-        turns = (start_hz + 0.5 * (end_hz - start_hz) * t_s / duration_s) * t_s
-    return amplitude_n * math.sin(2.0 * math.pi * turns)
+    return float(sweep[0]) * math.sin(2.0 * math.pi * _sweep_turns(sweep, t_s)[0])
 
 
 @_compiled
-def _interpolated(drive: Drive, low: int, high: int, t_s: float) -> float:
+def _sweep_turns(sweep: Floats, t_s: float) -> tuple[float, float]:
+    """Turns since the start, and frequency in Hz."""
+    _, start_hz, end_hz, duration_s, logarithmic = sweep
+    if logarithmic > 0.0 and start_hz != end_hz:
+        growth = math.log(end_hz / start_hz) / duration_s
+        turns = start_hz * math.expm1(growth * t_s) / growth
+        return turns, start_hz * math.exp(growth * t_s)
+    rise = (end_hz - start_hz) * t_s / duration_s
+    return (start_hz + 0.5 * rise) * t_s, start_hz + rise
+
+
+@_compiled
+def _interpolated(drive: Applied, low: int, high: int, t_s: float) -> float:
     t = drive.file_t_s
     force_n = drive.file_force_n
     if t_s < t[low] or t_s > t[high]:
@@ -264,9 +309,57 @@ def _interpolated(drive: Drive, low: int, high: int, t_s: float) -> float:
 
 
 @_compiled
-def acting_force(drive: Drive, t_s: float) -> float:
+def acting_force(drive: Applied, t_s: float) -> float:
     """Force in N that reaches the driven body, after undeclared gain and delay."""
     return drive.gain * applied_force(drive, t_s - drive.delay_s)
+
+
+@_compiled
+def imposed_motion(imposed: Imposed, t_s: float) -> tuple[float, float]:
+    """Imposed height in m and its rate in m/s. Files and sweeps stay where they end."""
+    height_m = imposed.mean_height_m
+    rate_m_per_s = 0.0
+    for i in range(imposed.sines.shape[0]):
+        rate_rad_per_s = imposed.sines[i, 1]
+        phase = rate_rad_per_s * t_s + imposed.sines[i, 2]
+        height_m += imposed.sines[i, 0] * math.sin(phase)
+        rate_m_per_s += imposed.sines[i, 0] * rate_rad_per_s * math.cos(phase)
+    for i in range(imposed.sweeps.shape[0]):
+        amplitude_m = imposed.sweeps[i, 0]
+        end_s = imposed.sweeps[i, 3]
+        turns, frequency_hz = _sweep_turns(imposed.sweeps[i], min(t_s, end_s))
+        height_m += amplitude_m * math.sin(2.0 * math.pi * turns)
+        if t_s < end_s:
+            phase = 2.0 * math.pi * turns
+            rate_m_per_s += amplitude_m * 2.0 * math.pi * frequency_hz * math.cos(phase)
+    for i in range(imposed.files.first.shape[0] - 1):
+        segment = imposed.files.segments[curve_segment(imposed.files, i, t_s)]
+        start, length, a, b, c, d = segment
+        offset = min(max(t_s - start, 0.0), length)
+        height_m += ((a * offset + b) * offset + c) * offset + d
+        if offset == t_s - start:
+            rate_m_per_s += (3.0 * a * offset + 2.0 * b) * offset + c
+    return height_m, rate_m_per_s
+
+
+@_compiled
+def give(mechanics: Mechanics, drive: Drive, t_s: float, given: Floats) -> None:
+    """Write what the drive gives at a time, shape (GIVEN,)."""
+    given[0] = acting_force(drive.force, t_s)
+    if mechanics.imposed >= 0:
+        given[1], given[2] = imposed_motion(drive.imposed, t_s)
+
+
+@_compiled
+def impose(mechanics: Mechanics, given: Floats, y: Floats) -> None:
+    """Put the body above an imposed strut where the drive has it."""
+    body = mechanics.imposed
+    if body < 0:
+        return
+    n = mechanics.mass_kg.shape[0]
+    below = int(mechanics.lower[body])
+    y[body] = given[1] + (y[below] if below >= 0 else 0.0)
+    y[n + body] = given[2] + (y[n + below] if below >= 0 else 0.0)
 
 
 @_compiled
@@ -419,23 +512,24 @@ def strut_force(mechanics: Mechanics, strut: int, t_s: float, y: Floats, dy: Flo
 
 
 @_compiled
-def derivatives(mechanics: Mechanics, t_s: float, acting_n: float, y: Floats, dy: Floats) -> None:
+def derivatives(mechanics: Mechanics, t_s: float, given: Floats, y: Floats, dy: Floats) -> None:
     """Rates of the whole state.
 
     Args:
         mechanics: The bench.
         t_s: Time in s.
-        acting_n: Force on the driven body in N.
-        y: State, shape (states,).
+        given: What the drive gives, shape (GIVEN,).
+        y: State, shape (states,); an imposed body is put where the drive has it.
         dy: Receives the rates, shape (states,).
     """
     n = mechanics.mass_kg.shape[0]
     thermal = mechanics.thermal
+    impose(mechanics, given, y)
     dy[2 * n] = thermal.cooling_per_s * (thermal.ambient_c - y[2 * n])
     for i in range(n):
         dy[i] = y[n + i]
         dy[n + i] = 0.0
-    dy[n + mechanics.driven] = acting_n
+    dy[n + mechanics.driven] = given[0]
     for i in range(n):
         force_n = strut_force(mechanics, i, t_s, y, dy)
         dy[n + i] += force_n
@@ -467,33 +561,34 @@ def hidden_mass_force(mechanics: Mechanics, effect: int, y: Floats, dy: Floats) 
 
 @_compiled
 def runge_kutta_step(
-    mechanics: Mechanics, step: Step, acting_n: Floats, y: Floats, work: Floats
+    mechanics: Mechanics, step: Step, given: Floats, y: Floats, work: Floats
 ) -> None:
     """Advance the state by one step of the classical fourth-order method.
 
     Args:
         mechanics: The bench.
         step: When the step is.
-        acting_n: Force on the driven body in N at start, middle and end of the step, shape (3,).
+        given: What the drive gives at start, middle and end of the step, shape (3, GIVEN).
         y: State, shape (states,); changed in place.
         work: Scratch, shape (5, states).
     """
     t_s = step.t_s
     step_s = step.length_s
     half_s = 0.5 * step_s
-    derivatives(mechanics, t_s, acting_n[0], y, work[0])
+    derivatives(mechanics, t_s, given[0], y, work[0])
     for j in range(y.shape[0]):
         work[4, j] = y[j] + half_s * work[0, j]
-    derivatives(mechanics, t_s + half_s, acting_n[1], work[4], work[1])
+    derivatives(mechanics, t_s + half_s, given[1], work[4], work[1])
     for j in range(y.shape[0]):
         work[4, j] = y[j] + half_s * work[1, j]
-    derivatives(mechanics, t_s + half_s, acting_n[1], work[4], work[2])
+    derivatives(mechanics, t_s + half_s, given[1], work[4], work[2])
     for j in range(y.shape[0]):
         work[4, j] = y[j] + step_s * work[2, j]
-    derivatives(mechanics, t_s + step_s, acting_n[2], work[4], work[3])
+    derivatives(mechanics, t_s + step_s, given[2], work[4], work[3])
     for j in range(y.shape[0]):
         slope = work[0, j] + 2.0 * (work[1, j] + work[2, j]) + work[3, j]
         y[j] += step_s / 6.0 * slope
+    impose(mechanics, given[2], y)
 
 
 @_compiled
@@ -514,8 +609,8 @@ def observe(mechanics: Mechanics, drive: Drive, t_s: float, y: Floats, record: F
         record[3 * i] = strut_height(mechanics.lower, i, y)
         record[3 * i + 1] = strut_rate(mechanics.lower, i, y)
         record[3 * i + 2] = strut_force(mechanics, i, t_s, y, rates)
-    record[3 * n] = applied_force(drive, t_s)
-    record[3 * n + 1] = acting_force(drive, t_s)
+    record[3 * n] = applied_force(drive.force, t_s)
+    record[3 * n + 1] = acting_force(drive.force, t_s)
     record[3 * n + 2] = y[2 * n]
 
 
@@ -531,14 +626,15 @@ def advance(mechanics: Mechanics, drive: Drive, span: Span, y: Floats, records: 
         records: Receives the records, shape (records, RECORD_COLUMNS * n + RECORD_EXTRA).
     """
     work = np.zeros((5, y.shape[0]))
-    acting_n = np.empty(3)
+    given = np.zeros((3, GIVEN))
     step_s = span.step_s
     for row in range(records.shape[0]):
         start = (span.first + row) * span.substeps
+        give(mechanics, drive, start * step_s, given[2])
+        impose(mechanics, given[2], y)
         observe(mechanics, drive, start * step_s, y, records[row])
-        acting_n[2] = acting_force(drive, start * step_s)
         for i in range(start, start + span.substeps):
-            acting_n[0] = acting_n[2]
-            acting_n[1] = acting_force(drive, (i + 0.5) * step_s)
-            acting_n[2] = acting_force(drive, (i + 1) * step_s)
-            runge_kutta_step(mechanics, Step(i * step_s, step_s), acting_n, y, work)
+            given[0] = given[2]
+            give(mechanics, drive, (i + 0.5) * step_s, given[1])
+            give(mechanics, drive, (i + 1) * step_s, given[2])
+            runge_kutta_step(mechanics, Step(i * step_s, step_s), given, y, work)

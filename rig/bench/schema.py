@@ -7,7 +7,7 @@ bodies apart, an applied force points upwards, a height is the length of a strut
 import math
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import (
     BaseModel,
@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from rig.bench.effects import EFFECT_KINDS, parameter_error
-from rig.bench.force_file import ForceRecord, read_force_file
+from rig.bench.samples import Samples, read_samples
 
 WORLD = "world"
 """Name of the ground."""
@@ -103,11 +103,10 @@ class Strut(_Section):
     initial_height_m: Positive | None = None
 
 
-class Sine(_Section):
-    """A sine force: amplitude_n * sin(angular frequency * t + phase_rad)."""
+class _Sine(_Section):
+    """A sine: amplitude * sin(angular frequency * t + phase_rad)."""
 
     kind: Literal["sine"]
-    amplitude_n: float
     frequency_hz: Positive | None = None
     angular_frequency_rad_per_s: Positive | None = None
     phase_rad: float = 0.0
@@ -126,12 +125,23 @@ class Sine(_Section):
         return 2.0 * math.pi * (self.frequency_hz or 0.0)
 
 
-class Multisine(_Section):
+class Sine(_Sine):
+    """A sine force."""
+
+    amplitude_n: float
+
+
+class HeightSine(_Sine):
+    """A sine motion."""
+
+    amplitude_m: float
+
+
+class _Multisine(_Section):
     """Sines of equal amplitude and random phase on equally spaced frequencies of a band.
 
     Attributes:
         kind: Tag of this component.
-        rms_n: Root mean square of the sum in N.
         low_hz: Lowest frequency in Hz.
         high_hz: Highest frequency in Hz.
         lines: Number of frequencies.
@@ -139,7 +149,6 @@ class Multisine(_Section):
     """
 
     kind: Literal["multisine"]
-    rms_n: Positive
     low_hz: Positive
     high_hz: Positive
     lines: Annotated[int, Field(ge=2, le=400)] = 40
@@ -152,39 +161,75 @@ class Multisine(_Section):
         return self
 
 
-class Sweep(_Section):
-    """A sine whose frequency runs from one value to another; zero after `duration_s`."""
+class Multisine(_Multisine):
+    """A multisine force; `rms_n` is the root mean square of the sum."""
+
+    rms_n: Positive
+
+
+class HeightMultisine(_Multisine):
+    """A multisine motion; `rms_m` is the root mean square of the sum."""
+
+    rms_m: Positive
+
+
+class _Sweep(_Section):
+    """A sine whose frequency runs from one value to another within `duration_s`."""
 
     kind: Literal["sweep"]
-    amplitude_n: float
     start_hz: Positive
     end_hz: Positive
     duration_s: Positive
     spacing: Literal["linear", "logarithmic"] = "linear"
 
 
-class ForceFile(_Section):
-    """A force from a CSV file with columns `t_s` and `applied_force_n`.
+class Sweep(_Sweep):
+    """A swept force; zero after `duration_s`."""
+
+    amplitude_n: float
+
+
+class HeightSweep(_Sweep):
+    """A swept motion; it stays where it ends."""
+
+    amplitude_m: float
+
+
+class _File(_Section):
+    """A column of a CSV file over its column `t_s`.
 
     Attributes:
         kind: Tag of this component.
         path: File, relative to the configuration, within its folder.
     """
 
+    column: ClassVar[str]
     kind: Literal["file"]
     path: Annotated[str, Field(min_length=1, max_length=1000)]
-    _record: ForceRecord = PrivateAttr()
+    _samples: Samples = PrivateAttr()
 
     @property
-    def record(self) -> ForceRecord:
+    def samples(self) -> Samples:
         """The samples of the file, read once when the configuration is validated."""
-        return self._record
+        return self._samples
 
     @model_validator(mode="after")
     def _read(self, info: ValidationInfo) -> Self:
         folder = info.context if isinstance(info.context, Path) else Path()
-        self._record = read_force_file(folder, self.path)
+        self._samples = read_samples(folder, self.path, self.column)
         return self
+
+
+class ForceFile(_File):
+    """A force from column `applied_force_n`, straight between samples, zero outside them."""
+
+    column = "applied_force_n"
+
+
+class HeightFile(_File):
+    """A motion from column `height_m`, a cubic spline between samples, still outside them."""
+
+    column = "height_m"
 
 
 Component = Annotated[Sine | Multisine | Sweep | ForceFile, Field(discriminator="kind")]
@@ -194,12 +239,37 @@ class AppliedForce(_Section):
     """The force that drives the bench.
 
     Attributes:
-        body: Body on which it acts.
+        body: Body on which it acts; None where the bench applies no force.
         components: Forces that add up.
     """
 
-    body: Name
+    body: Name | None = None
     components: Annotated[tuple[Component, ...], Field(strict=False, max_length=50)] = ()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.components and self.body is None:
+            raise ValueError("body is missing, expected the body on which the components act")
+        return self
+
+
+HeightComponent = Annotated[
+    HeightSine | HeightMultisine | HeightSweep | HeightFile, Field(discriminator="kind")
+]
+
+
+class ImposedMotion(_Section):
+    """A motion that a strut is forced through, whatever force it takes: a damper dyno.
+
+    Attributes:
+        strut: Strut whose height is imposed.
+        mean_height_m: Height about which the components move, in m.
+        components: Motions that add up.
+    """
+
+    strut: Name
+    mean_height_m: float = 0.0
+    components: Annotated[tuple[HeightComponent, ...], Field(strict=False, max_length=50)]
 
 
 class Temperature(_Section):
@@ -313,7 +383,8 @@ class BenchConfig(_Section):
         gravity_m_per_s2: Acceleration of free fall.
         masses: Bodies.
         struts: Struts; each carries one body, the lower ends are the world or other bodies.
-        applied_force: The force that drives the bench.
+        applied_force: The force that drives the bench, if any.
+        imposed_motion: The motion that drives a strut, if any.
         temperature: The damper's temperature.
         undeclared_effects: What the bench has and no model was told of.
         transmissions: Messages that the bench sends.
@@ -325,7 +396,8 @@ class BenchConfig(_Section):
     gravity_m_per_s2: NotNegative = 9.81
     masses: Annotated[tuple[Mass, ...], Field(strict=False, min_length=1, max_length=20)]
     struts: Annotated[tuple[Strut, ...], Field(strict=False, min_length=1, max_length=20)]
-    applied_force: AppliedForce
+    applied_force: AppliedForce = AppliedForce()
+    imposed_motion: ImposedMotion | None = None
     temperature: Temperature = Temperature()
     undeclared_effects: Annotated[tuple[Effect, ...], Field(strict=False, max_length=50)] = ()
     transmissions: Annotated[tuple[Transmission, ...], Field(strict=False, max_length=50)] = ()
@@ -337,7 +409,11 @@ class BenchConfig(_Section):
         masses = _unique("masses", [mass.name for mass in self.masses])
         struts = _unique("struts", [strut.name for strut in self.struts])
         _check_tree(self.struts, masses)
-        _check_known("applied_force.body", self.applied_force.body, masses)
+        if self.applied_force.body is not None:
+            _check_known("applied_force.body", self.applied_force.body, masses)
+        if self.imposed_motion is not None:
+            _check_known("imposed_motion.strut", self.imposed_motion.strut, struts)
+            _check_imposed(self.imposed_motion.strut, self.struts, self.undeclared_effects)
         for index, effect in enumerate(self.undeclared_effects):
             _check_known(f"undeclared_effects.{index}.strut", effect.strut, struts)
         for index, sent in enumerate(self.transmissions):
@@ -365,6 +441,23 @@ def _unique(key: str, names: list[str]) -> list[str]:
 def _check_known(key: str, name: str, known: list[str]) -> None:
     if name not in known:
         raise ValueError(f"{key} = {name!r}, expected one of {', '.join(known)}")
+
+
+_UNSEEN_IN_IMPOSED_MOTION = ("added_mass", "hidden_mass")
+
+
+def _check_imposed(name: str, struts: tuple[Strut, ...], effects: tuple[Effect, ...]) -> None:
+    strut = next(strut for strut in struts if strut.name == name)
+    if strut.initial_height_m is not None:
+        raise ValueError(
+            f"struts: {name} has an initial_height_m, expected none: its motion is imposed"
+        )
+    for index, effect in enumerate(effects):
+        if effect.strut == name and effect.name in _UNSEEN_IN_IMPOSED_MOTION:
+            raise ValueError(
+                f"undeclared_effects.{index}: {effect.name} does not change the force of strut "
+                f"{name}, whose motion is imposed, expected another effect"
+            )
 
 
 def _check_tree(struts: tuple[Strut, ...], masses: list[str]) -> None:

@@ -145,7 +145,7 @@ def test_force_file_is_read_beside_the_configuration(tmp_path):
     (tmp_path / "force.csv").write_text("t_s,applied_force_n\n0,0\n1,5\n")
     component = _load(tmp_path, _with_file("force.csv")).applied_force.components[0]
     assert component.kind == "file"
-    assert component.record.force_n.tolist() == [0.0, 5.0]
+    assert component.samples.values.tolist() == [0.0, 5.0]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""An applied force from a CSV file."""
+"""An applied force or an imposed height from a CSV file."""
 
 import csv
 import math
@@ -12,28 +12,28 @@ from numpy.typing import NDArray
 MAX_FILE_BYTES = 200_000_000
 """Largest file that is read."""
 
-COLUMNS = ("t_s", "applied_force_n")
-"""Columns that the file must have; others are ignored."""
+TIME_COLUMN = "t_s"
 
 
-class ForceRecord(NamedTuple):
-    """Samples of an applied force.
+class Samples(NamedTuple):
+    """Samples of a quantity.
 
     Attributes:
         t_s: Times in s, shape (samples,), increasing.
-        force_n: Force at each time in N, shape (samples,).
+        values: Value at each time, shape (samples,).
     """
 
     t_s: NDArray[np.float64]
-    force_n: NDArray[np.float64]
+    values: NDArray[np.float64]
 
 
-def read_force_file(folder: Path, name: str) -> ForceRecord:
-    """Read an applied force.
+def read_samples(folder: Path, name: str, column: str) -> Samples:
+    """Read one column over time; other columns are ignored.
 
     Args:
         folder: Folder of the configuration; the file must lie in it or below.
         name: Path of the file relative to `folder`.
+        column: Name of the column, with its unit.
 
     Returns:
         The samples.
@@ -49,7 +49,7 @@ def read_force_file(folder: Path, name: str) -> ForceRecord:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise ValueError(f"path = {name!r}, expected at most {MAX_FILE_BYTES} bytes")
         with path.open(newline="", encoding="utf-8") as file:
-            rows = list(_rows(csv.reader(file), name))
+            rows = list(_rows(csv.reader(file), name, (TIME_COLUMN, column)))
     except OSError as error:
         raise ValueError(f"path = {name!r} cannot be read: {error.strerror}") from error
     except (UnicodeDecodeError, csv.Error) as error:
@@ -61,24 +61,26 @@ def read_force_file(folder: Path, name: str) -> ForceRecord:
     if not bool(np.all(steps_s > 0.0)):
         line = int(np.argmin(steps_s > 0.0)) + 3
         raise ValueError(f"path = {name!r}, line {line}: t_s does not increase")
-    return ForceRecord(np.ascontiguousarray(table[:, 0]), np.ascontiguousarray(table[:, 1]))
+    return Samples(np.ascontiguousarray(table[:, 0]), np.ascontiguousarray(table[:, 1]))
 
 
-def _rows(reader: Iterator[list[str]], name: str) -> Iterator[tuple[float, float]]:
+def _rows(
+    reader: Iterator[list[str]], name: str, columns: tuple[str, str]
+) -> Iterator[tuple[float, float]]:
     empty: list[str] = []
     header = [cell.strip() for cell in next(reader, empty)]
-    for column in COLUMNS:
+    for column in columns:
         if header.count(column) != 1:
             raise ValueError(f"path = {name!r}, line 1: expected one column {column}")
-    where = [header.index(column) for column in COLUMNS]
+    where = [header.index(column) for column in columns]
     for line, row in enumerate(reader, start=2):
         if len(row) != len(header):
             raise ValueError(f"path = {name!r}, line {line}: expected {len(header)} columns")
-        t_s, force_n = (
+        t_s, value = (
             _number(row[index], name, line, column)
-            for index, column in zip(where, COLUMNS, strict=True)
+            for index, column in zip(where, columns, strict=True)
         )
-        yield t_s, force_n
+        yield t_s, value
 
 
 def _number(text: str, name: str, line: int, column: str) -> float:
