@@ -75,7 +75,7 @@ mkdir "$work/out"
 write_guest_script "$@"
 kernel=$(ls -v /boot/vmlinuz-*-amd64 | tail -n 1)
 timeout -k 10 "$limit_s" vng --run "$kernel" --user root --cpus 2 --memory 3G --force-9p --disable-kvm \
-    "${disks[@]}" --rwdir "$work/out" --exec "bash $work/guest.sh" </dev/null 2>&1 | grep -v "Image format was not\|detecting the format\|raw. format explicitly" || true
+    "${disks[@]}" --rwdir "$work/out" --exec "bash $work/guest.sh" </dev/null 2>&1 | grep --line-buffered -v "Image format was not\|detecting the format\|raw. format explicitly" || true
 if [ ! -s "$work/out/exit_code" ]; then
     echo "vcan: the booted kernel did not finish within $limit_s s" >&2
     exit 1

@@ -395,25 +395,24 @@ def run_bench(
         Number of frames sent.
 
     Raises:
-        BusError: The bus cannot be opened or a frame cannot be sent.
+        BusError: The bus cannot be opened.
         DatabaseError: The DBC is wrong.
     """
     bench = Bench(bench_config, load_database(dbc or DEFAULT_DATABASE))
     end_ns = None if duration_s is None else round(duration_s * 1e9)
     sent, due_ns = 0, 0
     clock = RealClock()
-    bus = Bus(bus_config, (), epoch_ns=clock.epoch_ns)
+    link = Link(lambda: Bus(bus_config, (), epoch_ns=clock.epoch_ns), clock.epoch_now_ns)
     try:
         while not stop() and (end_ns is None or due_ns < end_ns):
             # Woken at least every 0.1 s, so that Ctrl-C is heard between slow frames.
             now_ns = clock.wait_until(min(due_ns, clock.now_ns() + 100_000_000))
             frames, due_ns = bench.update(now_ns)
-            for frame in frames:
-                bus.send(frame)
-            sent += len(frames)
+            link.receive(now_ns)  # an interface that has gone tells so here
+            sent += len(link.send(frames))
             progress(now_ns, Mode.RUNNING)
     finally:
-        bus.close()
+        link.close()
     return sent
 
 

@@ -109,5 +109,7 @@ def first_ms(ticks: list[Tick], when: Callable[[Tick], bool], begin_ns: int = BE
 
 def force_error_n(ticks: list[Tick], begin_ns: int = BEGIN_NS) -> float:
     """RMS error of the force where it was published as valid."""
-    errors = [tick.force_n - tick.truth_n for tick in ticks if tick.t_ns >= begin_ns and tick.is_valid]
+    errors = [
+        tick.force_n - tick.truth_n for tick in ticks if tick.t_ns >= begin_ns and tick.is_valid
+    ]
     return float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan")

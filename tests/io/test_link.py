@@ -1,12 +1,11 @@
 """A bus that goes away and comes back, frames' times, and what the controller tells."""
 
-from concurrent.futures import Executor, Future
-
 import pytest
 
 from can_dbc.frame import Frame
 from rig.io.bus import BusError, BusFullError
 from rig.io.link import FIRST_PAUSE_NS, SENDING_FAILED_NS, Link
+from tests.io.at_once import AtOnce
 
 TICK_NS = 10_000_000
 PASSIVE = Frame(0, 0x004, bytes([0, 0x20, 0, 0, 0, 0, 0, 0]), is_error=True)
@@ -39,18 +38,6 @@ class ScriptedBus:
 
     def close(self):
         self.closed = True
-
-
-class AtOnce(Executor):
-    """Runs what it is given before `submit` returns."""
-
-    def submit(self, fn, /, *args, **kwargs):
-        future = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except BusError as error:
-            future.set_exception(error)
-        return future
 
 
 def link_of(*buses, epoch_now_ns=lambda: 0):

@@ -1,12 +1,28 @@
 """Virtual CAN interfaces of the kernel, or a skip that says what is missing."""
 
+import re
 import shutil
 import subprocess
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
 
 import pytest
+import yaml
+
+from can_dbc.database import DEFAULT_DATABASE
+from rig.config import CONFIGS, Setup, load_setup
+from rig.loop import Progress
+from rig.runs import Ended, live
 
 TOOLS = ("ip", "candump", "canplayer", "cangen", "cangw", "cansend")
+
+RATE_HZ = 100
+"""The kernel of these tests is emulated: sending and receiving one frame takes 370 us there."""
+
+BENCH_IDS = ("100", "200")
 
 
 def _missing() -> str | None:
@@ -33,22 +49,111 @@ def _kernel_with_vcan() -> None:
         pytest.skip(f"{reason}; .ci/vcan.sh boots a kernel that has all")
 
 
-def _up(name: str) -> None:
+@contextmanager
+def _interface(name: str) -> Iterator[str]:
     subprocess.run(["ip", "link", "add", "dev", name, "type", "vcan"], check=True)
     subprocess.run(["ip", "link", "set", "up", name], check=True)
+    yield name
+    subprocess.run(["ip", "link", "delete", name], check=True)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def vcan(_kernel_with_vcan: None) -> Iterator[str]:
-    """A fresh interface, up."""
-    _up("vcan0")
-    yield "vcan0"
-    subprocess.run(["ip", "link", "delete", "vcan0"], check=False)
+    """An interface, up."""
+    with _interface("vcan0") as name:
+        yield name
 
 
 @pytest.fixture
 def second_vcan(_kernel_with_vcan: None) -> Iterator[str]:
     """Another one, for what a gateway joins."""
-    _up("vcan1")
-    yield "vcan1"
-    subprocess.run(["ip", "link", "delete", "vcan1"], check=False)
+    with _interface("vcan1") as name:
+        yield name
+
+
+class Files(NamedTuple):
+    """Files for 100 Hz.
+
+    Attributes:
+        dbc: The package's DBC with cycle times of 10 ms.
+        bench: The seed's bench.
+        bridge: The seed's bridge, with gains for this rate, by interface.
+    """
+
+    dbc: Path
+    bench: Path
+    bridge: Callable[[str], Path]
+
+
+@pytest.fixture(scope="session")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
+    """The seed case at 100 Hz."""
+    folder = tmp_path_factory.mktemp("files")
+    dbc = folder / "slow.dbc"
+    slower = re.sub(r'("GenMsgCycleTime" BO_ \d+) 1;', r"\1 10;", DEFAULT_DATABASE.read_text())
+    dbc.write_text(slower)
+
+    def bridge(channel: str) -> Path:
+        config = yaml.safe_load((CONFIGS / "seed.yaml").read_text())
+        # With one cycle's delay the slowest pole is at 0.992, the least damping ratio 0.04.
+        gains = {"proportional_n_per_m": 4000.0, "integral_n_per_m_s": 1.0e4}
+        config |= {
+            "rate_hz": RATE_HZ,
+            "dbc": "slow.dbc",
+            "bus": {"interface": "socketcan", "channel": channel},
+            "observers": {"strut": gains | {"force_limit_n": 5000.0}},
+            "supervision": {"stale_after_s": 0.1, "safe_after_s": 1.0},
+            "realtime": {"fifo_priority": 0, "lock_memory": False},
+        }
+        path = folder / f"{channel}.yaml"
+        path.write_text(yaml.safe_dump(config))
+        return path
+
+    return Files(dbc, CONFIGS / "seed_bench.yaml", bridge)
+
+
+@contextmanager
+def running(command: Sequence[str | Path], **options: object) -> Iterator[subprocess.Popen[bytes]]:
+    """A program that runs meanwhile, and is ended in order."""
+    process = subprocess.Popen([str(part) for part in command], **options)  # pyright: ignore
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.wait(30.0)
+
+
+RIG = (Path(sys.executable).parent / "rig",)
+
+
+@pytest.fixture(scope="session")
+def bench(vcan: str, files: Files) -> Iterator[str]:
+    """The interface with `rig bench` on it, in a process of its own, while the tests run."""
+    command = (*RIG, "bench", files.bench, "--channel", vcan, "--dbc", files.dbc)
+    with running(command) as process:
+        subprocess.run(["candump", "-n", "1", vcan], check=True, timeout=300.0)
+        yield vcan
+        assert process.poll() is None
+
+
+@pytest.fixture
+def bridge(files: Files, tmp_path: Path) -> Callable[..., Ended]:
+    """Runs a bridge on an interface for a time."""
+
+    def run(
+        channel: str,
+        seconds: float,
+        *,
+        progress: Progress = lambda _t_ns, _mode: None,
+        listen_only: bool = False,
+    ) -> Ended:
+        ready: Setup = load_setup(files.bridge(channel), duration_s=seconds)
+        return live(
+            ready,
+            tmp_path / "run",
+            listen_only=listen_only,
+            stop=lambda: False,
+            progress=progress,
+        )
+
+    return run

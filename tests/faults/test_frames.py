@@ -1,0 +1,311 @@
+"""Faults of single frames and of the bench, between bench and bridge, at 1 kHz."""
+
+import random
+
+import pytest
+
+from can_dbc.codec import compile_decoder
+from can_dbc.protection import protect
+from can_dbc.units import Dimension
+from rig.core.bridge import RIVAL_FRAMES
+from rig.core.types import Mode
+from tests.faults.trial import (
+    BEGIN_NS,
+    MEASUREMENT,
+    MS,
+    Trial,
+    after,
+    first_ms,
+    force_error_n,
+    measurements_only,
+)
+
+NOTHING_RECEIVED = "nothing that was received"
+END_MS = 1300
+
+
+@pytest.fixture(scope="module")
+def undisturbed_n():
+    """RMS error of the force without any fault."""
+    return force_error_n(Trial().run(END_MS))
+
+
+def genuine_heights(trial):
+    """Every height the bench can have sent so far: a twin of it, heard without a fault."""
+    twin = Trial()
+    message = twin.ready.database.message("BENCH_MEASUREMENT")
+    decode = compile_decoder(message, ["HEIGHT"], [Dimension.LENGTH])
+    frames = twin.bench.update(len(trial.ticks) * MS)[0]
+    return {decode(frame.data)[0] for frame in frames if frame.arbitration_id == MEASUREMENT}
+
+
+def assert_only_genuine_heights_were_used(trial):
+    genuine = genuine_heights(trial)
+    used = [tick.result.step_input.heights[0] for tick in trial.ticks]
+    assert {item.height_m for item in used if item is not None} <= genuine
+
+
+def test_loss(row, undisturbed_n):
+    rng = random.Random(1)
+    trial = Trial()
+    ticks = trial.run(
+        END_MS, after(BEGIN_NS, measurements_only(lambda f: [] if rng.random() < 0.1 else [f]))
+    )
+    assert {tick.mode for tick in ticks[5:]} == {Mode.RUNNING}
+    error_n = force_error_n(ticks)
+    assert error_n < 1.5 * undisturbed_n
+    row(
+        1,
+        "loss: 10 % of the measurements",
+        f"goes on, counts every one ({ticks[-1].counts.lost}); force error {error_n:.1f} N "
+        f"instead of {undisturbed_n:.1f} N RMS",
+        first_ms(ticks, lambda tick: tick.counts.lost > 0),
+        NOTHING_RECEIVED,
+    )
+
+
+def test_repetition(row, undisturbed_n):
+    trial = Trial()
+    ticks = trial.run(END_MS, after(BEGIN_NS, measurements_only(lambda frame: [frame, frame])))
+    counts = ticks[-1].counts
+    assert counts.repeated == counts.refused == END_MS - BEGIN_NS // MS
+    assert force_error_n(ticks) == undisturbed_n
+    row(
+        2,
+        "repetition: every measurement twice",
+        "refuses and counts every second one; the estimate is the same bit for bit",
+        first_ms(ticks, lambda tick: tick.counts.repeated > 0),
+        "the repetitions",
+    )
+
+
+def test_reordering(row, undisturbed_n):
+    held = []
+
+    def swap(frame):
+        if held:
+            return [frame, held.pop()]
+        held.append(frame)
+        return []
+
+    trial = Trial()
+    ticks = trial.run(END_MS, after(BEGIN_NS, measurements_only(swap)))
+    assert ticks[-1].counts.out_of_sequence > 490
+    assert_only_genuine_heights_were_used(trial)
+    error_n = force_error_n(ticks)
+    row(
+        3,
+        "reordering: every measurement after its successor",
+        f"refuses the late ones and counts them; force error {error_n:.1f} N "
+        f"instead of {undisturbed_n:.1f} N RMS",
+        first_ms(ticks, lambda tick: tick.counts.out_of_sequence > 0),
+        "the overtaken frames",
+    )
+
+
+def test_delay(row):
+    limits = [{"value": "innovation_m", "low": -0.005, "high": 0.005, "action": "safe"}]
+    queue = []
+
+    def late(_t_ns, frames):
+        queue.append(frames)
+        return queue.pop(0) if len(queue) > 3 else []
+
+    trial = Trial(limits=limits)
+    ticks = trial.run(END_MS, after(BEGIN_NS, late))
+    assert ticks[-1].mode is Mode.SAFE
+    assert not any(tick.is_valid for tick in ticks[-100:])
+    assert (
+        max(abs(tick.result.output.struts[0].innovation_m) for tick in ticks[5:] if tick.is_valid)
+        <= 0.005
+    )
+    row(
+        4,
+        "delay: everything 3 ms late, at the seed's gains unstable",
+        "the limit on the innovation (5 mm) enters the safe state",
+        first_ms(ticks, lambda tick: tick.mode is Mode.SAFE),
+        NOTHING_RECEIVED,
+    )
+
+
+def flipped(frame, bits):
+    number = int.from_bytes(frame.data, "big")
+    for bit in bits:
+        number ^= 1 << bit
+    return frame._replace(data=number.to_bytes(len(frame.data), "big"))
+
+
+@pytest.mark.parametrize(
+    ("order", "name", "bits"),
+    [
+        (5, "corruption: one bit in 10 % of the measurements", lambda rng: [rng.randrange(64)]),
+        (
+            6,
+            "corruption: a burst of up to 8 bits in 10 % of the measurements",
+            lambda rng: [rng.randrange(57) + i for i in range(8) if i == 0 or rng.random() < 0.5],
+        ),
+    ],
+)
+def test_corruption(row, undisturbed_n, order, name, bits):
+    rng = random.Random(order)
+    corrupted = []
+
+    def corrupt(frame):
+        if rng.random() >= 0.1:
+            return [frame]
+        where = bits(rng)
+        start = where[0]
+        corrupted.append(frame)
+        return [flipped(frame, [start, *where[1:]])]
+
+    trial = Trial()
+    ticks = trial.run(END_MS, after(BEGIN_NS, measurements_only(corrupt)))
+    counts = ticks[-1].counts
+    assert counts.refused == len(corrupted) > 80
+    assert_only_genuine_heights_were_used(trial)
+    error_n = force_error_n(ticks)
+    assert error_n < 1.5 * undisturbed_n
+    row(
+        order,
+        name,
+        f"refuses all {len(corrupted)} and uses no part of them; force error {error_n:.1f} N "
+        f"instead of {undisturbed_n:.1f} N RMS",
+        first_ms(ticks, lambda tick: tick.counts.refused > 0),
+        "the corrupted frames",
+    )
+
+
+def test_masquerade(row):
+    trial = Trial()
+
+    def disguise(_t_ns, frames):
+        auxiliary = [frame for frame in frames if frame.arbitration_id == 0x200]
+        return frames + [frame._replace(arbitration_id=MEASUREMENT) for frame in auxiliary]
+
+    ticks = trial.run(END_MS, after(BEGIN_NS, disguise))
+    assert ticks[-1].counts.masquerade == 100
+    assert_only_genuine_heights_were_used(trial)
+    row(
+        7,
+        "masquerade: another message's frames under the measurement's id",
+        "recognises the other message by its data id, refuses and counts",
+        first_ms(ticks, lambda tick: tick.counts.masquerade > 0),
+        "the disguised frames",
+    )
+
+
+def test_a_second_sender_of_the_benchs_id(row):
+    trial = Trial()
+    protection = trial.ready.database.message("BENCH_MEASUREMENT").protection
+    sent = iter(range(5, 100_000))
+
+    def rival(frame):
+        return [frame, frame._replace(data=protect(frame.data, next(sent), protection))]
+
+    ticks = trial.run(END_MS, after(BEGIN_NS, measurements_only(rival)))
+    found_ms = first_ms(ticks, lambda tick: tick.counts.second_sender > 0)
+    assert found_ms <= 2 * RIVAL_FRAMES
+    row(
+        8,
+        "a second sender of the bench's id, with valid frames",
+        "believes one of the two, refuses the other's frames, tells of a second sender "
+        "(BUS_FAULT in RIG_STATUS)",
+        found_ms,
+        "the frames of one of the two",
+    )
+
+
+def test_a_second_sender_of_our_id(row):
+    trial = Trial()
+    ours = []
+
+    def echo(_t_ns, frames):
+        ours[:] = trial.ticks[-1].result.frames
+        return frames + [frame for frame in ours if frame.arbitration_id == 0x110]
+
+    ticks = trial.run(END_MS, after(BEGIN_NS, echo))
+    assert ticks[-1].counts.second_sender == END_MS - BEGIN_NS // MS
+    row(
+        9,
+        "a second sender of RIG_ESTIMATE",
+        "counts every frame and tells of it (BUS_FAULT in RIG_STATUS)",
+        first_ms(ticks, lambda tick: tick.counts.second_sender > 0),
+        NOTHING_RECEIVED,
+    )
+
+
+def test_flood(row):
+    # 20 frames a tick are three times what 1 Mbit/s can carry. A CRC of 8 bits lets 1 in 256 random
+    # frames pass and the counter half of these; limits on the height catch nearly all that is left.
+    limits = [
+        {"value": "measured_height_m", "low": 0.1, "high": 0.7, "action": "refuse"},
+        {"value": "measured_rate_m_per_s", "low": -3.0, "high": 3.0, "action": "refuse"},
+    ]
+    rng = random.Random(3)
+    trial = Trial(limits=limits)
+
+    def flood(_t_ns, frames):
+        random_ones = [frames[0]._replace(data=rng.randbytes(8)) for _ in range(20)]
+        return [*random_ones, *frames]
+
+    ticks = trial.run(END_MS, after(BEGIN_NS, flood))
+    genuine = genuine_heights(trial)
+    used = [tick.result.step_input.heights[0] for tick in ticks]
+    wrong = [item for item in used if item is not None and item.height_m not in genuine]
+    counts, sent = ticks[-1].counts, 20 * (END_MS - BEGIN_NS // MS)
+    assert counts.wrong_crc + counts.masquerade > 0.99 * sent
+    assert len(wrong) <= sent // 5000
+    error_n = force_error_n(ticks)
+    row(
+        10,
+        f"flood: {sent} random frames in a second under the measurement's id (with limits on range "
+        "and rate of the height)",
+        f"{sent - counts.wrong_crc - counts.masquerade} pass the CRC, {counts.implausible} of them "
+        f"the counter and not the limits, {len(wrong)} are used; force error {error_n:.1f} N RMS",
+        first_ms(ticks, lambda tick: tick.counts.refused > 0),
+        "measurements for 3 ms after each frame that passes CRC and counter",
+    )
+
+
+def test_stuck_value(row):
+    limits = [{"value": "unchanged_s", "high": 0.02, "action": "refuse"}]
+    trial = Trial(limits=limits)
+    message = trial.ready.database.message("BENCH_MEASUREMENT")
+    last = []
+
+    def stuck(frame):
+        last.append(frame)
+        return [
+            frame._replace(data=protect(last[0].data, frame.data[1] & 0x0F, message.protection))
+        ]
+
+    ticks = trial.run(END_MS, after(BEGIN_NS, measurements_only(stuck)))
+    assert ticks[-1].mode is Mode.SAFE
+    assert ticks[-1].counts.implausible > 0
+    hold_ms = first_ms(ticks, lambda tick: tick.mode is Mode.HOLD)
+    safe_ms = first_ms(ticks, lambda tick: tick.mode is Mode.SAFE)
+    row(
+        11,
+        "stuck value: the same height in valid frames (limit `unchanged_s: 0.02`)",
+        f"refuses the measurement; estimate invalid after {hold_ms:.0f} ms (HOLD), "
+        "then the safe state",
+        safe_ms,
+        "the stuck measurements",
+    )
+
+
+def test_dead_bench(row):
+    trial = Trial()
+    ticks = trial.run(END_MS, after(BEGIN_NS, lambda _t_ns, _frames: []))
+    hold_ms = first_ms(ticks, lambda tick: tick.mode is Mode.HOLD)
+    assert hold_ms <= 11
+    assert ticks[-1].mode is Mode.SAFE
+    assert ticks[-1].force_n == 0.0
+    row(
+        12,
+        "dead bench: no more frames",
+        f"estimate invalid after {hold_ms:.0f} ms (HOLD), then the safe state: force 0, invalid, "
+        "until acknowledged",
+        first_ms(ticks, lambda tick: tick.mode is Mode.SAFE),
+        NOTHING_RECEIVED,
+    )
