@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, Protocol, cast
 
 import dartpy
 import numpy as np
@@ -205,6 +205,48 @@ class _Strut:
                 )
                 memory_rates[start:stop] = out
         return force
+
+
+class _Joints(Protocol):
+    """What the integrator asks of coordinates; `_Value` is the same type in all of it."""
+
+    @property
+    def adds_up(self) -> bool:
+        """Whether ``q + h * v`` is where a velocity leads to."""
+        ...
+
+    @property
+    def acceleration(self) -> _Acceleration:
+        """DART's acceleration under given forces."""
+        ...
+
+    def values(self, state: PlantState) -> tuple[_Value, _Value]:
+        """Position and velocity of a state."""
+        ...
+
+    def state(self, q: _Value, v: _Value, memory: tuple[float, ...], t_s: float) -> PlantState:
+        """State of position and velocity."""
+        ...
+
+    def moved(self, q: _Value, v: _Value, h: float) -> _Value:
+        """Where a velocity leads to in `h` seconds."""
+        ...
+
+    def kinematics(self, q: _Value, v: _Value) -> list[tuple[float, float]]:
+        """Height and velocity of every strut."""
+        ...
+
+    def load(
+        self,
+        q: _Value,
+        v: _Value,
+        virtual_forces_n: Sequence[float],
+        memory: Sequence[float],
+        surroundings: _Surroundings,
+        memory_rates: list[float],
+    ) -> tuple[list[Motion], _Value, _Value, list[float]]:
+        """Motions of struts, forces to be held, acceleration, and accelerations of struts."""
+        ...
 
 
 class _Coordinate:
@@ -448,7 +490,7 @@ class DartPlant:
         self._directions = _guides(spec, self._skeleton, self._bodies)
         rows = self._constant_rows()
         self._rows = rows
-        self._joints: _Coordinate | _Coordinates = (
+        self._joints: _Joints = (
             _Coordinate(self._skeleton, self._struts, rows)
             if rows is not None and self.coordinates == 1
             else _Coordinates(self._skeleton, self._struts, self._rows_at, rows)
@@ -456,9 +498,11 @@ class DartPlant:
         lightest_kg = min(float(body.getMass()) for body in self._bodies.values())
         self.step_s = _stable_step_s(self._struts, lightest_kg)
         self._longest_s = self.step_s * (1.0 + 1e-9)
-        self._acceleration = self._joints.acceleration
+        self._acceleration: _Acceleration = self._joints.acceleration
         # Rotations in space do not add up; DART composes them.
-        self._moved = None if self._joints.adds_up else self._joints.moved
+        self._moved: Callable[[_Value, _Value, float], _Value] | None = (
+            None if self._joints.adds_up else self._joints.moved
+        )
 
     def initial(
         self, heights_m: Sequence[float], velocities_m_per_s: Sequence[float] | None = None
@@ -703,7 +747,9 @@ def _guides(
         if len(singular) > 1 and singular[1] > 1e-9 * singular[0]:
             guides.append(None)
             continue
-        direction = np.round(left[:, 0], 14)  # exact for guides along an axis
+        direction = cast(
+            "NDArray[np.float64]", np.round(left[:, 0], 14)
+        )  # exact for guides along an axis
         largest = direction[2] if direction[2] != 0.0 else direction[np.argmax(np.abs(direction))]
         guides.append(direction * math.copysign(1.0, largest))
     return tuple(guides)

@@ -32,9 +32,10 @@ class _PlainLoader(yaml.SafeLoader):
     """`SafeLoader` that refuses what a configuration never needs and a mistake or an attack has."""
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
+        events = cast("Any", self)  # untyped in the stubs
+        if events.check_event(yaml.AliasEvent):
             raise yaml.MarkedYAMLError(
-                problem="aliases are not accepted", problem_mark=self.peek_event().start_mark
+                problem="aliases are not accepted", problem_mark=events.peek_event().start_mark
             )
         return super().compose_node(parent, index)
 
@@ -43,7 +44,7 @@ class _PlainLoader(yaml.SafeLoader):
     ) -> dict[Hashable, object]:
         seen: set[object] = set()
         for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
+            key = cast("object", cast("Any", self).construct_object(key_node, deep=True))
             if isinstance(key, Hashable) and key in seen:
                 raise yaml.MarkedYAMLError(
                     problem=f"key {key!r} stands here twice", problem_mark=key_node.start_mark
@@ -157,18 +158,16 @@ def _keys(schema: _Schema, path: Sequence[int | str]) -> list[str]:
     """Keys that a JSON schema has at a path of keys and indices."""
     nodes = [schema]
     for part in path:
-        nodes = [
-            child
-            for node in _alternatives(schema, nodes)
-            for child in (
-                node.get("properties", {}).get(part),
-                node.get("items"),
-                *node.get("prefixItems", []),
-                node.get("additionalProperties"),
-            )
-            if isinstance(child, dict)
-        ]
-    found = [key for node in _alternatives(schema, nodes) for key in node.get("properties", {})]
+        below: list[_Schema | None] = []
+        for node in _alternatives(schema, nodes):
+            below += [node.get("properties", {}).get(part), node.get("items")]
+            below += node.get("prefixItems", [])
+            values = node.get("additionalProperties")
+            below.append(None if isinstance(values, bool) else values)
+        nodes = [node for node in below if node]
+    found: list[str] = []
+    for node in _alternatives(schema, nodes):
+        found += node.get("properties", {})
     return list(dict.fromkeys(found))
 
 
