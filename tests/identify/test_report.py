@@ -332,6 +332,7 @@ def test_every_law_can_be_reported(law) -> None:
         (0.0123456, "m", "12.3 mm"),
         (1.04e-5, "m", "10.4 µm"),
         (0.0, "m", "0 m"),
+        (2.51e-4, "s", "251 µs"),
         (-52340.0, "N/m", "−52\u202f300 N/m"),
         (1.5, "", "1.50"),
         (math.nan, "N", "–"),
@@ -346,6 +347,12 @@ def test_a_value_has_the_digits_that_its_interval_allows() -> None:
     value, interval = value_and_interval(Estimate(0.262134, 0.26195, 0.2623), "m")
     assert value.replace("\u00a0", " ") == "262.13 mm"
     assert interval.replace("\u00a0", " ") == "261.95 to 262.30 mm"
+
+
+def test_a_value_far_smaller_than_its_interval_is_not_shown_as_zero() -> None:
+    value, interval = value_and_interval(Estimate(0.0189, 0.0017, 0.2101), "m/s")
+    assert value.replace("\u00a0", " ") == "0.019 m/s"
+    assert interval.replace("\u00a0", " ") == "0.002 to 0.210 m/s"
 
 
 @given(

@@ -8,7 +8,7 @@ from rig.identify.diagnosis import BeforeAfter, Estimate
 _THIN_SPACE = "\u202f"
 _NO_BREAK = "\u00a0"
 _MINUS = "\u2212"
-_LENGTHS = ((1.0, 1.0, "m"), (1e-3, 1e3, "mm"), (0.0, 1e6, "µm"))
+_PREFIXES = ((1.0, 1.0, ""), (1e-3, 1e3, "m"), (0.0, 1e6, "µ"))
 _OF_UNIT = str.maketrans({"·": "_", "²": "2", "³": "3", "°": "", "^": "", ".": "_"})
 _SPELLED = {"coulomb": "Coulomb", "stribeck": "Stribeck"}
 
@@ -25,13 +25,13 @@ def decimals_of(uncertainty: float) -> int:
 
 
 def scale_of(largest: float, unit: str) -> tuple[float, str]:
-    """Factor and unit in which a value is best read; only lengths have prefixes."""
-    if unit != "m":
+    """Factor and unit in which a value is best read; only lengths and times have prefixes."""
+    if unit not in {"m", "s"} or largest == 0.0:
         return 1.0, unit
-    for least, factor, name in _LENGTHS:
-        if largest >= least:
-            return factor, name
-    return 1e6, "µm"
+    factor, prefix = next(
+        (factor, prefix) for least, factor, prefix in _PREFIXES if largest >= least
+    )
+    return factor, f"{prefix}{unit}"
 
 
 def quantity(value: float, unit: str) -> str:
@@ -58,7 +58,9 @@ def value_and_interval(estimate: Estimate, unit: str) -> tuple[str, str]:
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         return quantity(estimate.value, unit), "not bounded by the data"
     factor, name = scale_of(abs(estimate.value), unit)
-    decimals = decimals_of(0.5 * (high - low) * factor)
+    # A value far smaller than its interval keeps its digits too, or it would be shown as zero.
+    known = 0.5 * (high - low)
+    decimals = decimals_of(min(known, abs(estimate.value) or known) * factor)
     if not -7 < decimals < 7:
         ends = f"{quantity(low, unit)} to {quantity(high, unit)}"
         return quantity(estimate.value, unit), ends
@@ -77,6 +79,8 @@ def times(factor: float) -> str:
     """A factor with two digits."""
     if factor >= 100.0:
         return number(factor, 1 - math.floor(math.log10(factor)))
+    if factor < 1.0:
+        return f"{factor:.2f}"
     return f"{factor:.1f}" if factor < 10.0 else f"{factor:.0f}"
 
 
