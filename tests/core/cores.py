@@ -1,0 +1,45 @@
+"""Cores and inputs that the tests of this folder share."""
+
+from dart_model.plant import DartPlant
+from dart_model.spec import MODELS, load_model
+from rig.core.observer import ObserverGains
+from rig.core.step import RigCore
+from rig.core.supervisor import Supervision
+from rig.core.types import Measurement, RigState, StepInput, StepOutput
+
+MS = 1_000_000
+GAINS = ObserverGains(1e5, 1e4, 5000.0)
+SUPERVISION = Supervision(10 * MS, 500 * MS, safe_holds_last=False)
+
+
+def core(
+    model: str = "seed", gains: ObserverGains = GAINS, supervision: Supervision = SUPERVISION
+) -> RigCore:
+    """The core of a shipped model with the same gains for every strut."""
+    spec = load_model(MODELS / f"{model}.yaml")
+    return RigCore(DartPlant(spec), (gains,) * len(spec.struts), supervision)
+
+
+def measured(
+    tick: int, *heights_m: float | None, applied_n: float | None = None, late_ns: int = 0
+) -> StepInput:
+    """Input of a tick at 1 kHz."""
+    t_ns = tick * MS
+    heights = tuple(
+        None if height is None else Measurement(height, t_ns - late_ns) for height in heights_m
+    )
+    return StepInput(t_ns, heights, applied_n)
+
+
+def run(
+    rig: RigCore, inputs: list[StepInput], state: RigState | None = None
+) -> tuple[list[RigState], list[StepOutput]]:
+    """All states and outputs."""
+    state = rig.init(0) if state is None else state
+    states: list[RigState] = []
+    outputs: list[StepOutput] = []
+    for step_input in inputs:
+        state, output = rig.step(state, step_input)
+        states.append(state)
+        outputs.append(output)
+    return states, outputs
