@@ -26,12 +26,15 @@ from rig.config import InputError, load_setup
 from rig.core.types import Mode
 from rig.demo import CASES, Case, run_case
 from rig.diagnose import diagnose_runs
+from rig.export import FORMATS, export_run, import_run
 from rig.identify.diagnosis import Diagnosis
 from rig.identify.records import RecordError
 from rig.identify.report import sentence
+from rig.imports import import_log, import_table, load_mapping
 from rig.io.bus import BusConfig, BusError
 from rig.replay import replay
 from rig.runs import Ended, live, run_bench
+from rig.scoreboard import run_scoreboard
 from rig.story import tell
 
 OK, FAILED, WRONG_INPUT = 0, 1, 2
@@ -269,6 +272,91 @@ def replay_command(
     if result.different:
         console.print("The replay differs from the log.", style="red")
         raise typer.Exit(FAILED)
+
+
+@app.command(
+    name="import",
+    epilog="Examples: `rig import bench.txt --mapping bench.yaml --out bench.csv` · "
+    "`rig import bus.blf --config rig.yaml --out runs/9` · `rig import run.mf4 --out runs/10`",
+)
+def import_command(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Table, bus log or export.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="PATH", help="CSV file, or folder of the run.")
+    ],
+    mapping: Annotated[
+        Path | None,
+        typer.Option("--mapping", metavar="FILE", help="Columns and units of a foreign table."),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="FILE", help="Signals of a bus log, with its DBC."),
+    ] = None,
+) -> None:
+    """Make a CSV of a foreign table, or a run of a bus log or of an export.
+
+    A table wants --mapping, a bus log (BLF, ASC, candump, TRC, MF4) --config; what `rig export`
+    wrote wants neither.
+    """
+    if mapping is not None and config is not None:
+        raise InputError("--mapping and --config: expected one of them")
+    if mapping is not None:
+        report = import_table(source, load_mapping(mapping), out)
+    elif config is not None:
+        with _progress(None) as progress:
+            report = import_log(source, load_setup(config), out, progress)
+    else:
+        import_run(source, out)
+        console.print(f"Run: {out}")
+        return
+    console.print(
+        f"{report.samples} samples, {report.duration_s:.3f} s at {report.rate_hz:g} a second: "
+        f"{', '.join(report.columns)}"
+    )
+    for line in report.assumptions:
+        console.print(f"- {line}", markup=False)
+    console.print(f"Written: {report.out}")
+
+
+@app.command(
+    name="export",
+    epilog="Examples: `rig export runs/7 --format mf4 --out run.mf4` · "
+    "`rig export runs/7 --format candump --out run.log`",
+)
+def export_command(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="PATH", help="New file; for Parquet a folder.")
+    ],
+    kind: Annotated[str, typer.Option("--format", help=f"One of {', '.join(FORMATS)}.")],
+) -> None:
+    """Write a run for other programs: MF4, Parquet, CSV or candump."""
+    for path in export_run(folder, kind, out):
+        console.print(f"Written: {path}")
+
+
+@app.command(
+    name="scoreboard",
+    epilog="Example: `rig scoreboard --data measured --out scores`",
+)
+def scoreboard_command(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            "--data", metavar="DIR", help="Folder with silverbox/SNLS80mV.csv and mr_damper/*.txt."
+        ),
+    ] = None,
+) -> None:
+    """Diagnose published measured sets and print our figures beside the published ones."""
+    with _bar() as bar:
+        rows = run_scoreboard(data, out, bar)
+    table = Table("set", "test", "model", "figure", "source", title="Measured sets")
+    for row in rows:
+        figure = "-" if row.value is None else f"{row.value:.4g} {row.unit}"
+        table.add_row(row.dataset, row.test, row.model, figure, row.source)
+    console.print(table)
+    console.print(f"Written: {out}/scoreboard.csv, {out}/scoreboard.md")
 
 
 @contextlib.contextmanager
