@@ -28,8 +28,12 @@ Progress = Callable[[str, float], None]
 
 MOST_EFFECTS = 4
 WORKERS = 2
-_SIMULATED = 6
+_SIMULATED = 5
 _HOPELESS = 30.0
+_FAR = 12.0
+_NEAR = 2.5
+_LATER_GAIN = 0.03
+_FLOOR_COLOUR = 0.03
 _BLOCKS = 40
 _LEAST_GAIN = 0.004
 _LEAST_LIKELIHOOD_GAIN = 25.0
@@ -195,7 +199,7 @@ def attribute(model: Model, grids: Sequence[Grid], progress: Progress) -> Attrib
 
 def at_floor(result: Fit) -> bool:
     """Whether nothing is left but white noise."""
-    return all(colour(column) < 0.01 for residual in result.residuals for column in residual.T)
+    return all(colour(column) < _FLOOR_COLOUR for residual in result.residuals for column in residual.T)
 
 
 def _round(
@@ -249,11 +253,13 @@ def _finalists(trials: Sequence[screen.Trial]) -> list[screen.Trial]:
     """The best of each family, and the best of all, as long as they are not hopeless."""
     found: list[screen.Trial] = []
     families: dict[str, int] = {}
+    best = trials[0].cost if trials else 0.0
     for trial in trials:
-        if trial.cost > _HOPELESS * trials[0].cost:
+        if trial.cost > _FAR * best:
             break
         family = effect(trial.name).family
-        if families.get(family, 0) < 2 and len(found) < _SIMULATED:
+        most = 2 if trial.cost < _NEAR * best else 1
+        if families.get(family, 0) < most and len(found) < _SIMULATED:
             families[family] = families.get(family, 0) + 1
             found.append(trial)
     return found
@@ -272,9 +278,9 @@ def _joint(
         judge.grids,
         judge.noise_m2,
         motions,
-        10,
+        8,
         False,
-        1e-3,
+        2e-3,
     )
 
 
@@ -325,7 +331,8 @@ def significant(before: Fit, after: Fit, judge: Judge) -> bool:
     added = after.planted.parameter_count - before.planted.parameter_count
     likelihood = effective_samples(after) * float(np.log(before.cost / after.cost))
     need = _LEAST_LIKELIHOOD_GAIN + 5.0 * max(added, 0)
-    return share > _LEAST_GAIN and likelihood > need and t > _LEAST_T
+    least = _LATER_GAIN if before.planted.effects else _LEAST_GAIN
+    return share > least and likelihood > need and t > _LEAST_T
 
 
 def _pruned(judge: Judge, current: Fit, motions: Sequence[screen.Motion]) -> Fit:

@@ -13,7 +13,9 @@ from typing import Any, NamedTuple, cast
 
 import numba
 import numpy as np
+from llvmlite import ir
 from numba import types
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from dart_model.effects import CATALOGUE, effect
@@ -25,26 +27,61 @@ Integers = NDArray[np.int64]
 SLOTS = 5
 """Most effects that a simulation can carry."""
 
+_F8: Any = types.float64
+_I8: Any = types.int64
 _VECTOR: Any = types.Array(types.float64, 1, "C")
 _MATRIX: Any = types.Array(types.float64, 2, "C")
 _INDEX: Any = types.Array(types.int64, 2, "C")
-_F8: Any = types.float64
-_FORCE_SIGNATURE: Any = _F8(_F8, _F8, _F8, _F8, _F8, _VECTOR, _VECTOR, _VECTOR)
-_RATE_SIGNATURE: Any = types.void(_F8, _F8, _F8, _F8, _F8, _VECTOR, _VECTOR, _VECTOR, _VECTOR)
-_FORCE: Any = types.FunctionType(_FORCE_SIGNATURE)
-_RATE: Any = types.FunctionType(_RATE_SIGNATURE)
+_INTEGERS: Any = types.Array(types.int64, 1, "C")
+_POINTER: Any = types.CPointer(types.float64)
+_FORCE_SIGNATURE: Any = _F8(*(_F8,) * 5, *(_POINTER,) * 3)
+_RATE_SIGNATURE: Any = types.void(*(_F8,) * 5, *(_POINTER,) * 4)
 
 
 class Law(NamedTuple):
-    """A law as machine code: its force, and the rate of its memory."""
+    """A law as machine code: the addresses of its force and of its memory's rate."""
 
-    force: Any
-    rate: Any
+    force: int
+    rate: int
 
 
 def compile_loop(function: Callable[..., Any], signature: Any) -> Any:
+    """A function as machine code for one signature, kept on disk, without the interpreter's lock."""
     compiler = cast("Any", numba.njit)
     return compiler(signature, cache=True, error_model="numpy", nogil=True)(function)
+
+
+def _compile_law(function: Callable[..., Any], signature: Any) -> Any:
+    # A law only reads and writes by index, so bare pointers do, which cost least in a call.
+    compiler = cast("Any", numba.cfunc)
+    return compiler(signature, cache=True, error_model="numpy")(function)
+
+
+def _call(builder: Any, arguments: Any, result: Any, pointers: int) -> Any:
+    """Call a law by its address: five numbers, then pointers."""
+    number = ir.DoubleType()
+    pointer = number.as_pointer()
+    kind = ir.FunctionType(result, [number] * 5 + [pointer] * pointers)
+    function = builder.inttoptr(arguments[0], kind.as_pointer())
+    places = [builder.inttoptr(value, pointer) for value in arguments[6:]]
+    return builder.call(function, [*arguments[1:6], *places])
+
+
+@intrinsic
+def _call_force(_typing, address, t, z, w, applied, temperature, state, p, strut):  # noqa: ANN001, ANN202
+    def generate(_context, builder, _signature, arguments):  # noqa: ANN001, ANN202
+        return _call(builder, arguments, ir.DoubleType(), 3)
+
+    return _F8(_I8, *(_F8,) * 5, *(_I8,) * 3), generate
+
+
+@intrinsic
+def _call_rate(_typing, address, t, z, w, applied, temperature, state, p, strut, out):  # noqa: ANN001, ANN202
+    def generate(context, builder, _signature, arguments):  # noqa: ANN001, ANN202
+        _call(builder, arguments, ir.VoidType(), 4)
+        return context.get_dummy_value()
+
+    return types.void(_I8, *(_F8,) * 5, *(_I8,) * 4), generate
 
 
 def _no_memory(
@@ -61,14 +98,18 @@ def _no_memory(
     return
 
 
+_KEPT: list[Any] = []
+"""Machine code whose addresses are in use."""
+
+
 @functools.cache
 def law(name: str) -> Law:
     """The law of an effect as machine code, compiled on first use and kept on disk."""
     item = effect(name)
-    return Law(
-        compile_loop(item.force, _FORCE_SIGNATURE),
-        compile_loop(item.rate or _no_memory, _RATE_SIGNATURE),
-    )
+    force = _compile_law(item.force, _FORCE_SIGNATURE)
+    rate = _compile_law(item.rate or _no_memory, _RATE_SIGNATURE)
+    _KEPT.extend([force, rate])
+    return Law(force.address, rate.address)
 
 
 def compile_all() -> None:
@@ -81,21 +122,19 @@ class Slots(NamedTuple):
     """Effects as the loops read them.
 
     Attributes:
-        laws: `SLOTS` laws; ``none`` where fewer effects are given.
-        index: Strut, first parameter, past the last parameter, first memory state, past the last
-            memory state of each slot, shape (SLOTS, 5).
+        index: For each effect its strut, first parameter, past the last parameter, first memory
+            state, past the last memory state, and the addresses of force and rate, shape
+            (effects, 7).
         memory_size: Number of memory states of all.
     """
 
-    laws: tuple[Law, ...]
     index: Integers
     memory_size: int
 
 
 def slots(effects: tuple[tuple[int, str], ...]) -> Slots:
     """Slots for effects, each given by its strut and name."""
-    index = np.zeros((SLOTS, 5), dtype=np.int64)
-    laws: list[Law] = []
+    index = np.zeros((len(effects), 7), dtype=np.int64)
     parameter = memory = 0
     for row, (strut, name) in enumerate(effects):
         item = effect(name)
@@ -105,38 +144,17 @@ def slots(effects: tuple[tuple[int, str], ...]) -> Slots:
             parameter + len(item.parameters),
             memory,
             memory + item.state_size,
+            *law(name),
         )
         parameter += len(item.parameters)
         memory += item.state_size
-        laws.append(law(name))
-    laws.extend([law("none")] * (SLOTS - len(laws)))
-    return Slots(tuple(laws), index, memory)
+    return Slots(index, memory)
 
 
-_SLOT_TYPES = (_FORCE, _RATE) * SLOTS
 _MODEL_TYPES = (_INDEX, _VECTOR, _MATRIX, _MATRIX, _VECTOR, _MATRIX, _VECTOR, _VECTOR)
 
 
-def _slot_force(
-    force: Any, rate: Any, t: float, z: float, w: float, applied: float, temperature: float,
-    memory: Array, p: Array, strut: Array, out: Array,
-) -> float:  # fmt: skip
-    if p.shape[0] == 0:
-        return 0.0
-    if memory.shape[0] > 0:
-        rate(t, z, w, applied, temperature, memory, p, strut, out)
-    value: float = force(t, z, w, applied, temperature, memory, p, strut)
-    return value
-
-
-_slot_force_c = compile_loop(
-    _slot_force,
-    _F8(_FORCE, _RATE, _F8, _F8, _F8, _F8, _F8, _VECTOR, _VECTOR, _VECTOR, _VECTOR),
-)
-
-
 def _simulate(
-    f0: Any, r0: Any, f1: Any, r1: Any, f2: Any, r2: Any, f3: Any, r3: Any, f4: Any, r4: Any,
     index: Integers, p: Array, struts: Array, rows: Array, offsets: Array,
     inverse_mass: Array, constant: Array, applied_row: Array,
     t: Array, fine: Array, temperature: Array, substeps: int, start: Array,
@@ -145,8 +163,6 @@ def _simulate(
     n = rows.shape[1]
     struts_count = rows.shape[0]
     size = start.shape[0]
-    m = 2 * n
-    # One state and one rate are evaluated again and again, so that the views below stay valid.
     x = start.copy()
     y = start.copy()
     dy = np.zeros(size)
@@ -155,27 +171,11 @@ def _simulate(
     w = np.zeros(struts_count)
     force = np.zeros(struts_count)
     general = np.zeros(n)
-    p0 = p[index[0, 1] : index[0, 2]]
-    p1 = p[index[1, 1] : index[1, 2]]
-    p2 = p[index[2, 1] : index[2, 2]]
-    p3 = p[index[3, 1] : index[3, 2]]
-    p4 = p[index[4, 1] : index[4, 2]]
-    s0 = y[m + index[0, 3] : m + index[0, 4]]
-    s1 = y[m + index[1, 3] : m + index[1, 4]]
-    s2 = y[m + index[2, 3] : m + index[2, 4]]
-    s3 = y[m + index[3, 3] : m + index[3, 4]]
-    s4 = y[m + index[4, 3] : m + index[4, 4]]
-    d0 = dy[m + index[0, 3] : m + index[0, 4]]
-    d1 = dy[m + index[1, 3] : m + index[1, 4]]
-    d2 = dy[m + index[2, 3] : m + index[2, 4]]
-    d3 = dy[m + index[3, 3] : m + index[3, 4]]
-    d4 = dy[m + index[4, 3] : m + index[4, 4]]
-    i0, i1, i2, i3, i4 = index[0, 0], index[1, 0], index[2, 0], index[3, 0], index[4, 0]
-    k0, k1, k2, k3, k4 = struts[i0], struts[i1], struts[i2], struts[i3], struts[i4]
-    count = 0
-    for row in range(5):
-        if index[row, 2] > index[row, 1]:
-            count = row + 1
+    memory_at = y.ctypes.data + 16 * n
+    rate_at = dy.ctypes.data + 16 * n
+    p_at = p.ctypes.data
+    struts_at = struts.ctypes.data
+    width = 8 * struts.shape[1]
     for k in range(t.shape[0]):
         last = k + 1 == t.shape[0]
         h = 0.0
@@ -206,25 +206,18 @@ def _simulate(
                     z[i] = height
                     w[i] = velocity
                     force[i] = -struts[i, 1] * (height - struts[i, 0]) - struts[i, 2] * velocity
-                if count > 0:
-                    force[i0] += _slot_force_c(
-                        f0, r0, now, z[i0], w[i0], applied, warm, s0, p0, k0, d0
-                    )
-                if count > 1:
-                    force[i1] += _slot_force_c(
-                        f1, r1, now, z[i1], w[i1], applied, warm, s1, p1, k1, d1
-                    )
-                if count > 2:
-                    force[i2] += _slot_force_c(
-                        f2, r2, now, z[i2], w[i2], applied, warm, s2, p2, k2, d2
-                    )
-                if count > 3:
-                    force[i3] += _slot_force_c(
-                        f3, r3, now, z[i3], w[i3], applied, warm, s3, p3, k3, d3
-                    )
-                if count > 4:
-                    force[i4] += _slot_force_c(
-                        f4, r4, now, z[i4], w[i4], applied, warm, s4, p4, k4, d4
+                for row in range(index.shape[0]):
+                    i = index[row, 0]
+                    own = memory_at + 8 * index[row, 3]
+                    values = p_at + 8 * index[row, 1]
+                    strut = struts_at + width * i
+                    if index[row, 4] > index[row, 3]:
+                        _call_rate(
+                            index[row, 6], now, z[i], w[i], applied, warm, own, values, strut,
+                            rate_at + 8 * index[row, 3],
+                        )  # fmt: skip
+                    force[i] += _call_force(
+                        index[row, 5], now, z[i], w[i], applied, warm, own, values, strut
                     )
                 for j in range(n):
                     sum_n = constant[j] + applied_row[j] * applied
@@ -264,13 +257,13 @@ def _simulate(
 simulate = compile_loop(
     _simulate,
     types.boolean(
-        *_SLOT_TYPES, *_MODEL_TYPES,
+        *_MODEL_TYPES,
         _VECTOR, _VECTOR, _VECTOR, types.int64, _VECTOR, _MATRIX, _MATRIX, _MATRIX,
     ),
 )  # fmt: skip
 """Run a model open loop.
 
-Args: the laws; index, parameters, strut constants (struts, 4), strut rows (struts, n), offsets
+Args: index of the slots; parameters, strut constants (struts, 4), strut rows (struts, n), offsets
 (struts,), inverse mass (n, n), constant generalised force (n,), applied row (n,); times of the
 nodes (N,), applied force at half sub-steps (2 * substeps * (N - 1) + 1,), temperature (N,),
 sub-steps, start (2 n + memory,); heights, velocities and accelerations of the struts (N, struts),
@@ -279,7 +272,7 @@ written. Returns whether the motion stayed finite.
 
 
 def _along(
-    force: Any, rate: Any, p: Array, strut: Array, t: Array, z: Array, w: Array,
+    force: int, rate: int, p: Array, strut: Array, t: Array, z: Array, w: Array,
     applied: Array, temperature: Array, substeps: int, start: Array, out: Array,
 ) -> None:  # fmt: skip
     size = start.shape[0]
@@ -287,8 +280,13 @@ def _along(
     y = np.empty(size)
     k1 = np.zeros(size)
     k2 = np.zeros(size)
+    s_at, y_at = s.ctypes.data, y.ctypes.data
+    k1_at, k2_at = k1.ctypes.data, k2.ctypes.data
+    p_at, strut_at = p.ctypes.data, strut.ctypes.data
     for k in range(t.shape[0]):
-        out[k] = force(t[k], z[k], w[k], applied[k], temperature[k], s, p, strut)
+        out[k] = _call_force(
+            force, t[k], z[k], w[k], applied[k], temperature[k], s_at, p_at, strut_at
+        )
         if size == 0 or k + 1 == t.shape[0]:
             continue
         h = (t[k + 1] - t[k]) / substeps
@@ -298,15 +296,15 @@ def _along(
         for step in range(substeps):
             a = float(step)
             b = step + 0.5
-            rate(
-                t[k] + a * h, z[k] + a * dz, w[k] + a * dw, applied[k] + a * da,
-                temperature[k], s, p, strut, k1,
+            _call_rate(
+                rate, t[k] + a * h, z[k] + a * dz, w[k] + a * dw, applied[k] + a * da,
+                temperature[k], s_at, p_at, strut_at, k1_at,
             )  # fmt: skip
             for i in range(size):
                 y[i] = s[i] + 0.5 * h * k1[i]
-            rate(
-                t[k] + b * h, z[k] + b * dz, w[k] + b * dw, applied[k] + b * da,
-                temperature[k], y, p, strut, k2,
+            _call_rate(
+                rate, t[k] + b * h, z[k] + b * dz, w[k] + b * dw, applied[k] + b * da,
+                temperature[k], y_at, p_at, strut_at, k2_at,
             )  # fmt: skip
             for i in range(size):
                 s[i] += h * k2[i]
@@ -315,13 +313,28 @@ def _along(
 along = compile_loop(
     _along,
     types.void(
-        _FORCE, _RATE, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR,
-        types.int64, _VECTOR, _VECTOR,
+        _I8, _I8, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, types.int64,
+        _VECTOR, _VECTOR,
     ),
 )  # fmt: skip
-"""Force of one law along a known motion: parameters, strut constants (4,), then times, heights,
-velocities, applied force and temperature (N,), sub-steps for the memory, its start; force, written.
+"""Force of one law along a known motion: addresses of force and rate, parameters, strut constants
+(4,), then times, heights, velocities, applied force and temperature (N,), sub-steps for the memory,
+its start; force, written.
 """
+
+
+def _gram(columns: Array, out: Array) -> None:
+    for i in range(columns.shape[0]):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(columns.shape[1]):
+                total += columns[i, k] * columns[j, k]
+            out[i, j] = total
+            out[j, i] = total
+
+
+gram = compile_loop(_gram, types.void(_MATRIX, _MATRIX))
+"""Scalar products (k, k), written, of rows (k, m): on one core, without a thread pool's overhead."""
 
 
 def _respond(

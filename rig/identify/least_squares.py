@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.identify.compiled import gram
+
 Array = NDArray[np.float64]
 
 _DIFFERENCE = 1e-4
@@ -92,14 +94,14 @@ def solve(
     damping = _FIRST_DAMPING
     jacobian = _jacobian(residual_of, x, r, space)
     for _ in range(iterations):
-        gram, gradient = jacobian.T @ jacobian, jacobian.T @ r
-        diagonal = np.diag(gram).copy()
+        products, gradient = _gram(jacobian), jacobian.T @ r
+        diagonal = np.diag(products).copy()
         diagonal[diagonal <= 0.0] = 1e-300
         before = cost
         while damping < _LARGEST_DAMPING:
             free = ~_pressed(x, gradient, space)
             step = np.zeros_like(x)
-            part = gram[np.ix_(free, free)] + damping * np.diag(diagonal[free])
+            part = products[np.ix_(free, free)] + damping * np.diag(diagonal[free])
             step[free] = -np.linalg.lstsq(part, gradient[free], rcond=None)[0]
             step = np.clip(step, -_largest(space), _largest(space))
             trial = space.inner(space.outer(x + step))
@@ -144,3 +146,9 @@ def _jacobian(
                 columns[:, i] = (moved - r) / moved_by
                 break
     return columns
+
+
+def _gram(jacobian: Array) -> Array:
+    out = np.empty((jacobian.shape[1], jacobian.shape[1]))
+    gram(np.ascontiguousarray(jacobian.T), out)
+    return out

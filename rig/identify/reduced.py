@@ -241,9 +241,7 @@ def run(
         return None
     shape = (len(grid.t_s), model.rows.shape[0])
     heights, velocities, accelerations = np.empty(shape), np.empty(shape), np.empty(shape)
-    functions = [function for item in what.slots.laws for function in item]
     finite = simulate(
-        *functions,
         what.slots.index,
         parameters,
         model.struts,
