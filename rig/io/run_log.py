@@ -178,8 +178,9 @@ def _read_part(path: Path) -> Any:
     batches: list[Any] = []
     try:
         with _pa.memory_map(str(path)) as source:
-            if source.size() == 0:
+            if source.size() < _schema_bytes(bytes(source.read(8))):
                 return step_schema(()).empty_table()
+            source.seek(0)
             stream = _pa.ipc.open_stream(source)
             # Behind the last whole batch stands what a kill cut off.
             with contextlib.suppress(_pa.ArrowInvalid, OSError):
@@ -188,3 +189,9 @@ def _read_part(path: Path) -> Any:
     except (_pa.ArrowInvalid, OSError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: is no Arrow stream of steps: {reason}") from error
+
+
+def _schema_bytes(head: bytes) -> int:
+    """Bytes of an Arrow stream up to the end of its schema, by its first eight bytes."""
+    marker, length = head[:4], int.from_bytes(head[4:8], "little", signed=True)
+    return 8 + max(length, 0) if marker == b"\xff" * len(marker) else 0

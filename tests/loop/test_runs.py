@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+from dart_model.yaml_file import InputError
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig
 from rig.bench.trajectory import simulate
@@ -193,3 +194,20 @@ def test_steps_that_are_ahead_of_the_frames_are_replayed_as_far_as_the_frames_go
 def test_nothing_but_the_header_is_an_empty_replay(seed_run, tmp_path):
     found = replay(cut(seed_run, tmp_path / "run", 0, 0))
     assert len(found.steps) == found.logged == 0
+
+
+@pytest.mark.parametrize("steps_bytes", [1, 3, 7, 8, 100, 700])
+def test_steps_that_were_cut_before_the_first_are_all_computed_again(
+    seed_run, tmp_path, steps_bytes
+):
+    size = (seed_run / FRAMES_FILE).stat().st_size
+    found = replay(cut(seed_run, tmp_path / "run", size, steps_bytes))
+    assert found.logged == 0
+    assert bits(found.steps, 4000) == bits(read_run(seed_run).steps, 4000)
+
+
+def test_a_file_that_holds_no_steps_is_refused(seed_run, tmp_path):
+    folder = cut(seed_run, tmp_path / "run", 0, 0)
+    (folder / STEPS_FILE).write_text("these are no steps", "utf-8")
+    with pytest.raises(InputError, match=r"steps\.arrow: is no Arrow stream of steps"):
+        replay(folder)
