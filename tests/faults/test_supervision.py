@@ -1,0 +1,176 @@
+"""The table of limits, and the way into the safe state and out of it."""
+
+import pytest
+
+from can_dbc.codec import compile_decoder
+from can_dbc.protection import protect
+from can_dbc.units import Dimension
+from dart_model.yaml_file import InputError, load_validated
+from rig.config import CONFIGS, LimitConfig, RunConfig
+from rig.core.messages import Conditions
+from rig.core.supervisor import TRANSITIONS, Action, Event, Limit, Watched, judged
+from rig.core.types import Measurement, Mode
+from tests.faults.trial import BEGIN_NS, MS, Trial, after, measurements_only
+
+STATUS = 0x300
+
+
+def status_flags(trial, first_ms, last_ms):
+    """Every status frame of a time, decoded."""
+    names = [
+        "STATE",
+        "LIMIT_FAULT",
+        "MEASUREMENT_FAULT",
+        "BUS_FAULT",
+        "LOG_FAULT",
+        "REFUSED_FRAMES",
+    ]
+    decode = compile_decoder(
+        trial.ready.database.message("RIG_STATUS"), names, [Dimension.NUMBER] * 6
+    )
+    return [
+        dict(zip(names, decode(frame.data), strict=True))
+        for tick in trial.ticks[first_ms:last_ms]
+        for frame in tick.result.frames
+        if frame.arbitration_id == STATUS
+    ]
+
+
+def limit(value, action, low=None, high=None):
+    return {"value": value, "low": low, "high": high, "action": action}
+
+
+def test_warn_tells_of_it_and_changes_nothing_else():
+    plain, warned = Trial(), Trial(limits=[limit("force_n", "warn", high=100.0)])
+    forces = [[tick.force_n for tick in trial.run(900)[5:]] for trial in (plain, warned)]
+    assert forces[0] == forces[1]
+    beyond = sum(force > 100.0 for force in forces[0])
+    assert warned.ticks[-1].counts.limited == beyond > 100
+    assert {flags["LIMIT_FAULT"] for flags in status_flags(plain, 0, 900)} == {0.0}
+    assert 1.0 in {flags["LIMIT_FAULT"] for flags in status_flags(warned, 0, 900)}
+
+
+@pytest.mark.parametrize("value", ["height_m", "force_n", "virtual_force_n", "innovation_m"])
+def test_hold_marks_the_estimate_invalid_as_long_as_it_lasts(value):
+    reference = Trial().run(1000)
+    field = {"height_m": 0.35, "force_n": 100.0, "virtual_force_n": 0.0, "innovation_m": 0.0}[value]
+    values = [getattr(tick.result.output.struts[0], value) for tick in reference[5:]]
+    expected = [number <= field for number in values]
+    assert 50 < sum(expected) < 950
+    trial = Trial(limits=[limit(value, "hold", high=field)])
+    ticks = trial.run(1000)[5:]
+    assert [tick.is_valid for tick in ticks] == expected
+    assert {tick.mode for tick in ticks} == {Mode.RUNNING, Mode.HOLD}
+
+
+@pytest.mark.parametrize("safe_output", ["zero", "last"])
+def test_safe_is_held_with_its_defined_output_until_it_is_acknowledged(safe_output):
+    # The bench's height falls below 0.3 m at 0.5 s, and is above it again at 0.75 s.
+    trial = Trial(limits=[limit("height_m", "safe", low=0.3)], safe_output=safe_output)
+    ticks = trial.run(800)
+    first = next(index for index, tick in enumerate(ticks) if tick.mode is Mode.SAFE)
+    assert ticks[first - 1].result.output.struts[0].height_m >= 0.3
+    assert all(tick.mode is Mode.SAFE for tick in ticks[first:])
+    held = 0.0 if safe_output == "zero" else ticks[first - 1].force_n
+    assert {tick.force_n for tick in ticks[first:]} == {held}
+    assert not any(tick.is_valid for tick in ticks[first:])
+    # Acknowledged, the bridge starts anew with the next measurement.
+    trial.run(801, conditions=lambda _t_ns: Conditions(acknowledged=True))
+    assert trial.run(803)[-1].mode is Mode.RUNNING
+    assert trial.ticks[-1].is_valid
+
+
+def test_an_implausible_height_is_refused_with_all_of_its_frame():
+    limits = [limit("measured_height_m", "refuse", low=0.38, high=0.45)]
+    trial = Trial(limits=limits)
+    ticks = trial.run(300)
+    used = [tick.result.step_input for tick in ticks]
+    refused = [item for item in used if item.heights[0] is None]
+    assert refused
+    assert all(item.applied_force_n is None for item in refused)
+    assert all(0.38 <= item.heights[0].height_m <= 0.45 for item in used if item.heights[0])
+    assert ticks[-1].counts.implausible == len(refused)
+    assert status_flags(trial, 0, 300)[-1]["REFUSED_FRAMES"] > 0
+
+
+def seen_after(limits, *measured):
+    seen, actions = None, []
+    for height_m, t_ms in measured:
+        seen, action = judged(limits, seen, Measurement(height_m, t_ms * MS))
+        actions.append(action)
+    return actions
+
+
+def test_a_jump_is_refused_until_the_time_allows_for_it():
+    rate = [Limit(Watched.MEASURED_RATE_M_PER_S, -1.0, 1.0, Action.REFUSE)]
+    jumped = [(0.5, 0), (0.5005, 1), (0.51, 2), (0.51, 3), (0.51, 10), (0.51, 11)]
+    assert seen_after(rate, *jumped) == [0, 0, Action.REFUSE, Action.REFUSE, Action.REFUSE, 0]
+
+
+def test_a_height_may_stay_the_same_for_as_long_as_the_limit_says():
+    stuck = [Limit(Watched.UNCHANGED_S, 0.0, 0.002, Action.HOLD)]
+    same = [(0.5, 0), (0.5, 1), (0.5, 2), (0.5, 3), (0.5, 4), (0.50001, 5), (0.50001, 6)]
+    assert seen_after(stuck, *same) == [0, 0, 0, Action.HOLD, Action.HOLD, 0, 0]
+
+
+def test_the_gravest_action_counts():
+    rows = [
+        Limit(Watched.MEASURED_HEIGHT_M, 0.2, 0.8, Action.WARN),
+        Limit(Watched.MEASURED_HEIGHT_M, 0.1, 0.9, Action.SAFE),
+    ]
+    assert seen_after(rows, (0.5, 0), (0.85, 1), (0.95, 2)) == [0, Action.WARN, Action.SAFE]
+
+
+def test_a_measurement_beyond_a_safe_limit_enters_the_safe_state_at_once():
+    trial = Trial(limits=[limit("measured_height_m", "safe", low=0.05)])
+    message = trial.ready.database.message("BENCH_MEASUREMENT")
+    zero = bytes(8)
+
+    def broken_sensor(frame):
+        return [frame._replace(data=protect(zero, frame.data[1] & 0x0F, message.protection))]
+
+    ticks = trial.run(400, after(BEGIN_NS, measurements_only(broken_sensor)))
+    assert ticks[BEGIN_NS // MS - 1].mode is Mode.RUNNING
+    assert ticks[BEGIN_NS // MS].mode is Mode.SAFE
+
+
+def test_nothing_is_sent_before_the_first_valid_measurement():
+    ticks = Trial().run(200, lambda _t_ns, frames: [f._replace(data=bytes(8)) for f in frames])
+    assert all(tick.result.frames == [] for tick in ticks)
+    assert {tick.mode for tick in ticks} == {Mode.WAITING}
+
+
+def test_every_way_out_of_the_safe_state_is_somebodys_decision():
+    ways = {event for (mode, event) in TRANSITIONS if mode is Mode.SAFE}
+    assert ways == {Event.ACKNOWLEDGED, Event.STOP}
+
+
+@pytest.mark.parametrize(
+    ("row", "expected"),
+    [
+        ({"value": "force_n", "action": "warn"}, "expected low, high or both"),
+        ({"value": "force_n", "low": 2, "high": 1, "action": "warn"}, "expected less than high"),
+        ({"value": "force_n", "high": 1, "action": "refuse"}, "expected warn, hold or safe"),
+        ({"value": "force_kn", "high": 1, "action": "warn"}, "measured_height_m"),
+        (
+            {"value": "force_n", "high": 1, "action": "explode"},
+            "'warn', 'refuse', 'hold' or 'safe'",
+        ),
+        ({"value": "force_n", "high": ".nan", "action": "warn"}, "high"),
+        ({"value": "force_n", "high": 1, "action": "warn", "unit": "N"}, "unknown key"),
+    ],
+)
+def test_a_wrong_row_is_one_line_that_names_it(tmp_path, row, expected):
+    text = (CONFIGS / "seed.yaml").read_text()
+    cells = ", ".join(f"{key}: {value}" for key, value in row.items())
+    path = tmp_path / "rig.yaml"
+    path.write_text(f"{text}\nsupervision: {{limits: [{{{cells}}}]}}\n")
+    with pytest.raises(InputError, match=expected) as caught:
+        load_validated(RunConfig, path)
+    assert str(caught.value).startswith(f"{path}: supervision.limits.0")
+    assert "\n" not in str(caught.value)
+
+
+def test_an_open_limit_has_no_end():
+    limit_of = LimitConfig(value=Watched.FORCE_N, high=5.0, action="warn").limit()
+    assert limit_of == Limit(Watched.FORCE_N, float("-inf"), 5.0, Action.WARN)
