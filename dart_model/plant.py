@@ -128,9 +128,10 @@ _Acceleration = Callable[
 class _Strut:
     """A strut ready to be evaluated: constants and laws in the form that is read fastest."""
 
-    __slots__ = ("constants", "damping", "free_length", "laws", "memory_size", "stiffness")
+    __slots__ = ("constants", "damping", "free_length", "laws", "memory_size", "name", "stiffness")
 
     def __init__(self, spec: StrutSpec, first_memory: int, gravity_m_per_s2: float) -> None:
+        self.name = spec.name
         self.free_length = spec.free_length_m
         self.stiffness = spec.stiffness_n_per_m
         self.damping = spec.damping_n_s_per_m
@@ -797,25 +798,36 @@ def _add_masses(spec: ModelSpec, bodies: dict[str, Any]) -> None:
 def _stable_step_s(struts: Sequence[_Strut], lightest_kg: float) -> float:
     """Longest sub-step with which the stiffest strut is still integrated stably.
 
-    The steepest slopes of each law are sampled over heights and velocities that a bench can reach.
+    Raises:
+        InputError: The parameters of an effect give its law no value.
     """
-    if not any(strut.laws for strut in struts):
-        return DEFAULT_STEP_S
-    heights = np.linspace(-0.5, 0.5, 501)
-    speeds = np.concatenate([-np.logspace(-6, 0.5, 60)[::-1], np.logspace(-6, 0.5, 60)])
     size = sum(strut.memory_size for strut in struts)
-    memory, unused, surroundings = [0.0] * size, [0.0] * size, (0.0, 0.0, 20.0)
     fastest = 0.0
     for strut in struts:
-        rest = strut.free_length
+        if strut.laws:
+            stiffness, damping = _steepest(strut, [0.0] * size)
+            fastest = max(fastest, damping / lightest_kg, math.sqrt(stiffness / lightest_kg))
+    return min(DEFAULT_STEP_S, max(_STABLE_PRODUCT / max(fastest, 1e-9), 1e-6))
+
+
+def _steepest(strut: _Strut, memory: list[float]) -> tuple[float, float]:
+    """Largest stiffness (N/m) and damping (N·s/m), sampled where a bench can get to."""
+    heights = np.linspace(-0.5, 0.5, 501)
+    speeds = np.concatenate([-np.logspace(-6, 0.5, 60)[::-1], np.logspace(-6, 0.5, 60)])
+    rest, surroundings, unused = strut.free_length, (0.0, 0.0, 20.0), memory.copy()
+    try:
         by_height = [
             strut.effects_n(rest + x, 0.0, memory, surroundings, unused) for x in heights.tolist()
         ]
         by_speed = [strut.effects_n(rest, v, memory, surroundings, unused) for v in speeds.tolist()]
-        stiffness = strut.stiffness + float(np.max(np.abs(np.diff(by_height) / np.diff(heights))))
-        damping = strut.damping + float(np.max(np.abs(np.diff(by_speed) / np.diff(speeds))))
-        fastest = max(fastest, damping / lightest_kg, math.sqrt(stiffness / lightest_kg))
-    return min(DEFAULT_STEP_S, max(_STABLE_PRODUCT / max(fastest, 1e-9), 1e-6))
+    except (ArithmeticError, ValueError) as error:
+        names = ", ".join(law.name for law, *_ in strut.laws)
+        raise InputError(
+            f"strut {strut.name}: effects {names}: no force with these parameters ({error})"
+        ) from error
+    stiffness = strut.stiffness + float(np.max(np.abs(np.diff(by_height) / np.diff(heights))))
+    damping = strut.damping + float(np.max(np.abs(np.diff(by_speed) / np.diff(speeds))))
+    return stiffness, damping
 
 
 def _build(spec: ModelSpec) -> tuple[Any, dict[str, Any]]:
