@@ -18,7 +18,7 @@ _PRESLIDING = Parameter("presliding_m", "m", 1e-6, 2e-2, "deflection at which sl
 
 # A bristle settles at |velocity| / presliding, without bound; what is faster than this rate (1/s)
 # is over before it can be seen, and would only need shorter steps.
-_FASTEST_SETTLING_PER_S = 800.0
+_FASTEST_SETTLING_PER_S = 2000.0
 
 
 def _coulomb(

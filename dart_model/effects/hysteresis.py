@@ -13,7 +13,7 @@ ELEMENTS = 8
 """Slip elements of the Iwan model."""
 
 # See friction.py: what settles faster (1/s) cannot be seen.
-_FASTEST_SETTLING_PER_S = 800.0
+_FASTEST_SETTLING_PER_S = 2000.0
 
 
 def _bouc_wen(

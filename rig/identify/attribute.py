@@ -33,6 +33,7 @@ _HOPELESS = 30.0
 _FAR = 12.0
 _NEAR = 2.5
 _LATER_GAIN = 0.03
+_INPUT_MARGIN = 2.0
 _FLOOR_COLOUR = 0.03
 _BLOCKS = 40
 _LEAST_GAIN = 0.004
@@ -81,6 +82,7 @@ class Attribution(NamedTuple):
         final: The model with all effects found.
         rounds: The competition.
         noise_m2: Noise variance of each height, shape (struts,).
+        input_m2: Variance that the noise of the applied force adds to each height, shape (struts,).
         motions: What each strut did.
     """
 
@@ -88,6 +90,7 @@ class Attribution(NamedTuple):
     final: Fit
     rounds: tuple[Round, ...]
     noise_m2: Array
+    input_m2: Array
     motions: tuple[screen.Motion, ...]
 
 
@@ -157,12 +160,14 @@ class Judge(NamedTuple):
         model: The bench.
         grids: Runs.
         noise_m2: Noise variance of each height, shape (struts,).
+        input_m2: Variance that the noise of the applied force adds to each height, shape (struts,).
         every: Thinning of the trials.
     """
 
     model: Model
     grids: tuple[Grid, ...]
     noise_m2: Array
+    input_m2: Array
     every: int
 
 
@@ -176,7 +181,13 @@ def attribute(model: Model, grids: Sequence[Grid], progress: Progress) -> Attrib
     """
     base, noise = first_fit(model, grids)
     samples = sum(len(grid.t_s) for grid in grids)
-    judge = Judge(model, tuple(grids), noise, max(1, round(samples / screen.MOST_SAMPLES)))
+    judge = Judge(
+        model,
+        tuple(grids),
+        noise,
+        input_noise(model, grids),
+        max(1, round(samples / screen.MOST_SAMPLES)),
+    )
     current = base
     rounds: list[Round] = []
     motions: tuple[screen.Motion, ...] = ()
@@ -192,33 +203,56 @@ def attribute(model: Model, grids: Sequence[Grid], progress: Progress) -> Attrib
                 break
             current = winner.fit
             current = _pruned(judge, current, motions)
-            if at_floor(current):
+            if at_floor(current, judge):
                 break
-    return Attribution(base, current, tuple(rounds), noise, motions)
+    return Attribution(base, current, tuple(rounds), noise, judge.input_m2, motions)
 
 
-def at_floor(result: Fit) -> bool:
-    """Whether nothing is left but white noise."""
-    return all(colour(column) < _FLOOR_COLOUR for residual in result.residuals for column in residual.T)
+def input_noise(model: Model, grids: Sequence[Grid]) -> Array:
+    """Variance of each height that comes from noise and resolution of the applied force.
+
+    The noise is what third differences of the force hold, but never more than a thousandth of its
+    range: a force with real content up there is not noise.
+    """
+    variances: list[Array] = []
+    for grid in grids:
+        force = grid.applied_n
+        noise = float(np.sqrt(np.mean(np.diff(force, 3) ** 2) / 20.0))
+        noise = min(noise, 1e-3 * float(np.ptp(force)))
+        linear, _, _ = screen.linear_model(model, grid.step_s, float(grid.t_s[-1] - grid.t_s[0]))
+        impulse = np.zeros((min(len(force), 20_000), model.coordinates))
+        impulse[1] = noise * model.applied_row
+        variances.append(np.sum(screen.response(linear, impulse) ** 2, axis=0))
+    return np.max(np.array(variances), axis=0)
+
+
+def coloured(result: Fit, noise_m2: Array, input_m2: Array) -> float:
+    """Share of what remains that is neither white nor noise of the applied force; the worst strut.
+
+    Args:
+        result: A fit.
+        noise_m2: Noise variance of each height, shape (struts,).
+        input_m2: From `input_noise`.
+    """
+    worst = 0.0
+    for residual in result.residuals:
+        for i, column in enumerate(residual.T):
+            square = float(np.nanmean(column**2))
+            left = colour(column) * square - _INPUT_MARGIN * float(input_m2[i])
+            worst = max(worst, left / max(square, float(noise_m2[i])))
+    return worst
+
+
+def at_floor(result: Fit, judge: Judge) -> bool:
+    """Whether nothing is left but noise."""
+    return coloured(result, judge.noise_m2, judge.input_m2) < _FLOOR_COLOUR
 
 
 def _round(
     judge: Judge, base: Fit, current: Fit, pool: ThreadPoolExecutor
 ) -> tuple[Round, tuple[screen.Motion, ...]]:
-    model, grids = judge.model, judge.grids
-    misses = smoothed_misses(grids, current)
-    pieces = [
-        screen.thinned(model, grid, now, first, columns, judge.every)
-        for grid, now, first, columns in zip(
-            grids, current.trajectories, base.trajectories, misses, strict=True
-        )
-    ]
-    chosen = [
-        (strut, name, current.values[slice(*current.planted.slots.index[row, 1:3])])
-        for row, (strut, name) in enumerate(current.planted.effects)
-    ]
-    weight = judge.every / float(np.mean(judge.noise_m2))
-    shared = screen.stage(model, pieces, chosen, weight)
+    model = judge.model
+    shared = _shared(judge, base, current, current)
     keys = [(strut, name) for strut in range(len(model.struts)) for name in CANDIDATES]
     trials = _tried(shared, keys, pool)
     finalists = _finalists(trials)
@@ -226,6 +260,23 @@ def _round(
     simulated = {(t.strut, t.name): f for t, f in zip(finalists, fits, strict=True)}
     candidates = _ranked(trials, simulated)
     return Round(current, candidates), shared.motions
+
+
+def _shared(judge: Judge, base: Fit, chosen: Fit, motion: Fit) -> screen.Stage:
+    """What the trials share: effects that are chosen, and the fit that follows the motion best."""
+    misses = smoothed_misses(judge.grids, motion)
+    pieces = [
+        screen.thinned(judge.model, grid, now, first, columns, judge.every)
+        for grid, now, first, columns in zip(
+            judge.grids, motion.trajectories, base.trajectories, misses, strict=True
+        )
+    ]
+    index = chosen.planted.slots.index
+    given = [
+        (strut, name, chosen.values[slice(*index[row, 1:3])])
+        for row, (strut, name) in enumerate(chosen.planted.effects)
+    ]
+    return screen.stage(judge.model, pieces, given, judge.every / float(np.mean(judge.noise_m2)))
 
 
 def _tried(
@@ -397,12 +448,59 @@ def settle(model: Model, grids: Sequence[Grid], found: Attribution) -> Settled:
     final = found.final
     if not final.planted.effects:
         return Settled(final, (), found.motions)
+    samples = sum(len(grid.t_s) for grid in grids)
+    every = max(1, round(samples / screen.MOST_SAMPLES))
+    judge = Judge(model, tuple(grids), found.noise_m2, found.input_m2, every)
+    with ThreadPoolExecutor(WORKERS) as pool:
+        final = _refined(judge, found, final, pool)
     last = fit(
         model, final.planted, final.values, final.starts, grids, found.noise_m2, found.motions,
         20, False, 1e-7,
     )  # fmt: skip
     final = last if last is not None and last.cost <= final.cost else final
     return Settled(final, _rivals(found, final), found.motions)
+
+
+def _refined(judge: Judge, found: Attribution, final: Fit, pool: ThreadPoolExecutor) -> Fit:
+    """The same families, each by its best law: an early choice was made amid what others did."""
+    if len(final.planted.effects) < 2 and at_floor(final, judge):
+        return final
+    for strut, name in tuple(final.planted.effects):
+        row = final.planted.effects.index((strut, name))
+        family = effect(name).family
+        keys = [(strut, c) for c in CANDIDATES if effect(c).family == family and c != name]
+        if not keys:
+            continue
+        rest = _rest(judge, final, row)
+        shared = _shared(judge, found.base, rest, final)
+        begun = [b[0] for b in (screen.begin(shared, *key) for key in keys) if b]
+        trials = list(pool.map(lambda t: screen.polish(shared, t, 10), begun))  # noqa: B023
+        trials.sort(key=lambda t: t.cost)
+        fits = pool.map(
+            lambda t: _joint(judge, rest, t, found.motions),  # noqa: B023
+            trials[:2],
+        )
+        for rival in fits:
+            if rival is None:
+                continue
+            effective = effective_samples(min((rival, final), key=lambda f: f.cost))
+            if score(rival, effective) < score(final, effective) - 2.0:
+                final = rival
+    return final
+
+
+def _rest(judge: Judge, final: Fit, row: int) -> Fit:
+    """The fit less one effect, the others as they are."""
+    keep = [i for i in range(len(final.planted.effects)) if i != row]
+    index = final.planted.slots.index
+    what = planted(tuple(final.planted.effects[i] for i in keep))
+    values = np.concatenate([np.zeros(0), *(final.values[slice(*index[i, 1:3])] for i in keep)])
+    n = 2 * judge.model.coordinates
+    starts = tuple(
+        np.concatenate([start[:n], *(start[n + index[i, 3] : n + index[i, 4]] for i in keep)])
+        for start in final.starts
+    )
+    return final._replace(planted=what, values=values, starts=starts)
 
 
 def _rivals(found: Attribution, final: Fit) -> tuple[Candidate, ...]:

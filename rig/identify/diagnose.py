@@ -8,7 +8,16 @@ from numpy.typing import NDArray
 
 from dart_model.effects import effect
 from dart_model.spec import ModelSpec
-from rig.identify.attribute import Attribution, Candidate, Progress, Settled, attribute, settle
+from rig.identify.attribute import (
+    Attribution,
+    Candidate,
+    Progress,
+    Settled,
+    attribute,
+    coloured,
+    first_motion,
+    settle,
+)
 from rig.identify.correct import corrected_model, fitted_on_dart
 from rig.identify.diagnosis import (
     BeforeAfter,
@@ -30,14 +39,16 @@ from rig.identify.evaluate import (
     smoothed_motion,
     strut_forces,
 )
-from rig.identify.output_error import Fit, colour, intervals
+from rig.identify.output_error import Fit, intervals
 from rig.identify.records import Record, RecordError
-from rig.identify.reduced import Grid, Model, grid_of, planted, reduced_model
+from rig.identify.reduced import Grid, Model, grid_of, planted, reduced_model, start_of
 from rig.identify.report import FittedSeries, HeldOutSeries, Ranked
 
 Array = NDArray[np.float64]
 
 _KEPT_BACK = 0.2
+_WHITE = 0.1
+_EXPLAINED = 0.25
 _LONGEST_DURATION_S = 600.0
 
 
@@ -172,8 +183,8 @@ def _written_up(
     fitted, forces, missing = _fitted_series(model, grids, found, final)
     effects = _effects(model, final, grids, forces, missing)
     white = White(
-        all(colour(c) < 0.1 for r in found.base.residuals for c in r.T),
-        all(colour(c) < 0.1 for r in final.residuals for c in r.T),
+        coloured(found.base, found.noise_m2, found.input_m2) < _WHITE,
+        coloured(final, found.noise_m2, found.input_m2) < _WHITE,
     )
     floor = NoiseFloor(
         float(np.sqrt(np.mean(found.noise_m2))),
@@ -205,9 +216,6 @@ def _written_up(
 
 
 def _guess(model: Model, grid: Grid) -> Array:
-    from rig.identify.attribute import first_motion
-    from rig.identify.reduced import start_of
-
     heights, velocities = first_motion(grid)
     return start_of(model, heights, velocities, 0)
 
@@ -284,11 +292,11 @@ def _effects(
 
 def _verdict(found: Attribution, settled: Settled) -> Verdict:
     final = settled.final
-    left = max(colour(c) for r in final.residuals for c in r.T)
+    left = coloured(final, found.noise_m2, found.input_m2)
     if not final.planted.effects:
-        return "nothing_missing" if left < 0.1 else "not_explained"
+        return "nothing_missing" if left < _WHITE else "not_explained"
     gain = 1.0 - float(np.sqrt(final.mean_square / found.base.mean_square))
-    if left < 0.2:
+    if left < _EXPLAINED:
         return "ambiguous" if settled.rivals else "explained"
     return "partly_explained" if gain > 0.7 else "not_explained"
 

@@ -21,9 +21,9 @@ Array = NDArray[np.float64]
 _BLOCK_S = 1.0
 _MEMORY_FITTED = frozenset(
     {"bouc_wen", "dahl", "maxwell", "presliding_friction", "elastoplastic_friction",
-     "lugre_friction", "hidden_mass"}
+     "lugre_friction", "hidden_mass", "delay"}
 )  # fmt: skip
-_MEMORY_SCALE = {"maxwell": 0.01, "hidden_mass": 0.01}
+_MEMORY_SCALE = {"maxwell": 0.01, "hidden_mass": 0.01, "delay": 0.01}
 
 
 class Fit(NamedTuple):

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 MOST_SAMPLES = 8_000
 """Samples of all runs together that a trial looks at."""
 
-_LONGEST_MEMORY_STEP_S = 1.0e-3
+_LONGEST_MEMORY_STEP_S = 0.6e-3
 _TONES = 4
 
 
@@ -141,7 +141,8 @@ def _system(mass: Array, stiffness: Array, damping: Array) -> Array:
     return np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
 
 
-def _response(linear: Linear, forces_n: Array) -> Array:
+def response(linear: Linear, forces_n: Array) -> Array:
+    """Heights (N, struts) of the linear model from rest under forces (N, n)."""
     heights = np.empty((len(forces_n), linear.output.shape[0]))
     respond(*linear, np.ascontiguousarray(forces_n), heights)
     return heights
@@ -185,7 +186,7 @@ def thinned(
     if np.any(stiffness) or np.any(damping):
         inverse = np.linalg.inv(model.rows).T
         held = (missing @ inverse) @ stiffness + (missing_rate @ inverse) @ damping
-        missing = missing - _response(linear, held)
+        missing = missing - response(linear, held)
     substeps = max(1, int(np.ceil(step_s / _LONGEST_MEMORY_STEP_S - 1e-9)))
     segment = Segment(
         even, heights, velocities, accelerations, put(grid.applied_n), put(grid.temperature_c),
@@ -231,7 +232,7 @@ def _heights(
     values: Array,
 ) -> Array:
     parts = [
-        _response(lin, law_force(model, seg, strut, name, values))[1:].ravel()
+        response(lin, law_force(model, seg, strut, name, values))[1:].ravel()
         for seg, lin in zip(segments, linear, strict=True)
     ]
     return np.concatenate(parts)
@@ -357,7 +358,7 @@ def _phase(
 ) -> float:
     angle = 2.0 * np.pi * frequency * segment.t_s
     columns = [
-        _response(linear, f(angle)[:, np.newaxis] * model.rows[strut])[1:, strut]
+        response(linear, f(angle)[:, np.newaxis] * model.rows[strut])[1:, strut]
         for f in (np.sin, np.cos)
     ]
     sine, cosine = np.linalg.lstsq(np.column_stack(columns), y, rcond=None)[0]
