@@ -40,6 +40,8 @@ _LEAST_GAIN = 0.004
 _LEAST_LIKELIHOOD_GAIN = 25.0
 _LEAST_T = 2.5
 _INDISTINCT = 10.0
+_RIVAL = 5.0
+_RIVAL_COST = 200.0
 
 
 class Candidate(NamedTuple):
@@ -201,11 +203,27 @@ def attribute(model: Model, grids: Sequence[Grid], progress: Progress) -> Attrib
                 break
             if not significant(current, winner.fit, judge):
                 break
-            current = winner.fit
+            current = _converged(judge, winner.fit, motions)
             current = _pruned(judge, current, motions)
             if at_floor(current, judge):
                 break
     return Attribution(base, current, tuple(rounds), noise, judge.input_m2, motions)
+
+
+def _converged(judge: Judge, result: Fit, motions: Sequence[screen.Motion]) -> Fit:
+    """The fit led to its end: what it leaves by chance would be given a name in the next round."""
+    last = fit(
+        judge.model,
+        result.planted,
+        result.values,
+        result.starts,
+        judge.grids,
+        judge.noise_m2,
+        motions,
+        12,
+        tolerance=1e-5,
+    )
+    return last if last is not None and last.cost <= result.cost else result
 
 
 def input_noise(model: Model, grids: Sequence[Grid]) -> Array:
@@ -458,7 +476,11 @@ def settle(model: Model, grids: Sequence[Grid], found: Attribution) -> Settled:
         20, False, 1e-7,
     )  # fmt: skip
     final = last if last is not None and last.cost <= final.cost else final
-    return Settled(final, _rivals(found, final), found.motions)
+    if not at_floor(final, judge):
+        return Settled(final, (), found.motions)
+    with ThreadPoolExecutor(WORKERS) as pool:
+        rivals = _rivals(judge, found, final, pool)
+    return Settled(final, rivals, found.motions)
 
 
 def _refined(judge: Judge, found: Attribution, final: Fit, pool: ThreadPoolExecutor) -> Fit:
@@ -503,21 +525,35 @@ def _rest(judge: Judge, final: Fit, row: int) -> Fit:
     return final._replace(planted=what, values=values, starts=starts)
 
 
-def _rivals(found: Attribution, final: Fit) -> tuple[Candidate, ...]:
-    """Rivals of the round in which the last effect was chosen."""
-    for this in found.rounds:
-        if not this.candidates:
-            continue
-        winner = this.candidates[0]
-        if winner.fit is None or winner.fit.planted.effects != final.planted.effects:
-            continue
-        family = effect(winner.name).family
-        return tuple(
-            c
-            for c in this.candidates[1:]
-            if c.fit is not None
-            and effect(c.name).family != family
-            and len(effect(c.name).parameters) <= len(effect(winner.name).parameters)
-            and c.score - winner.score < _INDISTINCT
-        )
-    return ()
+def _rivals(
+    judge: Judge, found: Attribution, final: Fit, pool: ThreadPoolExecutor
+) -> tuple[Candidate, ...]:
+    """Effects of other families that do as well as one that was found, in its place."""
+    rivals: dict[tuple[int, str], Candidate] = {}
+    effective = effective_samples(final)
+    index = final.planted.slots.index
+    for row, (strut, name) in enumerate(final.planted.effects):
+        item = effect(name)
+        rest = _rest(judge, final, row)
+        shared = _shared(judge, found.base, rest, final)
+        own = screen.Trial(strut, name, final.values[slice(*index[row, 1:3])], np.inf)
+        own = screen.polish(shared, own, 1)
+        keys = [
+            (at, c)
+            for at in range(len(judge.model.struts))
+            for c in CANDIDATES
+            if effect(c).family != item.family
+            and len(effect(c).parameters) <= len(item.parameters)
+        ]
+        trials = [
+            t for t in _tried(shared, keys, pool) if t.cost < _RIVAL * own.cost + _RIVAL_COST
+        ]
+        fits = pool.map(lambda t: _joint(judge, rest, t, found.motions), trials[:3])  # noqa: B023
+        for trial, result in zip(trials[:3], fits, strict=True):
+            if result is None:
+                continue
+            value = score(result, effective)
+            if value - score(final, effective) < _INDISTINCT:
+                key = (trial.strut, trial.name)
+                rivals[key] = Candidate(*key, trial.cost, result, value, "")
+    return tuple(sorted(rivals.values(), key=lambda c: c.score))

@@ -48,6 +48,7 @@ Array = NDArray[np.float64]
 
 _KEPT_BACK = 0.2
 _WHITE = 0.1
+_IMPLAUSIBLE = 5.0
 _EXPLAINED = 0.25
 _LONGEST_DURATION_S = 600.0
 
@@ -148,15 +149,29 @@ def _kept_back(grids: Sequence[Grid]) -> tuple[list[Grid], Grid]:
 def _check_excitation(model: Model, grids: Sequence[Grid]) -> None:
     """Refuse columns that cannot be what their names say."""
     for grid in grids:
-        swing = float(np.nanmax(grid.heights_m) - np.nanmin(grid.heights_m))
-        steps = np.diff(grid.heights_m[:, 0])
-        noise = float(np.nanstd(steps)) / np.sqrt(2.0)
-        if float(np.nanstd(grid.heights_m)) < 3.0 * noise:
-            raise RecordError(
-                f"{grid.name}: height_m moves by {swing:.3g} m, no more than its own noise: "
-                "expected a stronger excitation"
-            )
-    del model
+        for i, column in enumerate(grid.heights_m.T):
+            swing = float(np.nanstd(column))
+            noise = float(np.nanstd(np.diff(column, 2))) / np.sqrt(6.0)
+            if swing < 5.0 * noise:
+                raise RecordError(
+                    f"{grid.name}: height_m moves by {swing:.3g} m RMS and its noise is "
+                    f"{noise:.3g} m, expected a run with more motion: apply a larger force"
+                )
+            _check_columns(model, grid, i, column)
+
+
+def _check_columns(model: Model, grid: Grid, strut: int, height_m: Array) -> None:
+    free_length, stiffness = float(model.struts[strut, 0]), float(model.struts[strut, 1])
+    if stiffness <= 0.0:
+        return
+    load = float(np.max(np.abs(grid.applied_n))) + float(np.max(np.abs(model.gravity_n)))
+    reach = abs(free_length) + load / stiffness
+    if float(np.nanmedian(np.abs(height_m - free_length))) > _IMPLAUSIBLE * reach:
+        raise RecordError(
+            f"{grid.name}: height_m is {np.nanmedian(height_m):.3g} m in the middle of the run, but "
+            f"a load of at most {load:.3g} N bends the model's strut by {load / stiffness:.3g} m: "
+            "expected heights near its free length: are the columns swapped, or the units wrong?"
+        )
 
 
 def _written_up(

@@ -62,6 +62,14 @@ def read_csv(path: Path) -> Record:
     """
     name = path.name
     columns, table = _read_table(path)
+    for i, column in enumerate(columns):
+        bad = ~np.isfinite(table[:, i])
+        if np.any(bad):
+            raise RecordError(
+                f"{name}: line {int(np.argmax(bad)) + 2}: {column} is no finite number "
+                f"({int(bad.sum())} such values), expected numbers: leave out rows without a "
+                "measurement, gaps in time are understood"
+            )
     values = {column: table[:, i] for i, column in enumerate(columns)}
     record = Record(
         name,
@@ -165,7 +173,9 @@ def checked(record: Record) -> Record:
         if channel is not None:
             _check_finite(name, label, channel)
     if record.applied_force_n is not None:
-        _check_force(name, record)
+        _check_moves(name, "applied_force_n", record.applied_force_n, "apply a force that changes")
+    if record.strut_force_n is not None:
+        _check_moves(name, "strut_force_n", record.strut_force_n, "is the load cell connected?")
     return record
 
 
@@ -238,10 +248,8 @@ def _longest_run(flags: NDArray[np.bool_]) -> int:
     return int(np.max(edges[1::2] - edges[::2])) if len(edges) else 0
 
 
-def _check_force(name: str, record: Record) -> None:
-    assert record.applied_force_n is not None
-    if float(np.ptp(record.applied_force_n)) == 0.0:
+def _check_moves(name: str, label: str, channel: Array, advice: str) -> None:
+    if float(np.ptp(channel)) == 0.0:
         raise RecordError(
-            f"{name}: applied_force_n is constant at {record.applied_force_n[0]:.6g} N, "
-            "expected an excitation: apply a force that changes"
+            f"{name}: {label} is constant at {channel[0]:.6g} N, expected it to change: {advice}"
         )
