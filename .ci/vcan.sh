@@ -4,8 +4,9 @@
 #   .ci/vcan.sh [PYTEST_ARGUMENT...]
 #
 # Wants Debian, root, and in $PYTHON (default: python3) an interpreter that has the project with its
-# `test` extra. The kernel is emulated, with this machine's own files under it, read-only; Python and
-# the project go onto a disk image, because reading them file by file would take minutes.
+# `test` extra. The kernel is emulated, with this machine's own files under it, read-only. Python goes
+# onto disk images, because reading it file by file would take minutes, and what numba compiles is
+# compiled here, because it would take longer still in there.
 set -euo pipefail
 
 project=$(cd "$(dirname "$0")/.." && pwd)
@@ -36,15 +37,30 @@ build_images() {
     : >"$work/folders"
     while read -r folder; do
         mksquashfs "$folder" "$work/$index.img" -noI -noD -noF -noX -no-xattrs -quiet -no-progress -wildcards \
-            -e .git .hypothesis share include "lib/python3.*/test" "... *.a" \
+            -e share include "lib/python3.*/test" "... *.a" "... asammdf" "... pandas" \
             >"$work/image.log" 2>&1 || { cat "$work/image.log"; exit 1; }
         echo "$index $folder" >>"$work/folders"
         disks+=(--disk "$work/$index.img")
         index=$((index + 1))
     done < <("$python" -c '
-import sys
-print(*dict.fromkeys([sys.base_prefix, sys.prefix]), sep="\n")
-' | grep -vx /usr; echo "$project")
+import sys, sysconfig
+base = sysconfig.get_path("stdlib") if sys.base_prefix == "/usr" else sys.base_prefix
+print(*dict.fromkeys([base, sys.prefix]), sep="\n")
+')
+}
+
+# For any processor, since the emulated one is not this one.
+export NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR="$work/out/numba" MPLCONFIGDIR="$work/out/mpl"
+
+fill_caches() {
+    (cd "$project" && timeout 600 "$python" -c '
+import rig.cli
+from can_dbc.database import DEFAULT_DATABASE, load_database
+from rig.bench.config import load_bench_config
+from rig.bench.simulated import Bench
+from rig.config import CONFIGS
+Bench(load_bench_config(CONFIGS / "seed_bench.yaml"), load_database(DEFAULT_DATABASE)).update(10**8)
+')
 }
 
 # What runs inside; its exit code comes back in a file, since the emulator has its own.
@@ -59,7 +75,8 @@ while read -r disk _ folder; do mount -t squashfs -o ro "\$disk" "\$folder"; don
 modprobe vcan
 modprobe can-gw
 cd "$project"
-export HOME=/tmp PYTHONDONTWRITEBYTECODE=1 NUMBA_CACHE_DIR=/tmp/numba MPLCONFIGDIR=/tmp
+export HOME=/tmp PYTHONDONTWRITEBYTECODE=1 MPLCONFIGDIR=$MPLCONFIGDIR
+export NUMBA_CPU_NAME=$NUMBA_CPU_NAME NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR=$NUMBA_CACHE_DIR
 set +e
 echo "vcan: \$(uname -r), up for \$(cut -d ' ' -f 1 /proc/uptime) s"
 "$python" -m pytest -m vcan -o addopts="-ra --import-mode=importlib" \
@@ -69,9 +86,10 @@ GUEST
 }
 
 install_needed
+mkdir "$work/out"
+fill_caches
 disks=()
 build_images
-mkdir "$work/out"
 write_guest_script "$@"
 kernel=$(ls -v /boot/vmlinuz-*-amd64 | tail -n 1)
 timeout -k 10 "$limit_s" vng --run "$kernel" --user root --cpus 2 --memory 3G --force-9p --disable-kvm \

@@ -19,7 +19,16 @@ from rig.io.bus import BusConfig
 from rig.io.captures import Window
 from rig.io.run_writer import Rotation
 
-__all__ = ["CONFIGS", "InputError", "RunConfig", "Setup", "build_bridge", "load_setup", "setup"]
+__all__ = [
+    "CONFIGS",
+    "InputError",
+    "RunConfig",
+    "Setup",
+    "build_bridge",
+    "load_setup",
+    "put_together",
+    "setup",
+]
 
 CONFIGS = Path(__file__).parent / "configs"
 """Folder of the configurations that come with the package."""
@@ -321,6 +330,16 @@ def setup(config: RunConfig, source: Path, model_path: Path | None = None) -> Se
     """
     model = load_model(model_path or _model_path(config.model, source))
     database = load_database(DEFAULT_DATABASE if config.dbc is None else source.parent / config.dbc)
+    return put_together(config, source, model, database)
+
+
+def put_together(config: RunConfig, source: Path, model: ModelSpec, database: Database) -> Setup:
+    """A configuration with what it names, checked against each other.
+
+    Raises:
+        InputError: One line that names file, key, value and what was expected.
+        DatabaseError: The same, of the DBC.
+    """
     named = _with_strut_names(config, model, source)
     _check_messages(named, database, source)
     return Setup(config=named, source=source, model=model, database=database)

@@ -22,7 +22,7 @@ from can_dbc.protection import SequenceState
 from can_dbc.protection_log import in_sequence
 from dart_model.spec import load_model
 from dart_model.yaml_file import InputError, validated
-from rig.config import RunConfig, Setup, build_bridge
+from rig.config import RunConfig, Setup, build_bridge, put_together
 from rig.core.bridge import Bridge, BridgeState
 from rig.core.messages import Conditions, Incoming, Quantity
 from rig.core.types import Measurement, Mode, RigState, StepInput, StepOutput, StrutOutput
@@ -40,6 +40,9 @@ from rig.loop import Progress
 
 _CHUNK = 2048
 """Ticks whose objects are in memory at once."""
+
+_MOST_LOST_A_FRAME = 1000
+"""Ticks without a step for each frame of a log, beyond which its times cannot be right."""
 
 _NOTHING = StrutOutput(nan, nan, nan, nan, nan, nan, nan)  # pyright: ignore[reportArgumentType]
 """Of a strut before the first measurements."""
@@ -96,8 +99,7 @@ def setup_of_run(folder: Path) -> tuple[RunFolder, Setup]:
     config = validated(RunConfig, found.header.get("config"), f"{folder / RUN_FILE}: config")
     model = load_model(folder / MODEL_FILE)
     database = load_database(folder / DBC_FILE)
-    ready = Setup(config=config, source=folder / RUN_FILE, model=model, database=database)
-    return found, ready
+    return found, put_together(config, folder / RUN_FILE, model, database)
 
 
 def replay(
@@ -191,6 +193,11 @@ def _ticks(found: RunFolder, frames: FrameColumns, period_ns: int) -> Ticks:
     end_ns = last_frame_ns(found.folder, found.epoch_ns) + 1
     if there < found.steps.num_rows:
         end_ns = begin_ns  # the next tick's frames are not all there
+    if (end_ns - begin_ns) // period_ns > _MOST_LOST_A_FRAME * (count + 1000):
+        raise InputError(
+            f"{found.folder}: the last frame is {(end_ns - begin_ns) * 1e-9:.0f} s after the last "
+            "step, expected a log whose times belong together"
+        )
     lost_ns = np.arange(begin_ns, end_ns, period_ns, dtype=np.int64)
     # A frame comes with the first tick after it, and after the frames before it.
     came_ns = np.maximum.accumulate(frames.t_ns[used:])

@@ -25,6 +25,17 @@ SETTLED_S = 5.0
 """The model starts at rest while the bench moves."""
 
 
+def is_calm(found: RunFolder) -> bool:
+    """Whether the emulated kernel kept the rate, without which errors of the force say nothing."""
+    return int(found.steps["overruns"].to_numpy().sum()) < 0.05 * found.steps.num_rows
+
+
+def skip_unless_calm(found: RunFolder) -> None:
+    if not is_calm(found):
+        overruns = int(found.steps["overruns"].to_numpy().sum())
+        pytest.skip(f"this machine is too busy to emulate 100 Hz: {overruns} ticks missed")
+
+
 def force_error_n(found: RunFolder, dbc: Path) -> float:
     """RMS of the estimated force less the load cell's, sample by sample."""
     cell = cantools.database.load_file(dbc).get_message_by_name("BENCH_AUXILIARY")
@@ -66,13 +77,14 @@ def recorded(bench, files, tmp_path_factory):
     folder = tmp_path_factory.mktemp("minute")
     record = folder / "candump.log"
     command = (*RIG, "run", files.bridge(bench), "--out", folder / "run", "--duration-s", "60")
-    with record.open("wb") as out, running(["candump", "-L", bench], stdout=out):
+    with record.open("wb") as out, running(["candump", "-L", "-r", "4000000", bench], stdout=out):
         subprocess.run([str(part) for part in command], check=True, timeout=300.0)
     return folder / "run", record
 
 
 def test_the_force_is_as_good_as_in_lockstep(recorded, files, tmp_path):
     run, _ = recorded
+    skip_unless_calm(read_run(run))
     ready = load_setup(files.bridge("vcan0"), duration_s=30.0)
     on_virtual = ready.config.bus.model_copy(update={"interface": "virtual", "channel": "lockstep"})
     lockstep = ready.model_copy(
@@ -117,12 +129,12 @@ def test_candumps_record_is_our_log(recorded, files):
 def test_a_replay_is_the_same_bit_for_bit(recorded):
     run, _ = recorded
     again = replay(run)
-    assert again.logged >= 0.9 * 60 * RATE_HZ
     assert again.different == 0
     ending = yaml.safe_load((run / "run.yaml").read_text())["ending"]
     print(f"overruns {ending['counts']['overruns']}, timing {ending['timing']}")
     assert ending["status"] == "done"
     assert ending["counts"]["refused"] == ending["counts"]["lost"] == 0
+    assert again.logged == ending["ticks"] == 60 * RATE_HZ - ending["counts"]["overruns"]
 
 
 def test_canplayers_bench_gives_the_same_estimate(recorded, bridge, second_vcan, tmp_path):
@@ -153,6 +165,9 @@ def test_canplayers_bench_gives_the_same_estimate(recorded, bridge, second_vcan,
     known = set(original.tolist())
     assert all(height in known for height in measured.tolist())
     assert ended.state.counts.refused == 0
+    assert replay(ended.folder).different == 0
+    skip_unless_calm(found)
+    skip_unless_calm(read_run(run))
     settled = slice(int(SETTLED_S * RATE_HZ), None)
     by_height = dict(zip(original.tolist(), original_n.tolist(), strict=True))
     difference = [
@@ -161,20 +176,19 @@ def test_canplayers_bench_gives_the_same_estimate(recorded, bridge, second_vcan,
     ]
     print(f"median difference to the first run: {np.median(np.abs(difference)):.2f} N")
     assert np.median(np.abs(difference)) < 5.0
-    assert replay(ended.folder).different == 0
 
 
 def test_ten_times_down_and_up_are_survived_and_each_gap_is_shown(bench, bridge):
-    cycle = f"ip link set {bench} down; sleep 0.4; ip link set {bench} up; sleep 1.6"
+    cycle = f"ip link set {bench} down; sleep 0.4; ip link set {bench} up; sleep 2.6"
     script = f"sleep 2; for i in 1 2 3 4 5 6 7 8 9 10; do {cycle}; done"
     with running(["sh", "-c", script]):
-        ended = bridge(bench, 26.0)
+        ended = bridge(bench, 36.0)
     ending = yaml.safe_load((ended.folder / "run.yaml").read_text())["ending"]
     gaps = ending["bus"]["gaps"]
     lengths = [gap["to_s"] - gap["from_s"] for gap in gaps]
     print(f"gaps of {min(lengths):.2f} to {max(lengths):.2f} s")
     assert len(gaps) == 10
-    assert all(0.2 < length < 2.0 for length in lengths)
+    assert all(0.2 < length < 2.6 for length in lengths)
     assert ended.state.rig.mode is Mode.RUNNING
     steps = read_run(ended.folder).steps
     assert replay(ended.folder).different == 0
@@ -207,18 +221,21 @@ def test_frames_that_a_gateway_corrupts_are_all_refused(bench, second_vcan, brid
     subprocess.run(route, check=True)
     corrupt = " ".join([*route, "-m", "XOR:D:0.0.0000000000010000"])
 
+    broken = []
+
     def break_it(t_ns, _mode):
-        if t_ns == 3 * S:
+        if t_ns >= 3 * S and not broken:
+            broken.append(t_ns)
             subprocess.Popen(["sh", "-c", f"cangw -F; {corrupt}"])
 
-    ended = bridge(second_vcan, 6.0, progress=break_it)
+    ended = bridge(second_vcan, 12.0, progress=break_it)
     subprocess.run(["cangw", "-F"], check=False)
     counts = ended.state.counts
     print(counts)
     assert counts.wrong_crc + counts.masquerade > 1.5 * RATE_HZ
     assert ended.state.rig.mode is Mode.SAFE
     steps = read_run(ended.folder).steps
-    late = steps["t_ns"].to_numpy() > 5 * S
+    late = steps["t_ns"].to_numpy() > 10 * S
     assert np.isnan(steps["strut.measured_height_m"].to_numpy()[late]).all()
     assert not steps["strut.valid"].to_numpy()[late].any()
 

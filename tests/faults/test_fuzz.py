@@ -1,0 +1,143 @@
+"""Mutated frames and files: no crash, and nothing used from what was refused.
+
+What the counter and an 8-bit CRC let through is bounded: all changes of one, two and three bits of
+every message are counted in the tests of `can_dbc`; here frames are changed in any way.
+"""
+
+import random
+from math import isfinite
+
+import pytest
+
+from can_dbc.protection import Verdict, check_crc
+from rig.core.messages import Quantity
+from rig.io.run_log import FRAMES_FILE, RUN_FILE, STEPS_FILE, read_run
+from rig.replay import replay
+from tests.faults.test_machine import lockstep
+from tests.faults.trial import Trial
+
+LENGTHS = (0, 1, 7, 8, 9, 12, 64)
+
+
+def mutated(rng, frame):
+    """A frame with one thing about it changed."""
+    data = bytearray(frame.data)
+    for _ in range(rng.randrange(1, 6)):
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    changes = (
+        {"data": rng.randbytes(len(data))},
+        {"data": rng.randbytes(rng.choice(LENGTHS))},
+        {"data": bytes(data)},
+        {"arbitration_id": rng.choice((0x100, 0x101, 0x110, 0x200, 0x300))},
+        {"is_extended": True, "arbitration_id": rng.getrandbits(29)},
+        {"is_error": True, "arbitration_id": rng.getrandbits(9)},
+        {"t_ns": frame.t_ns + rng.randrange(-(10**9), 10**9)},
+    )
+    return frame._replace(**rng.choice(changes))
+
+
+def fuzz(ticks, seed):
+    """A run in which three of four frames are mutated; every height used is accounted for."""
+    rng = random.Random(seed)
+    trial = Trial(limits=[{"value": "innovation_m", "low": -10, "high": 10, "action": "warn"}])
+    bridge = trial.bridge
+    incoming = {item.message.arbitration_id: item for item in bridge.incoming}
+    frames = 0
+    for index in range(ticks):
+        genuine = trial.bench.update(index * 1_000_000)[0]
+        given = [mutated(rng, f) if rng.random() < 0.75 else f for f in genuine for _ in range(4)]
+        frames += len(given)
+        before = trial.state.counts
+        trial.state, result = bridge.tick(trial.state, index * 1_000_000, given)
+        counts = trial.state.counts
+        heights = {_height(frame, incoming.get(frame.arbitration_id)) for frame in given}
+        used = {item.height_m for item in result.step_input.heights if item is not None}
+        assert used <= heights - {None}
+        assert counts.refused - before.refused <= len(given)
+        for strut in result.output.struts:
+            assert isfinite(strut.force_n)
+    return frames, trial.state.counts
+
+
+def _height(frame, item):
+    """Height of a frame of the measurement that passes its CRC, else None."""
+    if item is None or frame.is_error or frame.is_extended:
+        return None
+    if item.targets[0].quantity is not Quantity.HEIGHT:
+        return None
+    return item.decode(frame.data)[0] if check_crc(frame.data, item.protection) else None
+
+
+def test_mutated_frames():
+    frames, counts = fuzz(3000, seed=1)
+    assert frames > 13_000
+    causes = [verdict.value for verdict in Verdict if not verdict.accepted]
+    assert all(getattr(counts, cause) > 0 for cause in causes)
+    assert sum(getattr(counts, cause) for cause in causes) == counts.refused
+
+
+@pytest.mark.long
+def test_a_million_mutated_frames():
+    frames, _ = fuzz(230_000, seed=2)
+    assert frames > 1_000_000
+
+
+@pytest.fixture(scope="module")
+def logged(tmp_path_factory):
+    """The files of a short run."""
+    folder = tmp_path_factory.mktemp("fuzz") / "run"
+    lockstep(folder, "fuzz", 0.3)
+    return folder
+
+
+def mangled(rng, data):
+    """Bytes with some of them changed, lost, repeated or inserted."""
+    result = bytearray(data)
+    for _ in range(rng.choice((1, 1, 2, 5, 20))):
+        start = rng.randrange(len(result) + 1)
+        size = rng.choice((1, 1, 4, 40))
+        match rng.randrange(5):
+            case 0:
+                result[start : start + size] = rng.randbytes(size)
+            case 1:
+                del result[start : start + size]
+            case 2:
+                result[start:start] = rng.randbytes(size)
+            case 3:
+                result[start:start] = result[start : start + size]
+            case _:
+                del result[start:]
+    return bytes(result)
+
+
+def is_read(folder):
+    """Read a run and compute it again; says whether it was accepted."""
+    try:
+        _ = list(read_run(folder).frames())
+        replay(folder)
+    except ValueError as error:
+        return "\n" in str(error)  # would be no single line
+    return True
+
+
+def fuzz_file(logged, folder, name, count, seed):
+    rng = random.Random(seed)
+    for path in logged.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    original = (logged / name).read_bytes()
+    accepted = 0
+    for _ in range(count):
+        (folder / name).write_bytes(mangled(rng, original))
+        accepted += is_read(folder)
+    return accepted
+
+
+@pytest.mark.parametrize("name", [RUN_FILE, FRAMES_FILE, STEPS_FILE, "bus.dbc", "model.yaml"])
+def test_mutated_files_of_a_run(logged, tmp_path, name):
+    fuzz_file(logged, tmp_path, name, 12, seed=3)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [RUN_FILE, FRAMES_FILE, STEPS_FILE, "bus.dbc", "model.yaml"])
+def test_ten_thousand_mutated_files_of_each_kind(logged, tmp_path, name):
+    fuzz_file(logged, tmp_path, name, 10_000, seed=4)
