@@ -7,13 +7,12 @@ estimation techniques" (2021), equations (6) and (7). Anti-windup by conditional
 Åström and Hägglund, "Advanced PID Control" (2006), section 3.5.
 """
 
-from dataclasses import dataclass
+from msgspec import Struct
 
 from rig.core.types import ObserverState
 
 
-@dataclass(frozen=True)
-class ObserverGains:
+class ObserverGains(Struct, frozen=True, gc=False):
     """Gains of one observer.
 
     Attributes:
@@ -41,11 +40,10 @@ def update(
     Returns:
         Observer with the new virtual force. At the limit the integral grows no further.
     """
-    dt_s = (measured_ns - state.measured_ns) * 1e-9
-    integral = state.integral_m_s + innovation_m * dt_s
-    limit = gains.force_limit_n
+    integral = state.integral_m_s + innovation_m * ((measured_ns - state.measured_ns) * 1e-9)
     proportional = gains.proportional_n_per_m * innovation_m
     force = proportional + gains.integral_n_per_m_s * integral
+    limit = gains.force_limit_n
     if not -limit <= force <= limit:
         if force * innovation_m > 0.0:
             integral = state.integral_m_s

@@ -8,10 +8,10 @@ Reference: Åström and Wittenmark, "Computer-Controlled Systems" (1997), chapte
 
 import cmath
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dart_model.plant import DartPlant, PlantState

@@ -1,7 +1,5 @@
 """A replay in bulk gives what the bridge gave frame by frame, whatever came over the bus."""
 
-import math
-from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -9,88 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.codec import compile_encoder
-from can_dbc.frame import Frame
-from can_dbc.protection import protect
-from can_dbc.units import Dimension
-from rig.config import CONFIGS, Setup, build_bridge, load_setup
-from rig.core.messages import Conditions
+from rig.config import CONFIGS, Setup, load_setup
 from rig.core.supervisor import Supervision
-from rig.io.clock import VirtualClock
-from rig.io.link import LinkFigures
 from rig.replay import replay
-from rig.runs import logged
+from tests.loop.listed import MS, ListPort, bench_frames, live
 
-MS = 1_000_000
 FAULTS = ("lost", "repeated", "flipped", "short", "late", "foreign", "error", "again", "silent")
-
-
-class ListPort:
-    """Frames that were thought up beforehand, tick by tick."""
-
-    def __init__(self, frames: dict[int, list[Frame]], acknowledged: set[int]) -> None:
-        self._frames = frames
-        self._acknowledged = acknowledged
-
-    def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
-        return self._frames.get(t_ns // MS, []), Conditions(
-            acknowledged=t_ns // MS in self._acknowledged
-        )
-
-    def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
-        return frames
-
-
-def bench_frames(ready: Setup, ticks: int, faults: dict[int, str]) -> dict[int, list[Frame]]:
-    """Frames of a bench at 1 kHz, with faults at some ticks."""
-    message = ready.database.message("BENCH_MEASUREMENT")
-    assert message.protection is not None
-    encode = compile_encoder(
-        message, ["HEIGHT", "APPLIED_FORCE"], [Dimension.LENGTH, Dimension.FORCE]
-    )
-    found: dict[int, list[Frame]] = {}
-    for tick in range(ticks):
-        payload, _ = encode((0.4 + 0.02 * math.sin(0.02 * tick), 30.0 * math.sin(0.01 * tick)))
-        data = protect(payload, tick, message.protection)
-        frame = Frame(tick * MS - 1000, message.arbitration_id, data)
-        fault = faults.get(tick, "")
-        found.setdefault(tick, [])
-        if fault == "late":
-            found.setdefault(tick + 1, []).append(frame)
-        elif fault not in ("lost", "silent"):
-            found[tick] += disturbed(frame, fault)
-    for tick, fault in faults.items():
-        if fault == "silent":
-            for silent in range(tick, tick + 700):
-                found.pop(silent, None)
-    return found
-
-
-def disturbed(frame: Frame, fault: str) -> list[Frame]:
-    """What a fault makes of a frame."""
-    flipped = bytes([frame.data[0], frame.data[1], frame.data[2] ^ 0x10, *frame.data[3:]])
-    return {
-        "repeated": [frame, frame],
-        "flipped": [frame._replace(data=flipped)],
-        "short": [frame._replace(data=frame.data[:-1])],
-        "foreign": [frame._replace(arbitration_id=0x7FF), frame],
-        "error": [frame._replace(arbitration_id=0x4, data=b"", is_error=True), frame],
-        "again": [frame._replace(is_extended=True), frame],
-    }.get(fault, [frame])
-
-
-def live(ready: Setup, folder: Path, port: ListPort) -> None:
-    """The run as the loop does it."""
-    logged(
-        ready,
-        build_bridge(ready),
-        port,
-        VirtualClock(),
-        folder,
-        figures=LinkFigures(),
-        stop=lambda: False,
-        progress=lambda _t, _mode: None,
-    )
 
 
 def ready_for(ticks: int) -> Setup:

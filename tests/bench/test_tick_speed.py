@@ -1,0 +1,256 @@
+"""What a tick costs, as a ratio to DART alone in the same run.
+
+The measure is the bare DART loop: read position and velocity, set a force, step. It is taken twice,
+with DART's array functions (`getPositions`) and with its cheaper scalar ones (`getPosition(0)`).
+Rounds of all subjects alternate, so that what disturbs this machine disturbs all of them; the
+fastest round counts, and the spread is printed (`pytest -s`).
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter_ns, process_time_ns
+
+import dartpy
+import numpy as np
+import pytest
+
+from can_dbc.frame import Frame
+from dart_model.plant import DartPlant
+from dart_model.spec import MODELS, load_model
+from rig.config import CONFIGS, build_bridge, load_setup
+from rig.core.bridge import Bridge, BridgeState
+from rig.core.observer import update
+from rig.core.step import RigCore
+from rig.core.supervisor import Supervision
+from rig.core.types import ObserverState, RigState, StepInput
+from rig.io.bus import Bus, BusConfig
+from rig.replay import replay
+from tests.core.cores import GAINS, core, measured
+from tests.loop.listed import MS, ListPort, bench_frames, live
+
+TICKS = 60
+ROUNDS = 250
+TIMES_NS = tuple(tick * MS for tick in range(TICKS))
+
+Subject = Callable[[], None]
+
+
+def compared(subjects: dict[str, Subject], capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
+    """Time of one tick of each subject in µs, and a table of the ratios to the first."""
+    times: dict[str, list[float]] = {name: [] for name in subjects}
+    for _ in range(ROUNDS):
+        for name, subject in subjects.items():
+            start = process_time_ns()
+            subject()
+            times[name].append((process_time_ns() - start) / TICKS / 1000)
+    first = next(iter(times))
+    with capsys.disabled():
+        print()
+        for name, found in times.items():
+            ratios = np.percentile(np.array(found) / np.array(times[first]), [10, 50, 90])
+            low, middle, high = ratios
+            print(
+                f"{name:42} {min(found):7.2f} us {min(found) / min(times[first]):6.2f} times,"
+                f" per round {middle:5.2f} ({low:.2f} to {high:.2f})"
+            )
+    return {name: min(found) for name, found in times.items()}
+
+
+def dart_world() -> tuple[dartpy.simulation.World, dartpy.dynamics.Skeleton]:
+    """The seed's body in a DART world of its own."""
+    plant = DartPlant(load_model(MODELS / "seed.yaml"))
+    world = dartpy.simulation.World()
+    world.setTimeStep(1e-3)
+    world.addSkeleton(plant._skeleton)
+    return world, plant._skeleton
+
+
+def array_loop(*, observing: bool) -> Subject:
+    """The bare loop with array functions; with an observer if asked, and nothing else."""
+    world, skeleton = dart_world()
+    positions, velocities = skeleton.getPositions, skeleton.getVelocities
+    put_forces, step = skeleton.setForces, world.step
+
+    def bare() -> None:
+        for _ in range(TICKS):
+            q, v = float(positions()[0]), float(velocities()[0])
+            put_forces([500.0 * (0.5 - q) - 100.0 * v])
+            step()
+
+    def observed() -> None:
+        observer = ObserverState(0.0, 0.0, 0.0, 0)
+        for t_ns in TIMES_NS:
+            q, v = float(positions()[0]), float(velocities()[0])
+            observer = update(GAINS, observer, 0.4 - q, t_ns)
+            put_forces([500.0 * (0.5 - q) - 100.0 * v + observer.virtual_force_n])
+            step()
+
+    return observed if observing else bare
+
+
+def scalar_loop(*, observing: bool) -> Subject:
+    """The same with scalar functions."""
+    world, skeleton = dart_world()
+    position, velocity = skeleton.getPosition, skeleton.getVelocity
+    put_force, step = skeleton.setForce, world.step
+
+    def bare() -> None:
+        for _ in range(TICKS):
+            q, v = position(0), velocity(0)
+            put_force(0, 500.0 * (0.5 - q) - 100.0 * v)
+            step()
+
+    def observed() -> None:
+        observer = ObserverState(0.0, 0.0, 0.0, 0)
+        for t_ns in TIMES_NS:
+            q, v = position(0), velocity(0)
+            observer = update(GAINS, observer, 0.4 - q, t_ns)
+            put_force(0, 500.0 * (0.5 - q) - 100.0 * v + observer.virtual_force_n)
+            step()
+
+    return observed if observing else bare
+
+
+def bridge_and_frames() -> tuple[Bridge, BridgeState, list[list[Frame]]]:
+    """One BENCH_MEASUREMENT in, one RIG_ESTIMATE out."""
+    ready = load_setup(CONFIGS / "seed.yaml")
+    signals = ready.config.signals.model_copy(update={"load_cell_force": None, "temperature": None})
+    publish = {
+        name: item.model_copy(update={"kinematics": None})
+        for name, item in ready.config.publish.items()
+    }
+    config = ready.config.model_copy(
+        update={"signals": signals, "publish": publish, "status": None}
+    )
+    ready = ready.model_copy(update={"config": config})
+    frames = bench_frames(ready, TICKS + 1, {})
+    bridge = build_bridge(ready)
+    state, _ = bridge.tick(bridge.init(0), 0, frames[0])
+    return bridge, state, [frames[tick] for tick in range(1, TICKS + 1)]
+
+
+def whole_ticks() -> Subject:
+    bridge, start, frames = bridge_and_frames()
+
+    def ticks() -> None:
+        state = start
+        for tick, received in enumerate(frames, start=1):
+            state, _ = bridge.tick(state, tick * MS, received)
+
+    return ticks
+
+
+def steps(rig: RigCore, start: RigState, inputs: list[StepInput]) -> Subject:
+    def ticks() -> None:
+        state = start
+        for step_input in inputs:
+            state, _ = rig.step(state, step_input)
+
+    return ticks
+
+
+def core_steps(model: str, heights: tuple[float, ...], *, observing: bool) -> Subject:
+    rig = core(model, supervision=Supervision(10**15, 10**16, safe_holds_last=False))
+    start, _ = rig.step(rig.init(0), measured(0, *heights))
+    given = heights if observing else (None,) * len(heights)
+    inputs = [measured(tick, *given, applied_n=10.0) for tick in range(1, TICKS + 1)]
+    return steps(rig, start, inputs)
+
+
+def test_a_whole_tick_against_the_bare_dart_loop(capsys):
+    plant = DartPlant(load_model(MODELS / "seed.yaml"))
+    state = plant.initial([0.4])
+    loaded = plant.load(state, (0.0,), 10.0, 20.0)
+
+    def plant_ticks() -> None:
+        for _ in range(TICKS):
+            plant.step(loaded, 1e-3, 11.0)
+            plant.load(state, (0.0,), 10.0, 20.0)
+
+    found = compared(
+        {
+            "DART, array functions": array_loop(observing=False),
+            "DART, scalar functions": scalar_loop(observing=False),
+            "third-order plant": plant_ticks,
+            "core step": core_steps("seed", (0.4,), observing=True),
+            "whole tick, frame in and frame out": whole_ticks(),
+        },
+        capsys,
+    )
+    tick = found["whole tick, frame in and frame out"]
+    assert tick / found["DART, array functions"] <= 7.0
+    assert tick / found["DART, scalar functions"] <= 14.0
+
+
+def test_an_observer_adds_less_than_a_quarter(capsys):
+    found = compared(
+        {
+            "DART, array functions": array_loop(observing=False),
+            "the same with an observer": array_loop(observing=True),
+            "DART, scalar functions": scalar_loop(observing=False),
+            "these with an observer": scalar_loop(observing=True),
+        },
+        capsys,
+    )
+    bare = found["DART, array functions"]
+    assert (found["the same with an observer"] - bare) / bare < 0.25
+
+
+def test_a_second_observer_costs_no_more_than_the_first(capsys):
+    found = compared(
+        {
+            "seed, model alone": core_steps("seed", (0.4,), observing=False),
+            "seed, observed": core_steps("seed", (0.4,), observing=True),
+            "quarter car, model alone": core_steps("quarter_car", (0.29, 0.4), observing=False),
+            "quarter car, observed": core_steps("quarter_car", (0.29, 0.4), observing=True),
+        },
+        capsys,
+    )
+    one = found["seed, observed"] - found["seed, model alone"]
+    two = found["quarter car, observed"] - found["quarter car, model alone"]
+    # The difference of two times is noisy; the quarter car's own time bounds what it may be.
+    assert two <= 2.0 * one + 0.1 * found["quarter car, model alone"]
+
+
+def test_a_tick_over_a_virtual_bus(capsys):
+    """Told and not asserted: it depends on what else this machine does."""
+    bridge, state, frames = bridge_and_frames()
+    config = BusConfig("virtual", "test-tick-speed", 1_000_000)
+    near, far = Bus(config, bridge.heard), Bus(config)
+    work_us: list[float] = []
+    try:
+        for tick, received in enumerate(frames, start=1):
+            for frame in received:
+                far.send(frame)
+            start = perf_counter_ns()
+            state, result = bridge.tick(state, tick * MS, near.receive())
+            for frame in result.frames:
+                near.send(frame)
+            work_us.append((perf_counter_ns() - start) / 1000)
+            assert len(far.receive()) == 1
+    finally:
+        near.close()
+        far.close()
+    p50, p99, p999 = np.percentile(work_us, [50, 99, 99.9])
+    with capsys.disabled():
+        print(f"\ntick over virtual: p50 {p50:.0f}, p99 {p99:.0f}, p99.9 {p999:.0f} us of work")
+
+
+def test_a_replay_against_the_bare_dart_loop(tmp_path: Path, capsys):
+    ticks = 20_000
+    ready = load_setup(CONFIGS / "seed.yaml", duration_s=ticks / 1000)
+    live(ready, tmp_path / "run", ListPort(bench_frames(ready, ticks, {}), set()))
+    bare, per_tick_us = scalar_loop(observing=False), []
+    bare_us: list[float] = []
+    for _ in range(5):
+        start = process_time_ns()
+        bare()
+        bare_us.append((process_time_ns() - start) / TICKS / 1000)
+        start = process_time_ns()
+        found = replay(tmp_path / "run")
+        per_tick_us.append((process_time_ns() - start) / ticks / 1000)
+        assert found.different == 0
+    with capsys.disabled():
+        rate = 1e6 / min(per_tick_us)
+        print(f"\nreplay: {min(per_tick_us):.1f} us a tick, {rate:.0f} ticks a second of one core")
+    assert min(per_tick_us) / min(bare_us) <= 16.0
