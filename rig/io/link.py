@@ -159,8 +159,8 @@ class Link:
 
     def close(self) -> None:
         """Close the bus."""
-        if self._opening is not None and self._opening.done() and not self._opening.exception():
-            self._opening.result().close()
+        if self._opening is not None:
+            self._opening.add_done_callback(_close_opened)
         self._executor.shutdown(wait=False, cancel_futures=True)
         if self._bus is not None:
             self._bus.close()
@@ -245,3 +245,9 @@ class Link:
         self._unsent_since_ns = None
         self._controller = Controller.ACTIVE
         self.fault = None
+
+
+def _close_opened(opening: Future[Bus]) -> None:
+    """Close a bus that came when nobody waited for it any more."""
+    if not opening.cancelled() and opening.exception() is None:
+        opening.result().close()

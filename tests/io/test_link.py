@@ -170,3 +170,13 @@ def test_setting_the_systems_clock_moves_no_frame(step_s):
         wall[0] = step_ns if index > 5 else 0
         assert times(link, index) == [index * TICK_NS - 7]
     assert link.figures.clock_steps == 1
+
+
+def test_a_bus_that_is_opened_when_the_run_has_ended_is_closed():
+    late = ScriptedBus()
+    link = link_of(ScriptedBus(BusError("gone")), late)
+    link.receive(0)
+    link.receive(FIRST_PAUSE_NS)
+    assert not late.closed
+    link.close()
+    assert late.closed
