@@ -25,7 +25,7 @@ from dart_model.yaml_file import InputError, validated
 from rig.config import RunConfig, Setup, build_bridge, put_together
 from rig.core.bridge import Bridge, BridgeState
 from rig.core.messages import Conditions, Incoming, Quantity
-from rig.core.types import Measurement, Mode, RigState, StepInput, StepOutput, StrutOutput
+from rig.core.types import Measurement, Mode, RigState, StepInput, StepOutput
 from rig.io.frame_columns import FrameColumns, received_frames
 from rig.io.run_log import (
     DBC_FILE,
@@ -44,7 +44,7 @@ _CHUNK = 2048
 _MOST_LOST_A_FRAME = 1000
 """Ticks without a step for each frame of a log, beyond which its times cannot be right."""
 
-_NOTHING = StrutOutput(nan, nan, nan, nan, nan, nan, nan)  # pyright: ignore[reportArgumentType]
+_NOTHING = (nan,) * 7
 """Of a strut before the first measurements."""
 
 _HOLD = Mode.HOLD
@@ -385,10 +385,8 @@ def _table(
         measured = [item.heights[strut] for item in inputs]
         columns.append(np.array([nan if x is None else x.height_m for x in measured]))
         columns.append(np.array([nan if x is None else float(x.t_ns) for x in measured]))
-        published = [item.struts[strut] if item.struts else _NOTHING for item in outputs]
-        numbers = np.fromiter(
-            chain.from_iterable(map(astuple, published)), np.float64, 7 * len(published)
-        )
+        published = [astuple(item.struts[strut]) if item.struts else _NOTHING for item in outputs]
+        numbers = np.fromiter(chain.from_iterable(published), np.float64, 7 * len(published))
         columns += list(numbers.reshape(-1, 7).T)
     arrays = [_pa.array(column) for column in columns]
     return _pa.Table.from_arrays(arrays, schema=schema)

@@ -183,7 +183,7 @@ class Bridge:
         seen, action = state.seen, 0
         if self._measured_limits and accepted:
             accepted, seen, counts, action = self._plausible(seen, counts, accepted)
-        rig, step_input = self.gathered(state.rig, t_ns, accepted, conditions.acknowledged)
+        rig, step_input = self._gathered(state.rig, t_ns, accepted, conditions.acknowledged)
         rig, output = self._core.step(rig, step_input)
         if conditions.overruns or output.mode is _HOLD:
             counts = counts._replace(
@@ -212,7 +212,7 @@ class Bridge:
         state, sent = self._sent(state, t_ns, output, conditions)
         return state, TickResult(sent, step_input, output)
 
-    def gathered(
+    def _gathered(
         self, rig: RigState, t_ns: int, accepted: Sequence[Accepted], acknowledged: bool
     ) -> tuple[RigState, StepInput]:
         """What a tick's accepted frames are to the core.
@@ -239,7 +239,7 @@ class Bridge:
             for number, place in enumerate(places[index]):
                 value = values[number]
                 if place < struts:
-                    given[place] = Measurement(value, arrived_ns if arrived_ns < t_ns else t_ns)
+                    given[place] = Measurement(value, min(arrived_ns, t_ns))
                     measured.append(index)
                 else:
                     given[place] = value
