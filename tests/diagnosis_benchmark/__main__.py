@@ -40,17 +40,18 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=2, help="cases at a time")
     parser.add_argument("--seed", type=int, default=0, help="another one gives other cases")
     parser.add_argument("--out", type=Path, required=True, help="folder for results and tables")
+    parser.add_argument("--limit-s", type=float, default=600.0, help="longest time for a case")
     parser.add_argument("--write", nargs=2, metavar=("KIND", "SEED"), help="only write one case")
     return parser.parse_args()
 
 
-def _run_all(todo: list[Slot], out: Path, jobs: int) -> Iterator[Result]:
+def _run_all(todo: list[Slot], out: Path, jobs: int, limit_s: float) -> Iterator[Result]:
     if jobs > 1:
         # One thread a case: two cases at a time use two cores.
         os.environ.update({f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "NUMBA")})
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-        futures = {pool.submit(execute, slot, out): slot for slot in todo}
+        futures = {pool.submit(execute, slot, out, limit_s): slot for slot in todo}
         for future in as_completed(futures):
             error = future.exception()
             yield crashed(futures[future], error) if error else future.result()
@@ -71,7 +72,7 @@ def main() -> None:
     results = []
     with Progress() as progress:
         bar = progress.add_task("diagnosing", total=len(todo))
-        for result in _run_all(todo, args.out, args.jobs):
+        for result in _run_all(todo, args.out, args.jobs, args.limit_s):
             results.append(result)
             wrong = sum(not r.right for r in results)
             progress.update(bar, advance=1, description=f"{wrong} wrong, last {result.slot}")

@@ -2,7 +2,10 @@
 
 import json
 import shutil
+import signal
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -58,8 +61,28 @@ def crashed(slot: Slot, error: BaseException) -> Result:
     return Result(**judged, duration_s=float("nan"))
 
 
-def execute(slot: Slot, out: Path) -> Result:
-    """Diagnose one slot's case, unless that was done before; a failure is tried again."""
+@contextmanager
+def within(limit_s: float) -> Iterator[None]:
+    """Break off with a `TimeoutError` what takes longer; only on a process's main thread."""
+
+    def give_up(*_: object) -> None:
+        raise TimeoutError(f"no answer within {limit_s:.0f} s")
+
+    before = signal.signal(signal.SIGALRM, give_up)
+    signal.setitimer(signal.ITIMER_REAL, limit_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def execute(slot: Slot, out: Path, limit_s: float) -> Result:
+    """Diagnose one slot's case, unless that was done before; a failure is tried again.
+
+    Raises:
+        TimeoutError: There is no answer within the limit.
+    """
     kept = result_path(out, slot)
     if kept.exists():
         return load_result(kept)
@@ -68,7 +91,8 @@ def execute(slot: Slot, out: Path) -> Result:
     train, _ = write_case(case, folder)
     ratios = tuple(float(ratio) for ratio in floor_ratios(case, train))
     started = time.perf_counter()
-    diagnosis = diagnose(folder)
+    with within(limit_s):
+        diagnosis = diagnose(folder)
     duration_s = time.perf_counter() - started
     judged = judge(case, ratios, diagnosis, slot.name, slot.group)
     result = Result(**judged, duration_s=duration_s)

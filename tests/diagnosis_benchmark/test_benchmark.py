@@ -7,7 +7,14 @@ from rich.console import Console
 
 from tests.diagnosis_benchmark import execute as execution
 from tests.diagnosis_benchmark.comparable import COMPARABLE, intervals
-from tests.diagnosis_benchmark.execute import crashed, execute, failed, load_result, result_path
+from tests.diagnosis_benchmark.execute import (
+    crashed,
+    execute,
+    failed,
+    load_result,
+    result_path,
+    within,
+)
 from tests.diagnosis_benchmark.judge import is_right
 from tests.diagnosis_benchmark.plan import Counts, Slot, fill, slots
 from tests.diagnosis_benchmark.summary import print_tables, summarise, write_tables
@@ -105,10 +112,10 @@ def test_results_are_kept_and_tabulated(tmp_path, monkeypatch):
 
     monkeypatch.setattr(execution, "diagnose", oracle)
     slot = Slot("single", "preload", 0, 0)
-    first = execute(slot, tmp_path)
+    first = execute(slot, tmp_path, 60.0)
     assert first.right
     assert 0.9 < first.floor_multiple <= 1.1
-    assert execute(slot, tmp_path) == first == load_result(result_path(tmp_path, slot))
+    assert execute(slot, tmp_path, 60.0) == first == load_result(result_path(tmp_path, slot))
     assert len(calls) == 1
     summary = summarise([first])
     assert summary["groups"]["single"]["right"] == 1.0
@@ -124,7 +131,7 @@ def test_results_are_kept_and_tabulated(tmp_path, monkeypatch):
 def test_failure_is_reported_and_tried_again(tmp_path, monkeypatch):
     monkeypatch.setattr(execution, "diagnose", lambda _: failed("it broke"))
     slot = Slot("complete", "complete", 0, 0)
-    result = execute(slot, tmp_path)
+    result = execute(slot, tmp_path, 60.0)
     assert (result.verdict, result.right, result.message) == ("failed", False, "it broke")
     assert not result_path(tmp_path, slot).exists()
 
@@ -133,3 +140,9 @@ def test_crash_is_a_wrong_answer():
     result = crashed(Slot("outside", "outside", 0, 0), KeyError("x"))
     assert (result.verdict, result.right) == ("failed", False)
     assert "KeyError" in result.message
+
+
+def test_endless_diagnosis_is_broken_off():
+    with pytest.raises(TimeoutError, match="no answer within 0 s"), within(0.01):
+        while True:
+            pass

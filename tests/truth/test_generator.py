@@ -106,16 +106,6 @@ def test_smooth_laws_converge_with_fourth_order():
     np.testing.assert_allclose(np.log2(errors[:-1] / errors[1:]), 4.0, atol=0.1)
 
 
-def test_every_law_moves_the_body():
-    """A force of zero would balance, too."""
-    cases = [short_case(0, kind, 2.0) for kind in [*FAMILIES, *FOREIGN_KINDS]]
-    for case in cases:
-        run = record(case.bench, case.effects, case.train, case.sensors)
-        assert np.std(run.effect_force_n) > 0.0 or case.families == ("preload",), case.name
-        alone = record(case.bench, (), case.train, case.sensors)
-        assert np.ptp(run.true_height_m - alone.true_height_m) > 1e-6, case.name
-
-
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
@@ -136,6 +126,7 @@ def test_forces_of_every_family_balance(kind, seed):
         - bench.weight_n
         + run.effect_force_n.sum(axis=1)
     )
+    assert np.ptp(run.effect_force_n) > 0.0 or kind == "preload"
     scale = np.std(forces) + 1.0
     error = bench.mass_kg * run.true_acceleration_m_per_s2 - forces
     assert np.max(np.abs(error)) < 1e-9 * scale
