@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dart_model.yaml_file import InputError
 from rig.io.run_log import parse_frame
 
-_BLOCK_BYTES = 8 * 1024 * 1024
+_BLOCK_BYTES = 2 * 1024 * 1024
 _MOST_SHAPES = 16
 """Shapes of one length that are tried in a block before its other lines are read one by one."""
 
