@@ -275,19 +275,23 @@ def driven_start(record: Record, name: str) -> ModelSpec:
     model = reduced_model(_one_body(name, first, middle_m))
     nothing, none = planted(()), np.zeros(0)
     grid = grid_of(record)
-    scale = np.array([*first, np.nanstd(height_m)])
+    spread_m = float(np.nanstd(height_m))
+    guess = start_of(model, *first_motion(grid), 0)
+    speed_m_per_s = float(np.nanstd(np.gradient(height_m, record.t_s)))
+    scale = np.array([*first, spread_m, spread_m, speed_m_per_s])
 
     def missed(x: Array) -> Array:
-        mass_kg, damping, stiffness, offset_m = (float(value) for value in x * scale)
+        mass_kg, damping, stiffness, offset_m = (float(value) for value in (x * scale)[:4])
         struts = np.array([[middle_m + offset_m, stiffness, damping, 0.0]])
         trial = model._replace(mass_kg=np.array([[mass_kg]]), struts=struts)
-        there = run(trial, nothing, none, grid, start_of(trial, *first_motion(grid), 0))
+        there = run(trial, nothing, none, grid, guess + (x * scale)[4:])
         if there is None:  # it runs away, so no worse trial is needed
             return np.full(int(grid.measured.sum()), 1e3)
-        return ((grid.heights_m - there.heights_m)[grid.measured] / scale[3]).ravel()
+        return ((grid.heights_m - there.heights_m)[grid.measured] / spread_m).ravel()
 
-    found = cast("Any", optimize).least_squares(missed, np.array([1.0, 1.0, 1.0, 0.0]), max_nfev=20)
-    mass_kg, damping, stiffness, offset_m = (float(value) for value in found.x * scale)
+    begin = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    found = cast("Any", optimize).least_squares(missed, begin, max_nfev=20)
+    mass_kg, damping, stiffness, offset_m = (float(value) for value in (found.x * scale)[:4])
     return _one_body(name, (mass_kg, damping, stiffness), middle_m + offset_m)
 
 
