@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from can_dbc.database import DEFAULT_DATABASE, Database, load_database
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, ModelSpec, load_model
-from dart_model.yaml_file import InputError, load_validated
+from dart_model.yaml_file import Finite, InputError, NotNegative, Positive, load_validated
 from rig.core.bridge import Bridge
 from rig.core.messages import Outgoing, Quantity, Target, estimate, incoming, kinematics, status
 from rig.core.observer import ObserverGains
@@ -33,9 +33,6 @@ __all__ = [
 CONFIGS = Path(__file__).parent / "configs"
 """Folder of the configurations that come with the package."""
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Text = Annotated[str, Field(min_length=1, max_length=255)]
 
 
