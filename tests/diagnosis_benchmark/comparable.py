@@ -32,15 +32,6 @@ def _kept(truth: Truth, _: Bench) -> float:
     return 1.0 - truth["lost_fraction"]
 
 
-def _hung_stiffness(truth: Truth, _: Bench) -> float:
-    return truth["mass_kg"] * (2 * math.pi * truth["frequency_hz"]) ** 2
-
-
-def _hung_damping(truth: Truth, _: Bench) -> float:
-    omega = 2 * math.pi * truth["frequency_hz"]
-    return 2 * truth["damping_ratio"] * omega * truth["mass_kg"]
-
-
 def _yield_travel(truth: Truth, _: Bench) -> float:
     return truth["yield_n"] / truth["stiffness_n_per_m"]
 
@@ -49,12 +40,19 @@ _FRICTION = tuple(
     _of(f"{name}_friction", "coulomb_force_n", "coulomb_n")
     for name in ("coulomb", "stribeck", "presliding", "elastoplastic", "lugre")
 )
-_CONTACTS = tuple(
-    _of(f"{law}{side}_stop", "contact_height_m", height)
-    for law in ("", "hertz_", "power_")
-    for side, height in (("bump", "low_m"), ("rebound", "high_m"))
+_CONTACTS = (
+    *(
+        _of(f"{law}{side}_stop", "contact_height_m", height)
+        for law in ("", "hertz_", "power_")
+        for side, height in (("bump", "low_m"), ("rebound", "high_m"))
+    ),
+    *(
+        _of(f"{law}end_stops", f"{end}_contact_height_m", f"{end}_m")
+        for law in ("", "hertz_")
+        for end in ("low", "high")
+    ),
 )
-_SIDES = ("bump_stop", "rebound_stop")
+_SIDES = ("bump_stop", "rebound_stop", "end_stops")
 
 COMPARABLE: dict[str, tuple[Same, ...]] = {
     "constant": (_of("preload", "force_n", "force_n"),),
@@ -168,8 +166,8 @@ COMPARABLE: dict[str, tuple[Same, ...]] = {
     ),
     "hung_mass": (
         _of("hidden_mass", "mass_kg", "mass_kg"),
-        Same("hidden_mass", "stiffness_n_per_m", _hung_stiffness),
-        Same("hidden_mass", "damping_n_s_per_m", _hung_damping),
+        _of("hidden_mass", "frequency_hz", "frequency_hz"),
+        _of("hidden_mass", "damping_ratio", "damping_ratio"),
         Same("hidden_mass", "weight_n", lambda t, b: t["mass_kg"] * b.gravity_m_per_s2),
     ),
 }

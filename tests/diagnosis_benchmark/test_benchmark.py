@@ -5,6 +5,7 @@ import json
 import pytest
 from rich.console import Console
 
+from dart_model.effects import effect
 from tests.diagnosis_benchmark import execute as execution
 from tests.diagnosis_benchmark.comparable import COMPARABLE, intervals
 from tests.diagnosis_benchmark.execute import (
@@ -80,6 +81,13 @@ def test_comparable_laws_exist():
     assert set(COMPARABLE) <= set(CODES) | timed
 
 
+@pytest.mark.parametrize("law", COMPARABLE)
+def test_parameters_to_compare_exist_in_the_catalogue(law):
+    for same in COMPARABLE[law]:
+        names = [parameter.name for parameter in effect(same.effect).parameters]
+        assert same.parameter in names, same.effect
+
+
 def test_slots_are_as_many_as_asked_and_cover_every_family():
     counts = Counts(single=30, pair=10, triple=2, complete=5, outside=3, foreign=0, faint=0)
     found = slots(counts, 0)
@@ -142,7 +150,11 @@ def test_crash_is_a_wrong_answer():
     assert "KeyError" in result.message
 
 
+def never_end():
+    while True:
+        pass
+
+
 def test_endless_diagnosis_is_broken_off():
     with pytest.raises(TimeoutError, match="no answer within 0 s"), within(0.01):
-        while True:
-            pass
+        never_end()
