@@ -50,11 +50,10 @@ print(*dict.fromkeys([base, sys.prefix]), sep="\n")
 }
 
 # For any processor, since the emulated one is not this one.
-export NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR="$work/out/numba" MPLCONFIGDIR="$work/out/mpl"
+export NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR="$work/out/numba"
 
 fill_caches() {
     (cd "$project" && timeout 600 "$python" -c '
-import rig.cli
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from rig.bench.config import load_bench_config
 from rig.bench.simulated import Bench
@@ -75,7 +74,7 @@ while read -r disk _ folder; do mount -t squashfs -o ro "\$disk" "\$folder"; don
 modprobe vcan
 modprobe can-gw
 cd "$project"
-export HOME=/tmp PYTHONDONTWRITEBYTECODE=1 MPLCONFIGDIR=$MPLCONFIGDIR
+export HOME=/tmp PYTHONDONTWRITEBYTECODE=1
 export NUMBA_CPU_NAME=$NUMBA_CPU_NAME NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR=$NUMBA_CACHE_DIR
 set +e
 echo "vcan: \$(uname -r), up for \$(cut -d ' ' -f 1 /proc/uptime) s"

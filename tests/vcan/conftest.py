@@ -1,11 +1,13 @@
 """Virtual CAN interfaces of the kernel, or a skip that says what is missing."""
 
+import multiprocessing
 import re
 import shutil
+import signal
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,9 +15,11 @@ import pytest
 import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
+from rig.bench.config import load_bench_config
 from rig.config import CONFIGS, Setup, load_setup
+from rig.io.bus import BusConfig
 from rig.loop import Progress
-from rig.runs import Ended, live
+from rig.runs import Ended, live, run_bench
 
 TOOLS = ("ip", "candump", "canplayer", "cangen", "cangw", "cansend")
 
@@ -133,17 +137,45 @@ def running(command: Sequence[str | Path], **options: object) -> Iterator[subpro
         process.wait(120.0)
 
 
-RIG = (Path(sys.executable).parent / "rig",)
+@contextmanager
+def in_process(target: Callable[..., object], *arguments: object) -> Iterator[BaseProcess]:
+    """A function in a process of its own, forked: importing all anew takes minutes in emulation."""
+    process = multiprocessing.get_context("fork").Process(target=target, args=arguments)
+    process.start()
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.join(120.0)
+
+
+def run_until_terminated(bench: Path, channel: str, dbc: Path) -> None:
+    """What `rig bench` does."""
+    asked: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _frame: asked.append(number))
+    run_bench(
+        load_bench_config(bench),
+        BusConfig("socketcan", channel, 500_000),
+        dbc,
+        duration_s=None,
+        stop=lambda: bool(asked),
+        progress=lambda _t_ns, _mode: None,
+    )
+
+
+def run_for(config: Path, folder: Path, seconds: float) -> None:
+    """What `rig run` does."""
+    ready = load_setup(config, duration_s=seconds)
+    live(ready, folder, stop=lambda: False, progress=lambda _t_ns, _mode: None)
 
 
 @pytest.fixture(scope="session")
 def bench(vcan: str, files: Files) -> Iterator[str]:
-    """The interface with `rig bench` on it, in a process of its own, while the tests run."""
-    command = (*RIG, "bench", files.bench, "--channel", vcan, "--dbc", files.dbc)
-    with running(command) as process:
+    """The interface with a bench on it, in a process of its own, while the tests run."""
+    with in_process(run_until_terminated, files.bench, vcan, files.dbc) as process:
         subprocess.run(["candump", "-n", "1", vcan], check=True, timeout=300.0)
         yield vcan
-        assert process.poll() is None
+        assert process.is_alive()
 
 
 @pytest.fixture

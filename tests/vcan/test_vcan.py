@@ -16,7 +16,7 @@ from rig.io.bus import Bus, BusConfig
 from rig.io.run_log import RunFolder, parse_frame, read_run
 from rig.replay import replay
 from rig.runs import with_bench
-from tests.vcan.conftest import BENCH_IDS, RATE_HZ, RIG, running
+from tests.vcan.conftest import BENCH_IDS, RATE_HZ, in_process, run_for, running
 
 pytestmark = pytest.mark.vcan
 
@@ -73,12 +73,16 @@ def test_only_configured_ids_are_heard(second_vcan):
 
 @pytest.fixture(scope="module")
 def recorded(bench, files, tmp_path_factory):
-    """A minute of `rig run` and `rig bench` as two processes: the run, and candump's record."""
+    """A minute of bridge and bench as two processes: the run, and candump's record."""
     folder = tmp_path_factory.mktemp("minute")
     record = folder / "candump.log"
-    command = (*RIG, "run", files.bridge(bench), "--out", folder / "run", "--duration-s", "60")
-    with record.open("wb") as out, running(["candump", "-L", "-r", "4000000", bench], stdout=out):
-        subprocess.run([str(part) for part in command], check=True, timeout=300.0)
+    with (
+        record.open("wb") as out,
+        running(["candump", "-L", "-r", "4000000", bench], stdout=out),
+        in_process(run_for, files.bridge(bench), folder / "run", 60.0) as process,
+    ):
+        process.join(300.0)
+    assert process.exitcode == 0
     return folder / "run", record
 
 
