@@ -1,5 +1,7 @@
 """A further mass that hangs on the upper body by a spring."""
 
+import math
+
 from dart_model.effects.contract import Effect, Floats, Parameter, Writable
 
 
@@ -14,7 +16,8 @@ def _hidden_mass(
     _strut: Floats,
 ) -> float:
     # The state is the spring's deflection in m and the hidden mass's own velocity in m/s.
-    return p[1] * state[0] + p[2] * (state[1] - velocity_m_per_s) - p[3]
+    omega = 2.0 * math.pi * p[1]
+    return p[0] * omega * (omega * state[0] + 2.0 * p[2] * (state[1] - velocity_m_per_s)) - p[3]
 
 
 def _hidden_mass_rate(
@@ -28,8 +31,9 @@ def _hidden_mass_rate(
     _strut: Floats,
     out: Writable,
 ) -> None:
+    omega = 2.0 * math.pi * p[1]
     out[0] = state[1] - velocity_m_per_s
-    out[1] = -(p[1] * state[0] + p[2] * (state[1] - velocity_m_per_s)) / p[0]
+    out[1] = -omega * (omega * state[0] + 2.0 * p[2] * (state[1] - velocity_m_per_s))
 
 
 HIDDEN_MASS = Effect(
@@ -37,8 +41,8 @@ HIDDEN_MASS = Effect(
     family="unmodelled_mode",
     parameters=(
         Parameter("mass_kg", "kg", 1e-3, 1e4, "mass on the spring"),
-        Parameter("stiffness_n_per_m", "N/m", 0.1, 1e8, "spring between the mass and the body"),
-        Parameter("damping_n_s_per_m", "N·s/m", 0.0, 1e5, "damper between the mass and the body"),
+        Parameter("frequency_hz", "Hz", 0.05, 60.0, "natural frequency of the mass on its spring"),
+        Parameter("damping_ratio", "", 0.0, 2.0, "damping over critical damping"),
         Parameter("weight_n", "N", -1e5, 1e5, "weight the mass adds at rest"),
     ),
     force=_hidden_mass,
@@ -46,5 +50,5 @@ HIDDEN_MASS = Effect(
     reference="Den Hartog, Mechanical Vibrations (1956), 3.2, dynamic absorber",
     rate=_hidden_mass_rate,
     state_size=2,
-    scaled=(0, 1, 2, 3),
+    scaled=(0, 3),
 )
