@@ -34,13 +34,15 @@ _FAR = 12.0
 _NEAR = 2.5
 _LATER_GAIN = 0.03
 _INPUT_MARGIN = 2.0
+_PULL_PER_S = 8.0
 _FLOOR_COLOUR = 0.03
 _BLOCKS = 40
 _LEAST_GAIN = 0.004
 _LEAST_LIKELIHOOD_GAIN = 25.0
-_LEAST_T = 2.5
+_MOST_LOST = 0.4
 _INDISTINCT = 10.0
 _RIVAL = 5.0
+_BETTER = 0.9
 _RIVAL_COST = 200.0
 
 
@@ -76,23 +78,39 @@ class Round(NamedTuple):
     candidates: tuple[Candidate, ...]
 
 
+class Judge(NamedTuple):
+    """Data and settings of a competition.
+
+    Attributes:
+        model: The bench.
+        grids: Runs.
+        noise_m2: Noise variance of each height, shape (struts,).
+        input_m2: Variance that the noise of the applied force adds to each height, shape (struts,).
+        every: Thinning of the trials.
+    """
+
+    model: Model
+    grids: tuple[Grid, ...]
+    noise_m2: Array
+    input_m2: Array
+    every: int
+
+
 class Attribution(NamedTuple):
     """What was found.
 
     Attributes:
-        base: The model as given, initial states fitted.
-        final: The model with all effects found.
+        base: The model as given, open loop, initial states fitted.
+        final: The model with all effects found, pulled weakly towards the measured motion.
         rounds: The competition.
-        noise_m2: Noise variance of each height, shape (struts,).
-        input_m2: Variance that the noise of the applied force adds to each height, shape (struts,).
+        judge: Its data.
         motions: What each strut did.
     """
 
     base: Fit
     final: Fit
     rounds: tuple[Round, ...]
-    noise_m2: Array
-    input_m2: Array
+    judge: Judge
     motions: tuple[screen.Motion, ...]
 
 
@@ -155,24 +173,6 @@ def smoothed_misses(grids: Sequence[Grid], result: Fit) -> list[list[Smoothed]]:
     return found
 
 
-class Judge(NamedTuple):
-    """Data and settings of a competition.
-
-    Attributes:
-        model: The bench.
-        grids: Runs.
-        noise_m2: Noise variance of each height, shape (struts,).
-        input_m2: Variance that the noise of the applied force adds to each height, shape (struts,).
-        every: Thinning of the trials.
-    """
-
-    model: Model
-    grids: tuple[Grid, ...]
-    noise_m2: Array
-    input_m2: Array
-    every: int
-
-
 def attribute(model: Model, grids: Sequence[Grid], progress: Progress) -> Attribution:
     """Find the effects that a model lacks.
 
@@ -183,14 +183,9 @@ def attribute(model: Model, grids: Sequence[Grid], progress: Progress) -> Attrib
     """
     base, noise = first_fit(model, grids)
     samples = sum(len(grid.t_s) for grid in grids)
-    judge = Judge(
-        model,
-        tuple(grids),
-        noise,
-        input_noise(model, grids),
-        max(1, round(samples / screen.MOST_SAMPLES)),
-    )
-    current = base
+    every = max(1, round(samples / screen.MOST_SAMPLES))
+    judge = Judge(model, tuple(grids), noise, input_noise(model, grids), every)
+    judge, current = _pulled(judge, base, ())
     rounds: list[Round] = []
     motions: tuple[screen.Motion, ...] = ()
     with ThreadPoolExecutor(WORKERS) as pool:
@@ -201,13 +196,53 @@ def attribute(model: Model, grids: Sequence[Grid], progress: Progress) -> Attrib
             winner = this.candidates[0] if this.candidates else None
             if winner is None or winner.fit is None:
                 break
-            if not significant(current, winner.fit, judge):
+            if not significant(current, winner.fit):
                 break
             current = _converged(judge, winner.fit, motions)
             current = _pruned(judge, current, motions)
             if at_floor(current, judge):
                 break
-    return Attribution(base, current, tuple(rounds), noise, judge.input_m2, motions)
+            if len(current.planted.effects) > 1:
+                current = _swapped(judge, base, current, motions, pool)
+                if at_floor(current, judge):
+                    break
+            judge, current = _pulled(judge, current, motions)
+    return Attribution(base, current, tuple(rounds), judge, motions)
+
+
+def _pulled(judge: Judge, current: Fit, motions: Sequence[screen.Motion]) -> tuple[Judge, Fit]:
+    """Runs in which simulations are pulled weakly towards the measured motion, and the fit there.
+
+    An impact or a stick-slip multiplies small errors, so that a law which is right but not yet
+    fitted leaves as much as a wrong one when it runs alone. A weak pull, slower than what the
+    effects do, keeps rivals comparable; the last fit is open loop again.
+    """
+    grids: list[Grid] = []
+    for grid, there, columns in zip(
+        judge.grids, current.trajectories, smoothed_misses(judge.grids, current), strict=True
+    ):
+        heights = there.heights_m + np.column_stack([c.states[:, 0] for c in columns])
+        rates = there.velocities_m_per_s + np.column_stack([c.states[:, 1] for c in columns])
+        grids.append(
+            grid._replace(
+                pull_per_s=_PULL_PER_S,
+                target_m=np.ascontiguousarray(heights),
+                target_m_per_s=np.ascontiguousarray(rates),
+            )
+        )
+    judge = judge._replace(grids=tuple(grids))
+    there = fit(
+        judge.model,
+        current.planted,
+        current.values,
+        current.starts,
+        grids,
+        judge.noise_m2,
+        motions,
+        4,
+        fixed=True,
+    )
+    return judge, there or current
 
 
 def _converged(judge: Judge, result: Fit, motions: Sequence[screen.Motion]) -> Fit:
@@ -391,17 +426,16 @@ def _block_sums(result: Fit) -> Array:
     return np.array(sums)
 
 
-def significant(before: Fit, after: Fit, judge: Judge) -> bool:
+def significant(before: Fit, after: Fit) -> bool:
     """Whether an effect's gain is more than chance, given the colour of what remains."""
     gain = _block_sums(before) - _block_sums(after)
-    spread = float(np.std(gain, ddof=1)) * np.sqrt(len(gain))
-    t = float(gain.sum()) / max(spread, 1e-300)
+    lost, won = float(-gain[gain < 0.0].sum()), float(gain[gain > 0.0].sum())
     share = 1.0 - after.cost / before.cost
     added = after.planted.parameter_count - before.planted.parameter_count
     likelihood = effective_samples(after) * float(np.log(before.cost / after.cost))
     need = _LEAST_LIKELIHOOD_GAIN + 5.0 * max(added, 0)
     least = _LATER_GAIN if before.planted.effects else _LEAST_GAIN
-    return share > least and likelihood > need and t > _LEAST_T
+    return share > least and likelihood > need and lost < _MOST_LOST * won
 
 
 def _pruned(judge: Judge, current: Fit, motions: Sequence[screen.Motion]) -> Fit:
@@ -411,7 +445,7 @@ def _pruned(judge: Judge, current: Fit, motions: Sequence[screen.Motion]) -> Fit
         dropped: Fit | None = None
         for row in rows:
             less = without(judge, current, row, motions)
-            if less is not None and not significant(less, current, judge):
+            if less is not None and not significant(less, current):
                 dropped = less
                 break
         if dropped is None:
@@ -463,24 +497,42 @@ class Settled(NamedTuple):
 
 def settle(model: Model, grids: Sequence[Grid], found: Attribution) -> Settled:
     """Fit what was found to the end, and list the rivals that cannot be told from it."""
-    final = found.final
+    final, judge = found.final, found.judge
     if not final.planted.effects:
-        return Settled(final, (), found.motions)
-    samples = sum(len(grid.t_s) for grid in grids)
-    every = max(1, round(samples / screen.MOST_SAMPLES))
-    judge = Judge(model, tuple(grids), found.noise_m2, found.input_m2, every)
+        return Settled(found.base, (), found.motions)
     with ThreadPoolExecutor(WORKERS) as pool:
         final = _refined(judge, found, final, pool)
-    last = fit(
-        model, final.planted, final.values, final.starts, grids, found.noise_m2, found.motions,
-        20, False, 1e-7,
-    )  # fmt: skip
-    final = last if last is not None and last.cost <= final.cost else final
-    if not at_floor(final, judge):
-        return Settled(final, (), found.motions)
-    with ThreadPoolExecutor(WORKERS) as pool:
-        rivals = _rivals(judge, found, final, pool)
-    return Settled(final, rivals, found.motions)
+        rivals: tuple[Candidate, ...] = ()
+        if at_floor(final, judge):
+            final, rivals = _rivals(judge, found, final, pool)
+    return Settled(_alone(judge, final, grids, found.motions), rivals, found.motions)
+
+
+def _alone(
+    judge: Judge, final: Fit, grids: Sequence[Grid], motions: Sequence[screen.Motion]
+) -> Fit:
+    """The model running alone, reached by letting go of the pull step by step."""
+    for pull in (_PULL_PER_S, 0.3 * _PULL_PER_S, 0.0):
+        there = [
+            grid._replace(
+                pull_per_s=pull, target_m=pulled.target_m, target_m_per_s=pulled.target_m_per_s
+            )
+            for grid, pulled in zip(grids, judge.grids, strict=True)
+        ]
+        last = fit(
+            judge.model,
+            final.planted,
+            final.values,
+            final.starts,
+            there,
+            judge.noise_m2,
+            motions,
+            15,
+            tolerance=1e-6,
+        )
+        if last is not None:
+            final = last
+    return final
 
 
 def _refined(judge: Judge, found: Attribution, final: Fit, pool: ThreadPoolExecutor) -> Fit:
@@ -525,35 +577,91 @@ def _rest(judge: Judge, final: Fit, row: int) -> Fit:
     return final._replace(planted=what, values=values, starts=starts)
 
 
+def _trials_in_place(
+    judge: Judge,
+    base: Fit,
+    current: Fit,
+    row: int,
+    names: Sequence[str],
+    pool: ThreadPoolExecutor,
+) -> tuple[Fit, float, list[screen.Trial]]:
+    """Laws tried in the place of one effect.
+
+    Returns:
+        The fit without the effect; what the effect itself leaves along the motion; the laws' trials,
+        best first.
+    """
+    strut, name = current.planted.effects[row]
+    rest = _rest(judge, current, row)
+    shared = _shared(judge, base, rest, current)
+    values = current.values[slice(*current.planted.slots.index[row, 1:3])]
+    own = screen.polish(shared, screen.Trial(strut, name, values, np.inf), 2)
+    keys = [(at, c) for at in range(len(judge.model.struts)) for c in names if c != name]
+    return rest, own.cost, _tried(shared, keys, pool)
+
+
+def _swapped(
+    judge: Judge,
+    base: Fit,
+    current: Fit,
+    motions: Sequence[screen.Motion],
+    pool: ThreadPoolExecutor,
+) -> Fit:
+    """Early choices made again: what was best alone need not be best beside what came later."""
+    for key in current.planted.effects[:-1]:
+        row = current.planted.effects.index(key)
+        rest, own, trials = _trials_in_place(judge, base, current, row, CANDIDATES, pool)
+        better = [t for t in trials if t.cost < _BETTER * own][:3]
+        fits = pool.map(lambda t: _joint(judge, rest, t, motions), better)  # noqa: B023
+        for rival in fits:
+            if rival is None:
+                continue
+            effective = effective_samples(min((rival, current), key=lambda f: f.cost))
+            if score(rival, effective) < score(current, effective) - 5.0:
+                current = rival
+    return _converged(judge, current, motions)
+
+
 def _rivals(
     judge: Judge, found: Attribution, final: Fit, pool: ThreadPoolExecutor
-) -> tuple[Candidate, ...]:
-    """Effects of other families that do as well as one that was found, in its place."""
+) -> tuple[Fit, tuple[Candidate, ...]]:
+    """Effects with no more parameters that do as well as one that was found, in its place.
+
+    Returns:
+        The fit, an effect that a simpler one replaces exchanged; rivals of other families.
+    """
     rivals: dict[tuple[int, str], Candidate] = {}
-    effective = effective_samples(final)
-    index = final.planted.slots.index
-    for row, (strut, name) in enumerate(final.planted.effects):
+    for strut, name in tuple(final.planted.effects):
         item = effect(name)
-        rest = _rest(judge, final, row)
-        shared = _shared(judge, found.base, rest, final)
-        own = screen.Trial(strut, name, final.values[slice(*index[row, 1:3])], np.inf)
-        own = screen.polish(shared, own, 1)
-        keys = [
-            (at, c)
-            for at in range(len(judge.model.struts))
-            for c in CANDIDATES
-            if effect(c).family != item.family
-            and len(effect(c).parameters) <= len(item.parameters)
-        ]
-        trials = [
-            t for t in _tried(shared, keys, pool) if t.cost < _RIVAL * own.cost + _RIVAL_COST
-        ]
-        fits = pool.map(lambda t: _joint(judge, rest, t, found.motions), trials[:3])  # noqa: B023
-        for trial, result in zip(trials[:3], fits, strict=True):
+        row = final.planted.effects.index((strut, name))
+        size = len(item.parameters)
+        names = [c for c in CANDIDATES if len(effect(c).parameters) <= size]
+        rest, own, trials = _trials_in_place(judge, found.base, final, row, names, pool)
+        near = [t for t in trials if t.cost < _RIVAL * own + _RIVAL_COST]
+        simplest = sorted(near, key=lambda t: len(effect(t.name).parameters))[:4]
+        fits = pool.map(lambda t: _joint(judge, rest, t, found.motions), simplest)  # noqa: B023
+        best = final
+        effective = effective_samples(final)
+        for trial, result in zip(simplest, fits, strict=True):
             if result is None:
                 continue
             value = score(result, effective)
-            if value - score(final, effective) < _INDISTINCT:
+            if value < score(best, effective) - 2.0:
+                best = result
+            if (
+                effect(trial.name).family != item.family
+                and value - score(final, effective) < _INDISTINCT
+            ):
                 key = (trial.strut, trial.name)
                 rivals[key] = Candidate(*key, trial.cost, result, value, "")
-    return tuple(sorted(rivals.values(), key=lambda c: c.score))
+        final = best
+    chosen = {effect(name).family for _, name in final.planted.effects}
+    effective = effective_samples(final)
+    left = [
+        c
+        for c in rivals.values()
+        if effect(c.name).family not in chosen
+        and c.fit is not None
+        and score(c.fit, effective) - score(final, effective) < _INDISTINCT
+    ]
+    return final, tuple(sorted(left, key=lambda c: c.score))

@@ -154,19 +154,29 @@ def slots(effects: tuple[tuple[int, str], ...]) -> Slots:
 _MODEL_TYPES = (_INDEX, _VECTOR, _MATRIX, _MATRIX, _VECTOR, _MATRIX, _VECTOR, _VECTOR)
 
 
+_PIECES = 8
+"""Parts into which a step is cut where a force jumps."""
+
+_LARGEST_ERROR_M = 2e-8
+"""Change of height by a jump within a step from which on the step is cut."""
+
+
 def _simulate(
     index: Integers, p: Array, struts: Array, rows: Array, offsets: Array,
     inverse_mass: Array, constant: Array, applied_row: Array,
     t: Array, fine: Array, temperature: Array, substeps: int, start: Array,
+    pull: Array, target: Array, target_rate: Array,
     heights: Array, velocities: Array, accelerations: Array,
 ) -> bool:  # fmt: skip
     n = rows.shape[1]
     struts_count = rows.shape[0]
     size = start.shape[0]
     x = start.copy()
+    began = start.copy()
     y = start.copy()
     dy = np.zeros(size)
     total = np.zeros(size)
+    twist = np.zeros(n)
     z = np.zeros(struts_count)
     w = np.zeros(struts_count)
     force = np.zeros(struts_count)
@@ -178,77 +188,113 @@ def _simulate(
     width = 8 * struts.shape[1]
     for k in range(t.shape[0]):
         last = k + 1 == t.shape[0]
-        h = 0.0
-        rise = 0.0
-        if not last:
-            h = (t[k + 1] - t[k]) / substeps
-            rise = (temperature[k + 1] - temperature[k]) / substeps
+        after = k if last else k + 1
+        whole = 0.0 if last else (t[k + 1] - t[k]) / substeps
         for step in range(substeps):
-            for stage in range(4):
-                # Classical Runge-Kutta: nodes 0, 1/2, 1/2, 1; weights 1, 2, 2, 1.
-                half = (stage + 1) // 2
-                if stage == 0:
-                    for i in range(size):
-                        y[i] = x[i]
-                else:
-                    reach = h if stage == 3 else 0.5 * h
-                    for i in range(size):
-                        y[i] = x[i] + reach * dy[i]
-                now = t[k] + (step + 0.5 * half) * h
-                warm = temperature[k] + (step + 0.5 * half) * rise
-                applied = fine[min(2 * (substeps * k + step) + half, fine.shape[0] - 1)]
-                for i in range(struts_count):
-                    height = offsets[i]
-                    velocity = 0.0
-                    for j in range(n):
-                        height += rows[i, j] * y[j]
-                        velocity += rows[i, j] * y[n + j]
-                    z[i] = height
-                    w[i] = velocity
-                    force[i] = -struts[i, 1] * (height - struts[i, 0]) - struts[i, 2] * velocity
-                for row in range(index.shape[0]):
-                    i = index[row, 0]
-                    own = memory_at + 8 * index[row, 3]
-                    values = p_at + 8 * index[row, 1]
-                    strut = struts_at + width * i
-                    if index[row, 4] > index[row, 3]:
-                        _call_rate(
-                            index[row, 6], now, z[i], w[i], applied, warm, own, values, strut,
-                            rate_at + 8 * index[row, 3],
-                        )  # fmt: skip
-                    force[i] += _call_force(
-                        index[row, 5], now, z[i], w[i], applied, warm, own, values, strut
+            at = min(2 * (substeps * k + step), fine.shape[0] - 1)
+            f0 = fine[at]
+            f1 = fine[min(at + 1, fine.shape[0] - 1)]
+            f2 = fine[min(at + 2, fine.shape[0] - 1)]
+            for i in range(size):
+                began[i] = x[i]
+            pieces = 1
+            piece = 0
+            while piece < pieces:
+                h = whole / pieces
+                for stage in range(4):
+                    # Classical Runge-Kutta: nodes 0, 1/2, 1/2, 1; weights 1, 2, 2, 1.
+                    half = (stage + 1) // 2
+                    if stage == 0:
+                        for i in range(size):
+                            y[i] = x[i]
+                    else:
+                        reach = h if stage == 3 else 0.5 * h
+                        for i in range(size):
+                            y[i] = x[i] + reach * dy[i]
+                    u = (piece + 0.5 * half) / pieces
+                    share = (step + u) / substeps
+                    now = t[k] + (step + u) * whole
+                    warm = temperature[k] + share * (temperature[after] - temperature[k])
+                    applied = (
+                        f0 * (1.0 - u) * (1.0 - 2.0 * u)
+                        + 4.0 * f1 * u * (1.0 - u)
+                        + f2 * u * (2.0 * u - 1.0)
                     )
-                for j in range(n):
-                    sum_n = constant[j] + applied_row[j] * applied
                     for i in range(struts_count):
-                        sum_n += rows[i, j] * force[i]
-                    general[j] = sum_n
-                for j in range(n):
-                    acceleration = 0.0
-                    for i in range(n):
-                        acceleration += inverse_mass[j, i] * general[i]
-                    dy[j] = y[n + j]
-                    dy[n + j] = acceleration
-                if stage == 0:
-                    if step == 0:
+                        height = offsets[i]
+                        velocity = 0.0
+                        for j in range(n):
+                            height += rows[i, j] * y[j]
+                            velocity += rows[i, j] * y[n + j]
+                        z[i] = height
+                        w[i] = velocity
+                        force[i] = -struts[i, 1] * (height - struts[i, 0]) - struts[i, 2] * velocity
+                        if pull[i, 0] > 0.0:
+                            goal = target[k, i] + share * (target[after, i] - target[k, i])
+                            pace = target_rate[k, i]
+                            pace += share * (target_rate[after, i] - target_rate[k, i])
+                            force[i] += pull[i, 0] * (goal - height)
+                            force[i] += pull[i, 1] * (pace - velocity)
+                    for row in range(index.shape[0]):
+                        i = index[row, 0]
+                        own = memory_at + 8 * index[row, 3]
+                        values = p_at + 8 * index[row, 1]
+                        strut = struts_at + width * i
+                        if index[row, 4] > index[row, 3]:
+                            _call_rate(
+                                index[row, 6], now, z[i], w[i], applied, warm, own, values, strut,
+                                rate_at + 8 * index[row, 3],
+                            )  # fmt: skip
+                        force[i] += _call_force(
+                            index[row, 5], now, z[i], w[i], applied, warm, own, values, strut
+                        )
+                    for j in range(n):
+                        sum_n = constant[j] + applied_row[j] * applied
                         for i in range(struts_count):
-                            heights[k, i] = z[i]
-                            velocities[k, i] = w[i]
-                            along_strut = 0.0
-                            for j in range(n):
-                                along_strut += rows[i, j] * dy[n + j]
-                            accelerations[k, i] = along_strut
-                        if last:
-                            return True
-                    for i in range(size):
-                        total[i] = dy[i]
-                elif stage == 3:
-                    for i in range(size):
-                        x[i] += h / 6.0 * (total[i] + dy[i])
-                else:
-                    for i in range(size):
-                        total[i] += 2.0 * dy[i]
+                            sum_n += rows[i, j] * force[i]
+                        general[j] = sum_n
+                    for j in range(n):
+                        acceleration = 0.0
+                        for i in range(n):
+                            acceleration += inverse_mass[j, i] * general[i]
+                        dy[j] = y[n + j]
+                        dy[n + j] = acceleration
+                        if stage == 0:
+                            twist[j] = acceleration
+                        elif stage == 3:
+                            twist[j] += acceleration
+                        else:
+                            twist[j] -= acceleration
+                    if stage == 0:
+                        if step == 0 and piece == 0 and pieces == 1:
+                            for i in range(struts_count):
+                                heights[k, i] = z[i]
+                                velocities[k, i] = w[i]
+                                along_strut = 0.0
+                                for j in range(n):
+                                    along_strut += rows[i, j] * dy[n + j]
+                                accelerations[k, i] = along_strut
+                            if last:
+                                return True
+                        for i in range(size):
+                            total[i] = dy[i]
+                    elif stage == 3:
+                        for i in range(size):
+                            x[i] += h / 6.0 * (total[i] + dy[i])
+                    else:
+                        for i in range(size):
+                            total[i] += 2.0 * dy[i]
+                piece += 1
+                if pieces == 1:
+                    worst = 0.0
+                    for j in range(n):
+                        worst = max(worst, abs(twist[j]))
+                    if worst * whole * whole > 6.0 * _LARGEST_ERROR_M:
+                        # A contact closed or friction turned within the step: again, in parts.
+                        for i in range(size):
+                            x[i] = began[i]
+                        pieces = _PIECES
+                        piece = 0
         if not abs(x[0]) < 1e6:
             return False
     return True
@@ -258,7 +304,7 @@ simulate = compile_loop(
     _simulate,
     types.boolean(
         *_MODEL_TYPES,
-        _VECTOR, _VECTOR, _VECTOR, types.int64, _VECTOR, _MATRIX, _MATRIX, _MATRIX,
+        _VECTOR, _VECTOR, _VECTOR, types.int64, _VECTOR, *(_MATRIX,) * 6,
     ),
 )  # fmt: skip
 """Run a model open loop.
@@ -266,7 +312,8 @@ simulate = compile_loop(
 Args: index of the slots; parameters, strut constants (struts, 4), strut rows (struts, n), offsets
 (struts,), inverse mass (n, n), constant generalised force (n,), applied row (n,); times of the
 nodes (N,), applied force at half sub-steps (2 * substeps * (N - 1) + 1,), temperature (N,),
-sub-steps, start (2 n + memory,); heights, velocities and accelerations of the struts (N, struts),
+sub-steps, start (2 n + memory,); stiffness and damping of a pull towards a motion (struts, 2), its
+heights and velocities (N, struts), read where there is a pull; heights, velocities and accelerations of the struts (N, struts),
 written. Returns whether the motion stayed finite.
 """
 

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 _SIGNIFICANT = 12
 _AGREED = 0.002
+_TRIED_S = 4.0
+_MOST_STEPS = 16
 
 
 def corrected_model(model: Model, result: Fit) -> ModelSpec:
@@ -47,13 +49,14 @@ def _named(name: str, values: Array) -> dict[str, float]:
     }
 
 
-def dart_heights(spec: ModelSpec, grid: Grid, start: Array) -> Array:
+def dart_heights(spec: ModelSpec, grid: Grid, start: Array, steps: int = 2) -> Array:
     """Heights of the model running alone in DART, shape (N, struts).
 
     Args:
         spec: The model.
         grid: The applied force.
         start: Coordinates, velocities and memory at the first node.
+        steps: DART's steps between nodes.
     """
     plant = DartPlant(spec)
     n = plant.coordinates
@@ -69,20 +72,59 @@ def dart_heights(spec: ModelSpec, grid: Grid, start: Array) -> Array:
     )
     none = (0.0,) * len(spec.struts)
     heights = np.empty((len(grid.t_s), len(spec.struts)))
-    # Two steps between nodes, so that DART sees the same applied force as the reduced model.
-    applied = grid.fine_n[:: grid.substeps].tolist()
-    steps = (0.5 * np.diff(grid.t_s)).tolist()
+    applied = _applied(grid, steps).tolist()
+    lengths = (np.diff(grid.t_s) / steps).tolist()
     temperature = grid.temperature_c.tolist()
     last = len(grid.t_s) - 1
     for k in range(len(grid.t_s)):
-        loaded = plant.load(state, none, applied[2 * k], temperature[k])
+        at = steps * k
+        loaded = plant.load(state, none, applied[at], temperature[k])
         heights[k] = [motion.height_m for motion in loaded.motions]
         if k == last:
             break
-        state = plant.step(loaded, steps[k], applied[2 * k + 1])
-        loaded = plant.load(state, none, applied[2 * k + 1], temperature[k])
-        state = plant.step(loaded, steps[k], applied[2 * k + 2])
+        for step in range(steps):
+            if step > 0:
+                loaded = plant.load(state, none, applied[at + step], temperature[k])
+            state = plant.step(loaded, lengths[k], applied[at + step + 1])
     return heights
+
+
+def _applied(grid: Grid, steps: int) -> Array:
+    """Applied force at `steps` points between nodes, shape (steps * (N - 1) + 1,)."""
+    fine = np.linspace(0.0, len(grid.t_s) - 1.0, 2 * grid.substeps * (len(grid.t_s) - 1) + 1)
+    wanted = np.linspace(0.0, len(grid.t_s) - 1.0, steps * (len(grid.t_s) - 1) + 1)
+    return np.interp(wanted, fine, grid.fine_n)
+
+
+def steps_on_dart(
+    spec: ModelSpec, grid: Grid, start: Array, wanted: Array, tolerance_m: float
+) -> int:
+    """How many of DART's steps between nodes bring it within a tolerance of the reduced model.
+
+    Args:
+        spec: The model.
+        grid: A run; its first seconds are tried.
+        start: Coordinates, velocities and memory at the first node.
+        wanted: Heights of the reduced model, shape (N, struts).
+        tolerance_m: Root mean square by which the two may differ.
+    """
+    count = min(len(grid.t_s), max(50, int(_TRIED_S / grid.step_s)))
+    part = grid.rows(0, count)
+    steps = 2 if grid.substeps == 1 else 2 * grid.substeps
+    while steps < _MOST_STEPS:
+        there = dart_heights(spec, part, start, steps)
+        if float(np.sqrt(np.mean((there - wanted[:count]) ** 2))) < tolerance_m:
+            break
+        steps *= 2
+    return steps
+
+
+def _steps(model: Model, result: Fit, grids: Sequence[Grid], noise_m2: Array) -> int:
+    tolerance = 0.1 * float(np.sqrt(np.min(noise_m2)))
+    spec = corrected_model(model, result)
+    return steps_on_dart(
+        spec, grids[0], result.starts[0], result.trajectories[0].heights_m, tolerance
+    )
 
 
 def fitted_on_dart(
@@ -101,10 +143,14 @@ def fitted_on_dart(
     """
     weights = 1.0 / np.sqrt(noise_m2)
 
+    steps = _steps(model, result, grids, noise_m2)
+
     def on_dart(trial: Fit) -> Array:
         spec = corrected_model(model, trial)
         parts = [
-            ((grid.heights_m - dart_heights(spec, grid, start))[grid.measured] * weights).ravel()
+            (
+                (grid.heights_m - dart_heights(spec, grid, start, steps))[grid.measured] * weights
+            ).ravel()
             for grid, start in zip(grids, trial.starts, strict=True)
         ]
         return np.concatenate(parts)

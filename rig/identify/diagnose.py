@@ -112,7 +112,7 @@ def diagnose(
     progress("comparing rivals", 0.8)
     settled = settle(model, grids, found)
     progress("fitting on DART", 0.85)
-    final, _ = fitted_on_dart(model, settled.final, grids, found.noise_m2)
+    final, _ = fitted_on_dart(model, settled.final, grids, found.judge.noise_m2)
     settled = settled._replace(final=final)
     progress("judging on held-out data", 0.92)
     result = _written_up(spec, model, grids, judged, source, found, settled, runs)
@@ -188,7 +188,7 @@ def _written_up(
     results: list[tuple[RunResult, Array | None]] = []
     for grid, cell in judged:
         guess = _guess(model, grid)
-        there = evaluate_run(model, final, grid, guess, found.noise_m2, motions)
+        there = evaluate_run(model, final, grid, guess, found.judge.noise_m2, motions)
         if there is None:
             raise RecordError(
                 f"{grid.name}: the model runs away on this run, expected one that stays near the "
@@ -198,11 +198,11 @@ def _written_up(
     fitted, forces, missing = _fitted_series(model, grids, found, final)
     effects = _effects(model, final, grids, forces, missing)
     white = White(
-        coloured(found.base, found.noise_m2, found.input_m2) < _WHITE,
-        coloured(final, found.noise_m2, found.input_m2) < _WHITE,
+        coloured(found.base, found.judge.noise_m2, found.judge.input_m2) < _WHITE,
+        coloured(final, found.judge.noise_m2, found.judge.input_m2) < _WHITE,
     )
     floor = NoiseFloor(
-        float(np.sqrt(np.mean(found.noise_m2))),
+        float(np.sqrt(np.mean(found.judge.noise_m2))),
         rms(np.concatenate([s.residual_std_n for s in fitted])),
     )
     verdict = _verdict(found, settled)
@@ -307,7 +307,7 @@ def _effects(
 
 def _verdict(found: Attribution, settled: Settled) -> Verdict:
     final = settled.final
-    left = coloured(final, found.noise_m2, found.input_m2)
+    left = coloured(final, found.judge.noise_m2, found.judge.input_m2)
     if not final.planted.effects:
         return "nothing_missing" if left < _WHITE else "not_explained"
     gain = 1.0 - float(np.sqrt(final.mean_square / found.base.mean_square))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import effect
 from rig.identify.compiled import along, law
-from rig.identify.correct import corrected_model, dart_heights
+from rig.identify.correct import corrected_model, dart_heights, steps_on_dart
 from rig.identify.output_error import Fit, fit
 from rig.identify.reduced import Grid, Model, Planted, Trajectory, mass_and_gravity, planted, run
 from rig.identify.smoother import Noise, Smoothed, estimate_noise, smooth
@@ -187,12 +187,15 @@ def evaluate_run(
     missing_after = missing_force(model, found.planted, found.values, after[0], grid, motion)
     simulated_before = Motions(*before[1], wide.deviations)
     simulated_after = Motions(*after[1], motion.deviations)
+    tolerance = 0.1 * float(np.sqrt(np.min(noise_m2)))
+    heights: list[Array] = []
+    for spec, (start, there) in ((plain, before), (corrected, after)):
+        steps = steps_on_dart(spec, grid, start, there.heights_m, tolerance)
+        heights.append(dart_heights(spec, grid, start, steps))
     return RunResult(
         grid,
-        dart_heights(plain, grid, before[0]),
-        dart_heights(corrected, grid, after[0])
-        if found.planted.effects
-        else (dart_heights(plain, grid, before[0])),
+        heights[0],
+        heights[1],
         missing_before,
         missing_after,
         strut_forces(model, nothing, none, before[0], grid, simulated_before)[0],

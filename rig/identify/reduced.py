@@ -15,6 +15,7 @@ from dart_model.plant import DartPlant
 from dart_model.spec import EffectSpec, ModelSpec
 from rig.identify.compiled import Slots, simulate, slots
 from rig.identify.records import Record, RecordError
+from rig.identify.smoother import estimate_noise, smooth
 
 Array = NDArray[np.float64]
 
@@ -96,6 +97,9 @@ def reduced_model(spec: ModelSpec) -> Model:
     )
 
 
+_NOWHERE = np.zeros((1, 1))
+
+
 class Grid(NamedTuple):
     """A record on the nodes of the simulation.
 
@@ -109,6 +113,9 @@ class Grid(NamedTuple):
         temperature_c: Temperature at the nodes, shape (N,).
         has_temperature: Whether it was measured.
         substeps: Steps of the integrator between nodes.
+        pull_per_s: Rate at which a simulation is pulled towards `target_m`; 0 is open loop.
+        target_m: Smoothed heights, shape (N, struts); read where there is a pull.
+        target_m_per_s: Smoothed velocities.
     """
 
     name: str
@@ -120,6 +127,9 @@ class Grid(NamedTuple):
     temperature_c: Array
     has_temperature: bool
     substeps: int
+    pull_per_s: float = 0.0
+    target_m: Array = _NOWHERE
+    target_m_per_s: Array = _NOWHERE
 
     @property
     def step_s(self) -> float:
@@ -171,7 +181,7 @@ def grid_of(record: Record, *, held: bool = False) -> Grid:
         fine_n = CubicSpline(record.t_s, record.applied_force_n)(fine_t)
     temperature = np.full(len(t_s), NO_TEMPERATURE_C)
     if record.temperature_c is not None:
-        temperature = np.interp(t_s, record.t_s, record.temperature_c)
+        temperature = _smooth_temperature(record, t_s)
     return Grid(
         record.name,
         t_s,
@@ -183,6 +193,16 @@ def grid_of(record: Record, *, held: bool = False) -> Grid:
         record.temperature_c is not None,
         substeps,
     )
+
+
+def _smooth_temperature(record: Record, t_s: Array) -> Array:
+    # Oil warms slowly; the sensor's noise would make the damper tremble.
+    assert record.temperature_c is not None
+    if float(np.ptp(record.temperature_c)) == 0.0:
+        return np.full(len(t_s), float(record.temperature_c[0]))
+    noise = estimate_noise(record.t_s, record.temperature_c)
+    smoothed = smooth(record.t_s, record.temperature_c, noise)
+    return np.interp(t_s, record.t_s, smoothed.states[:, 0])
 
 
 def _fine_times(t_s: Array, substeps: int) -> Array:
@@ -255,11 +275,21 @@ def run(
         grid.temperature_c,
         grid.substeps,
         start,
+        _pull(model, grid),
+        grid.target_m,
+        grid.target_m_per_s,
         heights,
         velocities,
         accelerations,
     )
     return Trajectory(heights, velocities, accelerations) if finite else None
+
+
+def _pull(model: Model, grid: Grid) -> Array:
+    """Stiffness and damping of the pull on each strut: critically damped, shape (struts, 2)."""
+    rate = grid.pull_per_s
+    mass = 1.0 / np.einsum("ij,jk,ik->i", model.rows, np.linalg.inv(model.mass_kg), model.rows)
+    return np.ascontiguousarray(np.outer(mass, [rate * rate, 2.0 * rate]))
 
 
 def mass_and_gravity(model: Model, what: Planted, parameters: Array) -> tuple[Array, Array]:

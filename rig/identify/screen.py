@@ -264,7 +264,8 @@ def stage(
             moved[i] += 1e-4 * max(abs(value), 1e-6)
             change = _heights(model, segments, linear, strut, name, moved) - there
             columns.append(change)
-    kept = [c / np.linalg.norm(c) for c in columns if float(np.linalg.norm(c)) > 0.0]
+    sizes = [float(np.linalg.norm(c)) for c in columns]
+    kept = [c / s for c, s in zip(columns, sizes, strict=True) if 0.0 < s < np.inf]
     basis = np.linalg.qr(np.column_stack(kept))[0]
     target = target - basis @ (basis.T @ target)
     motions = tuple(_motion(model, segments, linear, i, target) for i in range(len(model.struts)))

@@ -5,7 +5,6 @@ stand for a force of arbitrary size, which a linear fit sets.
 """
 
 import itertools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
@@ -163,13 +162,9 @@ def _time_fade(m: Motion) -> list[Start]:
     return _grid([0.9, 0.5], [0.1 * m.duration_s, 0.3 * m.duration_s, m.duration_s])
 
 
-def _hidden_mass(m: Motion) -> list[Start]:
-    starts: list[Start] = []
-    for frequency in np.geomspace(0.4, 25.0, 16).tolist():
-        for ratio in (0.01, 0.06):
-            omega = 2.0 * math.pi * frequency
-            starts.append((1.0, omega * omega, 2.0 * ratio * omega, 9.81))
-    return starts
+def _hidden_mass(_: Motion) -> list[Start]:
+    frequencies: list[float] = np.geomspace(0.4, 25.0, 16).tolist()
+    return _grid([1.0], frequencies, [0.01, 0.06], [9.81])
 
 
 def _always(*starts: Start) -> Callable[[Motion], list[Start]]:
