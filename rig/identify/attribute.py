@@ -35,6 +35,7 @@ _NEAR = 2.5
 _LATER_GAIN = 0.03
 _INPUT_MARGIN = 2.0
 _PULL_PER_S = 8.0
+_ALONE = 3.0
 _FLOOR_COLOUR = 0.03
 _BLOCKS = 40
 _LEAST_GAIN = 0.004
@@ -198,15 +199,15 @@ def attribute(model: Model, grids: Sequence[Grid], progress: Progress) -> Attrib
                 break
             if not significant(current, winner.fit):
                 break
-            current = _converged(judge, winner.fit, motions)
-            current = _pruned(judge, current, motions)
+            current = _pruned(judge, _converged(judge, winner.fit, motions), motions)
+            judge, current = _retargeted(judge, current, motions)
             if at_floor(current, judge):
                 break
             if len(current.planted.effects) > 1:
                 current = _swapped(judge, base, current, motions, pool)
+                judge, current = _retargeted(judge, current, motions)
                 if at_floor(current, judge):
                     break
-            judge, current = _pulled(judge, current, motions)
     return Attribution(base, current, tuple(rounds), judge, motions)
 
 
@@ -243,6 +244,18 @@ def _pulled(judge: Judge, current: Fit, motions: Sequence[screen.Motion]) -> tup
         fixed=True,
     )
     return judge, there or current
+
+
+def _retargeted(judge: Judge, current: Fit, motions: Sequence[screen.Motion]) -> tuple[Judge, Fit]:
+    """The pull renewed with what is known now.
+
+    Smoothing blurs an impact that the model did not yet have, and a pull towards that blur would
+    itself look like a force. With the effect in the model, running alone, there is little left to
+    smooth.
+    """
+    alone = _alone(judge, current, motions, (0.0,), 10)
+    best = alone if alone.mean_square < _ALONE * current.mean_square else current
+    return _pulled(judge, best, motions)
 
 
 def _converged(judge: Judge, result: Fit, motions: Sequence[screen.Motion]) -> Fit:
@@ -495,7 +508,7 @@ class Settled(NamedTuple):
     motions: tuple[screen.Motion, ...]
 
 
-def settle(model: Model, grids: Sequence[Grid], found: Attribution) -> Settled:
+def settle(found: Attribution) -> Settled:
     """Fit what was found to the end, and list the rivals that cannot be told from it."""
     final, judge = found.final, found.judge
     if not final.planted.effects:
@@ -505,20 +518,19 @@ def settle(model: Model, grids: Sequence[Grid], found: Attribution) -> Settled:
         rivals: tuple[Candidate, ...] = ()
         if at_floor(final, judge):
             final, rivals = _rivals(judge, found, final, pool)
-    return Settled(_alone(judge, final, grids, found.motions), rivals, found.motions)
+    return Settled(_alone(judge, final, found.motions), rivals, found.motions)
 
 
 def _alone(
-    judge: Judge, final: Fit, grids: Sequence[Grid], motions: Sequence[screen.Motion]
+    judge: Judge,
+    final: Fit,
+    motions: Sequence[screen.Motion],
+    pulls: Sequence[float] = (_PULL_PER_S, 0.3 * _PULL_PER_S, 0.0),
+    iterations: int = 15,
 ) -> Fit:
     """The model running alone, reached by letting go of the pull step by step."""
-    for pull in (_PULL_PER_S, 0.3 * _PULL_PER_S, 0.0):
-        there = [
-            grid._replace(
-                pull_per_s=pull, target_m=pulled.target_m, target_m_per_s=pulled.target_m_per_s
-            )
-            for grid, pulled in zip(grids, judge.grids, strict=True)
-        ]
+    for pull in pulls:
+        there = [grid._replace(pull_per_s=pull) for grid in judge.grids]
         last = fit(
             judge.model,
             final.planted,
@@ -527,7 +539,7 @@ def _alone(
             there,
             judge.noise_m2,
             motions,
-            15,
+            iterations,
             tolerance=1e-6,
         )
         if last is not None:

@@ -110,7 +110,7 @@ def diagnose(
     _check_excitation(model, grids)
     found = attribute(model, grids, progress)
     progress("comparing rivals", 0.8)
-    settled = settle(model, grids, found)
+    settled = settle(found)
     progress("fitting on DART", 0.85)
     final, _ = fitted_on_dart(model, settled.final, grids, found.judge.noise_m2)
     settled = settled._replace(final=final)
