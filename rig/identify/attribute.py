@@ -5,9 +5,14 @@ them open loop together with what was found before. Blocks of the run that take 
 decide between them. An effect that later ones made needless is dropped again.
 
 References:
-    Hastie, Tibshirani, Friedman, The Elements of Statistical Learning (2009), 7.10, cross-validation.
-    Diebold and Mariano, J. Bus. Econ. Stat. 13 (1995), comparing rivals on coloured errors by blocks.
+    Hastie, Tibshirani, Friedman, The Elements of Statistical Learning (2009), 7.10:
+        cross-validation.
+    Diebold and Mariano, J. Bus. Econ. Stat. 13 (1995): rivals compared on coloured errors.
 """
+
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -411,7 +416,7 @@ def effective_samples(result: Fit) -> float:
     """How many independent samples a coloured residual is worth (first-order)."""
     shares = [colour(column) for residual in result.residuals for column in residual.T]
     rho = float(np.clip(np.mean(shares), 0.0, 0.9999))
-    return float(np.clip(result.count * (1.0 - rho) / (1.0 + rho), 60.0, result.count))
+    return float(np.clip(result.samples * (1.0 - rho) / (1.0 + rho), 60.0, result.samples))
 
 
 def _ranked(
@@ -434,8 +439,8 @@ def _ranked(
 def _block_sums(result: Fit) -> Array:
     sums: list[float] = []
     for residual in result.residuals:
-        for part in np.array_split(residual, max(4, _BLOCKS // len(result.residuals))):
-            sums.append(float(np.nansum(part**2)))
+        parts = np.array_split(residual, max(4, _BLOCKS // len(result.residuals)))
+        sums.extend(float(np.nansum(part**2)) for part in parts)
     return np.array(sums)
 
 
@@ -518,7 +523,8 @@ def settle(found: Attribution) -> Settled:
         rivals: tuple[Candidate, ...] = ()
         if at_floor(final, judge):
             final, rivals = _rivals(judge, found, final, pool)
-    return Settled(_alone(judge, final, found.motions), rivals, found.motions)
+    final = _needed(judge, found, _alone(judge, final, found.motions))
+    return Settled(final, rivals if final.planted.effects else (), found.motions)
 
 
 def _alone(
@@ -544,6 +550,19 @@ def _alone(
         )
         if last is not None:
             final = last
+    return final
+
+
+def _needed(judge: Judge, found: Attribution, final: Fit) -> Fit:
+    """Without the effects that the model running alone does not need."""
+    for key in tuple(final.planted.effects):
+        row = final.planted.effects.index(key)
+        if len(final.planted.effects) == 1:
+            less = found.base
+        else:
+            less = _alone(judge, _rest(judge, final, row), found.motions, (0.0,))
+        if not significant(less, final):
+            final = less
     return final
 
 
@@ -600,7 +619,7 @@ def _trials_in_place(
     """Laws tried in the place of one effect.
 
     Returns:
-        The fit without the effect; what the effect itself leaves along the motion; the laws' trials,
+        The fit without the effect; what the effect leaves along the motion; the laws' trials,
         best first.
     """
     strut, name = current.planted.effects[row]

@@ -7,6 +7,9 @@ Reference: Hairer, Nørsett, Wanner, Solving Ordinary Differential Equations I (
 classical Runge-Kutta method.
 """
 
+# numba ships no types, and what it compiles is read by numba, not by a type checker.
+# pyright: basic, reportCallIssue=false
+
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
@@ -46,7 +49,7 @@ class Law(NamedTuple):
 
 
 def compile_loop(function: Callable[..., Any], signature: Any) -> Any:
-    """A function as machine code for one signature, kept on disk, without the interpreter's lock."""
+    """A function as machine code for one signature, kept on disk, without the global lock."""
     compiler = cast("Any", numba.njit)
     return compiler(signature, cache=True, error_model="numpy", nogil=True)(function)
 
@@ -230,9 +233,17 @@ def _simulate(
                         w[i] = velocity
                         force[i] = -struts[i, 1] * (height - struts[i, 0]) - struts[i, 2] * velocity
                         if pull[i, 0] > 0.0:
-                            goal = target[k, i] + share * (target[after, i] - target[k, i])
+                            # Hermite's cubic between nodes: a chord would cut the motion's bends.
+                            gap = whole * substeps
+                            rise = target[after, i] - target[k, i]
+                            early = gap * target_rate[k, i]
+                            late = gap * target_rate[after, i]
+                            bend = early + late - 2.0 * rise
+                            sag = 3.0 * rise - 2.0 * early - late
+                            goal = target[k, i] + share * (early + share * (sag + share * bend))
                             pace = target_rate[k, i]
-                            pace += share * (target_rate[after, i] - target_rate[k, i])
+                            if gap > 0.0:
+                                pace = (early + share * (2.0 * sag + 3.0 * share * bend)) / gap
                             force[i] += pull[i, 0] * (goal - height)
                             force[i] += pull[i, 1] * (pace - velocity)
                     for row in range(index.shape[0]):
@@ -313,7 +324,8 @@ Args: index of the slots; parameters, strut constants (struts, 4), strut rows (s
 (struts,), inverse mass (n, n), constant generalised force (n,), applied row (n,); times of the
 nodes (N,), applied force at half sub-steps (2 * substeps * (N - 1) + 1,), temperature (N,),
 sub-steps, start (2 n + memory,); stiffness and damping of a pull towards a motion (struts, 2), its
-heights and velocities (N, struts), read where there is a pull; heights, velocities and accelerations of the struts (N, struts),
+heights and velocities (N, struts), read where there is a pull; heights, velocities and
+accelerations of the struts (N, struts),
 written. Returns whether the motion stayed finite.
 """
 
@@ -381,7 +393,7 @@ def _gram(columns: Array, out: Array) -> None:
 
 
 gram = compile_loop(_gram, types.void(_MATRIX, _MATRIX))
-"""Scalar products (k, k), written, of rows (k, m): on one core, without a thread pool's overhead."""
+"""Scalar products (k, k), written, of rows (k, m): on one core, without a pool of threads."""
 
 
 def _respond(

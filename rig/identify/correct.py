@@ -1,7 +1,7 @@
 """The corrected model, and its last fit on DART itself.
 
-The reduced model gives the start and the sensitivities; the residual is DART's. Two or three runs of
-DART are then enough.
+The reduced model gives the start and the sensitivities; the residual is DART's. Two or three runs
+of DART are then enough.
 """
 
 from collections.abc import Sequence
@@ -159,13 +159,13 @@ def fitted_on_dart(
     cost = float(residual @ residual)
     solution, bounds = result.solution, result.space
     if solution is None or bounds is None or cost < (1.0 + _AGREED) * result.cost:
-        return result, cost / result.count
+        return result, cost / result.samples
     change = np.linalg.lstsq(solution.jacobian, -residual, rcond=None)[0]
     moved = bounds.outer(bounds.inner(solution.values) + change)
     trial = with_solution(model, result, grids, moved)
     if trial is None:
-        return result, cost / result.count
+        return result, cost / result.samples
     there = on_dart(trial)
     if float(there @ there) >= cost:
-        return result, cost / result.count
-    return trial, float(there @ there) / result.count
+        return result, cost / result.samples
+    return trial, float(there @ there) / result.samples

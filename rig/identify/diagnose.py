@@ -1,6 +1,7 @@
 """From records to a diagnosis."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +43,7 @@ from rig.identify.evaluate import (
 from rig.identify.output_error import Fit, intervals
 from rig.identify.records import Record, RecordError
 from rig.identify.reduced import Grid, Model, grid_of, planted, reduced_model, start_of
-from rig.identify.report import FittedSeries, HeldOutSeries, Ranked
+from rig.identify.report import FittedSeries, HeldOutSeries, Ranked, sentence
 
 Array = NDArray[np.float64]
 
@@ -168,8 +169,9 @@ def _check_columns(model: Model, grid: Grid, strut: int, height_m: Array) -> Non
     reach = abs(free_length) + load / stiffness
     if float(np.nanmedian(np.abs(height_m - free_length))) > _IMPLAUSIBLE * reach:
         raise RecordError(
-            f"{grid.name}: height_m is {np.nanmedian(height_m):.3g} m in the middle of the run, but "
-            f"a load of at most {load:.3g} N bends the model's strut by {load / stiffness:.3g} m: "
+            f"{grid.name}: height_m is {np.nanmedian(height_m):.3g} m in the middle of the run, "
+            f"but a load of at most {load:.3g} N bends the model's strut by "
+            f"{load / stiffness:.3g} m: "
             "expected heights near its free length: are the columns swapped, or the units wrong?"
         )
 
@@ -216,15 +218,16 @@ def _written_up(
         _held_out(results, source),
         floor,
         white,
-        _sentence(verdict, effects, families),
+        "",
         tuple(record.name for record in runs),
         spec.name,
     )
+    diagnosis = replace(diagnosis, sentence=sentence(diagnosis, len(spec.struts)))
     return Result(
         diagnosis,
         corrected_model(model, final),
         fitted,
-        tuple(_held_out_series(model, there) for there, _ in results for _ in (0,)),
+        tuple(series for there, _ in results for series in _held_out_series(model, there)),
         _ranking(model, found, settled),
         _assumptions(source),
     )
@@ -264,7 +267,7 @@ def _fitted_series(
                     before.force_n[:, i],
                     after.force_n[:, i],
                     before.deviation_n[:, i],
-                )  # fmt: skip
+                )
             )
     return tuple(series), forces, left
 
@@ -410,11 +413,18 @@ def _mean(values: Sequence[BeforeAfter | None]) -> BeforeAfter:
     )
 
 
-def _held_out_series(model: Model, there: RunResult) -> HeldOutSeries:
-    return HeldOutSeries(
-        there.grid.name, model.spec.struts[0].name, there.grid.t_s, there.grid.heights_m[:, 0],
-        there.before_m[:, 0], there.after_m[:, 0],
-    )  # fmt: skip
+def _held_out_series(model: Model, there: RunResult) -> list[HeldOutSeries]:
+    return [
+        HeldOutSeries(
+            there.grid.name,
+            strut.name,
+            there.grid.t_s,
+            there.grid.heights_m[:, i],
+            there.before_m[:, i],
+            there.after_m[:, i],
+        )
+        for i, strut in enumerate(model.spec.struts)
+    ]
 
 
 def _suggestion(settled: Settled) -> str:
@@ -424,27 +434,9 @@ def _suggestion(settled: Settled) -> str:
     return "a run with " + "; and ".join(wanted)
 
 
-def _sentence(verdict: Verdict, effects: Sequence[FoundEffect], families: Sequence[str]) -> str:
-    if verdict == "nothing_missing":
-        return "The model lacks nothing that this run can show."
-    if not effects:
-        return "The model lacks a force, and no law of the catalogue explains it."
-    named = " and ".join(
-        f"{e.name.replace('_', ' ')} ({', '.join(f'{k} = {v.value:.4g}' for k, v in list(e.parameters.items())[:3])})"
-        for e in effects
-    )
-    if verdict == "explained":
-        return f"The model lacks {named}."
-    if verdict == "ambiguous":
-        return f"The model lacks {named}, or {' or '.join(families)}: this run cannot tell."
-    if verdict == "partly_explained":
-        return f"The model lacks {named}, and something more that no law explains."
-    return f"The model lacks a force that no law explains; the nearest is {named}."
-
-
 def _assumptions(source: str) -> tuple[str, ...]:
     said = [
-        "Between samples the applied force is a cubic spline; between nodes DART takes it as linear.",
+        "Between samples the applied force is a cubic spline; between nodes DART has it linear.",
         "The initial state of every run is fitted, for both models.",
     ]
     if source != "runs":

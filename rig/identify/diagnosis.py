@@ -7,7 +7,7 @@ import os
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 from dart_model.spec import ModelSpec, dump_model
 
@@ -149,9 +149,10 @@ def to_json(diagnosis: Diagnosis) -> str:
 
 def _finite(value: object) -> object:
     if isinstance(value, dict):
-        return {str(k): _finite(v) for k, v in value.items()}  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+        items = cast("dict[object, object]", value).items()
+        return {str(key): _finite(item) for key, item in items}
     if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]  # pyright: ignore[reportUnknownVariableType]
+        return [_finite(item) for item in cast("list[object]", value)]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -4,6 +4,10 @@ An observer with a high gain hides any model error. Here the model runs alone in
 applied force as its only input; only its initial state, which nobody measured, is fitted.
 """
 
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
+
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -6,6 +6,10 @@ References:
     intervals where what remains is coloured.
 """
 
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
+
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -38,7 +42,7 @@ class Fit(NamedTuple):
         solution: The fit itself, or None if nothing was fitted.
         cost: Sum of squares over the noise variances.
         space: Where it was searched.
-        count: Number of measured heights.
+        samples: Number of measured heights.
     """
 
     planted: Planted
@@ -49,12 +53,12 @@ class Fit(NamedTuple):
     solution: Solution | None
     space: Space | None
     cost: float
-    count: int
+    samples: int
 
     @property
     def mean_square(self) -> float:
         """Mean square of the residual over the noise variance; 1 at the noise floor."""
-        return self.cost / max(self.count, 1)
+        return self.cost / max(self.samples, 1)
 
 
 def _unpack(
@@ -136,12 +140,17 @@ def fit(
         high.append(np.full(size, np.inf))
         scale.append(np.concatenate([np.full(n, 1e-3), np.full(n, 1e-2), np.array(memory_scales)]))
         logarithmic.append(np.zeros(size, dtype=np.bool_))
-    whole = Space(*(np.concatenate(part) for part in (low, high, scale, logarithmic)))
+    whole = Space(
+        np.concatenate(low),
+        np.concatenate(high),
+        np.concatenate(scale),
+        np.concatenate(logarithmic),
+    )
     first = np.concatenate(x)
     free = np.ones(len(first), dtype=np.bool_)
     if fixed:
         free[: len(values)] = False
-    partial = Space(*(part[free] for part in whole))
+    partial = Space(whole.low[free], whole.high[free], whole.scale[free], whole.logarithmic[free])
 
     def motions_of(trial: Array) -> list[Trajectory] | None:
         full = first.copy()

@@ -229,7 +229,8 @@ def _check_heights(name: str, heights_m: Array) -> None:
     low, high = float(heights.min()), float(heights.max())
     if high - low == 0.0:
         raise RecordError(
-            f"{name}: height_m is constant at {low:.6g} m, expected motion: is the sensor connected?"
+            f"{name}: height_m is constant at {low:.6g} m, "
+            "expected motion: is the sensor connected?"
         )
     for label, limit in (("lowest", low), ("highest", high)):
         longest = _longest_run(heights == limit)

@@ -4,6 +4,10 @@ A bench on straight guides has a constant mass matrix and constant strut directi
 for them once; then a run of a minute takes milliseconds, fast enough to fit many rival laws.
 """
 
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
+
 from typing import NamedTuple
 
 import numpy as np
@@ -307,4 +311,4 @@ def start_of(model: Model, heights_m: Array, velocities_m_per_s: Array, memory: 
     """Start vector with the given strut heights and velocities, and memory at zero."""
     q = np.linalg.solve(model.rows, heights_m - model.offsets_m)
     v = np.linalg.solve(model.rows, velocities_m_per_s)
-    return np.concatenate([q, v, np.zeros(memory)])
+    return np.concatenate([q, v, np.zeros(memory)], dtype=np.float64)

@@ -9,6 +9,10 @@ References:
     Ljung, System Identification (1999), 4.3 and 16.4, output error and residual analysis.
 """
 
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
+
 from typing import NamedTuple
 
 import numpy as np
@@ -132,13 +136,14 @@ def linear_model(model: Model, step_s: float, duration_s: float) -> tuple[Linear
     early = e[:m, m : m + n] - late
     output = np.hstack([rows, np.zeros_like(rows)])
     parts = (e[:m, :m], early, late, output)
-    return Linear(*(np.ascontiguousarray(p) for p in parts)), more_stiffness, more_damping
+    linear = Linear(*(np.ascontiguousarray(p, dtype=np.float64) for p in parts))
+    return linear, more_stiffness, more_damping
 
 
 def _system(mass: Array, stiffness: Array, damping: Array) -> Array:
     n = len(mass)
     lower = -np.linalg.solve(mass, np.hstack([stiffness, damping]))
-    return np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
+    return np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower], dtype=np.float64)
 
 
 def response(linear: Linear, forces_n: Array) -> Array:
