@@ -85,10 +85,20 @@ CLOSED_FORMS = [
      50.0 * (1.0 - math.exp(-1.0))),
     ("linear_temperature_fade", [0.02, 20.0], {"velocity": 0.5, "temperature": 30.0}, 10.0),
     ("time_fade", [0.6, 10.0], {"velocity": 0.5, "t_s": 10.0}, 20.0 * (1.0 - math.exp(-1.0))),
-    ("energy_fade", [0.6, 10.0], {"velocity": 0.5, "state": (10.0,)}, 20.0 * (1.0 - math.exp(-1.0))),
+    (
+        "energy_fade",
+        [0.6, 10.0],
+        {"velocity": 0.5, "state": (10.0,)},
+        20.0 * (1.0 - math.exp(-1.0)),
+    ),
     ("delay", [5e-4], {"applied": 10.0, "state": (8.0, 0.0, 0.0, 0.0)}, -2.0),
     ("periodic_force", [3.0, 2.0, 0.5 * math.pi], {"t_s": 0.25}, -3.0),
-    ("hidden_mass", [2.0, 0.5 / math.pi, 0.5, 19.62], {"velocity": 1.0, "state": (0.1, 3.0)}, -15.42),
+    (
+        "hidden_mass",
+        [2.0, 0.5 / math.pi, 0.5, 19.62],
+        {"velocity": 1.0, "state": (0.1, 3.0)},
+        -15.42,
+    ),
     ("restoring_surface", TABLE, {"height": 0.5, "velocity": 0.3}, 4.0),
 ]  # fmt: skip
 
