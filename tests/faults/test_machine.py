@@ -275,9 +275,14 @@ def demo_until_logged(folder, number):
     """A demo in real time; ends it with a signal when its log has grown, gives its exit code."""
     command = [PROGRAM, "demo", "--case", "seed", "--out", folder, "--duration-s", "60"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    frames = folder / "run" / "frames.log"
+    frames, steps = folder / "run" / "frames.log", folder / "run" / "steps.arrow"
+
+    def is_logged():
+        # Steps too: their first batch is written after the first 0.2 s.
+        return frames.exists() and frames.stat().st_size > 150_000 and steps.stat().st_size > 20_000
+
     try:
-        while not (frames.exists() and frames.stat().st_size > 150_000):
+        while not is_logged():
             with pytest.raises(subprocess.TimeoutExpired):
                 process.wait(0.05)
         process.send_signal(number)

@@ -52,7 +52,7 @@ class Play(Nothing):
 
 class Friction(Nothing):
     def force(self, t, z, v, state):
-        return -6.0 * (2.0 / math.pi) * math.atan(v / 1e-3)
+        return -6.0 * v / math.sqrt(v * v + 9e-6)
 
 
 class Orifice(Nothing):
@@ -88,7 +88,8 @@ class HungMass(Nothing):
     size = 2
 
     def force(self, t, z, v, state):
-        return 1.0 * (9.0 * 2.0 * math.pi * 0.5) ** 2 * state[0] - 9.81
+        omega = 9.0 * math.pi
+        return 1.0 * omega * (omega * state[0] + 2.0 * 0.02 * state[1]) - 9.81
 
     def rate(self, t, z, v, a, state):
         omega = 9.0 * math.pi
