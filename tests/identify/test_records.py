@@ -126,9 +126,7 @@ def test_a_run_without_motion_is_refused():
     t_s = np.arange(2000) * 0.004
     rng = np.random.default_rng(1)
     heights = 0.35 + rng.normal(0.0, 1e-5, (2000, 1))
-    assert "apply a larger force" in refused(
-        Record("still", t_s, heights, 1e-3 * np.sin(t_s))
-    )
+    assert "apply a larger force" in refused(Record("still", t_s, heights, 1e-3 * np.sin(t_s)))
 
 
 def test_swapped_columns_of_a_gentle_run_are_refused():

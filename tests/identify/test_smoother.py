@@ -10,8 +10,10 @@ def steps_of(t_s):
     """Transition and covariance of the integrated walk for every step, by quadrature."""
     nodes, weights = np.polynomial.legendre.leggauss(8)
     for h in np.diff(t_s):
+
         def power(x):
             return np.array([x**3 / 6.0, x**2 / 2.0, x, 1.0])
+
         transition = np.array(
             [[1, h, h**2 / 2, h**3 / 6], [0, 1, h, h**2 / 2], [0, 0, 1, h], [0, 0, 0, 1.0]]
         )
