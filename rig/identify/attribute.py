@@ -41,9 +41,6 @@ _LATER_GAIN = 0.03
 _INPUT_MARGIN = 2.0
 _PULL_PER_S = 8.0
 _ALONE = 3.0
-_WORTHWHILE = 0.6
-_FIRST_STEPS = 3
-_BEHIND = 4.0
 _FLOOR_COLOUR = 0.03
 _BLOCKS = 40
 _LEAST_GAIN = 0.004
@@ -207,11 +204,6 @@ def attribute(model: Model, grids: Sequence[Grid], progress: Progress) -> Attrib
                 break
             if not significant(current, winner.fit):
                 break
-            if current.planted.effects and not (
-                at_floor(winner.fit, judge)
-                or winner.fit.mean_square < _WORTHWHILE * current.mean_square
-            ):
-                break
             current = _pruned(judge, _converged(judge, winner.fit, motions), motions)
             judge, current = _retargeted(judge, current, motions)
             if at_floor(current, judge):
@@ -273,7 +265,18 @@ def _retargeted(judge: Judge, current: Fit, motions: Sequence[screen.Motion]) ->
 
 def _converged(judge: Judge, result: Fit, motions: Sequence[screen.Motion]) -> Fit:
     """The fit led to its end: what it leaves by chance would be given a name in the next round."""
-    return _again(judge, result, motions, 12, 1e-5)
+    last = fit(
+        judge.model,
+        result.planted,
+        result.values,
+        result.starts,
+        judge.grids,
+        judge.noise_m2,
+        motions,
+        12,
+        tolerance=1e-5,
+    )
+    return last if last is not None and last.cost <= result.cost else result
 
 
 def input_noise(model: Model, grids: Sequence[Grid]) -> Array:
@@ -324,7 +327,7 @@ def _round(
     keys = [(strut, name) for strut in range(len(model.struts)) for name in CANDIDATES]
     trials = _tried(shared, keys, pool)
     finalists = _finalists(trials)
-    fits = _raced(judge, current, finalists, shared.motions, pool)
+    fits = list(pool.map(lambda t: _joint(judge, current, t, shared.motions), finalists))
     simulated = {(t.strut, t.name): f for t, f in zip(finalists, fits, strict=True)}
     candidates = _ranked(trials, simulated)
     return Round(current, candidates), shared.motions
@@ -384,31 +387,8 @@ def _finalists(trials: Sequence[screen.Trial]) -> list[screen.Trial]:
     return found
 
 
-def _raced(
-    judge: Judge,
-    current: Fit,
-    finalists: Sequence[screen.Trial],
-    motions: Sequence[screen.Motion],
-    pool: ThreadPoolExecutor,
-) -> list[Fit | None]:
-    """Joint fits of the finalists; those left far behind after a few steps go no further."""
-    early = list(pool.map(lambda t: _joint(judge, current, t, motions, _FIRST_STEPS), finalists))
-    best = min((f.cost for f in early if f is not None), default=0.0)
-
-    def further(result: Fit | None) -> Fit | None:
-        if result is None or result.cost > _BEHIND * best:
-            return result
-        return _again(judge, result, motions, 8, 2e-3)
-
-    return list(pool.map(further, early))
-
-
 def _joint(
-    judge: Judge,
-    current: Fit,
-    trial: screen.Trial,
-    motions: Sequence[screen.Motion],
-    iterations: int = 8,
+    judge: Judge, current: Fit, trial: screen.Trial, motions: Sequence[screen.Motion]
 ) -> Fit | None:
     what = planted((*current.planted.effects, (trial.strut, trial.name)))
     values = np.concatenate([current.values, trial.values])
@@ -420,26 +400,10 @@ def _joint(
         judge.grids,
         judge.noise_m2,
         motions,
-        iterations,
-        tolerance=2e-3,
+        8,
+        False,
+        2e-3,
     )
-
-
-def _again(
-    judge: Judge, result: Fit, motions: Sequence[screen.Motion], iterations: int, tolerance: float
-) -> Fit:
-    last = fit(
-        judge.model,
-        result.planted,
-        result.values,
-        result.starts,
-        judge.grids,
-        judge.noise_m2,
-        motions,
-        iterations,
-        tolerance=tolerance,
-    )
-    return last if last is not None and last.cost <= result.cost else result
 
 
 def score(result: Fit, effective: float) -> float:

@@ -160,8 +160,8 @@ _MODEL_TYPES = (_INDEX, _VECTOR, _MATRIX, _MATRIX, _VECTOR, _MATRIX, _VECTOR, _V
 _PIECES = 8
 """Parts into which a step is cut where a force jumps."""
 
-_LARGEST_ERROR_M_PER_S = 1.5e-6
-"""Change of velocity by a jump within a step from which on the step is cut."""
+_LARGEST_ERROR_M = 2e-8
+"""Change of height by a jump within a step from which on the step is cut."""
 
 
 def _simulate(
@@ -180,7 +180,6 @@ def _simulate(
     dy = np.zeros(size)
     total = np.zeros(size)
     twist = np.zeros(n)
-    usual = np.zeros(n)
     z = np.zeros(struts_count)
     w = np.zeros(struts_count)
     force = np.zeros(struts_count)
@@ -298,12 +297,10 @@ def _simulate(
                             total[i] += 2.0 * dy[i]
                 piece += 1
                 if pieces == 1:
-                    # Second differences of the acceleration change slowly, but for jumps.
                     worst = 0.0
                     for j in range(n):
-                        worst = max(worst, abs(twist[j] - usual[j]))
-                        usual[j] = twist[j]
-                    if worst * whole > 6.0 * _LARGEST_ERROR_M_PER_S:
+                        worst = max(worst, abs(twist[j]))
+                    if worst * whole * whole > 6.0 * _LARGEST_ERROR_M:
                         # A contact closed or friction turned within the step: again, in parts.
                         for i in range(size):
                             x[i] = began[i]

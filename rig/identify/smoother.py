@@ -28,7 +28,6 @@ from rig.identify.compiled import compile_loop
 Array = NDArray[np.float64]
 
 _ORDER = 4
-_PRIOR = 1e11
 _LONGEST_FOR_LIKELIHOOD = 12_000
 
 
@@ -84,18 +83,19 @@ _transition_c = compile_loop(_transition, types.void(_F8, _M, _M))
 
 
 def _filter(
-    t: Array, y: Array, prior: float, means: Array, covariances: Array, out: Array, keep: int
+    t: Array, y: Array, ratio: float, means: Array, covariances: Array, out: Array, keep: int
 ) -> None:
-    # Time is in units in which the random walk has intensity one; all covariances are in units of
-    # the noise variance, which is concentrated out.
+    # All covariances are in units of the noise variance, which is concentrated out.
     m = np.zeros(4)
     p = np.zeros((4, 4))
     a = np.eye(4)
     q = np.zeros((4, 4))
     ap = np.zeros((4, 4))
     m2 = np.zeros(4)
+    scale = 1.0
     for i in range(4):
-        p[i, i] = prior
+        p[i, i] = 1e14 * scale
+        scale *= 1e3
     squares = 0.0
     logs = 0.0
     count = 0
@@ -121,7 +121,7 @@ def _filter(
                     ap[i, j] = total
             for i in range(4):
                 for j in range(i + 1):
-                    total = q[i, j]
+                    total = ratio * q[i, j]
                     for l in range(j, 4):
                         total += ap[i, l] * a[j, l]
                     p[i, j] = total
@@ -157,7 +157,7 @@ def _filter(
 _filter_c = compile_loop(_filter, types.void(_V, _V, _F8, _M, _T3, _V, types.int64))
 
 
-def _smooth(t: Array, means: Array, covariances: Array) -> None:
+def _smooth(t: Array, ratio: float, means: Array, covariances: Array) -> None:
     a = np.eye(4)
     q = np.zeros((4, 4))
     last = -1.0
@@ -169,12 +169,13 @@ def _smooth(t: Array, means: Array, covariances: Array) -> None:
         p = covariances[k].copy()
         m = means[k].copy()
         ap = a @ p
-        ahead = ap @ a.T + q
+        ahead = ap @ a.T + ratio * q
         # Scale to unit diagonal: the states differ by many orders of magnitude.
         d = np.sqrt(np.diag(ahead))
         for i in range(4):
             for j in range(4):
                 ahead[i, j] /= d[i] * d[j]
+                ap[i, j] = ap[i, j]
         for i in range(4):
             for j in range(4):
                 ap[i, j] /= d[i]
@@ -184,11 +185,11 @@ def _smooth(t: Array, means: Array, covariances: Array) -> None:
                 g[i, j] /= d[j]
         g = np.ascontiguousarray(g)
         means[k] = m + g @ (means[k + 1] - a @ m)
-        full = a @ p @ a.T + q
+        full = a @ p @ a.T + ratio * q
         covariances[k] = p + g @ (covariances[k + 1] - full) @ g.T
 
 
-_smooth_c = compile_loop(_smooth, types.void(_V, _M, _T3))
+_smooth_c = compile_loop(_smooth, types.void(_V, _F8, _M, _T3))
 
 
 def estimate_noise(t_s: Array, y: Array) -> Noise:
@@ -211,9 +212,8 @@ def estimate_noise(t_s: Array, y: Array) -> Noise:
 
     def sums(log_ratio: float) -> tuple[float, float, float]:
         total = np.zeros(3)
-        pace = np.exp(log_ratio / 7.0)
         for t, part in pieces:
-            _filter_c(t * pace, part, _PRIOR, empty_means, empty_covariances, out, 0)
+            _filter_c(t, part, float(np.exp(log_ratio)), empty_means, empty_covariances, out, 0)
             total += out
         return float(total[0]), float(total[1]), float(total[2])
 
@@ -246,10 +246,8 @@ def smooth(t_s: Array, y: Array, noise: Noise) -> Smoothed:
     """
     n = len(t_s)
     means, covariances, out = np.empty((n, _ORDER)), np.empty((n, _ORDER, _ORDER)), np.empty(3)
-    pace = noise.ratio ** (1.0 / 7.0)
-    t = np.ascontiguousarray(t_s * pace)
-    _filter_c(t, np.ascontiguousarray(y), _PRIOR, means, covariances, out, 1)
-    _smooth_c(t, means, covariances)
+    t = np.ascontiguousarray(t_s)
+    _filter_c(t, np.ascontiguousarray(y), noise.ratio, means, covariances, out, 1)
+    _smooth_c(t, noise.ratio, means, covariances)
     variances = np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0) * noise.variance
-    units = pace ** np.arange(_ORDER)
-    return Smoothed(means * units, np.sqrt(variances) * units)
+    return Smoothed(means, np.sqrt(variances))
