@@ -19,7 +19,7 @@ from can_dbc.units import Dimension, si_conversion
 Decoder = Callable[[bytes | bytearray], tuple[float, ...] | None]
 """Payload to SI values, or None if the payload has another length or lacks one of the signals."""
 
-Encoder = Callable[[Sequence[float]], tuple[bytearray, bool]]
+Encoder = Callable[[Sequence[float]], tuple[bytes, bool]]
 """SI values to a payload, and whether one of them was out of range and held at its limit."""
 
 _FD_LENGTHS = frozenset({*range(9), 12, 16, 20, 24, 32, 48, 64})
@@ -116,17 +116,8 @@ def compile_encoder(
     """
     fields = _fields(message, signal_names, dimensions)
     base = _selected(message, signal_names)
-    little = tuple(
-        (index, _packer(message, field), field.shift)
-        for index, field in enumerate(fields)
-        if not field.is_big_endian
-    )
-    big = tuple(
-        (index, _packer(message, field), field.shift)
-        for index, field in enumerate(fields)
-        if field.is_big_endian
-    )
-    return _join_encoder(little, big, base, len(fields), message.length_bytes)
+    slots = tuple(_slot(message, field) for field in fields)
+    return _join_encoder(slots, base, message.length_bytes)
 
 
 def decode_log(
@@ -323,33 +314,52 @@ def _value(field: _Field, raw: int) -> float:
     return ((raw ^ field.sign) - field.sign) * field.scale + field.offset
 
 
-# Raw value (unsigned, ready to be shifted into place) of an SI value, and whether it was held.
-_Packer = Callable[[float], tuple[int, bool]]
+class _Slot(NamedTuple):
+    """How a signal is put into a payload.
+
+    Attributes:
+        scale: SI value of one raw step.
+        offset: SI value of raw 0.
+        below: A number of steps strictly between this and `above` is sent rounded.
+        above: See `below`.
+        mask: Ones for the bits of the value.
+        shift: Bits below the value in the joined payload.
+        hold: Any other number of steps -> raw value, unsigned, and whether it was held.
+    """
+
+    scale: float
+    offset: float
+    below: float
+    above: float
+    mask: int
+    shift: int
+    hold: Callable[[float], tuple[int, bool]]
 
 
-def _packer(message: Message, field: _Field) -> _Packer:
-    return _float_packer(field) if field.float_format else _integer_packer(message, field)
-
-
-def _integer_packer(message: Message, field: _Field) -> _Packer:
+def _slot(message: Message, field: _Field) -> _Slot:
+    # Joined, the bytes of big-endian signals stand above those of little-endian ones.
+    shift = field.shift + (8 * message.length_bytes if field.is_big_endian else 0)
     scale, offset, mask = field.scale, field.offset, field.mask
+    if field.float_format:
+        return _Slot(scale, offset, math.inf, -math.inf, mask, shift, _float_holder(field))
     low, high = _raw_limits(message, field)
-    # Strictly between these a number rounds into the limits. Where floats have no halves the
-    # limits themselves take the slow way, which is exact.
+    # Where floats have no halves the limits themselves are held, which is exact.
     below, above = low - 0.5, high + 0.5
-    unknown = min(max(round(-offset / scale), low), high)
+    return _Slot(scale, offset, below, above, mask, shift, _integer_holder(field, low, high))
 
-    def pack(value: float) -> tuple[int, bool]:
-        steps = (value - offset) / scale
-        if below < steps < above:
-            return round(steps) & mask, False
+
+def _integer_holder(field: _Field, low: int, high: int) -> Callable[[float], tuple[int, bool]]:
+    mask = field.mask
+    unknown = min(max(round(-field.offset / field.scale), low), high)
+
+    def hold(steps: float) -> tuple[int, bool]:
         if math.isfinite(steps):
             wanted = round(steps)
             held = min(max(wanted, low), high)
             return held & mask, held != wanted
         return (unknown if math.isnan(steps) else low if steps < low else high) & mask, True
 
-    return pack
+    return hold
 
 
 def _raw_limits(message: Message, field: _Field) -> tuple[int, int]:
@@ -378,47 +388,39 @@ def _range_in_steps(field: _Field, lowest: float, highest: float) -> tuple[float
     return lowest if low is None else low, highest if high is None else high
 
 
-def _float_packer(field: _Field) -> _Packer:
+def _float_holder(field: _Field) -> Callable[[float], tuple[int, bool]]:
     form = field.float_format
-    size = struct.calcsize(form)
-    largest = 3.4028234663852886e38 if size == 4 else 1.7976931348623157e308
+    largest = 3.4028234663852886e38 if form == "<f" else 1.7976931348623157e308
     low, high = _range_in_steps(field, -largest, largest)
     low, high = max(low, -largest), min(high, largest)
     unknown = min(max(-field.offset / field.scale, low), high)
 
-    def pack(value: float) -> tuple[int, bool]:
-        wanted = (value - field.offset) / field.scale
-        held = unknown if math.isnan(wanted) else min(max(wanted, low), high)
-        return int.from_bytes(struct.pack(form, held), "little"), held != wanted
+    def hold(steps: float) -> tuple[int, bool]:
+        held = unknown if math.isnan(steps) else min(max(steps, low), high)
+        return int.from_bytes(struct.pack(form, held), "little"), held != steps
 
-    return pack
+    return hold
 
 
-def _join_encoder(
-    little: tuple[tuple[int, _Packer, int], ...],
-    big: tuple[tuple[int, _Packer, int], ...],
-    base: int,
-    count: int,
-    length: int,
-) -> Encoder:
-    def encode(values: Sequence[float]) -> tuple[bytearray, bool]:
-        if len(values) != count:
-            raise ValueError(f"{len(values)} values, expected {count}")
-        joined = base
-        saturated = False
-        for index, pack, shift in little:
-            raw, held = pack(values[index])
-            joined |= raw << shift
-            saturated |= held
-        if not big:
-            return bytearray(joined.to_bytes(length, "little")), saturated
-        mirrored = 0
-        for index, pack, shift in big:
-            raw, held = pack(values[index])
-            mirrored |= raw << shift
-            saturated |= held
-        joined |= int.from_bytes(mirrored.to_bytes(length, "big"), "little")
-        return bytearray(joined.to_bytes(length, "little")), saturated
+def _join_encoder(slots: tuple[_Slot, ...], base: int, length: int) -> Encoder:
+    bits = 8 * length
+    has_big_endian = any(slot.shift >= bits for slot in slots)
+
+    def encode(values: Sequence[float]) -> tuple[bytes, bool]:
+        joined, saturated = base, False
+        for value, slot in zip(values, slots, strict=True):
+            scale, offset, below, above, mask, shift, hold = slot
+            steps = (value - offset) / scale
+            if below < steps < above:
+                joined |= (round(steps) & mask) << shift
+            else:
+                raw, held = hold(steps)
+                joined |= raw << shift
+                saturated = saturated or held
+        if has_big_endian:
+            mirrored, joined = divmod(joined, 1 << bits)
+            joined |= int.from_bytes(mirrored.to_bytes(length, "big"), "little")
+        return joined.to_bytes(length, "little"), saturated
 
     return encode
 

@@ -15,6 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from e2e.p01 import e2e_p01_check, e2e_p01_protect
 from e2e.p02 import e2e_p02_check, e2e_p02_protect
+from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 
@@ -112,7 +114,7 @@ RESYNC_FRAMES = 2
 """Frames in a row, after an out-of-sequence one, that make a restarted sequence believable."""
 
 
-class SequenceState(NamedTuple):
+class SequenceState(Struct, frozen=True, gc=False):
     """What a receiver remembers of one message.
 
     Attributes:
@@ -161,12 +163,13 @@ def protect(data: bytes | bytearray, counter: int, protection: Protection) -> by
     if len(data) != protection.length_bytes:
         raise ValueError(f"payload: {len(data)} bytes, expected {protection.length_bytes}")
     frame = bytearray(data)
-    frame[1] = frame[1] & 0xF0 | counter % protection.counter_modulus
+    # The package counts one further itself.
+    frame[1] = frame[1] & 0xF0 | (counter - 1) % protection.counter_modulus
     profile, data_ids = protection.identity
     if profile is _P02:
-        e2e_p02_protect(frame, data_ids, increment_counter=False)
+        e2e_p02_protect(frame, data_ids)
     else:
-        e2e_p01_protect(frame, int.from_bytes(data_ids, "big"), increment_counter=False)
+        e2e_p01_protect(frame, int.from_bytes(data_ids, "big"))
     return bytes(frame)
 
 
@@ -198,11 +201,10 @@ def check(
     if not _crc_fits(data, protection.identity):
         return state, _wrong_crc(data, protection)
     counter = data[1] & 0x0F
-    last, last_ns, _, _, _ = state
-    modulus = protection.counter_modulus
+    last, modulus = state.counter, protection.counter_modulus
     # The frequent case first: next in sequence and in time.
     next_in_sequence = (counter - last) % modulus == 1 and last >= 0 and counter < modulus
-    if next_in_sequence and t_ns - last_ns < protection.silence_ns:
+    if next_in_sequence and t_ns - state.t_ns < protection.silence_ns:
         return SequenceState(counter, t_ns), _OK
     return _judge_sequence(state, counter, t_ns, protection)
 
@@ -257,7 +259,7 @@ def _judge_sequence(
     cycles = _cycles_since(state.t_ns, t_ns, protection)
     silent = cycles >= modulus
     if delta == 0 and not silent:
-        return state._replace(t_ns=t_ns, lost=0), Verdict.REPEATED
+        return replace(state, t_ns=t_ns, lost=0), Verdict.REPEATED
     if not silent and delta > max(protection.max_delta_counter, cycles + 1):
         return _resynchronise(state, counter, t_ns, modulus)
     lost = _lost_in_silence(delta, cycles, modulus) if silent else delta - 1

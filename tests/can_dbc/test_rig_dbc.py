@@ -17,6 +17,7 @@ PHYSICAL = {
     "m/s^2": Dimension.ACCELERATION,
     "N": Dimension.FORCE,
     "degC": Dimension.TEMPERATURE,
+    "s": Dimension.TIME,
     "": Dimension.NUMBER,
 }
 
@@ -62,6 +63,7 @@ def test_range_and_resolution(
         ("RIG_KINEMATICS", 1, "RIG"),
         ("RIG_KINEMATICS_2", 1, "RIG"),
         ("RIG_STATUS", 100, "RIG"),
+        ("RIG_TIMING", 1000, "RIG"),
     ],
 )
 def test_cycle_time_and_sender(rig: Database, message: str, cycle_ms: int, sender: str) -> None:
@@ -89,6 +91,7 @@ def test_urgent_messages_win_arbitration(rig: Database) -> None:
         "RIG_KINEMATICS",
         "BENCH_AUXILIARY",
         "RIG_STATUS",
+        "RIG_TIMING",
     ]
 
 
