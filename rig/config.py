@@ -11,7 +11,16 @@ from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, ModelSpec, load_model
 from dart_model.yaml_file import Finite, InputError, NotNegative, Positive, load_validated
 from rig.core.bridge import Bridge
-from rig.core.messages import Outgoing, Quantity, Target, estimate, incoming, kinematics, status
+from rig.core.messages import (
+    Outgoing,
+    Quantity,
+    Target,
+    estimate,
+    incoming,
+    kinematics,
+    status,
+    timing,
+)
 from rig.core.observer import ObserverGains
 from rig.core.step import RigCore
 from rig.core.supervisor import Action, Limit, Supervision, Watched
@@ -236,6 +245,7 @@ class RunConfig(_Frozen):
         publish: Messages for each strut, by strut name; by default RIG_ESTIMATE and RIG_KINEMATICS
             for the first strut, and the same with _2, _3, ... for the next ones.
         status: Message that carries the state; null sends none.
+        timing: Message that carries how well the rate is kept; null sends none.
         supervision: Ages and safe state.
         realtime: What is asked of the machine.
         log: Rotation, and windows that are kept apart.
@@ -250,6 +260,7 @@ class RunConfig(_Frozen):
     observers: dict[str, ObserverConfig] = Field(default_factory=dict[str, ObserverConfig])
     publish: dict[str, Published] = Field(default_factory=dict[str, Published])
     status: Text | None = "RIG_STATUS"
+    timing: Text | None = None
     supervision: SupervisionConfig = SupervisionConfig()
     realtime: Realtime = Realtime()
     log: LogConfig = LogConfig()
@@ -266,7 +277,7 @@ class RunConfig(_Frozen):
 
     def published_messages(self) -> list[str]:
         """Names of all messages that the bridge sends."""
-        names = [self.status]
+        names = [self.status, self.timing]
         for entry in self.publish.values():
             names += [entry.estimate, entry.kinematics]
         return [name for name in names if name is not None]
@@ -372,6 +383,8 @@ def build_bridge(ready: Setup, model: ModelSpec | None = None) -> Bridge:
             outgoing.append(kinematics(database.message(entry.kinematics), index))
     if config.status is not None:
         outgoing.append(status(database.message(config.status)))
+    if config.timing is not None:
+        outgoing.append(timing(database.message(config.timing)))
     gains = tuple(observer.gains() for observer in config.observers.values())
     supervision = config.supervision.supervision()
     core = RigCore(DartPlant(model or ready.model), gains, supervision)

@@ -348,7 +348,7 @@ class Bridge:
         for index, item in enumerate(self._outgoing):
             if t_ns < due_ns[index]:
                 continue
-            report = Report(output, counts, told, conditions)
+            report = Report(output, counts, told, conditions, counters[index])
             payload, saturated = item.encode(item.values(report))
             if item.protection is None:
                 data = bytes(payload)

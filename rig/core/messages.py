@@ -100,6 +100,27 @@ class Counts(NamedTuple):
     bus_faulty: int = 0
 
 
+Levels = tuple[float, float, float, float]
+"""Median, 99th and 99.9th percentile, largest."""
+
+
+class TimingFigures(NamedTuple):
+    """How well the rate was kept so far.
+
+    Attributes:
+        lateness_s: Lateness of a tick.
+        work_s: Time that its work took.
+        longest_gap_s: Longest time between two ticks.
+    """
+
+    lateness_s: Levels = (0.0, 0.0, 0.0, 0.0)
+    work_s: Levels = (0.0, 0.0, 0.0, 0.0)
+    longest_gap_s: float = 0.0
+
+
+NO_TIMING = TimingFigures()
+
+
 class Conditions(NamedTuple):
     """What the loop knows and a tick is told.
 
@@ -108,12 +129,14 @@ class Conditions(NamedTuple):
         acknowledged: Somebody acknowledged the safe state.
         bus_fault: The bus could not be read or written.
         log_fault: The log could not be written.
+        timing: How well the rate was kept, for the bus; nothing else depends on it.
     """
 
     overruns: int = 0
     acknowledged: bool = False
     bus_fault: bool = False
     log_fault: bool = False
+    timing: TimingFigures = NO_TIMING
 
 
 class Report(Struct, frozen=True, gc=False):
@@ -124,12 +147,14 @@ class Report(Struct, frozen=True, gc=False):
         counts: What has been counted.
         told: What the last status that was sent knew of them.
         conditions: What the loop knows.
+        number: How many frames of the message came before.
     """
 
     output: StepOutput
     counts: Counts
     told: Counts
     conditions: Conditions
+    number: int
 
 
 @dataclass(frozen=True)
@@ -192,6 +217,14 @@ _STATUS = {
     "LOG_FAULT": Dimension.NUMBER,
 }
 
+_LEVELS = ("P50", "P99", "P99_9", "MAX")
+_TIMING_PAGES = (
+    {f"LATENESS_{level}": Dimension.TIME for level in _LEVELS},
+    {f"WORK_{level}": Dimension.TIME for level in _LEVELS},
+    {"LONGEST_GAP": Dimension.TIME, "OVERRUNS": Dimension.NUMBER},
+)
+"""Signals of the pages of a multiplexed message, in the order in which they are sent."""
+
 
 def estimate(message: Message, strut: int) -> Outgoing:
     """The message with a strut's estimated force.
@@ -253,6 +286,28 @@ def status(message: Message) -> Outgoing:
         return [min(value, limit) for value, limit in zip(raw, limits, strict=True)]
 
     return _outgoing(message, _STATUS, values, is_status=True)
+
+
+def timing(message: Message) -> Outgoing:
+    """The message with how well the rate was kept, page by page.
+
+    A figure beyond its range is sent as the end of it.
+
+    Raises:
+        DatabaseError: One of its signals is missing or has the wrong unit.
+    """
+    encoders = [compile_encoder(message, list(page), list(page.values())) for page in _TIMING_PAGES]
+
+    def values(report: Report) -> Sequence[float]:
+        page, kept = report.number % len(encoders), report.conditions.timing
+        pages = (kept.lateness_s, kept.work_s, (kept.longest_gap_s, float(report.counts.overruns)))
+        return (page, *pages[page])
+
+    def encode(paged: Sequence[float]) -> tuple[bytes, bool]:
+        # The end of a range says "that much or more" and is no saturation to be told of.
+        return encoders[int(paged[0])](paged[1:])[0], False
+
+    return Outgoing(message, encode, values, message.cycle_time_ns or 0, message.protection)
 
 
 def _outgoing(
