@@ -314,6 +314,10 @@ def _value(field: _Field, raw: int) -> float:
     return ((raw ^ field.sign) - field.sign) * field.scale + field.offset
 
 
+_Holder = Callable[[float], tuple[int, bool]]
+"""Number of steps -> the nearest raw value that is allowed, unsigned, and whether it is another."""
+
+
 class _Slot(NamedTuple):
     """How a signal is put into a payload.
 
@@ -324,7 +328,7 @@ class _Slot(NamedTuple):
         above: See `below`.
         mask: Ones for the bits of the value.
         shift: Bits below the value in the joined payload.
-        hold: Any other number of steps -> raw value, unsigned, and whether it was held.
+        hold: What is done with any other number of steps.
     """
 
     scale: float
@@ -333,7 +337,7 @@ class _Slot(NamedTuple):
     above: float
     mask: int
     shift: int
-    hold: Callable[[float], tuple[int, bool]]
+    hold: _Holder
 
 
 def _slot(message: Message, field: _Field) -> _Slot:
@@ -348,7 +352,7 @@ def _slot(message: Message, field: _Field) -> _Slot:
     return _Slot(scale, offset, below, above, mask, shift, _integer_holder(field, low, high))
 
 
-def _integer_holder(field: _Field, low: int, high: int) -> Callable[[float], tuple[int, bool]]:
+def _integer_holder(field: _Field, low: int, high: int) -> _Holder:
     mask = field.mask
     unknown = min(max(round(-field.offset / field.scale), low), high)
 
@@ -388,7 +392,7 @@ def _range_in_steps(field: _Field, lowest: float, highest: float) -> tuple[float
     return lowest if low is None else low, highest if high is None else high
 
 
-def _float_holder(field: _Field) -> Callable[[float], tuple[int, bool]]:
+def _float_holder(field: _Field) -> _Holder:
     form = field.float_format
     largest = 3.4028234663852886e38 if form == "<f" else 1.7976931348623157e308
     low, high = _range_in_steps(field, -largest, largest)
@@ -403,14 +407,19 @@ def _float_holder(field: _Field) -> Callable[[float], tuple[int, bool]]:
 
 
 def _join_encoder(slots: tuple[_Slot, ...], base: int, length: int) -> Encoder:
-    bits = 8 * length
+    count, bits = len(slots), 8 * length
     has_big_endian = any(slot.shift >= bits for slot in slots)
+    # Plain tuples are taken apart three times as fast as named ones.
+    numbered: list[tuple[int, float, float, float, float, int, int, _Holder]] = [
+        (index, *slot) for index, slot in enumerate(slots)
+    ]
 
     def encode(values: Sequence[float]) -> tuple[bytes, bool]:
+        if len(values) != count:
+            raise ValueError(f"{len(values)} values, expected {count}")
         joined, saturated = base, False
-        for value, slot in zip(values, slots, strict=True):
-            scale, offset, below, above, mask, shift, hold = slot
-            steps = (value - offset) / scale
+        for index, scale, offset, below, above, mask, shift, hold in numbered:
+            steps = (values[index] - offset) / scale
             if below < steps < above:
                 joined |= (round(steps) & mask) << shift
             else:
