@@ -1,9 +1,9 @@
 """A CAN frame as a value."""
 
-from typing import NamedTuple
+from msgspec import Struct
 
 
-class Frame(NamedTuple):
+class Frame(Struct, frozen=True, gc=False):
     """One CAN or CAN FD frame.
 
     Attributes:

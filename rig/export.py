@@ -24,6 +24,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
+from msgspec.structs import astuple
 from numpy.typing import NDArray
 
 from can_dbc.frame import Frame
@@ -194,7 +195,7 @@ _FRAME_SCHEMA = _pa.schema(
 
 def _to_parquet(found: RunFolder, out: Path) -> list[Path]:
     content = _content(found)
-    rows = [(*frame, direction == "T") for frame, direction in content.frames]
+    rows = [(*astuple(frame), direction == "T") for frame, direction in content.frames]
     columns = [list(column) for column in zip(*rows, strict=True)] or [[] for _ in _FRAME_SCHEMA]
     arrays = [
         _pa.array(column, type=field.type)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, cast
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -673,7 +674,7 @@ class _LogPort:
         while (frame := self._waiting) is not None and frame.t_ns + self._shift_ns <= t_ns:
             # A log that several channels were written to may be out of order by a little.
             self.last_ns = max(frame.t_ns, self.last_ns)
-            frames.append(frame._replace(t_ns=self.last_ns + self._shift_ns))
+            frames.append(replace(frame, t_ns=self.last_ns + self._shift_ns))
             self.taken += 1
             self._waiting = self._next()
         return frames, Conditions()

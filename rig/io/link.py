@@ -5,6 +5,8 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from msgspec.structs import replace
+
 from can_dbc.frame import Frame
 from rig.io.bus import Bus, BusError, BusFullError
 from rig.io.controller import Controller, state_after
@@ -134,7 +136,7 @@ class Link:
         last_ns, self._last_ns = self._last_ns, t_ns
         for index, frame in enumerate(frames):
             if not last_ns < frame.t_ns <= t_ns:
-                frames[index] = frame._replace(t_ns=self._arrival_ns(frame.t_ns, last_ns, t_ns))
+                frames[index] = replace(frame, t_ns=self._arrival_ns(frame.t_ns, last_ns, t_ns))
             if frame.is_error or self._controller:
                 self._judge(frame)
         return frames

@@ -7,6 +7,7 @@ import cantools
 import numpy as np
 import pyarrow.parquet
 import pytest
+from msgspec.structs import astuple
 
 from can_dbc.frame import Frame
 from dart_model.yaml_file import InputError
@@ -64,7 +65,7 @@ def test_a_candump_log_reads_as_one_to_the_microsecond(run, tmp_path):
     export_run(run, "candump", tmp_path / "a.log")
     frames = [parse_frame(line, 0)[0] for line in (tmp_path / "a.log").read_text().splitlines()]
     original = [frame for frame, _ in read_run(run).frames()]
-    assert [frame[1:] for frame in frames] == [frame[1:] for frame in original]
+    assert [astuple(frame)[1:] for frame in frames] == [astuple(frame)[1:] for frame in original]
     assert all(0 <= b.t_ns - a.t_ns < 1000 for a, b in zip(frames, original, strict=True))
     assert (tmp_path / "a.log").read_text().splitlines()[0].split(" ")[0] == "(0.000000)"
 

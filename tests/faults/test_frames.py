@@ -3,6 +3,7 @@
 import random
 
 import pytest
+from msgspec.structs import replace
 
 from can_dbc.codec import compile_decoder
 from can_dbc.protection import protect
@@ -132,7 +133,7 @@ def flipped(frame, bits):
     number = int.from_bytes(frame.data, "big")
     for bit in bits:
         number ^= 1 << bit
-    return frame._replace(data=number.to_bytes(len(frame.data), "big"))
+    return replace(frame, data=number.to_bytes(len(frame.data), "big"))
 
 
 @pytest.mark.parametrize(
@@ -180,7 +181,7 @@ def test_masquerade(row):
 
     def disguise(_t_ns, frames):
         auxiliary = [frame for frame in frames if frame.arbitration_id == 0x200]
-        return frames + [frame._replace(arbitration_id=MEASUREMENT) for frame in auxiliary]
+        return frames + [replace(frame, arbitration_id=MEASUREMENT) for frame in auxiliary]
 
     ticks = trial.run(END_MS, after(BEGIN_NS, disguise))
     assert ticks[-1].counts.masquerade == 100
@@ -200,7 +201,7 @@ def test_a_second_sender_of_the_benchs_id(row):
     sent = iter(range(5, 100_000))
 
     def rival(frame):
-        return [frame, frame._replace(data=protect(frame.data, next(sent), protection))]
+        return [frame, replace(frame, data=protect(frame.data, next(sent), protection))]
 
     ticks = trial.run(END_MS, after(BEGIN_NS, measurements_only(rival)))
     found_ms = first_ms(ticks, lambda tick: tick.counts.second_sender > 0)
@@ -245,7 +246,7 @@ def test_flood(row):
     trial = Trial(limits=limits)
 
     def flood(_t_ns, frames):
-        random_ones = [frames[0]._replace(data=rng.randbytes(8)) for _ in range(20)]
+        random_ones = [replace(frames[0], data=rng.randbytes(8)) for _ in range(20)]
         return [*random_ones, *frames]
 
     ticks = trial.run(END_MS, after(BEGIN_NS, flood))
@@ -276,7 +277,7 @@ def test_stuck_value(row):
     def stuck(frame):
         last.append(frame)
         return [
-            frame._replace(data=protect(last[0].data, frame.data[1] & 0x0F, message.protection))
+            replace(frame, data=protect(last[0].data, frame.data[1] & 0x0F, message.protection))
         ]
 
     ticks = trial.run(END_MS, after(BEGIN_NS, measurements_only(stuck)))

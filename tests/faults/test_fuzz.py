@@ -8,6 +8,7 @@ import random
 from math import isfinite
 
 import pytest
+from msgspec.structs import replace
 
 from can_dbc.protection import Verdict, check_crc
 from rig.core.messages import Quantity
@@ -33,7 +34,7 @@ def mutated(rng, frame):
         {"is_error": True, "arbitration_id": rng.getrandbits(9)},
         {"t_ns": frame.t_ns + rng.randrange(-(10**9), 10**9)},
     )
-    return frame._replace(**rng.choice(changes))
+    return replace(frame, **rng.choice(changes))
 
 
 def fuzz(ticks, seed):

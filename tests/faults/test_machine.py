@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from msgspec.structs import replace
 
 from can_dbc.frame import Frame
 from rig.bench.config import load_bench_config
@@ -136,7 +137,7 @@ def test_clock_jump(row, step_s):
     def fault(t_ns, frames):
         wall[0] = step_ns if t_ns >= BEGIN_NS else 0
         shift_ns = wall[0] - on_wire.wire.epoch_ns
-        return [frame._replace(t_ns=frame.t_ns + shift_ns) for frame in frames]
+        return [replace(frame, t_ns=frame.t_ns + shift_ns) for frame in frames]
 
     ticks = on_wire.run(END_MS, fault)
     assert on_wire.link.figures.clock_steps == 1

@@ -1,6 +1,7 @@
 """The table of limits, and the way into the safe state and out of it."""
 
 import pytest
+from msgspec.structs import replace
 
 from can_dbc.codec import compile_decoder
 from can_dbc.protection import protect
@@ -127,7 +128,7 @@ def test_a_measurement_beyond_a_safe_limit_enters_the_safe_state_at_once():
     zero = bytes(8)
 
     def broken_sensor(frame):
-        return [frame._replace(data=protect(zero, frame.data[1] & 0x0F, message.protection))]
+        return [replace(frame, data=protect(zero, frame.data[1] & 0x0F, message.protection))]
 
     ticks = trial.run(400, after(BEGIN_NS, measurements_only(broken_sensor)))
     assert ticks[BEGIN_NS // MS - 1].mode is Mode.RUNNING
@@ -135,7 +136,7 @@ def test_a_measurement_beyond_a_safe_limit_enters_the_safe_state_at_once():
 
 
 def test_nothing_is_sent_before_the_first_valid_measurement():
-    ticks = Trial().run(200, lambda _t_ns, frames: [f._replace(data=bytes(8)) for f in frames])
+    ticks = Trial().run(200, lambda _t_ns, frames: [replace(f, data=bytes(8)) for f in frames])
     assert all(tick.result.frames == [] for tick in ticks)
     assert {tick.mode for tick in ticks} == {Mode.WAITING}
 

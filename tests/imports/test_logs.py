@@ -7,6 +7,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from can_dbc.frame import Frame
 from dart_model.yaml_file import InputError
@@ -71,8 +72,8 @@ def test_a_log_becomes_the_run_that_was_heard(
 def test_frames_of_others_are_left_out_and_counted(
     tmp_path: Path, ready: Setup, frames: list[Frame]
 ) -> None:
-    foreign = [frame._replace(arbitration_id=0x7F0) for frame in frames[:50]]
-    mixed = sorted([*frames, *foreign])
+    foreign = [replace(frame, arbitration_id=0x7F0) for frame in frames[:50]]
+    mixed = sorted([*frames, *foreign], key=lambda frame: frame.t_ns)
     path = tmp_path / "bench.blf"
     with can.Logger(path) as log:
         for message in messages(mixed):
@@ -87,7 +88,7 @@ def test_a_log_without_the_bench_is_refused(
 ) -> None:
     path = tmp_path / "bench.blf"
     with can.Logger(path) as log:
-        for message in messages([frame._replace(arbitration_id=0x7F0) for frame in frames]):
+        for message in messages([replace(frame, arbitration_id=0x7F0) for frame in frames]):
             log.on_message_received(message)
     with pytest.raises(InputError, match="none of its 552 frames is one of BENCH_MEASUREMENT"):
         import_log(path, ready, tmp_path / "run")
@@ -95,7 +96,7 @@ def test_a_log_without_the_bench_is_refused(
 
 
 def test_a_day_without_frames_is_refused(tmp_path: Path, ready: Setup, frames: list[Frame]) -> None:
-    later = [frame._replace(t_ns=frame.t_ns + 86_400_000_000_000) for frame in frames]
+    later = [replace(frame, t_ns=frame.t_ns + 86_400_000_000_000) for frame in frames]
     path = tmp_path / "bench.blf"
     with can.Logger(path) as log:
         for message in messages([*frames, *later]):

@@ -1,6 +1,7 @@
 """A bus that goes away and comes back, frames' times, and what the controller tells."""
 
 import pytest
+from msgspec.structs import replace
 
 from can_dbc.frame import Frame
 from rig.io.bus import BusError, BusFullError
@@ -29,7 +30,7 @@ class ScriptedBus:
         answer = self._polls.pop(0) if self._polls else []
         if isinstance(answer, Exception):
             raise answer
-        return [frame._replace(t_ns=frame.t_ns - self.epoch_ns) for frame in answer]
+        return [replace(frame, t_ns=frame.t_ns - self.epoch_ns) for frame in answer]
 
     def send(self, frame):
         if self.sending is not None:

@@ -4,6 +4,8 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from can_dbc.codec import compile_encoder
 from can_dbc.frame import Frame
 from can_dbc.protection import protect
@@ -63,11 +65,11 @@ def disturbed(frame: Frame, fault: str) -> list[Frame]:
     flipped = bytes([frame.data[0], frame.data[1], frame.data[2] ^ 0x10, *frame.data[3:]])
     return {
         "repeated": [frame, frame],
-        "flipped": [frame._replace(data=flipped)],
-        "short": [frame._replace(data=frame.data[:-1])],
-        "foreign": [frame._replace(arbitration_id=0x7FF), frame],
-        "error": [frame._replace(arbitration_id=0x4, data=b"", is_error=True), frame],
-        "again": [frame._replace(is_extended=True), frame],
+        "flipped": [replace(frame, data=flipped)],
+        "short": [replace(frame, data=frame.data[:-1])],
+        "foreign": [replace(frame, arbitration_id=0x7FF), frame],
+        "error": [replace(frame, arbitration_id=0x4, data=b"", is_error=True), frame],
+        "again": [replace(frame, is_extended=True), frame],
     }.get(fault, [frame])
 
 

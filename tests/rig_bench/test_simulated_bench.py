@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from can_dbc.codec import compile_decoder
 from can_dbc.database import DEFAULT_DATABASE, DatabaseError, load_database
@@ -201,7 +202,7 @@ def test_start_time_shifts_the_stamps(database):
     start_ns = 123_456_789_012_345_678
     shifted = _frames(_config(), database, start_ns + 20 * MS_NS, start_ns=start_ns)
     plain = _frames(_config(), database, 20 * MS_NS)
-    assert shifted == [frame._replace(t_ns=frame.t_ns + start_ns) for frame in plain]
+    assert shifted == [replace(frame, t_ns=frame.t_ns + start_ns) for frame in plain]
     assert Bench(_config(), database, start_ns=start_ns).update(start_ns - 1) == ([], start_ns)
 
 
