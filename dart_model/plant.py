@@ -13,6 +13,7 @@ for the use in multibody dynamics: Featherstone, "Rigid Body Dynamics Algorithms
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import add, mul
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, cast
 
@@ -59,11 +60,13 @@ class Motion(Struct, frozen=True, gc=False):
         height_m: Length of the strut.
         velocity_m_per_s: Its rate; positive is rebound.
         force_n: Spring-damper force with effects, without the virtual force.
+        acceleration_m_per_s2: Second derivative of the height under all forces.
     """
 
     height_m: float
     velocity_m_per_s: float
     force_n: float
+    acceleration_m_per_s2: float
 
 
 class Loaded(Struct, frozen=True, gc=False):
@@ -72,21 +75,39 @@ class Loaded(Struct, frozen=True, gc=False):
     Attributes:
         state: The state.
         motions: What each strut does in it.
-        accelerations_m_per_s2: Second derivative of each strut's height.
-        held: The virtual forces, held until the next state, as the integrator wants them.
         applied_force_n: Applied force at the state.
         temperature_c: Damper temperature.
-        acceleration: Joint acceleration, as the integrator wants it.
+        held: The virtual forces, held until the next state; this and the next three are as the
+            integrator wants them.
+        position: Joint position.
+        velocity: Joint velocity.
+        acceleration: Joint acceleration.
         memory_rates: Derivative of the memory.
     """
 
     state: PlantState
     motions: Sequence[Motion]
-    accelerations_m_per_s2: Sequence[float]
-    held: "_Value"
     applied_force_n: float
     temperature_c: float
+    held: "_Value"
+    position: "_Value"
+    velocity: "_Value"
     acceleration: "_Value"
+    memory_rates: list[float]
+
+
+class Driven(NamedTuple):
+    """A strut whose motion is imposed.
+
+    Attributes:
+        force_n: Spring-damper force with effects: what the load cell would show.
+        drive_n: Force that the drive adds to it, by inverse dynamics: weight and inertia, less the
+            strut's own force.
+        memory_rates: Derivative of the memory.
+    """
+
+    force_n: float
+    drive_n: float
     memory_rates: list[float]
 
 
@@ -245,8 +266,8 @@ class _Joints(Protocol):
         memory: Sequence[float],
         surroundings: _Surroundings,
         memory_rates: list[float],
-    ) -> tuple[list[Motion], _Value, _Value, list[float]]:
-        """Motions of struts, forces to be held, acceleration, and accelerations of struts."""
+    ) -> tuple[list[Motion], _Value, _Value]:
+        """Motions of struts, forces to be held, and acceleration."""
         ...
 
 
@@ -274,7 +295,10 @@ class _Coordinate:
         return q + h * v
 
     def kinematics(self, q: float, v: float) -> list[tuple[float, float]]:
-        return [(offset + row * q, row * v) for _, _, offset, row in self._struts]
+        found: list[tuple[float, float]] = []
+        for _, _, offset, row in self._struts:
+            found.append((offset + row * q, row * v))
+        return found
 
     def load(
         self,
@@ -284,19 +308,20 @@ class _Coordinate:
         memory: Sequence[float],
         surroundings: _Surroundings,
         memory_rates: list[float],
-    ) -> tuple[list[Motion], float, float, list[float]]:
-        motions: list[Motion] = []
+    ) -> tuple[list[Motion], float, float]:
+        forces: list[float] = []
         held = own = 0.0
         for index, strut, offset, row in self._struts:
-            height, velocity = offset + row * q, row * v
-            force = strut.force_n(height, velocity, memory, surroundings, memory_rates)
-            motions.append(Motion(height, velocity, force))
+            force = strut.force_n(offset + row * q, row * v, memory, surroundings, memory_rates)
+            forces.append(force)
             own += row * force
             held += row * virtual_forces_n[index]
-        push = own + held + self._applied_row * surroundings[1]
-        acceleration = self._respond(q, v, push)
-        of_struts = [row * acceleration for _, _, _, row in self._struts]
-        return motions, held, acceleration, of_struts
+        acceleration = self._respond(q, v, own + held + self._applied_row * surroundings[1])
+        motions: list[Motion] = []
+        for index, _, offset, row in self._struts:
+            motion = Motion(offset + row * q, row * v, forces[index], row * acceleration)
+            motions.append(motion)
+        return motions, held, acceleration
 
     def _acceleration(self) -> "_Acceleration":
         # Springs and dampers of all struts are summed up once: this is called twice a tick.
@@ -346,6 +371,9 @@ def _response(skeleton: Any) -> Callable[[float, float, float], float]:
     return respond
 
 
+_Put = Callable[[float], None]
+
+
 class _Coordinates:
     """All coordinates of a model, as arrays."""
 
@@ -359,7 +387,13 @@ class _Coordinates:
         self._skeleton = skeleton
         self._struts = struts
         self._rows_at = rows_at
-        self._constant = constant
+        self._constant = None if constant is None else _as_lists(constant)
+        dofs = [skeleton.getDof(index) for index in range(int(skeleton.getNumDofs()))]
+        self._put: list[tuple[_Put, _Put, _Put]] = [
+            (dof.setPosition, dof.setVelocity, dof.setForce) for dof in dofs
+        ]
+        self._get: list[Callable[[], float]] = [dof.getAcceleration for dof in dofs]
+        self._solve: Callable[[], None] = skeleton.computeForwardDynamics
         self.adds_up = _coordinates_add_up(skeleton)
 
     def values(self, state: PlantState) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -385,9 +419,7 @@ class _Coordinates:
     def kinematics(
         self, q: NDArray[np.float64], v: NDArray[np.float64]
     ) -> list[tuple[float, float]]:
-        rows = self._constant or self._rows_at(q)
-        heights = (rows.offsets_m + rows.struts @ q).tolist()
-        return list(zip(heights, (rows.struts @ v).tolist(), strict=True))
+        return _kinematics(self._rows(q), q.tolist(), v.tolist())
 
     def load(
         self,
@@ -397,18 +429,20 @@ class _Coordinates:
         memory: Sequence[float],
         surroundings: _Surroundings,
         memory_rates: list[float],
-    ) -> tuple[list[Motion], Sequence[float], NDArray[np.float64], list[float]]:
-        rows = self._constant or self._rows_at(q)
-        motions = self._motions(rows, q, v, memory, surroundings, memory_rates)
-        forces = [
-            motion.force_n + virtual
-            for motion, virtual in zip(motions, virtual_forces_n, strict=True)
+    ) -> tuple[list[Motion], Sequence[float], NDArray[np.float64]]:
+        rows, position, velocity = self._rows(q), q.tolist(), v.tolist()
+        kinematics = _kinematics(rows, position, velocity)
+        forces = self._forces_n(kinematics, memory, surroundings, memory_rates)
+        push = _push(rows, forces, virtual_forces_n, surroundings[1])
+        acceleration = self._respond(position, velocity, push)
+        turning = [0.0] * len(forces) if self._constant else (self._turning(q, v) @ v).tolist()
+        motions = [
+            Motion(*motion, force, _dot(row, acceleration) + turned)
+            for motion, force, row, turned in zip(
+                kinematics, forces, rows.struts, turning, strict=True
+            )
         ]
-        acceleration = self._respond(q, v, rows, forces, surroundings[1])
-        of_struts = rows.struts @ acceleration
-        if not self._constant:
-            of_struts += self._turning(q, v) @ v
-        return motions, virtual_forces_n, acceleration, of_struts.tolist()
+        return motions, virtual_forces_n, np.array(acceleration)
 
     def acceleration(
         self,
@@ -419,46 +453,39 @@ class _Coordinates:
         surroundings: _Surroundings,
         memory_rates: list[float],
     ) -> NDArray[np.float64]:
-        rows = self._constant or self._rows_at(q)
-        motions = self._motions(rows, q, v, memory, surroundings, memory_rates)
-        forces = [motion.force_n + virtual for motion, virtual in zip(motions, held, strict=True)]
-        return self._respond(q, v, rows, forces, surroundings[1])
+        rows, position, velocity = self._rows(q), q.tolist(), v.tolist()
+        kinematics = _kinematics(rows, position, velocity)
+        forces = self._forces_n(kinematics, memory, surroundings, memory_rates)
+        push = _push(rows, forces, held, surroundings[1])
+        return np.array(self._respond(position, velocity, push))
 
-    def _motions(
+    def _rows(self, q: NDArray[np.float64]) -> "_Lists":
+        return self._constant or _as_lists(self._rows_at(q))
+
+    def _forces_n(
         self,
-        rows: "_Rows",
-        q: NDArray[np.float64],
-        v: NDArray[np.float64],
+        kinematics: list[tuple[float, float]],
         memory: Sequence[float],
         surroundings: _Surroundings,
         memory_rates: list[float],
-    ) -> list[Motion]:
-        heights: list[float] = (rows.offsets_m + rows.struts @ q).tolist()
-        velocities: list[float] = (rows.struts @ v).tolist()
-        return [
-            Motion(
-                height,
-                velocity,
-                strut.force_n(height, velocity, memory, surroundings, memory_rates),
-            )
-            for strut, height, velocity in zip(self._struts, heights, velocities, strict=True)
-        ]
+    ) -> list[float]:
+        """Force of every strut, without the virtual one."""
+        forces: list[float] = []
+        for strut, (height, velocity) in zip(self._struts, kinematics, strict=True):
+            forces.append(strut.force_n(height, velocity, memory, surroundings, memory_rates))
+        return forces
 
-    def _respond(
-        self,
-        q: NDArray[np.float64],
-        v: NDArray[np.float64],
-        rows: "_Rows",
-        forces_n: Sequence[float],
-        applied_n: float,
-    ) -> NDArray[np.float64]:
-        push = np.array(forces_n) @ rows.struts + applied_n * rows.applied
-        skeleton = self._skeleton
-        skeleton.setPositions(q)
-        skeleton.setVelocities(v)
-        skeleton.setForces(push)
-        skeleton.computeForwardDynamics()
-        return np.array(skeleton.getAccelerations())
+    def _respond(self, q: list[float], v: list[float], push: list[float]) -> list[float]:
+        """DART's acceleration; position, velocity and force number by number.
+
+        DART's functions for arrays cost as much as six or more of those for one number.
+        """
+        for index, (put_position, put_velocity, put_force) in enumerate(self._put):
+            put_position(q[index])
+            put_velocity(v[index])
+            put_force(push[index])
+        self._solve()
+        return [get() for get in self._get]
 
     def _turning(self, q: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
         """Time derivative of the struts' rows."""
@@ -558,11 +585,11 @@ class DartPlant:
         joints, memory = self._joints, state.memory
         rates = [0.0] * len(memory)
         q, v = joints.values(state)
-        motions, held, acceleration, of_struts = joints.load(
+        motions, held, acceleration = joints.load(
             q, v, virtual_forces_n, memory, (state.t_s, applied_force_n, temperature_c), rates
         )
         return Loaded(
-            state, motions, of_struts, held, applied_force_n, temperature_c, acceleration, rates
+            state, motions, applied_force_n, temperature_c, held, q, v, acceleration, rates
         )
 
     def step(self, loaded: Loaded, dt_s: float, applied_force_end_n: float) -> PlantState:
@@ -576,25 +603,19 @@ class DartPlant:
         Returns:
             State at the end.
         """
-        state, count = loaded.state, 1
+        count, h = 1, dt_s
         if dt_s > self._longest_s:
             count = min(math.ceil(dt_s / self._longest_s), _MAX_SUBSTEPS)
-        h = dt_s / count
+            h = dt_s / count
         half, sixth = 0.5 * h, h / 6.0
-        joints, moved, acceleration = self._joints, self._moved, self._acceleration
-        q, v = joints.values(state)
-        memory, t_s = state.memory, state.t_s
-        held, temperature_c = loaded.held, loaded.temperature_c
-        applied = loaded.applied_force_n
+        moved, acceleration = self._moved, self._acceleration
+        memory, t_s = loaded.state.memory, loaded.state.t_s
+        held, temperature_c, applied = loaded.held, loaded.temperature_c, loaded.applied_force_n
         half_rise = 0.5 * (applied_force_end_n - applied) / count
-        a1, s1 = loaded.acceleration, loaded.memory_rates
-        for index in range(count):
-            if index > 0:
-                s1 = [0.0] * len(memory)
-                a1 = acceleration(q, v, held, memory, (t_s, applied, temperature_c), s1)
+        q, v, a1, s1 = loaded.position, loaded.velocity, loaded.acceleration, loaded.memory_rates
+        while True:
             # Kutta's third-order method, in which the stages' velocities drive the positions.
-            m2 = m3 = memory
-            s2 = s3 = s1
+            m2, s2, m3, s3 = memory, s1, memory, s1
             if memory:
                 s2, s3 = [0.0] * len(memory), [0.0] * len(memory)
                 m2 = _advanced(memory, half, s1)
@@ -613,13 +634,12 @@ class DartPlant:
             q = moved(q, mean, h) if moved else q + h * mean
             v = v + sixth * (a1 + 4.0 * a2 + a3)
             if memory:
-                memory = tuple(
-                    [
-                        m + sixth * (a + 4.0 * b + c)
-                        for m, a, b, c in zip(memory, s1, s2, s3, strict=True)
-                    ]
-                )
-        return joints.state(q, v, memory, t_s)
+                memory = _summed(memory, sixth, s1, s2, s3)
+            count -= 1
+            if count == 0:
+                return self._joints.state(q, v, memory, t_s)
+            s1 = [0.0] * len(memory)
+            a1 = acceleration(q, v, held, memory, now, s1)
 
     def motions(
         self, state: PlantState, applied_force_n: float, temperature_c: float
@@ -646,6 +666,45 @@ class DartPlant:
         return GuidedModel(
             mass, gravity, self._rows.struts, self._rows.offsets_m, self._rows.applied
         )
+
+    def driven(
+        self,
+        height_m: float,
+        velocity_m_per_s: float,
+        acceleration_m_per_s2: float,
+        memory: tuple[float, ...],
+        t_s: float,
+        temperature_c: float,
+    ) -> "Driven":
+        """The model's only strut moved as on a dyno, whatever forces that takes.
+
+        Args:
+            height_m: Imposed height.
+            velocity_m_per_s: Its rate.
+            acceleration_m_per_s2: Its second derivative.
+            memory: Memory of the effects.
+            t_s: Time, for effects that depend on it.
+            temperature_c: Damper temperature.
+
+        Raises:
+            InputError: The model has more than one strut or coordinate.
+        """
+        rows = self._rows
+        if rows is None or rows.struts.shape != (1, 1):
+            raise InputError(
+                f"model {self.spec.name}: {len(self._struts)} struts, {self.coordinates} "
+                "coordinates: expected one of each, on a straight guide, for an imposed motion"
+            )
+        row = float(rows.struts[0, 0])
+        rates = [0.0] * len(memory)
+        surroundings = (t_s, 0.0, temperature_c)
+        force = self._struts[0].force_n(height_m, velocity_m_per_s, memory, surroundings, rates)
+        dof = self._skeleton.getDof(0)
+        dof.setPosition((height_m - float(rows.offsets_m[0])) / row)
+        dof.setVelocity(velocity_m_per_s / row)
+        dof.setAcceleration(acceleration_m_per_s2 / row)
+        self._skeleton.computeInverseDynamics()
+        return Driven(force, float(dof.getForce()) / row - force, rates)
 
     def _constant_rows(self) -> "_Rows | None":
         """The struts' rows if they are the same in every configuration, else None."""
@@ -688,8 +747,57 @@ class _Rows(NamedTuple):
     applied: NDArray[np.float64]
 
 
+class _Lists(NamedTuple):
+    """`_Rows` in the form that is read fastest, with the transpose of `struts`."""
+
+    offsets_m: list[float]
+    struts: list[list[float]]
+    columns: list[list[float]]
+    applied: list[float]
+
+
+def _as_lists(rows: _Rows) -> _Lists:
+    struts = rows.struts
+    return _Lists(
+        rows.offsets_m.tolist(), struts.tolist(), struts.T.tolist(), rows.applied.tolist()
+    )
+
+
+def _dot(a: list[float], b: list[float]) -> float:
+    return sum(map(mul, a, b))
+
+
+def _kinematics(
+    rows: _Lists, position: list[float], velocity: list[float]
+) -> list[tuple[float, float]]:
+    """Height and velocity of every strut."""
+    return [
+        (offset + _dot(row, position), _dot(row, velocity))
+        for offset, row in zip(rows.offsets_m, rows.struts, strict=True)
+    ]
+
+
+def _push(
+    rows: _Lists, forces_n: list[float], virtual_forces_n: Sequence[float], applied_n: float
+) -> list[float]:
+    """Force on every coordinate."""
+    total = list(map(add, forces_n, virtual_forces_n))
+    return [
+        _dot(column, total) + share * applied_n
+        for column, share in zip(rows.columns, rows.applied, strict=True)
+    ]
+
+
 def _advanced(memory: tuple[float, ...], h: float, rates: list[float]) -> tuple[float, ...]:
     return tuple([m + h * rate for m, rate in zip(memory, rates, strict=True)])
+
+
+def _summed(
+    memory: tuple[float, ...], sixth: float, s1: list[float], s2: list[float], s3: list[float]
+) -> tuple[float, ...]:
+    """Memory at the end of a step."""
+    stages = zip(memory, s1, s2, s3, strict=True)
+    return tuple([m + sixth * (a + 4.0 * b + c) for m, a, b, c in stages])
 
 
 def _struts(spec: ModelSpec) -> tuple[_Strut, ...]:

@@ -141,7 +141,6 @@ class RigCore:
         for index, motion in enumerate(loaded.motions):
             observer = observers[index]
             virtual_n = observer.virtual_force_n
-            acceleration = loaded.accelerations_m_per_s2[index]
             force_n = motion.force_n + virtual_n
             total += force_n + motion.height_m + motion.velocity_m_per_s
             published.append(
@@ -151,7 +150,7 @@ class RigCore:
                     valid,
                     motion.height_m,
                     motion.velocity_m_per_s,
-                    acceleration,
+                    motion.acceleration_m_per_s2,
                     observer.innovation_m,
                 )
             )

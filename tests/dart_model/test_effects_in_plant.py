@@ -69,7 +69,7 @@ def test_no_effect_changes_nothing():
 def accelerations(plant: DartPlant, heights: tuple[float, ...], applied_n: float) -> list[float]:
     without = (0.0,) * len(heights)
     loaded = plant.load(plant.initial(heights), without, applied_n, AMBIENT_C)
-    return list(loaded.accelerations_m_per_s2)
+    return [motion.acceleration_m_per_s2 for motion in loaded.motions]
 
 
 def test_an_added_mass_has_inertia_and_weight():
