@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,10 +39,12 @@ from rig.identify.evaluate import (
     smoothed_motion,
     strut_forces,
 )
+from rig.identify.imposed import diagnose_imposed, is_imposed
 from rig.identify.output_error import Fit, intervals
 from rig.identify.records import Record, RecordError
 from rig.identify.reduced import Grid, Model, grid_of, planted, reduced_model, start_of
 from rig.identify.report import FittedSeries, HeldOutSeries, Ranked, sentence
+from rig.identify.result import Result
 
 Array = NDArray[np.float64]
 
@@ -52,26 +53,6 @@ _WHITE = 0.1
 _IMPLAUSIBLE = 5.0
 _EXPLAINED = 0.25
 _LONGEST_DURATION_S = 600.0
-
-
-class Result(NamedTuple):
-    """All that a diagnosis gives.
-
-    Attributes:
-        diagnosis: What was found.
-        corrected: The corrected model.
-        fitted: Missing force along the runs that were learnt from, for the report.
-        held_out: Heights along the held-out runs, for the report.
-        ranking: Candidates, best first, for the report.
-        assumptions: What this diagnosis took for granted.
-    """
-
-    diagnosis: Diagnosis
-    corrected: ModelSpec
-    fitted: tuple[FittedSeries, ...]
-    held_out: tuple[HeldOutSeries, ...]
-    ranking: tuple[Ranked, ...]
-    assumptions: tuple[str, ...]
 
 
 def _quiet(_what: str, _share: float) -> None:
@@ -97,6 +78,8 @@ def diagnose(
     """
     if not runs:
         raise RecordError("no run given, expected at least one")
+    if is_imposed((*runs, *held_out)):
+        return diagnose_imposed(spec, runs, held_out, progress)
     model = reduced_model(spec)
     for record in (*runs, *held_out):
         _check_fits(record, model)
@@ -127,11 +110,6 @@ def _check_fits(record: Record, model: Model) -> None:
         raise RecordError(
             f"{record.name}: {record.heights_m.shape[1]} heights, model {model.spec.name} has "
             f"{struts} struts, expected one height for each"
-        )
-    if record.applied_force_n is None:
-        raise RecordError(
-            f"{record.name}: no applied_force_n, expected one: with strut_force_n alone the motion "
-            "is imposed and says nothing of the model's own motion"
         )
     if record.duration_s > _LONGEST_DURATION_S:
         raise RecordError(

@@ -32,6 +32,7 @@ class Motion(NamedTuple):
         temperatures_c: Lowest and highest temperature; equal where none was measured.
         tones: Frequency (Hz) and phase (rad) of the strongest lines of the missing force.
         mass_kg: Mass that the strut moves.
+        least_stroke_m: Stroke of the run with the smallest one; the whole stroke if zero.
     """
 
     z: Array
@@ -43,6 +44,7 @@ class Motion(NamedTuple):
     temperatures_c: tuple[float, float]
     tones: tuple[tuple[float, float], ...]
     mass_kg: float
+    least_stroke_m: float = 0.0
 
     @property
     def low(self) -> float:
@@ -58,6 +60,11 @@ class Motion(NamedTuple):
     def stroke(self) -> float:
         """Highest less lowest height."""
         return self.high - self.low
+
+    @property
+    def least_stroke(self) -> float:
+        """Stroke of the run with the smallest one."""
+        return self.least_stroke_m or self.stroke
 
     @property
     def speed(self) -> float:
@@ -298,7 +305,7 @@ def _narrower(name: str, key: str, m: Motion) -> tuple[float, float] | None:
     if key == "stribeck_velocity_m_per_s":
         return 1e-3, max(2e-3, m.speed)
     if key == "yield_displacement_m":
-        return 0.012 * m.stroke, 3.0 * m.stroke
+        return 0.012 * m.least_stroke, 3.0 * m.stroke
     if key == "knee_velocity_m_per_s":
         return max(1e-3, 0.08 * m.speed), max(2e-3, 6.0 * m.speed)
     if key == "width_m":

@@ -2,6 +2,7 @@
 
 from rig.identify.report.inputs import (
     FittedSeries,
+    HeldOutForce,
     HeldOutSeries,
     Ranked,
     ReportError,
@@ -12,6 +13,7 @@ from rig.identify.report.words import sentence
 
 __all__ = [
     "FittedSeries",
+    "HeldOutForce",
     "HeldOutSeries",
     "Ranked",
     "ReportError",

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from plotly import graph_objects, subplots
 
-from rig.identify.report.inputs import Array, FittedSeries, HeldOutSeries
+from rig.identify.report.inputs import Array, FittedSeries, HeldOutForce, HeldOutSeries
 from rig.identify.report.series import Joined, cloud, envelope, excerpt, join, spectrum, surface
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers and in grey print.
@@ -213,6 +213,88 @@ def held_out_plot(
         _json(figure, height_px),
         height_px,
     )
+
+
+def held_out_force_plot(
+    key: str,
+    series: Sequence[HeldOutForce],
+    floor_n: float,
+    shown: Sequence[_Curve],
+    points: int,
+) -> Plot:
+    """Forces along held-out imposed motions: over velocity and height, over time, and their errors.
+
+    Args:
+        key: Unique name in the page.
+        series: One strut along all held-out runs.
+        floor_n: Noise floor of the force, RMS.
+        shown: Curves, from `curves`.
+        points: Points of a line.
+    """
+    figure = cast("Any", subplots).make_subplots(
+        rows=3, cols=2, horizontal_spacing=0.11, vertical_spacing=0.12,
+        specs=[[{}, {}], [{"colspan": 2}, None], [{"colspan": 2}, None]],
+    )  # fmt: skip
+    worst = max(series, key=lambda item: _largest(item.force_before_n - item.force_n))
+    part = excerpt(worst)
+    loops = (
+        ("velocity / m/s", worst.velocity_m_per_s[part], 1),
+        ("height / mm", 1e3 * worst.height_m[part], 2),
+    )
+    for title, against, column in loops:
+        _forces(figure, worst, part, against, shown, points, (1, column))
+        figure.update_xaxes(title_text=title, row=1, col=column)
+    _forces(figure, worst, part, worst.t_s[part], shown, points, (2, 1))
+    figure.update_xaxes(title_text="time / s", row=2, col=1)
+    joined = join(
+        series,
+        [
+            np.column_stack([item.force_before_n, item.force_after_n]) - item.force_n[:, np.newaxis]
+            for item in series
+        ],
+    )
+    for index, curve in enumerate(shown):
+        style = {"color": curve.colour, "width": 1.1}
+        values = joined.values[:, index]
+        _line(figure, joined.t_s, values, curve.name, style, points, (3, 1), legend=False)
+    _run_marks(figure, joined, 3, _LONGEST_MARK)
+    _band(figure, _WIDE_SIGMA * floor_n, 3, 1)
+    figure.update_yaxes(title_text="force error / N", row=3, col=1)
+    figure.update_xaxes(title_text=_time_title(joined), row=3, col=1)
+    _band_legend(figure, _FLOOR_BAND)
+    return Plot(
+        key,
+        "Held-out data: force along the imposed motion",
+        "Load cell and model, driven along motions that had no part in the choice. First a few "
+        f"periods of “{worst.run}” where the model as given errs most, over velocity, height and "
+        "time, then the error (model less load cell) over all held-out data. A loop over velocity "
+        "is memory or a spring, a loop over height is what the damper dissipates.",
+        _json(figure, 860),
+        860,
+    )
+
+
+def _forces(
+    figure: Any,
+    run: HeldOutForce,
+    part: slice,
+    against: Array,
+    shown: Sequence[_Curve],
+    points: int,
+    panel: tuple[int, int],
+) -> None:
+    legend = panel == (1, 1)
+    measured: dict[str, object] = {"color": _MEASURED, "width": 3.2}
+    every = max(1, len(against) // points)
+    thin = slice(None, None, every)
+    x, force = against[thin], run.force_n[part][thin]
+    _line(figure, x, force, "measured", measured, len(x), panel, legend=legend)
+    for curve, model_n, dash in zip(
+        shown, (run.force_before_n, run.force_after_n), ("solid", "dot"), strict=False
+    ):
+        style = {"color": curve.colour, "width": 1.6, "dash": dash}
+        _line(figure, x, model_n[part][thin], curve.name, style, len(x), panel, legend=legend)
+    figure.update_yaxes(title_text="strut force / N", row=panel[0], col=panel[1])
 
 
 def _heights(figure: Any, run: HeldOutSeries, shown: Sequence[_Curve], points: int) -> None:

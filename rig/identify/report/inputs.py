@@ -1,6 +1,6 @@
 """What a report is written from."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,31 @@ class HeldOutSeries:
 
 
 @dataclass(frozen=True)
+class HeldOutForce:
+    """Strut force along one run with an imposed motion that was not fitted; arrays of shape (N,).
+
+    Attributes:
+        run: Name of the run.
+        strut: Name of the strut.
+        t_s: Times in s, increasing.
+        height_m: Measured height; NaN where a sample is missing.
+        velocity_m_per_s: Smoothed velocity.
+        force_n: Load cell.
+        force_before_n: The model as given, driven along the motion.
+        force_after_n: The corrected model, driven along the motion.
+    """
+
+    run: str
+    strut: str
+    t_s: Array
+    height_m: Array
+    velocity_m_per_s: Array
+    force_n: Array
+    force_before_n: Array
+    force_after_n: Array
+
+
+@dataclass(frozen=True)
 class Ranked:
     """A candidate in the ranking.
 
@@ -87,7 +112,8 @@ class ReportInput:
     Attributes:
         diagnosis: What was found.
         fitted: Series of every strut along the fitted runs.
-        held_out: Series of every strut along the held-out runs.
+        held_out: Series of every strut along the held-out runs: heights, or forces where the
+            motion is imposed.
         ranking: Every candidate, best first.
         assumptions: Whole sentences on what this diagnosis took for granted, beside those that
             hold for every diagnosis.
@@ -95,12 +121,12 @@ class ReportInput:
 
     diagnosis: Diagnosis
     fitted: tuple[FittedSeries, ...]
-    held_out: tuple[HeldOutSeries, ...]
+    held_out: tuple[HeldOutSeries, ...] | tuple[HeldOutForce, ...]
     ranking: tuple[Ranked, ...]
     assumptions: tuple[str, ...] = ()
 
 
-def check_series(series: FittedSeries | HeldOutSeries) -> None:
+def check_series(series: FittedSeries | HeldOutSeries | HeldOutForce) -> None:
     """Check that the arrays of a series belong together.
 
     Raises:
@@ -117,17 +143,12 @@ def check_series(series: FittedSeries | HeldOutSeries) -> None:
             raise ReportError(f"{where}: {name}: shape {value.shape}, expected {shape}")
 
 
-def _arrays(series: FittedSeries | HeldOutSeries) -> tuple[tuple[str, Array], ...]:
-    if isinstance(series, FittedSeries):
-        return (
-            ("height_m", series.height_m),
-            ("velocity_m_per_s", series.velocity_m_per_s),
-            ("residual_before_n", series.residual_before_n),
-            ("residual_after_n", series.residual_after_n),
-            ("residual_std_n", series.residual_std_n),
-        )
-    return (
-        ("height_m", series.height_m),
-        ("height_before_m", series.height_before_m),
-        ("height_after_m", series.height_after_m),
+def _arrays(
+    series: FittedSeries | HeldOutSeries | HeldOutForce,
+) -> tuple[tuple[str, Array], ...]:
+    arrays = (
+        (field.name, getattr(series, field.name))
+        for field in fields(series)
+        if field.name not in ("run", "strut", "t_s")
     )
+    return tuple((name, np.asarray(value)) for name, value in arrays)

@@ -14,6 +14,7 @@ from rig.identify.report import tables
 from rig.identify.report.figures import (
     Plot,
     curves,
+    held_out_force_plot,
     held_out_plot,
     left_plot,
     residual_plot,
@@ -21,6 +22,7 @@ from rig.identify.report.figures import (
 )
 from rig.identify.report.inputs import (
     FittedSeries,
+    HeldOutForce,
     HeldOutSeries,
     ReportInput,
     check_series,
@@ -49,6 +51,9 @@ _ASSUMPTIONS = (
     "The sensor's noise is not told but estimated from the data, and taken as white; the noise "
     "floor is what it alone would leave.",
     "95 % intervals hold if the law that is named is the right one.",
+)
+
+_OF_A_FREE_MOTION = (
     "Held-out data had no part in choosing or fitting; the open-loop height has the applied force "
     "as its only input, so nothing pulls the model back to the measurement.",
 )
@@ -111,7 +116,7 @@ def page(report: ReportInput) -> str:
         rivals=tables.rivals(found),
         nearest=None if rival is None else effect_words(rival.name),
         nearest_why="" if rival is None else rival.why.rstrip("."),
-        assumptions=(*_ASSUMPTIONS, *report.assumptions),
+        assumptions=(*_ASSUMPTIONS, *_of_motion(report), *report.assumptions),
         style=(_HERE / "page.css").read_text("utf-8"),
         plotly_script=plotly_script,
         own_script=own_script,
@@ -119,12 +124,17 @@ def page(report: ReportInput) -> str:
     )
 
 
+def _of_motion(report: ReportInput) -> tuple[str, ...]:
+    imposed = any(isinstance(item, HeldOutForce) for item in report.held_out)
+    return () if imposed else _OF_A_FREE_MOTION
+
+
 def _hash(script: str) -> str:
     digest = hashlib.sha256(script.encode("utf-8")).digest()
     return f"sha256-{base64.b64encode(digest).decode('ascii')}"
 
 
-def _names(series: Sequence[FittedSeries | HeldOutSeries]) -> tuple[str, ...]:
+def _names(series: Sequence[FittedSeries | HeldOutSeries | HeldOutForce]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(item.run for item in series))
 
 
@@ -136,14 +146,19 @@ def _plots(report: ReportInput, struts: Sequence[str]) -> tuple[_StrutPlots, ...
     points = max(min(_POINTS, _POINTS_OF_ALL // max(len(struts), 1)), _FEWEST_POINTS)
     corrected = bool(report.diagnosis.effects)
     shown = curves(corrected=corrected)
-    floor_m = report.diagnosis.noise_floor.height_rmse_m
+    floor = report.diagnosis.noise_floor
+    floor_m, floor_n = floor.height_rmse_m, floor.residual_force_rmse_n
     groups: list[_StrutPlots] = []
     for index, strut in enumerate(struts):
         fitted = [item for item in report.fitted if item.strut == strut]
         held_out = [item for item in report.held_out if item.strut == strut]
+        heights = [item for item in held_out if isinstance(item, HeldOutSeries)]
+        forces = [item for item in held_out if isinstance(item, HeldOutForce)]
         plots: list[Plot | None] = []
-        if held_out:
-            plots.append(held_out_plot(f"held-out-{index}", held_out, floor_m, shown, points))
+        if heights:
+            plots.append(held_out_plot(f"held-out-{index}", heights, floor_m, shown, points))
+        if forces:
+            plots.append(held_out_force_plot(f"held-out-{index}", forces, floor_n, shown, points))
         if fitted:
             plots.append(residual_plot(f"residual-{index}", fitted, shown, points))
             if corrected:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal, stats
 
-from rig.identify.report.inputs import Array, FittedSeries, HeldOutSeries
+from rig.identify.report.inputs import Array, FittedSeries, HeldOutForce, HeldOutSeries
 
 Indices = NDArray[np.intp]
 
@@ -70,7 +70,9 @@ class Surface(NamedTuple):
     least_count: int
 
 
-def join(series: Sequence[FittedSeries | HeldOutSeries], columns: Sequence[Array]) -> Joined:
+def join(
+    series: Sequence[FittedSeries | HeldOutSeries | HeldOutForce], columns: Sequence[Array]
+) -> Joined:
     """Lay runs one after another; a single run keeps its own times.
 
     Args:
@@ -102,7 +104,7 @@ def envelope(values: Array, limit: int) -> Indices:
     count = len(values)
     if count <= limit:
         return np.arange(count)
-    size = -(-2 * count // limit)
+    size = -(-count // max(limit // 2, 1))
     rows = -(-count // size)
     padded = np.full(rows * size, np.nan)
     padded[:count] = values
@@ -199,9 +201,12 @@ def surface(series: Sequence[FittedSeries]) -> Surface | None:
     )
 
 
-def excerpt(series: HeldOutSeries) -> slice:
-    """A few periods of a run around the largest open-loop error of the model as given."""
-    error = np.abs(series.height_before_m - series.height_m)
+def excerpt(series: HeldOutSeries | HeldOutForce) -> slice:
+    """A few periods of a run around the largest error of the model as given."""
+    if isinstance(series, HeldOutForce):
+        error = np.abs(series.force_before_n - series.force_n)
+    else:
+        error = np.abs(series.height_before_m - series.height_m)
     middle = int(np.nanargmax(error)) if np.any(np.isfinite(error)) else 0
     t_s = series.t_s
     length_s = max(_EXCERPT_PERIODS * _period_s(series), _LEAST_EXCERPT_S)
@@ -210,7 +215,7 @@ def excerpt(series: HeldOutSeries) -> slice:
     return slice(int(first), int(last) + 1)
 
 
-def _period_s(series: HeldOutSeries) -> float:
+def _period_s(series: HeldOutSeries | HeldOutForce) -> float:
     there = np.isfinite(series.height_m)
     if np.count_nonzero(there) < 2:
         return 0.0
