@@ -39,6 +39,7 @@ class StepInput(Struct, frozen=True, gc=False):
         applied_force_n: New applied force, None where no frame came.
         temperature_c: New damper temperature, None where no frame came.
         acknowledged: Somebody acknowledged the safe state.
+        load_cell_force_n: New load-cell force, None where no frame came.
     """
 
     t_ns: int
@@ -46,6 +47,7 @@ class StepInput(Struct, frozen=True, gc=False):
     applied_force_n: float | None = None
     temperature_c: float | None = None
     acknowledged: bool = False
+    load_cell_force_n: float | None = None
 
 
 class ObserverState(Struct, frozen=True, gc=False):
