@@ -146,6 +146,9 @@ _Acceleration = Callable[
 """Position, velocity, held forces, memory, surroundings -> acceleration; writes memory rates."""
 
 
+_Put = Callable[[float], None]
+
+
 class _Strut:
     """A strut ready to be evaluated: constants and laws in the form that is read fastest."""
 
@@ -175,10 +178,14 @@ class _Strut:
         memory_rates: list[float],
     ) -> float:
         """Force of spring, damper and effects; arguments as of `effects_n`."""
-        force = self.stiffness * (self.free_length - height_m) - self.damping * velocity_m_per_s
+        force = self.plain_n(height_m, velocity_m_per_s)
         if self.laws:
             force += self.effects_n(height_m, velocity_m_per_s, memory, surroundings, memory_rates)
         return force
+
+    def plain_n(self, height_m: float, velocity_m_per_s: float) -> float:
+        """Force of spring and damper."""
+        return self.stiffness * (self.free_length - height_m) - self.damping * velocity_m_per_s
 
     def effects_n(
         self,
@@ -282,8 +289,11 @@ class _Coordinate:
             (index, strut, float(offset), float(row)) for index, strut, offset, row in numbered
         ]
         self._applied_row = float(rows.applied[0])
-        self._respond = _response(skeleton)
-        self.acceleration = self._acceleration()
+        self._without_effects = self._plain_acceleration(skeleton)
+        with_effects = any(strut.laws for strut in struts)
+        self.acceleration: _Acceleration = (
+            self._acceleration_with_effects if with_effects else self._without_effects
+        )
 
     def values(self, state: PlantState) -> tuple[float, float]:
         return state.positions[0], state.velocities[0]
@@ -310,68 +320,73 @@ class _Coordinate:
         memory_rates: list[float],
     ) -> tuple[list[Motion], float, float]:
         forces: list[float] = []
-        held = own = 0.0
+        held = of_effects = 0.0
         for index, strut, offset, row in self._struts:
-            force = strut.force_n(offset + row * q, row * v, memory, surroundings, memory_rates)
+            height, velocity = offset + row * q, row * v
+            force = strut.plain_n(height, velocity)
+            if strut.laws:
+                effects = strut.effects_n(height, velocity, memory, surroundings, memory_rates)
+                of_effects += row * effects
+                force += effects
             forces.append(force)
-            own += row * force
             held += row * virtual_forces_n[index]
-        acceleration = self._respond(q, v, own + held + self._applied_row * surroundings[1])
+        acceleration = self._without_effects(
+            q, v, held + of_effects, memory, surroundings, memory_rates
+        )
         motions: list[Motion] = []
         for index, _, offset, row in self._struts:
             motion = Motion(offset + row * q, row * v, forces[index], row * acceleration)
             motions.append(motion)
         return motions, held, acceleration
 
-    def _acceleration(self) -> "_Acceleration":
-        # Springs and dampers of all struts are summed up once: this is called twice a tick.
+    def _acceleration_with_effects(
+        self,
+        q: float,
+        v: float,
+        held: float,
+        memory: Sequence[float],
+        surroundings: _Surroundings,
+        memory_rates: list[float],
+    ) -> float:
+        for _, strut, offset, row in self._struts:
+            if strut.laws:
+                held += row * strut.effects_n(
+                    offset + row * q, row * v, memory, surroundings, memory_rates
+                )
+        return self._without_effects(q, v, held, memory, surroundings, memory_rates)
+
+    def _plain_acceleration(self, skeleton: Any) -> "_Acceleration":
+        """DART's acceleration under springs, dampers, what is held, and the applied force."""
+        # A closure over locals, as it is called three times a tick. The springs and dampers of all
+        # struts are summed up once.
         preload = stiffness = damping = 0.0
         for _, strut, offset, row in self._struts:
-            preload += row * strut.stiffness * (strut.free_length - offset)
+            preload += row * strut.plain_n(offset, 0.0)
             stiffness += row * strut.stiffness * row
             damping += row * strut.damping * row
-        with_effects = [entry for entry in self._struts if entry[1].laws]
-        respond, applied_row = self._respond, self._applied_row
+        applied_row = self._applied_row
+        dof = skeleton.getDof(0)
+        put_position: _Put = dof.setPosition
+        put_velocity: _Put = dof.setVelocity
+        put_force: _Put = dof.setForce
+        get_acceleration: Callable[[], float] = dof.getAcceleration
+        solve: Callable[[], None] = skeleton.computeForwardDynamics
 
         def acceleration(
             q: float,
             v: float,
             held: float,
-            memory: Sequence[float],
+            _memory: Sequence[float],
             surroundings: _Surroundings,
-            memory_rates: list[float],
+            _memory_rates: list[float],
         ) -> float:
-            push = preload + held - stiffness * q - damping * v + applied_row * surroundings[1]
-            for _, strut, offset, row in with_effects:
-                push += row * strut.effects_n(
-                    offset + row * q, row * v, memory, surroundings, memory_rates
-                )
-            return respond(q, v, push)
+            put_position(q)
+            put_velocity(v)
+            put_force(preload + held - stiffness * q - damping * v + applied_row * surroundings[1])
+            solve()
+            return get_acceleration()
 
         return acceleration
-
-
-def _response(skeleton: Any) -> Callable[[float, float, float], float]:
-    """DART's answer for one coordinate: position, velocity, force -> acceleration."""
-    # A closure over locals: it is called three times a tick, and attributes cost.
-    dof = skeleton.getDof(0)
-    put_position: Callable[[float], None] = dof.setPosition
-    put_velocity: Callable[[float], None] = dof.setVelocity
-    put_force: Callable[[float], None] = dof.setForce
-    get_acceleration: Callable[[], float] = dof.getAcceleration
-    solve: Callable[[], None] = skeleton.computeForwardDynamics
-
-    def respond(q: float, v: float, push: float) -> float:
-        put_position(q)
-        put_velocity(v)
-        put_force(push)
-        solve()
-        return get_acceleration()
-
-    return respond
-
-
-_Put = Callable[[float], None]
 
 
 class _Coordinates:

@@ -111,11 +111,19 @@ class Bridge:
         limits: Sequence[Limit] = (),
     ) -> None:
         self._core = core
+        self._struts = core.struts
         self._measured_limits = tuple(item for item in limits if item.watched.is_measured)
         self._limits = tuple(item for item in limits if not item.watched.is_measured)
         self._incoming = tuple(incoming)
-        self._outgoing = tuple(outgoing)
-        self._places = [[self._place(target) for target in item.targets] for item in incoming]
+        # Numbered once: to count along costs as much as to make two small objects.
+        self._outgoing = tuple(enumerate(outgoing))
+        self._places = [
+            [(number, self._place(target)) for number, target in enumerate(item.targets)]
+            for item in incoming
+        ]
+        self._has_height = [
+            any(place < core.struts for _, place in places) for places in self._places
+        ]
         # What came in a tick: the struts' heights, then the others in the order of `_OTHERS`.
         self._nothing: list[Any] = [None] * (core.struts + len(_OTHERS))
         self._index = {
@@ -144,7 +152,7 @@ class Bridge:
     @property
     def struts(self) -> int:
         """Number of struts."""
-        return self._core.struts
+        return self._struts
 
     def init(self, t_ns: int) -> BridgeState:
         """State before the first tick."""
@@ -157,7 +165,7 @@ class Bridge:
             (t_ns,) * count,
             Counts(),
             Counts(),
-            (None,) * self._core.struts,
+            (None,) * self._struts,
             (Strays(),) * len(self._incoming),
         )
 
@@ -197,19 +205,32 @@ class Bridge:
                 limited=counts.limited + (action > 0),
                 bus_faulty=counts.bus_faulty + conditions.bus_fault,
             )
+        told, counters, due_ns = state.told, list(state.counters), list(state.due_ns)
+        sent: list[Frame] = []
+        if output.struts:  # nothing is sent before the first valid measurement
+            for index, item in self._outgoing:
+                if t_ns < due_ns[index]:
+                    continue
+                report = Report(output, counts, told, conditions, counters[index])
+                frame, saturated = _encoded(item, report, t_ns)
+                sent.append(frame)
+                counters[index] += 1
+                due_ns[index] = _next_due_ns(due_ns[index], t_ns, item.period_ns)
+                if item.is_status:
+                    # A status that cannot be sent tells nobody.
+                    told = told if conditions.bus_fault else counts
+                elif saturated:
+                    counts = counts._replace(saturated=counts.saturated + 1)
         state = BridgeState(
             rig,
-            sequences,
-            state.counters,
-            state.due_ns,
+            tuple(sequences),
+            tuple(counters),
+            tuple(due_ns),
             counts,
-            state.told,
+            told,
             seen,
             strays,
         )
-        if not output.struts:
-            return state, TickResult([], step_input, output)
-        state, sent = self._sent(state, t_ns, output, conditions)
         return state, TickResult(sent, step_input, output)
 
     def _gathered(
@@ -229,25 +250,23 @@ class Bridge:
         Returns:
             The core after all measurements that newer ones followed, and the input that is left.
         """
-        struts, places = self._core.struts, self._places
-        given = self._nothing.copy()
-        measured: list[int] = []
+        struts, given = self._struts, self._nothing.copy()
         for index, arrived_ns, values in accepted:
-            if index in measured:
+            places = self._places[index]
+            if self._has_height[index] and given[places[0][1]] is not None:
                 rig = self._caught_up(rig, given)
-                given, measured = self._nothing.copy(), []
-            for number, place in enumerate(places[index]):
+                given = self._nothing.copy()
+            for number, place in places:
                 value = values[number]
-                if place < struts:
-                    given[place] = Measurement(value, min(arrived_ns, t_ns))
-                    measured.append(index)
-                else:
+                if place >= struts:
                     given[place] = value
+                else:
+                    given[place] = Measurement(value, arrived_ns if arrived_ns < t_ns else t_ns)
         heights = tuple(given[:struts])
         return rig, StepInput(t_ns, heights, given[struts], given[struts + 1], acknowledged)
 
     def _caught_up(self, rig: RigState, given: list[Any]) -> RigState:
-        struts = self._core.struts
+        struts = self._struts
         heights = tuple(given[:struts])
         t_ns = max(rig.t_ns, *[item.t_ns for item in heights if item])
         step_input = StepInput(t_ns, heights, given[struts], given[struts + 1])
@@ -255,7 +274,7 @@ class Bridge:
 
     def _received(
         self, state: BridgeState, frames: Sequence[Frame]
-    ) -> tuple[list[Accepted], tuple[SequenceState, ...], Counts, tuple[Strays, ...]]:
+    ) -> tuple[list[Accepted], list[SequenceState], Counts, tuple[Strays, ...]]:
         """What the frames of a tick are worth."""
         counts, sequences, strays = state.counts, list(state.sequences), state.strays
         accepted: list[Accepted] = []
@@ -273,7 +292,7 @@ class Bridge:
                     counts = counts._replace(second_sender=counts.second_sender + rival)
             if values:
                 accepted.append((index, frame.t_ns, values))
-        return accepted, tuple(sequences), counts, strays
+        return accepted, sequences, counts, strays
 
     def _foreign(self, counts: Counts, frame: Frame) -> Counts:
         """Counts after a frame of no incoming message: error frames, or somebody under our ids."""
@@ -300,9 +319,9 @@ class Bridge:
         for item in accepted:
             index, arrived_ns, values = item
             after, action = list(seen), 0
-            for place, value in zip(self._places[index], values, strict=True):
+            for number, place in self._places[index]:
                 if place < len(seen):
-                    measured = Measurement(value, arrived_ns)
+                    measured = Measurement(values[number], arrived_ns)
                     after[place], asked = judged(self._measured_limits, seen[place], measured)
                     action = max(action, asked)
             gravest = max(gravest, action)
@@ -326,7 +345,7 @@ class Bridge:
         mode = next_mode(rig.mode, event)
         if mode is Mode.SAFE and rig.mode is not Mode.SAFE:
             rig = replace(rig, mode=mode, last_valid=before.last_valid)
-            rig, output = self._core.step(rig, StepInput(rig.t_ns, (None,) * self._core.struts))
+            rig, output = self._core.step(rig, StepInput(rig.t_ns, (None,) * self._struts))
         elif mode is Mode.HOLD:
             rig = replace(rig, mode=mode, last_valid=before.last_valid)
             struts = tuple([replace(strut, valid=False) for strut in output.struts])
@@ -336,45 +355,17 @@ class Bridge:
     def _place(self, target: Target) -> int:
         if target.quantity is Quantity.HEIGHT:
             return target.strut
-        return self._core.struts + _OTHERS.index(target.quantity)
+        return self._struts + _OTHERS.index(target.quantity)
 
-    def _sent(
-        self, state: BridgeState, t_ns: int, output: StepOutput, conditions: Conditions
-    ) -> tuple[BridgeState, list[Frame]]:
-        """Frames that are due; none before the first valid measurement."""
-        frames: list[Frame] = []
-        counters, due_ns = list(state.counters), list(state.due_ns)
-        counts, told = state.counts, state.told
-        for index, item in enumerate(self._outgoing):
-            if t_ns < due_ns[index]:
-                continue
-            report = Report(output, counts, told, conditions, counters[index])
-            payload, saturated = item.encode(item.values(report))
-            if item.protection is None:
-                data = bytes(payload)
-            else:
-                data = protect(payload, counters[index], item.protection)
-            message = item.message
-            frames.append(
-                Frame(t_ns, message.arbitration_id, data, message.is_extended, message.is_fd)
-            )
-            counters[index] += 1
-            due_ns[index] = _next_due_ns(due_ns[index], t_ns, item.period_ns)
-            if item.is_status:
-                # A status that cannot be sent tells nobody.
-                told = told if conditions.bus_fault else counts
-            elif saturated:
-                counts = counts._replace(saturated=counts.saturated + 1)
-        return BridgeState(
-            state.rig,
-            state.sequences,
-            tuple(counters),
-            tuple(due_ns),
-            counts,
-            told,
-            state.seen,
-            state.strays,
-        ), frames
+
+def _encoded(item: Outgoing, report: Report, t_ns: int) -> tuple[Frame, bool]:
+    """Frame of a message, and whether one of its values saturated."""
+    payload, saturated = item.encode(item.values(report))
+    if item.protection is not None:
+        payload = protect(payload, report.number, item.protection)
+    message = item.message
+    frame = Frame(t_ns, message.arbitration_id, payload, message.is_extended, message.is_fd)
+    return frame, saturated
 
 
 def _next_due_ns(due_ns: int, t_ns: int, period_ns: int) -> int:

@@ -21,7 +21,7 @@ _SENSELESS = 1e12
 """No bench has heights, velocities or forces of this size: the model has diverged."""
 
 # Looking up a member of an enum costs as much as the observer.
-_RUNNING, _WAITING, _SAFE, _FRESH = Mode.RUNNING, Mode.WAITING, Mode.SAFE, Event.FRESH
+_RUNNING, _WAITING, _SAFE = Mode.RUNNING, Mode.WAITING, Mode.SAFE
 
 
 class RigCore:
@@ -46,6 +46,8 @@ class RigCore:
             )
         self._plant = plant
         self._gains = gains
+        # Numbered once: to count along costs as much as to make an object.
+        self._numbered_gains = tuple(enumerate(gains))
         self._supervision = supervision
 
     @property
@@ -68,15 +70,16 @@ class RigCore:
         Returns:
             State after this tick, and what it publishes.
         """
-        if state.mode is _SAFE and step_input.acknowledged:
-            mode = next_mode(state.mode, Event.ACKNOWLEDGED)
+        mode, model = state.mode, state.model
+        if mode is _SAFE and step_input.acknowledged:
+            mode = next_mode(mode, Event.ACKNOWLEDGED)
             state = replace(state, mode=mode, first=(None,) * len(self._gains))
-        if state.mode is _WAITING:
+        if mode is _WAITING:
             return self._try_to_start(state, step_input)
-        if state.model is None or state.mode is _SAFE:
+        if model is None or mode is _SAFE:
             state = replace(state, t_ns=step_input.t_ns)
             return state, self._safe_output(state)
-        return self._observe(state, state.model, step_input)
+        return self._observe(state, model, step_input)
 
     def _try_to_start(self, state: RigState, step_input: StepInput) -> tuple[RigState, StepOutput]:
         """Start the model at rest at the first measured heights, once every strut has one."""
@@ -105,26 +108,33 @@ class RigCore:
         self, state: RigState, loaded: Loaded, step_input: StepInput
     ) -> tuple[RigState, StepOutput]:
         """Advance the model to the tick and correct it with what was measured."""
-        plant, t_ns, heights = self._plant, step_input.t_ns, step_input.heights
-        applied_n = _latest(step_input.applied_force_n, loaded.applied_force_n)
-        temperature_c = _latest(step_input.temperature_c, loaded.temperature_c)
+        plant, t_ns, applied_n = self._plant, step_input.t_ns, step_input.applied_force_n
+        if applied_n is None:
+            applied_n = loaded.applied_force_n
+        temperature_c = step_input.temperature_c
+        if temperature_c is None:
+            temperature_c = loaded.temperature_c
         plant_state = plant.step(loaded, (t_ns - state.t_ns) * 1e-9, applied_n)
+        kinematics = plant.kinematics(plant_state)
         observers: list[ObserverState] = []
+        virtual: list[float] = []
         oldest_ns = t_ns
-        for index, (height_m, velocity_m_per_s) in enumerate(plant.kinematics(plant_state)):
-            observer, measured = state.observers[index], heights[index]
+        for index, gains in self._numbered_gains:
+            observer, measured = state.observers[index], step_input.heights[index]
             if measured is not None:
+                height_m, velocity_m_per_s = kinematics[index]
+                measured_ns = measured.t_ns
                 # The model's height when the measurement was true, to first order.
-                model_m = height_m - velocity_m_per_s * (t_ns - measured.t_ns) * 1e-9
-                innovation_m = measured.height_m - model_m
-                observer = update(self._gains[index], observer, innovation_m, measured.t_ns)
+                model_m = height_m - velocity_m_per_s * (t_ns - measured_ns) * 1e-9
+                observer = update(gains, observer, measured.height_m - model_m, measured_ns)
             observers.append(observer)
-            oldest_ns = min(oldest_ns, observer.measured_ns)
-        virtual = [observer.virtual_force_n for observer in observers]
+            virtual.append(observer.virtual_force_n)
+            if observer.measured_ns < oldest_ns:
+                oldest_ns = observer.measured_ns
         loaded = plant.load(plant_state, virtual, applied_n, temperature_c)
-        mode, event = state.mode, age_event(self._supervision, t_ns - oldest_ns)
-        if mode is not _RUNNING or event is not _FRESH:
-            mode = next_mode(mode, event)
+        mode, age_ns = state.mode, t_ns - oldest_ns
+        if mode is not _RUNNING or age_ns > self._supervision.stale_after_ns:
+            mode = next_mode(mode, age_event(self._supervision, age_ns))
         return self._published(state, t_ns, mode, tuple(observers), loaded)
 
     def _published(
@@ -140,23 +150,23 @@ class RigCore:
         published: list[StrutOutput] = []
         for index, motion in enumerate(loaded.motions):
             observer = observers[index]
-            virtual_n = observer.virtual_force_n
+            virtual_n, height_m = observer.virtual_force_n, motion.height_m
+            velocity_m_per_s = motion.velocity_m_per_s
             force_n = motion.force_n + virtual_n
-            total += force_n + motion.height_m + motion.velocity_m_per_s
-            published.append(
-                StrutOutput(
-                    force_n,
-                    virtual_n,
-                    valid,
-                    motion.height_m,
-                    motion.velocity_m_per_s,
-                    motion.acceleration_m_per_s2,
-                    observer.innovation_m,
-                )
+            total += force_n + height_m + velocity_m_per_s
+            strut = StrutOutput(
+                force_n,
+                virtual_n,
+                valid,
+                height_m,
+                velocity_m_per_s,
+                motion.acceleration_m_per_s2,
+                observer.innovation_m,
             )
+            published.append(strut)
         # A model that has diverged says nothing of use, and would not come back by itself. DART
         # hides it: what is not finite has an acceleration of zero there.
-        if mode is _SAFE or not abs(total) < _SENSELESS:
+        if mode is _SAFE or not -_SENSELESS < total < _SENSELESS:
             state = replace(before, t_ns=t_ns, mode=Mode.SAFE)
             return state, self._safe_output(state)
         struts = tuple(published)

@@ -69,7 +69,7 @@ def test_the_seed_gains_leave_what_proportional_control_leaves():
 
 
 @given(gap=st.integers(1, 9))
-@settings(max_examples=10)
+@settings(max_examples=10, deadline=None)
 def test_between_measurements_the_virtual_force_is_held(gap):
     rig = core()
     inputs = [measured(tick, 0.4 if tick % (gap + 1) == 0 else None) for tick in range(100)]
@@ -206,7 +206,7 @@ INPUTS = st.lists(
 )
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(drawn=INPUTS, cut=st.integers(0, 15), stride=st.sampled_from([1, 7, 40]))
 def test_a_run_continues_identically_from_any_of_its_states(drawn, cut, stride):
     inputs = [

@@ -93,7 +93,7 @@ def momentum(state: PlantState, masses: list[float]) -> np.ndarray:
     return np.array(masses) @ velocities
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(
     mass=st.floats(0.5, 100.0),
     frequency_hz=st.floats(0.2, 5.0),
@@ -300,7 +300,7 @@ def test_the_virtual_force_and_the_applied_force_push_as_the_signs_say():
     assert accelerations((0.0, 0.0), 30.0) - free == pytest.approx([0.0, 30 / body])
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(
     angle=st.floats(-2.5, 2.5),
     rate=st.floats(-4.0, 4.0),

@@ -84,7 +84,7 @@ def models(draw: st.DrawFn) -> ModelSpec:
     )
 
 
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)
 @given(spec=models())
 def test_what_is_written_is_read_back_as_the_same(spec):
     assert parse_model(dump_model(spec), "drawn.yaml") == spec
@@ -264,13 +264,13 @@ def message_of(work: Callable[[], object]) -> str:
     return str(caught.value)
 
 
-@settings(max_examples=300)
+@settings(max_examples=300, deadline=None)
 @given(text=st.text(max_size=60))
 def test_any_text_is_read_or_refused_in_one_line(text):
     assert "\n" not in message_of(lambda: parse_mapping(text, "any.yaml"))
 
 
-@settings(max_examples=200)
+@settings(max_examples=200, deadline=None)
 @given(data=st.data())
 def test_a_mutated_model_is_read_or_refused_in_one_line(data):
     place = data.draw(st.integers(0, len(TEXT) - 1))
