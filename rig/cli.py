@@ -512,6 +512,16 @@ def _print_ended(ended: Ended, *, with_timing: bool) -> None:
         for label, figures in (("lateness", timing.lateness_us()), ("work", timing.work_us())):
             text = " · ".join(f"{level} {value:.0f}" for level, value in figures.items())
             table.add_row(f"{label} of a tick, µs", text)
+        table.add_row("longest gap, µs", f"{timing.extremes_ns[2] / 1000:.0f}")
     if ended.log_fault is not None:
         table.add_row("log", f"[red]{ended.log_fault}[/]")
     console.print(table)
+    if with_timing:
+        _draw_timing(ended)
+
+
+def _draw_timing(ended: Ended) -> None:
+    try:
+        console.print(f"Histograms of lateness and work: {ended.draw_timing()}")
+    except OSError as error:  # a disk that is full takes no picture, and the run is over anyway
+        console.print(f"No histograms: {error.strerror}", style="yellow")

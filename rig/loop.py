@@ -92,7 +92,8 @@ def _percentiles(histogram: NDArray[np.int64], largest_ns: int) -> dict[str, flo
     total = int(histogram.sum())
     if total == 0:
         return {}
-    cumulated = np.cumsum(histogram)
+    # A live run asks for this between two ticks.
+    cumulated = np.cumsum(histogram[: largest_ns // 1000 + 1])
     levels = {"p50": 0.5, "p99": 0.99, "p99_9": 0.999}
     result = {
         name: float(np.searchsorted(cumulated, level * total) + 1) for name, level in levels.items()
@@ -105,18 +106,21 @@ def regular_ticks(
 ) -> Iterator[Tick]:
     """Ticks on a grid of absolute deadlines; missed ones are skipped and counted.
 
+    The first one is the next after now: what had to be set up before it makes no tick late.
+
     Args:
         clock: The clock.
         period_ns: Time between two ticks.
-        count: Number of ticks of the grid; without end if None.
+        count: Number of ticks of the grid from the first one on; without end if None.
         stop: Asked before each tick whether to end.
         timing: Where lateness and work are written.
     """
     lateness, work, extremes = timing.lateness, timing.work, timing.extremes_ns
     last = _BINS - 1
-    index, woke_ns = 0, clock.now_ns()
-    overruns = 0
-    while (count is None or index < count) and not stop():
+    woke_ns = clock.now_ns()
+    index, overruns = -(-woke_ns // period_ns), 0
+    end = None if count is None else index + count
+    while (end is None or index < end) and not stop():
         deadline_ns = index * period_ns
         before_ns, woke_ns = woke_ns, clock.wait_until(deadline_ns)
         late_ns = woke_ns - deadline_ns
@@ -124,7 +128,7 @@ def regular_ticks(
         if missed > 0:
             index += missed
             overruns += missed
-            if count is not None and index >= count:
+            if end is not None and index >= end:
                 return
         lateness[min(late_ns // 1000, last)] += 1
         extremes[0] = max(extremes[0], late_ns)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import cast
 
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.frame import Frame
@@ -19,7 +20,7 @@ from rig.bench.schema import BenchConfig
 from rig.bench.simulated import Bench
 from rig.config import RunConfig, Setup, build_bridge
 from rig.core.bridge import Bridge, BridgeState, TickResult
-from rig.core.messages import Conditions
+from rig.core.messages import NO_TIMING, Conditions, Levels, TimingFigures
 from rig.core.types import Mode
 from rig.io.bus import Bus, BusConfig
 from rig.io.clock import Clock, RealClock, VirtualClock
@@ -28,11 +29,14 @@ from rig.io.realtime import Granted, Request, realtime
 from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE
 from rig.io.run_writer import RunLog
 from rig.io.steps import Step
+from rig.io.timing_picture import TIMING_PICTURE, Distribution, draw_timing
 from rig.loop import Port, Progress, Timing, regular_ticks, run
 
 _PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "autosar-e2e")
 _NO_CONDITIONS = Conditions()
 _BENCH_PORTION_NS = 20_000_000
+_TIMING_TOLD_NS = 500_000_000
+"""How often percentiles are taken of the timing, for the bus."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,7 @@ class Ended:
         granted: What the machine granted.
         log_fault: What went wrong with the log, if anything.
         ticks: Number of ticks.
+        period_ns: Time between two of them.
     """
 
     folder: Path
@@ -54,6 +59,7 @@ class Ended:
     granted: Granted | None
     log_fault: str | None
     ticks: int
+    period_ns: int
 
     def summary(self) -> dict[str, object]:
         """Every figure, for `summary.json`."""
@@ -65,6 +71,27 @@ class Ended:
             "granted": None if self.granted is None else self.granted.as_dict(),
             "log_fault": self.log_fault,
         }
+
+    def draw_timing(self) -> Path:
+        """Draw lateness and work of the ticks into the run's folder; returns the file.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        timing, granted = self.timing, self.granted
+        fifo = "granted" if granted is not None and granted.fifo else "not granted"
+        title = (
+            f"{1e9 / self.period_ns:g} ticks a second: {self.ticks} ticks, "
+            f"{self.state.counts.overruns} overruns, "
+            f"longest gap {timing.extremes_ns[2] * 1e-6:.2f} ms; SCHED_FIFO {fifo}"
+        )
+        distributions = (
+            Distribution("Lateness: deadline to wake-up", timing.lateness, timing.lateness_us()),
+            Distribution("Work: wake-up to the end of the tick", timing.work, timing.work_us()),
+        )
+        path = self.folder / TIMING_PICTURE
+        draw_timing(path, title, distributions, self.period_ns / 1000)
+        return path
 
 
 class BusPort:
@@ -91,19 +118,38 @@ class BusPort:
         return self.link.send(frames)
 
 
-class _ToldOfLog:
-    """A port whose conditions tell of the log too."""
+class _Told:
+    """A port whose conditions tell of the log too, and of how well the rate is kept."""
 
-    def __init__(self, port: Port, log: RunLog) -> None:
+    def __init__(self, port: Port, log: RunLog, timing: Timing) -> None:
         self._port = port
         self._log = log
+        self._timing = timing
+        self._told = NO_TIMING
+        self._calm = _NO_CONDITIONS
+        self._again_ns = _TIMING_TOLD_NS
         self.send = port.send
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
         frames, conditions = self._port.receive(t_ns)
-        if self._log.fault is not None:
-            conditions = conditions._replace(log_fault=True)
-        return frames, conditions
+        if t_ns >= self._again_ns:
+            self._again_ns = t_ns + _TIMING_TOLD_NS
+            self._told = _figures(self._timing)
+            self._calm = Conditions(timing=self._told)
+        if conditions is _NO_CONDITIONS and self._log.fault is None:
+            return frames, self._calm
+        log_fault = self._log.fault is not None
+        return frames, conditions._replace(log_fault=log_fault, timing=self._told)
+
+
+def _figures(timing: Timing) -> TimingFigures:
+    gap_s = float(timing.extremes_ns[2]) * 1e-9
+    return TimingFigures(_levels_s(timing.lateness_us()), _levels_s(timing.work_us()), gap_s)
+
+
+def _levels_s(levels_us: dict[str, float]) -> Levels:
+    """All zero before the first tick."""
+    return cast("Levels", tuple(value * 1e-6 for value in levels_us.values()) or (0.0,) * 4)
 
 
 class _BenchOnBus:
@@ -237,7 +283,7 @@ def logged(
     try:
         due = regular_ticks(clock, config.period_ns, count, stop, timing)
         with _on_signal(signal.SIGUSR2, lambda: log.trigger("user")):
-            state = run(bridge, state, due, _ToldOfLog(port, log), sink)
+            state = run(bridge, state, due, _Told(port, log, timing), sink)
         status = "safe" if state.rig.mode is Mode.SAFE else "done"
     finally:
         log.close(
@@ -253,7 +299,7 @@ def logged(
                 }
             }
         )
-    return Ended(folder, state, timing, granted, log.trouble, ticks)
+    return Ended(folder, state, timing, granted, log.trouble, ticks, config.period_ns)
 
 
 def live(

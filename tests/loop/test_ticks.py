@@ -117,3 +117,11 @@ def test_percentiles_are_the_ends_of_their_bins(us):
 def test_without_a_tick_there_are_no_percentiles():
     summary = Timing.empty().summary()
     assert summary == {"lateness_us": {}, "work_us": {}, "longest_gap_us": 0.0}
+
+
+def test_what_is_set_up_before_the_first_tick_makes_no_tick_late():
+    clock, timing = HandClock(iter([])), Timing.empty()
+    clock.t_ns = 7 * PERIOD_NS + 1
+    found = list(regular_ticks(clock, PERIOD_NS, 3, lambda: False, timing))
+    assert found == [Tick(number * PERIOD_NS, 0) for number in (8, 9, 10)]
+    assert timing.extremes_ns.tolist() == [0, 0, PERIOD_NS]
