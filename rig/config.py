@@ -11,6 +11,7 @@ from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, ModelSpec, load_model
 from dart_model.yaml_file import Finite, InputError, NotNegative, Positive, load_validated
 from rig.core.bridge import Bridge
+from rig.core.dyno import DynoCore
 from rig.core.messages import (
     Outgoing,
     Quantity,
@@ -24,6 +25,7 @@ from rig.core.messages import (
 from rig.core.observer import ObserverGains
 from rig.core.step import RigCore
 from rig.core.supervisor import Action, Limit, Supervision, Watched
+from rig.core.types import Core
 from rig.io.bus import BusConfig
 from rig.io.captures import Window
 from rig.io.run_writer import Rotation
@@ -92,6 +94,18 @@ class ObserverConfig(_Frozen):
     def gains(self) -> ObserverGains:
         """As the observer takes them."""
         return ObserverGains(self.proportional_n_per_m, self.integral_n_per_m_s, self.force_limit_n)
+
+
+class ImposedMotionConfig(_Frozen):
+    """A dyno: the motion is imposed, the model is driven along it, and the load cell measures.
+
+    Attributes:
+        settling_s: Time constant with which older heights fade in the velocity that the model is
+            given; the velocity errs by three times the square of its product with the motion's
+            angular frequency.
+    """
+
+    settling_s: Annotated[float, Field(gt=0, le=1.0, allow_inf_nan=False)] = 0.002
 
 
 class Published(_Frozen):
@@ -241,7 +255,8 @@ class RunConfig(_Frozen):
         dbc: DBC file beside the configuration; the package's own if absent.
         bus: How to open the bus.
         signals: What is read from it.
-        observers: One for each strut of the model, by strut name.
+        imposed_motion: Declares a dyno; there is then a load cell and no applied force.
+        observers: One for each strut of the model, by strut name; a dyno has no use for them.
         publish: Messages for each strut, by strut name; by default RIG_ESTIMATE and RIG_KINEMATICS
             for the first strut, and the same with _2, _3, ... for the next ones.
         status: Message that carries the state; null sends none.
@@ -257,6 +272,7 @@ class RunConfig(_Frozen):
     dbc: Text | None = None
     bus: BusSettings = BusSettings()
     signals: Signals
+    imposed_motion: ImposedMotionConfig | None = None
     observers: dict[str, ObserverConfig] = Field(default_factory=dict[str, ObserverConfig])
     publish: dict[str, Published] = Field(default_factory=dict[str, Published])
     status: Text | None = "RIG_STATUS"
@@ -274,6 +290,19 @@ class RunConfig(_Frozen):
                 return {**rest, "signals": {**others, "height": {"": height}}}
             case _:
                 return data
+
+    @model_validator(mode="after")
+    def _imposed_or_driven(self) -> "RunConfig":
+        if self.imposed_motion is None:
+            return self
+        if self.signals.load_cell_force is None:
+            raise ValueError("imposed_motion: expected signals.load_cell_force beside it")
+        if self.signals.applied_force is not None:
+            raise ValueError(
+                "imposed_motion: expected no signals.applied_force beside it, because a motion "
+                "that is imposed asks for no force"
+            )
+        return self
 
     def published_messages(self) -> list[str]:
         """Names of all messages that the bridge sends."""
@@ -387,7 +416,12 @@ def build_bridge(ready: Setup, model: ModelSpec | None = None) -> Bridge:
         outgoing.append(timing(database.message(config.timing)))
     gains = tuple(observer.gains() for observer in config.observers.values())
     supervision = config.supervision.supervision()
-    core = RigCore(DartPlant(model or ready.model), gains, supervision)
+    plant = DartPlant(model or ready.model)
+    core: Core
+    if config.imposed_motion is None:
+        core = RigCore(plant, gains, supervision)
+    else:
+        core = DynoCore(plant, config.imposed_motion.settling_s, supervision)
     received = [incoming(database.message(name), found) for name, found in targets.items()]
     return Bridge(core, received, outgoing, supervision.limits)
 

@@ -339,6 +339,8 @@ class _Log:
             zip(*heights, strict=True),
             others.get(Quantity.APPLIED_FORCE, nothing),
             others.get(Quantity.TEMPERATURE, nothing),
+            [False] * len(t_ns),
+            others.get(Quantity.LOAD_CELL_FORCE, nothing),
         )
         return [StepInput(*given) for given in zip(*columns, strict=True)]
 

@@ -323,20 +323,24 @@ def _solved(columns: Array, target: Array) -> list[float]:
     )
 
 
-def dyno_start(record: Record, name: str) -> ModelSpec:
+def dyno_start(records: Sequence[Record], name: str) -> ModelSpec:
     """The spring and damper that come nearest to a dyno's load cell; a mass of 1 kg, unseen.
 
     Args:
-        record: Run with one height, imposed, and a strut force.
+        records: Runs with one height, imposed, and a strut force.
         name: Name of the model.
     """
-    if record.strut_force_n is None:
-        raise InputError(f"{record.name}: has no strut_force_n, expected a load cell")
-    height_m = record.heights_m[:, 0]
-    middle_m = float(np.nanmean(height_m))
-    velocity = np.gradient(height_m, record.t_s)
-    columns = np.column_stack([middle_m - height_m, -velocity, np.ones_like(height_m)])
-    stiffness, damping, force_n = _solved(columns, record.strut_force_n)
+    middle_m = float(np.mean([np.nanmean(record.heights_m) for record in records]))
+    columns: list[Array] = []
+    forces: list[Array] = []
+    for record in records:
+        if record.strut_force_n is None:
+            raise InputError(f"{record.name}: has no strut_force_n, expected a load cell")
+        height_m = record.heights_m[:, 0]
+        velocity = np.gradient(height_m, record.t_s)
+        columns.append(np.column_stack([middle_m - height_m, -velocity, np.ones_like(height_m)]))
+        forces.append(record.strut_force_n)
+    stiffness, damping, force_n = _solved(np.concatenate(columns), np.concatenate(forces))
     stiffness, damping = max(stiffness, 1.0), max(damping, 0.0)
     # A constant force is a longer free length, within reason; the rest is left to be found.
     longer_m = float(np.clip(force_n / stiffness, -0.5 * middle_m, 0.5 * middle_m))
@@ -412,7 +416,7 @@ def _damper_rows(
     trained_on: str, runs: list[Path], tests: dict[str, Path], out: Path, progress: Progress
 ) -> list[Row]:
     """Force errors in % of the force's standard deviation, before and after."""
-    model = dyno_start(read_record(runs[0]), "mr_damper")
+    model = dyno_start([read_record(path) for path in runs], "mr_damper")
     names = (f"rig, linear, {trained_on}", f"rig, corrected, {trained_on}")
     try:
         diagnosis = diagnose_runs(runs, model, list(tests.values()), out, progress)

@@ -12,7 +12,6 @@ from msgspec.structs import replace
 from can_dbc.frame import Frame
 from can_dbc.protection import INITIAL, SequenceState, Verdict, check, protect
 from rig.core.messages import Conditions, Counts, Incoming, Outgoing, Quantity, Report, Target
-from rig.core.step import RigCore
 from rig.core.supervisor import (
     EVENTS_BEYOND,
     Action,
@@ -22,7 +21,7 @@ from rig.core.supervisor import (
     judged,
     next_mode,
 )
-from rig.core.types import Measurement, Mode, RigState, StepInput, StepOutput
+from rig.core.types import Core, Measurement, Mode, RigState, StepInput, StepOutput
 
 _NO_CONDITIONS = Conditions()
 
@@ -30,7 +29,7 @@ _NO_CONDITIONS = Conditions()
 _OK, _HOLD = Verdict.OK, Mode.HOLD
 
 _OTHERS = (Quantity.APPLIED_FORCE, Quantity.TEMPERATURE, Quantity.LOAD_CELL_FORCE)
-"""What comes beside heights; the core is given the first two."""
+"""What comes beside heights, as the core is given it."""
 
 RIVAL_FRAMES = 12
 """Frames out of sequence, one hardly after the other, that only a second sender explains: a sender
@@ -105,7 +104,7 @@ class Bridge:
 
     def __init__(
         self,
-        core: RigCore,
+        core: Core,
         incoming: Sequence[Incoming],
         outgoing: Sequence[Outgoing],
         limits: Sequence[Limit] = (),
@@ -140,7 +139,7 @@ class Bridge:
         return self._own.union(self._index)
 
     @property
-    def core(self) -> RigCore:
+    def core(self) -> Core:
         """The arithmetic."""
         return self._core
 
@@ -263,13 +262,16 @@ class Bridge:
                 else:
                     given[place] = Measurement(value, arrived_ns if arrived_ns < t_ns else t_ns)
         heights = tuple(given[:struts])
-        return rig, StepInput(t_ns, heights, given[struts], given[struts + 1], acknowledged)
+        applied_n, temperature_c, load_cell_n = given[struts:]
+        step_input = StepInput(t_ns, heights, applied_n, temperature_c, acknowledged, load_cell_n)
+        return rig, step_input
 
     def _caught_up(self, rig: RigState, given: list[Any]) -> RigState:
         struts = self._struts
         heights = tuple(given[:struts])
         t_ns = max(rig.t_ns, *[item.t_ns for item in heights if item])
-        step_input = StepInput(t_ns, heights, given[struts], given[struts + 1])
+        applied_n, temperature_c, load_cell_n = given[struts:]
+        step_input = StepInput(t_ns, heights, applied_n, temperature_c, False, load_cell_n)
         return self._core.step(rig, step_input)[0]
 
     def _received(

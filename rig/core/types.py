@@ -1,6 +1,7 @@
 """What goes into a step, what comes out, and the state in between."""
 
 from enum import IntEnum
+from typing import Protocol
 
 from msgspec import Struct
 
@@ -120,3 +121,20 @@ class StepOutput(Struct, frozen=True, gc=False):
 
     mode: Mode
     struts: tuple[StrutOutput, ...]
+
+
+class Core(Protocol):
+    """The arithmetic of a bridge: values in, values out."""
+
+    @property
+    def struts(self) -> int:
+        """Number of struts."""
+        ...
+
+    def init(self, t_ns: int) -> RigState:
+        """State before the first tick."""
+        ...
+
+    def step(self, state: RigState, step_input: StepInput) -> tuple[RigState, StepOutput]:
+        """State after a tick, and what it publishes."""
+        ...

@@ -59,6 +59,7 @@ _NEGLIGIBLE = 0.02
 _MOTION_MARGIN = 2.0
 _FLOOR_COLOUR = 0.03
 _AT_BOUND = 1e-3
+_SLOW = 0.1
 _TONES = 4
 _ONE_LINE = 0.9
 
@@ -388,9 +389,14 @@ def _with_memory(current: Fit, name: str, runs: int) -> list[tuple[Array, ...]]:
 def at_bound(result: Fit, motion: Motion) -> str:
     """Which parameter of a law stands at an end of its search, said in words; empty if none does.
 
-    There the law has turned into another one, and its name would mislead.
+    There the law has turned into another one, and its name would mislead. So has a fade that is
+    over when the run has hardly begun: it stands for how the run began.
     """
+    work_j = motion.damping_n_s_per_m * motion.speed**2 * motion.duration_s
+    soonest = {"time_fade": motion.duration_s, "energy_fade": work_j}
     for name, values in zip(result.effects, result.values, strict=True):
+        if name in soonest and values[1] < _SLOW * soonest[name]:
+            return f"{name} is over when the run has hardly begun"
         bounds: Space = space(name, motion, values)
         inner = bounds.inner(values)
         low, high = bounds.inner(bounds.low), bounds.inner(bounds.high)

@@ -64,7 +64,7 @@ def test_the_linear_start_of_a_dyno_is_found_from_its_record() -> None:
     height_m = 0.3 + 0.01 * np.sin(12.0 * t_s) + 0.004 * np.sin(31.0 * t_s)
     rate = 0.12 * np.cos(12.0 * t_s) + 0.124 * np.cos(31.0 * t_s)
     force_n = -4000.0 * (height_m - 0.31) - 700.0 * rate
-    spec = dyno_start(Record("dyno", t_s, height_m[:, np.newaxis], None, force_n), "dyno")
+    spec = dyno_start([Record("dyno", t_s, height_m[:, np.newaxis], None, force_n)], "dyno")
     (strut,) = spec.struts
     assert strut.stiffness_n_per_m == pytest.approx(4000.0, rel=1e-2)
     assert strut.damping_n_s_per_m == pytest.approx(700.0, rel=1e-2)
