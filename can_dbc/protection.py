@@ -10,7 +10,6 @@ profiles 1 (variant 1A) and 2.
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple
 
 import numpy as np
 from e2e.p01 import e2e_p01_check, e2e_p01_protect
@@ -42,7 +41,7 @@ class Profile(Enum):
         return 2 if self is Profile.P01 else 16
 
 
-class Identity(NamedTuple):
+class Identity(Struct, frozen=True, gc=False):
     """What the CRC of a message covers beside its payload.
 
     Attributes:
@@ -165,11 +164,11 @@ def protect(data: bytes | bytearray, counter: int, protection: Protection) -> by
     frame = bytearray(data)
     # The package counts one further itself.
     frame[1] = frame[1] & 0xF0 | (counter - 1) % protection.counter_modulus
-    profile, data_ids = protection.identity
-    if profile is _P02:
-        e2e_p02_protect(frame, data_ids)
+    identity = protection.identity
+    if identity.profile is _P02:
+        e2e_p02_protect(frame, identity.data_ids)
     else:
-        e2e_p01_protect(frame, int.from_bytes(data_ids, "big"))
+        e2e_p01_protect(frame, int.from_bytes(identity.data_ids, "big"))
     return bytes(frame)
 
 
@@ -221,9 +220,8 @@ def check_crc_log(data: NDArray[np.uint8], protection: Protection) -> NDArray[np
     """
     if data.ndim != 2 or data.shape[1] != protection.length_bytes:
         return np.zeros(len(data), dtype=np.bool_)
-    profile, data_ids = protection.identity
-    ids = np.frombuffer(data_ids, dtype=np.uint8)
-    if profile is Profile.P02:
+    ids = np.frombuffer(protection.identity.data_ids, dtype=np.uint8)
+    if protection.identity.profile is Profile.P02:
         crc = _crc_over_columns(np.full(len(data), 0xFF, dtype=np.uint8), data[:, 1:], _TABLE_2F)
         crc = _TABLE_2F[crc ^ ids[data[:, 1] & 0x0F]] ^ np.uint8(0xFF)
     else:
@@ -234,11 +232,10 @@ def check_crc_log(data: NDArray[np.uint8], protection: Protection) -> NDArray[np
 
 
 def _crc_fits(data: bytes | bytearray, identity: Identity) -> bool:
-    profile, data_ids = identity
-    if profile is _P02:
-        return e2e_p02_check(data, data_ids)
+    if identity.profile is _P02:
+        return e2e_p02_check(data, identity.data_ids)
     # The package checks this profile only in a mutable buffer.
-    return e2e_p01_check(bytearray(data), int.from_bytes(data_ids, "big"))
+    return e2e_p01_check(bytearray(data), int.from_bytes(identity.data_ids, "big"))
 
 
 def _wrong_crc(data: bytes | bytearray, protection: Protection) -> Verdict:

@@ -288,8 +288,10 @@ class _Log:
             last = int(np.searchsorted(found.tick, tick)) - 1
             if last >= 0 and self._incoming[index].protection is not None:
                 sequences[index] = SequenceState(int(found.counter[last]), int(found.t_ns[last]))
-        counts = state.counts._replace(stale=state.counts.stale + holds)
-        return replace(state, rig=rig, sequences=tuple(sequences), counts=counts)
+        ledger, counts = state.ledger, state.counts
+        if holds:
+            ledger = replace(ledger, counts=counts._replace(stale=counts.stale + holds))
+        return replace(state, rig=rig, sequences=tuple(sequences), ledger=ledger)
 
     def received(self, tick: int) -> tuple[int, list[Frame], Conditions]:
         """Time, frames and conditions of a tick."""

@@ -50,8 +50,20 @@ class Strays(NamedTuple):
     t_ns: int = 0
 
 
-Accepted = tuple[int, int, tuple[float, ...]]
-"""Index of the message, time of arrival (ns) and values of a frame that was accepted."""
+class Ledger(Struct, frozen=True, gc=False):
+    """What is remembered of the unusual; most ticks leave it as it is.
+
+    Attributes:
+        counts: What has been counted.
+        told: What the last status knew of it.
+        seen: What plausibility remembers of each strut's measurements.
+        strays: Of each incoming message, the frames that contradicted its counter.
+    """
+
+    counts: Counts
+    told: Counts
+    seen: tuple[Seen | None, ...]
+    strays: tuple[Strays, ...]
 
 
 class BridgeState(Struct, frozen=True, gc=False):
@@ -62,20 +74,19 @@ class BridgeState(Struct, frozen=True, gc=False):
         sequences: Counter state of each incoming message.
         counters: Frames sent so far of each outgoing message.
         due_ns: When each of them is sent next.
-        counts: What has been counted.
-        told: What the last status knew of it.
-        seen: What plausibility remembers of each strut's measurements.
-        strays: Of each incoming message, the frames that contradicted its counter.
+        ledger: What is remembered beside.
     """
 
     rig: RigState
     sequences: tuple[SequenceState, ...]
     counters: tuple[int, ...]
     due_ns: tuple[int, ...]
-    counts: Counts
-    told: Counts
-    seen: tuple[Seen | None, ...]
-    strays: tuple[Strays, ...]
+    ledger: Ledger
+
+    @property
+    def counts(self) -> Counts:
+        """What has been counted."""
+        return self.ledger.counts
 
 
 class TickResult(Struct, frozen=True, gc=False):
@@ -145,7 +156,7 @@ class Bridge:
 
     @property
     def incoming(self) -> tuple[Incoming, ...]:
-        """Messages of the bench; `Accepted` counts them from zero."""
+        """Messages of the bench."""
         return self._incoming
 
     @property
@@ -157,16 +168,10 @@ class Bridge:
         """State before the first tick."""
         count = len(self._outgoing)
         sequences = (INITIAL,) * len(self._incoming)
-        return BridgeState(
-            self._core.init(t_ns),
-            sequences,
-            (0,) * count,
-            (t_ns,) * count,
-            Counts(),
-            Counts(),
-            (None,) * self._struts,
-            (Strays(),) * len(self._incoming),
+        nothing = Ledger(
+            Counts(), Counts(), (None,) * self._struts, (Strays(),) * len(self._incoming)
         )
+        return BridgeState(self._core.init(t_ns), sequences, (0,) * count, (t_ns,) * count, nothing)
 
     def tick(
         self,
@@ -186,121 +191,102 @@ class Bridge:
         Returns:
             State after the tick, and what it did.
         """
-        accepted, sequences, counts, strays = self._received(state, frames)
-        seen, action = state.seen, 0
-        if self._measured_limits and accepted:
-            accepted, seen, counts, action = self._plausible(seen, counts, accepted)
-        rig, step_input = self._gathered(state.rig, t_ns, accepted, conditions.acknowledged)
+        rig, given, sequences, ledger, action = self._received(state, t_ns, frames)
+        step_input = self._step_input(t_ns, given, acknowledged=conditions.acknowledged)
         rig, output = self._core.step(rig, step_input)
-        if conditions.overruns or output.mode is _HOLD:
-            counts = counts._replace(
-                overruns=counts.overruns + conditions.overruns,
-                stale=counts.stale + (output.mode is _HOLD),
-            )
         if self._limits or action:
             rig, output, action = self._limited(state.rig, rig, output, action)
-        if action or conditions.bus_fault:
-            counts = counts._replace(
-                limited=counts.limited + (action > 0),
-                bus_faulty=counts.bus_faulty + conditions.bus_fault,
-            )
-        told, counters, due_ns = state.told, list(state.counters), list(state.due_ns)
+        if action or output.mode is _HOLD or conditions.overruns or conditions.bus_fault:
+            ledger = _noted(ledger, output, action, conditions)
+        counters, due_ns = list(state.counters), list(state.due_ns)
         sent: list[Frame] = []
         if output.struts:  # nothing is sent before the first valid measurement
             for index, item in self._outgoing:
                 if t_ns < due_ns[index]:
                     continue
-                report = Report(output, counts, told, conditions, counters[index])
-                frame, saturated = _encoded(item, report, t_ns)
+                frame, saturated = _encoded(
+                    item,
+                    Report(output, ledger.counts, ledger.told, conditions, counters[index]),
+                    t_ns,
+                )
                 sent.append(frame)
                 counters[index] += 1
                 due_ns[index] = _next_due_ns(due_ns[index], t_ns, item.period_ns)
-                if item.is_status:
-                    # A status that cannot be sent tells nobody.
-                    told = told if conditions.bus_fault else counts
-                elif saturated:
-                    counts = counts._replace(saturated=counts.saturated + 1)
-        state = BridgeState(
-            rig,
-            tuple(sequences),
-            tuple(counters),
-            tuple(due_ns),
-            counts,
-            told,
-            seen,
-            strays,
-        )
+                if item.is_status or saturated:
+                    ledger = _told(ledger, item, conditions, saturated=saturated)
+        state = BridgeState(rig, tuple(sequences), tuple(counters), tuple(due_ns), ledger)
         return state, TickResult(sent, step_input, output)
 
-    def _gathered(
-        self, rig: RigState, t_ns: int, accepted: Sequence[Accepted], acknowledged: bool
-    ) -> tuple[RigState, StepInput]:
-        """What a tick's accepted frames are to the core.
+    def _received(
+        self, state: BridgeState, t_ns: int, frames: Sequence[Frame]
+    ) -> tuple[RigState, list[Any], list[SequenceState], Ledger, int]:
+        """What the frames of a tick are to the core.
 
         A late tick finds several measurements of one strut. Each is used at its own time, or the
         model would run away under a force that was held for the whole gap.
 
-        Args:
-            rig: The core after the last tick.
-            t_ns: Time of this one.
-            accepted: Values of the frames that were accepted, in their order.
-            acknowledged: Somebody acknowledged the safe state.
-
         Returns:
-            The core after all measurements that newer ones followed, and the input that is left.
+            The core after all measurements that newer ones followed, what is left as
+            `_step_input` takes it, the counters' states, the ledger, and the gravest action that
+            the limits on measurements ask for.
         """
-        struts, given = self._struts, self._nothing.copy()
-        for index, arrived_ns, values in accepted:
-            places = self._places[index]
-            if self._has_height[index] and given[places[0][1]] is not None:
-                rig = self._caught_up(rig, given)
-                given = self._nothing.copy()
-            for number, place in places:
-                value = values[number]
-                if place >= struts:
-                    given[place] = value
-                else:
-                    given[place] = Measurement(value, arrived_ns if arrived_ns < t_ns else t_ns)
-        heights = tuple(given[:struts])
-        applied_n, temperature_c, load_cell_n = given[struts:]
-        step_input = StepInput(t_ns, heights, applied_n, temperature_c, acknowledged, load_cell_n)
-        return rig, step_input
-
-    def _caught_up(self, rig: RigState, given: list[Any]) -> RigState:
-        struts = self._struts
-        heights = tuple(given[:struts])
-        t_ns = max(rig.t_ns, *[item.t_ns for item in heights if item])
-        applied_n, temperature_c, load_cell_n = given[struts:]
-        step_input = StepInput(t_ns, heights, applied_n, temperature_c, False, load_cell_n)
-        return self._core.step(rig, step_input)[0]
-
-    def _received(
-        self, state: BridgeState, frames: Sequence[Frame]
-    ) -> tuple[list[Accepted], list[SequenceState], Counts, tuple[Strays, ...]]:
-        """What the frames of a tick are worth."""
-        counts, sequences, strays = state.counts, list(state.sequences), state.strays
-        accepted: list[Accepted] = []
+        rig, ledger, sequences, action = state.rig, state.ledger, list(state.sequences), 0
+        given, struts = self._nothing.copy(), self._struts
         for frame in frames:
             index = self._index.get((frame.arbitration_id, frame.is_extended))
             if index is None or frame.is_error:
-                counts = self._foreign(counts, frame)
+                ledger = self._foreign(ledger, frame)
                 continue
             sequence, verdict, values = _accepted(self._incoming[index], sequences[index], frame)
             sequences[index] = sequence
             if verdict is not _OK:
-                counts = _counted(counts, verdict, sequence)
-                if verdict is Verdict.OUT_OF_SEQUENCE:
-                    strays, rival = self._stray(strays, index, frame.t_ns)
-                    counts = counts._replace(second_sender=counts.second_sender + rival)
-            if values:
-                accepted.append((index, frame.t_ns, values))
-        return accepted, sequences, counts, strays
+                ledger = self._judged(ledger, index, frame.t_ns, verdict, sequence)
+            if values and self._measured_limits:
+                ledger, asked = self._plausible(ledger, index, frame.t_ns, values)
+                action = max(action, asked)
+                values = values if asked < Action.REFUSE else ()
+            if not values:
+                continue
+            places = self._places[index]
+            if self._has_height[index] and given[places[0][1]] is not None:
+                rig, given = self._caught_up(rig, given), self._nothing.copy()
+            for number, place in places:
+                if place >= struts:
+                    given[place] = values[number]
+                else:
+                    arrived_ns = frame.t_ns if frame.t_ns < t_ns else t_ns
+                    given[place] = Measurement(values[number], arrived_ns)
+        return rig, given, sequences, ledger, action
 
-    def _foreign(self, counts: Counts, frame: Frame) -> Counts:
-        """Counts after a frame of no incoming message: error frames, or somebody under our ids."""
+    def _step_input(self, t_ns: int, given: list[Any], *, acknowledged: bool = False) -> StepInput:
+        """Input of the core of what came: the struts' heights, then the `_OTHERS`."""
+        struts = self._struts
+        applied_n, temperature_c, load_cell_n = given[struts:]
+        heights = tuple(given[:struts])
+        return StepInput(t_ns, heights, applied_n, temperature_c, acknowledged, load_cell_n)
+
+    def _caught_up(self, rig: RigState, given: list[Any]) -> RigState:
+        """The core at the time of measurements that newer ones follow."""
+        arrived_ns = [item.t_ns for item in given[: self._struts] if item]
+        return self._core.step(rig, self._step_input(max(rig.t_ns, *arrived_ns), given))[0]
+
+    def _foreign(self, ledger: Ledger, frame: Frame) -> Ledger:
+        """After a frame of no incoming message: error frames, or somebody under our ids."""
         if frame.is_error or (frame.arbitration_id, frame.is_extended) not in self._own:
-            return counts
-        return counts._replace(second_sender=counts.second_sender + 1)
+            return ledger
+        counts = ledger.counts
+        return replace(ledger, counts=counts._replace(second_sender=counts.second_sender + 1))
+
+    def _judged(
+        self, ledger: Ledger, index: int, t_ns: int, verdict: Verdict, sequence: SequenceState
+    ) -> Ledger:
+        """After a frame that did not simply follow the one before."""
+        counts = _counted(ledger.counts, verdict, sequence)
+        if verdict is not Verdict.OUT_OF_SEQUENCE:
+            return replace(ledger, counts=counts)
+        strays, rival = self._stray(ledger.strays, index, t_ns)
+        counts = counts._replace(second_sender=counts.second_sender + rival)
+        return replace(ledger, counts=counts, strays=strays)
 
     def _stray(
         self, strays: tuple[Strays, ...], index: int, t_ns: int
@@ -313,27 +299,24 @@ class Bridge:
         return (*strays[:index], stray, *strays[index + 1 :]), stray.frames >= RIVAL_FRAMES
 
     def _plausible(
-        self, seen: tuple[Seen | None, ...], counts: Counts, accepted: list[Accepted]
-    ) -> tuple[list[Accepted], tuple[Seen | None, ...], Counts, int]:
-        """What is left of the accepted frames; a frame is used whole or not at all."""
-        left: list[Accepted] = []
-        gravest = 0
-        for item in accepted:
-            index, arrived_ns, values = item
-            after, action = list(seen), 0
-            for number, place in self._places[index]:
-                if place < len(seen):
-                    measured = Measurement(values[number], arrived_ns)
-                    after[place], asked = judged(self._measured_limits, seen[place], measured)
-                    action = max(action, asked)
-            gravest = max(gravest, action)
-            if action >= Action.REFUSE:
-                refused, implausible = counts.refused + 1, counts.implausible + 1
-                counts = counts._replace(refused=refused, implausible=implausible)
-            else:
-                seen = tuple(after)
-                left.append(item)
-        return left, seen, counts, gravest
+        self, ledger: Ledger, index: int, arrived_ns: int, values: tuple[float, ...]
+    ) -> tuple[Ledger, int]:
+        """The gravest action that an accepted frame's measurements ask for.
+
+        A frame is used whole or not at all: from `Action.REFUSE` on it is to be dropped.
+        """
+        seen, action = list(ledger.seen), 0
+        for number, place in self._places[index]:
+            if place < self._struts:
+                measured = Measurement(values[number], arrived_ns)
+                seen[place], asked = judged(self._measured_limits, seen[place], measured)
+                action = max(action, asked)
+        if action < Action.REFUSE:
+            return replace(ledger, seen=tuple(seen)), action
+        counts = ledger.counts
+        refused, implausible = counts.refused + 1, counts.implausible + 1
+        counts = counts._replace(refused=refused, implausible=implausible)
+        return replace(ledger, counts=counts), action
 
     def _limited(
         self, before: RigState, rig: RigState, output: StepOutput, action: int
@@ -358,6 +341,27 @@ class Bridge:
         if target.quantity is Quantity.HEIGHT:
             return target.strut
         return self._struts + _OTHERS.index(target.quantity)
+
+
+def _noted(ledger: Ledger, output: StepOutput, action: int, conditions: Conditions) -> Ledger:
+    """After a tick that was not as it should be."""
+    counts = ledger.counts
+    counts = counts._replace(
+        overruns=counts.overruns + conditions.overruns,
+        stale=counts.stale + (output.mode is _HOLD),
+        limited=counts.limited + (action > 0),
+        bus_faulty=counts.bus_faulty + conditions.bus_fault,
+    )
+    return replace(ledger, counts=counts)
+
+
+def _told(ledger: Ledger, item: Outgoing, conditions: Conditions, *, saturated: bool) -> Ledger:
+    """After a status, or after a frame with a value at the end of its range."""
+    counts = ledger.counts
+    if not item.is_status:
+        return replace(ledger, counts=counts._replace(saturated=counts.saturated + saturated))
+    # A status that cannot be sent tells nobody.
+    return ledger if conditions.bus_fault else replace(ledger, told=counts)
 
 
 def _encoded(item: Outgoing, report: Report, t_ns: int) -> tuple[Frame, bool]:
