@@ -1,4 +1,8 @@
-"""The `rig` command: arguments, printing and exit codes."""
+"""The `rig` command: arguments, printing and exit codes.
+
+What a command needs is imported when it runs: DART, numba and matplotlib take seconds, and nobody
+who asks for help should wait for them.
+"""
 
 import contextlib
 import itertools
@@ -10,7 +14,7 @@ import time
 from collections.abc import Callable, Generator
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -18,27 +22,15 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from can_dbc.errors import DatabaseError
-from dart_model.spec import load_model
-from rig.bench.config import load_bench_config
-from rig.bench.schema import BenchConfigError
-from rig.check import Severity, check
-from rig.config import InputError, load_setup
-from rig.core.types import Mode
-from rig.demo import CASES, Case, run_case
-from rig.diagnose import diagnose_runs
-from rig.export import FORMATS, export_run, import_run
-from rig.identify.diagnosis import Diagnosis
-from rig.identify.records import RecordError
-from rig.identify.report import sentence
-from rig.imports import import_log, import_table, load_mapping
-from rig.io.bus import BusConfig, BusError
-from rig.replay import replay
-from rig.runs import Ended, live, run_bench
-from rig.scoreboard import run_scoreboard
-from rig.story import tell
+from dart_model.yaml_file import InputError
+
+if TYPE_CHECKING:
+    from rig.core.types import Mode
+    from rig.demo import Case
+    from rig.identify.diagnosis import Diagnosis
+    from rig.runs import Ended
 
 OK, FAILED, WRONG_INPUT = 0, 1, 2
-_INPUT_ERRORS = (InputError, DatabaseError, BenchConfigError, BusError, RecordError)
 STORY = "story"
 _REFRESH_NS = 200_000_000
 
@@ -59,9 +51,22 @@ def main() -> None:
     """Run the command; a wrong input is one line on standard error and exit code 2."""
     try:
         app()
-    except _INPUT_ERRORS as error:
+    except (ValueError, OSError) as error:
+        if not _is_of_input(error):
+            raise
         Console(stderr=True).print(f"rig: {error}", style="red", markup=False, soft_wrap=True)
         sys.exit(WRONG_INPUT)
+
+
+def _is_of_input(error: Exception) -> bool:
+    """Whether the user's input is at fault, and not the program."""
+    if isinstance(error, (InputError, DatabaseError)):
+        return True
+    from rig.bench.schema import BenchConfigError
+    from rig.identify.records import RecordError
+    from rig.io.bus import BusError
+
+    return isinstance(error, (BenchConfigError, BusError, RecordError))
 
 
 @app.command(
@@ -71,7 +76,7 @@ def main() -> None:
 def demo(
     case: Annotated[
         str,
-        typer.Option(help=f"{STORY}: the whole story; or a plain case: {', '.join(CASES)}."),
+        typer.Option(help=f"{STORY}: the whole story; or a plain case: seed, quarter_car."),
     ] = STORY,
     seed: Annotated[
         int, typer.Option(min=0, help="Draws the effect that the story's bench carries.")
@@ -92,6 +97,8 @@ def demo(
     The story: a bench with an effect that nobody declared, logged by the bridge, diagnosed,
     corrected, and run again.
     """
+    from rig.demo import CASES, run_case
+
     if case not in (STORY, *CASES):
         raise InputError(f"--case {case!r}: expected one of {', '.join((STORY, *CASES))}")
     out = out or _free_folder("rig-demo")
@@ -109,6 +116,8 @@ def demo(
 
 
 def _tell(seed: int, out: Path, *, lockstep: bool, duration_s: float | None) -> None:
+    from rig.story import tell
+
     with _stoppable() as stop, _progress(duration_s) as progress, _bar() as bar:
         story = tell(
             seed,
@@ -148,6 +157,9 @@ def diagnose_command(
     ] = None,
 ) -> None:
     """Trace what the model lacks to named effects, correct it, and judge it on other data."""
+    from dart_model.spec import load_model
+    from rig.diagnose import diagnose_runs
+
     spec = load_model(model)
     with _bar() as bar:
         diagnosis = diagnose_runs(runs, spec, held_out or [], out, bar)
@@ -183,6 +195,10 @@ def run(
     listen_only: Annotated[bool, typer.Option("--listen-only", help="Send nothing.")] = False,
 ) -> None:
     """Run the bridge on a bus; Ctrl-C ends it in order."""
+    from rig.config import load_setup
+    from rig.core.types import Mode
+    from rig.runs import live
+
     ready = load_setup(config, model=model, duration_s=duration_s)
     folder = out or Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
     with _stoppable() as stop, _progress(ready.config.duration_s) as progress:
@@ -212,6 +228,10 @@ def bench(
     ] = None,
 ) -> None:
     """Run a simulated bench on a bus, in real time."""
+    from rig.bench.config import load_bench_config
+    from rig.io.bus import BusConfig
+    from rig.runs import run_bench
+
     bench_config = load_bench_config(config)
     with _stoppable() as stop, _progress(duration_s) as progress:
         sent = run_bench(
@@ -233,6 +253,9 @@ def check_command(
     ] = None,
 ) -> None:
     """Say what is wrong before a bench moves: signals, units, rate, bus load, poles."""
+    from rig.check import Severity, check
+    from rig.config import load_setup
+
     findings = check(load_setup(config))
     table = Table("", "What", "Finding", title=f"Check of {config}")
     styles = {Severity.OK: "green", Severity.WARNING: "yellow", Severity.ERROR: "red"}
@@ -254,6 +277,8 @@ def replay_command(
     ] = None,
 ) -> None:
     """Compute a run again from its frames and compare it with its log, bit for bit."""
+    from rig.replay import replay
+
     with _progress(None) as progress:
         result = replay(folder, progress=progress)
     summary: dict[str, object] = {
@@ -298,6 +323,10 @@ def import_command(
     A table wants --mapping, a bus log (BLF, ASC, candump, TRC, MF4) --config; what `rig export`
     wrote wants neither.
     """
+    from rig.config import load_setup
+    from rig.export import import_run
+    from rig.imports import import_log, import_table, load_mapping
+
     if mapping is not None and config is not None:
         raise InputError("--mapping and --config: expected one of them")
     if mapping is not None:
@@ -328,9 +357,11 @@ def export_command(
     out: Annotated[
         Path, typer.Option("--out", metavar="PATH", help="New file; for Parquet a folder.")
     ],
-    kind: Annotated[str, typer.Option("--format", help=f"One of {', '.join(FORMATS)}.")],
+    kind: Annotated[str, typer.Option("--format", help="One of mf4, parquet, csv, candump.")],
 ) -> None:
     """Write a run for other programs: MF4, Parquet, CSV or candump."""
+    from rig.export import export_run
+
     for path in export_run(folder, kind, out):
         console.print(f"Written: {path}")
 
@@ -349,6 +380,8 @@ def scoreboard_command(
     ] = None,
 ) -> None:
     """Diagnose published measured sets and print our figures beside the published ones."""
+    from rig.scoreboard import run_scoreboard
+
     with _bar() as bar:
         rows = run_scoreboard(data, out, bar)
     table = Table("set", "test", "model", "figure", "source", title="Measured sets")
@@ -390,13 +423,13 @@ def _bar() -> Generator[Callable[[str, float], None]]:
 
 
 @contextlib.contextmanager
-def _progress(duration_s: float | None) -> Generator[Callable[[int, Mode], None]]:
+def _progress(duration_s: float | None) -> Generator[Callable[[int, "Mode"], None]]:
     """One line that is rewritten; a single write, because the loop itself calls it."""
     shown = sys.stderr.isatty()
     due_ns = 0
     total = "" if duration_s is None else f" of {duration_s:g} s"
 
-    def show(t_ns: int, mode: Mode) -> None:
+    def show(t_ns: int, mode: "Mode") -> None:
         nonlocal due_ns
         if shown and t_ns >= due_ns:
             due_ns = t_ns + _REFRESH_NS
@@ -428,7 +461,7 @@ def _write_summary(folder: Path, summary: dict[str, object]) -> None:
         raise InputError(f"--out {folder}: cannot be written: {error.strerror}") from error
 
 
-def _print_case(case: Case) -> None:
+def _print_case(case: "Case") -> None:
     for strut in case.struts:
         table = Table(
             "after the first 0.5 s",
@@ -451,7 +484,9 @@ def _print_case(case: Case) -> None:
         console.print(table)
 
 
-def _print_diagnosis(diagnosis: Diagnosis, *, struts: int) -> None:
+def _print_diagnosis(diagnosis: "Diagnosis", *, struts: int) -> None:
+    from rig.identify.report import sentence
+
     console.print(f"\n[bold]{diagnosis.verdict.replace('_', ' ')}[/]: ", end="")
     console.print(sentence(diagnosis, struts), markup=False)
     if diagnosis.effects:
@@ -501,7 +536,7 @@ def _share(force_n: float, peak_n: float) -> str:
     return f"{force_n:.2f} N ({force_n / peak_n:.2%} of peak)"
 
 
-def _print_ended(ended: Ended, *, with_timing: bool) -> None:
+def _print_ended(ended: "Ended", *, with_timing: bool) -> None:
     table = Table("Run", f"{ended.ticks} ticks, ended {ended.state.rig.mode.name}")
     for name, value in ended.state.counts._asdict().items():
         if value or name in ("lost", "refused", "overruns"):
@@ -520,7 +555,7 @@ def _print_ended(ended: Ended, *, with_timing: bool) -> None:
         _draw_timing(ended)
 
 
-def _draw_timing(ended: Ended) -> None:
+def _draw_timing(ended: "Ended") -> None:
     try:
         console.print(f"Histograms of lateness and work: {ended.draw_timing()}")
     except OSError as error:  # a disk that is full takes no picture, and the run is over anyway
