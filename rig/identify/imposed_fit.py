@@ -21,11 +21,12 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
 from dart_model.spec import ModelSpec
-from rig.identify.compiled import along, law
+from rig.identify.compiled import along, compile_loop, law
 from rig.identify.least_squares import Solution, Space, solve
 from rig.identify.records import Record
 from rig.identify.reduced import NO_TEMPERATURE_C
@@ -253,6 +254,22 @@ def linear_columns(run: Run, names: Sequence[str]) -> Array:
     )
 
 
+def _take_out(basis: Array, values: Array) -> None:
+    for i in range(basis.shape[0]):
+        share = 0.0
+        for k in range(values.shape[0]):
+            share += basis[i, k] * values[k]
+        for k in range(values.shape[0]):
+            values[k] -= share * basis[i, k]
+
+
+take_out = compile_loop(
+    _take_out, types.void(types.Array(types.float64, 2, "C"), types.Array(types.float64, 1, "C"))
+)
+"""Take orthonormal rows (k, m) out of values (m,), in place: on one core, where a pool of threads
+would cost more than it gives."""
+
+
 class Fit(NamedTuple):
     """Laws fitted to the load cell.
 
@@ -398,7 +415,7 @@ def fit(
         free[: len(first) - len(layout.memories)] = False
     bounds = Space(whole.low[free], whole.high[free], whole.scale[free], whole.logarithmic[free])
     columns = np.concatenate([linear_columns(run, linear) for run in runs])
-    basis = np.linalg.qr(columns)[0]
+    basis = np.ascontiguousarray(np.linalg.qr(columns)[0].T)
     target = np.concatenate([run.missing_n() for run in runs])
     forces = _Forces(effects, runs, layout)
 
@@ -409,8 +426,8 @@ def fit(
 
     def left(inner: Array) -> Array | None:
         missed = target - forces.total(at(inner))
-        missed = missed - basis @ (basis.T @ missed)
-        return missed if np.isfinite(missed @ missed) else None
+        take_out(basis, missed)
+        return missed if np.isfinite(np.sum(missed)) else None
 
     begin = np.clip(first[free], bounds.low, bounds.high)
     solution = solve(left, begin, bounds, iterations, tolerance)
@@ -506,15 +523,16 @@ def held_back_errors(result: Fit, runs: Sequence[Run]) -> Array:
         return target - forces.total(np.concatenate([values, x[laws.stop :]]))
 
     for fold in range(_FOLDS):
-        kept = np.ones(len(target), dtype=np.bool_)
+        within = np.ones(len(target), dtype=np.bool_)
         for block in blocks[fold::_FOLDS]:
-            kept[block] = False
-        basis = np.linalg.qr(columns[kept])[0]
+            within[block] = False
+        kept = np.flatnonzero(within)
+        basis = np.ascontiguousarray(np.linalg.qr(columns[kept])[0].T)
 
         def left(values: Array) -> Array | None:
             missed = missed_by(values)[kept]  # noqa: B023
-            missed = missed - basis @ (basis.T @ missed)  # noqa: B023
-            return missed if np.isfinite(missed @ missed) else None
+            take_out(basis, missed)  # noqa: B023
+            return missed if np.isfinite(np.sum(missed)) else None
 
         solution = solve(left, x[laws], bounds, _REFITTED, 1e-3) if laws.stop else None
         missed = missed_by(x[laws] if solution is None else solution.values)

@@ -31,6 +31,7 @@ from rig.identify.imposed_fit import (
     law_force,
     linear_columns,
     motion_noise,
+    take_out,
 )
 from rig.identify.least_squares import Space, solve
 from rig.identify.output_error import colour
@@ -45,7 +46,7 @@ UNSEEN = frozenset({"added_mass", "inerter", "input_gain", "delay", "hidden_mass
 MOST_LAWS = 3
 _WORKERS = 2
 _MOST_TRIED = 6_000
-_MOST_FITTED = 24_000
+_MOST_FITTED = 9_000
 _HOPELESS = 6.0
 _POLISHED = 2
 _FINALISTS = 7
@@ -110,7 +111,7 @@ class Found(NamedTuple):
     """What was found.
 
     Attributes:
-        runs: The runs, with the samples that were fitted.
+        runs: The runs.
         base: The model as given: nothing fitted.
         linear: Stiffness, damping and preload alone, those that count.
         final: All that was found.
@@ -135,6 +136,7 @@ def search(runs: Sequence[Run], progress: Progress) -> Found:
         runs: Runs to learn from.
         progress: Told what is being done and the share that is done.
     """
+    whole = tuple(runs)
     samples = sum(len(run.counted) for run in runs)
     runs = [run.thinned(max(1, round(samples / _MOST_FITTED))) for run in runs]
     motion = motion_of(runs)
@@ -158,7 +160,18 @@ def search(runs: Sequence[Run], progress: Progress) -> Found:
         final = linear
         if current.effects:
             final, rivals = _compared(runs, current, motion, pool)
-    return Found(tuple(runs), base, linear, final, tuple(rounds), rivals, motion)
+    progress("fitting all samples", 0.88)
+    base, linear, final = (_on_all(whole, there, motion) for there in (base, linear, final))
+    return Found(whole, base, linear, final, tuple(rounds), rivals, motion)
+
+
+def _on_all(whole: Sequence[Run], there: Fit, motion: Motion) -> Fit:
+    """A fit led to its end on every sample."""
+    if there.samples == sum(len(run.counted) for run in whole):
+        return there
+    again = _again(whole, there, motion, there.linear)
+    kept = fit(whole, there.effects, there.values, motion, there.linear, 0, memories=there.memories)
+    return _required(kept if again is None or at_bound(again, motion) else again)
 
 
 def _lean(current: Fit, linear: Fit) -> Fit:
@@ -234,7 +247,7 @@ class _Stage(NamedTuple):
 
     Attributes:
         runs: Runs, thinned out.
-        basis: Orthonormal columns that no law may claim, shape (m, columns).
+        basis: Orthonormal rows that no law may claim, shape (rows, m).
         target: Missing force with those taken out, shape (m,).
         motion: What the strut did.
     """
@@ -255,8 +268,9 @@ def _stage(runs: Sequence[Run], current: Fit, motion: Motion) -> _Stage:
     columns = np.concatenate([part[::every] for part in np.split(known, ends)])
     columns = np.hstack([columns, np.concatenate([linear_columns(run, LINEAR) for run in few])])
     sizes = np.linalg.norm(columns, axis=0)
-    basis = np.linalg.qr(columns[:, sizes > 0.0] / sizes[sizes > 0.0])[0]
-    return _Stage(few, basis, target - basis @ (basis.T @ target), motion)
+    basis = np.ascontiguousarray(np.linalg.qr(columns[:, sizes > 0.0] / sizes[sizes > 0.0])[0].T)
+    take_out(basis, target)
+    return _Stage(few, basis, target, motion)
 
 
 class _Trial(NamedTuple):
@@ -272,7 +286,8 @@ def _claimed(shared: _Stage, name: str, values: Array) -> Array:
     force = np.concatenate(
         [law_force(run, name, values, memory)[run.counted] for run in shared.runs]
     )
-    return force - shared.basis @ (shared.basis.T @ force)
+    take_out(shared.basis, force)
+    return force
 
 
 def _begun(shared: _Stage, name: str) -> list[_Trial]:

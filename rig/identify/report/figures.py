@@ -424,8 +424,11 @@ def _line(
 def _run_marks(figure: Any, joined: Joined, row: int, room: int) -> None:
     if len(joined.names) < 2:
         return
-    length = room * 2 // len(joined.names)
-    for begin_s, name in zip(joined.begins, joined.names, strict=True):
+    ends = (*joined.begins[1:], float(joined.t_s[-1]))
+    whole_s = max(ends[-1] - joined.begins[0], 1e-9)
+    for begin_s, end_s, name in zip(joined.begins, ends, joined.names, strict=True):
+        # A short run has little room above it; names that run into each other say nothing.
+        length = int(2.0 * room * (end_s - begin_s) / whole_s)
         short = name if len(name) <= length else f"{name[: max(length - 1, 1)]}…"
         figure.add_vline(x=begin_s, line={"color": "#9aa5b1", "width": 1}, row=row, col=1)
         figure.add_annotation(

@@ -110,6 +110,7 @@ def page(report: ReportInput) -> str:
         struts=struts,
         errors=tables.errors(found),
         runs=tables.runs(found),
+        run_columns=tables.run_columns(found),
         strut_plots=_plots(report, struts),
         effects=tables.effects(found),
         ranking=tables.ranking(report.ranking, found),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from dart_model.effects import CATALOGUE, effect
 from dart_model.effects.restoring_surface import FIRST_FORCE, RESTORING_SURFACE
-from rig.identify.diagnosis import BeforeAfter, Diagnosis, FoundEffect
+from rig.identify.diagnosis import BeforeAfter, Diagnosis, FoundEffect, RunFigures
 from rig.identify.report.inputs import Ranked
 from rig.identify.report.quantities import (
     change,
@@ -88,16 +88,34 @@ class Rival:
 def errors(found: Diagnosis) -> tuple[ErrorRow, ...]:
     """Errors on held-out data beside the noise floor; only those that were measured."""
     held_out, floor = found.held_out, found.noise_floor
-    rows = (
-        ("Height, model running open loop", held_out.height_rmse_m, floor.height_rmse_m, "m"),
-        ("Residual force", held_out.residual_force_rmse_n, floor.residual_force_rmse_n, "N"),
-        ("Strut force against the load cell", held_out.strut_force_rmse_n, math.nan, "N"),
-    )
+    cell = "Strut force against the load cell"
+    if is_imposed(found):
+        # What the model lacks is then what the load cell shows beyond it.
+        floor_n = floor.residual_force_rmse_n
+        rows = ((f"{cell}, motion imposed", held_out.strut_force_rmse_n, floor_n, "N"),)
+    else:
+        rows = (
+            ("Height, model running open loop", held_out.height_rmse_m, floor.height_rmse_m, "m"),
+            ("Residual force", held_out.residual_force_rmse_n, floor.residual_force_rmse_n, "N"),
+            (cell, held_out.strut_force_rmse_n, math.nan, "N"),
+        )
     return tuple(
         _error(name, figure, at_least, unit)
         for name, figure, at_least, unit in rows
         if figure is not None and math.isfinite(figure.before)
     )
+
+
+def is_imposed(found: Diagnosis) -> bool:
+    """Whether the motion was imposed, so that there is no height error."""
+    return not math.isfinite(found.held_out.height_rmse_m.before)
+
+
+def run_columns(found: Diagnosis) -> tuple[str, ...]:
+    """What `runs` shows of each run, before and after."""
+    if is_imposed(found):
+        return ("Strut force",)
+    return ("Height, open loop", "Residual force", "Strut force")
 
 
 def _error(name: str, figure: BeforeAfter, floor: float, unit: str) -> ErrorRow:
@@ -116,13 +134,17 @@ def runs(found: Diagnosis) -> tuple[RunRow, ...]:
     return tuple(
         RunRow(
             run.run,
-            (
-                *_pair(run.height_rmse_m, "m"),
-                *_pair(run.residual_force_rmse_n, "N"),
-                *_pair(run.strut_force_rmse_n, "N"),
-            ),
+            _cells(run)[-2 * len(run_columns(found)) :],
         )
         for run in found.held_out.runs
+    )
+
+
+def _cells(run: RunFigures) -> tuple[str, ...]:
+    return (
+        *_pair(run.height_rmse_m, "m"),
+        *_pair(run.residual_force_rmse_n, "N"),
+        *_pair(run.strut_force_rmse_n, "N"),
     )
 
 
