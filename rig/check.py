@@ -1,16 +1,19 @@
 """What can be wrong before a bench moves."""
 
-from dataclasses import dataclass
+import stat
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from can_dbc.bus_load import frame_time_s
 from can_dbc.database import Message
 from dart_model.plant import DartPlant
-from rig.config import Setup, build_bridge
+from rig.config import Setup, build_bridge, load_authentication
 from rig.core.stability import Pole, closed_loop_poles
 
 LITTLE_DAMPING = 0.02
 """Damping ratio below which a pole is warned of: it rings for some 8 periods to a third."""
+
+_OTHERS_MAY_READ = stat.S_IRGRP | stat.S_IROTH
 
 FULL_LOAD, HIGH_LOAD = 1.0, 0.7
 
@@ -68,6 +71,7 @@ def check(ready: Setup) -> list[Finding]:
         *[_rate(message, config.period_ns) for message in heights],
         _staleness(ready, heights),
         _load(ready),
+        *_authenticated(ready),
     ]
     if config.imposed_motion is not None:
         text = "the motion is imposed: no loop is closed that could become unstable"
@@ -114,6 +118,23 @@ def _staleness(ready: Setup, heights: list[Message]) -> Finding:
     return Finding(Severity.OK, "supervision.stale_after_s", text)
 
 
+def _authenticated(ready: Setup) -> list[Finding]:
+    asked = ready.config.authentication
+    if asked is None:
+        return []
+    load_authentication(ready)
+    text = (
+        f"AES-128 CMAC, {asked.mac_bits} bits, freshness {asked.freshness_bits} bits, "
+        f"clocks within {asked.clock_tolerance_s:g} s"
+    )
+    path = ready.source.parent / asked.key_file
+    if path.stat().st_mode & _OTHERS_MAY_READ:
+        return [
+            Finding(Severity.WARNING, "authentication", f"{text}; {path} is readable by others")
+        ]
+    return [Finding(Severity.OK, "authentication", text)]
+
+
 def _load(ready: Setup) -> Finding:
     config, database = ready.config, ready.database
     sent = config.published_messages()
@@ -125,6 +146,9 @@ def _load(ready: Setup) -> Finding:
         cycle_ns = message.cycle_time_ns or period_ns
         if name in sent:
             cycle_ns = max(cycle_ns, period_ns)
+        if config.authentication is not None:
+            length = message.length_bytes + config.authentication.trailer_bytes
+            message = replace(message, length_bytes=length, is_fd=True)
         time_s = frame_time_s(message, config.bus.bitrate, config.bus.data_bitrate)
         load += time_s / (cycle_ns * 1e-9)
     rate = f"{config.bus.bitrate / 1e6:g} Mbit/s"

@@ -211,7 +211,10 @@ def run(
         raise typer.Exit(FAILED)
 
 
-@app.command(epilog="Example: `rig bench seed_bench.yaml --interface socketcan --channel vcan0`")
+@app.command(
+    epilog="Examples: `rig bench seed_bench.yaml --interface socketcan --channel vcan0` · "
+    "`rig bench seed_bench.yaml --bridge rig.yaml --out runs/bench`"
+)
 def bench(
     config: ConfigFile,
     interface: Annotated[
@@ -226,23 +229,43 @@ def bench(
         float | None,
         typer.Option("--duration-s", min=0.001, help="Length in s; until Ctrl-C by default."),
     ] = None,
+    bridge: Annotated[
+        Path | None,
+        typer.Option(
+            "--bridge",
+            metavar="FILE",
+            help="Take bus, DBC and authentication from a bridge's configuration instead.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Write summary.json there.")
+    ] = None,
 ) -> None:
     """Run a simulated bench on a bus, in real time."""
     from rig.bench.config import load_bench_config
+    from rig.config import load_authentication, load_setup
     from rig.io.bus import BusConfig
     from rig.runs import run_bench
 
     bench_config = load_bench_config(config)
+    bus, authentication = BusConfig(interface, channel, bitrate), None
+    if bridge is not None:
+        ready = load_setup(bridge)
+        bus, dbc = ready.config.bus.config(), ready.database.path
+        authentication = load_authentication(ready)
     with _stoppable() as stop, _progress(duration_s) as progress:
         sent = run_bench(
             bench_config,
-            BusConfig(interface, channel, bitrate),
+            bus,
             dbc,
+            authentication=authentication,
             duration_s=duration_s,
             stop=stop,
             progress=progress,
         )
     console.print(f"Sent {sent} frames.")
+    if out is not None:
+        _write_summary(out, {"bench": bench_config.name, "frames": sent})
 
 
 @app.command(name="check", epilog="Example: `rig check rig.yaml`")

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from can_dbc.database import DEFAULT_DATABASE, Database, load_database
+from can_dbc.database import DEFAULT_DATABASE, Database, Message, load_database
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, ModelSpec, load_model
 from dart_model.yaml_file import Finite, InputError, NotNegative, Positive, load_validated
@@ -29,6 +29,7 @@ from rig.core.types import Core
 from rig.io.bus import BusConfig
 from rig.io.captures import Window
 from rig.io.run_writer import Rotation
+from rig.io.secoc import FD_LENGTHS, Authentication, read_key
 
 __all__ = [
     "CONFIGS",
@@ -36,6 +37,7 @@ __all__ = [
     "RunConfig",
     "Setup",
     "build_bridge",
+    "load_authentication",
     "load_setup",
     "put_together",
     "setup",
@@ -214,6 +216,33 @@ class Realtime(_Frozen):
     freeze_garbage: bool = True
 
 
+class AuthenticationConfig(_Frozen):
+    """Authentication of all frames after AUTOSAR SecOC, on CAN FD.
+
+    Attributes:
+        key_file: File with 32 hexadecimal digits, beside the configuration.
+        freshness_bits: Bits of the freshness value in a frame.
+        mac_bits: Bits of the CMAC in a frame.
+        clock_tolerance_s: How far bench's and bridge's clocks may be apart. A frame that was
+            recorded longer ago is refused also by a bridge that has just been started.
+    """
+
+    key_file: Text
+    freshness_bits: Literal[8, 16, 24, 32] = 8
+    mac_bits: Literal[24, 32, 40, 48, 56, 64, 96, 128] = 24
+    clock_tolerance_s: Annotated[float, Field(ge=0.001, le=10.0, allow_inf_nan=False)] = 0.1
+
+    def with_key(self, key: bytes) -> Authentication:
+        """As the bus takes it."""
+        tolerance_ns = round(self.clock_tolerance_s * 1e9)
+        return Authentication(key, self.freshness_bits // 8, self.mac_bits // 8, tolerance_ns)
+
+    @property
+    def trailer_bytes(self) -> int:
+        """How much longer a frame becomes."""
+        return (self.freshness_bits + self.mac_bits) // 8
+
+
 class LogConfig(_Frozen):
     """How the log of a run is kept.
 
@@ -254,6 +283,7 @@ class RunConfig(_Frozen):
         model: Model file, beside the configuration, or the name of one that comes with the package.
         dbc: DBC file beside the configuration; the package's own if absent.
         bus: How to open the bus.
+        authentication: Authentication of all frames; none if absent.
         signals: What is read from it.
         imposed_motion: Declares a dyno; there is then a load cell and no applied force.
         observers: One for each strut of the model, by strut name; a dyno has no use for them.
@@ -271,6 +301,7 @@ class RunConfig(_Frozen):
     model: Text = "seed"
     dbc: Text | None = None
     bus: BusSettings = BusSettings()
+    authentication: AuthenticationConfig | None = None
     signals: Signals
     imposed_motion: ImposedMotionConfig | None = None
     observers: dict[str, ObserverConfig] = Field(default_factory=dict[str, ObserverConfig])
@@ -380,6 +411,16 @@ def put_together(config: RunConfig, source: Path, model: ModelSpec, database: Da
     named = _with_strut_names(config, model, source)
     _check_messages(named, database, source)
     return Setup(config=named, source=source, model=model, database=database)
+
+
+def load_authentication(ready: Setup) -> Authentication | None:
+    """How frames are authenticated, with its key; None without authentication.
+
+    Raises:
+        InputError: The key cannot be read.
+    """
+    asked = ready.config.authentication
+    return None if asked is None else asked.with_key(read_key(ready.source.parent / asked.key_file))
 
 
 def build_bridge(ready: Setup, model: ModelSpec | None = None) -> Bridge:
@@ -497,3 +538,32 @@ def _check_messages(config: RunConfig, database: Database, source: Path) -> None
         )
     for name in outputs:
         database.message(name)
+    if config.authentication is not None:
+        names = {entry.message for entry in config.signals.named()}.union(outputs)
+        _check_authentication(
+            config,
+            config.authentication,
+            [database.message(name) for name in sorted(names)],
+            source,
+        )
+
+
+def _check_authentication(
+    config: RunConfig, asked: AuthenticationConfig, messages: list[Message], source: Path
+) -> None:
+    if config.bus.data_bitrate is None:
+        raise InputError(
+            f"{source}: authentication: classic CAN has no room for it, expected bus.data_bitrate"
+        )
+    for message in messages:
+        if message.is_extended:
+            raise InputError(
+                f"{source}: authentication: {message.name} has a 29-bit id, expected 11 bits, "
+                "because SecOC's data ids have 16"
+            )
+        length = message.length_bytes + asked.trailer_bytes
+        if length not in FD_LENGTHS:
+            raise InputError(
+                f"{source}: authentication: {message.name} would be {length} bytes long, "
+                f"expected one of CAN FD's lengths {', '.join(map(str, FD_LENGTHS))}"
+            )

@@ -18,7 +18,7 @@ from dart_model.spec import copy_skeleton, dump_model
 from dart_model.yaml_file import InputError
 from rig.bench.schema import BenchConfig
 from rig.bench.simulated import Bench
-from rig.config import RunConfig, Setup, build_bridge
+from rig.config import RunConfig, Setup, build_bridge, load_authentication
 from rig.core.bridge import Bridge, BridgeState, TickResult
 from rig.core.messages import NO_TIMING, Conditions, Levels, TimingFigures
 from rig.core.types import Mode
@@ -28,6 +28,7 @@ from rig.io.link import Link, LinkFigures
 from rig.io.realtime import Granted, Request, realtime
 from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE
 from rig.io.run_writer import RunLog
+from rig.io.secoc import Authentication, Authenticator
 from rig.io.steps import Step
 from rig.io.timing_picture import TIMING_PICTURE, Distribution, draw_timing
 from rig.loop import Port, Progress, Timing, regular_ticks, run
@@ -100,6 +101,7 @@ class BusPort:
     def __init__(self, link: Link) -> None:
         self.link = link
         self._acknowledged = False
+        self._refused = 0
 
     def acknowledge(self) -> None:
         """Acknowledge the safe state at the next tick."""
@@ -107,11 +109,14 @@ class BusPort:
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
         """Frames that have come since the last tick."""
-        frames = self.link.receive(t_ns)
-        if self.link.fault is None and not self._acknowledged:
+        link = self.link
+        frames = link.receive(t_ns)
+        if link.fault is None and not self._acknowledged and link.refused == self._refused:
             return frames, _NO_CONDITIONS
+        bus_fault = link.fault is not None or link.refused > self._refused
+        self._refused = link.refused
         acknowledged, self._acknowledged = self._acknowledged, False
-        return frames, Conditions(acknowledged=acknowledged, bus_fault=self.link.fault is not None)
+        return frames, Conditions(acknowledged=acknowledged, bus_fault=bus_fault)
 
     def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
         """Send; returns what was sent."""
@@ -159,9 +164,17 @@ class _BenchOnBus:
     sends what is due at the tick that is awaited, so that its own work delays no tick.
     """
 
-    def __init__(self, bench: Bench, bench_bus: Bus, clock: Clock, port: BusPort) -> None:
+    def __init__(
+        self,
+        bench: Bench,
+        bench_bus: Bus,
+        clock: Clock,
+        port: BusPort,
+        authenticator: Authenticator | None,
+    ) -> None:
         self._bench = bench
         self._bench_bus = bench_bus
+        self._secured = None if authenticator is None else authenticator.secured
         self._clock = clock
         self._port = port
 
@@ -181,7 +194,7 @@ class _BenchOnBus:
 
     def _send_up_to(self, t_ns: int) -> None:
         for frame in self._bench.update(t_ns)[0]:
-            self._bench_bus.send(frame)
+            self._bench_bus.send(frame if self._secured is None else self._secured(frame))
         self._bench_bus.receive()  # the bench has no use for what the bridge says
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
@@ -370,7 +383,13 @@ def _link(ready: Setup, bridge: Bridge, clock: Clock, *, listen_only: bool = Fal
             epoch_ns=clock.epoch_ns,
         )
 
-    return Link(open_bus, clock.epoch_now_ns)
+    authenticator = _authenticator(ready, clock)
+    return Link(open_bus, clock.epoch_now_ns, authenticator=authenticator)
+
+
+def _authenticator(ready: Setup, clock: Clock) -> Authenticator | None:
+    how = load_authentication(ready)
+    return None if how is None else Authenticator(how, clock.epoch_ns)
 
 
 def with_bench(
@@ -405,7 +424,8 @@ def with_bench(
         stack.callback(link.close)
         bench_bus = Bus(ready.config.bus.config(), epoch_ns=clock.epoch_ns)
         stack.callback(bench_bus.close)
-        on_bus = _BenchOnBus(bench, bench_bus, clock, BusPort(link))
+        authenticator = _authenticator(ready, clock)
+        on_bus = _BenchOnBus(bench, bench_bus, clock, BusPort(link), authenticator)
         return logged(
             ready,
             bridge,
@@ -424,6 +444,7 @@ def run_bench(
     bus_config: BusConfig,
     dbc: Path | None,
     *,
+    authentication: Authentication | None = None,
     duration_s: float | None,
     stop: Callable[[], bool],
     progress: Progress,
@@ -434,6 +455,7 @@ def run_bench(
         bench_config: The bench.
         bus_config: The bus.
         dbc: What its messages mean; the package's own if None.
+        authentication: How its frames are secured; not at all if None.
         duration_s: Length; until asked to stop if None.
         stop: Asked before each frame whether to end.
         progress: Told of the time.
@@ -449,7 +471,11 @@ def run_bench(
     end_ns = None if duration_s is None else round(duration_s * 1e9)
     sent, due_ns = 0, 0
     clock = RealClock()
-    link = Link(lambda: Bus(bus_config, (), epoch_ns=clock.epoch_ns), clock.epoch_now_ns)
+    link = Link(
+        lambda: Bus(bus_config, (), epoch_ns=clock.epoch_ns),
+        clock.epoch_now_ns,
+        authenticator=authentication and Authenticator(authentication, clock.epoch_ns),
+    )
     try:
         while not stop() and (end_ns is None or due_ns < end_ns):
             # Woken at least every 0.1 s, so that Ctrl-C is heard between slow frames.

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from can_dbc.frame import Frame
 from rig.io.bus import Bus, BusError, BusFullError
 from rig.io.controller import Controller, state_after
+from rig.io.secoc import Authenticator
 
 FIRST_PAUSE_NS = 50_000_000
 """Pause before an interface that has gone is opened again; doubled at every failure."""
@@ -49,6 +50,8 @@ class LinkFigures:
         bus_off: Times it went bus-off.
         unsent: Frames that could not be sent.
         clock_steps: Times the system's clock was set.
+        unauthentic: Frames refused because no fresh value fits their authenticator.
+        replayed: Frames refused because one as new had come already.
         gaps: Times without an interface, at most the first 1000.
     """
 
@@ -58,6 +61,8 @@ class LinkFigures:
     bus_off: int = 0
     unsent: int = 0
     clock_steps: int = 0
+    unauthentic: int = 0
+    replayed: int = 0
     gaps: list[Gap] = field(default_factory=list[Gap])
 
     def as_dict(self) -> dict[str, object]:
@@ -69,6 +74,8 @@ class LinkFigures:
             "bus_off": self.bus_off,
             "unsent": self.unsent,
             "clock_steps": self.clock_steps,
+            "unauthentic": self.unauthentic,
+            "replayed": self.replayed,
             "gaps": [
                 {"from_s": gap.from_ns * 1e-9, "to_s": _seconds(gap.to_ns), "why": gap.why}
                 for gap in self.gaps
@@ -90,6 +97,7 @@ class Link:
         open_bus: Opens the bus; called at once, and again whenever it has gone.
         epoch_now_ns: Unix time of the run's start by the system's clock as it is set now.
         executor: Runs `open_bus` when it has gone; a thread of its own by default.
+        authenticator: Secures what is sent, and lets in what is authentic; None does neither.
 
     Raises:
         BusError: The bus cannot be opened at the start.
@@ -100,12 +108,14 @@ class Link:
         open_bus: Callable[[], Bus],
         epoch_now_ns: Callable[[], int],
         executor: Executor | None = None,
+        authenticator: Authenticator | None = None,
     ) -> None:
         self.figures = LinkFigures()
         self.fault: str | None = None
         """What is wrong now; None while all is well."""
         self._open_bus = open_bus
         self._epoch_now_ns = epoch_now_ns
+        self._authenticator = authenticator
         self._executor = executor or ThreadPoolExecutor(1, thread_name_prefix="bus")
         self._bus: Bus | None = open_bus()
         self._epoch_ns = self._bus.epoch_ns
@@ -139,17 +149,18 @@ class Link:
                 frames[index] = replace(frame, t_ns=self._arrival_ns(frame.t_ns, last_ns, t_ns))
             if frame.is_error or self._controller:
                 self._judge(frame)
-        return frames
+        return frames if self._authenticator is None else self._authentic(frames)
 
     def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
         """Send; returns the frames that were sent."""
         bus = self._bus
         if bus is None or bus.listens_only:
             return ()
+        secured = None if self._authenticator is None else self._authenticator.secured
         done = 0
         try:
             for frame in frames:
-                bus.send(frame)
+                bus.send(frame if secured is None else secured(frame))
                 done += 1
         except BusError as error:
             self._unsent(frames[done:], error)
@@ -159,6 +170,11 @@ class Link:
             self._tell_controller()
         return frames
 
+    @property
+    def refused(self) -> int:
+        """Frames refused so far because they are not authentic or not new."""
+        return self.figures.unauthentic + self.figures.replayed
+
     def close(self) -> None:
         """Close the bus."""
         if self._opening is not None:
@@ -166,6 +182,14 @@ class Link:
         self._executor.shutdown(wait=False, cancel_futures=True)
         if self._bus is not None:
             self._bus.close()
+
+    def _authentic(self, frames: Sequence[Frame]) -> Sequence[Frame]:
+        authenticator, figures = self._authenticator, self.figures
+        if authenticator is None:
+            return frames
+        accepted = authenticator.accepted(frames)
+        figures.unauthentic, figures.replayed = authenticator.unauthentic, authenticator.replayed
+        return accepted
 
     def _arrival_ns(self, stamp_ns: int, last_ns: int, t_ns: int) -> int:
         """A time in the tick for a stamp outside of it."""
