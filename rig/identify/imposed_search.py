@@ -55,6 +55,7 @@ _LEAST_GAIN = 0.004
 _LATER_GAIN = 0.03
 _CERTAIN = 2.0
 _MOST_LOST = 0.4
+_HARDLY_LOST = 0.005
 _INDISTINCT = 2.0
 _NEGLIGIBLE = 0.02
 _MOTION_MARGIN = 2.0
@@ -459,7 +460,9 @@ def significant(before: Fit, after: Fit, runs: Sequence[Run], least: float | Non
         least = _LATER_GAIN if before.effects else _LEAST_GAIN
     lost, won = -float(gain[gain < 0.0].sum()), float(gain[gain > 0.0].sum())
     broad = _certainty(gain) > _CERTAIN and lost < _MOST_LOST * won
-    return broad and float(gain.sum()) > least * float(old.sum())
+    # A stop that is met now and then gains in few blocks, but it costs in none.
+    rare = lost < _HARDLY_LOST * won
+    return (broad or rare) and float(gain.sum()) > least * float(old.sum())
 
 
 def without(result: Fit, row: int, runs: Sequence[Run], motion: Motion) -> Fit | None:
@@ -530,15 +533,15 @@ def _compared(
         for c in rivals
         if effect(c.name).family not in chosen
         and c.fit is not None
-        and _size(c) <= current.parameter_count + len(current.linear)
+        and _size(c) <= _size(c._replace(fit=current))
     ]
     return current, tuple(sorted(left, key=lambda c: c.score))
 
 
 def _size(candidate: Candidate) -> int:
-    """Number of parameters, those of linear effects too."""
+    """Number of parameters and of effects, linear ones too."""
     there = _required(candidate.fit)
-    return there.parameter_count + len(there.linear)
+    return there.parameter_count + len(there.effects) + 2 * len(there.linear)
 
 
 def _without_needless(runs: Sequence[Run], candidate: Candidate, motion: Motion) -> Candidate:

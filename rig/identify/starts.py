@@ -134,6 +134,10 @@ def _bristles(m: Motion) -> list[float]:
     return [x for x in (2e-5, 8e-5, 3e-4, 1e-3) if x <= 0.02 * m.stroke] or [0.01 * m.stroke]
 
 
+def _bends(m: Motion) -> list[float]:
+    return [m.stroke * share for share in (0.03, 0.1, 0.3)]
+
+
 def _stribeck(m: Motion) -> list[Start]:
     return _grid([1.0], [1.3], [0.02, 0.1 * m.speed, 0.3 * m.speed], [2e-3, 0.02 * m.speed])
 
@@ -237,11 +241,12 @@ _STARTS: Mapping[str, Callable[[Motion], list[Start]]] = MappingProxyType(
         "end_zone_damping": lambda m: _grid(
             [1.0], [m.free_length_m, *m.heights(0.2, 0.4, 0.6, 0.8)]
         ),
-        "bouc_wen": lambda m: _grid(
-            [1.0], [m.stroke * s for s in (0.03, 0.1, 0.3)], [1.0, 2.0], [0.5, 0.9]
-        ),
-        "dahl": lambda m: _grid([1.0], [m.stroke * s for s in (0.03, 0.1, 0.3)], [1.0]),
-        "iwan": lambda m: _grid([1.0], [m.stroke * s for s in (0.03, 0.1, 0.3)]),
+        "bouc_wen": lambda m: [
+            (1.0, 0.015 * m.least_stroke, 1.0, 0.5),
+            *_grid([1.0], _bends(m), [1.0, 2.0], [0.5, 0.9]),
+        ],
+        "dahl": lambda m: _grid([1.0], [0.015 * m.least_stroke, *_bends(m)], [1.0]),
+        "iwan": lambda m: _grid([1.0], [0.015 * m.least_stroke, *_bends(m)]),
         "maxwell": lambda _: _grid([1.0], [0.005, 0.02, 0.06, 0.2, 0.6, 2.0]),
         "temperature_fade": _temperature,
         "linear_temperature_fade": _linear_temperature,
