@@ -261,7 +261,7 @@ class _Joints(Protocol):
         """Where a velocity leads to in `h` seconds."""
         ...
 
-    def kinematics(self, q: _Value, v: _Value) -> list[tuple[float, float]]:
+    def kinematics(self, state: PlantState) -> list[tuple[float, float]]:
         """Height and velocity of every strut."""
         ...
 
@@ -304,7 +304,8 @@ class _Coordinate:
     def moved(self, q: float, v: float, h: float) -> float:
         return q + h * v
 
-    def kinematics(self, q: float, v: float) -> list[tuple[float, float]]:
+    def kinematics(self, state: PlantState) -> list[tuple[float, float]]:
+        q, v = state.positions[0], state.velocities[0]
         found: list[tuple[float, float]] = []
         for _, _, offset, row in self._struts:
             found.append((offset + row * q, row * v))
@@ -431,10 +432,9 @@ class _Coordinates:
         self._skeleton.integratePositions(h)
         return np.array(self._skeleton.getPositions())
 
-    def kinematics(
-        self, q: NDArray[np.float64], v: NDArray[np.float64]
-    ) -> list[tuple[float, float]]:
-        return _kinematics(self._rows(q), q.tolist(), v.tolist())
+    def kinematics(self, state: PlantState) -> list[tuple[float, float]]:
+        rows = self._rows(np.array(state.positions))
+        return _kinematics(rows, state.positions, state.velocities)
 
     def load(
         self,
@@ -580,7 +580,7 @@ class DartPlant:
 
     def kinematics(self, state: PlantState) -> list[tuple[float, float]]:
         """Height (m) and velocity (m/s) of every strut in a state."""
-        return self._joints.kinematics(*self._joints.values(state))
+        return self._joints.kinematics(state)
 
     def load(
         self,
@@ -598,7 +598,7 @@ class DartPlant:
             temperature_c: Damper temperature.
         """
         joints, memory = self._joints, state.memory
-        rates = [0.0] * len(memory)
+        rates = [0.0] * self.memory_size
         q, v = joints.values(state)
         motions, held, acceleration = joints.load(
             q, v, virtual_forces_n, memory, (state.t_s, applied_force_n, temperature_c), rates
@@ -653,7 +653,7 @@ class DartPlant:
             count -= 1
             if count == 0:
                 return self._joints.state(q, v, memory, t_s)
-            s1 = [0.0] * len(memory)
+            s1 = [0.0] * self.memory_size
             a1 = acceleration(q, v, held, memory, now, s1)
 
     def motions(
@@ -778,12 +778,12 @@ def _as_lists(rows: _Rows) -> _Lists:
     )
 
 
-def _dot(a: list[float], b: list[float]) -> float:
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
     return sum(map(mul, a, b))
 
 
 def _kinematics(
-    rows: _Lists, position: list[float], velocity: list[float]
+    rows: _Lists, position: Sequence[float], velocity: Sequence[float]
 ) -> list[tuple[float, float]]:
     """Height and velocity of every strut."""
     return [

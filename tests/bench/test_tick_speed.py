@@ -2,10 +2,12 @@
 
 The measure is the bare DART loop: read position and velocity, set a force, step. It is taken twice,
 with DART's array functions (`getPositions`) and with its cheaper scalar ones (`getPosition(0)`).
-Rounds of all subjects alternate, so that what disturbs this machine disturbs all of them; the
-fastest round counts, and the spread is printed (`pytest -s`).
+The body moves, as under the seed's applied force: for one at rest DART skips a fifth of its work.
+Rounds of all subjects alternate, so that what disturbs this machine disturbs all of them; CPU time
+is taken, the fastest round counts, and the spread is printed (`pytest -s`).
 """
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter_ns, process_time_ns
@@ -28,9 +30,11 @@ from rig.replay import replay
 from tests.core.cores import GAINS, core, measured
 from tests.loop.listed import MS, ListPort, bench_frames, live
 
-TICKS = 60
-ROUNDS = 250
+TICKS = 300
+ROUNDS = 50
 TIMES_NS = tuple(tick * MS for tick in range(TICKS))
+APPLIED_N = tuple(100.0 * math.sin(0.01 * tick) for tick in range(TICKS))
+HEIGHTS_M = tuple(0.4 + 0.02 * math.sin(0.02 * tick) for tick in range(TICKS))
 
 Subject = Callable[[], None]
 
@@ -72,17 +76,17 @@ def array_loop(*, observing: bool) -> Subject:
     put_forces, step = skeleton.setForces, world.step
 
     def bare() -> None:
-        for _ in range(TICKS):
+        for applied_n in APPLIED_N:
             q, v = float(positions()[0]), float(velocities()[0])
-            put_forces([500.0 * (0.5 - q) - 100.0 * v])
+            put_forces([500.0 * (0.5 - q) - 100.0 * v + applied_n])
             step()
 
     def observed() -> None:
         observer = ObserverState(0.0, 0.0, 0.0, 0)
-        for t_ns in TIMES_NS:
+        for t_ns, applied_n, height_m in zip(TIMES_NS, APPLIED_N, HEIGHTS_M, strict=True):
             q, v = float(positions()[0]), float(velocities()[0])
-            observer = update(GAINS, observer, 0.4 - q, t_ns)
-            put_forces([500.0 * (0.5 - q) - 100.0 * v + observer.virtual_force_n])
+            observer = update(GAINS, observer, height_m - q, t_ns)
+            put_forces([500.0 * (0.5 - q) - 100.0 * v + applied_n + observer.virtual_force_n])
             step()
 
     return observed if observing else bare
@@ -95,17 +99,17 @@ def scalar_loop(*, observing: bool) -> Subject:
     put_force, step = skeleton.setForce, world.step
 
     def bare() -> None:
-        for _ in range(TICKS):
+        for applied_n in APPLIED_N:
             q, v = position(0), velocity(0)
-            put_force(0, 500.0 * (0.5 - q) - 100.0 * v)
+            put_force(0, 500.0 * (0.5 - q) - 100.0 * v + applied_n)
             step()
 
     def observed() -> None:
         observer = ObserverState(0.0, 0.0, 0.0, 0)
-        for t_ns in TIMES_NS:
+        for t_ns, applied_n, height_m in zip(TIMES_NS, APPLIED_N, HEIGHTS_M, strict=True):
             q, v = position(0), velocity(0)
-            observer = update(GAINS, observer, 0.4 - q, t_ns)
-            put_force(0, 500.0 * (0.5 - q) - 100.0 * v + observer.virtual_force_n)
+            observer = update(GAINS, observer, height_m - q, t_ns)
+            put_force(0, 500.0 * (0.5 - q) - 100.0 * v + applied_n + observer.virtual_force_n)
             step()
 
     return observed if observing else bare
@@ -178,8 +182,8 @@ def test_a_whole_tick_against_the_bare_dart_loop(capsys):
         capsys,
     )
     tick = found["whole tick, frame in and frame out"]
-    assert tick / found["DART, array functions"] <= 20.0
-    assert tick / found["DART, scalar functions"] <= 40.0
+    assert tick / found["DART, array functions"] <= 5.0
+    assert tick / found["DART, scalar functions"] <= 9.0
 
 
 def test_an_observer_adds_less_than_a_quarter(capsys):
@@ -192,8 +196,9 @@ def test_an_observer_adds_less_than_a_quarter(capsys):
         },
         capsys,
     )
-    bare = found["DART, array functions"]
-    assert (found["the same with an observer"] - bare) / bare < 0.25
+    assert found["the same with an observer"] / found["DART, array functions"] < 1.25
+    # Measured: 1.17 to 1.23. The scalar loop is short enough for noise to matter.
+    assert found["these with an observer"] / found["DART, scalar functions"] < 1.35
 
 
 def test_a_second_observer_costs_no_more_than_the_first(capsys):
@@ -253,4 +258,4 @@ def test_a_replay_against_the_bare_dart_loop(tmp_path: Path, capsys):
     with capsys.disabled():
         rate = 1e6 / min(per_tick_us)
         print(f"\nreplay: {min(per_tick_us):.1f} us a tick, {rate:.0f} ticks a second of one core")
-    assert min(per_tick_us) / min(bare_us) <= 40.0
+    assert min(per_tick_us) / min(bare_us) <= 12.0
