@@ -280,7 +280,7 @@ def driven_start(record: Record, name: str) -> ModelSpec:
     first = _dynamic_stiffness(record.t_s, height_m - middle_m, record.applied_force_n)
     model = reduced_model(_one_body(name, first, middle_m))
     nothing, none = planted(()), np.zeros(0)
-    grid = grid_of(record)
+    grid = grid_of(record, model)
     spread_m = float(np.nanstd(height_m))
     guess = start_of(model, *first_motion(grid), 0)
     speed_m_per_s = float(np.nanstd(np.gradient(height_m, record.t_s)))
@@ -370,9 +370,9 @@ def open_loop_rmse_m(spec: ModelSpec, record: Record, skipped: int) -> float:
         record: Run with an applied force.
         skipped: Samples at the start that do not count.
     """
-    grid = grid_of(record)
-    head = grid.rows(0, skipped)
     model = reduced_model(spec)
+    grid = grid_of(record, model)
+    head = grid.rows(0, skipped)
     guess = start_of(model, *first_motion(head), 0)
     scale = np.array(
         [np.nanstd(grid.heights_m), np.nanstd(np.gradient(grid.heights_m[:, 0], grid.t_s))]

@@ -14,17 +14,19 @@ References:
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
 
+import itertools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import welch
 
 from dart_model.effects import effect
 from rig.identify import screen
-from rig.identify.output_error import Fit, colour, fit
-from rig.identify.reduced import Grid, Model, Trajectory, planted, run, start_of
+from rig.identify.output_error import Fit, colour, fit, intervals
+from rig.identify.reduced import Grid, Model, Planted, Trajectory, planted, pull_on, run, start_of
 from rig.identify.smoother import Noise, Smoothed, estimate_noise, smooth
 from rig.identify.starts import CANDIDATES
 
@@ -33,16 +35,26 @@ Progress = Callable[[str, float], None]
 
 MOST_EFFECTS = 4
 WORKERS = 2
-_SIMULATED = 5
+_SIMULATED = 9
+_FIRST_STEPS = 3
+_BEHIND = 3.0
 _HOPELESS = 30.0
 _FAR = 12.0
 _NEAR = 2.5
-_LATER_GAIN = 0.03
+_LATER_GAIN = 0.1
+_REPEATED_GAIN = 0.5
 _INPUT_MARGIN = 2.0
 _PULL_PER_S = 8.0
 _ALONE = 3.0
 _FLOOR_COLOUR = 0.03
+_NEARLY = 0.25
 _BLOCKS = 40
+_HIDDEN = 0.05
+_MOST_STEPS = 160_000
+_FEWER_STEPS = 80_000
+_PIECES = 4
+_LEAST_NODES = 2_000
+_FIRST_SHARE = 1e-3
 _LEAST_GAIN = 0.004
 _LEAST_LIKELIHOOD_GAIN = 25.0
 _MOST_LOST = 0.4
@@ -58,7 +70,7 @@ class Candidate(NamedTuple):
     Attributes:
         strut: Index of the strut.
         name: Effect.
-        tried: Sum of squares left along the motion.
+        tried: Share of the square of what is missing that it leaves in a trial.
         fit: Joint open-loop fit with the effects chosen before, or None if it was not simulated.
         score: Deviance with a penalty for parameters; lower is better; infinite without a fit.
         why: Why it was not chosen; empty for the winner.
@@ -92,32 +104,36 @@ class Judge(NamedTuple):
         grids: Runs.
         noise_m2: Noise variance of each height, shape (struts,).
         input_m2: Variance that the noise of the applied force adds to each height, shape (struts,).
-        every: Thinning of the trials.
+        along: Linear effects that are fitted along with all others, see `_fitted_along`.
     """
 
     model: Model
     grids: tuple[Grid, ...]
     noise_m2: Array
     input_m2: Array
-    every: int
+    along: tuple[tuple[int, str], ...] = ()
 
 
 class Attribution(NamedTuple):
     """What was found.
 
     Attributes:
-        base: The model as given, open loop, initial states fitted.
+        whole: The model as given on the whole runs, open loop, initial states fitted.
+        base: The same on the judge's pieces of them.
         final: The model with all effects found, pulled weakly towards the measured motion.
         rounds: The competition.
         judge: Its data.
         motions: What each strut did.
+        runs: The whole runs.
     """
 
+    whole: Fit
     base: Fit
     final: Fit
     rounds: tuple[Round, ...]
     judge: Judge
     motions: tuple[screen.Motion, ...]
+    runs: tuple[Grid, ...]
 
 
 def first_fit(model: Model, grids: Sequence[Grid]) -> tuple[Fit, Array]:
@@ -187,11 +203,12 @@ def attribute(model: Model, grids: Sequence[Grid], progress: Progress) -> Attrib
         grids: Runs to learn from.
         progress: Told what is being done and the share that is done.
     """
-    base, noise = first_fit(model, grids)
-    samples = sum(len(grid.t_s) for grid in grids)
-    every = max(1, round(samples / screen.MOST_SAMPLES))
-    judge = Judge(model, tuple(grids), noise, input_noise(model, grids), every)
+    whole, noise = first_fit(model, grids)
+    pieces = _pieces(grids)
+    base = whole if len(pieces) == len(grids) else first_fit(model, pieces)[0]
+    judge = Judge(model, pieces, noise, input_noise(model, grids))
     judge, current = _pulled(judge, base, ())
+    judge, current = _fitted_along(judge, base, current)
     rounds: list[Round] = []
     motions: tuple[screen.Motion, ...] = ()
     with ThreadPoolExecutor(WORKERS) as pool:
@@ -202,18 +219,77 @@ def attribute(model: Model, grids: Sequence[Grid], progress: Progress) -> Attrib
             winner = this.candidates[0] if this.candidates else None
             if winner is None or winner.fit is None:
                 break
-            if not significant(current, winner.fit):
+            if not significant(current, winner.fit, judge.along):
                 break
             current = _pruned(judge, _converged(judge, winner.fit, motions), motions)
             judge, current = _retargeted(judge, current, motions)
             if at_floor(current, judge):
                 break
-            if len(current.planted.effects) > 1:
+            if len(current.planted.effects) > len(judge.along) + 1:
                 current = _swapped(judge, base, current, motions, pool)
                 judge, current = _retargeted(judge, current, motions)
                 if at_floor(current, judge):
                     break
-    return Attribution(base, current, tuple(rounds), judge, motions)
+    return Attribution(whole, base, current, tuple(rounds), judge, motions, tuple(grids))
+
+
+def _pieces(grids: Sequence[Grid]) -> tuple[Grid, ...]:
+    """The runs that rivals are compared on: of those that take many steps, evenly spread parts."""
+    steps = sum(grid.substeps * len(grid.t_s) for grid in grids)
+    if steps <= _MOST_STEPS:
+        return tuple(grids)
+    pieces: list[Grid] = []
+    for grid in grids:
+        nodes = len(grid.t_s)
+        length = max(int(nodes * _FEWER_STEPS / steps / _PIECES), _LEAST_NODES)
+        if length * _PIECES >= nodes:
+            pieces.append(grid)
+            continue
+        firsts = [int(k * (nodes - length) / (_PIECES - 1)) for k in range(_PIECES)]
+        pieces += [grid.rows(first, first + length) for first in firsts]
+    return tuple(pieces)
+
+
+def _fitted_along(judge: Judge, base: Fit, current: Fit) -> tuple[Judge, Fit]:
+    """Linear effects that every fit holds, where the model was itself fitted to such a run.
+
+    Then what it lacks is partly hidden in its mass, stiffness, damping and free length, and its
+    residual is orthogonal to theirs: to fit them again gains nothing. They must give way as soon
+    as the missing effect is there.
+    """
+    if at_floor(base, judge):
+        return judge, current
+    motions = _shared(judge, base, current, current).motions
+    along: list[tuple[int, str]] = []
+    values: list[float] = []
+    for strut, motion in enumerate(motions):
+        constants = {
+            "preload": motion.stiffness_n_per_m * motion.stroke,
+            "linear_stiffness": motion.stiffness_n_per_m,
+            "linear_damping": motion.damping_n_s_per_m,
+            "added_mass": motion.mass_kg,
+        }
+        along += [(strut, name) for name in constants]
+        values += [_FIRST_SHARE * max(value, 1e-9) for value in constants.values()]
+    there = _fitted(judge, planted(tuple(along)), np.array(values), current.starts, motions, 12)
+    if there is None or there.cost < (1.0 - _HIDDEN) * current.cost:
+        return judge, current
+    return judge._replace(along=tuple(along)), there
+
+
+def _fitted(
+    judge: Judge,
+    what: Planted,
+    values: Array,
+    starts_at: Sequence[Array],
+    motions: Sequence[screen.Motion],
+    iterations: int,
+    tolerance: float = 1e-4,
+) -> Fit | None:
+    return fit(
+        judge.model, what, values, starts_at, judge.grids, judge.noise_m2, motions, iterations,
+        tolerance=tolerance,
+    )  # fmt: skip
 
 
 def _pulled(judge: Judge, current: Fit, motions: Sequence[screen.Motion]) -> tuple[Judge, Fit]:
@@ -265,31 +341,21 @@ def _retargeted(judge: Judge, current: Fit, motions: Sequence[screen.Motion]) ->
 
 def _converged(judge: Judge, result: Fit, motions: Sequence[screen.Motion]) -> Fit:
     """The fit led to its end: what it leaves by chance would be given a name in the next round."""
-    last = fit(
-        judge.model,
-        result.planted,
-        result.values,
-        result.starts,
-        judge.grids,
-        judge.noise_m2,
-        motions,
-        12,
-        tolerance=1e-5,
-    )
-    return last if last is not None and last.cost <= result.cost else result
+    return _further(judge, result, motions, 12, 1e-5)
 
 
 def input_noise(model: Model, grids: Sequence[Grid]) -> Array:
     """Variance of each height that comes from noise and resolution of the applied force.
 
-    The noise is what third differences of the force hold, but never more than a thousandth of its
-    range: a force with real content up there is not noise.
+    The noise is what the quietest tenth of the force's spectrum holds (Welch's periodogram), but
+    never more than a thousandth of its range.
     """
     variances: list[Array] = []
     for grid in grids:
         force = grid.applied_n
-        noise = float(np.sqrt(np.mean(np.diff(force, 3) ** 2) / 20.0))
-        noise = min(noise, 1e-3 * float(np.ptp(force)))
+        _, power = welch(force, 1.0 / grid.step_s, nperseg=min(1024, len(force) // 4))
+        quiet = float(np.quantile(power[1:], 0.05)) * 0.5 / grid.step_s
+        noise = min(float(np.sqrt(quiet)), 1e-3 * float(np.ptp(force)))
         linear, _, _ = screen.linear_model(model, grid.step_s, float(grid.t_s[-1] - grid.t_s[0]))
         impulse = np.zeros((min(len(force), 20_000), model.coordinates))
         impulse[1] = noise * model.applied_row
@@ -324,30 +390,92 @@ def _round(
 ) -> tuple[Round, tuple[screen.Motion, ...]]:
     model = judge.model
     shared = _shared(judge, base, current, current)
-    keys = [(strut, name) for strut in range(len(model.struts)) for name in CANDIDATES]
-    trials = _tried(shared, keys, pool)
+    keys = [
+        (strut, name)
+        for strut in range(len(model.struts))
+        for name in _competing(judge)
+        if name in _REPEATABLE or (strut, name) not in current.planted.effects
+    ]
+    trials = _shares(shared, _tried(shared, keys, pool))
+    if len(current.planted.effects) > len(judge.along):
+        left_over = _left_over(judge, current)
+        trials = _best_of(trials, _shares(left_over, _tried(left_over, keys, pool)))
     finalists = _finalists(trials)
-    fits = list(pool.map(lambda t: _joint(judge, current, t, shared.motions), finalists))
+    fits = _raced(judge, current, finalists, shared.motions, pool)
     simulated = {(t.strut, t.name): f for t, f in zip(finalists, fits, strict=True)}
     candidates = _ranked(trials, simulated)
     return Round(current, candidates), shared.motions
 
 
+_REPEATABLE = frozenset({"periodic_force"})
+_LINEAR_FAMILIES = frozenset({"preload", "stiffness", "damping", "inertia", "input_gain"})
+
+
+def _competing(judge: Judge) -> tuple[str, ...]:
+    """Effects that compete: linear ones do not, where they are fitted along anyway."""
+    if not judge.along:
+        return CANDIDATES
+    return tuple(name for name in CANDIDATES if effect(name).family not in _LINEAR_FAMILIES)
+
+
 def _shared(judge: Judge, base: Fit, chosen: Fit, motion: Fit) -> screen.Stage:
-    """What the trials share: effects that are chosen, and the fit that follows the motion best."""
+    """What trials share that look for what is missing along the measured motion.
+
+    Args:
+        judge: Data and settings.
+        base: The model without effects: from its motion on something is missing.
+        chosen: Effects, whose force along the measured motion is known.
+        motion: The fit that follows the measured motion best.
+    """
+    pieces = _sampled(judge, judge.model, base, motion)
+    known = _values(chosen)
+    return _stage(judge, screen.less_known(judge.model, pieces, known), known)
+
+
+def _left_over(judge: Judge, current: Fit) -> screen.Stage:
+    """What trials share that look for what a simulation, chosen effects and all, leaves over.
+
+    What is left is taken as a small motion of the linear model, held by the same pull. Where the
+    chosen effects are stiff that is rough, but what they do is simulated and not read off a
+    smoothed motion, whose blur an impact makes large.
+    """
+    pull = pull_on(judge.model, judge.grids[0])
+    struts = judge.model.struts.copy()
+    struts[:, 1:3] += pull
+    pieces = _sampled(judge, judge.model._replace(struts=struts), current, current)
+    return _stage(judge, pieces, _values(current))
+
+
+def _sampled(
+    judge: Judge, model: Model, base: Fit, motion: Fit
+) -> list[tuple[screen.Segment, screen.Linear]]:
     misses = smoothed_misses(judge.grids, motion)
-    pieces = [
-        screen.thinned(judge.model, grid, now, first, columns, judge.every)
-        for grid, now, first, columns in zip(
-            judge.grids, motion.trajectories, base.trajectories, misses, strict=True
-        )
-    ]
+    samples = sum(len(grid.t_s) for grid in judge.grids)
+    pieces: list[tuple[screen.Segment, screen.Linear]] = []
+    for grid, now, first, columns in zip(
+        judge.grids, motion.trajectories, base.trajectories, misses, strict=True
+    ):
+        pieces += screen.sampled(model, grid, now, first, columns, samples)
+    return pieces
+
+
+def _values(chosen: Fit) -> list[tuple[int, str, Array]]:
     index = chosen.planted.slots.index
-    given = [
+    return [
         (strut, name, chosen.values[slice(*index[row, 1:3])])
         for row, (strut, name) in enumerate(chosen.planted.effects)
     ]
-    return screen.stage(judge.model, pieces, given, judge.every / float(np.mean(judge.noise_m2)))
+
+
+def _stage(
+    judge: Judge,
+    pieces: list[tuple[screen.Segment, screen.Linear]],
+    chosen: list[tuple[int, str, Array]],
+) -> screen.Stage:
+    samples = sum(len(grid.t_s) for grid in judge.grids) * len(judge.model.struts)
+    compared = sum(segment.target_m.size for segment, _ in pieces)
+    weight = samples / compared / float(np.mean(judge.noise_m2))
+    return screen.stage(judge.model, pieces, chosen, weight)
 
 
 def _tried(
@@ -357,18 +485,37 @@ def _tried(
     begun = [b for b in pool.map(lambda key: screen.begin(shared, *key), keys) if b]
     if not begun:
         return []
-    first = min(b[0].cost for b in begun)
-    hopeful = [trial for b in begun for trial in b[:2] if trial.cost < _HOPELESS * first]
+    nothing = float(shared.target @ shared.target) * shared.weight
+    best = min(b[0].cost for b in begun)
+    hopeful = [trial for b in begun for trial in b[:2] if _promising(trial, best, nothing, 0.1)]
+    if not hopeful:
+        return _best_of([b[0] for b in begun])
     roughly = list(pool.map(lambda t: screen.polish(shared, t, 3), hopeful))
-    second = min(t.cost for t in roughly)
-    kept = [t for t in roughly if t.cost < _HOPELESS * second]
+    best = min(t.cost for t in roughly)
+    kept = [t for t in roughly if _promising(t, best, nothing, 0.3)]
     fully = list(pool.map(lambda t: screen.polish(shared, t, 12), kept))
-    best: dict[tuple[int, str], screen.Trial] = {}
-    for trial in [*(b[0] for b in begun), *roughly, *fully]:
+    return _best_of([b[0] for b in begun], roughly, fully)
+
+
+def _shares(shared: screen.Stage, trials: Sequence[screen.Trial]) -> list[screen.Trial]:
+    """The trials, their cost as a share of what is missing."""
+    nothing = max(float(shared.target @ shared.target) * shared.weight, 1e-300)
+    return [trial._replace(cost=trial.cost / nothing) for trial in trials]
+
+
+def _best_of(*trials: Sequence[screen.Trial]) -> list[screen.Trial]:
+    """Each law's best trial, best law first."""
+    found: dict[tuple[int, str], screen.Trial] = {}
+    for trial in itertools.chain(*trials):
         key = (trial.strut, trial.name)
-        if key not in best or trial.cost < best[key].cost:
-            best[key] = trial
-    return sorted(best.values(), key=lambda t: t.cost)
+        if key not in found or trial.cost < found[key].cost:
+            found[key] = trial
+    return sorted(found.values(), key=lambda t: t.cost)
+
+
+def _promising(trial: screen.Trial, best: float, nothing: float, share: float) -> bool:
+    """Whether a trial is worth more work, or gains too little of what the best one gains."""
+    return trial.cost < _HOPELESS * best and nothing - trial.cost >= share * (nothing - best)
 
 
 def _finalists(trials: Sequence[screen.Trial]) -> list[screen.Trial]:
@@ -380,30 +527,52 @@ def _finalists(trials: Sequence[screen.Trial]) -> list[screen.Trial]:
         if trial.cost > _FAR * best:
             break
         family = effect(trial.name).family
-        most = 2 if trial.cost < _NEAR * best else 1
+        most = 3 if trial.cost < _NEAR * best else 1
         if families.get(family, 0) < most and len(found) < _SIMULATED:
             families[family] = families.get(family, 0) + 1
             found.append(trial)
     return found
 
 
+def _raced(
+    judge: Judge,
+    current: Fit,
+    finalists: Sequence[screen.Trial],
+    motions: Sequence[screen.Motion],
+    pool: ThreadPoolExecutor,
+) -> list[Fit | None]:
+    """Joint fits of the finalists; those far behind after a few steps go no further."""
+    early = list(pool.map(lambda t: _joint(judge, current, t, motions, _FIRST_STEPS), finalists))
+    best = min((f.cost for f in early if f is not None), default=0.0)
+
+    def further(result: Fit | None) -> Fit | None:
+        if result is None or result.cost > _BEHIND * best:
+            return result
+        return _further(judge, result, motions, 8, 2e-3)
+
+    return list(pool.map(further, early))
+
+
 def _joint(
-    judge: Judge, current: Fit, trial: screen.Trial, motions: Sequence[screen.Motion]
+    judge: Judge,
+    current: Fit,
+    trial: screen.Trial,
+    motions: Sequence[screen.Motion],
+    iterations: int = 8,
 ) -> Fit | None:
     what = planted((*current.planted.effects, (trial.strut, trial.name)))
     values = np.concatenate([current.values, trial.values])
-    return fit(
-        judge.model,
-        what,
-        values,
-        current.starts,
-        judge.grids,
-        judge.noise_m2,
-        motions,
-        8,
-        False,
-        2e-3,
+    return _fitted(judge, what, values, current.starts, motions, iterations, 2e-3)
+
+
+def _further(
+    judge: Judge, result: Fit, motions: Sequence[screen.Motion], iterations: int, tolerance: float
+) -> Fit:
+    """A fit led on from where it is."""
+    last = _fitted(
+        judge, result.planted, result.values, result.starts, motions, iterations, tolerance
     )
+    return last if last is not None and last.cost <= result.cost else result
 
 
 def score(result: Fit, effective: float) -> float:
@@ -444,26 +613,47 @@ def _block_sums(result: Fit) -> Array:
     return np.array(sums)
 
 
-def significant(before: Fit, after: Fit) -> bool:
-    """Whether an effect's gain is more than chance, given the colour of what remains."""
+def significant(before: Fit, after: Fit, along: tuple[tuple[int, str], ...] = ()) -> bool:
+    """Whether an effect's gain is more than chance, given the colour of what remains.
+
+    Args:
+        before: Fit without the effect.
+        after: Fit with it.
+        along: Effects that every fit holds, and that do not count as found.
+    """
     gain = _block_sums(before) - _block_sums(after)
     lost, won = float(-gain[gain < 0.0].sum()), float(gain[gain > 0.0].sum())
     share = 1.0 - after.cost / before.cost
     added = after.planted.parameter_count - before.planted.parameter_count
     likelihood = effective_samples(after) * float(np.log(before.cost / after.cost))
     need = _LEAST_LIKELIHOOD_GAIN + 5.0 * max(added, 0)
-    least = _LATER_GAIN if before.planted.effects else _LEAST_GAIN
+    least = _least_gain(before, after, along)
     return share > least and likelihood > need and lost < _MOST_LOST * won
+
+
+def _least_gain(before: Fit, after: Fit, along: tuple[tuple[int, str], ...]) -> float:
+    """Share of the squares that an effect must take away.
+
+    A further effect must do more than the first: what is left by then is also what the first one's
+    formula does not get quite right. One of a family that is there already must do most of all.
+    """
+    found = set(before.planted.effects) - set(along)
+    if not found:
+        return _LEAST_GAIN
+    families = {(strut, effect(name).family) for strut, name in found}
+    new = set(after.planted.effects) - set(before.planted.effects)
+    repeated = any((strut, effect(name).family) in families for strut, name in new)
+    return _REPEATED_GAIN if repeated else _LATER_GAIN
 
 
 def _pruned(judge: Judge, current: Fit, motions: Sequence[screen.Motion]) -> Fit:
     """Without the effects that the others made needless."""
-    while len(current.planted.effects) > 1:
-        rows = range(len(current.planted.effects) - 1)
+    while len(current.planted.effects) > len(judge.along) + 1:
+        rows = range(len(judge.along), len(current.planted.effects) - 1)
         dropped: Fit | None = None
         for row in rows:
             less = without(judge, current, row, motions)
-            if less is not None and not significant(less, current):
+            if less is not None and not significant(less, current, judge.along):
                 dropped = less
                 break
         if dropped is None:
@@ -485,18 +675,7 @@ def without(judge: Judge, current: Fit, row: int, motions: Sequence[screen.Motio
     )
     n = 2 * judge.model.coordinates
     starts = [start[:n] for start in current.starts]
-    return fit(
-        judge.model,
-        planted(effects),
-        values,
-        starts,
-        judge.grids,
-        judge.noise_m2,
-        motions,
-        8,
-        False,
-        1e-3,
-    )
+    return _fitted(judge, planted(effects), values, starts, motions, 8, 1e-3)
 
 
 class Settled(NamedTuple):
@@ -517,14 +696,23 @@ def settle(found: Attribution) -> Settled:
     """Fit what was found to the end, and list the rivals that cannot be told from it."""
     final, judge = found.final, found.judge
     if not final.planted.effects:
-        return Settled(found.base, (), found.motions)
+        return Settled(found.whole, (), found.motions)
     with ThreadPoolExecutor(WORKERS) as pool:
         final = _refined(judge, found, final, pool)
         rivals: tuple[Candidate, ...] = ()
-        if at_floor(final, judge):
+        if coloured(final, judge.noise_m2, judge.input_m2) < _NEARLY:
             final, rivals = _rivals(judge, found, final, pool)
     final = _needed(judge, found, _alone(judge, final, found.motions))
+    if final.planted.effects and len(judge.grids) > len(found.runs):
+        final = _on_whole(judge, found, final)
     return Settled(final, rivals if final.planted.effects else (), found.motions)
+
+
+def _on_whole(judge: Judge, found: Attribution, final: Fit) -> Fit:
+    """The fit led to its end on the whole runs."""
+    n = 2 * judge.model.coordinates
+    whole = final._replace(starts=tuple(start[:n] for start in found.whole.starts))
+    return _alone(judge._replace(grids=found.runs), whole, found.motions, (0.0,))
 
 
 def _alone(
@@ -537,17 +725,10 @@ def _alone(
     """The model running alone, reached by letting go of the pull step by step."""
     for pull in pulls:
         there = [grid._replace(pull_per_s=pull) for grid in judge.grids]
-        last = fit(
-            judge.model,
-            final.planted,
-            final.values,
-            final.starts,
-            there,
-            judge.noise_m2,
-            motions,
-            iterations,
-            tolerance=1e-6,
-        )
+        last = _fitted(
+            judge._replace(grids=tuple(there)),
+            final.planted, final.values, final.starts, motions, iterations, 1e-6,
+        )  # fmt: skip
         if last is not None:
             final = last
     return final
@@ -555,7 +736,7 @@ def _alone(
 
 def _needed(judge: Judge, found: Attribution, final: Fit) -> Fit:
     """Without the effects that the model running alone does not need."""
-    for key in tuple(final.planted.effects):
+    for key in tuple(e for e in final.planted.effects if e not in judge.along):
         row = final.planted.effects.index(key)
         if len(final.planted.effects) == 1:
             less = found.base
@@ -563,14 +744,30 @@ def _needed(judge: Judge, found: Attribution, final: Fit) -> Fit:
             less = _alone(judge, _rest(judge, final, row), found.motions, (0.0,))
         if not significant(less, final):
             final = less
-    return final
+    return _without_idle(judge, found, final)
+
+
+def _without_idle(judge: Judge, found: Attribution, final: Fit) -> Fit:
+    """Without the linear effects fitted along whose interval holds zero."""
+    if not judge.along or not final.planted.effects:
+        return final
+    _, low, high = intervals(final, judge.grids)
+    index = final.planted.slots.index
+    idle = [
+        key
+        for row, key in enumerate(final.planted.effects)
+        if key in judge.along and low[index[row, 1]] < 0.0 < high[index[row, 1]]
+    ]
+    for key in idle:
+        final = _rest(judge, final, final.planted.effects.index(key))
+    return _alone(judge, final, found.motions, (0.0,)) if idle else final
 
 
 def _refined(judge: Judge, found: Attribution, final: Fit, pool: ThreadPoolExecutor) -> Fit:
     """The same families, each by its best law: an early choice was made amid what others did."""
     if len(final.planted.effects) < 2 and at_floor(final, judge):
         return final
-    for strut, name in tuple(final.planted.effects):
+    for strut, name in tuple(e for e in final.planted.effects if e not in judge.along):
         row = final.planted.effects.index((strut, name))
         family = effect(name).family
         keys = [(strut, c) for c in CANDIDATES if effect(c).family == family and c != name]
@@ -639,9 +836,9 @@ def _swapped(
     pool: ThreadPoolExecutor,
 ) -> Fit:
     """Early choices made again: what was best alone need not be best beside what came later."""
-    for key in current.planted.effects[:-1]:
+    for key in current.planted.effects[len(judge.along) : -1]:
         row = current.planted.effects.index(key)
-        rest, own, trials = _trials_in_place(judge, base, current, row, CANDIDATES, pool)
+        rest, own, trials = _trials_in_place(judge, base, current, row, _competing(judge), pool)
         better = [t for t in trials if t.cost < _BETTER * own][:3]
         fits = pool.map(lambda t: _joint(judge, rest, t, motions), better)  # noqa: B023
         for rival in fits:
@@ -662,11 +859,11 @@ def _rivals(
         The fit, an effect that a simpler one replaces exchanged; rivals of other families.
     """
     rivals: dict[tuple[int, str], Candidate] = {}
-    for strut, name in tuple(final.planted.effects):
+    for strut, name in tuple(e for e in final.planted.effects if e not in judge.along):
         item = effect(name)
         row = final.planted.effects.index((strut, name))
         size = len(item.parameters)
-        names = [c for c in CANDIDATES if len(effect(c).parameters) <= size]
+        names = [c for c in _competing(judge) if len(effect(c).parameters) <= size]
         rest, own, trials = _trials_in_place(judge, found.base, final, row, names, pool)
         near = [t for t in trials if t.cost < _RIVAL * own + _RIVAL_COST]
         simplest = sorted(near, key=lambda t: len(effect(t.name).parameters))[:4]

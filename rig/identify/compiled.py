@@ -157,10 +157,10 @@ def slots(effects: tuple[tuple[int, str], ...]) -> Slots:
 _MODEL_TYPES = (_INDEX, _VECTOR, _MATRIX, _MATRIX, _VECTOR, _MATRIX, _VECTOR, _VECTOR)
 
 
-_PIECES = 8
+_PIECES = 32
 """Parts into which a step is cut where a force jumps."""
 
-_LARGEST_ERROR_M = 2e-8
+_LARGEST_ERROR_M = 5e-9
 """Change of height by a jump within a step from which on the step is cut."""
 
 

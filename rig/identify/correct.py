@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from dart_model.effects import effect
 from dart_model.plant import DartPlant, PlantState
@@ -20,7 +21,9 @@ Array = NDArray[np.float64]
 _SIGNIFICANT = 12
 _AGREED = 0.002
 _TRIED_S = 4.0
-_MOST_STEPS = 16
+_MOST_STEPS = 32
+_MOST_STEPS_IN_ALL = 1_500_000
+_FIT_TOLERANCE = 0.01
 
 
 def corrected_model(model: Model, result: Fit) -> ModelSpec:
@@ -93,7 +96,7 @@ def _applied(grid: Grid, steps: int) -> Array:
     """Applied force at `steps` points between nodes, shape (steps * (N - 1) + 1,)."""
     fine = np.linspace(0.0, len(grid.t_s) - 1.0, 2 * grid.substeps * (len(grid.t_s) - 1) + 1)
     wanted = np.linspace(0.0, len(grid.t_s) - 1.0, steps * (len(grid.t_s) - 1) + 1)
-    return np.interp(wanted, fine, grid.fine_n)
+    return CubicSpline(fine, grid.fine_n)(wanted)
 
 
 def steps_on_dart(
@@ -111,7 +114,7 @@ def steps_on_dart(
     count = min(len(grid.t_s), max(50, int(_TRIED_S / grid.step_s)))
     part = grid.rows(0, count)
     steps = 2 if grid.substeps == 1 else 2 * grid.substeps
-    while steps < _MOST_STEPS:
+    while steps < _MOST_STEPS and 2 * steps * len(grid.t_s) <= _MOST_STEPS_IN_ALL:
         there = dart_heights(spec, part, start, steps)
         if float(np.sqrt(np.mean((there - wanted[:count]) ** 2))) < tolerance_m:
             break
@@ -120,7 +123,8 @@ def steps_on_dart(
 
 
 def _steps(model: Model, result: Fit, grids: Sequence[Grid], noise_m2: Array) -> int:
-    tolerance = 0.1 * float(np.sqrt(np.min(noise_m2)))
+    # Coarser steps would be made up for by parameters that are wrong.
+    tolerance = _FIT_TOLERANCE * float(np.sqrt(np.min(noise_m2)))
     spec = corrected_model(model, result)
     return steps_on_dart(
         spec, grids[0], result.starts[0], result.trajectories[0].heights_m, tolerance

@@ -40,11 +40,12 @@ from rig.identify.evaluate import (
     strut_forces,
 )
 from rig.identify.imposed import diagnose_imposed, is_imposed
-from rig.identify.output_error import Fit, intervals
+from rig.identify.output_error import Fit, intervals, numerical_shift
 from rig.identify.records import Record, RecordError
 from rig.identify.reduced import Grid, Model, grid_of, planted, reduced_model, start_of
 from rig.identify.report import FittedSeries, HeldOutSeries, Ranked, sentence
 from rig.identify.result import Result
+from rig.identify.smoother import estimate_noise
 
 Array = NDArray[np.float64]
 
@@ -52,6 +53,7 @@ _KEPT_BACK = 0.2
 _WHITE = 0.1
 _IMPLAUSIBLE = 5.0
 _EXPLAINED = 0.25
+_MOST_LAWS = 2
 _LONGEST_DURATION_S = 600.0
 
 
@@ -84,8 +86,8 @@ def diagnose(
     for record in (*runs, *held_out):
         _check_fits(record, model)
     progress("reading runs", 0.02)
-    grids = [grid_of(record) for record in runs]
-    judged = [(grid_of(record), record.strut_force_n) for record in held_out]
+    grids = [grid_of(record, model) for record in runs]
+    judged = [(grid_of(record, model), record.strut_force_n) for record in held_out]
     source = "runs"
     if not judged:
         grids, kept_back = _kept_back(grids)
@@ -130,7 +132,7 @@ def _check_excitation(model: Model, grids: Sequence[Grid]) -> None:
     for grid in grids:
         for i, column in enumerate(grid.heights_m.T):
             swing = float(np.nanstd(column))
-            noise = float(np.nanstd(np.diff(column, 2))) / np.sqrt(6.0)
+            noise = float(np.sqrt(estimate_noise(grid.t_s, column).variance))
             if swing < 5.0 * noise:
                 raise RecordError(
                     f"{grid.name}: height_m moves by {swing:.3g} m RMS and its noise is "
@@ -176,9 +178,12 @@ def _written_up(
             )
         results.append((there, cell))
     fitted, forces, missing = _fitted_series(model, grids, found, final)
-    effects = _effects(model, final, grids, forces, missing)
+    shift = None
+    if final.planted.effects:
+        shift = numerical_shift(model, final, grids, found.judge.noise_m2)
+    effects = _effects(model, final, grids, forces, missing, shift)
     white = White(
-        coloured(found.base, found.judge.noise_m2, found.judge.input_m2) < _WHITE,
+        coloured(found.whole, found.judge.noise_m2, found.judge.input_m2) < _WHITE,
         coloured(final, found.judge.noise_m2, found.judge.input_m2) < _WHITE,
     )
     floor = NoiseFloor(
@@ -223,9 +228,9 @@ def _fitted_series(
     forces: list[list[Array]] = []
     left: list[Array] = []
     for k, grid in enumerate(grids):
-        wide = smoothed_motion(grid, found.base.trajectories[k], None)
+        wide = smoothed_motion(grid, found.whole.trajectories[k], None)
         nothing, none = planted(()), np.zeros(0)
-        before = missing_force(model, nothing, none, found.base.starts[k], grid, wide)
+        before = missing_force(model, nothing, none, found.whole.starts[k], grid, wide)
         after = before
         if final.planted.effects:
             motion = smoothed_motion(grid, final.trajectories[k], None)
@@ -256,10 +261,11 @@ def _effects(
     grids: Sequence[Grid],
     forces: Sequence[Sequence[Array]],
     missing: Sequence[Array],
+    shift: Array | None,
 ) -> tuple[FoundEffect, ...]:
     if not final.planted.effects:
         return ()
-    _, low, high = intervals(final, grids)
+    _, low, high = intervals(final, grids, shift)
     listed: list[FoundEffect] = []
     for row, (strut, name) in enumerate(final.planted.effects):
         item = effect(name)
@@ -291,10 +297,24 @@ def _verdict(found: Attribution, settled: Settled) -> Verdict:
     left = coloured(final, found.judge.noise_m2, found.judge.input_m2)
     if not final.planted.effects:
         return "nothing_missing" if left < _WHITE else "not_explained"
-    gain = 1.0 - float(np.sqrt(final.mean_square / found.base.mean_square))
-    if left < _EXPLAINED:
+    gain = 1.0 - float(np.sqrt(final.mean_square / found.whole.mean_square))
+    if left < _EXPLAINED and not _makeshift(found, final):
         return "ambiguous" if settled.rivals else "explained"
     return "partly_explained" if gain > 0.7 else "not_explained"
+
+
+def _makeshift(found: Attribution, final: Fit) -> bool:
+    """Whether so many laws are put together that they would fit a force that has none.
+
+    Linear effects of a model that was itself fitted only undo that fit, and do not count.
+    """
+    laws = [
+        (at, effect(name).family)
+        for at, name in final.planted.effects
+        if (at, name) not in found.judge.along
+    ]
+    struts = {at for at, _ in laws}
+    return len(laws) > _MOST_LAWS * len(struts) or len(set(laws)) < len(laws)
 
 
 def _rejected(model: Model, found: Attribution, settled: Settled) -> tuple[RejectedEffect, ...]:

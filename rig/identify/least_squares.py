@@ -8,7 +8,8 @@ References:
     Kanzow, Yamashita, Fukushima, J. Comput. Appl. Math. 172 (2004), projected variant.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -67,12 +68,27 @@ class Solution(NamedTuple):
     cost: float
 
 
+class Rows(NamedTuple):
+    """Rows of the residual that are all that one parameter moves.
+
+    Attributes:
+        first: First row.
+        last: Past the last row.
+        residual_of: Those rows alone, of parameters, or None where there are none.
+    """
+
+    first: int
+    last: int
+    residual_of: Callable[[Array], Array | None]
+
+
 def solve(
     residual_of: Callable[[Array], Array | None],
     start: Array,
     space: Space,
     iterations: int,
     tolerance: float = 1e-4,
+    rows: Mapping[int, Rows] = MappingProxyType({}),
 ) -> Solution | None:
     """Least squares from a start.
 
@@ -82,6 +98,7 @@ def solve(
         space: Where to search.
         iterations: Most steps that are accepted.
         tolerance: Relative gain below which the search ends.
+        rows: Parameters, by index, that move some rows only; their derivatives then cost less.
 
     Returns:
         The solution, or None if there is no residual at the start.
@@ -92,7 +109,7 @@ def solve(
         return None
     cost = float(r @ r)
     damping = _FIRST_DAMPING
-    jacobian = _jacobian(residual_of, x, r, space)
+    jacobian = _jacobian(residual_of, x, r, space, rows)
     for _ in range(iterations):
         products, gradient = _gram(jacobian), jacobian.T @ r
         diagonal = np.diag(products).copy()
@@ -102,6 +119,8 @@ def solve(
             free = ~_pressed(x, gradient, space)
             step = np.zeros_like(x)
             part = products[np.ix_(free, free)] + damping * np.diag(diagonal[free])
+            if not np.all(np.isfinite(part)):
+                return Solution(space.outer(x), r, jacobian, cost)
             step[free] = -np.linalg.lstsq(part, gradient[free], rcond=None)[0]
             step = np.clip(step, -_largest(space), _largest(space))
             trial = space.inner(space.outer(x + step))
@@ -115,7 +134,7 @@ def solve(
             break
         if before - cost < tolerance * before:
             break
-        jacobian = _jacobian(residual_of, x, r, space)
+        jacobian = _jacobian(residual_of, x, r, space, rows)
     return Solution(space.outer(x), r, jacobian, cost)
 
 
@@ -130,10 +149,17 @@ def _pressed(x: Array, gradient: Array, space: Space) -> NDArray[np.bool_]:
 
 
 def _jacobian(
-    residual_of: Callable[[Array], Array | None], x: Array, r: Array, space: Space
+    residual_of: Callable[[Array], Array | None],
+    x: Array,
+    r: Array,
+    space: Space,
+    rows: Mapping[int, Rows],
 ) -> Array:
     columns = np.zeros((len(r), len(x)))
+    everything = Rows(0, len(r), residual_of)
     for i in range(len(x)):
+        there = rows.get(i, everything)
+        part = slice(there.first, there.last)
         size = _DIFFERENCE * (1.0 if space.logarithmic[i] else max(1.0, abs(x[i])))
         for step in (size, -size):
             trial = x.copy()
@@ -141,9 +167,9 @@ def _jacobian(
             moved_by = space.inner(space.outer(trial))[i] - x[i]
             if abs(moved_by) < 0.5 * size:
                 continue
-            moved = residual_of(space.outer(trial))
+            moved = there.residual_of(space.outer(trial))
             if moved is not None:
-                columns[:, i] = (moved - r) / moved_by
+                columns[part, i] = (moved - r[part]) / moved_by
                 break
     return columns
 

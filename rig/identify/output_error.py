@@ -10,13 +10,14 @@ References:
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.identify.least_squares import Solution, Space, solve
+from rig.identify.least_squares import Rows, Solution, Space, solve
 from rig.identify.reduced import Grid, Model, Planted, Trajectory, run
 from rig.identify.starts import Motion, space
 
@@ -152,41 +153,83 @@ def fit(
         free[: len(values)] = False
     partial = Space(whole.low[free], whole.high[free], whole.scale[free], whole.logarithmic[free])
 
-    def motions_of(trial: Array) -> list[Trajectory] | None:
-        full = first.copy()
-        full[free] = trial
-        p, begin = _unpack(model, what, grids, full, memory)
-        runs = [
-            run(model, what, np.ascontiguousarray(p), grid, start)
-            for grid, start in zip(grids, begin, strict=True)
-        ]
-        done = [r for r in runs if r is not None]
-        return done if len(done) == len(runs) else None
-
-    def residual_of(trial: Array) -> Array | None:
-        done = motions_of(trial)
-        if done is None:
-            return None
-        parts = [
-            ((grid.heights_m - r.heights_m)[grid.measured] * weights).ravel()
-            for grid, r in zip(grids, done, strict=True)
-        ]
-        return np.concatenate(parts)
-
-    solution = solve(residual_of, first[free], partial, iterations, tolerance)
+    search = _Search(model, what, tuple(grids), weights, memory, first, free)
+    solution = solve(
+        search.residual, first[free], partial, iterations, tolerance, _rows(search, len(values))
+    )
     if solution is None or not np.isfinite(solution.cost):
         return None
-    full = first.copy()
-    full[free] = solution.values
-    p, begin = _unpack(model, what, grids, full, memory)
-    done = motions_of(solution.values)
-    if done is None:
+    p, begin = search.whole(solution.values)
+    done = [there for k in range(len(grids)) if (there := search.motion(p, begin, k)) is not None]
+    if len(done) < len(grids):
         return None
     residuals = _residuals(grids, done)
     return Fit(
         what, p, tuple(begin), tuple(done), residuals, solution, partial,
         solution.cost, len(solution.residual),
     )  # fmt: skip
+
+
+class _Search(NamedTuple):
+    """What a fit varies, and what it misses then.
+
+    Attributes:
+        model: The bench.
+        what: Its effects.
+        grids: The runs.
+        weights: One over the standard deviation of each height, shape (struts,).
+        memory: Memory states that are fitted at the start.
+        first: Parameters and starts at the beginning, shape (m,).
+        free: Which of them are varied, shape (m,).
+    """
+
+    model: Model
+    what: Planted
+    grids: tuple[Grid, ...]
+    weights: Array
+    memory: list[int]
+    first: Array
+    free: NDArray[np.bool_]
+
+    def whole(self, trial: Array) -> tuple[Array, list[Array]]:
+        """Parameters and starts of a trial."""
+        full = self.first.copy()
+        full[self.free] = trial
+        return _unpack(self.model, self.what, self.grids, full, self.memory)
+
+    def motion(self, p: Array, begin: Sequence[Array], k: int) -> Trajectory | None:
+        """Motion of one run, or None if it runs away."""
+        return run(self.model, self.what, np.ascontiguousarray(p), self.grids[k], begin[k])
+
+    def missed(self, k: int, trial: Array) -> Array | None:
+        """What a trial misses of one run, in standard deviations of the noise, flat."""
+        there = self.motion(*self.whole(trial), k)
+        if there is None:
+            return None
+        grid = self.grids[k]
+        return ((grid.heights_m - there.heights_m)[grid.measured] * self.weights).ravel()
+
+    def residual(self, trial: Array) -> Array | None:
+        """What a trial misses of all runs."""
+        parts = [
+            part for k in range(len(self.grids)) if (part := self.missed(k, trial)) is not None
+        ]
+        return np.concatenate(parts) if len(parts) == len(self.grids) else None
+
+
+def _rows(search: _Search, parameters: int) -> dict[int, Rows]:
+    """Of each variable of a run's start, the rows that it moves: those of that run."""
+    starts = len(search.first) - parameters
+    size = starts // len(search.grids)
+    begin = int(search.free.sum()) - starts
+    found: dict[int, Rows] = {}
+    at = 0
+    for k, grid in enumerate(search.grids):
+        last = at + int(grid.measured.sum()) * grid.heights_m.shape[1]
+        rows = Rows(at, last, functools.partial(search.missed, k))
+        found.update(dict.fromkeys(range(begin + k * size, begin + (k + 1) * size), rows))
+        at = last
+    return found
 
 
 def _residuals(grids: Sequence[Grid], done: Sequence[Trajectory]) -> tuple[Array, ...]:
@@ -244,11 +287,49 @@ def colour(residual: Array) -> float:
     return 1.0 - float(np.mean(steps[both] ** 2)) / (2.0 * square)
 
 
-def intervals(result: Fit, grids: Sequence[Grid]) -> tuple[Array, Array, Array]:
+def numerical_shift(model: Model, result: Fit, grids: Sequence[Grid], noise_m2: Array) -> Array:
+    """How far a fit's parameters may be off because of steps and samples, shape (k,).
+
+    Two sources, each by what it changes of the motion: steps half as long, and the error of the
+    applied force between its samples. In the units of the search.
+
+    Args:
+        model: The bench.
+        result: A fit in which nothing was fixed.
+        grids: Its runs.
+        noise_m2: Noise variance of each height, shape (struts,).
+    """
+    assert result.solution is not None
+    jacobian = result.solution.jacobian
+    weights = 1.0 / np.sqrt(noise_m2)
+    total = np.zeros(len(result.values))
+    for other in ([g.finer() for g in grids], [g.input_moved() for g in grids]):
+        changes: list[Array] = []
+        for grid, moved, start, there in zip(
+            grids, other, result.starts, result.trajectories, strict=True
+        ):
+            again = run(model, result.planted, result.values, moved, start)
+            if again is None:
+                return np.full(len(total), np.inf)
+            change = (again.heights_m - there.heights_m)[grid.measured] * weights
+            changes.append(change.ravel())
+        shift = np.linalg.lstsq(jacobian, np.concatenate(changes), rcond=None)[0]
+        total += shift[: len(total)] ** 2
+    return np.sqrt(total)
+
+
+def intervals(
+    result: Fit, grids: Sequence[Grid], shift: Array | None = None
+) -> tuple[Array, Array, Array]:
     """95 % intervals of the parameters.
 
     The covariance takes what remains as it is: block sums of the score stand for its colour
     (White's sandwich), and the smaller white-noise covariance is a lower limit.
+
+    Args:
+        result: A fit in which nothing was fixed.
+        grids: Its runs.
+        shift: From `numerical_shift`; added as one standard deviation.
 
     Returns:
         Covariance of the parameters (k, k), and the intervals' ends, each of shape (k,).
@@ -276,6 +357,7 @@ def intervals(result: Fit, grids: Sequence[Grid]) -> tuple[Array, Array, Array]:
     robust = inverse @ blocks @ inverse * (count / max(count - len(size), 1))
     k = len(result.values)
     variance = np.maximum(np.diag(white), np.diag(robust))[:k]
+    variance = np.maximum(variance, 0.0) + (0.0 if shift is None else shift**2)
     deviation = np.sqrt(variance)
     logarithmic = bounds.logarithmic[:k]
     reach = 2.0 * deviation

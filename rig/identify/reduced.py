@@ -26,6 +26,9 @@ Array = NDArray[np.float64]
 LONGEST_STEP_S = 1.25e-3
 """Longest step of the reduced simulation."""
 
+_STEP_ANGLE = 0.2
+"""Longest step as an angle of the model's fastest motion: the integrator errs by 1e-5 a radian."""
+
 
 class Model(NamedTuple):
     """A bench on straight guides.
@@ -56,6 +59,16 @@ class Model(NamedTuple):
     def coordinates(self) -> int:
         """Number of coordinates."""
         return self.mass_kg.shape[0]
+
+    @property
+    def fastest_rad_per_s(self) -> float:
+        """Largest eigenvalue, by size, of the model without effects."""
+        n = self.coordinates
+        stiffness = self.rows.T @ np.diag(self.struts[:, 1]) @ self.rows
+        damping = self.rows.T @ np.diag(self.struts[:, 2]) @ self.rows
+        lower = -np.linalg.solve(self.mass_kg, np.hstack([stiffness, damping]))
+        system = np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
+        return float(np.max(np.abs(np.linalg.eigvals(system))))
 
 
 def reduced_model(spec: ModelSpec) -> Model:
@@ -153,16 +166,37 @@ class Grid(NamedTuple):
             temperature_c=self.temperature_c[cut],
         )
 
+    def finer(self) -> "Grid":
+        """The same run in half as long steps, the applied force a parabola over each step."""
+        whole = self.fine_n
+        first, middle, last = whole[:-2:2], whole[1:-1:2], whole[2::2]
+        fine = np.empty(2 * (len(whole) - 1) + 1)
+        fine[::2] = whole
+        fine[1::4] = 0.375 * first + 0.75 * middle - 0.125 * last
+        fine[3::4] = -0.125 * first + 0.75 * middle + 0.375 * last
+        return self._replace(fine_n=fine, substeps=2 * self.substeps)
+
+    def input_moved(self) -> "Grid":
+        """The run, its applied force moved by as much as its reconstruction may be wrong.
+
+        A cubic spline errs by the fourth power of the sampling interval: what it changes when every
+        other sample is left out is sixteen times its error, less that error itself (Richardson).
+        """
+        fine_t = _fine_times(self.t_s, self.substeps)
+        halved = CubicSpline(self.t_s[::2], self.applied_n[::2])(fine_t)
+        return self._replace(fine_n=self.fine_n + (self.fine_n - halved) / 15.0)
+
 
 NO_TEMPERATURE_C = 20.0
 """Temperature of a record that has none."""
 
 
-def grid_of(record: Record, *, held: bool = False) -> Grid:
+def grid_of(record: Record, model: Model, *, held: bool = False) -> Grid:
     """The record on simulation nodes; the applied force as a cubic spline, or held.
 
     Args:
         record: A record with an applied force.
+        model: The bench, whose fastest motion says how short the steps must be.
         held: The force is held between samples instead.
     """
     assert record.applied_force_n is not None
@@ -176,7 +210,8 @@ def grid_of(record: Record, *, held: bool = False) -> Grid:
     heights = np.full((len(t_s), record.heights_m.shape[1]), np.nan)
     heights[at] = record.heights_m
     measured = np.all(np.isfinite(heights), axis=1)
-    substeps = max(1, int(np.ceil(usual / LONGEST_STEP_S - 1e-9)))
+    longest = min(LONGEST_STEP_S, _STEP_ANGLE / max(model.fastest_rad_per_s, 1e-9))
+    substeps = max(1, int(np.ceil(usual / longest - 1e-9)))
     fine_t = _fine_times(t_s, substeps)
     if held:
         rank = np.clip(np.searchsorted(record.t_s, fine_t, side="right") - 1, 0, None)
@@ -279,7 +314,7 @@ def run(
         grid.temperature_c,
         grid.substeps,
         start,
-        _pull(model, grid),
+        pull_on(model, grid),
         grid.target_m,
         grid.target_m_per_s,
         heights,
@@ -289,7 +324,7 @@ def run(
     return Trajectory(heights, velocities, accelerations) if finite else None
 
 
-def _pull(model: Model, grid: Grid) -> Array:
+def pull_on(model: Model, grid: Grid) -> Array:
     """Stiffness and damping of the pull on each strut: critically damped, shape (struts, 2)."""
     rate = grid.pull_per_s
     mass = 1.0 / np.einsum("ij,jk,ik->i", model.rows, np.linalg.inv(model.mass_kg), model.rows)

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.linalg import expm
 
 from dart_model.effects import effect
@@ -31,15 +32,19 @@ Array = NDArray[np.float64]
 MOST_SAMPLES = 8_000
 """Samples of all runs together that a trial looks at."""
 
+_THINNEST_ANGLE = 0.6
+_FINEST_ANGLE = 0.25
+_BLOCKS = 8
+
 _LONGEST_MEMORY_STEP_S = 0.6e-3
 _TONES = 4
 
 
 class Segment(NamedTuple):
-    """One run, thinned out.
+    """A run or a piece of one, on a grid that suits the linear model.
 
     Attributes:
-        t_s: Times, shape (N,).
+        t_s: Even times, shape (N,).
         heights_m: Smoothed heights, shape (N, struts).
         velocities_m_per_s: Their rates.
         accelerations_m_per_s2: Their second derivatives.
@@ -47,6 +52,7 @@ class Segment(NamedTuple):
         temperature_c: Temperature, shape (N,).
         missing_m: Height that the linear model misses, shape (N, struts).
         substeps: Steps for a law's memory between samples.
+        compared: One of how many samples is compared; those between only serve the forces.
     """
 
     t_s: Array
@@ -57,6 +63,12 @@ class Segment(NamedTuple):
     temperature_c: Array
     missing_m: Array
     substeps: int
+    compared: int
+
+    @property
+    def target_m(self) -> Array:
+        """Missing height at the samples that are compared, the first excluded, flat."""
+        return self.missing_m[self.compared :: self.compared].ravel()
 
 
 class Linear(NamedTuple):
@@ -153,51 +165,122 @@ def response(linear: Linear, forces_n: Array) -> Array:
     return heights
 
 
-def thinned(
+class Sampling(NamedTuple):
+    """How a run is sampled for the trials.
+
+    Attributes:
+        every: Which nodes are kept.
+        finer: Samples for each of them: an input that is linear between samples must turn by a
+            small angle of the fastest motion only.
+        pieces: Nodes of each piece, as first and past the last.
+    """
+
+    every: int
+    finer: int
+    pieces: tuple[tuple[int, int], ...]
+
+
+def sampling(model: Model, grid: Grid, samples: int) -> Sampling:
+    """How a run is sampled: thinned out, or where its motion is too fast for that, in pieces.
+
+    Args:
+        model: The bench.
+        grid: The run.
+        samples: Nodes of all runs together.
+    """
+    angle = model.fastest_rad_per_s * grid.step_s
+    every = max(1, round(samples / MOST_SAMPLES))
+    every = max(1, min(every, int(_THINNEST_ANGLE / angle)))
+    nodes = len(grid.t_s)
+    share = MOST_SAMPLES * nodes / samples
+    whole = ((0, nodes),)
+    if nodes / every < 2.0 * share:
+        return Sampling(every, max(1, int(np.ceil(angle * every / _FINEST_ANGLE))), whole)
+    blocks = max(2, round(_BLOCKS * nodes / samples))
+    length = int(share * every / blocks)
+    firsts = [int(k * (nodes - length) / (blocks - 1)) for k in range(blocks)]
+    pieces = tuple((first, first + length) for first in firsts)
+    return Sampling(every, max(1, int(np.ceil(angle * every / _FINEST_ANGLE))), pieces)
+
+
+def sampled(
     model: Model,
     grid: Grid,
     reference: Trajectory,
     base: Trajectory,
     smoothed: list[Smoothed],
-    every: int,
-) -> tuple[Segment, Linear]:
-    """A run thinned out, and the linear model on its grid.
+    samples: int,
+) -> list[tuple[Segment, Linear]]:
+    """A run on the samples of the trials, and the linear model on each piece's grid.
 
     Args:
         model: The bench.
         grid: The run.
         reference: Simulated motion to which the smoothed difference belongs.
-        base: Motion of the model without effects.
+        base: Motion from which on something is missing.
         smoothed: Measured less `reference` heights, smoothed, one a strut.
-        every: Which nodes to keep.
+        samples: Nodes of all runs together.
     """
-    # Times may be uneven: everything is put on an even grid first.
-    count = (len(grid.t_s) - 1) // every + 1
-    even = grid.t_s[0] + np.arange(count) * ((grid.t_s[-1] - grid.t_s[0]) / (count - 1))
-
-    def put(values: Array) -> Array:
-        if values.ndim == 1:
-            return np.interp(even, grid.t_s, values)
-        return np.column_stack([np.interp(even, grid.t_s, column) for column in values.T])
-
+    how = sampling(model, grid, samples)
     parts = [np.column_stack([s.states[:, k] for s in smoothed]) for k in range(3)]
-    heights = put(reference.heights_m + parts[0])
-    velocities = put(reference.velocities_m_per_s + parts[1])
-    accelerations = put(reference.accelerations_m_per_s2 + parts[2])
-    missing = put(reference.heights_m + parts[0] - base.heights_m)
-    missing_rate = put(reference.velocities_m_per_s + parts[1] - base.velocities_m_per_s)
+    motion = Trajectory(*(there + more for there, more in zip(reference, parts, strict=True)))
+    missing = motion.heights_m - base.heights_m
+    if how.finer > 1:
+        # A few samples a period are too few for the smoother: it would take motion for noise.
+        missing = np.where(grid.measured[:, np.newaxis], grid.heights_m - base.heights_m, missing)
+    missing_rate = motion.velocities_m_per_s - base.velocities_m_per_s
+    return [
+        _piece(
+            model,
+            grid.rows(first, last),
+            Trajectory(*(values[first:last] for values in motion)),
+            (missing[first:last], missing_rate[first:last]),
+            how,
+        )
+        for first, last in how.pieces
+    ]
+
+
+def _piece(
+    model: Model, grid: Grid, motion: Trajectory, missing: tuple[Array, Array], how: Sampling
+) -> tuple[Segment, Linear]:
+    # Times may be uneven: everything is put on an even grid first.
+    count = ((len(grid.t_s) - 1) // how.every) * how.finer + 1
+    even = grid.t_s[0] + np.arange(count) * ((grid.t_s[-1] - grid.t_s[0]) / (count - 1))
+    heights, velocities, accelerations = motion
+    if how.finer == 1:
+        heights, velocities, accelerations = (_put(even, grid.t_s, values) for values in motion)
+    else:
+        heights = CubicHermiteSpline(grid.t_s, heights, velocities)(even)
+        velocities = CubicHermiteSpline(grid.t_s, velocities, accelerations)(even)
+        accelerations = CubicSpline(grid.t_s, accelerations)(even)
+    target, target_rate = (_put(even, grid.t_s, values) for values in missing)
     step_s = float(even[1] - even[0])
     linear, stiffness, damping = linear_model(model, step_s, float(even[-1] - even[0]))
     if np.any(stiffness) or np.any(damping):
         inverse = np.linalg.inv(model.rows).T
-        held = (missing @ inverse) @ stiffness + (missing_rate @ inverse) @ damping
-        missing = missing - response(linear, held)
-    substeps = max(1, int(np.ceil(step_s / _LONGEST_MEMORY_STEP_S - 1e-9)))
+        held = (target @ inverse) @ stiffness + (target_rate @ inverse) @ damping
+        target = target - response(linear, held)
+    fine_t = np.linspace(0.0, len(grid.t_s) - 1.0, len(grid.fine_n))
+    node = np.interp(even, grid.t_s, np.arange(len(grid.t_s), dtype=np.float64))
     segment = Segment(
-        even, heights, velocities, accelerations, put(grid.applied_n), put(grid.temperature_c),
-        missing, substeps,
-    )  # fmt: skip
+        even,
+        np.ascontiguousarray(heights),
+        np.ascontiguousarray(velocities),
+        np.ascontiguousarray(accelerations),
+        np.interp(node, fine_t, grid.fine_n),
+        _put(even, grid.t_s, grid.temperature_c),
+        target,
+        max(1, int(np.ceil(step_s / _LONGEST_MEMORY_STEP_S - 1e-9))),
+        how.finer,
+    )
     return segment, linear
+
+
+def _put(even: Array, t_s: Array, values: Array) -> Array:
+    if values.ndim == 1:
+        return np.interp(even, t_s, values)
+    return np.column_stack([np.interp(even, t_s, column) for column in values.T])
 
 
 def law_force(model: Model, segment: Segment, strut: int, name: str, values: Array) -> Array:
@@ -237,10 +320,33 @@ def _heights(
     values: Array,
 ) -> Array:
     parts = [
-        response(lin, law_force(model, seg, strut, name, values))[1:].ravel()
+        response(lin, law_force(model, seg, strut, name, values))[
+            seg.compared :: seg.compared
+        ].ravel()
         for seg, lin in zip(segments, linear, strict=True)
     ]
     return np.concatenate(parts)
+
+
+def less_known(
+    model: Model,
+    pieces: list[tuple[Segment, Linear]],
+    chosen: list[tuple[int, str, Array]],
+) -> list[tuple[Segment, Linear]]:
+    """The pieces, what effects add along the measured motion taken from what is missing.
+
+    Args:
+        model: The bench.
+        pieces: Runs, on their samples.
+        chosen: Effects found so far: strut, name, parameters.
+    """
+    left: list[tuple[Segment, Linear]] = []
+    for segment, linear in pieces:
+        missing = segment.missing_m
+        for strut, name, values in chosen:
+            missing = missing - response(linear, law_force(model, segment, strut, name, values))
+        left.append((segment._replace(missing_m=missing), linear))
+    return left
 
 
 def stage(
@@ -253,17 +359,17 @@ def stage(
 
     Args:
         model: The bench.
-        pieces: Runs, thinned out.
-        chosen: Effects found so far: strut, name, parameters.
+        pieces: Runs, on their samples.
+        chosen: Effects found so far: strut, name, parameters. What they add is no longer in what
+            is missing, but small changes of them may still be.
         weight: See `Stage`.
     """
     segments = tuple(segment for segment, _ in pieces)
     linear = tuple(lin for _, lin in pieces)
-    target = np.concatenate([segment.missing_m[1:].ravel() for segment in segments])
+    target = np.concatenate([segment.target_m for segment in segments])
     columns = _free_motion(segments, linear)
     for strut, name, values in chosen:
         there = _heights(model, segments, linear, strut, name, values)
-        target = target - there
         for i, value in enumerate(values):
             moved = values.copy()
             moved[i] += 1e-4 * max(abs(value), 1e-6)
@@ -279,7 +385,7 @@ def stage(
 
 def _free_motion(segments: tuple[Segment, ...], linear: tuple[Linear, ...]) -> list[Array]:
     columns: list[Array] = []
-    sizes = [segment.missing_m[1:].size for segment in segments]
+    sizes = [segment.target_m.size for segment in segments]
     for k, (segment, lin) in enumerate(zip(segments, linear, strict=True)):
         size = lin.transition.shape[0]
         for i in range(size):
@@ -288,7 +394,9 @@ def _free_motion(segments: tuple[Segment, ...], linear: tuple[Linear, ...]) -> l
             free = np.empty_like(segment.missing_m)
             respond(lin.transition, np.eye(size), np.zeros((size, size)), lin.output, impulse, free)
             whole = np.zeros(sum(sizes))
-            whole[sum(sizes[:k]) : sum(sizes[: k + 1])] = free[1:].ravel()
+            whole[sum(sizes[:k]) : sum(sizes[: k + 1])] = free[
+                segment.compared :: segment.compared
+            ].ravel()
             columns.append(whole)
     return columns
 
@@ -329,10 +437,10 @@ def _tones(
     longest = int(np.argmax([len(s.t_s) for s in segments]))
     segment = segments[longest]
     struts = segment.missing_m.shape[1]
-    first = sum(s.missing_m[1:].size for s in segments[:longest])
-    y = target[first : first + segment.missing_m[1:].size].reshape(-1, struts)[:, strut]
+    first = sum(s.target_m.size for s in segments[:longest])
+    y = target[first : first + segment.target_m.size].reshape(-1, struts)[:, strut]
     n = len(y)
-    step = float(segment.t_s[1] - segment.t_s[0])
+    step = float(segment.t_s[1] - segment.t_s[0]) * segment.compared
     spectrum = np.abs(np.fft.rfft(y * np.hanning(n), 4 * n)) ** 2
     frequencies = np.fft.rfftfreq(4 * n, step)
     spectrum[frequencies < 1.5 / (n * step)] = 0.0
@@ -364,7 +472,9 @@ def _phase(
 ) -> float:
     angle = 2.0 * np.pi * frequency * segment.t_s
     columns = [
-        response(linear, f(angle)[:, np.newaxis] * model.rows[strut])[1:, strut]
+        response(linear, f(angle)[:, np.newaxis] * model.rows[strut])[
+            segment.compared :: segment.compared, strut
+        ]
         for f in (np.sin, np.cos)
     ]
     sine, cosine = np.linalg.lstsq(np.column_stack(columns), y, rcond=None)[0]
