@@ -23,7 +23,7 @@ from rig.runs import Ended, with_bench
 SETTLED_NS = 500_000_000
 """Figures are taken after this time."""
 
-CASES = ("seed", "quarter_car")
+CASES = ("seed", "quarter_car", "dyno")
 """Names of the cases; each has a bridge and a bench among the package's configurations."""
 
 
@@ -141,16 +141,11 @@ def run_case(
 
 
 def _compared(ended: Ended, ready: Setup, bench: BenchConfig) -> Case:
-    alone = {
-        name: ObserverConfig(proportional_n_per_m=0.0, integral_n_per_m_s=0.0)
-        for name in ready.config.observers
-    }
-    config = ready.config.model_copy(update={"observers": alone})
     observed = read_run(ended.folder).steps
-    defective = replay(ended.folder, ready=ready.model_copy(update={"config": config})).steps
     t_ns = np.asarray(observed.column("t_ns").to_numpy(), dtype=np.int64)
     period_ns = ready.config.period_ns
     truth = simulate(bench, int(t_ns[-1]) + period_ns, period_ns)
+    model_alone = _alone(ended, ready, observed)
     at = t_ns // period_ns
     struts = tuple(
         StrutCase(
@@ -162,12 +157,29 @@ def _compared(ended: Ended, ready: Setup, bench: BenchConfig) -> Case:
                     for column in (truth.height_m, truth.velocity_m_per_s, truth.strut_force_n)
                 ]
             ),
-            _height_and_force(defective, name),
+            model_alone[name],
             _height_and_force(observed, name),
         )
         for index, name in enumerate(ready.config.observers)
     )
     return Case(ended, struts)
+
+
+def _alone(ended: Ended, ready: Setup, observed: Any) -> dict[str, NDArray[np.float64]]:
+    """Height and force of every strut of the model without virtual force."""
+    names = list(ready.config.observers)
+    if ready.config.imposed_motion is not None:
+        # The motion is what it is; the model's own force is what the virtual force comes on top of.
+        virtual_n = {n: observed.column(f"{n}.virtual_force_n").to_numpy() for n in names}
+        return {
+            n: _height_and_force(observed, n) - np.outer(virtual_n[n], [0.0, 1.0]) for n in names
+        }
+    without = {
+        name: ObserverConfig(proportional_n_per_m=0.0, integral_n_per_m_s=0.0) for name in names
+    }
+    config = ready.config.model_copy(update={"observers": without})
+    steps = replay(ended.folder, ready=ready.model_copy(update={"config": config})).steps
+    return {name: _height_and_force(steps, name) for name in names}
 
 
 def _height_and_force(steps: Any, strut: str) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from rig.bench.config import load_bench_config
 from rig.bench.trajectory import simulate
 from rig.check import check
 from rig.config import CONFIGS, InputError, load_setup
+from rig.demo import run_case
 from rig.diagnose import diagnose_runs, read_record
 from rig.replay import replay
 from rig.runs import with_bench
@@ -146,3 +147,19 @@ def test_a_dyno_asks_for_a_load_cell_and_no_applied_force(tmp_path: Path) -> Non
 def test_a_dyno_has_no_loop_that_could_ring() -> None:
     findings = {item.what: item.text for item in check(load_setup(CONFIGS / "dyno.yaml"))}
     assert "the motion is imposed" in findings["poles"]
+
+
+def test_the_case_that_comes_with_the_package_tells_how_far_the_model_is(tmp_path: Path) -> None:
+    case = run_case(
+        "dyno",
+        tmp_path / "case",
+        lockstep=True,
+        duration_s=1.5,
+        stop=lambda: False,
+        progress=lambda _t, _mode: None,
+    )
+    (strut,) = case.struts
+    alone, observed = strut.figures(strut.defective), strut.figures(strut.observed)
+    assert alone.force_error_rms_n > 0.2 * alone.force_peak_n
+    assert observed.force_error_rms_n == pytest.approx(0.5, rel=0.2)
+    assert alone.height_error_max_m < 2e-6
