@@ -42,7 +42,7 @@ _CHUNK = 2048
 """Ticks whose objects are in memory at once."""
 
 _MOST_LOST_A_FRAME = 1000
-"""Ticks without a step for each frame of a log, beyond which its times cannot be right."""
+"""Ticks without a step for each frame after the last step, beyond which times cannot be right."""
 
 _NOTHING = (nan,) * 7
 """Of a strut before the first measurements."""
@@ -193,7 +193,7 @@ def _ticks(found: RunFolder, frames: FrameColumns, period_ns: int) -> Ticks:
     end_ns = last_frame_ns(found.folder, found.epoch_ns) + 1
     if there < found.steps.num_rows:
         end_ns = begin_ns  # the next tick's frames are not all there
-    if (end_ns - begin_ns) // period_ns > _MOST_LOST_A_FRAME * (count + 1000):
+    if (end_ns - begin_ns) // period_ns > _MOST_LOST_A_FRAME * (count - used + 10):
         raise InputError(
             f"{found.folder}: the last frame is {(end_ns - begin_ns) * 1e-9:.0f} s after the last "
             "step, expected a log whose times belong together"

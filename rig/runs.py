@@ -277,6 +277,7 @@ def logged(
         clock.epoch_ns,
         config.bus.channel,
         paced=granted is not None,
+        priority=config.realtime.fifo_priority if granted is not None and granted.fifo else 0,
         rotation=config.log.rotation(),
         window=config.log.window(),
         graver=_graver,

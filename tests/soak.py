@@ -13,6 +13,8 @@ from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
+import yaml
+from numpy.typing import NDArray
 
 from can_dbc.codec import decode_log
 from can_dbc.database import load_database
@@ -20,27 +22,35 @@ from can_dbc.units import Dimension
 from rig.bench.config import load_bench_config
 from rig.config import CONFIGS, load_setup
 from rig.io.frame_columns import received_frames
-from rig.io.run_log import DBC_FILE, FRAMES_FILE, STEPS_FILE, parts
+from rig.io.run_log import DBC_FILE, FRAMES_FILE, RUN_FILE, STEPS_FILE, parts
 from rig.runs import with_bench
 
 PART_S = 600
 S = 1_000_000_000
 MOST_GROWTH_MIB = 10.0
 WORSE = 1.02
+SETTLING = 1000
+"""Frames of the load cell at the beginning that do not count: ten seconds."""
+
+
+def load_cell(folder: Path, part: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Times and forces of the load cell in one part of the log."""
+    frames = received_frames([parts(folder, FRAMES_FILE)[part]], 0)
+    message = load_database(folder / DBC_FILE).message("BENCH_AUXILIARY")
+    of_cell = frames.arbitration_id == message.arbitration_id
+    payload = np.ascontiguousarray(frames.payload[of_cell][:, : message.length_bytes])
+    decoded = decode_log(message, ["LOAD_CELL_FORCE"], [Dimension.FORCE], payload)
+    epoch_ns = int(yaml.safe_load((folder / RUN_FILE).read_text())["epoch_ns"])
+    return frames.t_ns[of_cell] - epoch_ns, decoded["LOAD_CELL_FORCE"]
 
 
 def force_error_n(folder: Path, part: int) -> float:
     """RMS of the estimated force less the load cell's in one part of the log."""
     with cast("Any", pa).memory_map(str(parts(folder, STEPS_FILE)[part])) as source:
         steps = cast("Any", pa).ipc.open_stream(source).read_all()
-    frames = received_frames([parts(folder, FRAMES_FILE)[part]], 0)
-    message = load_database(folder / DBC_FILE).message("BENCH_AUXILIARY")
-    of_cell = frames.arbitration_id == message.arbitration_id
-    payload = np.ascontiguousarray(frames.payload[of_cell][:, : message.length_bytes])
-    cell_n = decode_log(message, ["LOAD_CELL_FORCE"], [Dimension.FORCE], payload)["LOAD_CELL_FORCE"]
-    index = np.searchsorted(steps["t_ns"].to_numpy(), frames.t_ns[of_cell])
-    error_n = steps["strut.force_n"].to_numpy()[index] - cell_n
-    return float(np.sqrt(np.mean(error_n[1000:] ** 2)))
+    t_ns, cell_n = load_cell(folder, part)
+    estimate_n = np.interp(t_ns, steps["t_ns"].to_numpy(), steps["strut.force_n"].to_numpy())
+    return float(np.sqrt(np.mean((estimate_n - cell_n)[SETTLING:] ** 2)))
 
 
 def main() -> int:

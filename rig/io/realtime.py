@@ -100,11 +100,24 @@ def realtime(request: Request) -> Generator[Granted]:
         sys.setswitchinterval(switch_interval_s)
 
 
+def follow(priority: int) -> None:
+    """Let the calling thread run just below the loop's real-time priority, where that is allowed.
+
+    A thread that holds the interpreter and waits for the processor behind ordinary processes makes
+    the loop wait with it, whatever the loop's own priority is.
+
+    Args:
+        priority: The loop's priority; 0 if it has none, then nothing is done.
+    """
+    if priority > 1:
+        _fifo(priority - 1)
+
+
 def _fifo(priority: int) -> bool:
     if priority == 0:
         return False
     try:
-        # Threads started later (the log's) must not inherit it.
+        # What is started later must not inherit it: threads ask for their own.
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(0, policy, os.sched_param(priority))
     except (OSError, AttributeError):

@@ -185,10 +185,26 @@ def _read_part(path: Path) -> Any:
             # Behind the last whole batch stands what a kill cut off.
             with contextlib.suppress(_pa.ArrowInvalid, OSError):
                 batches.extend(stream)
-            return _pa.Table.from_batches(batches, schema=stream.schema)
+            table = _pa.Table.from_batches(batches, schema=stream.schema)
     except (_pa.ArrowInvalid, OSError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: is no Arrow stream of steps: {reason}") from error
+    _check_columns(table, path)
+    return table
+
+
+def _check_columns(table: Any, path: Path) -> None:
+    common = step_schema(())
+    for number, column in enumerate(table.schema):
+        expected = common[number] if number < len(common) else _pa.field(column.name, _pa.float64())
+        if (column.name, column.type) != (expected.name, expected.type):
+            raise InputError(
+                f"{path}: column {number + 1} is {str(column)[:60]!r}, expected '{expected}'"
+            )
+        if table.column(number).null_count:
+            raise InputError(f"{path}: column {column.name[:60]!r} has gaps, expected none")
+    if table.num_columns < len(common):
+        raise InputError(f"{path}: expected columns {', '.join(common.names)} at least")
 
 
 def _schema_bytes(head: bytes) -> int:

@@ -20,6 +20,7 @@ import yaml
 from can_dbc.frame import Frame
 from dart_model.yaml_file import InputError
 from rig.io.captures import Capture, Captures, Entry, Window
+from rig.io.realtime import follow
 from rig.io.run_log import (
     DBC_FILE,
     FRAMES_FILE,
@@ -112,6 +113,7 @@ class RunLog:
         channel: Name of the bus in `frames.log`.
         paced: The run waits for a clock, so a thread of its own writes; otherwise the run waits for
             the disk.
+        priority: Real-time priority of the loop, which the thread follows; 0 for none.
         rotation: When the files are continued in others.
         window: What is captured around faults; None captures nothing.
         graver: Whether a change of mode is a trigger of a capture, and its name if so.
@@ -129,6 +131,7 @@ class RunLog:
         channel: str,
         *,
         paced: bool,
+        priority: int = 0,
         rotation: Rotation = Rotation(),
         window: Window | None = None,
         graver: Callable[[int, int], str | None] = lambda _before, _now: None,
@@ -158,6 +161,7 @@ class RunLog:
         self._waiting: deque[Entry] = deque()
         self._lines = b""
         self._batch: list[Step] = []
+        self._priority = priority
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._write_until_closed, name="run-log")
         self._paced = paced
@@ -224,6 +228,7 @@ class RunLog:
             self.trouble = why
 
     def _write_until_closed(self) -> None:
+        follow(self._priority)
         # The loop only appends: waking this thread at every tick would cost the loop more.
         while not self._closing.wait(POLL_S):
             self._write_waiting()

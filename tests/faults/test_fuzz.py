@@ -1,4 +1,4 @@
-"""Mutated frames and files: no crash, and nothing used from what was refused.
+"""Mutated frames: no crash, and nothing used from what was refused.
 
 What the counter and an 8-bit CRC let through is bounded: all changes of one, two and three bits of
 every message are counted in the tests of `can_dbc`; here frames are changed in any way.
@@ -12,9 +12,6 @@ from msgspec.structs import replace
 
 from can_dbc.protection import Verdict, check_crc
 from rig.core.messages import Quantity
-from rig.io.run_log import FRAMES_FILE, RUN_FILE, STEPS_FILE, read_run
-from rig.replay import replay
-from tests.faults.test_machine import lockstep
 from tests.faults.trial import Trial
 
 LENGTHS = (0, 1, 7, 8, 9, 12, 64)
@@ -81,64 +78,3 @@ def test_mutated_frames():
 def test_a_million_mutated_frames():
     frames, _ = fuzz(230_000, seed=2)
     assert frames > 1_000_000
-
-
-@pytest.fixture(scope="module")
-def logged(tmp_path_factory):
-    """The files of a short run."""
-    folder = tmp_path_factory.mktemp("fuzz") / "run"
-    lockstep(folder, "fuzz", 0.3)
-    return folder
-
-
-def mangled(rng, data):
-    """Bytes with some of them changed, lost, repeated or inserted."""
-    result = bytearray(data)
-    for _ in range(rng.choice((1, 1, 2, 5, 20))):
-        start = rng.randrange(len(result) + 1)
-        size = rng.choice((1, 1, 4, 40))
-        match rng.randrange(5):
-            case 0:
-                result[start : start + size] = rng.randbytes(size)
-            case 1:
-                del result[start : start + size]
-            case 2:
-                result[start:start] = rng.randbytes(size)
-            case 3:
-                result[start:start] = result[start : start + size]
-            case _:
-                del result[start:]
-    return bytes(result)
-
-
-def is_read(folder):
-    """Read a run and compute it again; says whether it was accepted."""
-    try:
-        _ = list(read_run(folder).frames())
-        replay(folder)
-    except ValueError as error:
-        return "\n" in str(error)  # would be no single line
-    return True
-
-
-def fuzz_file(logged, folder, name, count, seed):
-    rng = random.Random(seed)
-    for path in logged.iterdir():
-        (folder / path.name).write_bytes(path.read_bytes())
-    original = (logged / name).read_bytes()
-    accepted = 0
-    for _ in range(count):
-        (folder / name).write_bytes(mangled(rng, original))
-        accepted += is_read(folder)
-    return accepted
-
-
-@pytest.mark.parametrize("name", [RUN_FILE, FRAMES_FILE, STEPS_FILE, "bus.dbc", "model.yaml"])
-def test_mutated_files_of_a_run(logged, tmp_path, name):
-    fuzz_file(logged, tmp_path, name, 12, seed=3)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", [RUN_FILE, FRAMES_FILE, STEPS_FILE, "bus.dbc", "model.yaml"])
-def test_ten_thousand_mutated_files_of_each_kind(logged, tmp_path, name):
-    fuzz_file(logged, tmp_path, name, 10_000, seed=4)

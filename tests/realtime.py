@@ -1,0 +1,120 @@
+"""Bridge and bench over a virtual bus in real time: `python -m tests.realtime --out FOLDER`.
+
+One frame in and one frame out a tick, by default at 1 kHz for five minutes, with a busy process on
+every core. Prints overruns, lateness, work and the error of the estimate. Exit code 1 if the
+estimate is off by more than 2 % of the peak force, or if a tick was missed under SCHED_FIFO.
+"""
+
+import argparse
+import contextlib
+import multiprocessing
+import os
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from can_dbc.database import DEFAULT_DATABASE, load_database
+from rig.bench.config import load_bench_config
+from rig.bench.schema import BenchConfig
+from rig.config import CONFIGS, Published, Setup, load_setup, put_together
+from rig.runs import Ended, with_bench
+from tests.soak import force_error_n, load_cell
+
+CLASSIC_CAN_HZ = 3703
+"""What 1 Mbit/s carries of one frame in and one out, with the most stuff bits."""
+
+MOST_ERROR = 0.02
+
+
+def spin() -> None:
+    """Keep a core busy."""
+    while True:
+        pass
+
+
+@contextlib.contextmanager
+def busy_cores() -> Iterator[None]:
+    """A busy process on each core."""
+    processes = [multiprocessing.Process(target=spin, daemon=True) for _ in range(os.cpu_count())]
+    for process in processes:
+        process.start()
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.join()
+
+
+def at_rate(
+    rate_hz: float, seconds: float, *, fifo: bool, folder: Path
+) -> tuple[Setup, BenchConfig]:
+    """The seed case with one frame in and one out a tick."""
+    ready = load_setup(CONFIGS / "seed.yaml", duration_s=seconds)
+    folder.mkdir(parents=True)
+    dbc = folder / "every_tick.dbc"
+    # Without a cycle time a message is sent at every tick.
+    text = re.sub(r'("GenMsgCycleTime" BO_ (?:256|272)) 1;', r"\1 0;", DEFAULT_DATABASE.read_text())
+    dbc.write_text(text)
+    realtime = ready.config.realtime.model_copy(update={} if fifo else {"fifo_priority": 0})
+    config = ready.config.model_copy(
+        update={
+            "rate_hz": rate_hz,
+            "publish": {"strut": Published(kinematics=None)},
+            "realtime": realtime,
+        }
+    )
+    bench = load_bench_config(CONFIGS / "seed_bench.yaml")
+    measurement, auxiliary = bench.transmissions
+    period_ns = config.period_ns
+    every = (
+        measurement.model_copy(update={"period_ns": period_ns}),
+        auxiliary.model_copy(update={"period_ns": 10 * period_ns}),
+    )
+    ready = put_together(config, ready.source, ready.model, load_database(dbc))
+    return ready, bench.model_copy(update={"transmissions": every})
+
+
+def show(ended: Ended, rate_hz: float, error: float) -> None:
+    """Print the figures."""
+    granted = ended.granted
+    fifo = granted is not None and granted.fifo
+    print(f"{rate_hz:g} Hz = {rate_hz / CLASSIC_CAN_HZ:.2f} x {CLASSIC_CAN_HZ} Hz, FIFO {fifo}")
+    print(f"{ended.ticks} ticks, {ended.state.counts.overruns} overruns")
+    for name, figures in ended.timing.summary().items():
+        print(f"{name}: {figures}")
+    print(f"force error: {error:.2%} of the peak")
+    print(ended.draw_timing())
+
+
+def main() -> int:
+    """Run it, print the figures, and give the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--seconds", type=float, default=300.0)
+    parser.add_argument("--rate-hz", type=float, default=1000.0)
+    parser.add_argument("--no-fifo", action="store_true")
+    parser.add_argument("--idle", action="store_true", help="no busy processes beside it")
+    asked = parser.parse_args()
+    ready, bench = at_rate(asked.rate_hz, asked.seconds, fifo=not asked.no_fifo, folder=asked.out)
+    with contextlib.nullcontext() if asked.idle else busy_cores():
+        ended = with_bench(
+            ready,
+            bench,
+            asked.out / "run",
+            lockstep=False,
+            stop=lambda: False,
+            progress=lambda _t_ns, _mode: None,
+        )
+    peak_n = float(np.abs(load_cell(ended.folder, 0)[1]).max())
+    error = force_error_n(ended.folder, 0) / peak_n
+    show(ended, asked.rate_hz, error)
+    missed = ended.granted is not None and ended.granted.fifo and ended.state.counts.overruns > 0
+    return 1 if missed or error > MOST_ERROR else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
