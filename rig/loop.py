@@ -115,7 +115,9 @@ def regular_ticks(
         stop: Asked before each tick whether to end.
         timing: Where lateness and work are written.
     """
-    lateness, work, extremes = timing.lateness, timing.work, timing.extremes_ns
+    # A number is written through a view of the memory in half the time it takes in the array.
+    lateness, work = timing.lateness.data, timing.work.data
+    extremes = timing.extremes_ns.data
     last = _BINS - 1
     woke_ns = clock.now_ns()
     index, overruns = -(-woke_ns // period_ns), 0
