@@ -124,7 +124,7 @@ def bridge_and_frames() -> tuple[Bridge, BridgeState, list[list[Frame]]]:
         for name, item in ready.config.publish.items()
     }
     config = ready.config.model_copy(
-        update={"signals": signals, "publish": publish, "status": None}
+        update={"signals": signals, "publish": publish, "status": None, "timing": None}
     )
     ready = ready.model_copy(update={"config": config})
     frames = bench_frames(ready, TICKS + 1, {})
@@ -182,8 +182,9 @@ def test_a_whole_tick_against_the_bare_dart_loop(capsys):
         capsys,
     )
     tick = found["whole tick, frame in and frame out"]
-    assert tick / found["DART, array functions"] <= 5.0
-    assert tick / found["DART, scalar functions"] <= 9.0
+    # Measured: 3.2 to 3.3, and 6.6 to 7.1.
+    assert tick / found["DART, array functions"] <= 4.2
+    assert tick / found["DART, scalar functions"] <= 8.5
 
 
 def test_an_observer_adds_less_than_a_quarter(capsys):
@@ -197,8 +198,8 @@ def test_an_observer_adds_less_than_a_quarter(capsys):
         capsys,
     )
     assert found["the same with an observer"] / found["DART, array functions"] < 1.25
-    # Measured: 1.17 to 1.23. The scalar loop is short enough for noise to matter.
-    assert found["these with an observer"] / found["DART, scalar functions"] < 1.35
+    # Measured: 1.19 to 1.23. The scalar loop is so short that noise matters.
+    assert found["these with an observer"] / found["DART, scalar functions"] < 1.30
 
 
 def test_a_second_observer_costs_no_more_than_the_first(capsys):
@@ -258,4 +259,4 @@ def test_a_replay_against_the_bare_dart_loop(tmp_path: Path, capsys):
     with capsys.disabled():
         rate = 1e6 / min(per_tick_us)
         print(f"\nreplay: {min(per_tick_us):.1f} us a tick, {rate:.0f} ticks a second of one core")
-    assert min(per_tick_us) / min(bare_us) <= 12.0
+    assert min(per_tick_us) / min(bare_us) <= 10.0  # measured: 6.6 to 7.1
