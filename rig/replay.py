@@ -184,6 +184,10 @@ def _ticks(found: RunFolder, frames: FrameColumns, period_ns: int) -> Ticks:
             cast("NDArray[np.int64]", found.steps.column(name).to_numpy())
             for name in ("t_ns", "overruns", "received", "flags")
         )
+    if (received < 0).any() or (np.diff(t_ns) <= 0).any():
+        raise InputError(
+            f"{found.folder}: steps.arrow: expected times that rise and numbers of frames received"
+        )
     there = int(np.searchsorted(np.cumsum(received), count, side="right"))
     t_ns, overruns, received, flags = (
         column[:there] for column in (t_ns, overruns, received, flags)

@@ -183,14 +183,17 @@ def _read_part(path: Path) -> Any:
             source.seek(0)
             stream = _pa.ipc.open_stream(source)
             # Behind the last whole batch stands what a kill cut off.
-            with contextlib.suppress(_pa.ArrowInvalid, OSError):
+            with contextlib.suppress(_pa.ArrowException, OSError):
                 batches.extend(stream)
             table = _pa.Table.from_batches(batches, schema=stream.schema)
-    except (_pa.ArrowInvalid, OSError) as error:
+            table.validate(full=True)
+            _check_columns(table, path)
+            return table
+    except InputError:
+        raise
+    except (_pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: is no Arrow stream of steps: {reason}") from error
-    _check_columns(table, path)
-    return table
 
 
 def _check_columns(table: Any, path: Path) -> None:
