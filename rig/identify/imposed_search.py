@@ -62,6 +62,7 @@ _MOTION_MARGIN = 2.0
 _FLOOR_COLOUR = 0.03
 _AT_BOUND = 1e-3
 _SLOW = 0.1
+_LARGEST_SWING = 8.0
 _TONES = 4
 _ONE_LINE = 0.9
 
@@ -384,7 +385,8 @@ def _round(
         if there is None:
             return Candidate(trial.name, trial.cost, None, np.zeros(0), "its force is not finite")
         errors = held_back_errors(there, runs)
-        return Candidate(trial.name, trial.cost, there, errors, at_bound(there, motion))
+        why = at_bound(there, motion) or cancelling(there, runs)
+        return Candidate(trial.name, trial.cost, there, errors, why)
 
     fitted = list(pool.map(joint, finalists))
     far = [
@@ -425,6 +427,24 @@ def at_bound(result: Fit, motion: Motion) -> str:
                 if there and (parameter.name, side) not in _NATURAL_ENDS:
                     whose = "its" if name == result.effects[-1] else f"{name}'s"
                     return f"{whose} {parameter.name} runs to an end of its search"
+    return ""
+
+
+def cancelling(result: Fit, runs: Sequence[Run]) -> str:
+    """Which law swings far more than all that is missing, said in words; empty if none does.
+
+    Such a law and a linear effect take each other away, and what is left of both is a curve that
+    neither of them stands for.
+    """
+    missing = np.concatenate([run.missing_n() for run in runs])
+    most = _LARGEST_SWING * float(np.sqrt(np.mean(missing**2)))
+    for row, (name, values) in enumerate(zip(result.effects, result.values, strict=True)):
+        parts = [
+            law_force(run, name, values, result.memories[k][row])[run.counted]
+            for k, run in enumerate(runs)
+        ]
+        if float(np.std(np.concatenate(parts))) > most:
+            return f"{name} swings far more than all that is missing, and is cancelled by others"
     return ""
 
 
