@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.yaml_file import InputError
-from rig.io.run_log import parse_frame
+from rig.io.run_log import LATEST_S, parse_frame
 
 _BLOCK_BYTES = 2 * 1024 * 1024
 _MOST_SHAPES = 16
@@ -162,6 +162,8 @@ def _read_alike(
     alike = (lines[:, fixed] == lines[0, fixed]).all(axis=1)
     for value, base in zip(values, (10, 10, 16, 16), strict=True):
         alike &= (value < base).all(axis=1)
+    if values[0].shape[1] >= len(str(LATEST_S)):
+        alike &= values[0][:, 0] < int(str(LATEST_S)[0])
     seconds, fraction, identifier, data = (value[alike] for value in values)
     at = rows[alike]
     number = _number(identifier, 16)

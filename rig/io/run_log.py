@@ -26,6 +26,9 @@ _TAIL_BYTES = 4096
 RUN_FILE, FRAMES_FILE, STEPS_FILE = "run.yaml", "frames.log", "steps.arrow"
 MODEL_FILE, DBC_FILE = "model.yaml", "bus.dbc"
 
+LATEST_S = 9_000_000_000
+"""Unix time beyond which a stamp is wrong: in ns it would hardly go into 64 bits."""
+
 _pa = cast("Any", pa)
 
 
@@ -51,6 +54,8 @@ def parse_frame(line: str, epoch_ns: int) -> tuple[Frame, str]:
     text, _, direction = rest.partition(" ")
     seconds, _, fraction = stamp.strip("()").partition(".")
     if not (stamp.startswith("(") and stamp.endswith(")") and 1 <= len(fraction) <= 9):
+        raise ValueError(f"time stamp {stamp!r}")
+    if not 0 <= int(seconds) < LATEST_S:
         raise ValueError(f"time stamp {stamp!r}")
     t_ns = int(seconds) * 1_000_000_000 + int(fraction.ljust(9, "0")) - epoch_ns
     identifier, mark, payload = text.partition("#")
@@ -141,8 +146,8 @@ def read_run(folder: Path) -> RunFolder:
     path = folder / RUN_FILE
     header = parse_mapping(read_text(path, 64 * 1024 * 1024), str(path))
     epoch_ns = header.get("epoch_ns")
-    if not isinstance(epoch_ns, int):
-        raise InputError(f"{path}: epoch_ns: {epoch_ns!r}: expected an integer")
+    if not isinstance(epoch_ns, int) or not 0 <= epoch_ns < LATEST_S * 1_000_000_000:
+        raise InputError(f"{path}: epoch_ns: {str(epoch_ns)[:40]}: expected a Unix time in ns")
     return RunFolder(folder, header, _read_steps(parts(folder, STEPS_FILE)), epoch_ns)
 
 

@@ -107,3 +107,12 @@ def test_a_last_line_without_an_end_is_left_out(tmp_path):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match=r"frames\.log: cannot be read: No such file"):
         received_frames([tmp_path / "frames.log"], 0)
+
+
+@pytest.mark.parametrize("stamp", ["9999999999.000000000", "99000000000.000000000", "-5.000000000"])
+def test_a_time_that_cannot_be_is_refused(tmp_path, stamp):
+    path = tmp_path / "frames.log"
+    good = "(1.000000000) can0 100#0102 R\n"
+    path.write_text(f"{good}({stamp}) can0 100#0102 R\n", "ascii")
+    with pytest.raises(InputError, match=r"frames\.log: line 2: "):
+        received_frames([path], 0)
