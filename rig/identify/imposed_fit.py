@@ -63,7 +63,6 @@ class Run(NamedTuple):
         force_n: Load cell, shape (N,).
         given_n: Force of the model as given, shape (N,).
         temperature_c: Temperature, shape (N,).
-        has_temperature: Whether it was measured.
         substeps: Steps for a law's memory between samples.
         counted: Samples that a fit looks at, shape (n,).
         strut: Free length, stiffness, damping and gravity, shape (4,).
@@ -79,7 +78,6 @@ class Run(NamedTuple):
     force_n: Array
     given_n: Array
     temperature_c: Array
-    has_temperature: bool
     substeps: int
     counted: Integers
     strut: Array
@@ -142,7 +140,6 @@ def run_of(record: Record, spec: ModelSpec) -> Run:
         np.interp(t_s, record.t_s, record.strut_force_n),
         np.zeros(len(t_s)),
         _temperature(record, t_s),
-        record.temperature_c is not None,
         max(1, int(np.ceil(usual_s / _LONGEST_MEMORY_STEP_S - 1e-9))),
         np.flatnonzero(np.isfinite(height)),
         np.array([

@@ -115,7 +115,6 @@ class Found(NamedTuple):
     Attributes:
         runs: The runs.
         base: The model as given: nothing fitted.
-        linear: Stiffness, damping and preload alone, those that count.
         final: All that was found.
         rounds: The competition.
         rivals: Laws of other families that do as well in the place of one that was found.
@@ -124,7 +123,6 @@ class Found(NamedTuple):
 
     runs: tuple[Run, ...]
     base: Fit
-    linear: Fit
     final: Fit
     rounds: tuple[Round, ...]
     rivals: tuple[Candidate, ...]
@@ -163,8 +161,8 @@ def search(runs: Sequence[Run], progress: Progress) -> Found:
         if current.effects:
             final, rivals = _compared(runs, current, motion, pool)
     progress("fitting all samples", 0.88)
-    base, linear, final = (_on_all(whole, there, motion) for there in (base, linear, final))
-    return Found(whole, base, linear, final, tuple(rounds), rivals, motion)
+    base, final = (_on_all(whole, there, motion) for there in (base, final))
+    return Found(whole, base, final, tuple(rounds), rivals, motion)
 
 
 def _on_all(whole: Sequence[Run], there: Fit, motion: Motion) -> Fit:
