@@ -2,7 +2,7 @@
 
 DART's own `World.step` is semi-implicit Euler, first order, with forces held over the step. Here
 DART only answers "what is the acceleration in this state under these forces?"
-(`computeForwardDynamics`, a sixth of the cost of a step), and Kutta's third-order method asks it
+(`computeForwardDynamics`, two fifths of the cost of a step), and Kutta's third-order method asks it
 three times a sub-step. That keeps the error of the seed case far below the height's resolution at
 one sub-step a millisecond, where a second-order method would need four.
 
