@@ -6,7 +6,8 @@ from dart_model.effects.contract import Effect, Floats, Parameter, Writable
 
 _FAMILY = "hysteresis"
 _LOOPS = "loops of different amplitude and frequency"
-_LIMIT = Parameter("yield_force_n", "N", -1e5, 1e5, "force at which the loop is fully bent")
+# A loop that turned the other way would make energy out of nothing.
+_LIMIT = Parameter("yield_force_n", "N", 0.0, 1e5, "force at which the loop is fully bent")
 _BEND = Parameter("yield_displacement_m", "m", 1e-5, 1.0, "travel from rest to full force")
 
 ELEMENTS = 8
@@ -188,7 +189,7 @@ MAXWELL = Effect(
     name="maxwell",
     family=_FAMILY,
     parameters=(
-        Parameter("stiffness_n_per_m", "N/m", -1e6, 1e7, "spring in series with a damper"),
+        Parameter("stiffness_n_per_m", "N/m", 0.0, 1e7, "spring in series with a damper"),
         Parameter("relaxation_time_s", "s", 2e-3, 100.0, "damping over stiffness"),
     ),
     force=_maxwell,

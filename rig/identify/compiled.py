@@ -167,7 +167,7 @@ _LARGEST_ERROR_M = 5e-9
 def _simulate(
     index: Integers, p: Array, struts: Array, rows: Array, offsets: Array,
     inverse_mass: Array, constant: Array, applied_row: Array,
-    t: Array, fine: Array, temperature: Array, substeps: int, start: Array,
+    t: Array, fine: Array, temperature: Array, substeps: int, bend: float, start: Array,
     pull: Array, target: Array, target_rate: Array,
     heights: Array, velocities: Array, accelerations: Array,
 ) -> bool:  # fmt: skip
@@ -238,12 +238,12 @@ def _simulate(
                             rise = target[after, i] - target[k, i]
                             early = gap * target_rate[k, i]
                             late = gap * target_rate[after, i]
-                            bend = early + late - 2.0 * rise
+                            turn = early + late - 2.0 * rise
                             sag = 3.0 * rise - 2.0 * early - late
-                            goal = target[k, i] + share * (early + share * (sag + share * bend))
+                            goal = target[k, i] + share * (early + share * (sag + share * turn))
                             pace = target_rate[k, i]
                             if gap > 0.0:
-                                pace = (early + share * (2.0 * sag + 3.0 * share * bend)) / gap
+                                pace = (early + share * (2.0 * sag + 3.0 * share * turn)) / gap
                             force[i] += pull[i, 0] * (goal - height)
                             force[i] += pull[i, 1] * (pace - velocity)
                     for row in range(index.shape[0]):
@@ -298,9 +298,11 @@ def _simulate(
                 piece += 1
                 if pieces == 1:
                     worst = 0.0
+                    largest = 0.0
                     for j in range(n):
                         worst = max(worst, abs(twist[j]))
-                    if worst * whole * whole > 6.0 * _LARGEST_ERROR_M:
+                        largest = max(largest, abs(dy[n + j]), abs(total[n + j]) / 5.0)
+                    if worst * whole * whole > 6.0 * _LARGEST_ERROR_M and worst > bend * largest:
                         # A contact closed or friction turned within the step: again, in parts.
                         for i in range(size):
                             x[i] = began[i]
@@ -315,7 +317,7 @@ simulate = compile_loop(
     _simulate,
     types.boolean(
         *_MODEL_TYPES,
-        _VECTOR, _VECTOR, _VECTOR, types.int64, _VECTOR, *(_MATRIX,) * 6,
+        _VECTOR, _VECTOR, _VECTOR, types.int64, types.float64, _VECTOR, *(_MATRIX,) * 6,
     ),
 )  # fmt: skip
 """Run a model open loop.
@@ -323,9 +325,9 @@ simulate = compile_loop(
 Args: index of the slots; parameters, strut constants (struts, 4), strut rows (struts, n), offsets
 (struts,), inverse mass (n, n), constant generalised force (n,), applied row (n,); times of the
 nodes (N,), applied force at half sub-steps (2 * substeps * (N - 1) + 1,), temperature (N,),
-sub-steps, start (2 n + memory,); stiffness and damping of a pull towards a motion (struts, 2), its
-heights and velocities (N, struts), read where there is a pull; heights, velocities and
-accelerations of the struts (N, struts),
+sub-steps, share by which a smooth acceleration bends within one, start (2 n + memory,); stiffness
+and damping of a pull towards a motion (struts, 2), its heights and velocities (N, struts), read
+where there is a pull; heights, velocities and accelerations of the struts (N, struts),
 written. Returns whether the motion stayed finite.
 """
 

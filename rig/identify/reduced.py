@@ -29,6 +29,9 @@ LONGEST_STEP_S = 1.25e-3
 _STEP_ANGLE = 0.2
 """Longest step as an angle of the model's fastest motion: the integrator errs by 1e-5 a radian."""
 
+_BEND = 4.0
+"""How much more than its fastest linear motion a smooth nonlinear one may bend within a step."""
+
 
 class Model(NamedTuple):
     """A bench on straight guides.
@@ -130,6 +133,7 @@ class Grid(NamedTuple):
         temperature_c: Temperature at the nodes, shape (N,).
         has_temperature: Whether it was measured.
         substeps: Steps of the integrator between nodes.
+        angle: Angle by which the model's fastest motion turns in one of those steps, in rad.
         pull_per_s: Rate at which a simulation is pulled towards `target_m`; 0 is open loop.
         target_m: Smoothed heights, shape (N, struts); read where there is a pull.
         target_m_per_s: Smoothed velocities.
@@ -144,6 +148,7 @@ class Grid(NamedTuple):
     temperature_c: Array
     has_temperature: bool
     substeps: int
+    angle: float
     pull_per_s: float = 0.0
     target_m: Array = _NOWHERE
     target_m_per_s: Array = _NOWHERE
@@ -174,7 +179,7 @@ class Grid(NamedTuple):
         fine[::2] = whole
         fine[1::4] = 0.375 * first + 0.75 * middle - 0.125 * last
         fine[3::4] = -0.125 * first + 0.75 * middle + 0.375 * last
-        return self._replace(fine_n=fine, substeps=2 * self.substeps)
+        return self._replace(fine_n=fine, substeps=2 * self.substeps, angle=0.5 * self.angle)
 
     def input_moved(self) -> "Grid":
         """The run, its applied force moved by as much as its reconstruction may be wrong.
@@ -231,6 +236,7 @@ def grid_of(record: Record, model: Model, *, held: bool = False) -> Grid:
         temperature,
         record.temperature_c is not None,
         substeps,
+        model.fastest_rad_per_s * usual / substeps,
     )
 
 
@@ -313,6 +319,7 @@ def run(
         grid.fine_n,
         grid.temperature_c,
         grid.substeps,
+        _BEND * grid.angle**2,
         start,
         pull_on(model, grid),
         grid.target_m,
