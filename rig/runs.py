@@ -36,6 +36,8 @@ from rig.loop import Port, Progress, Timing, regular_ticks, run
 _PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "autosar-e2e")
 _NO_CONDITIONS = Conditions()
 _BENCH_PORTION_NS = 20_000_000
+_CATCHING_UP = 4
+"""How often a simulated bench catches up before the first tick; each time it takes a tenth as long."""
 _TIMING_TOLD_NS = 500_000_000
 """How often percentiles are taken of the timing, for the bus."""
 
@@ -188,6 +190,13 @@ class _BenchOnBus:
     def now_ns(self) -> int:
         return self._clock.now_ns()
 
+    def begin(self) -> None:
+        """Let what the bench sent while the run was set up be gone before the first tick."""
+        for _ in range(_CATCHING_UP):
+            now_ns = self._clock.now_ns()
+            self._send_up_to(now_ns)
+            self._port.receive(now_ns)
+
     def wait_until(self, t_ns: int) -> int:
         self._send_up_to(t_ns)
         return self._clock.wait_until(t_ns)
@@ -237,6 +246,10 @@ def _copy_inputs(ready: Setup, folder: Path) -> None:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
 
 
+def _nothing() -> None:
+    """Begin without ado."""
+
+
 def logged(
     ready: Setup,
     bridge: Bridge,
@@ -246,6 +259,7 @@ def logged(
     *,
     figures: LinkFigures,
     granted: Granted | None = None,
+    begin: Callable[[], None] = _nothing,
     stop: Callable[[], bool],
     progress: Progress,
 ) -> Ended:
@@ -259,6 +273,7 @@ def logged(
         folder: Folder of the run; absent or empty.
         figures: What becomes of the bus behind the port, for `run.yaml`.
         granted: What the machine granted; None for simulated time, which then waits for the disk.
+        begin: Called when all is set up, before the first tick.
         stop: Asked before each tick whether to end.
         progress: Told of every tick.
 
@@ -295,6 +310,7 @@ def logged(
         progress(step.t_ns, result.output.mode)
 
     try:
+        begin()
         due = regular_ticks(clock, config.period_ns, count, stop, timing)
         with _on_signal(signal.SIGUSR2, lambda: log.trigger("user")):
             state = run(bridge, state, due, _Told(port, log, timing), sink)
@@ -418,6 +434,9 @@ def with_bench(
     """
     bridge = build_bridge(ready)
     bench = Bench(bench_config, ready.database)
+    if not lockstep:
+        # What is loaded at a bench's first use would hold the first ticks up.
+        Bench(bench_config, ready.database).update(_BENCH_PORTION_NS)
     with contextlib.ExitStack() as stack:
         granted = None if lockstep else stack.enter_context(realtime(_request(ready.config)))
         clock = VirtualClock() if granted is None else _real_clock(ready.config, granted)
@@ -435,6 +454,7 @@ def with_bench(
             folder,
             figures=link.figures,
             granted=granted,
+            begin=_nothing if lockstep else on_bus.begin,
             stop=stop,
             progress=progress,
         )
