@@ -30,14 +30,13 @@ from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE
 from rig.io.run_writer import RunLog
 from rig.io.secoc import Authentication, Authenticator
 from rig.io.steps import Step
-from rig.io.timing_picture import TIMING_PICTURE, Distribution, draw_timing
 from rig.loop import Port, Progress, Timing, regular_ticks, run
 
 _PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "autosar-e2e")
 _NO_CONDITIONS = Conditions()
 _BENCH_PORTION_NS = 20_000_000
 _CATCHING_UP = 4
-"""How often a simulated bench catches up before the first tick; each time it takes a tenth as long."""
+"""How often a simulated bench catches up before the first tick, each time in less time."""
 _TIMING_TOLD_NS = 500_000_000
 """How often percentiles are taken of the timing, for the bus."""
 
@@ -81,6 +80,9 @@ class Ended:
         Raises:
             OSError: It cannot be written.
         """
+        # Loading what draws takes longer than all that a run needs.
+        from rig.io.timing_picture import TIMING_PICTURE, Distribution, draw_timing
+
         timing, granted = self.timing, self.granted
         fifo = "granted" if granted is not None and granted.fifo else "not granted"
         title = (
