@@ -54,6 +54,7 @@ _WHITE = 0.1
 _IMPLAUSIBLE = 5.0
 _EXPLAINED = 0.25
 _MOST_LAWS = 2
+_HELD = 0.3
 _LONGEST_DURATION_S = 600.0
 
 
@@ -212,7 +213,7 @@ def _written_up(
         fitted,
         tuple(series for there, _ in results for series in _held_out_series(model, there)),
         _ranking(model, found, settled),
-        _assumptions(source),
+        _assumptions(source, final, grids, found.judge.along),
     )
 
 
@@ -432,11 +433,33 @@ def _suggestion(settled: Settled) -> str:
     return "a run with " + "; and ".join(wanted)
 
 
-def _assumptions(source: str) -> tuple[str, ...]:
+def _looks_held(final: Fit, grids: Sequence[Grid]) -> bool:
+    """Whether a delay was found that a force held between samples would feign."""
+    half_s = 0.5 * float(np.median(np.concatenate([np.diff(grid.t_s) for grid in grids])))
+    return any(
+        name == "delay"
+        and abs(float(final.values[final.planted.slots.index[row, 1]]) / half_s - 1.0) < _HELD
+        for row, (_, name) in enumerate(final.planted.effects)
+    )
+
+
+def _assumptions(
+    source: str, final: Fit, grids: Sequence[Grid], along: Sequence[tuple[int, str]]
+) -> tuple[str, ...]:
     said = [
         "Between samples the applied force is a cubic spline; between nodes DART has it linear.",
         "The initial state of every run is fitted, for both models.",
     ]
+    if _looks_held(final, grids):
+        said.append(
+            "The delay found is half a sampling interval: that is what an applied force looks like "
+            "that is held between samples. If the bench holds it, nothing is wrong with it."
+        )
+    if undone := [name for at, name in final.planted.effects if (at, name) in along]:
+        said.append(
+            "The model's linear part had itself been fitted to such a run, so that it hid a part "
+            f"of what is missing; {', '.join(undone)} undo that."
+        )
     if source != "runs":
         said.append("No run was held out: the last fifth of the last run was kept back instead.")
     return tuple(said)
