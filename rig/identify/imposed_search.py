@@ -53,6 +53,7 @@ _FINALISTS = 7
 _A_FAMILY = 3
 _LEAST_GAIN = 0.004
 _LATER_GAIN = 0.03
+_POLISH = 0.2
 _CERTAIN = 2.0
 _MOST_LOST = 0.4
 _HARDLY_LOST = 0.005
@@ -153,7 +154,10 @@ def search(runs: Sequence[Run], progress: Progress) -> Found:
             winner = _winner(this)
             if winner is None or winner.fit is None:
                 break
-            if not significant(current, winner.fit, runs):
+            least = _LATER_GAIN if current.effects else _LEAST_GAIN
+            if current.effects and not at_floor(winner.fit, runs):
+                least = _POLISH
+            if not significant(current, winner.fit, runs, least):
                 break
             current = _rechosen(runs, winner.fit, motion, pool)
         progress("comparing rivals", 0.75)
@@ -471,7 +475,16 @@ def _certainty(gains: Array) -> float:
 
 
 def significant(before: Fit, after: Fit, runs: Sequence[Run], least: float | None = None) -> bool:
-    """Whether blocks that took no part in the fits gain more than by chance."""
+    """Whether blocks that took no part in the fits gain more than by chance.
+
+    Args:
+        before: Fit with less.
+        after: Fit with more.
+        runs: The runs.
+        least: Share of the squared error that must be gained; by default what a first or a later
+            effect must gain. A law that is one too many polishes what another shape would have
+            fitted, and does worse elsewhere.
+    """
     old, new = held_back_errors(before, runs), held_back_errors(after, runs)
     gain = old - new
     if least is None:
