@@ -581,7 +581,9 @@ def _print_ended(ended: "Ended", *, with_timing: bool) -> None:
 
 
 def _draw_timing(ended: "Ended") -> None:
+    from rig.timing_picture import draw_run
+
     try:
-        console.print(f"Histograms of lateness and work: {ended.draw_timing()}")
+        console.print(f"Histograms of lateness and work: {draw_run(ended)}")
     except OSError as error:  # a disk that is full takes no picture, and the run is over anyway
         console.print(f"No histograms: {error.strerror}", style="yellow")

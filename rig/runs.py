@@ -74,30 +74,6 @@ class Ended:
             "log_fault": self.log_fault,
         }
 
-    def draw_timing(self) -> Path:
-        """Draw lateness and work of the ticks into the run's folder; returns the file.
-
-        Raises:
-            OSError: It cannot be written.
-        """
-        # Loading what draws takes longer than all that a run needs.
-        from rig.io.timing_picture import TIMING_PICTURE, Distribution, draw_timing
-
-        timing, granted = self.timing, self.granted
-        fifo = "granted" if granted is not None and granted.fifo else "not granted"
-        title = (
-            f"{1e9 / self.period_ns:g} ticks a second: {self.ticks} ticks, "
-            f"{self.state.counts.overruns} overruns, "
-            f"longest gap {timing.extremes_ns[2] * 1e-6:.2f} ms; SCHED_FIFO {fifo}"
-        )
-        distributions = (
-            Distribution("Lateness: deadline to wake-up", timing.lateness, timing.lateness_us()),
-            Distribution("Work: wake-up to the end of the tick", timing.work, timing.work_us()),
-        )
-        path = self.folder / TIMING_PICTURE
-        draw_timing(path, title, distributions, self.period_ns / 1000)
-        return path
-
 
 class BusPort:
     """A port on a bus. A fault of the bus is told with every tick; it does not stop the loop."""

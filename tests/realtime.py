@@ -21,6 +21,7 @@ from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig
 from rig.config import CONFIGS, Published, Setup, load_setup, put_together
 from rig.runs import Ended, with_bench
+from rig.timing_picture import draw_run
 from tests.soak import force_error_n, load_cell
 
 CLASSIC_CAN_HZ = 3703
@@ -87,7 +88,7 @@ def show(ended: Ended, rate_hz: float, error: float) -> None:
     for name, figures in ended.timing.summary().items():
         print(f"{name}: {figures}")
     print(f"force error: {error:.2%} of the peak")
-    print(ended.draw_timing())
+    print(draw_run(ended))
 
 
 def main() -> int:

@@ -9,6 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from rig.runs import Ended
+
 TIMING_PICTURE = "timing.png"
 """Its name in the folder of a run."""
 
@@ -29,6 +31,28 @@ class Distribution:
     what: str
     ticks: NDArray[np.int64]
     levels_us: Mapping[str, float]
+
+
+def draw_run(ended: Ended) -> Path:
+    """Draw lateness and work of a run's ticks into its folder; returns the file.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    timing, granted = ended.timing, ended.granted
+    fifo = "granted" if granted is not None and granted.fifo else "not granted"
+    title = (
+        f"{1e9 / ended.period_ns:g} ticks a second: {ended.ticks} ticks, "
+        f"{ended.state.counts.overruns} overruns, "
+        f"longest gap {timing.extremes_ns[2] * 1e-6:.2f} ms; SCHED_FIFO {fifo}"
+    )
+    distributions = (
+        Distribution("Lateness: deadline to wake-up", timing.lateness, timing.lateness_us()),
+        Distribution("Work: wake-up to the end of the tick", timing.work, timing.work_us()),
+    )
+    path = ended.folder / TIMING_PICTURE
+    draw_timing(path, title, distributions, ended.period_ns / 1000)
+    return path
 
 
 def draw_timing(
