@@ -46,7 +46,7 @@ def bench_frames(ready: Setup, ticks: int, faults: dict[int, str]) -> dict[int, 
     for tick in range(ticks):
         payload, _ = encode((0.4 + 0.02 * math.sin(0.02 * tick), 30.0 * math.sin(0.01 * tick)))
         data = protect(payload, tick, message.protection)
-        frame = Frame(tick * MS - 1000, message.arbitration_id, data)
+        frame = Frame(max(tick * MS - 1000, 0), message.arbitration_id, data)
         fault = faults.get(tick, "")
         found.setdefault(tick, [])
         if fault == "late":
