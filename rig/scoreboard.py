@@ -93,6 +93,9 @@ SILVERBOX_TESTS = (
     Part("arrow, no extrapolation", 100, 32_100),
 )
 _SKIPPED_SAMPLES = 50
+_DART_ANGLE = 0.045
+"""Angle of the fastest motion, in rad, within a step of DART whose error does not count."""
+
 _CORRECTED = "rig, corrected"
 _MV_PER_M = 1000.0 / 0.1
 _MV, _PERCENT = "RMSE in mV", "RMSE in % of the force's standard deviation"
@@ -374,15 +377,18 @@ def open_loop_rmse_m(spec: ModelSpec, record: Record, skipped: int) -> float:
     grid = grid_of(record, model)
     head = grid.rows(0, skipped)
     guess = start_of(model, *first_motion(head), 0)
+    steps = max(2, int(np.ceil(model.fastest_rad_per_s * grid.step_s / _DART_ANGLE)))
     scale = np.array(
         [np.nanstd(grid.heights_m), np.nanstd(np.gradient(grid.heights_m[:, 0], grid.t_s))]
     )
 
     def missed(x: Array) -> Array:
-        return (head.heights_m - dart_heights(spec, head, guess + x * scale)).ravel() / scale[0]
+        return (
+            head.heights_m - dart_heights(spec, head, guess + x * scale, steps)
+        ).ravel() / scale[0]
 
     found = cast("Any", optimize).least_squares(missed, np.zeros(2), max_nfev=20)
-    heights_m = dart_heights(spec, grid, guess + np.asarray(found.x) * scale)
+    heights_m = dart_heights(spec, grid, guess + np.asarray(found.x) * scale, steps)
     return float(np.sqrt(np.nanmean((grid.heights_m - heights_m)[skipped:] ** 2)))
 
 

@@ -778,10 +778,7 @@ def _refined(judge: Judge, found: Attribution, final: Fit, pool: ThreadPoolExecu
         begun = [b[0] for b in (screen.begin(shared, *key) for key in keys) if b]
         trials = list(pool.map(lambda t: screen.polish(shared, t, 10), begun))  # noqa: B023
         trials.sort(key=lambda t: t.cost)
-        fits = pool.map(
-            lambda t: _joint(judge, rest, t, found.motions),  # noqa: B023
-            trials[:2],
-        )
+        fits = _raced(judge, rest, trials[:2], found.motions, pool)
         for rival in fits:
             if rival is None:
                 continue
@@ -840,7 +837,7 @@ def _swapped(
         row = current.planted.effects.index(key)
         rest, own, trials = _trials_in_place(judge, base, current, row, _competing(judge), pool)
         better = [t for t in trials if t.cost < _BETTER * own][:3]
-        fits = pool.map(lambda t: _joint(judge, rest, t, motions), better)  # noqa: B023
+        fits = _raced(judge, rest, better, motions, pool)
         for rival in fits:
             if rival is None:
                 continue
@@ -867,7 +864,7 @@ def _rivals(
         rest, own, trials = _trials_in_place(judge, found.base, final, row, names, pool)
         near = [t for t in trials if t.cost < _RIVAL * own + _RIVAL_COST]
         simplest = sorted(near, key=lambda t: len(effect(t.name).parameters))[:4]
-        fits = pool.map(lambda t: _joint(judge, rest, t, found.motions), simplest)  # noqa: B023
+        fits = _raced(judge, rest, simplest, found.motions, pool)
         best = final
         effective = effective_samples(final)
         for trial, result in zip(simplest, fits, strict=True):
