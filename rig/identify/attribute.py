@@ -45,6 +45,7 @@ _LATER_GAIN = 0.1
 _REPEATED_GAIN = 0.5
 _INPUT_MARGIN = 2.0
 _PULL_PER_S = 8.0
+_ON_THE_WAY = 4
 _ALONE = 3.0
 _FLOOR_COLOUR = 0.03
 _NEARLY = 0.25
@@ -725,9 +726,11 @@ def _alone(
     """The model running alone, reached by letting go of the pull step by step."""
     for pull in pulls:
         there = [grid._replace(pull_per_s=pull) for grid in judge.grids]
+        # On the way there is nothing to be gained from a fit led to its end.
+        steps, tolerance = (iterations, 1e-6) if pull == 0.0 else (_ON_THE_WAY, 1e-3)
         last = _fitted(
             judge._replace(grids=tuple(there)),
-            final.planted, final.values, final.starts, motions, iterations, 1e-6,
+            final.planted, final.values, final.starts, motions, steps, tolerance,
         )  # fmt: skip
         if last is not None:
             final = last
@@ -741,9 +744,9 @@ def _needed(judge: Judge, found: Attribution, final: Fit) -> Fit:
         if len(final.planted.effects) == 1:
             less = found.base
         else:
-            less = _alone(judge, _rest(judge, final, row), found.motions, (0.0,))
+            less = _alone(judge, _rest(judge, final, row), found.motions, (0.0,), _ON_THE_WAY)
         if not significant(less, final):
-            final = less
+            final = less if less is found.base else _alone(judge, less, found.motions, (0.0,))
     return _without_idle(judge, found, final)
 
 
@@ -765,7 +768,7 @@ def _without_idle(judge: Judge, found: Attribution, final: Fit) -> Fit:
 
 def _refined(judge: Judge, found: Attribution, final: Fit, pool: ThreadPoolExecutor) -> Fit:
     """The same families, each by its best law: an early choice was made amid what others did."""
-    if len(final.planted.effects) < 2 and at_floor(final, judge):
+    if at_floor(final, judge):
         return final
     for strut, name in tuple(e for e in final.planted.effects if e not in judge.along):
         row = final.planted.effects.index((strut, name))

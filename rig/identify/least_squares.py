@@ -9,6 +9,7 @@ References:
 """
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -22,6 +23,8 @@ Array = NDArray[np.float64]
 _DIFFERENCE = 1e-4
 _FIRST_DAMPING = 1e-3
 _LARGEST_DAMPING = 1e9
+_WORTH_THREADS = 10_000
+_THREADS = 2
 
 
 class Space(NamedTuple):
@@ -157,7 +160,8 @@ def _jacobian(
 ) -> Array:
     columns = np.zeros((len(r), len(x)))
     everything = Rows(0, len(r), residual_of)
-    for i in range(len(x)):
+
+    def fill(i: int) -> None:
         there = rows.get(i, everything)
         part = slice(there.first, there.last)
         size = _DIFFERENCE * (1.0 if space.logarithmic[i] else max(1.0, abs(x[i])))
@@ -170,7 +174,15 @@ def _jacobian(
             moved = there.residual_of(space.outer(trial))
             if moved is not None:
                 columns[part, i] = (moved - r[part]) / moved_by
-                break
+                return
+
+    if len(r) < _WORTH_THREADS:
+        for i in range(len(x)):
+            fill(i)
+    else:
+        # The simulations are machine code, which lets go of the interpreter.
+        with ThreadPoolExecutor(_THREADS) as pool:
+            list(pool.map(fill, range(len(x))))
     return columns
 
 
