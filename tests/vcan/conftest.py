@@ -108,21 +108,19 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
 
     def bridge(channel: str) -> Path:
         config = yaml.safe_load((CONFIGS / "seed.yaml").read_text())
-        # Soft enough for measurements that are 50 ms late: with one cycle's delay the slowest pole
-        # is at 0.993 and the least damping ratio 0.32.
-        gains = {"proportional_n_per_m": 1000.0, "integral_n_per_m_s": 1000.0}
+        # Soft enough for two processes whose ticks are up to two cycles apart: at that delay the
+        # slowest pole is at 0.986 and the least damping ratio 0.09.
+        gains = {"proportional_n_per_m": 2000.0, "integral_n_per_m_s": 5000.0}
         config |= {
             "rate_hz": RATE_HZ,
             "dbc": "slow.dbc",
             "bus": {"interface": "socketcan", "channel": channel},
             "observers": {"strut": gains | {"force_limit_n": 5000.0}},
-            # The emulation may stand still for a second when the machine has other work.
             "supervision": {
                 "stale_after_s": 0.5,
                 "safe_after_s": 5.0,
                 "limits": [
                     {"value": "measured_height_m", "low": 0.1, "high": 0.7, "action": "refuse"},
-                    {"value": "measured_rate_m_per_s", "low": -3, "high": 3, "action": "refuse"},
                 ],
             },
             "realtime": {"fifo_priority": 0, "lock_memory": False},

@@ -1,54 +1,87 @@
 """The bridge on the kernel's CAN stack, against programs that nobody here wrote."""
 
 import subprocess
+from math import isnan
 from pathlib import Path
 
 import cantools
 import numpy as np
 import pytest
 import yaml
+from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from can_dbc.frame import Frame
 from rig.bench.config import load_bench_config
-from rig.config import load_setup
+from rig.bench.simulated import Bench
+from rig.config import build_bridge, load_setup
 from rig.core.types import Mode
 from rig.io.bus import Bus, BusConfig
 from rig.io.run_log import RunFolder, parse_frame, read_run
 from rig.replay import replay
-from rig.runs import with_bench
-from tests.vcan.conftest import BENCH_IDS, RATE_HZ, in_process, run_for, running
+from tests.vcan.conftest import BENCH_IDS, RATE_HZ, Files, in_process, run_for, running
 
 pytestmark = pytest.mark.vcan
 
 S = 1_000_000_000
+MEASUREMENT = 0x100
 SETTLED_S = 5.0
 """The model starts at rest while the bench moves."""
 
 
-def is_calm(found: RunFolder) -> bool:
-    """Whether the emulated kernel kept the rate, without which errors of the force say nothing."""
-    return int(found.steps["overruns"].to_numpy().sum()) < 0.05 * found.steps.num_rows
+def assert_rate_was_kept(found: RunFolder) -> None:
+    """The emulated kernel's clock counts instructions, so that no load of this machine shows."""
+    overruns = int(found.steps["overruns"].to_numpy().sum())
+    assert overruns < 0.02 * found.steps.num_rows, f"{overruns} ticks missed"
 
 
-def skip_unless_calm(found: RunFolder) -> None:
-    if not is_calm(found):
-        overruns = int(found.steps["overruns"].to_numpy().sum())
-        pytest.skip(f"this machine is too busy to emulate 100 Hz: {overruns} ticks missed")
-
-
-def force_error_n(found: RunFolder, dbc: Path) -> float:
-    """RMS of the estimated force less the load cell's, sample by sample."""
-    cell = cantools.database.load_file(dbc).get_message_by_name("BENCH_AUXILIARY")
-    measured = [
-        (frame.t_ns, cell.decode(frame.data)["LOAD_CELL_FORCE"])
-        for frame, direction in found.frames()
-        if direction == "R" and frame.arbitration_id == cell.frame_id
-    ]
-    t_ns, force_n = (np.array(column) for column in zip(*measured, strict=True))
+def median_age_ns(found: RunFolder) -> int:
+    """Age of a measurement at the tick that uses it."""
     steps = found.steps
-    estimate_n = np.interp(t_ns, steps["t_ns"].to_numpy(), steps["strut.force_n"].to_numpy())
-    late = t_ns > t_ns[0] + SETTLED_S * S
-    return float(np.sqrt(np.mean((estimate_n - force_n)[late] ** 2)))
+    age_ns = steps["t_ns"].to_numpy() - steps["strut.measured_t_ns"].to_numpy()
+    return int(np.nanmedian(age_ns))
+
+
+def force_error_n(
+    cell: list[tuple[int, float]], t_ns: NDArray[np.int64], force_n: NDArray[np.float64]
+) -> float:
+    """RMS of an estimated force less the load cell's, sample by sample."""
+    cell_ns, cell_n = (np.array(column) for column in zip(*cell, strict=True))
+    difference_n = np.interp(cell_ns, t_ns, force_n) - cell_n
+    return float(np.sqrt(np.mean(difference_n[cell_ns > cell_ns[0] + SETTLED_S * S] ** 2)))
+
+
+def logged_error_n(found: RunFolder, dbc: Path) -> float:
+    """The force error of a run."""
+    message = cantools.database.load_file(dbc).get_message_by_name("BENCH_AUXILIARY")
+    cell = [
+        (frame.t_ns, message.decode(frame.data)["LOAD_CELL_FORCE"])
+        for frame, direction in found.frames()
+        if direction == "R" and frame.arbitration_id == message.frame_id
+    ]
+    steps = found.steps
+    return force_error_n(cell, steps["t_ns"].to_numpy(), steps["strut.force_n"].to_numpy())
+
+
+def lockstep_error_n(files: Files, age_ns: int, seconds: int) -> float:
+    """The force error without processes and clocks, with measurements of a given age."""
+    ready = load_setup(files.bridge("vcan0"))
+    bridge, bench = build_bridge(ready), Bench(load_bench_config(files.bench), ready.database)
+    message = cantools.database.load_file(files.dbc).get_message_by_name("BENCH_AUXILIARY")
+    state, cell, t_ns, force_n = bridge.init(0), [], [], []
+    for tick_ns in range(0, seconds * S, ready.config.period_ns):
+        frames = [
+            replace(frame, t_ns=frame.t_ns + age_ns) for frame in bench.update(tick_ns - age_ns)[0]
+        ]
+        cell += [
+            (frame.t_ns, message.decode(frame.data)["LOAD_CELL_FORCE"])
+            for frame in frames
+            if frame.arbitration_id == message.frame_id
+        ]
+        state, result = bridge.tick(state, tick_ns, frames)
+        t_ns.append(tick_ns)
+        force_n.append(result.output.struts[0].force_n if result.output.struts else np.nan)
+    return force_error_n(cell, np.array(t_ns), np.array(force_n))
 
 
 def dumped(path: Path) -> list[Frame]:
@@ -86,26 +119,15 @@ def recorded(bench, files, tmp_path_factory):
     return folder / "run", record
 
 
-def test_the_force_is_as_good_as_in_lockstep(recorded, files, tmp_path):
-    run, _ = recorded
-    skip_unless_calm(read_run(run))
-    ready = load_setup(files.bridge("vcan0"), duration_s=30.0)
-    on_virtual = ready.config.bus.model_copy(update={"interface": "virtual", "channel": "lockstep"})
-    lockstep = ready.model_copy(
-        update={"config": ready.config.model_copy(update={"bus": on_virtual})}
-    )
-    with_bench(
-        lockstep,
-        load_bench_config(files.bench),
-        tmp_path / "lockstep",
-        lockstep=True,
-        stop=lambda: False,
-        progress=lambda _t_ns, _mode: None,
-    )
-    expected_n = force_error_n(read_run(tmp_path / "lockstep"), files.dbc)
-    live_n = force_error_n(read_run(run), files.dbc)
-    print(f"force error: {live_n:.2f} N on vcan, {expected_n:.2f} N in lockstep")
-    assert live_n <= 1.2 * expected_n + 0.5
+def test_the_force_is_as_good_as_in_lockstep(recorded, files):
+    found = read_run(recorded[0])
+    assert_rate_was_kept(found)
+    age_ns = median_age_ns(found)
+    live_n = logged_error_n(found, files.dbc)
+    lockstep_n = lockstep_error_n(files, age_ns, 30)
+    print(f"force error: {live_n:.2f} N on vcan, {lockstep_n:.2f} N in lockstep, {age_ns} ns old")
+    # Over ages of 0 to 15 ms the error in lockstep itself varies by 7 %.
+    assert live_n == pytest.approx(lockstep_n, rel=0.07)
 
 
 def test_candumps_record_is_our_log(recorded, files):
@@ -137,74 +159,98 @@ def test_a_replay_is_the_same_bit_for_bit(recorded):
     ending = yaml.safe_load((run / "run.yaml").read_text())["ending"]
     print(f"overruns {ending['counts']['overruns']}, timing {ending['timing']}")
     assert again.logged == ending["ticks"]
-    skip_unless_calm(read_run(run))
     assert ending["counts"]["refused"] == ending["counts"]["lost"] == 0
     assert ending["ticks"] + ending["counts"]["overruns"] == 60 * RATE_HZ
 
 
-def test_canplayers_bench_gives_the_same_estimate(recorded, bridge, files, second_vcan, tmp_path):
+def force_by_measurement(found: RunFolder) -> dict[bytes, float]:
+    """What was estimated at the tick that used a measurement, by the measurement's frame."""
+    frames = {
+        frame.t_ns: frame.data
+        for frame, direction in found.frames()
+        if direction == "R" and frame.arbitration_id == MEASUREMENT
+    }
+    used_ns, force_n = (
+        found.steps[f"strut.{name}"].to_pylist() for name in ("measured_t_ns", "force_n")
+    )
+    used = [(t_ns, n) for t_ns, n in zip(used_ns, force_n, strict=True) if not isnan(t_ns)]
+    return {frames[int(t_ns)]: n for t_ns, n in used}
+
+
+def test_canplayers_bench_gives_the_same_steps(recorded, bridge, second_vcan, tmp_path):
     run, record = recorded
     part = tmp_path / "bench.log"
     lines = record.read_text().splitlines()
     bench = [line for line in lines if line.split(" ")[2].split("#")[0] in BENCH_IDS]
-    first = parse_frame(bench[0], 0)[0].t_ns
-    part.write_text(
-        "\n".join(line for line in bench if parse_frame(line, 0)[0].t_ns < first + 10 * S) + "\n"
-    )
+    part.write_text("\n".join(bench) + "\n")
     with running(["canplayer", "-I", part, f"{second_vcan}=vcan0"]):
-        ended = bridge(second_vcan, 8.0)
-    found = read_run(ended.folder)
-    measured = found.steps["strut.measured_height_m"].to_numpy()
-    force_n = found.steps["strut.force_n"].to_numpy()
-    logged = read_run(run).steps
-    original, original_n = (
-        logged[name].to_numpy() for name in ("strut.measured_height_m", "strut.force_n")
-    )
-    here, there = ~np.isnan(measured), ~np.isnan(original)
-    measured, force_n, original, original_n = (
-        measured[here],
-        force_n[here],
-        original[there],
-        original_n[there],
-    )
-    message = cantools.database.load_file(files.dbc).get_message_by_name("BENCH_MEASUREMENT")
-    played = [frame for frame in dumped(part) if frame.arbitration_id == message.frame_id]
-    known = {round(message.decode(frame.data)["HEIGHT"], 9) for frame in played}
-    assert {round(height, 9) for height in measured.tolist()} <= known
-    assert len(measured) > 0
-    assert ended.state.counts.refused == 0
+        ended = bridge(second_vcan, 15.0)
+    assert ended.state.counts.refused == ended.state.counts.lost == 0
+    first, second = read_run(run), read_run(ended.folder)
+    assert_rate_was_kept(second)
     assert replay(ended.folder).different == 0
-    skip_unless_calm(found)
-    skip_unless_calm(read_run(run))
-    settled = slice(int(SETTLED_S * RATE_HZ), None)
-    by_height = dict(zip(original.tolist(), original_n.tolist(), strict=True))
-    difference = [
-        n - by_height[z]
-        for z, n in zip(measured[settled].tolist(), force_n[settled].tolist(), strict=True)
-    ]
-    print(f"median difference to the first run: {np.median(np.abs(difference)):.2f} N")
-    assert np.median(np.abs(difference)) < 5.0
+    original, again = force_by_measurement(first), force_by_measurement(second)
+    both = [frame for frame in again if frame in original]
+    # Where two measurements come to one tick, the steps show the last one alone.
+    assert len(both) > 0.7 * len(again)
+    settled = both[int(SETTLED_S * RATE_HZ) :]
+    assert len(settled) > 5 * RATE_HZ
+    # The same measurement waits longer for its tick in one run than in the other.
+    later_s = abs(median_age_ns(second) - median_age_ns(first)) * 1e-9
+    steepest_n_per_s = np.abs(np.diff(list(original.values()))).max() * RATE_HZ
+    difference_n = np.median([abs(again[frame] - original[frame]) for frame in settled])
+    print(f"median difference: {difference_n:.2f} N at {later_s * 1e3:.1f} ms")
+    assert difference_n <= 1.0 + steepest_n_per_s * later_s
+
+
+class LinkCycles:
+    """Takes an interface down and up, each time when the bridge has seen the time before."""
+
+    def __init__(self, interface: str, count: int) -> None:
+        self._interface = interface
+        self._left = count
+        self._is_down = False
+        self._since_ns = 0
+        self._calm_after_last = False
+
+    def see(self, t_ns: int, mode: Mode) -> None:
+        """Told of every tick."""
+        if mode is not (Mode.HOLD if self._is_down else Mode.RUNNING):
+            self._since_ns = t_ns
+        elif t_ns - self._since_ns > S // 5:
+            self._since_ns = t_ns
+            if self._left or self._is_down:
+                self._change()
+            else:
+                self._calm_after_last = True
+
+    def _change(self) -> None:
+        self._is_down = not self._is_down
+        self._left -= self._is_down
+        state = "down" if self._is_down else "up"
+        subprocess.run(["ip", "link", "set", state, self._interface], check=True)
+
+    def are_over(self) -> bool:
+        """Whether the bridge has run on after the last one."""
+        return self._calm_after_last
 
 
 def test_ten_times_down_and_up_are_survived_and_each_gap_is_shown(bench, bridge):
-    cycle = f"ip link set {bench} down; sleep 0.4; ip link set {bench} up; sleep 2.6"
-    script = f"sleep 2; for i in 1 2 3 4 5 6 7 8 9 10; do {cycle}; done; sleep 3"
-    with running(["sh", "-c", script]) as cycles:
-        ended = bridge(bench, 300.0, stop=lambda: cycles.poll() is not None)
+    cycles = LinkCycles(bench, 10)
+    ended = bridge(bench, 300.0, progress=cycles.see, stop=cycles.are_over)
     ending = yaml.safe_load((ended.folder / "run.yaml").read_text())["ending"]
     gaps = ending["bus"]["gaps"]
     lengths = [gap["to_s"] - gap["from_s"] for gap in gaps]
     print(f"gaps of {min(lengths):.2f} to {max(lengths):.2f} s")
     assert len(gaps) == 10
-    assert all(0.1 < length < 30.0 for length in lengths)
     steps = read_run(ended.folder).steps
     assert replay(ended.folder).different == 0
     t_s, flags = steps["t_ns"].to_numpy() * 1e-9, steps["flags"].to_numpy()
     for gap in gaps:
         inside = (t_s > gap["from_s"]) & (t_s < gap["to_s"] - 0.02)
+        assert inside.sum() > 0.1 * RATE_HZ
         assert (flags[inside] & 2).all()
         assert (steps["received"].to_numpy()[inside] == 0).all()
-    skip_unless_calm(read_run(ended.folder))
     assert ended.state.rig.mode is Mode.RUNNING
 
 
@@ -224,7 +270,6 @@ def test_a_flood_of_foreign_and_of_broken_frames_changes_nothing(bench, bridge):
     assert heights.min() > 0.1
     assert heights.max() < 0.7
     assert replay(ended.folder).different == 0
-    skip_unless_calm(found)
     assert ended.state.rig.mode is Mode.RUNNING
     assert len(heights) > 6 * RATE_HZ
 
@@ -248,8 +293,6 @@ def test_frames_that_a_gateway_corrupts_are_all_refused(bench, second_vcan, brid
     late = found.steps["t_ns"].to_numpy() > 10 * S
     assert np.isnan(found.steps["strut.measured_height_m"].to_numpy()[late]).all()
     assert not (found.steps["strut.valid"].to_numpy()[late] == 1.0).any()
-    assert counts.wrong_crc + counts.masquerade > 0
-    skip_unless_calm(found)
     assert counts.wrong_crc + counts.masquerade > 1.5 * RATE_HZ
     assert ended.state.rig.mode is Mode.SAFE
 
