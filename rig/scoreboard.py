@@ -34,9 +34,9 @@ from dart_model.spec import (
 from dart_model.yaml_file import InputError
 from rig.config import CONFIGS
 from rig.diagnose import CORRECTED_FILE, diagnose_runs, read_record
-from rig.identify.attribute import first_motion
 from rig.identify.correct import dart_heights
 from rig.identify.diagnosis import Diagnosis
+from rig.identify.judge import first_motion
 from rig.identify.records import Record, RecordError
 from rig.identify.reduced import grid_of, planted, reduced_model, run, start_of
 from rig.imports import Mapping, import_table, load_mapping

@@ -8,16 +8,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import effect
 from dart_model.spec import ModelSpec
-from rig.identify.attribute import (
-    Attribution,
-    Candidate,
-    Progress,
-    Settled,
-    attribute,
-    coloured,
-    first_motion,
-    settle,
-)
+from rig.identify.attribute import Attribution, Candidate, Progress, attribute
 from rig.identify.correct import corrected_model, fitted_on_dart
 from rig.identify.diagnosis import (
     BeforeAfter,
@@ -40,11 +31,13 @@ from rig.identify.evaluate import (
     strut_forces,
 )
 from rig.identify.imposed import diagnose_imposed, is_imposed
+from rig.identify.judge import coloured, first_motion
 from rig.identify.output_error import Fit, intervals, numerical_shift
 from rig.identify.records import Record, RecordError
 from rig.identify.reduced import Grid, Model, grid_of, planted, reduced_model, start_of
 from rig.identify.report import FittedSeries, HeldOutSeries, Ranked, sentence
 from rig.identify.result import Result
+from rig.identify.settle import Settled, settle
 from rig.identify.smoother import estimate_noise
 
 Array = NDArray[np.float64]

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from rig.identify.attribute import first_motion
 from rig.identify.diagnose import diagnose
+from rig.identify.judge import first_motion
 from rig.identify.least_squares import Rows, Space, solve
 from rig.identify.reduced import grid_of, planted, reduced_model, run, start_of
 from rig.scoreboard import driven_start
