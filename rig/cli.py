@@ -509,7 +509,9 @@ def _print_case(case: "Case") -> None:
 
 
 def _print_diagnosis(diagnosis: "Diagnosis", *, struts: int) -> None:
+    from dart_model.effects import effect
     from rig.identify.report import sentence
+    from rig.identify.report.quantities import value_and_interval
 
     console.print(f"\n[bold]{diagnosis.verdict.replace('_', ' ')}[/]: ", end="")
     console.print(sentence(diagnosis, struts), markup=False)
@@ -517,12 +519,9 @@ def _print_diagnosis(diagnosis: "Diagnosis", *, struts: int) -> None:
         table = Table("effect", "parameter", "value", "95 % interval", title="What was found")
         for found in diagnosis.effects:
             for name, estimate in found.parameters.items():
-                table.add_row(
-                    f"{found.family}: {found.name}",
-                    name,
-                    f"{estimate.value:.5g}",
-                    f"{estimate.low:.5g} to {estimate.high:.5g}",
-                )
+                unit = next(p.unit for p in effect(found.name).parameters if p.name == name)
+                row = value_and_interval(estimate, unit)
+                table.add_row(f"{found.family}: {found.name}", name, *row)
         console.print(table)
     held_out, floor = diagnosis.held_out, diagnosis.noise_floor
     table = Table("on held-out data", "before", "after", "noise floor", title="RMS error")
