@@ -47,6 +47,7 @@ _WHITE = 0.1
 _IMPLAUSIBLE = 5.0
 _EXPLAINED = 0.25
 _MOST_LAWS = 2
+_CONFIRMED = 3.0
 _HELD = 0.3
 _LONGEST_DURATION_S = 600.0
 
@@ -184,7 +185,8 @@ def _written_up(
         float(np.sqrt(np.mean(found.judge.noise_m2))),
         rms(np.concatenate([s.residual_std_n for s in fitted])),
     )
-    verdict = _verdict(found, settled)
+    held_out = _held_out(results, source)
+    verdict = _confirmed(_verdict(found, settled), held_out.height_rmse_m, floor.height_rmse_m)
     families = tuple(dict.fromkeys(effect(c.name).family for c in settled.rivals))
     diagnosis = Diagnosis(
         verdict,
@@ -192,7 +194,7 @@ def _written_up(
         _rejected(model, found, settled),
         families if verdict == "ambiguous" else (),
         _suggestion(settled) if verdict == "ambiguous" else None,
-        _held_out(results, source),
+        held_out,
         floor,
         white,
         "",
@@ -295,6 +297,15 @@ def _verdict(found: Attribution, settled: Settled) -> Verdict:
     if left < _EXPLAINED and not _makeshift(found, final):
         return "ambiguous" if settled.rivals else "explained"
     return "partly_explained" if gain > 0.7 else "not_explained"
+
+
+def _confirmed(verdict: Verdict, error_m: BeforeAfter, floor_m: float) -> Verdict:
+    """The verdict that held-out data leave: a law that fails there explains nothing."""
+    if verdict == "nothing_missing" or error_m.after < _CONFIRMED * floor_m:
+        return verdict
+    if error_m.after > error_m.before:
+        return "not_explained"
+    return "partly_explained" if verdict in ("explained", "ambiguous") else verdict
 
 
 def _makeshift(found: Attribution, final: Fit) -> bool:
