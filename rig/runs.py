@@ -40,7 +40,8 @@ _SPINNING_SHARE = 5
 _CATCHING_UP = 4
 """How often a simulated bench catches up before the first tick, each time in less time."""
 _TIMING_TOLD_NS = 500_000_000
-"""How often percentiles are taken of the timing, for the bus."""
+"""How often percentiles are taken for the bus, in turn of lateness and of work: both in one tick
+would make it the slowest of a thousand."""
 
 
 @dataclass(frozen=True)
@@ -115,23 +116,26 @@ class _Told:
         self._told = NO_TIMING
         self._calm = _NO_CONDITIONS
         self._again_ns = _TIMING_TOLD_NS
+        self._turn_of_work = False
         self.send = port.send
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
         frames, conditions = self._port.receive(t_ns)
         if t_ns >= self._again_ns:
             self._again_ns = t_ns + _TIMING_TOLD_NS
-            self._told = _figures(self._timing)
+            self._told = self._refreshed()
             self._calm = Conditions(timing=self._told)
         if conditions is _NO_CONDITIONS and self._log.fault is None:
             return frames, self._calm
         log_fault = self._log.fault is not None
         return frames, conditions._replace(log_fault=log_fault, timing=self._told)
 
-
-def _figures(timing: Timing) -> TimingFigures:
-    gap_s = float(timing.extremes_ns[2]) * 1e-9
-    return TimingFigures(_levels_s(timing.lateness_us()), _levels_s(timing.work_us()), gap_s)
+    def _refreshed(self) -> TimingFigures:
+        told = self._told._replace(longest_gap_s=float(self._timing.extremes_ns[2]) * 1e-9)
+        self._turn_of_work = not self._turn_of_work
+        if self._turn_of_work:
+            return told._replace(work_s=_levels_s(self._timing.work_us()))
+        return told._replace(lateness_s=_levels_s(self._timing.lateness_us()))
 
 
 def _levels_s(levels_us: dict[str, float]) -> Levels:

@@ -34,10 +34,13 @@ from rig.io.steps import Step, step_schema, step_table
 from rig.io.whole_file import WholeFile
 
 FLUSH_NS = 190_000_000
-"""Time of the run that a batch of steps spans; with `POLL_S` at most 0.2 s are lost to a kill."""
+"""Time of the run that a batch of steps spans; with `WAKE_NS` at most 0.2 s are lost to a kill."""
 
-POLL_S = 0.01
-"""How often the writing thread looks for what was handed over."""
+WAKE_NS = 10_000_000
+"""Time of the run after which the writing thread is woken for what was handed over."""
+
+_LONGEST_PAUSE_S = 0.05
+"""After which the writing thread looks by itself, while no tick wakes it."""
 
 MOST_WAITING = 120_000
 """Ticks that may wait for the disk before they are dropped, and counted: two minutes at 1 kHz."""
@@ -163,6 +166,8 @@ class RunLog:
         self._batch: list[Step] = []
         self._priority = priority
         self._closing = threading.Event()
+        self._wake = threading.Event()
+        self._woken_ns = 0
         self._thread = threading.Thread(target=self._write_until_closed, name="run-log")
         self._paced = paced
         if paced:
@@ -179,6 +184,11 @@ class RunLog:
         self._waiting.append(Entry(received, sent, step))
         if not self._paced:
             self._write_waiting()
+        elif step.t_ns - self._woken_ns >= WAKE_NS:
+            # Woken by the end of a tick's work, and not by a timer, which would as often go off in
+            # the middle of it and take the interpreter from the loop.
+            self._woken_ns = step.t_ns
+            self._wake.set()
 
     def trigger(self, why: str) -> None:
         """Capture a window around the next tick, if windows are captured at all.
@@ -196,6 +206,7 @@ class RunLog:
             ending: Gives what is added to `run.yaml`, when all else is written.
         """
         self._closing.set()
+        self._wake.set()
         if self._paced:
             self._thread.join(_CLOSING_S)
         if self._thread.is_alive():
@@ -229,8 +240,9 @@ class RunLog:
 
     def _write_until_closed(self) -> None:
         follow(self._priority)
-        # The loop only appends: waking this thread at every tick would cost the loop more.
-        while not self._closing.wait(POLL_S):
+        while not self._closing.is_set():
+            self._wake.wait(_LONGEST_PAUSE_S)
+            self._wake.clear()
             self._write_waiting()
 
     def _write_waiting(self) -> None:
