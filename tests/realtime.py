@@ -3,6 +3,9 @@
 One frame in and one frame out a tick, by default at 1 kHz for five minutes, with a busy process on
 every core. Prints overruns, lateness, work and the error of the estimate. Exit code 1 if the
 estimate is off by more than 2 % of the peak force, or if a tick was missed under SCHED_FIFO.
+
+With `--bare` ticks come and nothing is done in them: what this machine takes from any program, be
+it a thread that holds a lock in the kernel or a host that runs other machines beside this one.
 """
 
 import argparse
@@ -20,6 +23,9 @@ from can_dbc.database import DEFAULT_DATABASE, load_database
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig
 from rig.config import CONFIGS, Published, Setup, load_setup, put_together
+from rig.io.clock import RealClock
+from rig.io.realtime import Request, realtime
+from rig.loop import Timing, regular_ticks
 from rig.runs import Ended, with_bench
 from rig.timing_picture import draw_run
 from tests.soak import force_error_n, load_cell
@@ -79,6 +85,21 @@ def at_rate(
     return ready, bench.model_copy(update={"transmissions": every})
 
 
+def bare(ready: Setup) -> None:
+    """Let ticks come with nothing to do, and print how well the rate was kept."""
+    asked = ready.config.realtime
+    request = Request(asked.fifo_priority, asked.lock_memory, asked.cpu, asked.freeze_garbage)
+    timing = Timing.empty()
+    with realtime(request) as granted:
+        clock = RealClock(round(asked.spin_s * 1e9) if granted.fifo else 0)
+        count = round((ready.config.duration_s or 0.0) * ready.config.rate_hz)
+        ticks = regular_ticks(clock, ready.config.period_ns, count, lambda: False, timing)
+        overruns = [tick.overruns for tick in ticks]
+    print(f"bare loop: {len(overruns)} ticks, {sum(overruns)} overruns, FIFO {granted.fifo}")
+    for name, figures in timing.summary().items():
+        print(f"{name}: {figures}")
+
+
 def show(ended: Ended, rate_hz: float, error: float) -> None:
     """Print the figures."""
     granted = ended.granted
@@ -99,8 +120,13 @@ def main() -> int:
     parser.add_argument("--rate-hz", type=float, default=1000.0)
     parser.add_argument("--no-fifo", action="store_true")
     parser.add_argument("--idle", action="store_true", help="no busy processes beside it")
+    parser.add_argument("--bare", action="store_true", help="ticks with nothing to do")
     asked = parser.parse_args()
     ready, bench = at_rate(asked.rate_hz, asked.seconds, fifo=not asked.no_fifo, folder=asked.out)
+    if asked.bare:
+        with contextlib.nullcontext() if asked.idle else busy_cores():
+            bare(ready)
+        return 0
     with contextlib.nullcontext() if asked.idle else busy_cores():
         ended = with_bench(
             ready,
