@@ -249,10 +249,6 @@ class _Joints(Protocol):
         """DART's acceleration under given forces."""
         ...
 
-    def values(self, state: PlantState) -> tuple[_Value, _Value]:
-        """Position and velocity of a state."""
-        ...
-
     def state(self, q: _Value, v: _Value, memory: tuple[float, ...], t_s: float) -> PlantState:
         """State of position and velocity."""
         ...
@@ -267,14 +263,12 @@ class _Joints(Protocol):
 
     def load(
         self,
-        q: _Value,
-        v: _Value,
+        state: PlantState,
         virtual_forces_n: Sequence[float],
-        memory: Sequence[float],
-        surroundings: _Surroundings,
-        memory_rates: list[float],
-    ) -> tuple[list[Motion], _Value, _Value]:
-        """Motions of struts, forces to be held, and acceleration."""
+        applied_force_n: float,
+        temperature_c: float,
+    ) -> Loaded:
+        """Let forces act on a state."""
         ...
 
 
@@ -295,9 +289,6 @@ class _Coordinate:
             self._acceleration_with_effects if with_effects else self._without_effects
         )
 
-    def values(self, state: PlantState) -> tuple[float, float]:
-        return state.positions[0], state.velocities[0]
-
     def state(self, q: float, v: float, memory: tuple[float, ...], t_s: float) -> PlantState:
         return PlantState((q,), (v,), memory, t_s)
 
@@ -313,32 +304,33 @@ class _Coordinate:
 
     def load(
         self,
-        q: float,
-        v: float,
+        state: PlantState,
         virtual_forces_n: Sequence[float],
-        memory: Sequence[float],
-        surroundings: _Surroundings,
-        memory_rates: list[float],
-    ) -> tuple[list[Motion], float, float]:
+        applied_force_n: float,
+        temperature_c: float,
+    ) -> Loaded:
+        q, v, memory = state.positions[0], state.velocities[0], state.memory
+        surroundings = (state.t_s, applied_force_n, temperature_c)
+        rates = [0.0] * len(memory)
         forces: list[float] = []
         held = of_effects = 0.0
         for index, strut, offset, row in self._struts:
             height, velocity = offset + row * q, row * v
             force = strut.plain_n(height, velocity)
             if strut.laws:
-                effects = strut.effects_n(height, velocity, memory, surroundings, memory_rates)
+                effects = strut.effects_n(height, velocity, memory, surroundings, rates)
                 of_effects += row * effects
                 force += effects
             forces.append(force)
             held += row * virtual_forces_n[index]
-        acceleration = self._without_effects(
-            q, v, held + of_effects, memory, surroundings, memory_rates
-        )
+        acceleration = self._without_effects(q, v, held + of_effects, memory, surroundings, rates)
         motions: list[Motion] = []
         for index, _, offset, row in self._struts:
             motion = Motion(offset + row * q, row * v, forces[index], row * acceleration)
             motions.append(motion)
-        return motions, held, acceleration
+        return Loaded(
+            state, motions, applied_force_n, temperature_c, held, q, v, acceleration, rates
+        )
 
     def _acceleration_with_effects(
         self,
@@ -441,9 +433,6 @@ class _Coordinates:
         self._solve: Callable[[], None] = skeleton.computeForwardDynamics
         self.adds_up = _coordinates_add_up(skeleton)
 
-    def values(self, state: PlantState) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return np.array(state.positions), np.array(state.velocities)
-
     def state(
         self,
         q: NDArray[np.float64],
@@ -467,17 +456,19 @@ class _Coordinates:
 
     def load(
         self,
-        q: NDArray[np.float64],
-        v: NDArray[np.float64],
+        state: PlantState,
         virtual_forces_n: Sequence[float],
-        memory: Sequence[float],
-        surroundings: _Surroundings,
-        memory_rates: list[float],
-    ) -> tuple[list[Motion], Sequence[float], NDArray[np.float64]]:
-        rows, position, velocity = self._rows(q), q.tolist(), v.tolist()
+        applied_force_n: float,
+        temperature_c: float,
+    ) -> Loaded:
+        position, velocity, memory = list(state.positions), list(state.velocities), state.memory
+        surroundings = (state.t_s, applied_force_n, temperature_c)
+        rates = [0.0] * len(memory)
+        q, v = np.array(position), np.array(velocity)
+        rows = self._rows(q)
         kinematics = _kinematics(rows, position, velocity)
-        forces = self._forces_n(kinematics, memory, surroundings, memory_rates)
-        push = _push(rows, forces, virtual_forces_n, surroundings[1])
+        forces = self._forces_n(kinematics, memory, surroundings, rates)
+        push = _push(rows, forces, virtual_forces_n, applied_force_n)
         acceleration = self._respond(position, velocity, push)
         turning = [0.0] * len(forces) if self._constant else (self._turning(q, v) @ v).tolist()
         motions = [
@@ -486,7 +477,18 @@ class _Coordinates:
                 kinematics, forces, rows.struts, turning, strict=True
             )
         ]
-        return motions, virtual_forces_n, np.array(acceleration)
+        answer = np.array(acceleration)
+        return Loaded(
+            state,
+            motions,
+            applied_force_n,
+            temperature_c,
+            virtual_forces_n,
+            q,
+            v,
+            answer,
+            rates,
+        )
 
     def acceleration(
         self,
@@ -626,15 +628,7 @@ class DartPlant:
             applied_force_n: Applied force.
             temperature_c: Damper temperature.
         """
-        joints, memory = self._joints, state.memory
-        rates = [0.0] * self.memory_size
-        q, v = joints.values(state)
-        motions, held, acceleration = joints.load(
-            q, v, virtual_forces_n, memory, (state.t_s, applied_force_n, temperature_c), rates
-        )
-        return Loaded(
-            state, motions, applied_force_n, temperature_c, held, q, v, acceleration, rates
-        )
+        return self._joints.load(state, virtual_forces_n, applied_force_n, temperature_c)
 
     def step(self, loaded: Loaded, dt_s: float, applied_force_end_n: float) -> PlantState:
         """Advance the model.
