@@ -8,6 +8,7 @@ import signal
 import threading
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import cast
@@ -23,7 +24,7 @@ from rig.core.bridge import Bridge, BridgeState, TickResult
 from rig.core.messages import NO_TIMING, Conditions, Levels, TimingFigures
 from rig.core.types import Mode
 from rig.io.bus import Bus, BusConfig
-from rig.io.clock import Clock, RealClock, VirtualClock
+from rig.io.clock import Clock, OccupiedClock, RealClock, VirtualClock
 from rig.io.link import Link, LinkFigures
 from rig.io.realtime import Granted, Request, realtime
 from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE
@@ -40,8 +41,7 @@ _SPINNING_SHARE = 5
 _CATCHING_UP = 4
 """How often a simulated bench catches up before the first tick, each time in less time."""
 _TIMING_TOLD_NS = 500_000_000
-"""How often percentiles are taken for the bus, in turn of lateness and of work: both in one tick
-would make it the slowest of a thousand."""
+"""How often percentiles are taken of the timing, for the bus."""
 
 
 @dataclass(frozen=True)
@@ -116,26 +116,26 @@ class _Told:
         self._told = NO_TIMING
         self._calm = _NO_CONDITIONS
         self._again_ns = _TIMING_TOLD_NS
-        self._turn_of_work = False
         self.send = port.send
+
+    def look(self, t_ns: int) -> None:
+        """Take the percentiles anew, if it is time; done in a tick it would delay that tick."""
+        if t_ns >= self._again_ns:
+            self._again_ns = t_ns + _TIMING_TOLD_NS
+            self._told = _figures(self._timing)
+            self._calm = Conditions(timing=self._told)
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
         frames, conditions = self._port.receive(t_ns)
-        if t_ns >= self._again_ns:
-            self._again_ns = t_ns + _TIMING_TOLD_NS
-            self._told = self._refreshed()
-            self._calm = Conditions(timing=self._told)
         if conditions is _NO_CONDITIONS and self._log.fault is None:
             return frames, self._calm
         log_fault = self._log.fault is not None
         return frames, conditions._replace(log_fault=log_fault, timing=self._told)
 
-    def _refreshed(self) -> TimingFigures:
-        told = self._told._replace(longest_gap_s=float(self._timing.extremes_ns[2]) * 1e-9)
-        self._turn_of_work = not self._turn_of_work
-        if self._turn_of_work:
-            return told._replace(work_s=_levels_s(self._timing.work_us()))
-        return told._replace(lateness_s=_levels_s(self._timing.lateness_us()))
+
+def _figures(timing: Timing) -> TimingFigures:
+    gap_s = float(timing.extremes_ns[2]) * 1e-9
+    return TimingFigures(_levels_s(timing.lateness_us()), _levels_s(timing.work_us()), gap_s)
 
 
 def _levels_s(levels_us: dict[str, float]) -> Levels:
@@ -144,58 +144,41 @@ def _levels_s(levels_us: dict[str, float]) -> Levels:
 
 
 class _BenchOnBus:
-    """A simulated bench at the other end of the bus. It works while the loop waits.
+    """A port with a simulated bench at the other end of its bus.
 
-    It is the clock that the loop waits on and the port that it reads: before the wait the bench
-    sends what is due at the tick that is awaited, so that its own work delays no tick.
+    While the loop waits the bench sends what is due up to the tick that is awaited, so that its own
+    work delays no tick.
     """
 
     def __init__(
-        self,
-        bench: Bench,
-        bench_bus: Bus,
-        clock: Clock,
-        port: BusPort,
-        authenticator: Authenticator | None,
+        self, bench: Bench, bench_bus: Bus, port: BusPort, authenticator: Authenticator | None
     ) -> None:
         self._bench = bench
         self._bench_bus = bench_bus
         self._secured = None if authenticator is None else authenticator.secured
-        self._clock = clock
         self._port = port
+        self._sent_ns = -1
+        self.send = port.send
 
-    @property
-    def epoch_ns(self) -> int:
-        return self._clock.epoch_ns
-
-    def epoch_now_ns(self) -> int:
-        return self._clock.epoch_now_ns()
-
-    def now_ns(self) -> int:
-        return self._clock.now_ns()
-
-    def begin(self) -> None:
+    def begin(self, clock: Clock) -> None:
         """Let what the bench sent while the run was set up be gone before the first tick."""
         for _ in range(_CATCHING_UP):
-            now_ns = self._clock.now_ns()
-            self._send_up_to(now_ns)
+            now_ns = clock.now_ns()
+            self.send_up_to(now_ns)
             self._port.receive(now_ns)
 
-    def wait_until(self, t_ns: int) -> int:
-        self._send_up_to(t_ns)
-        return self._clock.wait_until(t_ns)
-
-    def _send_up_to(self, t_ns: int) -> None:
+    def send_up_to(self, t_ns: int) -> None:
+        """Send what is due; at most once up to a time."""
+        if t_ns <= self._sent_ns:
+            return
+        self._sent_ns = t_ns
         for frame in self._bench.update(t_ns)[0]:
             self._bench_bus.send(frame if self._secured is None else self._secured(frame))
         self._bench_bus.receive()  # the bench has no use for what the bridge says
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
-        self._send_up_to(t_ns)  # ticks that were missed
+        self.send_up_to(t_ns)  # ticks that were missed
         return self._port.receive(t_ns)
-
-    def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
-        return self._port.send(frames)
 
 
 def _header(
@@ -295,9 +278,11 @@ def logged(
 
     try:
         begin()
-        due = regular_ticks(clock, config.period_ns, count, stop, timing)
+        told = _Told(port, log, timing)
+        waiting = OccupiedClock(clock, told.look)
+        due = regular_ticks(waiting, config.period_ns, count, stop, timing)
         with _on_signal(signal.SIGUSR2, lambda: log.trigger("user")):
-            state = run(bridge, state, due, _Told(port, log, timing), sink)
+            state = run(bridge, state, due, told, sink)
         status = "safe" if state.rig.mode is Mode.SAFE else "done"
     finally:
         log.close(
@@ -429,16 +414,16 @@ def with_bench(
         bench_bus = Bus(ready.config.bus.config(), epoch_ns=clock.epoch_ns)
         stack.callback(bench_bus.close)
         authenticator = _authenticator(ready, clock)
-        on_bus = _BenchOnBus(bench, bench_bus, clock, BusPort(link), authenticator)
+        on_bus = _BenchOnBus(bench, bench_bus, BusPort(link), authenticator)
         return logged(
             ready,
             bridge,
             on_bus,
-            on_bus,
+            OccupiedClock(clock, on_bus.send_up_to),
             folder,
             figures=link.figures,
             granted=granted,
-            begin=_nothing if lockstep else on_bus.begin,
+            begin=_nothing if lockstep else partial(on_bus.begin, clock),
             stop=stop,
             progress=progress,
         )

@@ -1,6 +1,7 @@
 """When ticks come: a real clock with absolute deadlines, or a virtual one that never waits."""
 
 import time
+from collections.abc import Callable
 from typing import Protocol
 
 
@@ -77,3 +78,34 @@ class VirtualClock:
         """Jump to `t_ns`, never back."""
         self._now_ns = max(self._now_ns, t_ns)
         return self._now_ns
+
+
+class OccupiedClock:
+    """A clock whose waits begin with something to do, which then delays nothing that is due.
+
+    Args:
+        clock: The clock.
+        occupation: Called before each wait, with the time that is awaited.
+    """
+
+    def __init__(self, clock: Clock, occupation: Callable[[int], None]) -> None:
+        self._clock = clock
+        self._occupation = occupation
+
+    @property
+    def epoch_ns(self) -> int:
+        """Unix time of the run's start."""
+        return self._clock.epoch_ns
+
+    def epoch_now_ns(self) -> int:
+        """The same by the system's clock as it is set now."""
+        return self._clock.epoch_now_ns()
+
+    def now_ns(self) -> int:
+        """Time of the run."""
+        return self._clock.now_ns()
+
+    def wait_until(self, t_ns: int) -> int:
+        """Do what there is to do, then wait."""
+        self._occupation(t_ns)
+        return self._clock.wait_until(t_ns)
