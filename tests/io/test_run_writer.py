@@ -151,6 +151,26 @@ def test_a_slow_disk_holds_nothing_up_and_is_told(tmp_path, monkeypatch):
     assert_holds(tmp_path / "run", 0, 2 * MANY_WAITING + 1000)
 
 
+def test_what_was_handed_over_is_written_while_the_run_goes_on(tmp_path, monkeypatch):
+    written = threading.Event()
+    append = WholeFile.append
+
+    def told(self, piece):
+        append(self, piece)
+        if b"R\n" in piece:
+            written.set()
+
+    monkeypatch.setattr(WholeFile, "append", told)
+    log = open_log(tmp_path / "run", paced=True)
+    for index in range(20):
+        log.add(*tick(index))
+    try:
+        assert written.wait(30.0)
+    finally:
+        log.close(ending)
+    assert_holds(tmp_path / "run", 0, 20)
+
+
 def test_a_folder_that_cannot_be_written_is_refused_before_anything_moves(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"file/run: cannot be written"):
