@@ -238,6 +238,23 @@ def parse_model(text: str, source: str, folder: Path = Path()) -> ModelSpec:
     return spec.model_copy(update={"folder": folder})
 
 
+def model_file(name: str, folder: Path) -> Path:
+    """The file of a model: one in a folder, or the shipped one of that name.
+
+    Args:
+        name: File, absolute or from the folder on, or the name of a shipped model.
+        folder: The folder.
+
+    Raises:
+        InputError: There is neither.
+    """
+    for path in (folder / name, MODELS / f"{name}.yaml"):
+        if path.is_file():
+            return path
+    choices = ", ".join(sorted(path.stem for path in MODELS.glob("*.yaml")))
+    raise InputError(f"model {name!r}: expected a file in {folder}, or one of {choices}")
+
+
 def load_model(path: Path) -> ModelSpec:
     """Model from a YAML file.
 

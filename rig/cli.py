@@ -150,7 +150,10 @@ def diagnose_command(
     runs: Annotated[
         list[Path], typer.Argument(metavar="RUN...", help="Folders of runs, or CSV files.")
     ],
-    model: Annotated[Path, typer.Option("--model", metavar="MODEL", help="Model file.")],
+    model: Annotated[
+        str,
+        typer.Option("--model", metavar="MODEL", help="Model file, or the name of a shipped one."),
+    ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
     held_out: Annotated[
         list[Path] | None,
@@ -158,10 +161,10 @@ def diagnose_command(
     ] = None,
 ) -> None:
     """Trace what the model lacks to named effects, correct it, and judge it on other data."""
-    from dart_model.spec import load_model
+    from dart_model.spec import load_model, model_file
     from rig.diagnose import diagnose_runs
 
-    spec = load_model(model)
+    spec = load_model(model_file(model, Path()))
     with _bar() as bar:
         diagnosis = diagnose_runs(runs, spec, held_out or [], out, bar)
     _print_diagnosis(diagnosis, struts=len(spec.struts))
@@ -178,10 +181,10 @@ def run(
         ),
     ] = None,
     model: Annotated[
-        Path | None,
+        str | None,
         typer.Option(
             "--model",
-            metavar="FILE",
+            metavar="MODEL",
             help="Another model than the configuration's, e.g. a corrected one.",
         ),
     ] = None,
@@ -437,7 +440,9 @@ def _stoppable() -> Generator[Callable[[], bool]]:
 def _bar() -> Generator[Callable[[str, float], None]]:
     """A bar for the diagnosis, which has no tick to miss."""
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+    shown = Console(stderr=True)
+    # Where it cannot be rewritten it would leave an empty line behind.
+    with Progress(*columns, console=shown, transient=True, disable=not shown.is_terminal) as bars:
         task = bars.add_task("diagnosis", total=1.0, visible=False)
 
         def show(what: str, share: float) -> None:

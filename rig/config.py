@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.database import DEFAULT_DATABASE, Database, Message, load_database
 from dart_model.plant import DartPlant
-from dart_model.spec import MODELS, ModelSpec, load_model
+from dart_model.spec import ModelSpec, load_model, model_file
 from dart_model.yaml_file import Finite, InputError, NotNegative, Positive, load_validated
 from rig.core.bridge import Bridge
 from rig.core.dyno import DynoCore
@@ -366,12 +366,12 @@ class Setup(BaseModel):
     database: Database
 
 
-def load_setup(path: Path, *, model: Path | None = None, duration_s: float | None = None) -> Setup:
+def load_setup(path: Path, *, model: str | None = None, duration_s: float | None = None) -> Setup:
     """A configuration and all files it names.
 
     Args:
         path: YAML file.
-        model: A model to use instead of the configuration's.
+        model: File or name of a model to use instead of the configuration's.
         duration_s: A length to use instead of the configuration's.
 
     Raises:
@@ -381,7 +381,7 @@ def load_setup(path: Path, *, model: Path | None = None, duration_s: float | Non
     config = load_validated(RunConfig, path)
     if duration_s is not None:
         config = config.model_copy(update={"duration_s": duration_s})
-    return setup(config, path, model)
+    return setup(config, path, None if model is None else model_file(model, Path()))
 
 
 def setup(config: RunConfig, source: Path, model_path: Path | None = None) -> Setup:
@@ -468,14 +468,10 @@ def build_bridge(ready: Setup, model: ModelSpec | None = None) -> Bridge:
 
 
 def _model_path(name: str, source: Path) -> Path:
-    beside = source.parent / name
-    if beside.is_file():
-        return beside
-    shipped = MODELS / f"{name}.yaml"
-    if shipped.is_file():
-        return shipped
-    choices = ", ".join(sorted(path.stem for path in MODELS.glob("*.yaml")))
-    raise InputError(f"{source}: model {name!r}: expected a file beside it, or one of {choices}")
+    try:
+        return model_file(name, source.parent)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None
 
 
 def _with_strut_names(config: RunConfig, model: ModelSpec, source: Path) -> RunConfig:

@@ -17,7 +17,7 @@ from rig.identify.diagnose import diagnose
 from rig.identify.diagnosis import Diagnosis, write_results
 from rig.identify.records import Record, checked, read_csv
 from rig.identify.report import ReportInput, write_report
-from rig.io.run_log import RunFolder
+from rig.io.run_log import RUN_FILE, RunFolder
 from rig.replay import setup_of_run
 
 _Array = NDArray[np.float64]
@@ -160,9 +160,11 @@ def diagnose_runs(
         progress: Told what is being done, and the share that is done.
 
     Raises:
-        InputError: A run cannot be read, or `out` cannot be written.
+        InputError: A run cannot be read, or `out` cannot be written or holds a run.
         RecordError: A run holds nothing that can be diagnosed.
     """
+    if (out / RUN_FILE).exists():
+        raise InputError(f"{out}: holds a run, expected another folder for what was found")
     result = diagnose(
         model,
         [read_record(path) for path in runs],

@@ -89,7 +89,7 @@ class Timing:
 
 
 def _percentiles(histogram: NDArray[np.int64], largest_ns: int) -> dict[str, float]:
-    # A live run asks for this in the middle of a tick.
+    # A live run asks for this between two ticks.
     cumulated = np.cumsum(histogram[: largest_ns // 1000 + 1])
     total = int(cumulated[-1])
     if total == 0:

@@ -264,7 +264,7 @@ def logged(
         window=config.log.window(),
         graver=_graver,
     )
-    count = None if config.duration_s is None else round(config.duration_s * config.rate_hz)
+    count = None if config.duration_s is None else _ticks(config.duration_s, config.rate_hz)
     timing, ticks, status = Timing.empty(), 0, "failed"
     state = bridge.init(0)
 
@@ -301,6 +301,29 @@ def logged(
     return Ended(folder, state, timing, granted, log.trouble, ticks, config.period_ns)
 
 
+@contextlib.contextmanager
+def on_time(config: RunConfig) -> Generator[tuple[Granted, RealClock]]:
+    """Ask the machine for what a fixed rate needs.
+
+    Args:
+        config: What is asked for.
+
+    Yields:
+        What was granted, and the clock to wait on; it spins only where SCHED_FIFO was granted.
+    """
+    asked = config.realtime
+    request = Request(asked.fifo_priority, asked.lock_memory, asked.cpu, asked.freeze_garbage)
+    with realtime(request) as granted:
+        # From a real-time thread that never leaves its core Linux takes it for 50 ms in every
+        # second.
+        spin_ns = min(round(asked.spin_s * 1e9), config.period_ns // _SPINNING_SHARE)
+        yield granted, RealClock(spin_ns if granted.fifo else 0)
+
+
+def _ticks(duration_s: float, rate_hz: float) -> int:
+    return max(1, round(duration_s * rate_hz))
+
+
 def live(
     ready: Setup,
     folder: Path,
@@ -316,8 +339,7 @@ def live(
         BusError: The bus cannot be opened.
     """
     bridge = build_bridge(ready)
-    with realtime(_request(ready.config)) as granted:
-        clock = _real_clock(ready.config, granted)
+    with on_time(ready.config) as (granted, clock):
         link = _link(ready, bridge, clock, listen_only=listen_only)
         port = BusPort(link)
         try:
@@ -407,8 +429,9 @@ def with_bench(
         # What is loaded at a bench's first use would hold the first ticks up.
         Bench(bench_config, ready.database).update(_BENCH_PORTION_NS)
     with contextlib.ExitStack() as stack:
-        granted = None if lockstep else stack.enter_context(realtime(_request(ready.config)))
-        clock = VirtualClock() if granted is None else _real_clock(ready.config, granted)
+        granted, clock = None, VirtualClock()
+        if not lockstep:
+            granted, clock = stack.enter_context(on_time(ready.config))
         link = _link(ready, bridge, clock)
         stack.callback(link.close)
         bench_bus = Bus(ready.config.bus.config(), epoch_ns=clock.epoch_ns)
@@ -478,14 +501,3 @@ def run_bench(
     finally:
         link.close()
     return sent
-
-
-def _request(config: RunConfig) -> Request:
-    asked = config.realtime
-    return Request(asked.fifo_priority, asked.lock_memory, asked.cpu, asked.freeze_garbage)
-
-
-def _real_clock(config: RunConfig, granted: Granted) -> RealClock:
-    # From a real-time thread that never leaves its core Linux takes it for 50 ms in every second.
-    spin_ns = min(round(config.realtime.spin_s * 1e9), config.period_ns // _SPINNING_SHARE)
-    return RealClock(spin_ns if granted.fifo else 0)

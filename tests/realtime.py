@@ -23,10 +23,8 @@ from can_dbc.database import DEFAULT_DATABASE, load_database
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig
 from rig.config import CONFIGS, Published, Setup, load_setup, put_together
-from rig.io.clock import RealClock
-from rig.io.realtime import Request, realtime
 from rig.loop import Timing, regular_ticks
-from rig.runs import Ended, with_bench
+from rig.runs import Ended, on_time, with_bench
 from rig.timing_picture import draw_run
 from tests.soak import force_error_n, load_cell
 
@@ -87,13 +85,10 @@ def at_rate(
 
 def bare(ready: Setup) -> None:
     """Let ticks come with nothing to do, and print how well the rate was kept."""
-    asked = ready.config.realtime
-    request = Request(asked.fifo_priority, asked.lock_memory, asked.cpu, asked.freeze_garbage)
-    timing = Timing.empty()
-    with realtime(request) as granted:
-        clock = RealClock(round(asked.spin_s * 1e9) if granted.fifo else 0)
-        count = round((ready.config.duration_s or 0.0) * ready.config.rate_hz)
-        ticks = regular_ticks(clock, ready.config.period_ns, count, lambda: False, timing)
+    config, timing = ready.config, Timing.empty()
+    count = round((config.duration_s or 0.0) * config.rate_hz)
+    with on_time(config) as (granted, clock):
+        ticks = regular_ticks(clock, config.period_ns, count, lambda: False, timing)
         overruns = [tick.overruns for tick in ticks]
     print(f"bare loop: {len(overruns)} ticks, {sum(overruns)} overruns, FIFO {granted.fifo}")
     for name, figures in timing.summary().items():
@@ -123,11 +118,12 @@ def main() -> int:
     parser.add_argument("--bare", action="store_true", help="ticks with nothing to do")
     asked = parser.parse_args()
     ready, bench = at_rate(asked.rate_hz, asked.seconds, fifo=not asked.no_fifo, folder=asked.out)
+    load = contextlib.nullcontext() if asked.idle else busy_cores()
     if asked.bare:
-        with contextlib.nullcontext() if asked.idle else busy_cores():
+        with load:
             bare(ready)
         return 0
-    with contextlib.nullcontext() if asked.idle else busy_cores():
+    with load:
         ended = with_bench(
             ready,
             bench,

@@ -1,13 +1,14 @@
 """From what the model misses to named effects: laws compete, one after another, then together.
 
 Each round tries every law of the catalogue along the measured motion, and simulates the best of
-them open loop together with what was found before. Blocks of the run that take no part in a fit
-decide between them. An effect that later ones made needless is dropped again.
+them open loop together with what was found before. A law has to gain nearly everywhere in the run,
+and more than coloured residuals do by chance; rivals are ranked with a penalty for parameters. An
+effect that later ones made needless is dropped again. Data that took no part in any of this have
+the last word, see `rig.identify.verdict`.
 
 References:
-    Hastie, Tibshirani, Friedman, The Elements of Statistical Learning (2009), 7.10:
-        cross-validation.
     Diebold and Mariano, J. Bus. Econ. Stat. 13 (1995): rivals compared on coloured errors.
+    Schwarz, Ann. Stat. 6 (1978): the penalty for parameters.
 """
 
 # numba and scipy ship no types for what is used here.
@@ -74,7 +75,7 @@ class Candidate(NamedTuple):
         name: Effect.
         tried: Share of the square of what is missing that it leaves in a trial.
         fit: Joint open-loop fit with the effects chosen before, or None if it was not simulated.
-        score: Deviance with a penalty for parameters; lower is better; infinite _without a fit.
+        score: Deviance with a penalty for parameters; lower is better; infinite without a fit.
         why: Why it was not chosen; empty for the winner.
     """
 
@@ -90,7 +91,7 @@ class Round(NamedTuple):
     """One round of the competition.
 
     Attributes:
-        before: Fit _without the new effect.
+        before: Fit without the new effect.
         candidates: Best first.
     """
 
@@ -310,7 +311,7 @@ def _pruned(judge: Judge, current: Fit, motions: Sequence[screen.Motion]) -> Fit
 
 
 def _without(judge: Judge, current: Fit, row: int, motions: Sequence[screen.Motion]) -> Fit | None:
-    """The fit _without one effect, the others fitted again."""
+    """The fit without one effect, the others fitted again."""
     effects = tuple(e for i, e in enumerate(current.planted.effects) if i != row)
     index = current.planted.slots.index
     values = np.concatenate(

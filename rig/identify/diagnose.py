@@ -39,6 +39,7 @@ from rig.identify.report import FittedSeries, HeldOutSeries, Ranked, sentence
 from rig.identify.result import Result
 from rig.identify.settle import Settled, settle
 from rig.identify.smoother import estimate_noise
+from rig.identify.verdict import confirmed
 
 Array = NDArray[np.float64]
 
@@ -47,7 +48,6 @@ _WHITE = 0.1
 _IMPLAUSIBLE = 5.0
 _EXPLAINED = 0.25
 _MOST_LAWS = 2
-_CONFIRMED = 3.0
 _HELD = 0.3
 _LONGEST_DURATION_S = 600.0
 
@@ -186,7 +186,8 @@ def _written_up(
         rms(np.concatenate([s.residual_std_n for s in fitted])),
     )
     held_out = _held_out(results, source)
-    verdict = _confirmed(_verdict(found, settled), held_out.height_rmse_m, floor.height_rmse_m)
+    floor_m = max(floor.height_rmse_m, _height_noise_m([grid for grid, _ in judged]))
+    verdict = confirmed(_verdict(found, settled), held_out.height_rmse_m, floor_m)
     families = tuple(dict.fromkeys(effect(c.name).family for c in settled.rivals))
     diagnosis = Diagnosis(
         verdict,
@@ -299,13 +300,12 @@ def _verdict(found: Attribution, settled: Settled) -> Verdict:
     return "partly_explained" if gain > 0.7 else "not_explained"
 
 
-def _confirmed(verdict: Verdict, error_m: BeforeAfter, floor_m: float) -> Verdict:
-    """The verdict that held-out data leave: a law that fails there explains nothing."""
-    if verdict == "nothing_missing" or error_m.after < _CONFIRMED * floor_m:
-        return verdict
-    if error_m.after > error_m.before:
-        return "not_explained"
-    return "partly_explained" if verdict in ("explained", "ambiguous") else verdict
+def _height_noise_m(grids: Sequence[Grid]) -> float:
+    """Noise of the heights of runs, which a sensor other than the first's may have measured."""
+    variances = [
+        estimate_noise(grid.t_s, column).variance for grid in grids for column in grid.heights_m.T
+    ]
+    return float(np.sqrt(np.mean(variances)))
 
 
 def _makeshift(found: Attribution, final: Fit) -> bool:

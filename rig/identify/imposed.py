@@ -57,6 +57,7 @@ from rig.identify.imposed_search import (
 from rig.identify.records import Record, RecordError
 from rig.identify.report import FittedSeries, HeldOutForce, Ranked, sentence
 from rig.identify.result import Result
+from rig.identify.verdict import confirmed
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -297,7 +298,10 @@ def _written_up(
     there = [_judge(run, spec, corrected, final) for run in judged]
     strut = spec.struts[0].name
     effects = _effects(found, strut)
-    verdict = _verdict(found)
+    held_out, floor = _held_out(there, source), _floor(found)
+    verdict = confirmed(
+        _verdict(found), held_out.residual_force_rmse_n, floor.residual_force_rmse_n
+    )
     families = tuple(dict.fromkeys(effect(c.name).family for c in found.rivals))
     ambiguous = verdict == "ambiguous"
     diagnosis = Diagnosis(
@@ -306,8 +310,8 @@ def _written_up(
         _rejected(found, strut),
         families if ambiguous else (),
         _suggestion(found) if ambiguous else None,
-        _held_out(there, source),
-        _floor(found),
+        held_out,
+        floor,
         White(coloured(found.base, found.runs) < _WHITE, coloured(final, found.runs) < _WHITE),
         "",
         tuple(run.name for run in runs),

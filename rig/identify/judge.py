@@ -167,7 +167,7 @@ def significant(before: Fit, after: Fit, along: tuple[tuple[int, str], ...] = ()
     """Whether an effect's gain is more than chance, given the colour of what remains.
 
     Args:
-        before: Fit _without the effect.
+        before: Fit without the effect.
         after: Fit with it.
         along: Effects that every fit holds, and that do not count as found.
     """

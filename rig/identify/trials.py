@@ -51,7 +51,7 @@ def along_motion(judge: Judge, base: Fit, chosen: Fit, motion: Fit) -> screen.St
 
     Args:
         judge: Data and settings.
-        base: The model _without effects: from its motion on something is missing.
+        base: The model without effects: from its motion on something is missing.
         chosen: Effects, whose force along the measured motion is known.
         motion: The fit that follows the measured motion best.
     """
@@ -173,7 +173,7 @@ def trials_in_place(
     """Laws tried in the place of one effect.
 
     Returns:
-        The fit _without the effect; what the effect leaves along the motion; the laws' trials,
+        The fit without the effect; what the effect leaves along the motion; the laws' trials,
         best first.
     """
     strut, name = current.planted.effects[row]

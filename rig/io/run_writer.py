@@ -1,8 +1,8 @@
 """Writes the folder of a run while it runs, so that it can be read after a kill.
 
 A thread of its own writes, so that a slow disk does not delay a tick. Frames are written
-unbuffered, at most 10 ms after they came; steps are flushed in batches. While the disk takes
-nothing, ticks wait in memory, and what does not fit there is counted.
+unbuffered, at most 10 ms after they came (20 ms while no tick comes); steps are flushed in batches.
+While the disk takes nothing, ticks wait in memory, and what does not fit there is counted.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ FLUSH_NS = 190_000_000
 WAKE_NS = 10_000_000
 """Time of the run after which the writing thread is woken for what was handed over."""
 
-_LONGEST_PAUSE_S = 0.05
+_LONGEST_PAUSE_S = 0.02
 """After which the writing thread looks by itself, while no tick wakes it."""
 
 MOST_WAITING = 120_000

@@ -189,6 +189,29 @@ def test_a_run_without_a_file_is_one_line_and_exit_code_2(
     assert name in one_line(capsys)
 
 
+@pytest.mark.parametrize(
+    ("model", "out", "expected"),
+    [
+        ("seed", "run", "holds a run, expected another folder"),
+        ("sead", "found", "model 'sead': expected a file in ., or one of bench, quarter_car, seed"),
+        ("none.yaml", "found", "model 'none.yaml': expected a file"),
+    ],
+)
+def test_a_diagnosis_that_cannot_begin_is_one_line_and_exit_code_2(
+    model: str,
+    out: str,
+    expected: str,
+    seed_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = seed_folder / out if out == "run" else tmp_path / out
+    arguments = (seed_folder / "run", "--model", model, "--out", folder)
+    assert rig(monkeypatch, "diagnose", *arguments) == 2
+    assert expected in one_line(capsys)
+
+
 def test_every_command_has_help_with_an_example(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -105,20 +105,35 @@ def test_a_file_gives_the_same_motion_as_the_inline_bodies(name, tmp_path):
     assert after[0][0] == pytest.approx(after[1][0], abs=1e-12)
 
 
-def test_damping_of_the_joint_itself_brakes_the_body(tmp_path):
+DAMPED = URDF.replace('<limit lower="-10"', '<dynamics damping="40"/><limit lower="-10"')
+SPRUNG = SKEL.replace(
+    "<axis><xyz>0 0 1</xyz></axis>",
+    "<axis><xyz>0 0 1</xyz><dynamics><spring_stiffness>300</spring_stiffness></dynamics></axis>",
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "own_force_n"),
+    [("bench.urdf", DAMPED, -40.0 * 0.7), ("bench.skel", SPRUNG, -300.0 * 0.42)],
+)
+def test_a_spring_or_damper_of_the_joint_itself_acts(name, text, own_force_n, tmp_path):
     """DART's own forces depend on the state, which it must then be told at every stage."""
-    damped = URDF.replace('<limit lower="-10"', '<dynamics damping="40"/><limit lower="-10"')
-    (tmp_path / "bench.urdf").write_text(damped, "utf-8")
-    speed_m_per_s = 0.7
+    (tmp_path / name).write_text(text, "utf-8")
     found: list[float] = []
-    for text in ("{file: bench.urdf}", INLINE):
-        plant = DartPlant(model(tmp_path, text))
-        moving = plant.initial([0.42], [speed_m_per_s])
+    for skeleton in (f"{{file: {name}}}", INLINE):
+        plant = DartPlant(model(tmp_path, skeleton))
+        moving = plant.initial([0.42], [0.7])
         plant.load(plant.initial([0.1]), (0.0,), 0.0, 20.0)
         found.append(plant.load(moving, (0.0,), 0.0, 20.0).motions[0].acceleration_m_per_s2)
-    # DART takes its own damping at the end of its step of 1 ms.
-    expected = (found[1] * 10.0 - 40.0 * speed_m_per_s) / (10.0 + 40.0 * 1e-3)
-    assert found[0] == pytest.approx(expected, rel=1e-12)
+    assert found[0] == pytest.approx(found[1] + own_force_n / 10.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(("name", "text"), [("bench.urdf", DAMPED), ("bench.skel", SPRUNG)])
+def test_a_spring_or_damper_of_the_joint_itself_is_not_left_out_of_matrices(name, text, tmp_path):
+    (tmp_path / name).write_text(text, "utf-8")
+    plant = DartPlant(model(tmp_path, f"{{file: {name}}}"))
+    with pytest.raises(InputError, match=r"joint guide has a spring or a damper of its own"):
+        plant.guided()
 
 
 @pytest.mark.parametrize("name", FILES)

@@ -1,9 +1,11 @@
 """A verdict does not outlive the held-out data that it fails on."""
 
+import math
+
 import pytest
 
-from rig.identify.diagnose import _confirmed
 from rig.identify.diagnosis import BeforeAfter
+from rig.identify.verdict import confirmed
 
 
 @pytest.mark.parametrize(
@@ -13,6 +15,10 @@ from rig.identify.diagnosis import BeforeAfter
         ("explained", 900.0, 60.0, "partly_explained"),
         ("ambiguous", 900.0, 60.0, "partly_explained"),
         ("explained", 900.0, 1200.0, "not_explained"),
+        ("partly_explained", 900.0, 1200.0, "not_explained"),
+        ("partly_explained", 900.0, 901.0, "partly_explained"),
+        ("explained", 900.0, math.nan, "not_explained"),
+        ("explained", 900.0, math.inf, "not_explained"),
         ("partly_explained", 900.0, 60.0, "partly_explained"),
         ("not_explained", 900.0, 60.0, "not_explained"),
         ("nothing_missing", 60.0, 60.0, "nothing_missing"),
@@ -20,4 +26,4 @@ from rig.identify.diagnosis import BeforeAfter
 )
 def test_held_out_data_decide(verdict, before_um, after_um, left):
     error_m = BeforeAfter(before_um * 1e-6, after_um * 1e-6)
-    assert _confirmed(verdict, error_m, floor_m=1e-5) == left
+    assert confirmed(verdict, error_m, 1e-5) == left

@@ -152,6 +152,7 @@ def test_a_slow_disk_holds_nothing_up_and_is_told(tmp_path, monkeypatch):
 
 
 def test_what_was_handed_over_is_written_while_the_run_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr("rig.io.run_writer._LONGEST_PAUSE_S", None)  # nothing but a tick wakes it
     written = threading.Event()
     append = WholeFile.append
 

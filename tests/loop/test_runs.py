@@ -6,10 +6,12 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import cantools
 import numpy as np
 import pytest
 import yaml
 
+from can_dbc.database import DEFAULT_DATABASE
 from dart_model.yaml_file import InputError
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig
@@ -99,6 +101,21 @@ def test_both_struts_of_the_quarter_car_are_estimated(quarter_run):
     assert set(found) == {"tyre", "suspension"}
     for strut in found.values():
         assert strut["force_rms"] <= 0.02
+
+
+def test_how_well_the_rate_is_kept_is_told_on_the_bus(seed_run):
+    message = cantools.database.load_file(DEFAULT_DATABASE).get_message_by_name("RIG_TIMING")
+    pages: dict[int, dict[str, float]] = {}
+    for frame, direction in read_run(seed_run).frames():
+        if direction == "T" and frame.arbitration_id == message.frame_id:
+            page = message.decode(frame.data, decode_choices=False)
+            pages[page["PAGE"]] = page
+    # Simulated time: every tick is in time and takes none, and they are a millisecond apart.
+    assert pages[0]["LATENESS_P50"] == pages[0]["LATENESS_P99_9"] == pytest.approx(1e-6)
+    assert pages[1]["WORK_P50"] == pytest.approx(1e-6)
+    assert pages[1]["WORK_MAX"] == 0.0
+    assert pages[2]["LONGEST_GAP"] == pytest.approx(1e-3)
+    assert pages[2]["OVERRUNS"] == 0
 
 
 def test_two_runs_are_identical_byte_by_byte(seed_run, tmp_path):
