@@ -30,11 +30,14 @@ from rig.io.run_log import (
     format_frame,
     part_name,
 )
-from rig.io.steps import Step, step_schema, step_table
+from rig.io.steps import Step, serialized, step_schema
 from rig.io.whole_file import WholeFile
 
 FLUSH_NS = 190_000_000
 """Time of the run that a batch of steps spans; with `WAKE_NS` at most 0.2 s are lost to a kill."""
+
+_MOST_STEPS = 200
+"""Steps in a batch: while a larger one is put together a fast loop waits for the interpreter."""
 
 WAKE_NS = 10_000_000
 """Time of the run after which the writing thread is woken for what was handed over."""
@@ -253,7 +256,8 @@ class RunLog:
                 self._take(min(_CHUNK, len(self._waiting)))
                 self._write_lines()
                 last_ns = self._batch[-1].t_ns
-                if last_ns - self._batch[0].t_ns >= FLUSH_NS:
+                spans_ns = last_ns - self._batch[0].t_ns
+                if spans_ns >= FLUSH_NS or len(self._batch) >= _MOST_STEPS:
                     self._flush()
                     self._rotate(last_ns)
         except OSError as error:
@@ -280,7 +284,9 @@ class RunLog:
         self._lines = b""
 
     def _flush(self) -> None:
-        self._part.steps.append(_serialized(self._batch, self._schema))
+        if not self._batch:
+            return
+        self._part.steps.append(serialized(self._batch, self._schema))
         self._batch = []
 
     def _rotate(self, now_ns: int) -> None:
@@ -303,7 +309,10 @@ class RunLog:
             folder.mkdir(parents=True)
             part = _Part(folder, 0, self._schema, 0)
             part.frames.append("".join(lines).encode("ascii"))
-            part.steps.append(_serialized([entry.step for entry in capture.entries], self._schema))
+            steps = [entry.step for entry in capture.entries]
+            for first in range(0, len(steps), _MOST_STEPS):
+                batch = steps[first : first + _MOST_STEPS]
+                part.steps.append(serialized(batch, self._schema))
             part.close()
             for name in (MODEL_FILE, DBC_FILE):
                 if (self.folder / name).exists():
@@ -311,11 +320,6 @@ class RunLog:
             _write_yaml(folder / RUN_FILE, header)
         except OSError as error:
             self._failed(f"capture {folder.name}: {error.strerror}")
-
-
-def _serialized(steps: Sequence[Step], schema: Any) -> bytes:
-    batches = step_table(steps, schema).combine_chunks().to_batches()
-    return b"".join(batch.serialize().to_pybytes() for batch in batches)
 
 
 def _write_yaml(path: Path, content: dict[str, object]) -> None:

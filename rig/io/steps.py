@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
+import numpy as np
 import pyarrow as pa
 
 ACKNOWLEDGED, BUS_FAULT, LOG_FAULT = 1, 2, 4
@@ -64,13 +65,16 @@ def step_schema(struts: Sequence[str]) -> Any:
     return _pa.schema(fields)
 
 
-def step_table(steps: Sequence[Step], schema: Any) -> Any:
-    """Steps as an Arrow table."""
-    if not steps:
-        return schema.empty_table()
+def serialized(steps: Sequence[Step], schema: Any) -> bytes:
+    """Steps as a record batch of an Arrow stream.
+
+    Args:
+        steps: At least one.
+        schema: Their `step_schema`.
+    """
     *columns, struts = zip(*steps, strict=True)
+    every = [*columns, *np.array(struts, dtype=np.float64).T]
     arrays = [
-        _pa.array(column, type=field.type)
-        for column, field in zip([*columns, *zip(*struts, strict=True)], schema, strict=True)
+        _pa.array(column, type=field.type) for column, field in zip(every, schema, strict=True)
     ]
-    return _pa.Table.from_arrays(arrays, schema=schema)
+    return bytes(_pa.RecordBatch.from_arrays(arrays, schema=schema).serialize())
