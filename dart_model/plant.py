@@ -368,33 +368,31 @@ class _Coordinate:
         get_acceleration: Callable[[], float] = dof.getAcceleration
         solve: Callable[[], None] = skeleton.computeForwardDynamics
 
-        def acceleration(
+        def by_force(
             q: float,
             v: float,
             held: float,
             _memory: Sequence[float],
             surroundings: _Surroundings,
             _memory_rates: list[float],
+        ) -> float:
+            put_force(preload + held - stiffness * q - damping * v + applied_row * surroundings[1])
+            solve()
+            return get_acceleration()
+
+        def by_state_and_force(
+            q: float,
+            v: float,
+            held: float,
+            memory: Sequence[float],
+            surroundings: _Surroundings,
+            memory_rates: list[float],
         ) -> float:
             put_position(q)
             put_velocity(v)
-            put_force(preload + held - stiffness * q - damping * v + applied_row * surroundings[1])
-            solve()
-            return get_acceleration()
+            return by_force(q, v, held, memory, surroundings, memory_rates)
 
-        def acceleration_by_force(
-            q: float,
-            v: float,
-            held: float,
-            _memory: Sequence[float],
-            surroundings: _Surroundings,
-            _memory_rates: list[float],
-        ) -> float:
-            put_force(preload + held - stiffness * q - damping * v + applied_row * surroundings[1])
-            solve()
-            return get_acceleration()
-
-        return acceleration_by_force if _only_force_matters(skeleton) else acceleration
+        return by_force if _only_force_matters(skeleton) else by_state_and_force
 
 
 _SAMPLE_FORCES = (0.0, 1e-3, -0.7, 37.3, -4100.0)
@@ -408,18 +406,15 @@ def _only_force_matters(skeleton: Any) -> bool:
     where the body is would make it compute all anew, which takes as long as the answer itself.
     """
     dof = skeleton.getDof(0)
-    answers: set[float] = set()
-    for force in _SAMPLE_FORCES:
-        answers.clear()
-        for k in range(16):
-            dof.setPosition(0.3 * math.sin(1.7 * k))
-            dof.setVelocity(2.0 * math.cos(2.3 * k))
-            dof.setForce(force)
-            skeleton.computeForwardDynamics()
-            answers.add(float(dof.getAcceleration()))
-        if len(answers) > 1:
-            return False
-    return True
+
+    def answer(force_n: float, k: int) -> float:
+        dof.setPosition(0.3 * math.sin(1.7 * k))
+        dof.setVelocity(2.0 * math.cos(2.3 * k))
+        dof.setForce(force_n)
+        skeleton.computeForwardDynamics()
+        return float(dof.getAcceleration())
+
+    return all(len({answer(force_n, k) for k in range(16)}) == 1 for force_n in _SAMPLE_FORCES)
 
 
 class _Coordinates:

@@ -11,10 +11,6 @@ References:
     Schwarz, Ann. Stat. 6 (1978): the penalty for parameters.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -29,6 +25,7 @@ from rig.identify.judge import (
     effective_samples,
     first_fit,
     input_noise,
+    preferred,
     score,
     significant,
     smoothed_misses,
@@ -47,6 +44,7 @@ from rig.identify.trials import (
     fitted,
     led_on,
     left_over,
+    less_one,
     raced,
     running_alone,
     shares,
@@ -312,18 +310,10 @@ def _pruned(judge: Judge, current: Fit, motions: Sequence[screen.Motion]) -> Fit
 
 def _without(judge: Judge, current: Fit, row: int, motions: Sequence[screen.Motion]) -> Fit | None:
     """The fit without one effect, the others fitted again."""
-    effects = tuple(e for i, e in enumerate(current.planted.effects) if i != row)
-    index = current.planted.slots.index
-    values = np.concatenate(
-        [
-            current.values[slice(*index[i, 1:3])]
-            for i in range(len(current.planted.effects))
-            if i != row
-        ]
-    )
+    rest = less_one(judge, current, row)
     n = 2 * judge.model.coordinates
-    starts = [start[:n] for start in current.starts]
-    return fitted(judge, planted(effects), values, starts, motions, 8, 1e-3)
+    starts = [start[:n] for start in rest.starts]
+    return fitted(judge, rest.planted, rest.values, starts, motions, 8, 1e-3)
 
 
 def _swapped(
@@ -338,11 +328,5 @@ def _swapped(
         row = current.planted.effects.index(key)
         rest, own, trials = trials_in_place(judge, base, current, row, competing(judge), pool)
         better = [t for t in trials if t.cost < _BETTER * own][:3]
-        fits = raced(judge, rest, better, motions, pool)
-        for rival in fits:
-            if rival is None:
-                continue
-            effective = effective_samples(min((rival, current), key=lambda f: f.cost))
-            if score(rival, effective) < score(current, effective) - 5.0:
-                current = rival
+        current = preferred(current, raced(judge, rest, better, motions, pool), 5.0)
     return _converged(judge, current, motions)

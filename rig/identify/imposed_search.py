@@ -154,9 +154,8 @@ def search(runs: Sequence[Run], progress: Progress) -> Found:
             winner = _winner(this)
             if winner is None or winner.fit is None:
                 break
-            least = _LATER_GAIN if current.effects else _LEAST_GAIN
-            if current.effects and not at_floor(winner.fit, runs):
-                least = _POLISH
+            polishes = current.effects and not at_floor(winner.fit, runs)
+            least = _POLISH if polishes else None
             if not significant(current, winner.fit, runs, least):
                 break
             current = _rechosen(runs, winner.fit, motion, pool)

@@ -163,6 +163,17 @@ def effective_samples(result: Fit) -> float:
     return float(np.clip(result.samples * (1.0 - rho) / (1.0 + rho), 60.0, result.samples))
 
 
+def preferred(current: Fit, rivals: Sequence[Fit | None], margin: float) -> Fit:
+    """The fit, or a rival whose score is better by a margin; None is a rival that failed."""
+    for rival in rivals:
+        if rival is None:
+            continue
+        effective = effective_samples(min((rival, current), key=lambda f: f.cost))
+        if score(rival, effective) < score(current, effective) - margin:
+            current = rival
+    return current
+
+
 def significant(before: Fit, after: Fit, along: tuple[tuple[int, str], ...] = ()) -> bool:
     """Whether an effect's gain is more than chance, given the colour of what remains.
 

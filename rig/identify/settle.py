@@ -1,10 +1,7 @@
 """The last word on what was found: fitted to its end, simplified, and its rivals named."""
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -13,13 +10,22 @@ from numpy.typing import NDArray
 from dart_model.effects import effect
 from rig.identify import screen
 from rig.identify.attribute import Attribution, Candidate
-from rig.identify.judge import Judge, at_floor, coloured, effective_samples, score, significant
+from rig.identify.judge import (
+    Judge,
+    at_floor,
+    coloured,
+    effective_samples,
+    preferred,
+    score,
+    significant,
+)
 from rig.identify.output_error import Fit, intervals
 from rig.identify.starts import CANDIDATES
 from rig.identify.trials import (
     ON_THE_WAY,
     WORKERS,
     along_motion,
+    best_of,
     competing,
     less_one,
     raced,
@@ -117,15 +123,9 @@ def _refined(judge: Judge, found: Attribution, final: Fit, pool: ThreadPoolExecu
         rest = less_one(judge, final, row)
         shared = along_motion(judge, found.base, rest, final)
         begun = [b[0] for b in (screen.begin(shared, *key) for key in keys) if b]
-        trials = list(pool.map(lambda t: screen.polish(shared, t, 10), begun))  # noqa: B023
-        trials.sort(key=lambda t: t.cost)
-        fits = raced(judge, rest, trials[:2], found.motions, pool)
-        for rival in fits:
-            if rival is None:
-                continue
-            effective = effective_samples(min((rival, final), key=lambda f: f.cost))
-            if score(rival, effective) < score(final, effective) - 2.0:
-                final = rival
+        polish = partial(screen.polish, shared, iterations=10)
+        best = best_of(list(pool.map(polish, begun)))[:2]
+        final = preferred(final, raced(judge, rest, best, found.motions, pool), 2.0)
     return final
 
 

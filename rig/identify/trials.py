@@ -4,38 +4,40 @@ A trial along a motion is a regression and costs a millisecond; the best are the
 loop together with what was found before, all parameters and initial states fitted.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 import itertools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
 from rig.identify import screen
-from rig.identify.judge import (
-    Judge,
-    smoothed_misses,
-)
+from rig.identify.judge import Judge, smoothed_misses
 from rig.identify.output_error import Fit, fit
 from rig.identify.reduced import Model, Planted, planted, pull_on
 from rig.identify.starts import CANDIDATES
 
 Array = NDArray[np.float64]
 WORKERS = 2
+"""Threads: the simulations are machine code, which lets go of the interpreter."""
+
 PULL_PER_S = 8.0
+"""Rate at which simulations are pulled towards the measured motion while laws compete."""
+
 ON_THE_WAY = 4
+"""Steps of a fit that another one follows."""
+
+REPEATABLE = frozenset({"periodic_force"})
+"""Effects that a strut may have several of."""
+
 _SIMULATED = 9
 _FIRST_STEPS = 3
 _BEHIND = 3.0
 _HOPELESS = 30.0
 _FAR = 12.0
 _NEAR = 2.5
-REPEATABLE = frozenset({"periodic_force"})
 _LINEAR_FAMILIES = frozenset({"preload", "stiffness", "damping", "inertia", "input_gain"})
 
 
@@ -110,7 +112,11 @@ def tried(
     shared: screen.Stage, keys: Sequence[tuple[int, str]], pool: ThreadPoolExecutor
 ) -> list[screen.Trial]:
     """Every law's best along the motion, best law first; hopeless ones are not polished."""
-    begun = [b for b in pool.map(lambda key: screen.begin(shared, *key), keys) if b]
+
+    def begin(key: tuple[int, str]) -> list[screen.Trial]:
+        return screen.begin(shared, *key)
+
+    begun = [b for b in pool.map(begin, keys) if b]
     if not begun:
         return []
     nothing = float(shared.target @ shared.target) * shared.weight
@@ -118,10 +124,10 @@ def tried(
     hopeful = [trial for b in begun for trial in b[:2] if _promising(trial, best, nothing, 0.1)]
     if not hopeful:
         return best_of([b[0] for b in begun])
-    roughly = list(pool.map(lambda t: screen.polish(shared, t, 3), hopeful))
+    roughly = list(pool.map(partial(screen.polish, shared, iterations=3), hopeful))
     best = min(t.cost for t in roughly)
     kept = [t for t in roughly if _promising(t, best, nothing, 0.3)]
-    fully = list(pool.map(lambda t: screen.polish(shared, t, 12), kept))
+    fully = list(pool.map(partial(screen.polish, shared, iterations=12), kept))
     return best_of([b[0] for b in begun], roughly, fully)
 
 
@@ -193,7 +199,8 @@ def raced(
     pool: ThreadPoolExecutor,
 ) -> list[Fit | None]:
     """Joint fits of the finalists; those far behind after a few steps go no further."""
-    early = list(pool.map(lambda t: _joint(judge, current, t, motions, _FIRST_STEPS), finalists))
+    joint = partial(_joint, judge, current, motions=motions)
+    early = list(pool.map(joint, finalists))
     best = min((f.cost for f in early if f is not None), default=0.0)
 
     def further(result: Fit | None) -> Fit | None:
@@ -209,11 +216,10 @@ def _joint(
     current: Fit,
     trial: screen.Trial,
     motions: Sequence[screen.Motion],
-    iterations: int = 8,
 ) -> Fit | None:
     what = planted((*current.planted.effects, (trial.strut, trial.name)))
     values = np.concatenate([current.values, trial.values])
-    return fitted(judge, what, values, current.starts, motions, iterations, 2e-3)
+    return fitted(judge, what, values, current.starts, motions, _FIRST_STEPS, 2e-3)
 
 
 def fitted(

@@ -81,7 +81,7 @@ class VirtualClock:
 
 
 class OccupiedClock:
-    """A clock whose waits begin with something to do, which then delays nothing that is due.
+    """A clock whose waits begin with something to do, which then takes time that is waited anyway.
 
     Args:
         clock: The clock.

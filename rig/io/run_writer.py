@@ -51,9 +51,6 @@ MOST_WAITING = 120_000
 MANY_WAITING = 2_000
 """Ticks waiting that are a fault."""
 
-_CHUNK = 1000
-"""Ticks written in one go."""
-
 _CLOSING_S = 30.0
 """How long the end of a run waits for a slow disk."""
 
@@ -253,7 +250,7 @@ class RunLog:
         try:
             self._write_lines()
             while self._waiting:
-                self._take(min(_CHUNK, len(self._waiting)))
+                self._take(min(_MOST_STEPS - len(self._batch), len(self._waiting)))
                 self._write_lines()
                 last_ns = self._batch[-1].t_ns
                 spans_ns = last_ns - self._batch[0].t_ns
