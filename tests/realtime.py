@@ -14,6 +14,7 @@ import multiprocessing
 import os
 import re
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -33,17 +34,25 @@ CLASSIC_CAN_HZ = 3703
 
 MOST_ERROR = 0.02
 
+_ROUND_NS = 20_000_000
 
-def spin() -> None:
-    """Keep a core busy."""
+
+def spin(share: float) -> None:
+    """Keep a core busy, for this share of the time."""
     while True:
-        pass
+        until_ns = time.monotonic_ns() + round(share * _ROUND_NS)
+        while time.monotonic_ns() < until_ns:
+            pass
+        time.sleep((1.0 - share) * _ROUND_NS * 1e-9)
 
 
 @contextlib.contextmanager
-def busy_cores() -> Iterator[None]:
+def busy_cores(share: float) -> Iterator[None]:
     """A busy process on each core."""
-    processes = [multiprocessing.Process(target=spin, daemon=True) for _ in range(os.cpu_count())]
+    processes = [
+        multiprocessing.Process(target=spin, args=(share,), daemon=True)
+        for _ in range(os.cpu_count() or 1)
+    ]
     for process in processes:
         process.start()
     try:
@@ -114,11 +123,13 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=300.0)
     parser.add_argument("--rate-hz", type=float, default=1000.0)
     parser.add_argument("--no-fifo", action="store_true")
-    parser.add_argument("--idle", action="store_true", help="no busy processes beside it")
+    parser.add_argument(
+        "--busy", type=float, default=1.0, help="share of a core that a busy process takes, 0 to 1"
+    )
     parser.add_argument("--bare", action="store_true", help="ticks with nothing to do")
     asked = parser.parse_args()
     ready, bench = at_rate(asked.rate_hz, asked.seconds, fifo=not asked.no_fifo, folder=asked.out)
-    load = contextlib.nullcontext() if asked.idle else busy_cores()
+    load = busy_cores(asked.busy) if asked.busy > 0.0 else contextlib.nullcontext()
     if asked.bare:
         with load:
             bare(ready)

@@ -8,6 +8,7 @@ While the disk takes nothing, ticks wait in memory, and what does not fit there 
 import contextlib
 import shutil
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ from rig.io.run_log import (
     format_frame,
     part_name,
 )
-from rig.io.steps import Step, serialized, step_schema
+from rig.io.steps import Step, StepRows
 from rig.io.whole_file import WholeFile
 
 FLUSH_NS = 190_000_000
@@ -38,6 +39,13 @@ FLUSH_NS = 190_000_000
 
 _MOST_STEPS = 200
 """Steps in a batch: while a larger one is put together a fast loop waits for the interpreter."""
+
+_MOST_AT_ONCE = 40
+"""Ticks taken over in one go, for the same reason."""
+
+_GIVEN_WAY_S = 5e-5
+"""Pause after each go. Less would not do: a thread that lets go of the interpreter and wants it
+back at once has it again before the one that waits is awake."""
 
 WAKE_NS = 10_000_000
 """Time of the run after which the writing thread is woken for what was handed over."""
@@ -149,7 +157,8 @@ class RunLog:
         self._header = header
         self._epoch_ns = epoch_ns
         self._channel = channel
-        self._schema = step_schema(struts)
+        self._struts = tuple(struts)
+        self._rows = StepRows(struts)
         self._rotation = rotation
         self._captures = None if window is None else Captures(window, graver, self._write_capture)
         try:
@@ -158,12 +167,11 @@ class RunLog:
                 raise InputError(f"{folder}: holds a run already, expected an empty folder")
             _write_yaml(folder / RUN_FILE, header)
             (folder / _RESERVE_FILE).write_bytes(bytes(_RESERVE_BYTES))
-            self._part = _Part(folder, 0, self._schema, 0)
+            self._part = _Part(folder, 0, self._rows.schema, 0)
         except OSError as error:
             raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
         self._waiting: deque[Entry] = deque()
         self._lines = b""
-        self._batch: list[Step] = []
         self._priority = priority
         self._closing = threading.Event()
         self._wake = threading.Event()
@@ -213,7 +221,7 @@ class RunLog:
             self._failed("the disk is too slow")
         else:
             self._finish()
-        self.dropped += len(self._waiting) + len(self._batch)
+        self.dropped += len(self._waiting) + len(self._rows)
         with contextlib.suppress(OSError):
             (self.folder / _RESERVE_FILE).unlink()
         try:
@@ -249,18 +257,21 @@ class RunLog:
         """Write what waits; what the disk does not take is kept, and tried again the next time."""
         try:
             self._write_lines()
+            self._flush_if_due()
             while self._waiting:
-                self._take(min(_MOST_STEPS - len(self._batch), len(self._waiting)))
+                self._take(min(_MOST_AT_ONCE, len(self._waiting)))
                 self._write_lines()
-                last_ns = self._batch[-1].t_ns
-                spans_ns = last_ns - self._batch[0].t_ns
-                if spans_ns >= FLUSH_NS or len(self._batch) >= _MOST_STEPS:
-                    self._flush()
-                    self._rotate(last_ns)
+                self._give_way()
+                self._flush_if_due()
         except OSError as error:
             self._failed(str(error.strerror))
         else:
             self.fault = None
+
+    def _give_way(self) -> None:
+        """Let the loop have the interpreter, if it waits for it."""
+        if self._paced:
+            time.sleep(_GIVEN_WAY_S)
 
     def _take(self, count: int) -> None:
         lines: list[str] = []
@@ -268,7 +279,7 @@ class RunLog:
             entry = self._waiting.popleft()
             lines += [self._line(frame, "R") for frame in entry.received]
             lines += [self._line(frame, "T") for frame in entry.sent]
-            self._batch.append(entry.step)
+            self._rows.append(entry.step)
             if self._captures is not None:
                 self._captures.take(entry)
         self._lines = "".join(lines).encode("ascii")
@@ -280,11 +291,17 @@ class RunLog:
         self._part.frames.append(self._lines)
         self._lines = b""
 
+    def _flush_if_due(self) -> None:
+        if self._rows.span_ns >= FLUSH_NS or len(self._rows) >= _MOST_STEPS:
+            last_ns = self._rows.last_ns
+            self._flush()
+            self._rotate(last_ns)
+            self._give_way()
+
     def _flush(self) -> None:
-        if not self._batch:
-            return
-        self._part.steps.append(serialized(self._batch, self._schema))
-        self._batch = []
+        if self._rows:
+            self._part.steps.append(self._rows.serialized())
+            self._rows.clear()
 
     def _rotate(self, now_ns: int) -> None:
         """Continue in new files, if it is time; frames and steps then end with the same tick."""
@@ -292,24 +309,23 @@ class RunLog:
         is_full = limit.size_bytes is not None and part.size >= limit.size_bytes
         is_long = limit.time_ns is not None and now_ns - part.begin_ns >= limit.time_ns
         if is_full or is_long:
-            self._part = _Part(self.folder, part.number + 1, self._schema, now_ns)
+            self._part = _Part(self.folder, part.number + 1, self._rows.schema, now_ns)
             part.close()
 
     def _write_capture(self, capture: Capture) -> None:
         folder = self.folder / "captures" / f"{capture.number:03d}_{capture.why}"
         header = {**self._header, "capture": {"why": capture.why, "t_s": capture.t_ns * 1e-9}}
         lines: list[str] = []
+        rows = StepRows(self._struts)
         for entry in capture.entries:
+            rows.append(entry.step)
             lines += [self._line(frame, "R") for frame in entry.received]
             lines += [self._line(frame, "T") for frame in entry.sent]
         try:
             folder.mkdir(parents=True)
-            part = _Part(folder, 0, self._schema, 0)
+            part = _Part(folder, 0, rows.schema, 0)
             part.frames.append("".join(lines).encode("ascii"))
-            steps = [entry.step for entry in capture.entries]
-            for first in range(0, len(steps), _MOST_STEPS):
-                batch = steps[first : first + _MOST_STEPS]
-                part.steps.append(serialized(batch, self._schema))
+            part.steps.append(rows.serialized())
             part.close()
             for name in (MODEL_FILE, DBC_FILE):
                 if (self.folder / name).exists():

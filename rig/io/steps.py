@@ -1,5 +1,6 @@
 """What is logged of each tick, and its columns in `steps.arrow`."""
 
+import struct
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
@@ -65,16 +66,49 @@ def step_schema(struts: Sequence[str]) -> Any:
     return _pa.schema(fields)
 
 
-def serialized(steps: Sequence[Step], schema: Any) -> bytes:
-    """Steps as a record batch of an Arrow stream.
+class StepRows:
+    """Steps on their way to a record batch of an Arrow stream.
+
+    Each is packed at once, in a third of a microsecond: to turn a batch of Python numbers into
+    columns in one go would keep the interpreter from a fast loop for longer than a tick lasts.
 
     Args:
-        steps: At least one.
-        schema: Their `step_schema`.
+        struts: Names of the struts.
     """
-    *columns, struts = zip(*steps, strict=True)
-    every = [*columns, *np.array(struts, dtype=np.float64).T]
-    arrays = [
-        _pa.array(column, type=field.type) for column, field in zip(every, schema, strict=True)
-    ]
-    return bytes(_pa.RecordBatch.from_arrays(arrays, schema=schema).serialize())
+
+    def __init__(self, struts: Sequence[str]) -> None:
+        self.schema = step_schema(struts)
+        self._packer = struct.Struct(f"<qiibbdd{len(struts) * len(STRUT_COLUMNS)}d")
+        self._columns = np.dtype(
+            [(field.name, field.type.to_pandas_dtype()) for field in self.schema]
+        )
+        self._rows = bytearray()
+        self._first_ns = 0
+        self.last_ns = 0
+        """Time of the last one."""
+
+    def __len__(self) -> int:
+        return len(self._rows) // self._packer.size
+
+    @property
+    def span_ns(self) -> int:
+        """Time from the first one to the last."""
+        return self.last_ns - self._first_ns if self._rows else 0
+
+    def append(self, step: Step) -> None:
+        """Add a step."""
+        if not self._rows:
+            self._first_ns = step.t_ns
+        self.last_ns = step.t_ns
+        self._rows += self._packer.pack(*step[:-1], *step.struts)
+
+    def serialized(self) -> bytes:
+        """All steps as a record batch."""
+        table = np.frombuffer(self._rows, self._columns)
+        arrays = [_pa.array(np.ascontiguousarray(table[name])) for name in self.schema.names]
+        batch = _pa.RecordBatch.from_arrays(arrays, schema=self.schema)
+        return bytes(batch.serialize())
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self._rows = bytearray()
