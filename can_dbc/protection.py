@@ -8,8 +8,10 @@ Reference: AUTOSAR, "Specification of SW-C End-to-End Communication Protection L
 profiles 1 (variant 1A) and 2.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any, NamedTuple
 
 import numpy as np
 from e2e.p01 import e2e_p01_check, e2e_p01_protect
@@ -106,8 +108,7 @@ class Verdict(Enum):
 _ACCEPTED = frozenset({Verdict.OK, Verdict.FIRST, Verdict.LOST})
 
 # Looking up a member of an enum costs as much as the CRC of a frame.
-_P02 = Profile.P02
-_OK = Verdict.OK
+_OK, _WRONG_LENGTH = Verdict.OK, Verdict.WRONG_LENGTH
 
 RESYNC_FRAMES = 2
 """Frames in a row, after an out-of-sequence one, that make a restarted sequence believable."""
@@ -144,38 +145,34 @@ def check_crc(data: bytes | bytearray, protection: Protection) -> bool:
     return len(data) == protection.length_bytes and _crc_fits(data, protection.identity)
 
 
-def protect(data: bytes | bytearray, counter: int, protection: Protection) -> bytes:
-    """Put counter and CRC into a frame.
+Checker = Callable[[SequenceState, bytes | bytearray, int], tuple[SequenceState, Verdict]]
+"""What is remembered of a message (`INITIAL` at first), payload, time of reception in ns -> the
+same after the frame, and what the frame is."""
 
-    Args:
-        data: Payload, `protection.length_bytes` long; not changed.
-        counter: Number of the frame, any integer of at least 0; it is sent modulo the profile's
-            number of counter values.
-        protection: Protection of the frame's message.
-
-    Returns:
-        The payload to send.
-
-    Raises:
-        ValueError: The payload has another length.
-    """
-    if len(data) != protection.length_bytes:
-        raise ValueError(f"payload: {len(data)} bytes, expected {protection.length_bytes}")
-    frame = bytearray(data)
-    # The package counts one further itself.
-    frame[1] = frame[1] & 0xF0 | (counter - 1) % protection.counter_modulus
-    identity = protection.identity
-    if identity.profile is _P02:
-        e2e_p02_protect(frame, identity.data_ids)
-    else:
-        e2e_p01_protect(frame, int.from_bytes(identity.data_ids, "big"))
-    return bytes(frame)
+Protector = Callable[[bytes | bytearray, int], bytes]
+"""Payload, and number of the frame (any integer of at least 0; it is sent modulo the profile's
+number of counter values) -> the payload to send. Raises `ValueError` for another length."""
 
 
-def check(
-    state: SequenceState, data: bytes | bytearray, t_ns: int, protection: Protection
-) -> tuple[SequenceState, Verdict]:
-    """Judge one received frame.
+def compile_protector(protection: Protection) -> Protector:
+    """Build what puts counter and CRC into the frames of a message."""
+    length, modulus = protection.length_bytes, protection.counter_modulus
+    _, put_crc, identity = _crc(protection.identity)
+
+    def protect(data: bytes | bytearray, number: int) -> bytes:
+        if len(data) != length:
+            raise ValueError(f"payload: {len(data)} bytes, expected {length}")
+        frame = bytearray(data)
+        # The package counts one further itself.
+        frame[1] = frame[1] & 0xF0 | (number - 1) % modulus
+        put_crc(frame, identity)
+        return bytes(frame)
+
+    return protect
+
+
+def compile_checker(protection: Protection) -> Checker:
+    """Build what judges the frames of a message, one by one.
 
     A counter that went up by 1 to `max_delta_counter` (more where more cycle times have passed
     since the last frame) is accepted, with the number of lost frames in the new state. After a
@@ -185,27 +182,26 @@ def check(
 
     A corrupted frame may by chance carry the CRC of another message; it is then called
     MASQUERADE and not WRONG_CRC. Both are refused.
-
-    Args:
-        state: What is remembered of this message; start with `INITIAL`.
-        data: Payload.
-        t_ns: Time of reception, in ns.
-        protection: Protection of the message.
-
-    Returns:
-        New state and verdict.
     """
-    if len(data) != protection.length_bytes:
-        return state, Verdict.WRONG_LENGTH
-    if not _crc_fits(data, protection.identity):
-        return state, _wrong_crc(data, protection)
-    counter = data[1] & 0x0F
-    last, modulus = state.counter, protection.counter_modulus
-    # The frequent case first: next in sequence and in time.
-    next_in_sequence = (counter - last) % modulus == 1 and last >= 0 and counter < modulus
-    if next_in_sequence and t_ns - state.t_ns < protection.silence_ns:
-        return SequenceState(counter, t_ns), _OK
-    return _judge_sequence(state, counter, t_ns, protection)
+    length, modulus = protection.length_bytes, protection.counter_modulus
+    # The last one is for counter -1, before the first frame, which nothing follows.
+    following = (*range(1, modulus), 0, None)
+    silence_ns, (crc_fits, _, identity) = protection.silence_ns, _crc(protection.identity)
+
+    def check(
+        state: SequenceState, data: bytes | bytearray, t_ns: int
+    ) -> tuple[SequenceState, Verdict]:
+        if len(data) != length:
+            return state, _WRONG_LENGTH
+        if not crc_fits(data, identity):
+            return state, _wrong_crc(data, protection)
+        counter = data[1] & 0x0F
+        # The frequent case first: next in sequence and in time.
+        if counter == following[state.counter] and t_ns - state.t_ns < silence_ns:
+            return SequenceState(counter, t_ns), _OK
+        return _judge_sequence(state, counter, t_ns, protection)
+
+    return check
 
 
 def check_crc_log(data: NDArray[np.uint8], protection: Protection) -> NDArray[np.bool_]:
@@ -231,11 +227,28 @@ def check_crc_log(data: NDArray[np.uint8], protection: Protection) -> NDArray[np
     return crc == data[:, 0]
 
 
-def _crc_fits(data: bytes | bytearray, identity: Identity) -> bool:
-    if identity.profile is _P02:
-        return e2e_p02_check(data, identity.data_ids)
+class _Crc(NamedTuple):
+    """What a profile does with a frame and a message's identity."""
+
+    check: Callable[[bytes | bytearray, Any], bool]
+    put: Callable[[bytearray, Any], object]
+    identity: Any
+
+
+def _crc(identity: Identity) -> _Crc:
+    if identity.profile is Profile.P02:
+        return _Crc(e2e_p02_check, e2e_p02_protect, identity.data_ids)
+    return _Crc(_p01_check, e2e_p01_protect, int.from_bytes(identity.data_ids, "big"))
+
+
+def _p01_check(data: bytes | bytearray, data_id: int) -> bool:
     # The package checks this profile only in a mutable buffer.
-    return e2e_p01_check(bytearray(data), int.from_bytes(identity.data_ids, "big"))
+    return e2e_p01_check(bytearray(data), data_id)
+
+
+def _crc_fits(data: bytes | bytearray, identity: Identity) -> bool:
+    crc = _crc(identity)
+    return crc.check(data, crc.identity)
 
 
 def _wrong_crc(data: bytes | bytearray, protection: Protection) -> Verdict:

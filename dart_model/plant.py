@@ -41,35 +41,22 @@ _STABLE_PRODUCT = 1.0
 
 
 class PlantState(Struct, frozen=True, gc=False):
-    """State of the model.
+    """State of a model, made by its `DartPlant`.
 
     Attributes:
         positions: Joint coordinates, in m or rad, as DART orders them.
         velocities: Joint velocities, in m/s or rad/s.
         memory: Memory of all effects, strut after strut.
         t_s: Time, for effects that depend on it.
+        struts: Height (m) and velocity (m/s; positive is rebound) of every strut: what the
+            coordinates mean to them.
     """
 
     positions: tuple[float, ...]
     velocities: tuple[float, ...]
     memory: tuple[float, ...]
     t_s: float
-
-
-class Motion(Struct, frozen=True, gc=False):
-    """What one strut does in a state.
-
-    Attributes:
-        height_m: Length of the strut.
-        velocity_m_per_s: Its rate; positive is rebound.
-        force_n: Spring-damper force with effects, without the virtual force.
-        acceleration_m_per_s2: Second derivative of the height under all forces.
-    """
-
-    height_m: float
-    velocity_m_per_s: float
-    force_n: float
-    acceleration_m_per_s2: float
+    struts: Sequence[tuple[float, float]]
 
 
 class Loaded(Struct, frozen=True, gc=False):
@@ -77,7 +64,8 @@ class Loaded(Struct, frozen=True, gc=False):
 
     Attributes:
         state: The state.
-        motions: What each strut does in it.
+        forces_n: Spring-damper force of each strut with its effects, without the virtual force.
+        accelerations_m_per_s2: Second derivative of each strut's height under all forces.
         applied_force_n: Applied force at the state.
         temperature_c: Damper temperature.
         held: The virtual forces, held until the next state; this and the next three are as the
@@ -89,7 +77,8 @@ class Loaded(Struct, frozen=True, gc=False):
     """
 
     state: PlantState
-    motions: Sequence[Motion]
+    forces_n: list[float]
+    accelerations_m_per_s2: list[float]
     applied_force_n: float
     temperature_c: float
     held: "_Value"
@@ -252,16 +241,16 @@ class _Joints(Protocol):
         """DART's acceleration under given forces."""
         ...
 
+    def value(self, numbers: Sequence[float]) -> _Value:
+        """One number a coordinate, as the integrator has them."""
+        ...
+
     def state(self, q: _Value, v: _Value, memory: tuple[float, ...], t_s: float) -> PlantState:
         """State of position and velocity."""
         ...
 
     def moved(self, q: _Value, v: _Value, h: float) -> _Value:
         """Where a velocity leads to in `h` seconds."""
-        ...
-
-    def kinematics(self, state: PlantState) -> list[tuple[float, float]]:
-        """Height and velocity of every strut."""
         ...
 
     def load(
@@ -292,18 +281,17 @@ class _Coordinate:
             self._acceleration_with_effects if with_effects else self._without_effects
         )
 
+    def value(self, numbers: Sequence[float]) -> float:
+        return numbers[0]
+
     def state(self, q: float, v: float, memory: tuple[float, ...], t_s: float) -> PlantState:
-        return PlantState((q,), (v,), memory, t_s)
+        struts: list[tuple[float, float]] = []
+        for _, _, offset, row in self._struts:
+            struts.append((offset + row * q, row * v))
+        return PlantState((q,), (v,), memory, t_s, struts)
 
     def moved(self, q: float, v: float, h: float) -> float:
         return q + h * v
-
-    def kinematics(self, state: PlantState) -> list[tuple[float, float]]:
-        q, v = state.positions[0], state.velocities[0]
-        found: list[tuple[float, float]] = []
-        for _, _, offset, row in self._struts:
-            found.append((offset + row * q, row * v))
-        return found
 
     def load(
         self,
@@ -317,8 +305,8 @@ class _Coordinate:
         rates = [0.0] * len(memory)
         forces: list[float] = []
         held = of_effects = 0.0
-        for index, strut, offset, row in self._struts:
-            height, velocity = offset + row * q, row * v
+        for index, strut, _, row in self._struts:
+            height, velocity = state.struts[index]
             force = strut.plain_n(height, velocity)
             if strut.laws:
                 effects = strut.effects_n(height, velocity, memory, surroundings, rates)
@@ -327,12 +315,20 @@ class _Coordinate:
             forces.append(force)
             held += row * virtual_forces_n[index]
         acceleration = self._without_effects(q, v, held + of_effects, memory, surroundings, rates)
-        motions: list[Motion] = []
-        for index, _, offset, row in self._struts:
-            motion = Motion(offset + row * q, row * v, forces[index], row * acceleration)
-            motions.append(motion)
+        accelerations: list[float] = []
+        for _, _, _, row in self._struts:
+            accelerations.append(row * acceleration)
         return Loaded(
-            state, motions, applied_force_n, temperature_c, held, q, v, acceleration, rates
+            state,
+            forces,
+            accelerations,
+            applied_force_n,
+            temperature_c,
+            held,
+            q,
+            v,
+            acceleration,
+            rates,
         )
 
     def _acceleration_with_effects(
@@ -439,6 +435,9 @@ class _Coordinates:
         self._solve: Callable[[], None] = skeleton.computeForwardDynamics
         self.adds_up = _coordinates_add_up(skeleton)
 
+    def value(self, numbers: Sequence[float]) -> NDArray[np.float64]:
+        return np.array(numbers)
+
     def state(
         self,
         q: NDArray[np.float64],
@@ -446,7 +445,9 @@ class _Coordinates:
         memory: tuple[float, ...],
         t_s: float,
     ) -> PlantState:
-        return PlantState(tuple(q.tolist()), tuple(v.tolist()), memory, t_s)
+        positions, velocities = tuple(q.tolist()), tuple(v.tolist())
+        struts = _kinematics(self._rows(q), positions, velocities)
+        return PlantState(positions, velocities, memory, t_s, struts)
 
     def moved(
         self, q: NDArray[np.float64], v: NDArray[np.float64], h: float
@@ -455,10 +456,6 @@ class _Coordinates:
         self._skeleton.setVelocities(v)
         self._skeleton.integratePositions(h)
         return np.array(self._skeleton.getPositions())
-
-    def kinematics(self, state: PlantState) -> list[tuple[float, float]]:
-        rows = self._rows(np.array(state.positions))
-        return _kinematics(rows, state.positions, state.velocities)
 
     def load(
         self,
@@ -472,21 +469,19 @@ class _Coordinates:
         rates = [0.0] * len(memory)
         q, v = np.array(position), np.array(velocity)
         rows = self._rows(q)
-        kinematics = _kinematics(rows, position, velocity)
-        forces = self._forces_n(kinematics, memory, surroundings, rates)
+        forces = self._forces_n(state.struts, memory, surroundings, rates)
         push = _push(rows, forces, virtual_forces_n, applied_force_n)
         acceleration = self._respond(position, velocity, push)
         turning = [0.0] * len(forces) if self._constant else (self._turning(q, v) @ v).tolist()
-        motions = [
-            Motion(*motion, force, _dot(row, acceleration) + turned)
-            for motion, force, row, turned in zip(
-                kinematics, forces, rows.struts, turning, strict=True
-            )
+        accelerations = [
+            _dot(row, acceleration) + turned
+            for row, turned in zip(rows.struts, turning, strict=True)
         ]
         answer = np.array(acceleration)
         return Loaded(
             state,
-            motions,
+            forces,
+            accelerations,
             applied_force_n,
             temperature_c,
             virtual_forces_n,
@@ -516,7 +511,7 @@ class _Coordinates:
 
     def _forces_n(
         self,
-        kinematics: list[tuple[float, float]],
+        kinematics: Sequence[tuple[float, float]],
         memory: Sequence[float],
         surroundings: _Surroundings,
         memory_rates: list[float],
@@ -614,12 +609,18 @@ class DartPlant:
         v = np.zeros(self.coordinates)
         if velocities_m_per_s is not None:
             v = np.linalg.lstsq(rows.struts, np.asarray(velocities_m_per_s), rcond=None)[0]
-        memory = (0.0,) * self.memory_size
-        return PlantState(tuple(q.tolist()), tuple(v.tolist()), memory, 0.0)
+        return self.state(q.tolist(), v.tolist(), (0.0,) * self.memory_size, 0.0)
 
-    def kinematics(self, state: PlantState) -> list[tuple[float, float]]:
-        """Height (m) and velocity (m/s) of every strut in a state."""
-        return self._joints.kinematics(state)
+    def state(
+        self,
+        positions: Sequence[float],
+        velocities: Sequence[float],
+        memory: tuple[float, ...],
+        t_s: float,
+    ) -> PlantState:
+        """State with the given coordinates; arguments as of `PlantState`."""
+        value = self._joints.value
+        return self._joints.state(value(positions), value(velocities), memory, t_s)
 
     def load(
         self,
@@ -686,19 +687,6 @@ class DartPlant:
                 return self._joints.state(q, v, memory, t_s)
             s1 = [0.0] * self.memory_size
             a1 = acceleration(q, v, held, memory, now, s1)
-
-    def motions(
-        self, state: PlantState, applied_force_n: float, temperature_c: float
-    ) -> Sequence[Motion]:
-        """Height, velocity and force of every strut in a state.
-
-        Args:
-            state: The state.
-            applied_force_n: Applied force, for effects that depend on it.
-            temperature_c: Damper temperature.
-        """
-        without = (0.0,) * len(self._struts)
-        return self.load(state, without, applied_force_n, temperature_c).motions
 
     def guided(self) -> GuidedModel | None:
         """The model as constant matrices, or None if its struts do not move on straight guides.

@@ -15,7 +15,7 @@ import pyarrow as pa
 from msgspec.structs import astuple, replace
 from numpy.typing import NDArray
 
-from can_dbc.codec import decode_log
+from can_dbc.codec import compile_decoder, decode_log
 from can_dbc.database import load_database
 from can_dbc.frame import Frame
 from can_dbc.protection import SequenceState
@@ -261,10 +261,10 @@ class _Log:
         tick, payload = tick_of[number], frames.payload[number]
         length, t_ns = frames.length[number], frames.t_ns[number]
         counter = np.zeros(len(number), dtype=np.int64)
-        if item.protection is None:
+        if item.message.protection is None:
             good = length == message.length_bytes
         else:
-            good = in_sequence(payload, length, t_ns, item.protection)
+            good = in_sequence(payload, length, t_ns, item.message.protection)
             if payload.shape[1] > 1:
                 counter = (payload[:, 1] & 0x0F).astype(np.int64)
         values, has_values = _decoded(item, payload)
@@ -279,7 +279,7 @@ class _Log:
         for index, found in enumerate(self._messages):
             last = int(np.searchsorted(found.tick, tick)) - 1
             sequence = state.sequences[index]
-            if last >= 0 and self._incoming[index].protection is not None:
+            if last >= 0 and self._incoming[index].message.protection is not None:
                 expected = int(found.counter[last]), int(found.t_ns[last])
                 if (sequence.counter, sequence.t_ns) != expected:
                     return False
@@ -290,7 +290,7 @@ class _Log:
         sequences = list(state.sequences)
         for index, found in enumerate(self._messages):
             last = int(np.searchsorted(found.tick, tick)) - 1
-            if last >= 0 and self._incoming[index].protection is not None:
+            if last >= 0 and self._incoming[index].message.protection is not None:
                 sequences[index] = SequenceState(int(found.counter[last]), int(found.t_ns[last]))
         ledger, counts = state.ledger, state.counts
         if holds:
@@ -360,13 +360,14 @@ def _decoded(
     length, count = message.length_bytes, len(payloads)
     if payloads.shape[1] < length:
         return np.full((count, len(names)), nan), np.zeros(count, dtype=np.bool_)
+    dimensions = [target.quantity.dimension for target in item.targets]
     if any(message.signal(name).multiplexer is not None for name in names):
-        each = [item.decode(payload[:length].tobytes()) for payload in payloads]
+        decode = compile_decoder(message, names, dimensions)
+        each = [decode(payload[:length].tobytes()) for payload in payloads]
         nothing = (nan,) * len(names)
         values = np.array([values or nothing for values in each], dtype=np.float64)
         has_values = np.array([values is not None for values in each], dtype=np.bool_)
         return values.reshape(-1, len(names)), has_values
-    dimensions = [target.quantity.dimension for target in item.targets]
     columns = decode_log(message, names, dimensions, np.ascontiguousarray(payloads[:, :length]))
     values = np.column_stack([columns[name] for name in names])
     return values, np.ones(count, dtype=np.bool_)

@@ -124,7 +124,10 @@ def main() -> int:
     parser.add_argument("--rate-hz", type=float, default=1000.0)
     parser.add_argument("--no-fifo", action="store_true")
     parser.add_argument(
-        "--busy", type=float, default=1.0, help="share of a core that a busy process takes (0: none)"
+        "--busy",
+        type=float,
+        default=1.0,
+        help="share of a core that each takes (0: none)",
     )
     parser.add_argument("--bare", action="store_true", help="ticks with nothing to do")
     asked = parser.parse_args()

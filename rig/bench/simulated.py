@@ -14,7 +14,7 @@ import numpy as np
 from can_dbc.codec import Encoder, compile_encoder
 from can_dbc.database import Database, Message
 from can_dbc.frame import Frame
-from can_dbc.protection import protect
+from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from rig.bench.assembly import assemble
 from rig.bench.mechanics import RECORD_COLUMNS, RECORD_EXTRA
@@ -97,6 +97,8 @@ class _Sender:
             tuple(channel.signal for channel in self._channels),
             tuple(channel.dimension for channel in self._channels),
         )
+        protection = self.message.protection
+        self._protect = None if protection is None else compile_protector(protection)
         self._counter = 0
         self._last_sent_ns = 0
 
@@ -105,8 +107,8 @@ class _Sender:
         values = [channel.measure(record) for channel in self._channels]
         data, saturated = self._encode(values)
         self.saturated_frames += bool(saturated)
-        if self.message.protection is not None:
-            data = protect(data, self._counter, self.message.protection)
+        if self._protect is not None:
+            data = self._protect(data, self._counter)
         self._counter += 1
         late_ns = self.transmission.latency_ns
         late_ns += round(self._jitter.random() * self.transmission.jitter_ns)

@@ -4,14 +4,14 @@ A refused frame is counted and never used in part; values come from accepted fra
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from msgspec import Struct
 from msgspec.structs import replace
 
 from can_dbc.frame import Frame
-from can_dbc.protection import INITIAL, SequenceState, Verdict, check, protect
-from rig.core.messages import Conditions, Counts, Incoming, Outgoing, Quantity, Report, Target
+from can_dbc.protection import INITIAL, SequenceState, Verdict
+from rig.core.messages import Conditions, Counts, Incoming, Outgoing, Quantity, Reader, Report
 from rig.core.supervisor import (
     EVENTS_BEYOND,
     Action,
@@ -30,6 +30,8 @@ _OK, _HOLD = Verdict.OK, Mode.HOLD
 
 _OTHERS = (Quantity.APPLIED_FORCE, Quantity.TEMPERATURE, Quantity.LOAD_CELL_FORCE)
 """What comes beside heights, as the core is given it."""
+
+_NO_OTHERS: list[float | None] = [None] * len(_OTHERS)
 
 RIVAL_FRAMES = 12
 """Frames out of sequence, one hardly after the other, that only a second sender explains: a sender
@@ -72,15 +74,14 @@ class BridgeState(Struct, frozen=True, gc=False):
     Attributes:
         rig: State of the core.
         sequences: Counter state of each incoming message.
-        counters: Frames sent so far of each outgoing message.
-        due_ns: When each of them is sent next.
+        sendings: Of each outgoing message, how many frames were sent, and when the next is due, in
+            ns.
         ledger: What is remembered beside.
     """
 
     rig: RigState
     sequences: tuple[SequenceState, ...]
-    counters: tuple[int, ...]
-    due_ns: tuple[int, ...]
+    sendings: tuple[tuple[int, int], ...]
     ledger: Ledger
 
     @property
@@ -101,6 +102,12 @@ class TickResult(Struct, frozen=True, gc=False):
     frames: list[Frame]
     step_input: StepInput
     output: StepOutput
+
+
+_Source = tuple[int, Reader, list[tuple[int, int]], list[tuple[int, int]]]
+"""An incoming message as a tick wants it: its place among the incoming ones; what reads it; place
+of a height among its values and the strut that it is of; place of another value and which one of
+`_OTHERS` it is. A plain tuple is taken apart three times as fast as a named one."""
 
 
 class Bridge:
@@ -127,19 +134,12 @@ class Bridge:
         self._incoming = tuple(incoming)
         # Numbered once: to count along costs as much as to make two small objects.
         self._outgoing = tuple(enumerate(outgoing))
-        self._places = [
-            [(number, self._place(target)) for number, target in enumerate(item.targets)]
-            for item in incoming
-        ]
-        self._has_height = [
-            any(place < core.struts for _, place in places) for places in self._places
-        ]
-        # What came in a tick: the struts' heights, then the others in the order of `_OTHERS`.
-        self._nothing: list[Any] = [None] * (core.struts + len(_OTHERS))
-        self._index = {
-            (item.message.arbitration_id, item.message.is_extended): index
-            for index, item in enumerate(incoming)
-        }
+        self._no_heights: list[Measurement | None] = [None] * core.struts
+        # By whether the id is extended, then by the id: half the time that a pair takes as a key.
+        self._sources: tuple[dict[int, _Source], dict[int, _Source]] = ({}, {})
+        for index, item in enumerate(incoming):
+            message = item.message
+            self._sources[message.is_extended][message.arbitration_id] = _source(index, item)
         self._own = frozenset(
             (item.message.arbitration_id, item.message.is_extended) for item in outgoing
         )
@@ -147,7 +147,8 @@ class Bridge:
     @property
     def heard(self) -> frozenset[tuple[int, bool]]:
         """The (arbitration id, is extended) that the bridge listens to, its own among them."""
-        return self._own.union(self._index)
+        messages = [item.message for item in self._incoming]
+        return self._own.union((item.arbitration_id, item.is_extended) for item in messages)
 
     @property
     def core(self) -> Core:
@@ -166,12 +167,12 @@ class Bridge:
 
     def init(self, t_ns: int) -> BridgeState:
         """State before the first tick."""
-        count = len(self._outgoing)
         sequences = (INITIAL,) * len(self._incoming)
         nothing = Ledger(
             Counts(), Counts(), (None,) * self._struts, (Strays(),) * len(self._incoming)
         )
-        return BridgeState(self._core.init(t_ns), sequences, (0,) * count, (t_ns,) * count, nothing)
+        sendings = ((0, t_ns),) * len(self._outgoing)
+        return BridgeState(self._core.init(t_ns), sequences, sendings, nothing)
 
     def tick(
         self,
@@ -191,84 +192,90 @@ class Bridge:
         Returns:
             State after the tick, and what it did.
         """
-        rig, given, sequences, ledger, action = self._received(state, t_ns, frames)
-        step_input = self._step_input(t_ns, given, acknowledged=conditions.acknowledged)
+        rig, step_input, sequences, ledger, action = self._received(
+            state, t_ns, frames, conditions.acknowledged
+        )
         rig, output = self._core.step(rig, step_input)
         if self._limits or action:
             rig, output, action = self._limited(state.rig, rig, output, action)
         if action or output.mode is _HOLD or conditions.overruns or conditions.bus_fault:
             ledger = _noted(ledger, output, action, conditions)
-        counters, due_ns = list(state.counters), list(state.due_ns)
-        sent: list[Frame] = []
+        sendings, sent = state.sendings, []
         if output.struts:  # nothing is sent before the first valid measurement
-            for index, item in self._outgoing:
-                if t_ns < due_ns[index]:
-                    continue
-                frame, saturated = _encoded(
-                    item,
-                    Report(output, ledger.counts, ledger.told, conditions, counters[index]),
-                    t_ns,
-                )
-                sent.append(frame)
-                counters[index] += 1
-                due_ns[index] = _next_due_ns(due_ns[index], t_ns, item.period_ns)
-                if item.is_status or saturated:
-                    ledger = _told(ledger, item, conditions, saturated=saturated)
-        state = BridgeState(rig, tuple(sequences), tuple(counters), tuple(due_ns), ledger)
+            sendings, sent, ledger = self._sent(sendings, t_ns, output, ledger, conditions)
+        state = BridgeState(rig, tuple(sequences), sendings, ledger)
         return state, TickResult(sent, step_input, output)
 
+    def _sent(
+        self,
+        sendings: tuple[tuple[int, int], ...],
+        t_ns: int,
+        output: StepOutput,
+        ledger: Ledger,
+        conditions: Conditions,
+    ) -> tuple[tuple[tuple[int, int], ...], list[Frame], Ledger]:
+        """The frames that are due."""
+        after = list(sendings)
+        sent: list[Frame] = []
+        for index, item in self._outgoing:
+            number, due_ns = after[index]
+            if t_ns < due_ns:
+                continue
+            report = Report(output, ledger.counts, ledger.told, conditions, number)
+            frame, saturated = item.frame(report, t_ns)
+            sent.append(frame)
+            after[index] = (number + 1, _next_due_ns(due_ns, t_ns, item.period_ns))
+            if item.is_status or saturated:
+                ledger = _told(ledger, item, conditions, saturated=saturated)
+        return tuple(after), sent, ledger
+
     def _received(
-        self, state: BridgeState, t_ns: int, frames: Sequence[Frame]
-    ) -> tuple[RigState, list[Any], list[SequenceState], Ledger, int]:
+        self, state: BridgeState, t_ns: int, frames: Sequence[Frame], acknowledged: bool
+    ) -> tuple[RigState, StepInput, list[SequenceState], Ledger, int]:
         """What the frames of a tick are to the core.
 
         A late tick finds several measurements of one strut. Each is used at its own time, or the
         model would run away under a force that was held for the whole gap.
 
         Returns:
-            The core after all measurements that newer ones followed, what is left as
-            `_step_input` takes it, the counters' states, the ledger, and the gravest action that
-            the limits on measurements ask for.
+            The core after all measurements that newer ones followed, its input of what is left, the
+            counters' states, the ledger, and the gravest action that the limits on measurements
+            ask for.
         """
         rig, ledger, sequences, action = state.rig, state.ledger, list(state.sequences), 0
-        given, struts = self._nothing.copy(), self._struts
+        heights, others = self._no_heights.copy(), _NO_OTHERS.copy()
         for frame in frames:
-            index = self._index.get((frame.arbitration_id, frame.is_extended))
-            if index is None or frame.is_error:
+            source = self._sources[frame.is_extended].get(frame.arbitration_id)
+            if source is None or frame.is_error:
                 ledger = self._foreign(ledger, frame)
                 continue
-            sequence, verdict, values = _accepted(self._incoming[index], sequences[index], frame)
-            sequences[index] = sequence
+            place, read, of_struts, of_others = source
+            sequences[place], verdict, values = read(sequences[place], frame)
             if verdict is not _OK:
-                ledger = self._judged(ledger, index, frame.t_ns, verdict, sequence)
-            if values and self._measured_limits:
-                ledger, asked = self._plausible(ledger, index, frame.t_ns, values)
-                action = max(action, asked)
-                values = values if asked < Action.REFUSE else ()
-            if not values:
+                ledger = self._judged(ledger, place, frame.t_ns, verdict, sequences[place])
+            if values is None:
                 continue
-            places = self._places[index]
-            if self._has_height[index] and given[places[0][1]] is not None:
-                rig, given = self._caught_up(rig, given), self._nothing.copy()
-            for number, place in places:
-                if place >= struts:
-                    given[place] = values[number]
-                else:
-                    arrived_ns = frame.t_ns if frame.t_ns < t_ns else t_ns
-                    given[place] = Measurement(values[number], arrived_ns)
-        return rig, given, sequences, ledger, action
+            if self._measured_limits:
+                ledger, asked = self._plausible(ledger, source, frame.t_ns, values)
+                action = max(action, asked)
+                if asked >= Action.REFUSE:
+                    continue
+            if of_struts and heights[of_struts[0][1]] is not None:
+                rig = self._caught_up(rig, heights, others)
+                heights, others = self._no_heights.copy(), _NO_OTHERS.copy()
+            for number, strut in of_struts:
+                arrived = frame.t_ns if frame.t_ns < t_ns else t_ns
+                heights[strut] = Measurement(values[number], arrived)
+            for number, other in of_others:
+                others[other] = values[number]
+        return rig, _step_input(t_ns, heights, others, acknowledged), sequences, ledger, action
 
-    def _step_input(self, t_ns: int, given: list[Any], *, acknowledged: bool = False) -> StepInput:
-        """Input of the core of what came: the struts' heights, then the `_OTHERS`."""
-        struts = self._struts
-        applied_n, temperature_c, load_cell_n = given[struts:]
-        heights = tuple(given[:struts])
-        return StepInput(t_ns, heights, applied_n, temperature_c, acknowledged, load_cell_n)
-
-    def _caught_up(self, rig: RigState, given: list[Any]) -> RigState:
+    def _caught_up(
+        self, rig: RigState, heights: list[Measurement | None], others: list[float | None]
+    ) -> RigState:
         """The core at the time of measurements that newer ones follow."""
-        arrived_ns = [item.t_ns for item in given[: self._struts] if item]
-        return self._core.step(rig, self._step_input(max(rig.t_ns, *arrived_ns), given))[0]
+        t_ns = max([rig.t_ns, *[item.t_ns for item in heights if item]])
+        return self._core.step(rig, _step_input(t_ns, heights, others))[0]
 
     def _foreign(self, ledger: Ledger, frame: Frame) -> Ledger:
         """After a frame of no incoming message: error frames, or somebody under our ids."""
@@ -299,18 +306,17 @@ class Bridge:
         return (*strays[:index], stray, *strays[index + 1 :]), stray.frames >= RIVAL_FRAMES
 
     def _plausible(
-        self, ledger: Ledger, index: int, arrived_ns: int, values: tuple[float, ...]
+        self, ledger: Ledger, source: _Source, arrived_ns: int, values: tuple[float, ...]
     ) -> tuple[Ledger, int]:
         """The gravest action that an accepted frame's measurements ask for.
 
         A frame is used whole or not at all: from `Action.REFUSE` on it is to be dropped.
         """
         seen, action = list(ledger.seen), 0
-        for number, place in self._places[index]:
-            if place < self._struts:
-                measured = Measurement(values[number], arrived_ns)
-                seen[place], asked = judged(self._measured_limits, seen[place], measured)
-                action = max(action, asked)
+        for number, strut in source[2]:
+            measured = Measurement(values[number], arrived_ns)
+            seen[strut], asked = judged(self._measured_limits, seen[strut], measured)
+            action = max(action, asked)
         if action < Action.REFUSE:
             return replace(ledger, seen=tuple(seen)), action
         counts = ledger.counts
@@ -337,10 +343,29 @@ class Bridge:
             output = StepOutput(mode, struts)
         return rig, output, action
 
-    def _place(self, target: Target) -> int:
-        if target.quantity is Quantity.HEIGHT:
-            return target.strut
-        return self._struts + _OTHERS.index(target.quantity)
+
+def _source(place: int, item: Incoming) -> _Source:
+    of_struts = [
+        (number, target.strut)
+        for number, target in enumerate(item.targets)
+        if target.quantity is Quantity.HEIGHT
+    ]
+    of_others = [
+        (number, _OTHERS.index(target.quantity))
+        for number, target in enumerate(item.targets)
+        if target.quantity is not Quantity.HEIGHT
+    ]
+    return place, item.read, of_struts, of_others
+
+
+def _step_input(
+    t_ns: int,
+    heights: list[Measurement | None],
+    others: list[float | None],
+    acknowledged: bool = False,
+) -> StepInput:
+    applied_n, temperature_c, load_cell_n = others
+    return StepInput(t_ns, tuple(heights), applied_n, temperature_c, acknowledged, load_cell_n)
 
 
 def _noted(ledger: Ledger, output: StepOutput, action: int, conditions: Conditions) -> Ledger:
@@ -364,39 +389,12 @@ def _told(ledger: Ledger, item: Outgoing, conditions: Conditions, *, saturated: 
     return ledger if conditions.bus_fault else replace(ledger, told=counts)
 
 
-def _encoded(item: Outgoing, report: Report, t_ns: int) -> tuple[Frame, bool]:
-    """Frame of a message, and whether one of its values saturated."""
-    payload, saturated = item.encode(item.values(report))
-    if item.protection is not None:
-        payload = protect(payload, report.number, item.protection)
-    message = item.message
-    frame = Frame(t_ns, message.arbitration_id, payload, message.is_extended, message.is_fd)
-    return frame, saturated
-
-
 def _next_due_ns(due_ns: int, t_ns: int, period_ns: int) -> int:
     """On the message's own grid; what was missed is not made up for."""
     if due_ns == t_ns:
         return t_ns + period_ns
     late = (t_ns - due_ns) // period_ns if period_ns else 0
     return due_ns + (late + 1) * period_ns if period_ns else t_ns
-
-
-def _accepted(
-    item: Incoming, sequence: SequenceState, frame: Frame
-) -> tuple[SequenceState, Verdict, tuple[float, ...]]:
-    """State, verdict and values of a frame; no values unless it is accepted whole."""
-    verdict = _OK
-    if item.protection is not None:
-        sequence, verdict = check(sequence, frame.data, frame.t_ns, item.protection)
-        if verdict is not _OK and not verdict.accepted:
-            return sequence, verdict, ()
-    values = item.decode(frame.data)
-    if values is None:
-        # Unprotected: a multiplexed frame without these signals is no fault, a short one is.
-        right_length = len(frame.data) == item.message.length_bytes
-        return sequence, verdict if right_length else Verdict.WRONG_LENGTH, ()
-    return sequence, verdict, values
 
 
 _CAUSES = {

@@ -9,7 +9,8 @@ from msgspec import Struct
 
 from can_dbc.codec import Decoder, Encoder, compile_decoder, compile_encoder
 from can_dbc.database import Message
-from can_dbc.protection import Protection
+from can_dbc.frame import Frame
+from can_dbc.protection import SequenceState, Verdict, compile_checker, compile_protector
 from can_dbc.units import Dimension
 from rig.core.types import Mode, StepOutput
 
@@ -44,21 +45,24 @@ class Target(NamedTuple):
     strut: int
 
 
+Reader = Callable[[SequenceState, Frame], tuple[SequenceState, Verdict, tuple[float, ...] | None]]
+
+
 @dataclass(frozen=True)
 class Incoming:
     """A message of the bench.
 
     Attributes:
         message: Its definition.
-        decode: Payload -> values in SI, in the order of `targets`.
+        read: What is remembered of its counter, and a frame of it -> the same after the frame, what
+            the frame is, and its values in SI in the order of `targets`; None where there are none
+            to be used.
         targets: Where the values go.
-        protection: How its frames are checked; None for an unprotected message.
     """
 
     message: Message
-    decode: Decoder
+    read: Reader
     targets: tuple[Target, ...]
-    protection: Protection | None
 
 
 class Counts(NamedTuple):
@@ -163,18 +167,15 @@ class Outgoing:
 
     Attributes:
         message: Its definition.
-        encode: Values in SI -> payload, and whether one saturated.
-        values: What is sent, in the order of `encode`.
+        frame: What is to be told, and the time in ns -> the frame, and whether one of its values
+            saturated.
         period_ns: Time between two frames.
-        protection: Counter and CRC; None for an unprotected message.
         is_status: Whether it tells of what has happened since the last one of its kind.
     """
 
     message: Message
-    encode: Encoder
-    values: Callable[[Report], Sequence[float]]
+    frame: Callable[[Report, int], tuple[Frame, bool]]
     period_ns: int
-    protection: Protection | None
     is_status: bool = False
 
 
@@ -190,7 +191,32 @@ def incoming(message: Message, targets: Sequence[Target]) -> Incoming:
     """
     names = [target.signal for target in targets]
     decode = compile_decoder(message, names, [target.quantity.dimension for target in targets])
-    return Incoming(message, decode, tuple(targets), message.protection)
+    return Incoming(message, _reader(message, decode), tuple(targets))
+
+
+def _reader(message: Message, decode: Decoder) -> Reader:
+    length, ok = message.length_bytes, Verdict.OK
+
+    def read_unprotected(
+        sequence: SequenceState, frame: Frame
+    ) -> tuple[SequenceState, Verdict, tuple[float, ...] | None]:
+        values = decode(frame.data)
+        # A multiplexed frame without these signals is no fault, a short one is.
+        is_short = values is None and len(frame.data) != length
+        return sequence, Verdict.WRONG_LENGTH if is_short else ok, values
+
+    if message.protection is None:
+        return read_unprotected
+    check = compile_checker(message.protection)
+
+    def read(
+        sequence: SequenceState, frame: Frame
+    ) -> tuple[SequenceState, Verdict, tuple[float, ...] | None]:
+        data = frame.data
+        sequence, verdict = check(sequence, data, frame.t_ns)
+        return sequence, verdict, decode(data) if verdict is ok or verdict.accepted else None
+
+    return read
 
 
 _ESTIMATE = {
@@ -237,7 +263,7 @@ def estimate(message: Message, strut: int) -> Outgoing:
         output = report.output.struts[strut]
         return output.force_n, output.virtual_force_n, output.valid
 
-    return _outgoing(message, _ESTIMATE, values)
+    return _coded(message, _ESTIMATE, values)
 
 
 def kinematics(message: Message, strut: int) -> Outgoing:
@@ -256,7 +282,7 @@ def kinematics(message: Message, strut: int) -> Outgoing:
             output.innovation_m,
         )
 
-    return _outgoing(message, _KINEMATICS, values)
+    return _coded(message, _KINEMATICS, values)
 
 
 def status(message: Message) -> Outgoing:
@@ -285,7 +311,7 @@ def status(message: Message) -> Outgoing:
         )
         return [min(value, limit) for value, limit in zip(raw, limits, strict=True)]
 
-    return _outgoing(message, _STATUS, values, is_status=True)
+    return _coded(message, _STATUS, values, is_status=True)
 
 
 def timing(message: Message) -> Outgoing:
@@ -307,10 +333,10 @@ def timing(message: Message) -> Outgoing:
         # The end of a range says "that much or more" and is no saturation to be told of.
         return encoders[int(paged[0])](paged[1:])[0], False
 
-    return Outgoing(message, encode, values, message.cycle_time_ns or 0, message.protection)
+    return _outgoing(message, encode, values)
 
 
-def _outgoing(
+def _coded(
     message: Message,
     signals: dict[str, Dimension],
     values: Callable[[Report], Sequence[float]],
@@ -318,5 +344,23 @@ def _outgoing(
     is_status: bool = False,
 ) -> Outgoing:
     encode = compile_encoder(message, list(signals), list(signals.values()))
-    period_ns = message.cycle_time_ns or 0
-    return Outgoing(message, encode, values, period_ns, message.protection, is_status)
+    return _outgoing(message, encode, values, is_status=is_status)
+
+
+def _outgoing(
+    message: Message,
+    encode: Encoder,
+    values: Callable[[Report], Sequence[float]],
+    *,
+    is_status: bool = False,
+) -> Outgoing:
+    protect = None if message.protection is None else compile_protector(message.protection)
+    number, is_extended, is_fd = message.arbitration_id, message.is_extended, message.is_fd
+
+    def frame(report: Report, t_ns: int) -> tuple[Frame, bool]:
+        payload, saturated = encode(values(report))
+        if protect is not None:
+            payload = protect(payload, report.number)
+        return Frame(t_ns, number, payload, is_extended, is_fd), saturated
+
+    return Outgoing(message, frame, message.cycle_time_ns or 0, is_status)

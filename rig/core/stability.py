@@ -14,7 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dart_model.plant import DartPlant, PlantState
+from dart_model.plant import DartPlant
 from rig.core.observer import ObserverGains, update
 from rig.core.types import ObserverState
 
@@ -62,7 +62,7 @@ def closed_loop_poles(
 
     def after(x: NDArray[np.float64]) -> NDArray[np.float64]:
         values = x.tolist()
-        state = PlantState(
+        state = plant.state(
             tuple(values[:size]),
             tuple(values[size : 2 * size]),
             tuple(values[2 * size : 2 * size + plant.memory_size]),
@@ -74,7 +74,7 @@ def closed_loop_poles(
         past = rest[2 * count :]
         for _ in range(measured_every):
             state = plant.step(plant.load(state, forces, 0.0, 20.0), period_ns * 1e-9, 0.0)
-        now = [height_m for height_m, _ in plant.kinematics(state)]
+        now = [height_m for height_m, _ in state.struts]
         seen = past[-count:] if delay else now
         updated = [
             update(gain, ObserverState(integral, 0.0, 0.0, 0), height - model, interval_ns)

@@ -46,8 +46,8 @@ class RigCore:
             )
         self._plant = plant
         self._gains = gains
-        # Numbered once: to count along costs as much as to make an object.
-        self._numbered_gains = tuple(enumerate(gains))
+        # Counted once: to count along costs as much as to make an object.
+        self._struts = tuple(range(len(gains)))
         self._supervision = supervision
 
     @property
@@ -115,18 +115,19 @@ class RigCore:
         if temperature_c is None:
             temperature_c = loaded.temperature_c
         plant_state = plant.step(loaded, (t_ns - state.t_ns) * 1e-9, applied_n)
-        kinematics = plant.kinematics(plant_state)
         observers: list[ObserverState] = []
         virtual: list[float] = []
         oldest_ns = t_ns
-        for index, gains in self._numbered_gains:
+        for index in self._struts:
             observer, measured = state.observers[index], step_input.heights[index]
             if measured is not None:
-                height_m, velocity_m_per_s = kinematics[index]
+                height_m, velocity_m_per_s = plant_state.struts[index]
                 measured_ns = measured.t_ns
                 # The model's height when the measurement was true, to first order.
                 model_m = height_m - velocity_m_per_s * (t_ns - measured_ns) * 1e-9
-                observer = update(gains, observer, measured.height_m - model_m, measured_ns)
+                observer = update(
+                    self._gains[index], observer, measured.height_m - model_m, measured_ns
+                )
             observers.append(observer)
             virtual.append(observer.virtual_force_n)
             if observer.measured_ns < oldest_ns:
@@ -147,12 +148,14 @@ class RigCore:
     ) -> tuple[RigState, StepOutput]:
         """State and output at the end of a tick."""
         valid, total = mode is _RUNNING, loaded.applied_force_n
+        motions, forces = loaded.state.struts, loaded.forces_n
+        accelerations = loaded.accelerations_m_per_s2
         published: list[StrutOutput] = []
-        for index, motion in enumerate(loaded.motions):
+        for index in self._struts:
             observer = observers[index]
-            virtual_n, height_m = observer.virtual_force_n, motion.height_m
-            velocity_m_per_s = motion.velocity_m_per_s
-            force_n = motion.force_n + virtual_n
+            height_m, velocity_m_per_s = motions[index]
+            virtual_n = observer.virtual_force_n
+            force_n = forces[index] + virtual_n
             total += force_n + height_m + velocity_m_per_s
             strut = StrutOutput(
                 force_n,
@@ -160,7 +163,7 @@ class RigCore:
                 valid,
                 height_m,
                 velocity_m_per_s,
-                motion.acceleration_m_per_s2,
+                accelerations[index],
                 observer.innovation_m,
             )
             published.append(strut)
@@ -184,8 +187,8 @@ class RigCore:
             forces = [strut.force_n for strut in state.last_valid]
         struts = tuple(
             [
-                StrutOutput(force, 0.0, False, motion.height_m, 0.0, 0.0, 0.0)
-                for force, motion in zip(forces, state.model.motions, strict=True)
+                StrutOutput(force, 0.0, False, height_m, 0.0, 0.0, 0.0)
+                for force, (height_m, _) in zip(forces, state.model.state.struts, strict=True)
             ]
         )
         return StepOutput(state.mode, struts)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from dart_model.effects import effect
-from dart_model.plant import DartPlant, PlantState
+from dart_model.plant import DartPlant
 from dart_model.spec import EffectSpec, ModelSpec
 from rig.identify.output_error import Fit, with_solution
 from rig.identify.reduced import Grid, Model
@@ -67,7 +67,7 @@ def dart_heights(spec: ModelSpec, grid: Grid, start: Array, steps: int = 2) -> A
     given = start[2 * n :]
     if len(given):
         memory[plant.memory_size - len(given) :] = given
-    state = PlantState(
+    state = plant.state(
         tuple(start[:n].tolist()),
         tuple(start[n : 2 * n].tolist()),
         tuple(memory.tolist()),
@@ -82,7 +82,7 @@ def dart_heights(spec: ModelSpec, grid: Grid, start: Array, steps: int = 2) -> A
     for k in range(len(grid.t_s)):
         at = steps * k
         loaded = plant.load(state, none, applied[at], temperature[k])
-        heights[k] = [motion.height_m for motion in loaded.motions]
+        heights[k] = [height_m for height_m, _ in state.struts]
         if k == last:
             break
         for step in range(steps):

@@ -17,10 +17,10 @@ from can_dbc.protection import (
     Protection,
     SequenceState,
     Verdict,
-    check,
     check_crc,
     check_crc_log,
-    protect,
+    compile_checker,
+    compile_protector,
     read_counter,
 )
 from can_dbc.units import Dimension
@@ -50,7 +50,7 @@ def first_profile(write_dbc: Callable[..., Path]) -> Protection:
 
 
 def frame(counter: int, protection: Protection, fill: int = 0x5A) -> bytes:
-    return protect(bytes([fill]) * protection.length_bytes, counter, protection)
+    return compile_protector(protection)(bytes([fill]) * protection.length_bytes, counter)
 
 
 def judge(
@@ -58,8 +58,9 @@ def judge(
 ) -> tuple[SequenceState, list[Verdict]]:
     """Check frames given as (time in ms, number)."""
     verdicts: list[Verdict] = []
+    check = compile_checker(protection)
     for t_ms, number in frames:
-        state, verdict = check(state, frame(number, protection), round(t_ms * MS), protection)
+        state, verdict = check(state, frame(number, protection), round(t_ms * MS))
         verdicts.append(verdict)
     return state, verdicts
 
@@ -81,7 +82,7 @@ def test_no_error_of_up_to_three_bits_passes(rig: Database) -> None:
         assert protection is not None
         # CRC and ids are linear: whether an error passes depends on the counter, not the payload.
         for counter in range(16):
-            sent = protect(rng.bytes(8), counter, protection)
+            sent = compile_protector(protection)(rng.bytes(8), counter)
             received = errors ^ np.frombuffer(sent, dtype=np.uint8)
             assert not check_crc_log(received, protection).any(), (message.name, counter)
 
@@ -91,7 +92,7 @@ def test_a_refused_frame_leaves_no_trace(protection: Protection) -> None:
     for bit in range(64):
         damaged = bytearray(frame(1, protection))
         damaged[bit // 8] ^= 1 << bit % 8
-        after, verdict = check(state, damaged, MS, protection)
+        after, verdict = compile_checker(protection)(state, damaged, MS)
         assert after == state
         assert verdict in {Verdict.WRONG_CRC, Verdict.MASQUERADE}
         assert not verdict.accepted
@@ -101,7 +102,8 @@ def test_a_refused_frame_leaves_no_trace(protection: Protection) -> None:
 def test_log_agrees_with_frames(request: pytest.FixtureRequest, profile: str) -> None:
     protection: Protection = request.getfixturevalue(profile)
     rng = np.random.default_rng(5)
-    frames = [protect(rng.bytes(protection.length_bytes), i, protection) for i in range(300)]
+    protect = compile_protector(protection)
+    frames = [protect(rng.bytes(protection.length_bytes), i) for i in range(300)]
     data = np.array([list(entry) for entry in frames], dtype=np.uint8)
     assert check_crc_log(data, protection).all()
     data ^= (rng.random(data.shape) < 0.1).astype(np.uint8)
@@ -118,7 +120,7 @@ def test_protected_frames_pass_and_keep_their_payload(
 ) -> None:
     message = rig.message("BENCH_MEASUREMENT")
     assert message.protection is not None
-    sent = protect(payload, counter, message.protection)
+    sent = compile_protector(message.protection)(payload, counter)
     assert check_crc(sent, message.protection)
     assert read_counter(sent) == counter % 16
     names, dimensions = ["HEIGHT", "APPLIED_FORCE"], [Dimension.LENGTH, Dimension.FORCE]
@@ -133,17 +135,17 @@ def test_another_messages_frame_is_a_masquerade(rig: Database) -> None:
                 continue
             for counter in range(16):
                 sent = frame(counter, other.protection)
-                _, verdict = check(INITIAL, sent, 0, message.protection)
+                _, verdict = compile_checker(message.protection)(INITIAL, sent, 0)
                 assert verdict is Verdict.MASQUERADE
 
 
 def test_wrong_length(protection: Protection) -> None:
     for length in (0, 1, 7, 9, 64):
-        state, verdict = check(INITIAL, bytes(length), 0, protection)
+        state, verdict = compile_checker(protection)(INITIAL, bytes(length), 0)
         assert (state, verdict) == (INITIAL, Verdict.WRONG_LENGTH)
         assert not check_crc(bytes(length), protection)
     with pytest.raises(ValueError, match="7 bytes, expected 8"):
-        protect(bytes(7), 0, protection)
+        compile_protector(protection)(bytes(7), 0)
 
 
 def test_frames_in_sequence(protection: Protection) -> None:
@@ -242,7 +244,7 @@ def test_accepted_and_lost_frames_add_up(
     for event, bit in events:
         t_ns += MS
         if event == "repeat":
-            state, verdict = check(state, frame(number - 1, protection), t_ns, protection)
+            state, verdict = compile_checker(protection)(state, frame(number - 1, protection), t_ns)
         elif event == "lose":
             number += 1
             continue
@@ -251,7 +253,7 @@ def test_accepted_and_lost_frames_add_up(
             number += 1
             if event == "corrupt":
                 data[bit // 8] ^= 1 << bit % 8
-            state, verdict = check(state, data, t_ns, protection)
+            state, verdict = compile_checker(protection)(state, data, t_ns)
         if verdict.accepted:
             assert event != "corrupt"
             accepted.append(number - 1)
@@ -268,4 +270,4 @@ def test_first_profile_counts_to_fourteen(first_profile: Protection) -> None:
     assert verdicts == [Verdict.FIRST] + [Verdict.OK] * 39
     damaged = bytearray(frame(3, first_profile))
     damaged[4] ^= 1
-    assert check(INITIAL, damaged, 0, first_profile)[1] is Verdict.WRONG_CRC
+    assert compile_checker(first_profile)(INITIAL, damaged, 0)[1] is Verdict.WRONG_CRC

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from can_dbc.database import DEFAULT_DATABASE, load_database
-from can_dbc.protection import INITIAL, Verdict, check, protect
+from can_dbc.protection import INITIAL, Verdict, compile_checker, compile_protector
 from can_dbc.protection_log import in_sequence
 
 MESSAGE = load_database(DEFAULT_DATABASE).message("BENCH_MEASUREMENT")
@@ -35,12 +35,12 @@ def test_the_frequent_case_is_judged_as_frame_by_frame(steps):
     for index, (step, cycles, fault) in enumerate(steps):
         counter += step
         now_ns += cycles * 1_000_000
-        data = bytearray(protect(bytes(length), counter, protection))
+        data = bytearray(compile_protector(protection)(bytes(length), counter))
         data[-1] ^= 0x04 if fault == "flip" else 0
         data = data[: length - (fault == "short")]
         payloads[index, : len(data)] = np.frombuffer(data, dtype=np.uint8)
         lengths[index], t_ns[index] = len(data), now_ns
-        state, verdict = check(state, data, now_ns, protection)
+        state, verdict = compile_checker(protection)(state, data, now_ns)
         verdicts.append(verdict)
     follows = in_sequence(payloads, lengths, t_ns, protection)
     assert not follows[:1].any()

@@ -37,13 +37,13 @@ def test_a_law_s_force_is_in_the_strut(name):
     plant = with_effect(name)
     state = plant.initial([0.43], [0.2])
     memory = tuple(0.01 * (k + 1) for k in range(law.state_size))
-    state = PlantState(state.positions, state.velocities, memory, 1.5)
-    ((height_m, velocity),) = plant.kinematics(state)
+    state = plant.state(state.positions, state.velocities, memory, 1.5)
+    ((height_m, velocity),) = state.struts
     values = [parameters[item.name] for item in law.parameters]
     expected = law.force(1.5, height_m, velocity, 30.0, AMBIENT_C, memory, values, STRUT)
-    (motion,) = plant.load(state, (0.0,), 30.0, AMBIENT_C).motions
+    (force_n,) = plant.load(state, (0.0,), 30.0, AMBIENT_C).forces_n
     linear = -500.0 * (height_m - 0.5) - 100.0 * velocity
-    assert motion.force_n == pytest.approx(linear + expected, rel=1e-12, abs=1e-9)
+    assert force_n == pytest.approx(linear + expected, rel=1e-12, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", sorted(CATALOGUE))
@@ -69,7 +69,7 @@ def test_no_effect_changes_nothing():
 def accelerations(plant: DartPlant, heights: tuple[float, ...], applied_n: float) -> list[float]:
     without = (0.0,) * len(heights)
     loaded = plant.load(plant.initial(heights), without, applied_n, AMBIENT_C)
-    return [motion.acceleration_m_per_s2 for motion in loaded.motions]
+    return loaded.accelerations_m_per_s2
 
 
 def test_an_added_mass_has_inertia_and_weight():
@@ -103,15 +103,16 @@ def test_memory_relaxes_as_the_maxwell_branch_does():
     plant = with_effect("maxwell", heavy, **parameters)
 
     def branch_n(state: PlantState) -> float:
-        (motion,) = plant.load(state, (0.0,), 0.0, AMBIENT_C).motions
-        return motion.force_n + 500.0 * (motion.height_m - 0.5) + 100.0 * motion.velocity_m_per_s
+        ((height_m, velocity_m_per_s),) = state.struts
+        (force_n,) = plant.load(state, (0.0,), 0.0, AMBIENT_C).forces_n
+        return force_n + 500.0 * (height_m - 0.5) + 100.0 * velocity_m_per_s
 
     state = plant.initial([0.5], [0.3])
     for _ in range(100):
         state = plant.step(plant.load(state, (0.0,), 0.0, AMBIENT_C), 1e-3, 0.0)
     start_n = branch_n(state)
     assert start_n == pytest.approx(-1000.0 * 0.05 * 0.3 * (1.0 - math.exp(-0.1 / 0.05)), rel=1e-3)
-    still = PlantState(state.positions, (0.0,), state.memory, state.t_s)
+    still = plant.state(state.positions, (0.0,), state.memory, state.t_s)
     for _ in range(50):
         still = plant.step(plant.load(still, (0.0,), 0.0, AMBIENT_C), 1e-3, 0.0)
     assert branch_n(still) == pytest.approx(start_n * math.exp(-1.0), rel=1e-4)

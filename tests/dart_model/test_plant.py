@@ -110,7 +110,7 @@ def test_free_oscillation_follows_the_closed_form(mass, frequency_hz, ratio, sta
     phase = damped * duration_s
     decay = math.exp(-ratio * natural * duration_s)
     expected = start_m * decay * (math.cos(phase) + ratio * natural / damped * math.sin(phase))
-    ((height_m, _),) = plant.kinematics(state)
+    ((height_m, _),) = state.struts
     assert height_m - rest_m == pytest.approx(expected, abs=2e-6)
 
 
@@ -129,7 +129,7 @@ def test_forced_oscillation_has_the_amplitude_of_the_transfer_function():
             lambda t: 100.0 * math.sin(omega * t),
         )
         expected = (response * np.exp(1j * omega * duration_s)).imag
-        ((height_m, _),) = plant.kinematics(after)
+        ((height_m, _),) = after.struts
         assert height_m - 0.5 + mass * GRAVITY / stiffness == pytest.approx(expected, abs=1e-6)
 
 
@@ -173,7 +173,7 @@ def test_order_of_convergence_is_two_or_more_where_bodies_turn(joint):
     spec = parse_model(PENDULUM.replace("JOINT", joint).replace("AXIS", axis), "pendulum.yaml")
     plant = whole_steps(DartPlant(spec))
     count = plant.coordinates
-    state = PlantState(
+    state = plant.state(
         tuple(0.3 * math.sin(k + 1.0) for k in range(count)),
         tuple(0.8 * math.cos(2.0 * k) for k in range(count)),
         (),
@@ -212,19 +212,18 @@ def test_nothing_is_remembered_between_calls(joint):
     spec = one_body() if joint == "prismatic" else free_bodies()
     plant = DartPlant(spec)
     count = plant.coordinates
-    state = PlantState((0.31,) * count, (0.7,) * count, (), 0.2)
-    other = PlantState((-0.9,) * count, (-3.0,) * count, (), 7.0)
+    state = plant.state((0.31,) * count, (0.7,) * count, (), 0.2)
+    other = plant.state((-0.9,) * count, (-3.0,) * count, (), 7.0)
     virtual = (12.0,) * len(spec.struts)
 
     def answer() -> tuple[object, ...]:
         loaded = plant.load(state, virtual, 5.0, AMBIENT_C)
         after = plant.step(loaded, 1e-3, 6.0)
-        return after, loaded.motions
+        return after, loaded.forces_n, loaded.accelerations_m_per_s2
 
     first = answer()
     plant.step(plant.load(other, virtual, -40.0, 80.0), 3e-3, 9.0)
     plant.guided()
-    plant.kinematics(other)
     assert answer() == first
 
 
@@ -234,7 +233,7 @@ def free_bodies(damping: float = 8.0) -> ModelSpec:
 
 def test_internal_forces_keep_the_momentum_of_free_bodies():
     plant = DartPlant(free_bodies())
-    state = PlantState(
+    state = plant.state(
         (0.0,) * 9 + (0.3, 0.2, 0.5), (0.0,) * 3 + (0.4, -0.1, 0.2) + (0.0,) * 6, (), 0.0
     )
     # Spatial velocities are in the body's own frame; all start unrotated.
@@ -260,12 +259,12 @@ def test_an_undamped_strut_keeps_the_energy():
     def energy(state: PlantState) -> float:
         skeleton.setPositions(np.array(state.positions))
         skeleton.setVelocities(np.array(state.velocities))
-        ((height_m, _),) = plant.kinematics(state)
+        ((height_m, _),) = state.struts
         skeleton.setPositions(np.array(state.positions))
         kinetic = float(skeleton.computeKineticEnergy())
         return kinetic + 0.5 * 300.0 * (height_m - 0.4) ** 2
 
-    state = PlantState((0.0,) * 9 + (0.3, 0.2, 0.5), (0.2,) * 12, (), 0.0)
+    state = plant.state((0.0,) * 9 + (0.3, 0.2, 0.5), (0.2,) * 12, (), 0.0)
     before = energy(state)
     gains = [energy(simulated(plant, state, 1.0, steps)) - before for steps in (1000, 2000)]
     assert abs(gains[0]) < 1e-5 * before
@@ -277,7 +276,7 @@ def test_struts_take_away_no_degree_of_freedom():
     plant = DartPlant(free_bodies())
     assert plant.coordinates == 12
     positions = (0.0,) * 9 + (0.3, 0.2, 0.5)
-    state = PlantState(positions, (0.0,) * 12, (), 0.0)
+    state = plant.state(positions, (0.0,) * 12, (), 0.0)
     accelerations = plant.load(state, (50.0,), 0.0, AMBIENT_C).acceleration
     assert np.count_nonzero(np.abs(accelerations) > 1e-9) == 12
 
@@ -288,7 +287,7 @@ def test_the_virtual_force_and_the_applied_force_push_as_the_signs_say():
 
     def accelerations(virtual: tuple[float, float], applied_n: float) -> np.ndarray:
         loaded = plant.load(state, virtual, applied_n, AMBIENT_C)
-        return np.array([motion.acceleration_m_per_s2 for motion in loaded.motions])
+        return np.array(loaded.accelerations_m_per_s2)
 
     free = accelerations((0.0, 0.0), 0.0)
     wheel, body = 3.0, 15.0
@@ -333,20 +332,20 @@ struts:
     if length < 0.05:
         return
     gradient = float(end @ turned) / length
-    state = PlantState((angle,), (rate,), (), 0.0)
+    state = plant.state((angle,), (rate,), (), 0.0)
     loaded = plant.load(state, (7.0,), 0.0, AMBIENT_C)
-    (motion,) = loaded.motions
-    assert motion.height_m == pytest.approx(length, abs=1e-12)
-    assert motion.velocity_m_per_s == pytest.approx(gradient * rate, abs=1e-11)
+    ((height_m, velocity_m_per_s),) = state.struts
+    assert height_m == pytest.approx(length, abs=1e-12)
+    assert velocity_m_per_s == pytest.approx(gradient * rate, abs=1e-11)
     force = -1000.0 * (length - 0.5) - 40.0 * gradient * rate
-    assert motion.force_n == pytest.approx(force, abs=1e-8)
+    assert loaded.forces_n[0] == pytest.approx(force, abs=1e-8)
     # The centre of mass is on the axis: only the strut turns the arm.
     angular = (force + 7.0) * gradient / 0.4
     assert loaded.acceleration[0] == pytest.approx(angular, abs=1e-7)
     centripetal = -np.array([end[0] + x, end[1] + z])
     curvature = (float(turned @ turned) + float(end @ centripetal) - gradient**2) / length
     expected = gradient * angular + curvature * rate**2
-    assert motion.acceleration_m_per_s2 == pytest.approx(expected, rel=1e-5, abs=1e-5)
+    assert loaded.accelerations_m_per_s2[0] == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
 def test_struts_between_the_same_bodies_add_up():
@@ -384,7 +383,7 @@ def test_a_long_step_is_divided():
 def test_initial_reaches_heights_and_velocities():
     plant = DartPlant(load_model(MODELS / "quarter_car.yaml"))
     state = plant.initial([0.29, 0.35], [0.1, -0.4])
-    assert plant.kinematics(state) == [
+    assert state.struts == [
         (pytest.approx(0.29), pytest.approx(0.1)),
         (pytest.approx(0.35), pytest.approx(-0.4)),
     ]
@@ -409,10 +408,10 @@ def test_guided_matrices_are_the_equations_of_motion():
         virtual, applied_n = rng.uniform(-50.0, 50.0, 2), float(rng.uniform(-50.0, 50.0))
         state = plant.initial(heights, velocities)
         loaded = plant.load(state, virtual.tolist(), applied_n, AMBIENT_C)
-        forces = np.array([motion.force_n for motion in loaded.motions]) + virtual
+        forces = np.array(loaded.forces_n) + virtual
         push = guided.gravity_n + guided.strut_rows.T @ forces + guided.applied_row * applied_n
         expected = guided.strut_rows @ np.linalg.solve(guided.mass_kg, push)
-        accelerations = [motion.acceleration_m_per_s2 for motion in loaded.motions]
+        accelerations = loaded.accelerations_m_per_s2
         assert accelerations == pytest.approx(expected, abs=1e-10)
         q = np.array(state.positions)
         assert guided.heights_m + guided.strut_rows @ q == pytest.approx(heights)
@@ -428,7 +427,7 @@ def test_a_guide_need_not_be_vertical():
     plant = DartPlant(parse_model(text, "inclined.yaml"))
     loaded = plant.load(plant.initial([0.5]), (0.0,), 10.0, AMBIENT_C)
     # Weight and the applied force act along z, of which the guide takes 4/5.
-    assert loaded.motions[0].acceleration_m_per_s2 == pytest.approx(0.8 * (10.0 / 2.0 - GRAVITY))
+    assert loaded.accelerations_m_per_s2[0] == pytest.approx(0.8 * (10.0 / 2.0 - GRAVITY))
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 from msgspec.structs import replace
 
 from can_dbc.codec import compile_decoder
-from can_dbc.protection import protect
+from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from rig.core.bridge import RIVAL_FRAMES
 from rig.core.types import Mode
@@ -201,7 +201,7 @@ def test_a_second_sender_of_the_benchs_id(row):
     sent = iter(range(5, 100_000))
 
     def rival(frame):
-        return [frame, replace(frame, data=protect(frame.data, next(sent), protection))]
+        return [frame, replace(frame, data=compile_protector(protection)(frame.data, next(sent)))]
 
     ticks = trial.run(END_MS, after(BEGIN_NS, measurements_only(rival)))
     found_ms = first_ms(ticks, lambda tick: tick.counts.second_sender > 0)
@@ -272,13 +272,11 @@ def test_stuck_value(row):
     limits = [{"value": "unchanged_s", "high": 0.02, "action": "refuse"}]
     trial = Trial(limits=limits)
     message = trial.ready.database.message("BENCH_MEASUREMENT")
-    last = []
+    protect, last = compile_protector(message.protection), []
 
     def stuck(frame):
         last.append(frame)
-        return [
-            replace(frame, data=protect(last[0].data, frame.data[1] & 0x0F, message.protection))
-        ]
+        return [replace(frame, data=protect(last[0].data, frame.data[1] & 0x0F))]
 
     ticks = trial.run(END_MS, after(BEGIN_NS, measurements_only(stuck)))
     assert ticks[-1].mode is Mode.SAFE

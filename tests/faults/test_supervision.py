@@ -4,7 +4,7 @@ import pytest
 from msgspec.structs import replace
 
 from can_dbc.codec import compile_decoder
-from can_dbc.protection import protect
+from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from dart_model.yaml_file import InputError, load_validated
 from rig.config import CONFIGS, LimitConfig, RunConfig
@@ -126,9 +126,10 @@ def test_a_measurement_beyond_a_safe_limit_enters_the_safe_state_at_once():
     trial = Trial(limits=[limit("measured_height_m", "safe", low=0.05)])
     message = trial.ready.database.message("BENCH_MEASUREMENT")
     zero = bytes(8)
+    protect = compile_protector(message.protection)
 
     def broken_sensor(frame):
-        return [replace(frame, data=protect(zero, frame.data[1] & 0x0F, message.protection))]
+        return [replace(frame, data=protect(zero, frame.data[1] & 0x0F))]
 
     ticks = trial.run(400, after(BEGIN_NS, measurements_only(broken_sensor)))
     assert ticks[BEGIN_NS // MS - 1].mode is Mode.RUNNING

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from can_dbc.codec import compile_encoder
 from can_dbc.frame import Frame
-from can_dbc.protection import protect
+from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from rig.config import Setup, build_bridge
 from rig.core.messages import Conditions
@@ -45,7 +45,7 @@ def bench_frames(ready: Setup, ticks: int, faults: dict[int, str]) -> dict[int, 
     found: dict[int, list[Frame]] = {}
     for tick in range(ticks):
         payload, _ = encode((0.4 + 0.02 * math.sin(0.02 * tick), 30.0 * math.sin(0.01 * tick)))
-        data = protect(payload, tick, message.protection)
+        data = compile_protector(message.protection)(payload, tick)
         frame = Frame(max(tick * MS - 1000, 0), message.arbitration_id, data)
         fault = faults.get(tick, "")
         found.setdefault(tick, [])

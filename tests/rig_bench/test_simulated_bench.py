@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from can_dbc.codec import compile_decoder
 from can_dbc.database import DEFAULT_DATABASE, DatabaseError, load_database
-from can_dbc.protection import INITIAL, Verdict, check, check_crc, read_counter
+from can_dbc.protection import INITIAL, Verdict, check_crc, compile_checker, read_counter
 from can_dbc.units import Dimension
 from rig.bench.schema import BenchConfigError
 from rig.bench.simulated import RECORDS_KEPT, Bench
@@ -84,7 +84,7 @@ def test_every_frame_passes_its_check(database):
     protection = database.message("BENCH_MEASUREMENT").protection
     state, verdicts = INITIAL, []
     for frame in _frames(_config(), database, 100 * MS_NS):
-        state, verdict = check(state, frame.data, frame.t_ns, protection)
+        state, verdict = compile_checker(protection)(state, frame.data, frame.t_ns)
         verdicts.append(verdict)
     assert verdicts == [Verdict.FIRST] + [Verdict.OK] * 100
 
