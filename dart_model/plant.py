@@ -133,9 +133,10 @@ _Surroundings = tuple[float, float, float]
 """Time (s), applied force (N), temperature (°C)."""
 
 _Acceleration = Callable[
-    [_Value, _Value, _Value, Sequence[float], _Surroundings, list[float]], _Value
+    [_Value, _Value, _Value, float, Sequence[float], float, float, list[float]], _Value
 ]
-"""Position, velocity, held forces, memory, surroundings -> acceleration; writes memory rates."""
+"""Position, velocity, held forces, applied force, memory, time, temperature -> acceleration; writes
+memory rates."""
 
 
 _Put = Callable[[float], None]
@@ -314,7 +315,9 @@ class _Coordinate:
                 force += effects
             forces.append(force)
             held += row * virtual_forces_n[index]
-        acceleration = self._without_effects(q, v, held + of_effects, memory, surroundings, rates)
+        acceleration = self._without_effects(
+            q, v, held + of_effects, applied_force_n, memory, state.t_s, temperature_c, rates
+        )
         accelerations: list[float] = []
         for _, _, _, row in self._struts:
             accelerations.append(row * acceleration)
@@ -336,16 +339,21 @@ class _Coordinate:
         q: float,
         v: float,
         held: float,
+        applied_n: float,
         memory: Sequence[float],
-        surroundings: _Surroundings,
+        t_s: float,
+        temperature_c: float,
         memory_rates: list[float],
     ) -> float:
+        surroundings = (t_s, applied_n, temperature_c)
         for _, strut, offset, row in self._struts:
             if strut.laws:
                 held += row * strut.effects_n(
                     offset + row * q, row * v, memory, surroundings, memory_rates
                 )
-        return self._without_effects(q, v, held, memory, surroundings, memory_rates)
+        return self._without_effects(
+            q, v, held, applied_n, memory, t_s, temperature_c, memory_rates
+        )
 
     def _plain_acceleration(self, skeleton: Any) -> "_Acceleration":
         """DART's acceleration under springs, dampers, what is held, and the applied force."""
@@ -368,11 +376,13 @@ class _Coordinate:
             q: float,
             v: float,
             held: float,
+            applied_n: float,
             _memory: Sequence[float],
-            surroundings: _Surroundings,
+            _t_s: float,
+            _temperature_c: float,
             _memory_rates: list[float],
         ) -> float:
-            put_force(preload + held - stiffness * q - damping * v + applied_row * surroundings[1])
+            put_force(preload + held - stiffness * q - damping * v + applied_row * applied_n)
             solve()
             return get_acceleration()
 
@@ -380,13 +390,15 @@ class _Coordinate:
             q: float,
             v: float,
             held: float,
+            applied_n: float,
             memory: Sequence[float],
-            surroundings: _Surroundings,
+            t_s: float,
+            temperature_c: float,
             memory_rates: list[float],
         ) -> float:
             put_position(q)
             put_velocity(v)
-            return by_force(q, v, held, memory, surroundings, memory_rates)
+            return by_force(q, v, held, applied_n, memory, t_s, temperature_c, memory_rates)
 
         return by_force if _only_force_matters(skeleton) else by_state_and_force
 
@@ -496,14 +508,17 @@ class _Coordinates:
         q: NDArray[np.float64],
         v: NDArray[np.float64],
         held: Sequence[float],
+        applied_n: float,
         memory: Sequence[float],
-        surroundings: _Surroundings,
+        t_s: float,
+        temperature_c: float,
         memory_rates: list[float],
     ) -> NDArray[np.float64]:
         rows, position, velocity = self._rows(q), q.tolist(), v.tolist()
         kinematics = _kinematics(rows, position, velocity)
+        surroundings = (t_s, applied_n, temperature_c)
         forces = self._forces_n(kinematics, memory, surroundings, memory_rates)
-        push = _push(rows, forces, held, surroundings[1])
+        push = _push(rows, forces, held, applied_n)
         return np.array(self._respond(position, velocity, push))
 
     def _rows(self, q: NDArray[np.float64]) -> "_Lists":
@@ -667,16 +682,17 @@ class DartPlant:
                 s2, s3 = [0.0] * len(memory), [0.0] * len(memory)
                 m2 = _advanced(memory, half, s1)
             q2 = moved(q, v, half) if moved else q + half * v
-            now = (t_s + half, applied + half_rise, temperature_c)
-            a2 = acceleration(q2, v + half * a1, held, m2, now, s2)
+            a2 = acceleration(
+                q2, v + half * a1, held, applied + half_rise, m2, t_s + half, temperature_c, s2
+            )
             if memory:
                 m3 = _advanced(_advanced(memory, 2.0 * h, s2), -h, s1)
-            v3 = v + h * a1
-            q3 = moved(q, v3, h) if moved else q + h * v3
+            ahead = v + h * a1
+            q3 = moved(q, ahead, h) if moved else q + h * ahead
             t_s += h
             applied += 2.0 * half_rise
-            now = (t_s, applied, temperature_c)
-            a3 = acceleration(q3, v + h * (2.0 * a2 - a1), held, m3, now, s3)
+            v3 = v + h * (2.0 * a2 - a1)
+            a3 = acceleration(q3, v3, held, applied, m3, t_s, temperature_c, s3)
             mean = v + sixth * (a1 + 2.0 * a2)
             q = moved(q, mean, h) if moved else q + h * mean
             v = v + sixth * (a1 + 4.0 * a2 + a3)
@@ -686,7 +702,7 @@ class DartPlant:
             if count == 0:
                 return self._joints.state(q, v, memory, t_s)
             s1 = [0.0] * self.memory_size
-            a1 = acceleration(q, v, held, memory, now, s1)
+            a1 = acceleration(q, v, held, applied, memory, t_s, temperature_c, s1)
 
     def guided(self) -> GuidedModel | None:
         """The model as constant matrices, or None if its struts do not move on straight guides.

@@ -71,6 +71,8 @@ class RigCore:
             State after this tick, and what it publishes.
         """
         mode, model = state.mode, state.model
+        if mode is _RUNNING and model is not None:
+            return self._observe(state, model, step_input)
         if mode is _SAFE and step_input.acknowledged:
             mode = next_mode(mode, Event.ACKNOWLEDGED)
             state = replace(state, mode=mode, first=(None,) * len(self._gains))
