@@ -68,8 +68,8 @@ class Loaded(Struct, frozen=True, gc=False):
         accelerations_m_per_s2: Second derivative of each strut's height under all forces.
         applied_force_n: Applied force at the state.
         temperature_c: Damper temperature.
-        held: The virtual forces, held until the next state; this and the next three are as the
-            integrator wants them.
+        held: Forces that are held until the next state, the virtual ones among them; this and the
+            next three are as the integrator wants them.
         position: Joint position.
         velocity: Joint velocity.
         acceleration: Joint acceleration.
@@ -276,6 +276,8 @@ class _Coordinate:
             (index, strut, float(offset), float(row)) for index, strut, offset, row in numbered
         ]
         self._applied_row = float(rows.applied[0])
+        # What the springs push where the coordinate is zero.
+        self._preload = sum(row * strut.plain_n(x, 0.0) for _, strut, x, row in self._struts)
         self._without_effects = self._plain_acceleration(skeleton)
         with_effects = any(strut.laws for strut in struts)
         self.acceleration: _Acceleration = (
@@ -305,7 +307,7 @@ class _Coordinate:
         surroundings = (state.t_s, applied_force_n, temperature_c)
         rates = [0.0] * len(memory)
         forces: list[float] = []
-        held = of_effects = 0.0
+        held, of_effects = self._preload, 0.0
         for index, strut, _, row in self._struts:
             height, velocity = state.struts[index]
             force = strut.plain_n(height, velocity)
@@ -359,9 +361,8 @@ class _Coordinate:
         """DART's acceleration under springs, dampers, what is held, and the applied force."""
         # Closures over locals, as they are called three times a tick. The springs and dampers of
         # all struts are summed up once.
-        preload = stiffness = damping = 0.0
-        for _, strut, offset, row in self._struts:
-            preload += row * strut.plain_n(offset, 0.0)
+        stiffness = damping = 0.0
+        for _, strut, _, row in self._struts:
             stiffness += row * strut.stiffness * row
             damping += row * strut.damping * row
         applied_row = self._applied_row
@@ -382,7 +383,7 @@ class _Coordinate:
             _temperature_c: float,
             _memory_rates: list[float],
         ) -> float:
-            put_force(preload + held - stiffness * q - damping * v + applied_row * applied_n)
+            put_force(held - stiffness * q - damping * v + applied_row * applied_n)
             solve()
             return get_acceleration()
 
@@ -671,9 +672,9 @@ class DartPlant:
             h = dt_s / count
         half, sixth = 0.5 * h, h / 6.0
         moved, acceleration = self._moved, self._acceleration
-        memory, t_s = loaded.state.memory, loaded.state.t_s
-        held, temperature_c, applied = loaded.held, loaded.temperature_c, loaded.applied_force_n
-        half_rise = 0.5 * (applied_force_end_n - applied) / count
+        start, held, temperature_c = loaded.state, loaded.held, loaded.temperature_c
+        memory, t_s, applied = start.memory, start.t_s, loaded.applied_force_n
+        rise = (applied_force_end_n - applied) / count
         q, v, a1, s1 = loaded.position, loaded.velocity, loaded.acceleration, loaded.memory_rates
         while True:
             # Kutta's third-order method, in which the stages' velocities drive the positions.
@@ -683,14 +684,14 @@ class DartPlant:
                 m2 = _advanced(memory, half, s1)
             q2 = moved(q, v, half) if moved else q + half * v
             a2 = acceleration(
-                q2, v + half * a1, held, applied + half_rise, m2, t_s + half, temperature_c, s2
+                q2, v + half * a1, held, applied + 0.5 * rise, m2, t_s + half, temperature_c, s2
             )
             if memory:
                 m3 = _advanced(_advanced(memory, 2.0 * h, s2), -h, s1)
             ahead = v + h * a1
             q3 = moved(q, ahead, h) if moved else q + h * ahead
             t_s += h
-            applied += 2.0 * half_rise
+            applied += rise
             v3 = v + h * (2.0 * a2 - a1)
             a3 = acceleration(q3, v3, held, applied, m3, t_s, temperature_c, s3)
             mean = v + sixth * (a1 + 2.0 * a2)

@@ -200,34 +200,21 @@ class Bridge:
             rig, output, action = self._limited(state.rig, rig, output, action)
         if action or output.mode is _HOLD or conditions.overruns or conditions.bus_fault:
             ledger = _noted(ledger, output, action, conditions)
-        sendings, sent = state.sendings, []
-        if output.struts:  # nothing is sent before the first valid measurement
-            sendings, sent, ledger = self._sent(sendings, t_ns, output, ledger, conditions)
-        state = BridgeState(rig, tuple(sequences), sendings, ledger)
-        return state, TickResult(sent, step_input, output)
-
-    def _sent(
-        self,
-        sendings: tuple[tuple[int, int], ...],
-        t_ns: int,
-        output: StepOutput,
-        ledger: Ledger,
-        conditions: Conditions,
-    ) -> tuple[tuple[tuple[int, int], ...], list[Frame], Ledger]:
-        """The frames that are due."""
-        after = list(sendings)
+        sendings = list(state.sendings)
         sent: list[Frame] = []
-        for index, item in self._outgoing:
-            number, due_ns = after[index]
-            if t_ns < due_ns:
-                continue
-            report = Report(output, ledger.counts, ledger.told, conditions, number)
-            frame, saturated = item.frame(report, t_ns)
-            sent.append(frame)
-            after[index] = (number + 1, _next_due_ns(due_ns, t_ns, item.period_ns))
-            if item.is_status or saturated:
-                ledger = _told(ledger, item, conditions, saturated=saturated)
-        return tuple(after), sent, ledger
+        if output.struts:  # nothing is sent before the first valid measurement
+            for index, item in self._outgoing:
+                number, due_ns = sendings[index]
+                if t_ns < due_ns:
+                    continue
+                report = Report(output, ledger.counts, ledger.told, conditions, number)
+                frame, saturated = item.frame(report, t_ns)
+                sent.append(frame)
+                sendings[index] = (number + 1, _next_due_ns(due_ns, t_ns, item.period_ns))
+                if item.is_status or saturated:
+                    ledger = _told(ledger, item, conditions, saturated=saturated)
+        state = BridgeState(rig, tuple(sequences), tuple(sendings), ledger)
+        return state, TickResult(sent, step_input, output)
 
     def _received(
         self, state: BridgeState, t_ns: int, frames: Sequence[Frame], acknowledged: bool
