@@ -303,22 +303,22 @@ class _Coordinate:
         applied_force_n: float,
         temperature_c: float,
     ) -> Loaded:
-        q, v, memory = state.positions[0], state.velocities[0], state.memory
-        surroundings = (state.t_s, applied_force_n, temperature_c)
-        rates = [0.0] * len(memory)
+        q, v, memory, t_s = state.positions[0], state.velocities[0], state.memory, state.t_s
+        rates = [0.0] * len(memory) if memory else []
         forces: list[float] = []
         held, of_effects = self._preload, 0.0
         for index, strut, _, row in self._struts:
             height, velocity = state.struts[index]
             force = strut.plain_n(height, velocity)
             if strut.laws:
+                surroundings = (t_s, applied_force_n, temperature_c)
                 effects = strut.effects_n(height, velocity, memory, surroundings, rates)
                 of_effects += row * effects
                 force += effects
             forces.append(force)
             held += row * virtual_forces_n[index]
         acceleration = self._without_effects(
-            q, v, held + of_effects, applied_force_n, memory, state.t_s, temperature_c, rates
+            q, v, held + of_effects, applied_force_n, memory, t_s, temperature_c, rates
         )
         accelerations: list[float] = []
         for _, _, _, row in self._struts:

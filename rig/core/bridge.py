@@ -31,7 +31,11 @@ _OK, _HOLD = Verdict.OK, Mode.HOLD
 _OTHERS = (Quantity.APPLIED_FORCE, Quantity.TEMPERATURE, Quantity.LOAD_CELL_FORCE)
 """What comes beside heights, as the core is given it."""
 
-_NO_OTHERS: list[float | None] = [None] * len(_OTHERS)
+_Heights = list[Measurement | None]
+_Others = list[float | None]
+"""What came of each strut, and of each of `_OTHERS`."""
+
+_NO_OTHERS: _Others = [None] * len(_OTHERS)
 
 RIVAL_FRAMES = 12
 """Frames out of sequence, one hardly after the other, that only a second sender explains: a sender
@@ -134,7 +138,7 @@ class Bridge:
         self._incoming = tuple(incoming)
         # Numbered once: to count along costs as much as to make two small objects.
         self._outgoing = tuple(enumerate(outgoing))
-        self._no_heights: list[Measurement | None] = [None] * core.struts
+        self._no_heights: _Heights = [None] * core.struts
         # By whether the id is extended, then by the id: half the time that a pair takes as a key.
         self._sources: tuple[dict[int, _Source], dict[int, _Source]] = ({}, {})
         for index, item in enumerate(incoming):
@@ -192,8 +196,11 @@ class Bridge:
         Returns:
             State after the tick, and what it did.
         """
-        rig, step_input, sequences, ledger, action = self._received(
-            state, t_ns, frames, conditions.acknowledged
+        rig, heights, others, sequences, ledger, action = self._received(state, t_ns, frames)
+        applied_n, temperature_c, load_cell_n = others
+        acknowledged = conditions.acknowledged
+        step_input = StepInput(
+            t_ns, tuple(heights), applied_n, temperature_c, acknowledged, load_cell_n
         )
         rig, output = self._core.step(rig, step_input)
         if self._limits or action:
@@ -217,17 +224,17 @@ class Bridge:
         return state, TickResult(sent, step_input, output)
 
     def _received(
-        self, state: BridgeState, t_ns: int, frames: Sequence[Frame], acknowledged: bool
-    ) -> tuple[RigState, StepInput, list[SequenceState], Ledger, int]:
+        self, state: BridgeState, t_ns: int, frames: Sequence[Frame]
+    ) -> tuple[RigState, _Heights, _Others, list[SequenceState], Ledger, int]:
         """What the frames of a tick are to the core.
 
         A late tick finds several measurements of one strut. Each is used at its own time, or the
         model would run away under a force that was held for the whole gap.
 
         Returns:
-            The core after all measurements that newer ones followed, its input of what is left, the
-            counters' states, the ledger, and the gravest action that the limits on measurements
-            ask for.
+            The core after all measurements that newer ones followed; what is left of heights and
+            others; the counters' states, the ledger, and the gravest action that the limits on
+            measurements ask for.
         """
         rig, ledger, sequences, action = state.rig, state.ledger, list(state.sequences), 0
         heights, others = self._no_heights.copy(), _NO_OTHERS.copy()
@@ -255,14 +262,16 @@ class Bridge:
                 heights[strut] = Measurement(values[number], arrived)
             for number, other in of_others:
                 others[other] = values[number]
-        return rig, _step_input(t_ns, heights, others, acknowledged), sequences, ledger, action
+        return rig, heights, others, sequences, ledger, action
 
-    def _caught_up(
-        self, rig: RigState, heights: list[Measurement | None], others: list[float | None]
-    ) -> RigState:
+    def _caught_up(self, rig: RigState, heights: _Heights, others: _Others) -> RigState:
         """The core at the time of measurements that newer ones follow."""
         t_ns = max([rig.t_ns, *[item.t_ns for item in heights if item]])
-        return self._core.step(rig, _step_input(t_ns, heights, others))[0]
+        applied_n, temperature_c, load_cell_n = others
+        step_input = StepInput(
+            t_ns, tuple(heights), applied_n, temperature_c, load_cell_force_n=load_cell_n
+        )
+        return self._core.step(rig, step_input)[0]
 
     def _foreign(self, ledger: Ledger, frame: Frame) -> Ledger:
         """After a frame of no incoming message: error frames, or somebody under our ids."""
@@ -343,16 +352,6 @@ def _source(place: int, item: Incoming) -> _Source:
         if target.quantity is not Quantity.HEIGHT
     ]
     return place, item.read, of_struts, of_others
-
-
-def _step_input(
-    t_ns: int,
-    heights: list[Measurement | None],
-    others: list[float | None],
-    acknowledged: bool = False,
-) -> StepInput:
-    applied_n, temperature_c, load_cell_n = others
-    return StepInput(t_ns, tuple(heights), applied_n, temperature_c, acknowledged, load_cell_n)
 
 
 def _noted(ledger: Ledger, output: StepOutput, action: int, conditions: Conditions) -> Ledger:

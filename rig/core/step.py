@@ -117,8 +117,9 @@ class RigCore:
         if temperature_c is None:
             temperature_c = loaded.temperature_c
         plant_state = plant.step(loaded, (t_ns - state.t_ns) * 1e-9, applied_n)
-        observers: list[ObserverState] = []
-        virtual: list[float] = []
+        # Tuples that grow: for the few struts that there are, less work than lists made tuples.
+        observers: tuple[ObserverState, ...] = ()
+        virtual: tuple[float, ...] = ()
         oldest_ns = t_ns
         for index in self._struts:
             observer, measured = state.observers[index], step_input.heights[index]
@@ -130,15 +131,15 @@ class RigCore:
                 observer = update(
                     self._gains[index], observer, measured.height_m - model_m, measured_ns
                 )
-            observers.append(observer)
-            virtual.append(observer.virtual_force_n)
+            observers += (observer,)
+            virtual += (observer.virtual_force_n,)
             if observer.measured_ns < oldest_ns:
                 oldest_ns = observer.measured_ns
         loaded = plant.load(plant_state, virtual, applied_n, temperature_c)
         mode, age_ns = state.mode, t_ns - oldest_ns
         if mode is not _RUNNING or age_ns > self._supervision.stale_after_ns:
             mode = next_mode(mode, age_event(self._supervision, age_ns))
-        return self._published(state, t_ns, mode, tuple(observers), loaded)
+        return self._published(state, t_ns, mode, observers, loaded)
 
     def _published(
         self,
@@ -152,7 +153,7 @@ class RigCore:
         valid, total = mode is _RUNNING, loaded.applied_force_n
         motions, forces = loaded.state.struts, loaded.forces_n
         accelerations = loaded.accelerations_m_per_s2
-        published: list[StrutOutput] = []
+        struts: tuple[StrutOutput, ...] = ()
         for index in self._struts:
             observer = observers[index]
             height_m, velocity_m_per_s = motions[index]
@@ -168,13 +169,12 @@ class RigCore:
                 accelerations[index],
                 observer.innovation_m,
             )
-            published.append(strut)
+            struts += (strut,)
         # A model that has diverged says nothing of use, and would not come back by itself. DART
         # hides it: what is not finite has an acceleration of zero there.
         if mode is _SAFE or not -_SENSELESS < total < _SENSELESS:
             state = replace(before, t_ns=t_ns, mode=Mode.SAFE)
             return state, self._safe_output(state)
-        struts = tuple(published)
         last_valid = struts if valid else before.last_valid
         temperature_c = loaded.temperature_c
         state = RigState(t_ns, mode, observers, before.first, loaded, temperature_c, last_valid)
