@@ -316,8 +316,8 @@ def _value(field: _Field, raw: int) -> float:
 
 
 _ROUNDING, _MOST_ROUNDED = 1.5 * 2.0**52, 2.0**51
-"""To add this and to take it away rounds a smaller number as `round` does, half to even, but in a
-third of the time: from there on floats are whole."""
+"""To add this and to take it away rounds a smaller number as `round` does, half to even, in little
+more than half the time: from there on floats are whole."""
 
 _Holder = Callable[[float], tuple[int, bool]]
 """Number of steps -> the nearest raw value that is allowed, unsigned, and whether it is another."""
