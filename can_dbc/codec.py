@@ -316,8 +316,9 @@ def _value(field: _Field, raw: int) -> float:
 
 
 _ROUNDING, _MOST_ROUNDED = 1.5 * 2.0**52, 2.0**51
-"""To add this and to take it away rounds a smaller number as `round` does, half to even, in little
-more than half the time: from there on floats are whole."""
+"""Adding the first and taking it away rounds a number below the second in size as `round` does
+(half to even), in little more than half the time: between 2**52 and 2**53 floats are whole
+numbers."""
 
 _Holder = Callable[[float], tuple[int, bool]]
 """Number of steps -> the nearest raw value that is allowed, unsigned, and whether it is another."""

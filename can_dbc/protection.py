@@ -8,7 +8,7 @@ Reference: AUTOSAR, "Specification of SW-C End-to-End Communication Protection L
 profiles 1 (variant 1A) and 2.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, NamedTuple
@@ -142,7 +142,8 @@ def read_counter(data: bytes | bytearray) -> int:
 
 def check_crc(data: bytes | bytearray, protection: Protection) -> bool:
     """Check CRC and data id of one frame; a frame of wrong length fails."""
-    return len(data) == protection.length_bytes and _crc_fits(data, protection.identity)
+    crc = _crc(protection.identity)
+    return len(data) == protection.length_bytes and crc.check(data, crc.identity)
 
 
 Checker = Callable[[SequenceState, bytes | bytearray, int], tuple[SequenceState, Verdict]]
@@ -187,6 +188,7 @@ def compile_checker(protection: Protection) -> Checker:
     # The last one is for counter -1, before the first frame, which nothing follows.
     following = (*range(1, modulus), 0, None)
     silence_ns, (crc_fits, _, identity) = protection.silence_ns, _crc(protection.identity)
+    foreign = [_crc(other) for other in protection.foreign]
 
     def check(
         state: SequenceState, data: bytes | bytearray, t_ns: int
@@ -194,7 +196,7 @@ def compile_checker(protection: Protection) -> Checker:
         if len(data) != length:
             return state, _WRONG_LENGTH
         if not crc_fits(data, identity):
-            return state, _wrong_crc(data, protection)
+            return state, _wrong_crc(data, foreign)
         counter = data[1] & 0x0F
         # The frequent case first: next in sequence and in time.
         if counter == following[state.counter] and t_ns - state.t_ns < silence_ns:
@@ -246,13 +248,8 @@ def _p01_check(data: bytes | bytearray, data_id: int) -> bool:
     return e2e_p01_check(bytearray(data), data_id)
 
 
-def _crc_fits(data: bytes | bytearray, identity: Identity) -> bool:
-    crc = _crc(identity)
-    return crc.check(data, crc.identity)
-
-
-def _wrong_crc(data: bytes | bytearray, protection: Protection) -> Verdict:
-    if any(_crc_fits(data, other) for other in protection.foreign):
+def _wrong_crc(data: bytes | bytearray, foreign: Sequence[_Crc]) -> Verdict:
+    if any(crc.check(data, crc.identity) for crc in foreign):
         return Verdict.MASQUERADE
     return Verdict.WRONG_CRC
 

@@ -358,7 +358,10 @@ class _Coordinate:
         )
 
     def _plain_acceleration(self, skeleton: Any) -> "_Acceleration":
-        """DART's acceleration under springs, dampers, what is held, and the applied force."""
+        """DART's acceleration under springs, dampers, what is held, and the applied force.
+
+        What is held has to include the springs' preload.
+        """
         # Closures over locals, as they are called three times a tick. The springs and dampers of
         # all struts are summed up once.
         stiffness = damping = 0.0

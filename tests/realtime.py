@@ -35,6 +35,7 @@ CLASSIC_CAN_HZ = 3703
 MOST_ERROR = 0.02
 
 _ROUND_NS = 20_000_000
+"""In which a busy process works for its share, and then rests."""
 
 
 def spin(share: float) -> None:
@@ -116,6 +117,13 @@ def show(ended: Ended, rate_hz: float, error: float) -> None:
     print(draw_run(ended))
 
 
+def _share(text: str) -> float:
+    share = float(text)
+    if not 0.0 <= share <= 1.0:
+        raise argparse.ArgumentTypeError(f"{text}: expected 0 to 1")
+    return share
+
+
 def main() -> int:
     """Run it, print the figures, and give the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -125,9 +133,9 @@ def main() -> int:
     parser.add_argument("--no-fifo", action="store_true")
     parser.add_argument(
         "--busy",
-        type=float,
+        type=_share,
         default=1.0,
-        help="share of a core that each takes (0: none)",
+        help="share of its core that each busy process takes (0: no such processes)",
     )
     parser.add_argument("--bare", action="store_true", help="ticks with nothing to do")
     asked = parser.parse_args()

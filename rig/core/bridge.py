@@ -250,7 +250,7 @@ class Bridge:
             if values is None:
                 continue
             if self._measured_limits:
-                ledger, asked = self._plausible(ledger, source, frame.t_ns, values)
+                ledger, asked = self._plausible(ledger, of_struts, frame.t_ns, values)
                 action = max(action, asked)
                 if asked >= Action.REFUSE:
                     continue
@@ -258,8 +258,8 @@ class Bridge:
                 rig = self._caught_up(rig, heights, others)
                 heights, others = self._no_heights.copy(), _NO_OTHERS.copy()
             for number, strut in of_struts:
-                arrived = frame.t_ns if frame.t_ns < t_ns else t_ns
-                heights[strut] = Measurement(values[number], arrived)
+                arrived_ns = frame.t_ns if frame.t_ns < t_ns else t_ns
+                heights[strut] = Measurement(values[number], arrived_ns)
             for number, other in of_others:
                 others[other] = values[number]
         return rig, heights, others, sequences, ledger, action
@@ -302,14 +302,18 @@ class Bridge:
         return (*strays[:index], stray, *strays[index + 1 :]), stray.frames >= RIVAL_FRAMES
 
     def _plausible(
-        self, ledger: Ledger, source: _Source, arrived_ns: int, values: tuple[float, ...]
+        self,
+        ledger: Ledger,
+        of_struts: list[tuple[int, int]],
+        arrived_ns: int,
+        values: tuple[float, ...],
     ) -> tuple[Ledger, int]:
         """The gravest action that an accepted frame's measurements ask for.
 
         A frame is used whole or not at all: from `Action.REFUSE` on it is to be dropped.
         """
         seen, action = list(ledger.seen), 0
-        for number, strut in source[2]:
+        for number, strut in of_struts:
             measured = Measurement(values[number], arrived_ns)
             seen[strut], asked = judged(self._measured_limits, seen[strut], measured)
             action = max(action, asked)

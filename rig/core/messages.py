@@ -46,6 +46,8 @@ class Target(NamedTuple):
 
 
 Reader = Callable[[SequenceState, Frame], tuple[SequenceState, Verdict, tuple[float, ...] | None]]
+"""What is remembered of a message's counter, and a frame of it -> the same after the frame, what
+the frame is, and its values in SI; None where there are none to be used."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +56,7 @@ class Incoming:
 
     Attributes:
         message: Its definition.
-        read: What is remembered of its counter, and a frame of it -> the same after the frame, what
-            the frame is, and its values in SI in the order of `targets`; None where there are none
-            to be used.
+        read: What reads its frames; values are in the order of `targets`.
         targets: Where the values go.
     """
 
@@ -355,12 +355,12 @@ def _outgoing(
     is_status: bool = False,
 ) -> Outgoing:
     protect = None if message.protection is None else compile_protector(message.protection)
-    number, is_extended, is_fd = message.arbitration_id, message.is_extended, message.is_fd
+    arbitration_id, is_extended, is_fd = message.arbitration_id, message.is_extended, message.is_fd
 
     def frame(report: Report, t_ns: int) -> tuple[Frame, bool]:
         payload, saturated = encode(values(report))
         if protect is not None:
             payload = protect(payload, report.number)
-        return Frame(t_ns, number, payload, is_extended, is_fd), saturated
+        return Frame(t_ns, arbitration_id, payload, is_extended, is_fd), saturated
 
     return Outgoing(message, frame, message.cycle_time_ns or 0, is_status)

@@ -46,8 +46,8 @@ class RigCore:
             )
         self._plant = plant
         self._gains = gains
-        # Counted once: to count along costs as much as to make an object.
-        self._struts = tuple(range(len(gains)))
+        # Made once: `enumerate` would make an object for each strut at every tick.
+        self._indices = tuple(range(len(gains)))
         self._supervision = supervision
 
     @property
@@ -121,7 +121,7 @@ class RigCore:
         observers: tuple[ObserverState, ...] = ()
         virtual: tuple[float, ...] = ()
         oldest_ns = t_ns
-        for index in self._struts:
+        for index in self._indices:
             observer, measured = state.observers[index], step_input.heights[index]
             if measured is not None:
                 height_m, velocity_m_per_s = plant_state.struts[index]
@@ -154,7 +154,7 @@ class RigCore:
         motions, forces = loaded.state.struts, loaded.forces_n
         accelerations = loaded.accelerations_m_per_s2
         struts: tuple[StrutOutput, ...] = ()
-        for index in self._struts:
+        for index in self._indices:
             observer = observers[index]
             height_m, velocity_m_per_s = motions[index]
             virtual_n = observer.virtual_force_n

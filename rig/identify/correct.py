@@ -81,13 +81,11 @@ def dart_heights(spec: ModelSpec, grid: Grid, start: Array, steps: int = 2) -> A
     last = len(grid.t_s) - 1
     for k in range(len(grid.t_s)):
         at = steps * k
-        loaded = plant.load(state, none, applied[at], temperature[k])
         heights[k] = [height_m for height_m, _ in state.struts]
         if k == last:
             break
         for step in range(steps):
-            if step > 0:
-                loaded = plant.load(state, none, applied[at + step], temperature[k])
+            loaded = plant.load(state, none, applied[at + step], temperature[k])
             state = plant.step(loaded, lengths[k], applied[at + step + 1])
     return heights
 

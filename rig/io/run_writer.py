@@ -259,7 +259,8 @@ class RunLog:
             self._write_lines()
             self._flush_if_due()
             while self._waiting:
-                self._take(min(_MOST_AT_ONCE, len(self._waiting)))
+                room = _MOST_STEPS - len(self._rows)
+                self._take(min(_MOST_AT_ONCE, room, len(self._waiting)))
                 self._write_lines()
                 self._give_way()
                 self._flush_if_due()
@@ -277,12 +278,15 @@ class RunLog:
         lines: list[str] = []
         for _ in range(count):
             entry = self._waiting.popleft()
-            lines += [self._line(frame, "R") for frame in entry.received]
-            lines += [self._line(frame, "T") for frame in entry.sent]
+            lines += self._lines_of(entry)
             self._rows.append(entry.step)
             if self._captures is not None:
                 self._captures.take(entry)
         self._lines = "".join(lines).encode("ascii")
+
+    def _lines_of(self, entry: Entry) -> list[str]:
+        lines = [self._line(frame, "R") for frame in entry.received]
+        return lines + [self._line(frame, "T") for frame in entry.sent]
 
     def _line(self, frame: Frame, direction: str) -> str:
         return format_frame(frame, self._epoch_ns, self._channel, direction)
@@ -315,17 +319,19 @@ class RunLog:
     def _write_capture(self, capture: Capture) -> None:
         folder = self.folder / "captures" / f"{capture.number:03d}_{capture.why}"
         header = {**self._header, "capture": {"why": capture.why, "t_s": capture.t_ns * 1e-9}}
-        lines: list[str] = []
         rows = StepRows(self._struts)
-        for entry in capture.entries:
-            rows.append(entry.step)
-            lines += [self._line(frame, "R") for frame in entry.received]
-            lines += [self._line(frame, "T") for frame in entry.sent]
         try:
             folder.mkdir(parents=True)
             part = _Part(folder, 0, rows.schema, 0)
-            part.frames.append("".join(lines).encode("ascii"))
-            part.steps.append(rows.serialized())
+            for first in range(0, len(capture.entries), _MOST_AT_ONCE):
+                lines: list[str] = []
+                for entry in capture.entries[first : first + _MOST_AT_ONCE]:
+                    rows.append(entry.step)
+                    lines += self._lines_of(entry)
+                part.frames.append("".join(lines).encode("ascii"))
+                part.steps.append(rows.serialized())
+                rows.clear()
+                self._give_way()
             part.close()
             for name in (MODEL_FILE, DBC_FILE):
                 if (self.folder / name).exists():

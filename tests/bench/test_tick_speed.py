@@ -182,7 +182,7 @@ def test_a_whole_tick_against_the_bare_dart_loop(capsys):
         capsys,
     )
     tick = found["whole tick, frame in and frame out"]
-    # Measured: 2.5, and 5.1 to 5.2 (4.7 to 4.9 by a Python built with its optimisations).
+    # Measured: 2.5, and 5.0 to 5.2 (4.6 to 4.9 by a Python built with its optimisations).
     assert tick / found["DART, array functions"] <= 3.2
     assert tick / found["DART, scalar functions"] <= 6.4
 
