@@ -193,10 +193,11 @@ def test_canplayers_bench_gives_the_same_steps(recorded, bridge, second_vcan, tm
     assert replay(ended.folder).different == 0
     original, again = force_by_measurement(first), force_by_measurement(second)
     both = [frame for frame in again if frame in original]
-    # Where two measurements come to one tick, the steps show the last one alone.
-    assert len(both) > 0.7 * len(again)
-    settled = both[int(SETTLED_S * RATE_HZ) :]
-    assert len(settled) > 5 * RATE_HZ
+    # Where two measurements come to one tick, the steps show the last one alone: in the worst phase
+    # every second one, in either run.
+    assert len(both) > 0.4 * len(again)
+    settled = both[len(both) // 3 :]
+    assert len(settled) > RATE_HZ
     # The same measurement waits longer for its tick in one run than in the other.
     later_s = abs(median_age_ns(second) - median_age_ns(first)) * 1e-9
     steepest_n_per_s = np.abs(np.diff(list(original.values()))).max() * RATE_HZ
