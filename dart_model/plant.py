@@ -12,7 +12,6 @@ for the use in multibody dynamics: Featherstone, "Rigid Body Dynamics Algorithms
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from operator import add, mul
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, cast
@@ -103,26 +102,25 @@ class Driven(NamedTuple):
     memory_rates: list[float]
 
 
-@dataclass(frozen=True)
-class GuidedModel:
-    """A model whose struts move on straight guides, as matrices that DART gave.
+class Mechanics(NamedTuple):
+    """Equations of motion in one configuration, as DART has them.
 
-    Mass matrix, gravity and strut directions are then constant, and the equations of motion are
-    ``mass @ acceleration = gravity + strut_rows.T @ strut_forces + applied_row * applied_force``.
+    ``mass @ acceleration = bias + rows.T @ strut_forces + applied * applied_force``.
 
     Attributes:
-        mass_kg: Generalised mass matrix, shape (n, n).
-        gravity_n: Generalised gravity force, shape (n,).
-        strut_rows: Derivative of strut heights by coordinates, shape (struts, n).
-        heights_m: Strut heights at zero coordinates, shape (struts,).
-        applied_row: Generalised force per newton of applied force, shape (n,).
+        heights_m: Strut heights, shape (struts,).
+        rows: Jacobian of the struts, shape (struts, n).
+        applied: Generalised force per newton of applied force, shape (n,).
+        mass: Mass matrix, shape (n, n).
+        bias: Generalised force of all else: weight, Coriolis and centrifugal forces, springs and
+            dampers of the joints' own, shape (n,).
     """
 
-    mass_kg: NDArray[np.float64]
-    gravity_n: NDArray[np.float64]
-    strut_rows: NDArray[np.float64]
     heights_m: NDArray[np.float64]
-    applied_row: NDArray[np.float64]
+    rows: NDArray[np.float64]
+    applied: NDArray[np.float64]
+    mass: NDArray[np.float64]
+    bias: NDArray[np.float64]
 
 
 _Value = Any
@@ -270,7 +268,7 @@ class _Coordinate:
 
     adds_up = True
 
-    def __init__(self, skeleton: Any, struts: Sequence[_Strut], rows: "_Rows") -> None:
+    def __init__(self, skeleton: Any, struts: Sequence[_Strut], rows: "Rows") -> None:
         numbered = zip(range(len(struts)), struts, rows.offsets_m, rows.struts[:, 0], strict=True)
         self._struts = [
             (index, strut, float(offset), float(row)) for index, strut, offset, row in numbered
@@ -436,12 +434,12 @@ class _Coordinates:
         self,
         skeleton: Any,
         struts: Sequence[_Strut],
-        rows_at: "Callable[[NDArray[np.float64]], _Rows]",
-        constant: "_Rows | None",
+        rows_at: "Callable[[NDArray[np.float64]], Rows]",
+        constant: "Rows | None",
     ) -> None:
         self._skeleton = skeleton
         self._struts = struts
-        self._rows_at = rows_at
+        self.strut_rows = rows_at
         self._constant = None if constant is None else _as_lists(constant)
         dofs = [skeleton.getDof(index) for index in range(int(skeleton.getNumDofs()))]
         self._put: list[tuple[_Put, _Put, _Put]] = [
@@ -526,7 +524,7 @@ class _Coordinates:
         return np.array(self._respond(position, velocity, push))
 
     def _rows(self, q: NDArray[np.float64]) -> "_Lists":
-        return self._constant or _as_lists(self._rows_at(q))
+        return self._constant or _as_lists(self.strut_rows(q))
 
     def _forces_n(
         self,
@@ -556,7 +554,7 @@ class _Coordinates:
     def _turning(self, q: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
         """Time derivative of the struts' rows."""
         h = 1e-6
-        ahead, behind = self._rows_at(self.moved(q, v, h)), self._rows_at(self.moved(q, v, -h))
+        ahead, behind = self.strut_rows(self.moved(q, v, h)), self.strut_rows(self.moved(q, v, -h))
         return (ahead.struts - behind.struts) / (2.0 * h)
 
 
@@ -589,7 +587,7 @@ class DartPlant:
         self._joints: _Joints = (
             _Coordinate(self._skeleton, self._struts, rows)
             if rows is not None and self.coordinates == 1
-            else _Coordinates(self._skeleton, self._struts, self._rows_at, rows)
+            else _Coordinates(self._skeleton, self._struts, self.strut_rows, rows)
         )
         lightest_kg = min(float(body.getMass()) for body in self._bodies.values())
         self.step_s = _stable_step_s(self._struts, lightest_kg)
@@ -615,12 +613,12 @@ class DartPlant:
         target = np.asarray(heights_m, dtype=np.float64)
         q = np.zeros(self.coordinates)
         for _ in range(50):
-            rows = self._rows_at(q)
+            rows = self.strut_rows(q)
             error = target - rows.offsets_m - rows.struts @ q
             if float(np.max(np.abs(error))) < 1e-13:
                 break
             q = q + np.linalg.lstsq(rows.struts, error, rcond=None)[0]
-        rows = self._rows_at(q)
+        rows = self.strut_rows(q)
         if not np.allclose(rows.offsets_m + rows.struts @ q, target, rtol=0.0, atol=1e-9):
             raise InputError(
                 f"model {self.spec.name}: heights {target.tolist()} m: out of the joints' reach"
@@ -708,30 +706,27 @@ class DartPlant:
             s1 = [0.0] * self.memory_size
             a1 = acceleration(q, v, held, applied, memory, t_s, temperature_c, s1)
 
-    def guided(self) -> GuidedModel | None:
-        """The model as constant matrices, or None if its struts do not move on straight guides.
-
-        Raises:
-            InputError: A joint has a spring or a damper of its own, which these matrices leave out.
-        """
+    @property
+    def is_constant(self) -> bool:
+        """Whether mass matrix and Jacobians are the same in every configuration."""
         if self._rows is None:
-            return None
-        for index in range(self.coordinates):
-            dof = self._skeleton.getDof(index)
-            if float(dof.getSpringStiffness()) or float(dof.getDampingCoefficient()):
-                raise InputError(
-                    f"model {self.spec.name}: joint {dof.getName()} has a spring or a "
-                    "damper of its own, expected none: what a strut lacks cannot be told from it; "
-                    "give its stiffness and damping to the strut"
-                )
-        zero = np.zeros(self.coordinates)
-        self._skeleton.setPositions(zero)
-        self._skeleton.setVelocities(zero)
-        mass = np.array(self._skeleton.getMassMatrix(), dtype=np.float64)
-        gravity = -np.array(self._skeleton.getGravityForces(), dtype=np.float64)
-        return GuidedModel(
-            mass, gravity, self._rows.struts, self._rows.offsets_m, self._rows.applied
-        )
+            return False
+        first, *others = [
+            self.mechanics(q, np.zeros_like(q)).mass for q in _sample_positions(self.coordinates)
+        ]
+        return all(np.allclose(first, other, rtol=1e-9, atol=0.0) for other in others)
+
+    def mechanics(self, q: NDArray[np.float64], v: NDArray[np.float64]) -> Mechanics:
+        """Equations of motion at coordinates `q` with velocities `v`, each of shape (n,)."""
+        rows = self.strut_rows(q)
+        skeleton = self._skeleton
+        skeleton.setPositions(q)
+        skeleton.setVelocities(v)
+        skeleton.setForces(np.zeros(self.coordinates))
+        skeleton.computeForwardDynamics()
+        mass = np.array(skeleton.getMassMatrix(), dtype=np.float64)
+        bias = mass @ np.array(skeleton.getAccelerations(), dtype=np.float64)
+        return Mechanics(rows.offsets_m + rows.struts @ q, rows.struts, rows.applied, mass, bias)
 
     def driven(
         self,
@@ -772,9 +767,9 @@ class DartPlant:
         self._skeleton.computeInverseDynamics()
         return Driven(force, float(dof.getForce()) / row - force, rates)
 
-    def _constant_rows(self) -> "_Rows | None":
+    def _constant_rows(self) -> "Rows | None":
         """The struts' rows if they are the same in every configuration, else None."""
-        first, *others = [self._rows_at(q) for q in _sample_positions(self.coordinates)]
+        first, *others = [self.strut_rows(q) for q in _sample_positions(self.coordinates)]
         same = all(
             np.allclose(a, b, rtol=1e-9, atol=1e-12)
             for other in others
@@ -782,7 +777,7 @@ class DartPlant:
         )
         return first if same else None
 
-    def _rows_at(self, q: NDArray[np.float64]) -> "_Rows":
+    def strut_rows(self, q: NDArray[np.float64]) -> "Rows":
         """Struts linearised at `q`: ``height = offset + row @ q`` holds exactly at `q`."""
         self._skeleton.setPositions(q)
         heights = np.empty(len(self._directions))
@@ -796,10 +791,10 @@ class DartPlant:
             rows[index] = direction @ jacobian
         body = self._bodies[_applied_force_body(self.spec, self._bodies)]
         applied = np.array(self._skeleton.getLinearJacobian(body), dtype=np.float64)[2]
-        return _Rows(heights - rows @ q, rows, applied)
+        return Rows(heights - rows @ q, rows, applied)
 
 
-class _Rows(NamedTuple):
+class Rows(NamedTuple):
     """Struts linearised in a configuration.
 
     Attributes:
@@ -814,7 +809,7 @@ class _Rows(NamedTuple):
 
 
 class _Lists(NamedTuple):
-    """`_Rows` in the form that is read fastest, with the transpose of `struts`."""
+    """`Rows` in the form that is read fastest, with the transpose of `struts`."""
 
     offsets_m: list[float]
     struts: list[list[float]]
@@ -822,7 +817,7 @@ class _Lists(NamedTuple):
     applied: list[float]
 
 
-def _as_lists(rows: _Rows) -> _Lists:
+def _as_lists(rows: Rows) -> _Lists:
     struts = rows.struts
     return _Lists(
         rows.offsets_m.tolist(), struts.tolist(), struts.T.tolist(), rows.applied.tolist()

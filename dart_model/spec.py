@@ -1,13 +1,25 @@
 """What a model is: bodies, joints and struts, as a frozen value read from and written to YAML."""
 
+import re
 import shutil
 from collections import Counter
 from collections.abc import Iterable
+from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PlainSerializer,
+    Tag,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
 
 from dart_model.effects import CATALOGUE, effect
 from dart_model.yaml_file import (
@@ -27,6 +39,29 @@ WORLD = "world"
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_.-]{0,63}$")]
 Vector = tuple[Finite, Finite, Finite]
+
+_PERCENTAGE = re.compile(r"([0-9]{1,20}(?:\.[0-9]{1,40})?) ?%")
+
+
+def _share_of_percentage(value: object) -> float:
+    found = _PERCENTAGE.fullmatch(value) if isinstance(value, str) else None
+    share = float(Decimal(found[1]) / 100) if found else 0.0
+    if not 0.0 < share <= 10.0:
+        raise PydanticCustomError("percentage", "expected a percentage up to 1000 %, such as 20 %")
+    return share
+
+
+def _percentage_of_share(share: float) -> str:
+    # In decimal digits, so that what is written is read back as the same share.
+    return f"{(Decimal(repr(share)) * 100).normalize():f} %"
+
+
+Share = Annotated[
+    float,
+    BeforeValidator(_share_of_percentage),
+    PlainSerializer(_percentage_of_share, return_type=str),
+]
+"""A share of a nominal value, in a model file a percentage such as ``20 %``."""
 
 
 class _Frozen(BaseModel):
@@ -116,6 +151,13 @@ class EffectSpec(_Frozen):
             raise ValueError(
                 f"parameters of {self.name}: {wrong}, expected {', '.join(expected) or 'none'}"
             )
+        for item in effect(self.name).parameters:
+            value = self.parameters[item.name]
+            if not item.low <= value <= item.high:
+                limits = f"{item.low:.10g} to {item.high:.10g} {item.unit}".rstrip()
+                raise ValueError(
+                    f"parameters of {self.name}: {item.name} = {value}: expected {limits}"
+                )
         return self
 
     def values(self) -> list[float]:
@@ -151,6 +193,26 @@ class StrutSpec(_Frozen):
         return self
 
 
+class Tolerance(_Frozen):
+    """How far the bench may be from the model's own numbers: one standard deviation each.
+
+    A diagnosis takes it as what is known before the recordings; what is not given is not known.
+
+    Attributes:
+        mass_kg: Share of each mass.
+        stiffness_n_per_m: Share of each strut's stiffness.
+        damping_n_s_per_m: Share of each strut's damping.
+        preload_n: Constant force in each strut, in N.
+        input_gain: Share of the applied force.
+    """
+
+    mass_kg: Share | None = None
+    stiffness_n_per_m: Share | None = None
+    damping_n_s_per_m: Share | None = None
+    preload_n: Positive | None = None
+    input_gain: Share | None = None
+
+
 class ModelSpec(_Frozen):
     """A multibody model of the bench.
 
@@ -160,6 +222,7 @@ class ModelSpec(_Frozen):
         skeleton: Bodies and joints, inline or in a file.
         struts: Spring-dampers; one observer may act on each.
         applied_force_body: Body on which the applied force acts; by default the last strut's upper.
+        tolerance: How far the bench may be from these numbers, if that is known.
         folder: Folder of the model file, where a skeleton file is looked for; not part of the YAML.
     """
 
@@ -171,6 +234,7 @@ class ModelSpec(_Frozen):
     ]
     struts: Annotated[tuple[StrutSpec, ...], Field(min_length=1, max_length=64)]
     applied_force_body: Name | None = None
+    tolerance: Tolerance | None = None
     folder: Annotated[Path, Field(exclude=True)] = Path()
 
     @model_validator(mode="after")

@@ -7,7 +7,6 @@ who asks for help should wait for them.
 import contextlib
 import itertools
 import json
-import math
 import os
 import signal
 import sys
@@ -28,7 +27,7 @@ from dart_model.yaml_file import InputError
 if TYPE_CHECKING:
     from rig.core.types import Mode
     from rig.demo import Case
-    from rig.identify.diagnosis import Diagnosis
+    from rig.diagnosis.outcome import Diagnosis
     from rig.runs import Ended
 
 OK, FAILED, WRONG_INPUT = 0, 1, 2
@@ -64,10 +63,10 @@ def _is_of_input(error: Exception) -> bool:
     if isinstance(error, (InputError, DatabaseError)):
         return True
     from rig.bench.schema import BenchConfigError
-    from rig.identify.records import RecordError
+    from rig.diagnosis.recording import RecordingError
     from rig.io.bus import BusError
 
-    return isinstance(error, (BenchConfigError, BusError, RecordError))
+    return isinstance(error, (BenchConfigError, BusError, RecordingError))
 
 
 @app.command(
@@ -162,12 +161,14 @@ def diagnose_command(
 ) -> None:
     """Trace what the model lacks to named effects, correct it, and judge it on other data."""
     from dart_model.spec import load_model, model_file
-    from rig.diagnose import diagnose_runs
+    from rig.diagnosis.command import diagnose_runs
+    from rig.pages.report import write_report
 
     spec = load_model(model_file(model, Path()))
     with _bar() as bar:
-        diagnosis = diagnose_runs(runs, spec, held_out or [], out, bar)
-    _print_diagnosis(diagnosis, struts=len(spec.struts))
+        result = diagnose_runs(runs, spec, held_out or [], out, bar)
+        write_report(result, out / "report.html")
+    _print_diagnosis(result.diagnosis, struts=len(spec.struts))
     console.print(f"Written: {out}/diagnosis.json, {out}/corrected.yaml, {out}/report.html")
 
 
@@ -514,50 +515,50 @@ def _print_case(case: "Case") -> None:
 
 
 def _print_diagnosis(diagnosis: "Diagnosis", *, struts: int) -> None:
-    from dart_model.effects import effect
-    from rig.identify.report import sentence
-    from rig.identify.report.quantities import value_and_interval
+    from rig.pages.report import sentence
 
     console.print(f"\n[bold]{diagnosis.verdict.replace('_', ' ')}[/]: ", end="")
     console.print(sentence(diagnosis, struts), markup=False)
-    if diagnosis.effects:
-        table = Table("effect", "parameter", "value", "95 % interval", title="What was found")
-        for found in diagnosis.effects:
-            for name, estimate in found.parameters.items():
-                unit = next(p.unit for p in effect(found.name).parameters if p.name == name)
-                row = value_and_interval(estimate, unit)
-                table.add_row(f"{found.family}: {found.name}", name, *row)
+    _print_linear(diagnosis, struts=struts)
+    _print_effects(diagnosis)
+    _print_held_out(diagnosis)
+    for note in diagnosis.notes:
+        console.print(f"- {note}", markup=False)
+
+
+def _print_linear(diagnosis: "Diagnosis", *, struts: int) -> None:
+    from rig.pages.report.tables import linear
+
+    if diagnosis.linear:
+        table = Table(
+            "linear correction", "nominal", "corrected", "95 % interval", "", title="Linear part"
+        )
+        for name, _, strut, *cells in linear(diagnosis):
+            table.add_row(f"{name} ({strut})" if struts > 1 else name, *cells)
         console.print(table)
-    held_out, floor = diagnosis.held_out, diagnosis.noise_floor
+
+
+def _print_effects(diagnosis: "Diagnosis") -> None:
+    from rig.pages.report.tables import effects, existing
+
+    missing, changed = effects(diagnosis), existing(diagnosis)
+    if missing:
+        table = Table("effect", "parameter", "value", "95 % interval", title="What is missing")
+        for law, _, rows in missing:
+            for *_, value, interval, _, key in rows:
+                table.add_row(f"{law.family}: {law.name}", key, value, interval)
+        console.print(table)
+    for law, note, rows in changed:
+        values = [f"{key} {before} → {value}" for _, before, value, _, _, key in rows]
+        console.print(f"- {law.name}, {'; '.join((note, *values))}", markup=False)
+
+
+def _print_held_out(diagnosis: "Diagnosis") -> None:
+    from rig.pages.report.tables import errors
+
     table = Table("on held-out data", "before", "after", "noise floor", title="RMS error")
-    if math.isfinite(held_out.height_rmse_m.before):  # an imposed motion has no height error
-        table.add_row(
-            "height, model running open loop",
-            *(
-                f"{value * 1e3:.4f} mm"
-                for value in (
-                    held_out.height_rmse_m.before,
-                    held_out.height_rmse_m.after,
-                    floor.height_rmse_m,
-                )
-            ),
-        )
-    table.add_row(
-        "force that the model lacks",
-        *(
-            f"{value:.3f} N"
-            for value in (
-                held_out.residual_force_rmse_n.before,
-                held_out.residual_force_rmse_n.after,
-                floor.residual_force_rmse_n,
-            )
-        ),
-    )
-    if held_out.strut_force_rmse_n is not None:
-        strut = held_out.strut_force_rmse_n
-        table.add_row(
-            "strut force against the load cell", f"{strut.before:.3f} N", f"{strut.after:.3f} N", ""
-        )
+    for name, before, after, _, floor, _ in errors(diagnosis):
+        table.add_row(name[:1].lower() + name[1:], before, after, floor)
     console.print(table)
 
 

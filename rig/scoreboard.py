@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, signal
+from scipy import signal
 
 from dart_model.spec import (
     WORLD,
@@ -33,13 +33,16 @@ from dart_model.spec import (
 )
 from dart_model.yaml_file import InputError
 from rig.config import CONFIGS
-from rig.diagnose import CORRECTED_FILE, diagnose_runs, read_record
-from rig.identify.correct import dart_heights
-from rig.identify.diagnosis import Diagnosis
-from rig.identify.judge import first_motion
-from rig.identify.records import Record, RecordError
-from rig.identify.reduced import grid_of, planted, reduced_model, run, start_of
+from rig.diagnosis.command import diagnose_runs
+from rig.diagnosis.on_dart import Simulated, dart_heights
+from rig.diagnosis.outcome import CORRECTED_FILE, Diagnosis
+from rig.diagnosis.problem.build import build
+from rig.diagnosis.problem.contract import Parts, existing_values, nominal
+from rig.diagnosis.problem.free_run import FreeRun
+from rig.diagnosis.recording import Recording, RecordingError, read_recording
+from rig.diagnosis.search.fit import fit
 from rig.imports import Mapping, import_table, load_mapping
+from rig.pages.report import write_report
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -93,8 +96,12 @@ SILVERBOX_TESTS = (
     Part("arrow, no extrapolation", 100, 32_100),
 )
 _SKIPPED_SAMPLES = 50
-_DART_ANGLE = 0.045
-"""Angle of the fastest motion, in rad, within a step of DART whose error does not count."""
+_SLOW = 0.4
+"""Share of the resonance below which a bench answers as its spring."""
+_RESONANCE_HZ = 68.0
+"""Where the Silverbox resonates, roughly; its diagnosis starts from there."""
+_AGREEMENT = 0.02
+"""Share of the error to which DART's steps are settled."""
 
 _CORRECTED = "rig, corrected"
 _MV_PER_M = 1000.0 / 0.1
@@ -231,24 +238,25 @@ def _silverbox(source: Path, out: Path, progress: Progress) -> list[Row]:
         for part, value in zip(SILVERBOX_TESTS, values, strict=True)
     ]
     progress(f"{SILVERBOX}: linear model", 0.05)
-    record = read_record(training)
-    model = driven_start(record, "silverbox")
+    record = read_recording(training)
+    model = driven_start(record, "silverbox", _RESONANCE_HZ)
     began_s = time.monotonic()
     told = _within(progress, SILVERBOX, 0.05, 0.95)
-    specs = [("rig, linear start", model, "here, fitted to the training part")]
+    specs = [("rig, rough start", model, f"here: resonance at {_RESONANCE_HZ:g} Hz, damping ratio 0.05")]
     try:
-        diagnosis = diagnose_runs([training], model, tests, out / "diagnosis", told)
-    except RecordError as error:
+        result = diagnose_runs([training], model, tests, out / "diagnosis", told)
+    except RecordingError as error:
         refused = f"refused: {error}"
         rows += [
             Row(SILVERBOX, part.name, _CORRECTED, None, _MV, refused) for part in SILVERBOX_TESTS
         ]
     else:
-        how = f"here, in {time.monotonic() - began_s:.0f} s: {_named(diagnosis)}"
+        how = f"here, in {time.monotonic() - began_s:.0f} s: {_named(result.diagnosis)}"
+        write_report(result, out / "diagnosis" / "report.html")
         specs.append((_CORRECTED, load_model(out / "diagnosis" / CORRECTED_FILE), how))
     progress(f"{SILVERBOX}: tests", 0.98)
     for part, path in zip(SILVERBOX_TESTS, tests, strict=True):
-        test = read_record(path)
+        test = read_recording(path)
         for name, spec, origin in specs:
             value = open_loop_rmse_m(spec, test, _SKIPPED_SAMPLES) * _MV_PER_M
             rows.append(Row(SILVERBOX, part.name, name, value, _MV, origin))
@@ -267,56 +275,33 @@ def _named(diagnosis: Diagnosis) -> str:
     return f"{diagnosis.verdict.replace('_', ' ')}: {effects or 'nothing found'}"
 
 
-def driven_start(record: Record, name: str) -> ModelSpec:
-    """The linear model of a force-driven bench that runs open loop with the least height error.
+def driven_start(record: Recording, name: str, resonance_hz: float) -> ModelSpec:
+    """A rough linear model of a force-driven bench, as one would write it down from its data sheet.
 
-    Without gravity, because a constant force goes into the free length.
+    The stiffness is the ratio of force to height well below the resonance, the mass follows from
+    the resonance, the damping ratio is 0.05. Without gravity, because a constant force goes into
+    the free length.
 
     Args:
         record: Run with one height and an applied force.
         name: Name of the model.
+        resonance_hz: About where the bench resonates.
     """
     if record.applied_force_n is None:
         raise InputError(f"{record.name}: has no applied_force_n, expected a force-driven bench")
     height_m = record.heights_m[:, 0]
     middle_m = float(np.nanmean(height_m))
-    first = _dynamic_stiffness(record.t_s, height_m - middle_m, record.applied_force_n)
-    model = reduced_model(_one_body(name, first, middle_m))
-    nothing, none = planted(()), np.zeros(0)
-    grid = grid_of(record, model)
-    spread_m = float(np.nanstd(height_m))
-    guess = start_of(model, *first_motion(grid), 0)
-    speed_m_per_s = float(np.nanstd(np.gradient(height_m, record.t_s)))
-    scale = np.array([*first, spread_m, spread_m, speed_m_per_s])
-
-    def missed(x: Array) -> Array:
-        mass_kg, damping, stiffness, offset_m = (float(value) for value in (x * scale)[:4])
-        struts = np.array([[middle_m + offset_m, stiffness, damping, 0.0]])
-        trial = model._replace(mass_kg=np.array([[mass_kg]]), struts=struts)
-        there = run(trial, nothing, none, grid, guess + (x * scale)[4:])
-        if there is None:  # it runs away, so no worse trial is needed
-            return np.full(int(grid.measured.sum()), 1e3)
-        return ((grid.heights_m - there.heights_m)[grid.measured] / spread_m).ravel()
-
-    begin = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
-    found = cast("Any", optimize).least_squares(missed, begin, max_nfev=20)
-    mass_kg, damping, stiffness, offset_m = (float(value) for value in (found.x * scale)[:4])
-    return _one_body(name, (mass_kg, damping, stiffness), middle_m + offset_m)
-
-
-def _dynamic_stiffness(t_s: Array, height_m: Array, force_n: Array) -> tuple[float, float, float]:
-    """Mass, damping and stiffness from spectra: force = (k - m w^2 + i c w) height."""
-    rate_hz = 1.0 / float(np.median(np.diff(t_s)))
+    rate_hz = 1.0 / float(np.median(np.diff(record.t_s)))
     spectra = cast("Any", signal)
-    size = min(4096, len(t_s))
-    frequency_hz, cross = spectra.csd(height_m, force_n, rate_hz, nperseg=size)
-    power = spectra.welch(height_m, rate_hz, nperseg=size)[1]
-    omega = 2.0 * np.pi * frequency_hz[1:]
-    ratio, weight = cross[1:] / power[1:], np.sqrt(power[1:])
-    real = np.column_stack([-(omega**2), np.ones_like(omega)])
-    mass_kg, stiffness = _solved(real * weight[:, np.newaxis], ratio.real * weight)
-    (damping,) = _solved((omega * weight)[:, np.newaxis], ratio.imag * weight)
-    return mass_kg, damping, stiffness
+    size = min(4096, len(record.t_s))
+    moved_m = np.nan_to_num(height_m - middle_m)
+    frequency_hz, cross = spectra.csd(moved_m, record.applied_force_n, rate_hz, nperseg=size)
+    power = spectra.welch(moved_m, rate_hz, nperseg=size)[1]
+    slow = (frequency_hz > 0.0) & (frequency_hz < _SLOW * resonance_hz)
+    stiffness = float(np.real(cross[slow]).sum() / power[slow].sum())
+    omega = 2.0 * np.pi * resonance_hz
+    mass_kg = stiffness / omega**2
+    return _one_body(name, (mass_kg, 0.1 * mass_kg * omega, stiffness), middle_m)
 
 
 def _solved(columns: Array, target: Array) -> list[float]:
@@ -326,7 +311,7 @@ def _solved(columns: Array, target: Array) -> list[float]:
     )
 
 
-def dyno_start(records: Sequence[Record], name: str) -> ModelSpec:
+def dyno_start(records: Sequence[Recording], name: str) -> ModelSpec:
     """The spring and damper that come nearest to a dyno's load cell; a mass of 1 kg, unseen.
 
     Args:
@@ -337,12 +322,12 @@ def dyno_start(records: Sequence[Record], name: str) -> ModelSpec:
     columns: list[Array] = []
     forces: list[Array] = []
     for record in records:
-        if record.strut_force_n is None:
+        if record.strut_forces_n is None:
             raise InputError(f"{record.name}: has no strut_force_n, expected a load cell")
         height_m = record.heights_m[:, 0]
         velocity = np.gradient(height_m, record.t_s)
         columns.append(np.column_stack([middle_m - height_m, -velocity, np.ones_like(height_m)]))
-        forces.append(record.strut_force_n)
+        forces.append(record.strut_forces_n[:, 0])
     stiffness, damping, force_n = _solved(np.concatenate(columns), np.concatenate(forces))
     stiffness, damping = max(stiffness, 1.0), max(damping, 0.0)
     # A constant force is a longer free length, within reason; the rest is left to be found.
@@ -365,31 +350,34 @@ def _one_body(name: str, constants: tuple[float, float, float], free_length_m: f
     )
 
 
-def open_loop_rmse_m(spec: ModelSpec, record: Record, skipped: int) -> float:
-    """Error of a model that runs alone in DART, its start found in the samples that are skipped.
+def open_loop_rmse_m(spec: ModelSpec, record: Recording, skipped: int) -> float:
+    """Error of a free-run simulation in DART, its start found in the samples that are skipped.
 
     Args:
         spec: The model.
         record: Run with an applied force.
         skipped: Samples at the start that do not count.
     """
-    model = reduced_model(spec)
-    grid = grid_of(record, model)
-    head = grid.rows(0, skipped)
-    guess = start_of(model, *first_motion(head), 0)
-    steps = max(2, int(np.ceil(model.fastest_rad_per_s * grid.step_s / _DART_ANGLE)))
-    scale = np.array(
-        [np.nanstd(grid.heights_m), np.nanstd(np.gradient(grid.heights_m[:, 0], grid.t_s))]
-    )
-
-    def missed(x: Array) -> Array:
-        return (
-            head.heights_m - dart_heights(spec, head, guess + x * scale, steps)
-        ).ravel() / scale[0]
-
-    found = cast("Any", optimize).least_squares(missed, np.zeros(2), max_nfev=20)
-    heights_m = dart_heights(spec, grid, guess + np.asarray(found.x) * scale, steps)
-    return float(np.sqrt(np.nanmean((grid.heights_m - heights_m)[skipped:] ** 2)))
+    given, problem = build(spec, [record], 2, None)
+    if not isinstance(problem, FreeRun):
+        raise InputError(f"{record.name}: has no applied_force_n, expected a force-driven bench")
+    (run,) = problem.runs
+    head = np.arange(len(run.grid.t_s)) < skipped
+    heads = problem.with_runs([run._replace(grid=run.grid._replace(fitted=run.grid.fitted & head))])
+    base = nominal(heads)
+    none = np.zeros(len(given.linear))
+    first = Parts(none, existing_values(heads, base), (heads.start(0, base),))
+    found = fit(heads, base, first, none > 0.0, 20, effects=False)
+    if found is None:
+        return float("nan")
+    (start,) = found.parts.starts
+    there = problem.simulated(run, base, found.parts, start)
+    if there is None:
+        return float("nan")
+    model = Simulated(spec, base, found.parts)
+    tolerance = _AGREEMENT * float(np.nanstd(run.grid.heights_m - there.heights_m))
+    heights_m = dart_heights(problem, run, model, start, there.heights_m, tolerance)
+    return float(np.sqrt(np.nanmean((run.grid.heights_m - heights_m)[skipped:] ** 2)))
 
 
 def _damper(folder: Path, out: Path, progress: Progress) -> list[Row]:
@@ -422,15 +410,17 @@ def _damper_rows(
     trained_on: str, runs: list[Path], tests: dict[str, Path], out: Path, progress: Progress
 ) -> list[Row]:
     """Force errors in % of the force's standard deviation, before and after."""
-    model = dyno_start([read_record(path) for path in runs], "mr_damper")
+    model = dyno_start([read_recording(path) for path in runs], "mr_damper")
     names = (f"rig, linear, {trained_on}", f"rig, corrected, {trained_on}")
     try:
-        diagnosis = diagnose_runs(runs, model, list(tests.values()), out, progress)
-    except RecordError as error:
+        result = diagnose_runs(runs, model, list(tests.values()), out, progress)
+    except RecordingError as error:
         return [Row(DAMPER, test, names[1], None, _PERCENT, f"refused: {error}") for test in tests]
+    diagnosis = result.diagnosis
+    write_report(result, out / "report.html")
     rows: list[Row] = []
     for (test, path), figures in zip(tests.items(), diagnosis.held_out.runs, strict=True):
-        force = read_record(path).strut_force_n
+        force = read_recording(path).strut_forces_n
         if force is None or figures.strut_force_rmse_n is None:
             continue
         percent = 100.0 / float(np.std(force))

@@ -14,9 +14,10 @@ from rig.bench.schema import BenchConfig, Effect
 from rig.config import CONFIGS, Setup, load_setup
 from rig.core.types import Mode
 from rig.demo import SETTLED_NS
-from rig.diagnose import CORRECTED_FILE, diagnose_runs
-from rig.identify.diagnosis import Diagnosis, to_json
+from rig.diagnosis.command import diagnose_runs
+from rig.diagnosis.outcome import CORRECTED_FILE, Diagnosis, to_json
 from rig.io.run_log import read_run
+from rig.pages.report import write_report
 from rig.runs import Ended, with_bench
 
 _STRUT = "strut"
@@ -130,21 +131,17 @@ def tell(
     chapter("A second run, with another excitation, is held out")
     held_out = run(1, "held_out", ready, in_lockstep=True)
     chapter("The first run is diagnosed")
-    diagnosis = diagnose_runs(
-        [first.folder],
-        ready.model,
-        [held_out.folder],
-        folder / "diagnosis",
-        diagnosis_progress,
-    )
+    out = folder / "diagnosis"
+    result = diagnose_runs([first.folder], ready.model, [held_out.folder], out, diagnosis_progress)
+    write_report(result, out / "report.html")
     chapter("A fresh run, with the model as it was and with the corrected one")
     before = run(2, "fresh_before", ready, in_lockstep=True)
-    corrected = load_model(folder / "diagnosis" / CORRECTED_FILE)
+    corrected = load_model(out / CORRECTED_FILE)
     after = run(2, "fresh_after", ready.model_copy(update={"model": corrected}), in_lockstep=True)
     story = Story(
         family,
         effect,
-        diagnosis,
+        result.diagnosis,
         (_virtual_force_rms_n(before), _virtual_force_rms_n(after)),
         first,
     )

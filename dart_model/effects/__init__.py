@@ -23,15 +23,31 @@ from dart_model.effects import (
     stop,
     unmodelled_mode,
 )
-from dart_model.effects.contract import Effect, Floats, Force, Parameter, Rate, Writable
+from dart_model.effects.contract import (
+    Bench,
+    Bounds,
+    Effect,
+    Floats,
+    Force,
+    Motion,
+    Parameter,
+    Rate,
+    Start,
+    Writable,
+)
 
 __all__ = [
     "CATALOGUE",
+    "FAMILY_WORDS",
+    "Bench",
+    "Bounds",
     "Effect",
     "Floats",
     "Force",
+    "Motion",
     "Parameter",
     "Rate",
+    "Start",
     "UnknownEffectError",
     "Writable",
     "effect",
@@ -82,6 +98,8 @@ _ALL = (
     nonlinear_damping.END_ZONE_DAMPING,
     hysteresis.BOUC_WEN,
     hysteresis.DAHL,
+    hysteresis.GENERAL_BOUC_WEN,
+    hysteresis.FRICTION_BEHIND_PLAY,
     hysteresis.IWAN,
     hysteresis.MAXWELL,
     fade.TEMPERATURE_FADE,
@@ -96,6 +114,28 @@ _ALL = (
 
 CATALOGUE: Mapping[str, Effect] = MappingProxyType({item.name: item for item in _ALL})
 """Every effect by its name in a model file."""
+
+FAMILY_WORDS: Mapping[str, str] = MappingProxyType(
+    {
+        "preload": "a preload",
+        "stiffness": "another stiffness",
+        "damping": "another damping",
+        "inertia": "another inertia",
+        "input_gain": "a wrong gain of the applied force",
+        "nonlinear_stiffness": "a non-linear spring",
+        "stop": "an end stop",
+        "backlash": "free play",
+        "friction": "friction",
+        "nonlinear_damping": "a non-linear damper",
+        "hysteresis": "hysteresis",
+        "fade": "fade of the damper",
+        "delay": "a delay between the channels",
+        "periodic_force": "a periodic force",
+        "unmodelled_mode": "a further mass on a spring",
+        "restoring_surface": "a force over height and velocity without a name",
+    }
+)
+"""Every family of effects as a phrase with its article."""
 
 
 class UnknownEffectError(ValueError):

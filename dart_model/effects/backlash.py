@@ -2,11 +2,12 @@
 
 import math
 
-from dart_model.effects.contract import Effect, Floats, Parameter
+from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start
+from dart_model.effects.ranges import grid, height, moving, within
 
 _BOTH = "heights on both sides of the free play"
-_CENTRE = Parameter("centre_height_m", "m", -10.0, 10.0, "middle of the free play")
-_GAP = Parameter("gap_m", "m", 1e-5, 2.0, "width of the free play")
+_CENTRE = Parameter("centre_height_m", "m", -1e4, 1e4, "middle of the free play")
+_GAP = Parameter("gap_m", "m", 1e-12, 1e4, "width of the free play")
 
 
 def _dead_zone(
@@ -38,25 +39,62 @@ def _free_play(
     return strut[1] * min(max(height_m - p[0], -half), half)
 
 
+def _centres_m(motion: Motion) -> list[float]:
+    # A zone whose middle the strut does not come near is a linear spring.
+    low, high = _CENTRES(motion)
+    free = [motion.free_length_m] if low <= motion.free_length_m <= high else []
+    return [*free, *motion.heights_m(0.3, 0.5, 0.7)]
+
+
+@moving
+def _backlash_starts(motion: Motion) -> list[Start]:
+    gaps = [share * motion.stroke_m for share in (0.08, 0.25, 0.5)]
+    return grid([1.0], gaps, _centres_m(motion))
+
+
+@moving
+def _free_play_starts(motion: Motion) -> list[Start]:
+    gaps = [share * motion.stroke_m for share in (0.03, 0.1, 0.3)]
+    return grid(_centres_m(motion), gaps)
+
+
+def _gaps(motion: Motion) -> tuple[float, float]:
+    # Play that takes most of the stroke is a pair of stops.
+    return 1e-3 * motion.least_stroke_m, 0.6 * motion.stroke_m
+
+
+_CENTRES = height(-1.0, 2.0)
+_BOUNDS = within(centre_height_m=_CENTRES, gap_m=_gaps)
+
+
 BACKLASH = Effect(
     name="backlash",
     family="backlash",
+    words="free play (backlash)",
     parameters=(
-        Parameter("stiffness_n_per_m", "N/m", 1.0, 1e8, "stiffness beyond the free play"),
+        Parameter("stiffness_n_per_m", "N/m", 1e-12, 1e12, "stiffness beyond the free play"),
         _GAP,
         _CENTRE,
     ),
     force=_dead_zone,
     excitation=_BOTH,
     reference="Nordin and Gutman, Automatica 38 (2002), dead-zone model",
+    starts=_backlash_starts,
+    bounds=_BOUNDS,
+    simpler=("free_play", "linear_stiffness"),
+    shown=("gap_m",),
 )
 
 FREE_PLAY = Effect(
     name="free_play",
     family="backlash",
+    words="free play (of the spring-damper itself)",
     parameters=(_CENTRE, _GAP),
     force=_free_play,
     excitation=_BOTH,
     reference="Nordin and Gutman, Automatica 38 (2002), dead-zone model",
     scaled=(),
+    starts=_free_play_starts,
+    bounds=_BOUNDS,
+    shown=("gap_m",),
 )

@@ -1,7 +1,14 @@
-"""What an effect is: a strut force the seed's spring-damper law does not have."""
+"""What an effect is: a strut force that the linear spring-damper law does not have.
 
-from collections.abc import Callable, MutableSequence, Sequence
+Everything that one needs to know of an effect stands with it: the law, its internal states, where
+a search for its parameters begins and ends, what it degenerates to, where it can be seen, and how
+it is said.
+"""
+
+from collections.abc import Callable, Mapping, MutableSequence, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal, NamedTuple
 
 Floats = Sequence[float]
 Writable = MutableSequence[float]
@@ -13,7 +20,7 @@ Force = Callable[
         float,  # velocity_m_per_s
         float,  # applied_force_n
         float,  # temperature_c
-        Sequence[float],  # state
+        Sequence[float],  # internal state
         Sequence[float],  # parameters, in the order of Effect.parameters
         Sequence[float],  # strut: free length (m), stiffness (N/m), damping (N·s/m), gravity (m/s²)
     ],
@@ -35,7 +42,73 @@ Rate = Callable[
     ],
     None,
 ]
-"""Same arguments as `Force`, then the derivative of the effect's state, written in place."""
+"""Same arguments as `Force`, then the derivative of the internal state, written in place."""
+
+Bench = Literal["force_given", "motion_given"]
+"""Force given, height missed (a free run); or motion given, force missed (a dyno)."""
+
+
+class Motion(NamedTuple):
+    """What a strut did on the recordings: that from which starts and bounds of a law follow.
+
+    Attributes:
+        low_m: Lowest height.
+        high_m: Highest height.
+        speed_m_per_s: Root mean square of the velocity.
+        top_speed_m_per_s: Largest velocity.
+        least_stroke_m: Stroke of the recording with the smallest one.
+        duration_s: Length of the longest recording.
+        step_s: Usual time between samples.
+        free_length_m: Free length of the strut.
+        stiffness_n_per_m: Its stiffness.
+        damping_n_s_per_m: Its damping.
+        mass_kg: Mass that the strut moves.
+        force_n: Root mean square of the force that the linear part leaves over.
+        temperatures_c: Lowest and highest temperature; equal where none was measured.
+        tones: Frequency (Hz) and phase (rad) of the strongest lines of that force.
+    """
+
+    low_m: float
+    high_m: float
+    speed_m_per_s: float
+    top_speed_m_per_s: float
+    least_stroke_m: float
+    duration_s: float
+    step_s: float
+    free_length_m: float
+    stiffness_n_per_m: float
+    damping_n_s_per_m: float
+    mass_kg: float
+    force_n: float
+    temperatures_c: tuple[float, float]
+    tones: tuple[tuple[float, float], ...]
+
+    @property
+    def stroke_m(self) -> float:
+        """Highest less lowest height."""
+        return self.high_m - self.low_m
+
+    def heights_m(self, *shares: float) -> list[float]:
+        """Heights at shares of the stroke."""
+        return [self.low_m + share * self.stroke_m for share in shares]
+
+
+Start = tuple[float, ...]
+"""All parameters of a law. Those in `Effect.scaled` stand for a force of arbitrary size, which a
+linear fit sets."""
+
+Bounds = Mapping[str, tuple[float, float]]
+"""Parameter -> lowest and highest value within a search; what is not named keeps its own bounds."""
+
+
+def no_starts(_: Motion) -> list[Start]:
+    """Of an effect that no search proposes."""
+    return []
+
+
+def no_bounds(_: Motion) -> Bounds:
+    """Of an effect whose parameters keep their own bounds."""
+    return MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -45,8 +118,8 @@ class Parameter:
     Attributes:
         name: Key in the model file, with its unit.
         unit: Unit as printed in reports; empty if dimensionless.
-        low: Smallest value that makes physical sense.
-        high: Largest value that makes physical sense.
+        low: Smallest value that makes physical sense; a model file below it is refused.
+        high: Largest value that makes physical sense; a model file above it is refused.
         meaning: One line for the report.
     """
 
@@ -59,33 +132,55 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Effect:
-    """An effect that a model can be given and that an attribution can find.
+    """An effect that a model can be given and that a diagnosis can find.
 
     A law is written once, in plain scalar arithmetic (`math`, no numpy), so that the plant can call
-    it tick by tick and the attribution can compile the very same function over a whole log.
+    it tick by tick and the diagnosis can compile the very same function over a whole recording.
 
     Attributes:
         name: Key in the model file.
         family: Family as in the diagnosis, e.g. ``friction``.
+        words: The effect as a phrase with its article, the law in brackets.
         parameters: Parameters in the order in which the law reads them.
         force: The law.
-        rate: Derivative of the memory, or None for a law without memory.
-        state_size: Number of memory states; they start at zero.
+        excitation: What a recording must contain for the effect to be seen.
+        reference: Literature.
+        rate: Derivative of the internal state, or None for a law without one.
+        state_scales: Usual size of each internal state, which all start at zero in a live run.
+        fits_state: Whether the state at the beginning of a recording is fitted: states that fade
+            or are overwritten by the motion are, those that add up from the beginning are not.
         adds_mass: The first parameter is a mass in kg which is added to the strut's second body
             (DART carries it, with its weight); `force` is what acts beyond that.
+        linear: Part of every model: a search corrects it and does not propose it.
         scaled: Indices of the parameters which, multiplied together by a factor, multiply the
             force by it; empty where there are none.
-        excitation: What a run must contain for the effect to be seen.
-        reference: Literature.
+        starts: Where a search begins, for a motion; empty where the motion cannot show it.
+        bounds: Where a search ends, for a motion.
+        simpler: Effects to which this one degenerates at the ends of its parameters.
+        benches: Kinds of bench on which it can be seen.
+        shown: Parameters that a sentence about it states.
     """
 
     name: str
     family: str
+    words: str
     parameters: tuple[Parameter, ...]
     force: Force
     excitation: str
     reference: str
     rate: Rate | None = None
-    state_size: int = 0
+    state_scales: tuple[float, ...] = ()
+    fits_state: bool = False
     adds_mass: bool = False
+    linear: bool = False
     scaled: tuple[int, ...] = (0,)
+    starts: Callable[[Motion], list[Start]] = no_starts
+    bounds: Callable[[Motion], Bounds] = no_bounds
+    simpler: tuple[str, ...] = ()
+    benches: tuple[Bench, ...] = ("force_given", "motion_given")
+    shown: tuple[str, ...] = ()
+
+    @property
+    def state_size(self) -> int:
+        """Number of internal states."""
+        return len(self.state_scales)

@@ -19,8 +19,11 @@ def _force(
 LINEAR_DAMPING = Effect(
     name="linear_damping",
     family="damping",
-    parameters=(Parameter("damping_n_s_per_m", "N·s/m", -1e5, 1e6, "viscous damping"),),
+    words="linear damping",
+    parameters=(Parameter("damping_n_s_per_m", "N·s/m", -1e12, 1e12, "viscous damping"),),
     force=_force,
     excitation="velocities at more than one frequency",
     reference="Rao, Mechanical Vibrations (2017), 1.9",
+    linear=True,
+    shown=("damping_n_s_per_m",),
 )

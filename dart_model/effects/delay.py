@@ -1,6 +1,7 @@
 """Delay between the channels: the force acts later than it was recorded, or heights come late."""
 
-from dart_model.effects.contract import Effect, Floats, Parameter, Writable
+from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start, Writable
+from dart_model.effects.ranges import moving, within
 
 # Padé approximants of exp(-delay * s). An explicit integrator must follow their poles, so a short
 # delay, which needs no more, has a low order and a pole of its own.
@@ -61,16 +62,27 @@ def _rate(
         out[3] = (applied_force_n - highest) / delay
 
 
+@moving
+def _starts(motion: Motion) -> list[Start]:
+    return [(steps * motion.step_s,) for steps in (0.5, 2.0, 5.0, 15.0, 40.0)]
+
+
 DELAY = Effect(
     name="delay",
     family="delay",
+    words="a delay between applied force and height",
     parameters=(
-        Parameter("delay_s", "s", 0.0, 0.5, "time by which the height lags the applied force"),
+        Parameter("delay_s", "s", 0.0, 1e3, "time by which the height lags the applied force"),
     ),
     force=_force,
     excitation="an applied force with frequencies near the inverse of the delay, or changing often",
     reference="Golub and Van Loan, Matrix Computations (2013), 9.3, Padé approximation",
     rate=_rate,
-    state_size=4,
     scaled=(),
+    state_scales=(0.01, 0.01, 0.01, 0.01),
+    fits_state=True,
+    starts=_starts,
+    bounds=within(delay_s=lambda m: (0.0, 200.0 * m.step_s)),
+    benches=("force_given",),
+    shown=("delay_s",),
 )

@@ -2,12 +2,13 @@
 
 import math
 
-from dart_model.effects.contract import Effect, Floats, Parameter, Writable
+from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start, Writable
+from dart_model.effects.ranges import grid, moving, within
 
 _FAMILY = "fade"
 _REFERENCE = "Dixon, The Shock Absorber Handbook (2007), 7.12, temperature effects"
 _FINAL = Parameter("final_fraction", "", 0.0, 3.0, "share of the damping that stays")
-_COLD = Parameter("reference_c", "°C", -100.0, 300.0, "temperature with full damping")
+_COLD = Parameter("reference_c", "°C", -273.15, 2000.0, "temperature with full damping")
 _LARGEST_EXPONENT = 40.0
 
 
@@ -80,9 +81,53 @@ def _energy_rate(
     out[0] = strut[2] * left * velocity_m_per_s * velocity_m_per_s
 
 
+def _shows_temperature(motion: Motion) -> bool:
+    cold, hot = motion.temperatures_c
+    return hot - cold >= 1.0
+
+
+@moving
+def _temperature_starts(motion: Motion) -> list[Start]:
+    if not _shows_temperature(motion):
+        return []
+    return grid([0.003, 0.015, -0.005], [motion.temperatures_c[0], 20.0])
+
+
+@moving
+def _linear_temperature_starts(motion: Motion) -> list[Start]:
+    if not _shows_temperature(motion):
+        return []
+    return grid([0.01], [motion.temperatures_c[0], 20.0])
+
+
+@moving
+def _time_starts(motion: Motion) -> list[Start]:
+    if motion.damping_n_s_per_m <= 0.0:
+        return []
+    return grid([0.9, 0.5], [share * motion.duration_s for share in (0.1, 0.3, 1.0)])
+
+
+def _work_j(motion: Motion) -> float:
+    # What the damper turns into heat over the longest recording.
+    return motion.damping_n_s_per_m * motion.speed_m_per_s**2 * motion.duration_s
+
+
+@moving
+def _energy_starts(motion: Motion) -> list[Start]:
+    work_j = _work_j(motion)
+    if work_j <= 0.0:
+        return []
+    return grid([0.9, 0.5], [share * work_j for share in (0.1, 0.3, 1.0)])
+
+
+def _energies(motion: Motion) -> tuple[float, float]:
+    return 0.01 * _work_j(motion), 10.0 * _work_j(motion)
+
+
 TEMPERATURE_FADE = Effect(
     name="temperature_fade",
     family=_FAMILY,
+    words="fade of the damper with temperature",
     parameters=(
         Parameter("fraction_per_k", "1/K", -0.2, 0.2, "share of the damping lost per kelvin"),
         _COLD,
@@ -91,11 +136,15 @@ TEMPERATURE_FADE = Effect(
     excitation="a measured temperature that changes by several kelvin",
     reference=_REFERENCE,
     scaled=(),
+    starts=_temperature_starts,
+    simpler=("linear_damping", "linear_temperature_fade"),
+    shown=("fraction_per_k",),
 )
 
 LINEAR_TEMPERATURE_FADE = Effect(
     name="linear_temperature_fade",
     family=_FAMILY,
+    words="fade of the damper with temperature (linear)",
     parameters=(
         Parameter("fraction_per_k", "1/K", -0.2, 0.2, "share of the damping lost per kelvin"),
         _COLD,
@@ -103,32 +152,45 @@ LINEAR_TEMPERATURE_FADE = Effect(
     force=_linear_temperature,
     excitation="a measured temperature that changes by several kelvin",
     reference=_REFERENCE,
+    starts=_linear_temperature_starts,
+    simpler=("linear_damping",),
+    shown=("fraction_per_k",),
 )
 
 TIME_FADE = Effect(
     name="time_fade",
     family=_FAMILY,
+    words="fade of the damper with time",
     parameters=(
         _FINAL,
-        Parameter("time_constant_s", "s", 0.1, 1e5, "time in which the damper warms up"),
+        Parameter("time_constant_s", "s", 1e-9, 1e12, "time in which the damper warms up"),
     ),
     force=_time,
     excitation="a long run with the same motion at its beginning and end",
     reference=_REFERENCE,
     scaled=(),
+    starts=_time_starts,
+    bounds=within(time_constant_s=lambda m: (0.01 * m.duration_s, 10.0 * m.duration_s)),
+    simpler=("linear_damping",),
+    shown=("final_fraction",),
 )
 
 ENERGY_FADE = Effect(
     name="energy_fade",
     family=_FAMILY,
+    words="fade of the damper with dissipated energy",
     parameters=(
         _FINAL,
-        Parameter("energy_j", "J", 1e-3, 1e7, "work in which the damper warms up"),
+        Parameter("energy_j", "J", 1e-12, 1e12, "work in which the damper warms up"),
     ),
     force=_energy,
     excitation="a long run with the same motion at its beginning and end",
     reference=_REFERENCE,
     rate=_energy_rate,
-    state_size=1,
     scaled=(),
+    state_scales=(1.0,),
+    starts=_energy_starts,
+    bounds=within(energy_j=_energies),
+    simpler=("linear_damping",),
+    shown=("final_fraction",),
 )

@@ -34,21 +34,29 @@ def _inerter(
 ADDED_MASS = Effect(
     name="added_mass",
     family="inertia",
-    parameters=(Parameter("mass_kg", "kg", -1e3, 1e4, "mass that moves with the upper body"),),
+    words="inertia (a mass that moves with the upper body)",
+    parameters=(Parameter("mass_kg", "kg", -1e9, 1e9, "mass that moves with the upper body"),),
     force=_mass,
     excitation="frequencies above and below the resonance, so that mass and stiffness differ",
     reference="Featherstone, Rigid Body Dynamics Algorithms (2008), 2.13",
     adds_mass=True,
+    linear=True,
+    benches=("force_given",),
+    shown=("mass_kg",),
 )
 
 INERTER = Effect(
     name="inerter",
     family="inertia",
+    words="inertia between the bodies (an inerter)",
     parameters=(
-        Parameter("inertance_kg", "kg", -1e3, 1e4, "force per acceleration, without weight"),
+        Parameter("inertance_kg", "kg", -1e9, 1e9, "force per acceleration, without weight"),
     ),
     force=_inerter,
     excitation="frequencies above and below the resonance, so that mass and stiffness differ",
     reference="Smith, Synthesis of mechanical networks: the inerter, IEEE TAC 47 (2002)",
     adds_mass=True,
+    linear=True,
+    benches=("force_given",),
+    shown=("inertance_kg",),
 )

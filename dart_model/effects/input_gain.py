@@ -19,8 +19,12 @@ def _force(
 INPUT_GAIN = Effect(
     name="input_gain",
     family="input_gain",
+    words="the right gain of the applied force",
     parameters=(Parameter("gain", "", -0.99, 10.0, "share of the applied force that is missing"),),
     force=_force,
     excitation="an applied force of several frequencies or levels",
     reference="Ljung, System Identification (1999), 14.1",
+    linear=True,
+    benches=("force_given",),
+    shown=("gain",),
 )

@@ -19,6 +19,7 @@ def _force(
 NONE = Effect(
     name="none",
     family="none",
+    words="nothing",
     parameters=(),
     force=_force,
     excitation="none",

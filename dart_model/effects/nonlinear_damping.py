@@ -2,13 +2,23 @@
 
 import math
 
-from dart_model.effects.contract import Effect, Floats, Parameter
+from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start
+from dart_model.effects.ranges import (
+    Starts,
+    always,
+    grid,
+    height,
+    moving,
+    of_speed,
+    of_stroke,
+    within,
+)
 
 _FAMILY = "nonlinear_damping"
 _SPEEDS = "velocities that differ by a factor of three or more, in both directions"
 _PLACES = "the same velocities at different heights"
-_DAMPING = Parameter("damping_n_s_per_m", "N·s/m", -1e5, 1e6, "damping")
-_KNEE = Parameter("knee_velocity_m_per_s", "m/s", 1e-3, 10.0, "velocity of the knee")
+_DAMPING = Parameter("damping_n_s_per_m", "N·s/m", -1e12, 1e12, "damping")
+_KNEE = Parameter("knee_velocity_m_per_s", "m/s", 1e-12, 1e6, "velocity of the knee")
 
 
 def _quadratic(
@@ -174,134 +184,219 @@ def _end_zone(
     return -p[0] * max(p[1] - height_m, 0.0) * velocity_m_per_s
 
 
+def _knees(*shares: float) -> Starts:
+    def starts(motion: Motion) -> list[Start]:
+        return [(1.0, share * motion.speed_m_per_s) for share in shares]
+
+    return moving(starts)
+
+
+@moving
+def _saturating_starts(motion: Motion) -> list[Start]:
+    return grid([1.0], [0.3 * motion.speed_m_per_s, motion.speed_m_per_s], [1.0, 4.0])
+
+
+@moving
+def _zone_starts(motion: Motion) -> list[Start]:
+    widths = [0.1 * motion.stroke_m, 0.3 * motion.stroke_m]
+    return grid([1.0], motion.heights_m(0.1, 0.3, 0.5, 0.7, 0.9), widths)
+
+
+@moving
+def _end_zone_starts(motion: Motion) -> list[Start]:
+    # A zone that begins below all heights is never entered.
+    free = [motion.free_length_m] if motion.free_length_m > motion.low_m else []
+    return grid([1.0], [*free, *motion.heights_m(0.2, 0.4, 0.6, 0.8)])
+
+
+def _zone_heights(motion: Motion) -> tuple[float, float]:
+    margin = 0.02 * motion.stroke_m
+    return motion.low_m - margin, max(motion.high_m, motion.free_length_m) + margin
+
+
 QUADRATIC_DAMPING = Effect(
     name="quadratic_damping",
     family=_FAMILY,
+    words="a non-linear damper (quadratic, orifice flow)",
     parameters=(
-        Parameter("damping_n_s2_per_m2", "N·s²/m²", -1e6, 1e7, "force per squared velocity"),
+        Parameter("damping_n_s2_per_m2", "N·s²/m²", -1e18, 1e18, "force per squared velocity"),
     ),
     force=_quadratic,
     excitation=_SPEEDS,
     reference="Dixon, The Shock Absorber Handbook (2007), 6.9, orifice flow",
+    starts=always((1.0,)),
+    simpler=("linear_damping",),
+    shown=("damping_n_s2_per_m2",),
 )
 
 POWER_DAMPING = Effect(
     name="power_damping",
     family=_FAMILY,
+    words="a non-linear damper (power law)",
     parameters=(
-        Parameter("force_at_1_m_per_s_n", "N", -1e6, 1e7, "force at 1 m/s"),
+        Parameter("force_at_1_m_per_s_n", "N", -1e18, 1e18, "force at 1 m/s"),
         Parameter("exponent", "", 0.3, 4.0, "exponent of the velocity"),
     ),
     force=_power,
     excitation=_SPEEDS,
     reference="Symans and Constantinou, Eng. Struct. 20 (1998), fractional velocity damper",
+    starts=always((1.0, 0.5), (1.0, 1.5), (1.0, 2.5)),
+    simpler=("linear_damping", "quadratic_damping"),
+    shown=("force_at_1_m_per_s_n",),
 )
 
 ASYMMETRIC_DAMPING = Effect(
     name="asymmetric_damping",
     family=_FAMILY,
+    words="a non-linear damper (rebound and compression differ)",
     parameters=(
-        Parameter("compression_n_s_per_m", "N·s/m", -1e5, 1e6, "damping while heights fall"),
-        Parameter("rebound_n_s_per_m", "N·s/m", -1e5, 1e6, "damping while heights rise"),
+        Parameter("compression_n_s_per_m", "N·s/m", -1e12, 1e12, "damping while heights fall"),
+        Parameter("rebound_n_s_per_m", "N·s/m", -1e12, 1e12, "damping while heights rise"),
     ),
     force=_asymmetric,
     excitation=_SPEEDS,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.2",
     scaled=(0, 1),
+    starts=always((1.0, 0.0), (0.0, 1.0), (1.0, -1.0)),
+    simpler=("linear_damping",),
+    shown=("compression_n_s_per_m", "rebound_n_s_per_m"),
 )
 
 DIGRESSIVE_DAMPING = Effect(
     name="digressive_damping",
     family=_FAMILY,
+    words="a non-linear damper (digressive)",
     parameters=(_DAMPING, _KNEE),
     force=_digressive,
     excitation=_SPEEDS,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
+    starts=_knees(0.2, 0.6, 1.5),
+    bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
+    simpler=("linear_damping",),
+    shown=("damping_n_s_per_m",),
 )
 
 SATURATING_DAMPING = Effect(
     name="saturating_damping",
     family=_FAMILY,
+    words="a non-linear damper (saturating)",
     parameters=(_DAMPING, _KNEE, Parameter("sharpness", "", 0.5, 12.0, "sharpness of the knee")),
     force=_saturating,
     excitation=_SPEEDS,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
+    starts=_saturating_starts,
+    bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
+    simpler=("linear_damping", "digressive_damping"),
+    shown=("damping_n_s_per_m",),
 )
 
 ARCTAN_DAMPING = Effect(
     name="arctan_damping",
     family=_FAMILY,
+    words="a non-linear damper (arctangent)",
     parameters=(_DAMPING, _KNEE),
     force=_arctan,
     excitation=_SPEEDS,
     reference="Duym, Vehicle Syst. Dyn. 33 (2000), simulation tools for shock absorbers",
+    starts=_knees(0.2, 0.6, 1.5),
+    bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
+    simpler=("linear_damping",),
+    shown=("damping_n_s_per_m",),
 )
 
 BLOW_OFF_DAMPING = Effect(
     name="blow_off_damping",
     family=_FAMILY,
+    words="a non-linear damper (blow-off valve)",
     parameters=(
-        Parameter("lost_damping_n_s_per_m", "N·s/m", -1e5, 1e6, "slope lost beyond the knee"),
+        Parameter("lost_damping_n_s_per_m", "N·s/m", -1e12, 1e12, "slope lost beyond the knee"),
         _KNEE,
     ),
     force=_blow_off,
     excitation=_SPEEDS,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
+    starts=_knees(0.2, 0.5, 1.0, 1.8),
+    bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
+    simpler=("linear_damping",),
+    shown=("lost_damping_n_s_per_m",),
 )
 
 SMOOTH_BLOW_OFF_DAMPING = Effect(
     name="smooth_blow_off_damping",
     family=_FAMILY,
+    words="a non-linear damper (blow-off valve, rounded knee)",
     parameters=(
-        Parameter("lost_damping_n_s_per_m", "N·s/m", -1e5, 1e6, "slope lost beyond the knee"),
+        Parameter("lost_damping_n_s_per_m", "N·s/m", -1e12, 1e12, "slope lost beyond the knee"),
         _KNEE,
     ),
     force=_smooth_blow_off,
     excitation=_SPEEDS,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
+    starts=_knees(0.2, 0.6, 1.5),
+    bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
+    simpler=("linear_damping",),
+    shown=("lost_damping_n_s_per_m",),
 )
 
 STROKE_DAMPING = Effect(
     name="stroke_damping",
     family=_FAMILY,
-    parameters=(Parameter("damping_n_s_per_m2", "N·s/m²", -1e6, 1e7, "damping per deflection"),),
+    words="a non-linear damper (linear in the stroke)",
+    parameters=(Parameter("damping_n_s_per_m2", "N·s/m²", -1e18, 1e18, "damping per deflection"),),
     force=_over_stroke,
     excitation=_PLACES,
     reference="Dixon, The Shock Absorber Handbook (2007), 8.3, position-dependent damping",
+    starts=always((1.0,)),
+    simpler=("linear_damping",),
+    shown=("damping_n_s_per_m2",),
 )
 
 POSITION_DEPENDENT_DAMPING = Effect(
     name="position_dependent_damping",
     family=_FAMILY,
+    words="a non-linear damper (quadratic in the stroke)",
     parameters=(
-        Parameter("damping_n_s_per_m3", "N·s/m³", -1e7, 1e8, "damping per squared deflection"),
+        Parameter("damping_n_s_per_m3", "N·s/m³", -1e18, 1e18, "damping per squared deflection"),
     ),
     force=_over_squared_stroke,
     excitation=_PLACES,
     reference="van der Pol, Phil. Mag. 2 (1926); Dixon (2007), 8.3",
+    starts=always((1.0,)),
+    simpler=("linear_damping",),
+    shown=("damping_n_s_per_m3",),
 )
 
 ZONE_DAMPING = Effect(
     name="zone_damping",
     family=_FAMILY,
+    words="a non-linear damper (a zone of its stroke)",
     parameters=(
         _DAMPING,
-        Parameter("centre_height_m", "m", -10.0, 10.0, "middle of the zone"),
-        Parameter("width_m", "m", 1e-3, 10.0, "half width of the zone"),
+        Parameter("centre_height_m", "m", -1e4, 1e4, "middle of the zone"),
+        Parameter("width_m", "m", 1e-12, 1e4, "half width of the zone"),
     ),
     force=_zone,
     excitation=_PLACES,
     reference="Dixon, The Shock Absorber Handbook (2007), 8.3, position-dependent damping",
+    starts=_zone_starts,
+    bounds=within(centre_height_m=height(-1.0, 2.0), width_m=of_stroke(0.03, 1.5)),
+    simpler=("linear_damping",),
+    shown=("damping_n_s_per_m",),
 )
 
 END_ZONE_DAMPING = Effect(
     name="end_zone_damping",
     family=_FAMILY,
+    words="a non-linear damper (hydraulic end stop)",
     parameters=(
-        Parameter("damping_n_s_per_m2", "N·s/m²", -1e6, 1e7, "damping per depth in the zone"),
-        Parameter("zone_height_m", "m", -10.0, 10.0, "height below which the zone begins"),
+        Parameter("damping_n_s_per_m2", "N·s/m²", -1e18, 1e18, "damping per depth in the zone"),
+        Parameter("zone_height_m", "m", -1e4, 1e4, "height below which the zone begins"),
     ),
     force=_end_zone,
     excitation=_PLACES,
     reference="Dixon, The Shock Absorber Handbook (2007), 8.3, hydraulic bump stop",
+    starts=_end_zone_starts,
+    bounds=within(zone_height_m=_zone_heights),
+    simpler=("linear_damping",),
+    shown=("damping_n_s_per_m2",),
 )

@@ -2,7 +2,8 @@
 
 import math
 
-from dart_model.effects.contract import Effect, Floats, Parameter
+from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start
+from dart_model.effects.ranges import always, grid, height, moving, of_stroke, within
 
 _FAMILY = "nonlinear_stiffness"
 _WIDE = "deflections from the free length that differ by a factor of three or more"
@@ -122,98 +123,155 @@ def _balanced_gas(
     return p[0] * ((p[1] / length) ** p[2] - 1.0)
 
 
+@moving
+def _lengths(motion: Motion) -> list[Start]:
+    return grid([1.0], [share * motion.stroke_m for share in (0.1, 0.25, 0.6)])
+
+
+def _deepest_m(motion: Motion) -> float:
+    return max(motion.free_length_m - motion.low_m, 0.25 * motion.stroke_m)
+
+
+@moving
+def _gas_starts(motion: Motion) -> list[Start]:
+    lengths = [share * _deepest_m(motion) for share in (1.15, 1.5, 2.0, 4.0)]
+    return grid([1.0], lengths, [1.0, 1.4])
+
+
+def _gas_lengths(motion: Motion) -> tuple[float, float]:
+    # The gas is not compressed to nothing; of one that is much longer, only the charge is felt.
+    return 1.02 * _deepest_m(motion), 50.0 * _deepest_m(motion)
+
+
 QUADRATIC_STIFFNESS = Effect(
     name="quadratic_stiffness",
     family=_FAMILY,
+    words="a non-linear spring (quadratic)",
     parameters=(
-        Parameter("stiffness_n_per_m2", "N/m²", -1e8, 1e8, "force per squared deflection"),
+        Parameter("stiffness_n_per_m2", "N/m²", -1e18, 1e18, "force per squared deflection"),
     ),
     force=_quadratic,
     excitation=_WIDE,
     reference="Nayfeh and Mook, Nonlinear Oscillations (1979), 2.1",
+    starts=always((1.0,)),
+    simpler=("linear_stiffness",),
+    shown=("stiffness_n_per_m2",),
 )
 
 CUBIC_STIFFNESS = Effect(
     name="cubic_stiffness",
     family=_FAMILY,
+    words="a non-linear spring (cubic, about the free length)",
     parameters=(
-        Parameter("stiffness_n_per_m3", "N/m³", -1e10, 1e10, "force per cubed deflection"),
+        Parameter("stiffness_n_per_m3", "N/m³", -1e24, 1e24, "force per cubed deflection"),
     ),
     force=_cubic,
     excitation=_WIDE,
     reference="Duffing, Erzwungene Schwingungen bei veränderlicher Eigenfrequenz (1918)",
+    starts=always((1.0,)),
+    simpler=("linear_stiffness",),
+    shown=("stiffness_n_per_m3",),
 )
 
 CENTRED_CUBIC_STIFFNESS = Effect(
     name="centred_cubic_stiffness",
     family=_FAMILY,
+    words="a non-linear spring (cubic, about a centre of its own)",
     parameters=(
-        Parameter("stiffness_n_per_m3", "N/m³", -1e10, 1e10, "force per cubed deflection"),
-        Parameter("centre_height_m", "m", -10.0, 10.0, "height without force"),
+        Parameter("stiffness_n_per_m3", "N/m³", -1e24, 1e24, "force per cubed deflection"),
+        Parameter("centre_height_m", "m", -1e4, 1e4, "height without force"),
     ),
     force=_centred_cubic,
     excitation=_WIDE,
     reference="Nayfeh and Mook, Nonlinear Oscillations (1979), 2.1",
+    starts=moving(lambda m: grid([1.0], m.heights_m(0.1, 0.3, 0.5, 0.7, 0.9))),
+    bounds=within(centre_height_m=height(-1.0, 2.0)),
+    simpler=("linear_stiffness", "cubic_stiffness", "quadratic_stiffness"),
+    shown=("stiffness_n_per_m3",),
 )
 
 POWER_STIFFNESS = Effect(
     name="power_stiffness",
     family=_FAMILY,
+    words="a non-linear spring (power law)",
     parameters=(
-        Parameter("force_at_100_mm_n", "N", -1e6, 1e6, "force at a deflection of 100 mm"),
+        Parameter("force_at_100_mm_n", "N", -1e36, 1e36, "force at a deflection of 100 mm"),
         Parameter("exponent", "", 1.2, 8.0, "exponent of the deflection"),
     ),
     force=_power,
     excitation=_WIDE,
     reference="Kovacic and Brennan, The Duffing Equation (2011), 1.3",
+    starts=always((1.0, 1.5), (1.0, 2.5), (1.0, 3.5), (1.0, 5.0)),
+    simpler=("linear_stiffness", "cubic_stiffness"),
+    shown=("force_at_100_mm_n",),
 )
 
 PROGRESSIVE_STIFFNESS = Effect(
     name="progressive_stiffness",
     family=_FAMILY,
+    words="a non-linear spring (progressive)",
     parameters=(
-        Parameter("force_n", "N", -1e5, 1e5, "force scale"),
-        Parameter("length_m", "m", 0.005, 10.0, "deflection at which the spring stiffens"),
+        Parameter("force_n", "N", -1e12, 1e12, "force scale"),
+        Parameter("length_m", "m", 1e-12, 1e4, "deflection at which the spring stiffens"),
     ),
     force=_progressive,
     excitation=_WIDE,
     reference="Kovacic and Brennan, The Duffing Equation (2011), 1.3",
+    starts=_lengths,
+    bounds=within(length_m=of_stroke(0.04, 4.0)),
+    simpler=("linear_stiffness", "cubic_stiffness"),
+    shown=("force_n",),
 )
 
 EXPONENTIAL_STIFFNESS = Effect(
     name="exponential_stiffness",
     family=_FAMILY,
+    words="a non-linear spring (exponential, as rubber)",
     parameters=(
-        Parameter("force_n", "N", -1e5, 1e5, "force scale"),
-        Parameter("length_m", "m", 0.005, 10.0, "compression by which the force grows e-fold"),
+        Parameter("force_n", "N", -1e12, 1e12, "force scale"),
+        Parameter("length_m", "m", 1e-12, 1e4, "compression by which the force grows e-fold"),
     ),
     force=_exponential,
     excitation=_WIDE,
     reference="Gent, Engineering with Rubber (2012), 3.2",
+    starts=_lengths,
+    bounds=within(length_m=of_stroke(0.04, 4.0)),
+    simpler=("linear_stiffness", "quadratic_stiffness"),
+    shown=("force_n",),
 )
 
 GAS_SPRING = Effect(
     name="gas_spring",
     family=_FAMILY,
+    words="a gas spring (polytropic)",
     parameters=(
-        Parameter("charge_force_n", "N", -1e5, 1e5, "force at the free length"),
-        Parameter("gas_length_m", "m", 0.02, 10.0, "gas volume over piston area at free length"),
+        Parameter("charge_force_n", "N", -1e12, 1e12, "force at the free length"),
+        Parameter("gas_length_m", "m", 1e-12, 1e4, "gas volume over piston area at free length"),
         Parameter("polytropic_exponent", "", 1.0, 3.0, "1 isothermal, 1.4 adiabatic air"),
     ),
     force=_gas,
     excitation=_WIDE,
     reference="Dixon, The Shock Absorber Handbook (2007), 6.4",
+    starts=_gas_starts,
+    bounds=within(gas_length_m=_gas_lengths),
+    simpler=("linear_stiffness", "quadratic_stiffness"),
+    shown=("charge_force_n",),
 )
 
 BALANCED_GAS_SPRING = Effect(
     name="balanced_gas_spring",
     family=_FAMILY,
+    words="a gas spring (polytropic, balanced at the free length)",
     parameters=(
-        Parameter("charge_force_n", "N", -1e5, 1e5, "charge, balanced at the free length"),
-        Parameter("gas_length_m", "m", 0.02, 10.0, "gas volume over piston area at free length"),
+        Parameter("charge_force_n", "N", -1e12, 1e12, "charge, balanced at the free length"),
+        Parameter("gas_length_m", "m", 1e-12, 1e4, "gas volume over piston area at free length"),
         Parameter("polytropic_exponent", "", 1.0, 3.0, "1 isothermal, 1.4 adiabatic air"),
     ),
     force=_balanced_gas,
     excitation=_WIDE,
     reference="Dixon, The Shock Absorber Handbook (2007), 6.4",
+    starts=_gas_starts,
+    bounds=within(gas_length_m=_gas_lengths),
+    simpler=("linear_stiffness", "quadratic_stiffness"),
+    shown=("charge_force_n",),
 )

@@ -2,7 +2,8 @@
 
 import math
 
-from dart_model.effects.contract import Effect, Floats, Parameter
+from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start
+from dart_model.effects.ranges import within
 
 
 def _force(
@@ -18,15 +19,23 @@ def _force(
     return p[0] * math.sin(2.0 * math.pi * p[1] * t_s + p[2])
 
 
+def _starts(motion: Motion) -> list[Start]:
+    return [(1.0, frequency_hz, phase_rad) for frequency_hz, phase_rad in motion.tones]
+
+
 PERIODIC_FORCE = Effect(
     name="periodic_force",
     family="periodic_force",
+    words="a periodic force",
     parameters=(
-        Parameter("amplitude_n", "N", 0.0, 1e5, "amplitude"),
-        Parameter("frequency_hz", "Hz", 0.01, 2000.0, "frequency"),
+        Parameter("amplitude_n", "N", 0.0, 1e12, "amplitude"),
+        Parameter("frequency_hz", "Hz", 1e-9, 1e9, "frequency"),
         Parameter("phase_rad", "rad", -100.0, 100.0, "phase of the sine at time zero"),
     ),
     force=_force,
     excitation="many of its periods, at another frequency than the applied force",
     reference="Rao, Mechanical Vibrations (2017), 3.7, rotating unbalance",
+    starts=_starts,
+    bounds=within(frequency_hz=lambda m: (0.5 / m.duration_s, 0.5 / m.step_s)),
+    shown=("amplitude_n", "frequency_hz"),
 )

@@ -19,10 +19,13 @@ def _force(
 PRELOAD = Effect(
     name="preload",
     family="preload",
+    words="a constant preload",
     parameters=(
-        Parameter("force_n", "N", -1e5, 1e5, "constant force that pushes the bodies apart"),
+        Parameter("force_n", "N", -1e12, 1e12, "constant force that pushes the bodies apart"),
     ),
     force=_force,
     excitation="any run whose mean height is measured",
     reference="Dixon, The Shock Absorber Handbook (2007), gas preload",
+    linear=True,
+    shown=("force_n",),
 )

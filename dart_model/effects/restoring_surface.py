@@ -39,13 +39,14 @@ def _force(
 RESTORING_SURFACE = Effect(
     name="restoring_surface",
     family="restoring_surface",
+    words="a force over height and velocity without a name",
     parameters=(
-        Parameter("lowest_height_m", "m", -100.0, 100.0, "height of the first row"),
-        Parameter("highest_height_m", "m", -100.0, 100.0, "height of the last row"),
-        Parameter("lowest_velocity_m_per_s", "m/s", -100.0, 100.0, "velocity of the first column"),
-        Parameter("highest_velocity_m_per_s", "m/s", -100.0, 100.0, "velocity of the last column"),
+        Parameter("lowest_height_m", "m", -1e4, 1e4, "height of the first row"),
+        Parameter("highest_height_m", "m", -1e4, 1e4, "height of the last row"),
+        Parameter("lowest_velocity_m_per_s", "m/s", -1e6, 1e6, "velocity of the first column"),
+        Parameter("highest_velocity_m_per_s", "m/s", -1e6, 1e6, "velocity of the last column"),
         *(
-            Parameter(f"force_{i}_{j}_n", "N", -1e6, 1e6, f"force in row {i}, column {j}")
+            Parameter(f"force_{i}_{j}_n", "N", -1e12, 1e12, f"force in row {i}, column {j}")
             for i in range(HEIGHTS)
             for j in range(VELOCITIES)
         ),

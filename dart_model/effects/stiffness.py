@@ -19,10 +19,13 @@ def _force(
 LINEAR_STIFFNESS = Effect(
     name="linear_stiffness",
     family="stiffness",
+    words="linear stiffness",
     parameters=(
-        Parameter("stiffness_n_per_m", "N/m", -1e6, 1e7, "stiffness about the free length"),
+        Parameter("stiffness_n_per_m", "N/m", -1e12, 1e12, "stiffness about the free length"),
     ),
     force=_force,
     excitation="heights on both sides of the rest position, at more than one frequency",
     reference="Rao, Mechanical Vibrations (2017), 1.7",
+    linear=True,
+    shown=("stiffness_n_per_m",),
 )

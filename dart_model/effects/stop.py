@@ -1,9 +1,19 @@
 """End stops, which push but never pull."""
 
-from dart_model.effects.contract import Effect, Floats, Parameter
+from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start
+from dart_model.effects.ranges import (
+    Starts,
+    crossing_time_s,
+    dissipation,
+    grid,
+    height,
+    moving,
+    slowness_s_per_m,
+    within,
+)
 
 _FAMILY = "stop"
-_CONTACT = Parameter("contact_height_m", "m", -10.0, 10.0, "height at which the stop is touched")
+_CONTACT = Parameter("contact_height_m", "m", -1e4, 1e4, "height at which the stop is touched")
 _BUMP = "heights below the bump stop's contact, several times"
 _REBOUND = "heights above the rebound stop's contact, several times"
 _HUNT_CROSSLEY = "Hunt and Crossley, J. Appl. Mech. 42 (1975)"
@@ -146,102 +156,187 @@ def _hertz_ends(
     return force
 
 
-_LOW = Parameter("low_contact_height_m", "m", -10.0, 10.0, "height of the bump stop")
-_HIGH = Parameter("high_contact_height_m", "m", -10.0, 10.0, "height of the rebound stop")
+def _stop_starts(*shares: float) -> Starts:
+    def starts(motion: Motion) -> list[Start]:
+        dampings = [share * crossing_time_s(motion) for share in (0.01, 0.1)]
+        return grid(motion.heights_m(*shares), [1.0], dampings)
+
+    return moving(starts)
+
+
+def _hertz_starts(*shares: float) -> Starts:
+    def starts(motion: Motion) -> list[Start]:
+        dissipations = [share * slowness_s_per_m(motion) for share in (0.01, 0.1)]
+        return grid(motion.heights_m(*shares), [1.0], dissipations)
+
+    return moving(starts)
+
+
+def _power_starts(*shares: float) -> Starts:
+    def starts(motion: Motion) -> list[Start]:
+        dissipations = [0.03 * slowness_s_per_m(motion)]
+        return grid(motion.heights_m(*shares), [1.0], [1.0, 2.0], dissipations)
+
+    return moving(starts)
+
+
+def _both_ends_m(motion: Motion) -> list[tuple[float, float]]:
+    lows, highs = motion.heights_m(0.04, 0.1, 0.18), motion.heights_m(0.96, 0.9, 0.82)
+    return list(zip(lows, highs, strict=True))
+
+
+@moving
+def _ends_starts(motion: Motion) -> list[Start]:
+    return [(*ends, 1.0, 0.02 * crossing_time_s(motion)) for ends in _both_ends_m(motion)]
+
+
+@moving
+def _hertz_ends_starts(motion: Motion) -> list[Start]:
+    return [(*ends, 1.0, 0.05 * slowness_s_per_m(motion)) for ends in _both_ends_m(motion)]
+
+
+# A stop that is never touched has no force; one that is always touched is a spring.
+_TOUCHED = height(-0.02, 1.02)
+_LOW_END = height(-0.02, 0.3)
+_HIGH_END = height(0.7, 1.02)
+
+
+_LOW = Parameter("low_contact_height_m", "m", -1e4, 1e4, "height of the bump stop")
+_HIGH = Parameter("high_contact_height_m", "m", -1e4, 1e4, "height of the rebound stop")
 
 _LINEAR = (
     _CONTACT,
-    Parameter("stiffness_n_per_m", "N/m", 10.0, 1e8, "stiffness in contact"),
-    Parameter("damping_n_s_per_m", "N·s/m", 0.0, 1e6, "damping in contact"),
+    Parameter("stiffness_n_per_m", "N/m", 1e-12, 1e12, "stiffness in contact"),
+    Parameter("damping_n_s_per_m", "N·s/m", 0.0, 1e12, "damping in contact"),
 )
 _HERTZ = (
     _CONTACT,
-    Parameter("contact_stiffness_n_per_m1_5", "N/m^1.5", 10.0, 1e10, "Hertzian stiffness"),
-    Parameter("dissipation_s_per_m", "s/m", 0.0, 20.0, "dissipation by closing speed"),
+    Parameter("contact_stiffness_n_per_m1_5", "N/m^1.5", 1e-12, 1e18, "Hertzian stiffness"),
+    Parameter("dissipation_s_per_m", "s/m", 0.0, 1e12, "dissipation by closing speed"),
 )
 _POWER = (
     _CONTACT,
-    Parameter("force_at_10_mm_n", "N", 0.01, 1e7, "force at a depth of 10 mm"),
+    Parameter("force_at_10_mm_n", "N", 1e-12, 1e24, "force at a depth of 10 mm"),
     Parameter("exponent", "", 0.8, 4.0, "exponent of the depth"),
-    Parameter("dissipation_s_per_m", "s/m", 0.0, 20.0, "dissipation by closing speed"),
+    Parameter("dissipation_s_per_m", "s/m", 0.0, 1e12, "dissipation by closing speed"),
 )
 
 BUMP_STOP = Effect(
     name="bump_stop",
     family=_FAMILY,
+    words="a bump stop",
     parameters=_LINEAR,
     force=_bump,
     excitation=_BUMP,
     reference=_KELVIN_VOIGT,
     scaled=(1, 2),
+    starts=_stop_starts(0.03, 0.07, 0.12, 0.18, 0.26, 0.36),
+    bounds=within(contact_height_m=_TOUCHED),
+    shown=("contact_height_m", "stiffness_n_per_m"),
 )
 
 REBOUND_STOP = Effect(
     name="rebound_stop",
     family=_FAMILY,
+    words="a rebound stop",
     parameters=_LINEAR,
     force=_rebound,
     excitation=_REBOUND,
     reference=_KELVIN_VOIGT,
     scaled=(1, 2),
+    starts=_stop_starts(0.97, 0.93, 0.88, 0.82, 0.74, 0.64),
+    bounds=within(contact_height_m=_TOUCHED),
+    shown=("contact_height_m", "stiffness_n_per_m"),
 )
 
 HERTZ_BUMP_STOP = Effect(
     name="hertz_bump_stop",
     family=_FAMILY,
+    words="a bump stop (Hertzian contact)",
     parameters=_HERTZ,
     force=_hertz_bump,
     excitation=_BUMP,
     reference=_HUNT_CROSSLEY,
     scaled=(1,),
+    starts=_hertz_starts(0.04, 0.1, 0.16, 0.24, 0.36),
+    bounds=within(contact_height_m=_TOUCHED, dissipation_s_per_m=dissipation),
+    shown=("contact_height_m",),
 )
 
 HERTZ_REBOUND_STOP = Effect(
     name="hertz_rebound_stop",
     family=_FAMILY,
+    words="a rebound stop (Hertzian contact)",
     parameters=_HERTZ,
     force=_hertz_rebound,
     excitation=_REBOUND,
     reference=_HUNT_CROSSLEY,
     scaled=(1,),
+    starts=_hertz_starts(0.96, 0.9, 0.84, 0.76, 0.64),
+    bounds=within(contact_height_m=_TOUCHED, dissipation_s_per_m=dissipation),
+    shown=("contact_height_m",),
 )
 
 POWER_BUMP_STOP = Effect(
     name="power_bump_stop",
     family=_FAMILY,
+    words="a bump stop (power law, as rubber)",
     parameters=_POWER,
     force=_power_bump,
     excitation=_BUMP,
     reference=_HUNT_CROSSLEY,
     scaled=(1,),
+    starts=_power_starts(0.05, 0.15, 0.3),
+    bounds=within(contact_height_m=_TOUCHED, dissipation_s_per_m=dissipation),
+    simpler=("bump_stop", "hertz_bump_stop"),
+    shown=("contact_height_m", "force_at_10_mm_n"),
 )
 
 POWER_REBOUND_STOP = Effect(
     name="power_rebound_stop",
     family=_FAMILY,
+    words="a rebound stop (power law, as rubber)",
     parameters=_POWER,
     force=_power_rebound,
     excitation=_REBOUND,
     reference=_HUNT_CROSSLEY,
     scaled=(1,),
+    starts=_power_starts(0.95, 0.85, 0.7),
+    bounds=within(contact_height_m=_TOUCHED, dissipation_s_per_m=dissipation),
+    simpler=("rebound_stop", "hertz_rebound_stop"),
+    shown=("contact_height_m", "force_at_10_mm_n"),
 )
 
 END_STOPS = Effect(
     name="end_stops",
     family=_FAMILY,
+    words="a bump stop and a rebound stop",
     parameters=(_LOW, _HIGH, *_LINEAR[1:]),
     force=_ends,
     excitation="heights beyond both stops, several times",
     reference=_KELVIN_VOIGT,
     scaled=(2, 3),
+    starts=_ends_starts,
+    bounds=within(low_contact_height_m=_LOW_END, high_contact_height_m=_HIGH_END),
+    simpler=("bump_stop", "rebound_stop"),
+    shown=("low_contact_height_m", "high_contact_height_m", "stiffness_n_per_m"),
 )
 
 HERTZ_END_STOPS = Effect(
     name="hertz_end_stops",
     family=_FAMILY,
+    words="a bump stop and a rebound stop (Hertzian contact)",
     parameters=(_LOW, _HIGH, *_HERTZ[1:]),
     force=_hertz_ends,
     excitation="heights beyond both stops, several times",
     reference=_HUNT_CROSSLEY,
     scaled=(2,),
+    starts=_hertz_ends_starts,
+    bounds=within(
+        low_contact_height_m=_LOW_END,
+        high_contact_height_m=_HIGH_END,
+        dissipation_s_per_m=dissipation,
+    ),
+    simpler=("hertz_bump_stop", "hertz_rebound_stop"),
+    shown=("low_contact_height_m", "high_contact_height_m"),
 )

@@ -2,7 +2,10 @@
 
 import math
 
-from dart_model.effects.contract import Effect, Floats, Parameter, Writable
+from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start, Writable
+from dart_model.effects.ranges import geometric, grid, moving, within
+
+_STANDARD_GRAVITY_M_PER_S2 = 9.81
 
 
 def _hidden_mass(
@@ -36,19 +39,46 @@ def _hidden_mass_rate(
     out[1] = -omega * (omega * state[0] + 2.0 * p[2] * (state[1] - velocity_m_per_s))
 
 
+@moving
+def _hidden_mass_starts(motion: Motion) -> list[Start]:
+    low_hz, high_hz = 3.0 / motion.duration_s, 0.1 / motion.step_s
+    if motion.stiffness_n_per_m > 0.0:
+        # Far from the strut's own resonance a further one is an added mass, or is not excited.
+        natural_hz = math.sqrt(motion.stiffness_n_per_m / motion.mass_kg) / (2.0 * math.pi)
+        low_hz, high_hz = max(low_hz, 0.2 * natural_hz), min(high_hz, 15.0 * natural_hz)
+    mass_kg = 0.1 * motion.mass_kg
+    frequencies = geometric(low_hz, high_hz, 16)
+    return grid([mass_kg], frequencies, [0.01, 0.06], [_STANDARD_GRAVITY_M_PER_S2 * mass_kg])
+
+
+def _masses(motion: Motion) -> tuple[float, float]:
+    return 1e-4 * motion.mass_kg, 3.0 * motion.mass_kg
+
+
+def _frequencies(motion: Motion) -> tuple[float, float]:
+    return 1.0 / motion.duration_s, 0.25 / motion.step_s
+
+
 HIDDEN_MASS = Effect(
     name="hidden_mass",
     family="unmodelled_mode",
+    words="a further mass on a spring (an unmodelled mode)",
     parameters=(
-        Parameter("mass_kg", "kg", 1e-3, 1e4, "mass on the spring"),
-        Parameter("frequency_hz", "Hz", 0.05, 60.0, "natural frequency of the mass on its spring"),
+        Parameter("mass_kg", "kg", 1e-12, 1e9, "mass on the spring"),
+        Parameter("frequency_hz", "Hz", 1e-9, 1e9, "natural frequency of the mass on its spring"),
         Parameter("damping_ratio", "", 0.0, 2.0, "damping over critical damping"),
-        Parameter("weight_n", "N", -1e5, 1e5, "weight the mass adds at rest"),
+        Parameter("weight_n", "N", -1e12, 1e12, "weight the mass adds at rest"),
     ),
     force=_hidden_mass,
     excitation="frequencies around the mass's own resonance",
     reference="Den Hartog, Mechanical Vibrations (1956), 3.2, dynamic absorber",
     rate=_hidden_mass_rate,
-    state_size=2,
     scaled=(0, 3),
+    state_scales=(0.01, 0.01),
+    fits_state=True,
+    starts=_hidden_mass_starts,
+    bounds=within(mass_kg=_masses, frequency_hz=_frequencies),
+    simpler=("added_mass",),
+    benches=("force_given",),
+    shown=("mass_kg", "frequency_hz"),
 )

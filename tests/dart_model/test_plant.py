@@ -223,7 +223,7 @@ def test_nothing_is_remembered_between_calls(joint):
 
     first = answer()
     plant.step(plant.load(other, virtual, -40.0, 80.0), 3e-3, 9.0)
-    plant.guided()
+    plant.mechanics(np.full(count, 0.4), np.full(count, -2.0))
     assert answer() == first
 
 
@@ -397,28 +397,26 @@ def test_initial_says_what_cannot_be_reached():
         DartPlant(spec).initial([9.0])
 
 
-def test_guided_matrices_are_the_equations_of_motion():
+def test_mechanics_are_the_equations_of_motion():
     spec = load_model(MODELS / "quarter_car.yaml")
     plant = DartPlant(spec)
-    guided = plant.guided()
-    assert guided is not None
+    assert plant.is_constant
     rng = np.random.default_rng(3)
     for _ in range(5):
         heights, velocities = rng.uniform(0.2, 0.5, 2), rng.uniform(-1.0, 1.0, 2)
         virtual, applied_n = rng.uniform(-50.0, 50.0, 2), float(rng.uniform(-50.0, 50.0))
         state = plant.initial(heights, velocities)
+        there = plant.mechanics(np.array(state.positions), np.array(state.velocities))
         loaded = plant.load(state, virtual.tolist(), applied_n, AMBIENT_C)
         forces = np.array(loaded.forces_n) + virtual
-        push = guided.gravity_n + guided.strut_rows.T @ forces + guided.applied_row * applied_n
-        expected = guided.strut_rows @ np.linalg.solve(guided.mass_kg, push)
-        accelerations = loaded.accelerations_m_per_s2
-        assert accelerations == pytest.approx(expected, abs=1e-10)
-        q = np.array(state.positions)
-        assert guided.heights_m + guided.strut_rows @ q == pytest.approx(heights)
+        push = there.bias + there.rows.T @ forces + there.applied * applied_n
+        expected = there.rows @ np.linalg.solve(there.mass, push)
+        assert loaded.accelerations_m_per_s2 == pytest.approx(expected, abs=1e-10)
+        assert there.heights_m == pytest.approx(heights)
 
 
-def test_a_model_that_turns_is_not_guided():
-    assert DartPlant(free_bodies()).guided() is None
+def test_a_model_that_turns_is_not_constant():
+    assert not DartPlant(free_bodies()).is_constant
 
 
 def test_a_guide_need_not_be_vertical():

@@ -19,6 +19,7 @@ from dart_model.spec import (
     JointSpec,
     ModelSpec,
     StrutSpec,
+    Tolerance,
     dump_model,
     load_model,
     parse_model,
@@ -51,6 +52,18 @@ def effects(draw: st.DrawFn) -> EffectSpec:
     return EffectSpec(name=law.name, parameters=parameters)
 
 
+PERCENTAGES = st.none() | st.decimals("0.0001", 1000, places=4).map(lambda x: f"{x:f} %")
+
+
+@st.composite
+def tolerances(draw: st.DrawFn) -> Tolerance:
+    shares = {
+        name: draw(PERCENTAGES)
+        for name in ("mass_kg", "stiffness_n_per_m", "damping_n_s_per_m", "input_gain")
+    }
+    return Tolerance.model_validate({**shares, "preload_n": draw(st.none() | POSITIVE)})
+
+
 @st.composite
 def models(draw: st.DrawFn) -> ModelSpec:
     bodies: list[BodySpec] = []
@@ -81,6 +94,7 @@ def models(draw: st.DrawFn) -> ModelSpec:
         skeleton=InlineSkeleton(bodies=tuple(bodies)),
         struts=tuple(struts),
         applied_force_body=draw(st.none() | st.sampled_from(names[1:])),
+        tolerance=draw(st.none() | tolerances()),
     )
 
 
@@ -114,6 +128,32 @@ def test_effects_of_a_strut_are_replaced():
     assert changed.with_effects("strut", []) == spec
     with pytest.raises(InputError, match="strut 'other': expected one of strut"):
         spec.with_effects("other", [])
+
+
+def test_tolerances_are_shares_and_written_as_percentages():
+    known = (
+        "tolerance: {mass_kg: 0.1 %, stiffness_n_per_m: 20%, damping_n_s_per_m: 40 %, "
+        "preload_n: 5.0, input_gain: 7 %}"
+    )
+    spec = parse_model(TEXT + known, "seed.yaml")
+    assert spec.tolerance == Tolerance.model_construct(
+        mass_kg=0.001, stiffness_n_per_m=0.2, damping_n_s_per_m=0.4, preload_n=5.0, input_gain=0.07
+    )
+    assert yaml.safe_load(dump_model(spec))["tolerance"] == {
+        "mass_kg": "0.1 %",
+        "stiffness_n_per_m": "20 %",
+        "damping_n_s_per_m": "40 %",
+        "preload_n": 5.0,
+        "input_gain": "7 %",
+    }
+
+
+def test_a_model_without_tolerances_has_none():
+    spec = parse_model(TEXT, "seed.yaml")
+    assert spec.tolerance is None
+    assert "tolerance" not in dump_model(spec)
+    some = parse_model(TEXT + "tolerance: {mass_kg: 1 %}", "seed.yaml").tolerance
+    assert some == Tolerance.model_construct(mass_kg=0.01)
 
 
 def refused(text: str) -> str:
@@ -170,6 +210,30 @@ def refused(text: str) -> str:
             "effects: []",
             "effects: [{name: preload}]",
             "effects.0: parameters of preload: 'force_n' is missing",
+        ),
+        (
+            "effects: []",
+            "effects: [{name: coulomb_friction, parameters: {coulomb_force_n: -2.5, "
+            "rounding_velocity_m_per_s: 0.01}}]",
+            "effects.0: parameters of coulomb_friction: coulomb_force_n = -2.5: "
+            "expected 0 to 1e+12 N",
+        ),
+        (
+            "effects: []",
+            "effects: [{name: power_damping, parameters: {force_at_1_m_per_s_n: 3, exponent: 9}}]",
+            "effects.0: parameters of power_damping: exponent = 9.0: expected 0.3 to 4",
+        ),
+        ("9.81", "9.81\ntolerance: {mass_kg: 0.1}", "tolerance.mass_kg: 0.1: expected a percent"),
+        ("9.81", "9.81\ntolerance: {mass_kg: 0.0 %}", "tolerance.mass_kg: '0.0 %': expected a per"),
+        ("9.81", "9.81\ntolerance: {mass_kg: -1 %}", "tolerance.mass_kg: '-1 %': expected a perc"),
+        ("9.81", "9.81\ntolerance: {mass_kg: 2000 %}", "such as 20 %"),
+        ("9.81", "9.81\ntolerance: {mass_kg: true}", "tolerance.mass_kg: True: expected a percen"),
+        ("9.81", "9.81\ntolerance: {preload_n: 5 %}", "tolerance.preload_n: '5 %': input should b"),
+        ("9.81", "9.81\ntolerance: {preload_n: 0}", "tolerance.preload_n: 0: input should be grea"),
+        (
+            "9.81",
+            "9.81\ntolerance: {mass: 1 %}",
+            "tolerance.mass: unknown key, expected one of mass_kg, stiffness_n_per_m, damping_n_s",
         ),
         ("gravity_m_per_s2: 9.81", "applied_force_body: wheel", "applied_force_body 'wheel': exp"),
         (

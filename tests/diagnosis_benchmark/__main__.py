@@ -1,12 +1,14 @@
 """``python -m tests.diagnosis_benchmark``: the full benchmark, one command.
 
 Results are kept in ``--out``, so an interrupted run goes on where it stopped; after a change of the
-program, give a new folder. ``--write KIND SEED`` only writes one case's files.
+program, give a new folder. The folder then holds ``summary.json``, ``table.md`` and ``cases.csv``.
+``--tenth --bounds`` is what CI runs. ``--write KIND SEED`` only writes one case's files.
 """
 
 import argparse
 import multiprocessing
 import os
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -14,9 +16,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
+from tests.diagnosis_benchmark.bounds import violations
 from tests.diagnosis_benchmark.execute import crashed, execute
 from tests.diagnosis_benchmark.judge import Result
-from tests.diagnosis_benchmark.plan import Counts, Slot, slots
+from tests.diagnosis_benchmark.plan import GROUPS, Counts, Slot, a_tenth, slots
 from tests.diagnosis_benchmark.summary import print_tables, summarise, write_tables
 from tests.truth.cases import make_case
 from tests.truth.files import write_case
@@ -28,21 +31,34 @@ def _arguments() -> argparse.Namespace:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--cases", type=int, default=200, help="single effects above the floor")
-    parser.add_argument("--pairs", type=int, default=50, help="two effects")
-    parser.add_argument("--triples", type=int, default=0, help="three effects")
-    parser.add_argument("--complete", type=int, default=50, help="nothing planted")
-    parser.add_argument("--outside", type=int, default=30, help="forces no catalogue holds")
-    parser.add_argument(
-        "--foreign", type=int, default=32, help="formulas kept back from catalogues"
-    )
-    parser.add_argument("--faint", type=int, default=0, help="single effects below the floor's 5x")
+    for name, group in GROUPS.items():
+        option = f"--{name.replace('_', '-')}"
+        says = f"{group.says} ({group.cases})"
+        parser.add_argument(option, type=int, default=group.cases, metavar="N", help=says)
+    parser.add_argument("--tenth", action="store_true", help="a tenth of each group")
+    parser.add_argument("--groups", help="only these, with commas between")
+    parser.add_argument("--bounds", action="store_true", help="exit with 1 where one is violated")
     parser.add_argument("--jobs", type=int, default=2, help="cases at a time")
     parser.add_argument("--seed", type=int, default=0, help="another one gives other cases")
     parser.add_argument("--out", type=Path, required=True, help="folder for results and tables")
     parser.add_argument("--limit-s", type=float, default=600.0, help="longest time for a case")
     parser.add_argument("--write", nargs=2, metavar=("KIND", "SEED"), help="only write one case")
-    return parser.parse_args()
+    args = parser.parse_args()
+    unknown = set(_chosen(args)) - set(GROUPS)
+    if unknown:
+        parser.error(
+            f"--groups: {', '.join(sorted(unknown))}: expected some of {', '.join(GROUPS)}"
+        )
+    return args
+
+
+def _chosen(args: argparse.Namespace) -> list[str]:
+    return args.groups.split(",") if args.groups else list(GROUPS)
+
+
+def _counts(args: argparse.Namespace) -> Counts:
+    counts = {group: getattr(args, group) for group in _chosen(args)}
+    return a_tenth(counts) if args.tenth else counts
 
 
 def _run_all(todo: list[Slot], out: Path, jobs: int, limit_s: float) -> Iterator[Result]:
@@ -57,18 +73,15 @@ def _run_all(todo: list[Slot], out: Path, jobs: int, limit_s: float) -> Iterator
             yield crashed(futures[future], error) if error else future.result()
 
 
-def main() -> None:
-    """Run the benchmark, or write one case."""
+def main() -> int:
+    """Run the benchmark, or write one case; returns the exit code."""
     args = _arguments()
     args.out.mkdir(parents=True, exist_ok=True)
     if args.write:
         kind, seed = args.write
         write_case(make_case(int(seed), kind), args.out)
-        return
-    counts = Counts(
-        args.cases, args.pairs, args.triples, args.complete, args.outside, args.foreign, args.faint
-    )
-    todo = slots(counts, args.seed)
+        return 0
+    todo = slots(_counts(args), args.seed)
     results = []
     with Progress() as progress:
         bar = progress.add_task("diagnosing", total=len(todo))
@@ -79,8 +92,13 @@ def main() -> None:
     results.sort(key=lambda result: result.slot)
     summary = summarise(results)
     write_tables(results, summary, args.out)
-    print_tables(summary, Console(width=180))
+    console = Console(width=200)
+    print_tables(summary, console)
+    violated = violations(summary)
+    for line in violated:
+        console.print(f"bound violated: {line}", markup=False)
+    return 1 if args.bounds and violated else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

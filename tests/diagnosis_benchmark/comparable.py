@@ -1,11 +1,16 @@
-"""Which parameter of a diagnosis means the same as which one of the truth."""
+"""Which parameter of a diagnosis means the same as which one of the truth.
+
+A gain of the load cannot be told from the size of all that the load moves, so where the load's
+sensor is wrong nothing that is in newtons or kilograms is compared.
+"""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+from tests.truth.cases import FOREIGN_KINDS
 from tests.truth.compiled import REFERENCE_C
-from tests.truth.plant import Bench, Planted
+from tests.truth.plant import Bench, Case
 
 Truth = dict[str, float]
 
@@ -55,11 +60,6 @@ _CONTACTS = (
 _SIDES = ("bump_stop", "rebound_stop", "end_stops")
 
 COMPARABLE: dict[str, tuple[Same, ...]] = {
-    "constant": (_of("preload", "force_n", "force_n"),),
-    "stiffness_error": (_of("linear_stiffness", "stiffness_n_per_m", "stiffness_n_per_m"),),
-    "damping_error": (_of("linear_damping", "damping_n_s_per_m", "damping_n_s_per_m"),),
-    "rigid_mass": (_of("added_mass", "mass_kg", "mass_kg"),),
-    "load_scale": (_of("input_gain", "gain", "fraction"),),
     "late_load": (_of("delay", "delay_s", "lag_s"),),
     "tone": (
         _of("periodic_force", "amplitude_n", "force_n"),
@@ -171,7 +171,70 @@ COMPARABLE: dict[str, tuple[Same, ...]] = {
         Same("hidden_mass", "weight_n", lambda t, b: t["mass_kg"] * b.gravity_m_per_s2),
     ),
 }
-"""Planted law -> the parameters of a diagnosis that can be held against it."""
+"""Planted law -> the parameters of a diagnosis that can be held against it.
+
+What is linear is reported as a total apart from the effects, see `TOTALS`.
+"""
+
+ABOUT_THE_FREE_LENGTH = frozenset(
+    {
+        "cubic_stiffness.stiffness_n_per_m3",
+        "power_stiffness.force_at_100_mm_n",
+        "power_stiffness.exponent",
+        "exponential_stiffness.force_n",
+        "gas_spring.gas_length_m",
+        "balanced_gas_spring.gas_length_m",
+        "position_dependent_damping.damping_n_s_per_m3",
+    }
+)
+"""Parameters that mean something else in a model file whose free length is wrong."""
+
+
+class Total(NamedTuple):
+    """A linear parameter of the whole bench.
+
+    Attributes:
+        family: Family of a diagnosis that corrects it.
+        change: True change against the model file.
+        overlaps: Families whose laws change it too, so that its truth depends on the law.
+    """
+
+    family: str
+    change: Callable[[Case], float]
+    overlaps: frozenset[str]
+
+
+def _planted(law: str) -> Callable[[Case], float]:
+    """Sum of a linear law's only parameter."""
+
+    def total(case: Case) -> float:
+        return sum(next(iter(e.truth.values())) for e in case.effects if e.law == law)
+
+    return total
+
+
+def _change(field: str, law: str) -> Callable[[Case], float]:
+    planted = _planted(law)
+    return lambda case: getattr(case.bench, field) - getattr(case.nominal, field) + planted(case)
+
+
+_ANY_FORCE = frozenset({"input_gain", "delay", "unmodelled_mode", "outside"})
+_ANY_SPRING = _ANY_FORCE | {"nonlinear_stiffness", "backlash", "hysteresis"}
+
+TOTALS: dict[str, Total] = {
+    "mass_kg": Total("inertia", _change("mass_kg", "rigid_mass"), _ANY_FORCE),
+    "stiffness_n_per_m": Total(
+        "stiffness", _change("stiffness_n_per_m", "stiffness_error"), _ANY_SPRING
+    ),
+    "damping_n_s_per_m": Total(
+        "damping",
+        _change("damping_n_s_per_m", "damping_error"),
+        _ANY_FORCE | {"nonlinear_damping", "hysteresis", "fade"},
+    ),
+    "preload_n": Total("preload", _planted("constant"), _ANY_SPRING),
+    "input_gain": Total("input_gain", _planted("load_scale"), _ANY_FORCE - {"input_gain"}),
+}
+"""Parameter of a linear correction -> how to hold it against the truth."""
 
 
 class Interval(NamedTuple):
@@ -189,31 +252,70 @@ class Interval(NamedTuple):
         return self.low <= self.truth <= self.high
 
 
-def intervals(planted: tuple[Planted, ...], bench: Bench, found: list[dict]) -> list[Interval]:
+def carries_force(parameter: str) -> bool:
+    """Whether a parameter is in newtons, kilograms or joules, times or by anything."""
+    return not {"n", "kg", "j"}.isdisjoint(parameter.split("_"))
+
+
+def is_bounded(estimate: dict) -> bool:
+    """Whether the data bound an estimate on both sides."""
+    return estimate["low"] is not None and estimate["high"] is not None
+
+
+def intervals(case: Case, diagnosis: dict) -> list[Interval]:
     """Every interval of a diagnosis that the truth can be held against.
 
     Args:
-        planted: What is in the bench.
-        bench: The bench.
-        found: ``effects`` of the diagnosis.
+        case: The truth.
+        diagnosis: The diagnosis.
     """
-    held = []
-    for planted_effect in planted:
+    if any(case.kind.endswith(kind) for kind in FOREIGN_KINDS):
+        return []
+    held = [*_of_effects(case, diagnosis["effects"]), *_of_totals(case, diagnosis)]
+    return [interval for interval in held if math.isfinite(interval.high - interval.low)]
+
+
+def _of_effects(case: Case, found: list[dict]) -> Iterator[Interval]:
+    for planted_effect in case.effects:
         same = COMPARABLE.get(planted_effect.law, ())
         comparable = {entry.effect for entry in same}
         answers = [answer for answer in found if answer["name"] in comparable]
         # Two stops may stand for one law with two ends; of all else the first answer counts.
         for answer in answers if planted_effect.family == "stop" else answers[:1]:
-            held += [
-                _interval(planted_effect, entry, bench, answer["parameters"][entry.parameter])
-                for entry in same
-                if entry.effect == answer["name"] and entry.parameter in answer["parameters"]
-            ]
-    return [interval for interval in held if math.isfinite(interval.high - interval.low)]
+            for entry in same:
+                estimate = answer["parameters"].get(entry.parameter)
+                name = f"{entry.effect}.{entry.parameter}"
+                if entry.effect != answer["name"] or estimate is None or _is_blurred(case, name):
+                    continue
+                truth = entry.value(planted_effect.truth, case.bench)
+                yield _interval(planted_effect.law, name, truth, estimate)
 
 
-def _interval(planted: Planted, same: Same, bench: Bench, estimate: dict) -> Interval:
+def _is_blurred(case: Case, name: str) -> bool:
+    """Whether the roughness of the model file changes what a parameter of an effect means."""
+    if case.roughness.input_gain and carries_force(name.partition(".")[2]):
+        return True
+    return not case.roughness.is_exact and name in ABOUT_THE_FREE_LENGTH
+
+
+def _of_totals(case: Case, diagnosis: dict) -> Iterator[Interval]:
+    corrected = {entry["parameter"] for entry in diagnosis.get("linear", [])}
+    for entry in diagnosis.get("linear", []):
+        parameter, nominal = entry["parameter"], entry["nominal"]
+        total = TOTALS[parameter]
+        # About mid-stroke a wrong stiffness or free length is a preload as well.
+        is_moved = "stiffness_n_per_m" in corrected or not case.roughness.is_exact
+        if (
+            case.roughness.input_gain
+            or not total.overlaps.isdisjoint(case.families)
+            or (parameter == "preload_n" and is_moved)
+            or (parameter == "mass_kg" and case.is_dyno)
+        ):
+            continue
+        truth = nominal + total.change(case)
+        yield _interval("linear", f"total.{parameter}", truth, entry["total"])
+
+
+def _interval(law: str, parameter: str, truth: float, estimate: dict) -> Interval:
     low, high = (math.nan if estimate[end] is None else estimate[end] for end in ("low", "high"))
-    truth = same.value(planted.truth, bench)
-    parameter = f"{same.effect}.{same.parameter}"
-    return Interval(planted.law, parameter, truth, estimate["value"], low, high)
+    return Interval(law, parameter, truth, estimate["value"], low, high)

@@ -10,9 +10,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from dart_model.spec import load_model
-from rig.identify.diagnose import diagnose as rig_diagnose
-from rig.identify.diagnosis import to_json
-from rig.identify.records import RecordError, read_csv
+from rig.diagnosis.diagnose import diagnose as rig_diagnose
+from rig.diagnosis.outcome import to_json
+from rig.diagnosis.recording import RecordingError, read_csv
 from tests.diagnosis_benchmark.comparable import Interval
 from tests.diagnosis_benchmark.judge import Result, judge
 from tests.diagnosis_benchmark.plan import Slot, fill
@@ -29,9 +29,9 @@ def diagnose(folder: Path) -> dict:
     model = load_model(folder / "model.yaml")
     try:
         found = rig_diagnose(
-            model, [read_csv(folder / "train.csv")], [read_csv(folder / "test.csv")]
+            model, [read_csv(folder / "train.csv")], held_out=[read_csv(folder / "test.csv")]
         )
-    except RecordError as error:
+    except RecordingError as error:
         return failed(str(error))
     return json.loads(to_json(found.diagnosis))
 

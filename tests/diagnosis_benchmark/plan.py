@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tests.truth.cases import FAMILIES, FOREIGN_KINDS, make_case
+from tests.truth import dyno
+from tests.truth.cases import FAMILIES, FOREIGN_KINDS, NONLINEAR_FAMILIES, make_case
 from tests.truth.plant import Case
 from tests.truth.simulation import floor_ratios, record
 
@@ -15,12 +16,55 @@ ATTEMPTS = 60
 SEEDS_PER_GROUP = 100_000
 
 
+class Group(NamedTuple):
+    """Cases of one sort.
+
+    Attributes:
+        cases: How many by default.
+        kinds: As for `make_case`, in turn.
+        says: What they are.
+    """
+
+    cases: int
+    kinds: tuple[str, ...]
+    says: str
+
+
+# The pair that a first trial of such an attribution got wrong is every fifth.
+_PAIRS = ("friction_and_cubic", "pair", "pair", "pair", "pair")
+
+GROUPS = {
+    "single": Group(100, FAMILIES, "one effect above the floor"),
+    "pair": Group(25, _PAIRS, "two effects"),
+    "triple": Group(15, ("triple",), "three effects"),
+    "complete": Group(40, ("complete",), "nothing planted"),
+    "outside": Group(20, ("outside",), "a force that no catalogue holds"),
+    "foreign": Group(25, tuple(FOREIGN_KINDS), "a formula kept back from catalogues"),
+    "rough": Group(
+        75, tuple(f"rough_{f}" for f in NONLINEAR_FAMILIES), "one effect, rough nominal model"
+    ),
+    "rough_pair": Group(
+        20, tuple(f"rough_{kind}" for kind in _PAIRS), "two effects, rough nominal model"
+    ),
+    "rough_triple": Group(10, ("rough_triple",), "three effects, rough nominal model"),
+    "rough_complete": Group(40, ("rough_complete",), "nothing but a rough nominal model"),
+    "rough_foreign": Group(
+        20, tuple(f"rough_{kind}" for kind in FOREIGN_KINDS), "kept-back formula, rough model"
+    ),
+    "dyno": Group(
+        45, tuple(f"dyno_{f}" for f in dyno.FAMILIES), "one effect on a dyno, half rough"
+    ),
+    "dyno_pair": Group(10, ("dyno_pair",), "two effects on a dyno, half rough"),
+    "dyno_complete": Group(20, ("dyno_complete",), "nothing planted on a dyno, half rough"),
+    "faint": Group(0, FAMILIES, "one effect below five times the floor"),
+}
+
+
 class Slot(NamedTuple):
     """One place in the benchmark; the first fit case drawn for it takes it.
 
     Attributes:
-        group: ``single``, ``pair``, ``triple``, ``complete``, ``outside``, ``foreign``,
-            ``faint``.
+        group: One of `GROUPS`.
         kind: As for `make_case`.
         index: Within its group.
         seed: Of the benchmark.
@@ -36,40 +80,29 @@ class Slot(NamedTuple):
         return f"{self.group}-{self.index:03d}-{self.kind}"
 
 
-class Counts(NamedTuple):
-    """How many cases of each group."""
+Counts = dict[str, int]
+"""Group -> number of cases; what is not named has none."""
 
-    single: int
-    pair: int
-    triple: int
-    complete: int
-    outside: int
-    foreign: int
-    faint: int
+
+def a_tenth(counts: Counts) -> Counts:
+    """About a tenth of each group, one case at least of each that has any."""
+    return {group: max(1, round(count / 10)) if count else 0 for group, count in counts.items()}
 
 
 def slots(counts: Counts, seed: int) -> list[Slot]:
     """All places, groups interleaved so that an interrupted run has something of each."""
-    kinds: dict[str, tuple[str, ...]] = {
-        "single": FAMILIES,
-        "faint": FAMILIES,
-        "foreign": tuple(FOREIGN_KINDS),
-        # The pair that a first trial of such an attribution got wrong is every fifth.
-        "pair": ("friction_and_cubic", "pair", "pair", "pair", "pair"),
-    }
     found = [
-        (
-            (i + 0.5) / count,
-            Slot(group, kinds.get(group, (group,))[i % _cycle(kinds, group)], i, seed),
-        )
-        for group, count in counts._asdict().items()
+        ((i + 0.5) / count, Slot(group, _kind(group, i, count), i, seed))
+        for group, count in counts.items()
         for i in range(count)
     ]
     return [slot for _, slot in sorted(found)]
 
 
-def _cycle(kinds: dict[str, tuple[str, ...]], group: str) -> int:
-    return len(kinds.get(group, (group,)))
+def _kind(group: str, index: int, count: int) -> str:
+    """Kinds in turn, or spread over all where there are fewer cases than kinds."""
+    kinds = GROUPS[group].kinds
+    return kinds[index * len(kinds) // count if count < len(kinds) else index % len(kinds)]
 
 
 def _candidates(slot: Slot) -> Iterator[Case]:
@@ -80,7 +113,7 @@ def _candidates(slot: Slot) -> Iterator[Case]:
 def _is_fit(slot: Slot, case: Case) -> bool:
     if not case.effects:
         return True
-    ratios = floor_ratios(case, record(case.bench, case.effects, case.train, case.sensors))
+    ratios = floor_ratios(case, record(case, case.train))
     if slot.group == "faint":
         return bool(np.all(ratios < LEAST_RATIO))
     least = LEAST_RATIO_OUTSIDE if slot.group == "outside" else LEAST_RATIO

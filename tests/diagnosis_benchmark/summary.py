@@ -2,59 +2,99 @@
 
 import csv
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from tests.diagnosis_benchmark.judge import Result
+from tests.diagnosis_benchmark.plan import GROUPS
 from tests.truth.cases import FAMILIES
 
 FIRST_COLUMNS = (*FAMILIES, "restoring_surface", "none")
-GROUPS = ("single", "pair", "triple", "complete", "outside", "foreign", "faint")
-TARGETS = {"single": 0.98, "pair": 0.90, "complete": 0.98, "outside": 1.0}
+EXPLAINED_MULTIPLE = 1.2
+"""An ``explained`` bench leaves no more than this many times the noise floor."""
+WILSON_Z = 1.959964
+"""Two-sided 95 % of a normal distribution."""
+POOLS = {
+    "one effect": ("single", "rough", "dyno"),
+    "several effects": ("pair", "triple", "rough_pair", "rough_triple", "dyno_pair"),
+    "nothing planted": ("complete", "rough_complete", "dyno_complete"),
+    "foreign formula": ("foreign", "rough_foreign"),
+    "all but outside": tuple(group for group in GROUPS if group not in {"outside", "faint"}),
+    "all": tuple(group for group in GROUPS if group != "faint"),
+}
+"""Groups that are also counted together. A force outside any catalogue has no right name, so what
+is named there is counted apart."""
 
 
-def _share(results: Iterable[Result], holds: Callable[[Result], bool]) -> float:
-    flags = [holds(result) for result in results]
-    return float(np.mean(flags)) if flags else float("nan")
+class Rate(NamedTuple):
+    """A share of cases with its 95 % interval after Wilson (1927); None where there are none."""
+
+    hits: int
+    of: int
+    share: float | None
+    low: float | None
+    high: float | None
+
+    def __str__(self) -> str:
+        if self.share is None:
+            return "-"
+        return f"{_percent(self.share)} % ({_percent(self.low)}-{_percent(self.high)})"
 
 
-def _percentile(values: list[float], percent: float) -> float:
-    finite = [value for value in values if np.isfinite(value)]
-    return float(np.percentile(finite, percent)) if finite else float("nan")
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.1f}".removesuffix(".0")
+
+
+def rate(flags: Iterable[bool]) -> Rate:
+    """Share of what is true."""
+    values = list(flags)
+    hits, count = sum(values), len(values)
+    if not count:
+        return Rate(0, 0, None, None, None)
+    share, z2 = hits / count, WILSON_Z**2
+    middle = (share + z2 / (2 * count)) / (1 + z2 / count)
+    reach = share * (1 - share) / count + z2 / (4 * count**2)
+    half = WILSON_Z / (1 + z2 / count) * math.sqrt(reach)
+    # Rounding must not put an end beside the share itself, where all or none are hits.
+    low = 0.0 if hits == 0 else middle - half
+    high = 1.0 if hits == count else middle + half
+    return Rate(hits, count, share, low, high)
+
+
+def _percentile(values: Iterable[float], percent: float) -> float | None:
+    finite = [value for value in values if math.isfinite(value)]
+    return float(np.percentile(finite, percent)) if finite else None
 
 
 def _named(result: Result) -> str:
     return result.families[0] if result.families else "none"
 
 
-def group_figures(results: list[Result]) -> dict[str, object]:
-    """Figures of one group of cases."""
-    multiples = [result.floor_multiple for result in results]
+def figures(results: list[Result]) -> dict[str, object]:
+    """Figures of some cases."""
+    explained = [result.floor_multiple for result in results if result.verdict == "explained"]
     held = [interval for result in results if result.right for interval in result.intervals]
     times = [result.duration_s for result in results]
-    before = [result.rmse_before_m / result.height_noise_m for result in results]
     return {
         "cases": len(results),
-        "right": _share(results, lambda result: result.right),
+        "right": rate(result.right for result in results),
+        "false_names": rate(bool(result.false_names) for result in results),
+        "unbound": rate(bool(result.unbound) for result in results),
+        "explained_within": rate(multiple <= EXPLAINED_MULTIPLE for multiple in explained),
+        "explained_worst": _percentile(explained, 100),
+        "coverage": rate(interval.holds for interval in held),
         "verdicts": dict(Counter(result.verdict for result in results)),
-        "spurious_effects": _share(results, _has_spurious),
-        "held_out_over_floor_before_median": _percentile(before, 50),
-        "held_out_over_floor_median": _percentile(multiples, 50),
-        "held_out_over_floor_95_percent": _percentile(multiples, 95),
-        "intervals": len(held),
-        "interval_coverage": _share(held, lambda interval: interval.holds),
+        "over_floor_median": _percentile((result.floor_multiple for result in results), 50),
         "seconds_median": _percentile(times, 50),
-        "seconds_max": _percentile(times, 100),
+        "seconds_worst": _percentile(times, 100),
     }
-
-
-def _has_spurious(result: Result) -> bool:
-    return any(family not in result.planted for family in result.families)
 
 
 def confusion(results: list[Result]) -> dict[str, dict[str, int]]:
@@ -65,78 +105,124 @@ def confusion(results: list[Result]) -> dict[str, dict[str, int]]:
     }
 
 
-def coverage(results: list[Result]) -> dict[str, tuple[int, int]]:
-    """Parameter -> intervals that hold the truth, and all."""
-    held = [i for r in results if r.right for i in r.intervals]
-    names = sorted({i.parameter for i in held})
+def coverage(results: list[Result]) -> dict[str, Rate]:
+    """Parameter -> intervals that hold the truth, where the answer is right."""
+    held = [interval for result in results if result.right for interval in result.intervals]
     return {
-        name: (sum(i.holds for i in held if i.parameter == name), _count(held, name))
-        for name in names
+        name: rate(interval.holds for interval in held if interval.parameter == name)
+        for name in sorted({interval.parameter for interval in held})
     }
 
 
-def _count(held: list, name: str) -> int:
-    return sum(1 for interval in held if interval.parameter == name)
+def _pooled(results: list[Result], pools: dict[str, tuple[str, ...]]) -> dict[str, object]:
+    members = {name: [r for r in results if r.group in groups] for name, groups in pools.items()}
+    return {name: figures(found) for name, found in members.items() if found}
 
 
 def summarise(results: list[Result]) -> dict[str, object]:
-    """Everything that the tables show, as plain data."""
-    groups = {g: [r for r in results if r.group == g] for g in GROUPS}
+    """Everything that the tables show."""
     return {
-        "groups": {g: group_figures(members) for g, members in groups.items() if members},
-        "targets_right": TARGETS,
-        "confusion": confusion(groups["single"]),
-        "coverage": coverage([r for r in results if r.group in {"single", "pair", "triple"}]),
-        "wrong": [
-            {
-                "slot": r.slot,
-                "case": r.case,
-                "ratios": r.ratios,
-                "verdict": r.verdict,
-                "families": r.families,
-                "ambiguous_with": r.ambiguous_with,
-                "message": r.message,
-            }
-            for r in results
-            if not r.right and r.group != "faint"
-        ],
+        "groups": _pooled(results, {group: (group,) for group in GROUPS}),
+        "pools": _pooled(results, POOLS),
+        "confusion": confusion([r for r in results if r.group in POOLS["one effect"]]),
+        "coverage": coverage([r for r in results if r.group != "faint"]),
+        "wrong": _entries(results, lambda r: not r.right and r.group != "faint"),
+        "false": _entries(results, lambda r: bool(r.false_names) and r.group != "outside"),
+        "unbound": _entries(results, lambda r: bool(r.unbound)),
+        "missed_floor": _entries(results, _misses_floor),
     }
+
+
+def _misses_floor(result: Result) -> bool:
+    return result.verdict == "explained" and not result.floor_multiple <= EXPLAINED_MULTIPLE
+
+
+def _entries(results: list[Result], shown: Callable[[Result], bool]) -> list[dict]:
+    return [
+        {
+            "slot": result.slot,
+            "case": result.case,
+            "ratios": result.ratios,
+            "verdict": result.verdict,
+            "families": result.families,
+            "linear": result.linear,
+            "ambiguous_with": result.ambiguous_with,
+            "false_names": result.false_names,
+            "unbound": result.unbound,
+            "over_floor": result.floor_multiple if math.isfinite(result.floor_multiple) else None,
+            "message": result.message,
+        }
+        for result in results
+        if shown(result)
+    ]
+
+
+class Column(NamedTuple):
+    """A column of the table of groups: its heading, and its cell from a group's figures."""
+
+    heading: str
+    cell: Callable[[dict], str]
+
+
+def _decimal(key: str, form: str) -> Callable[[dict], str]:
+    return lambda found: "-" if found[key] is None else format(found[key], form)
+
+
+def _explained(found: dict) -> str:
+    worst = "" if found["explained_worst"] is None else f", worst {found['explained_worst']:.2f}"
+    return f"{found['explained_within']}{worst}"
+
+
+COLUMNS = (
+    Column("cases", lambda found: str(found["cases"])),
+    Column("right", lambda found: str(found["right"])),
+    Column("false names", lambda found: str(found["false_names"])),
+    Column("not bound", lambda found: str(found["unbound"])),
+    Column(f"`explained` within {EXPLAINED_MULTIPLE} floors", _explained),
+    Column("95 % intervals that hold", lambda found: f"{found['coverage']}"),
+    Column("s median", _decimal("seconds_median", ".1f")),
+    Column("s worst", _decimal("seconds_worst", ".1f")),
+)
+
+
+def _rows(summary: dict) -> list[list[str]]:
+    every = summary["groups"] | {f"*{name}*": f for name, f in summary["pools"].items()}
+    return [[name, *(column.cell(found) for column in COLUMNS)] for name, found in every.items()]
+
+
+def markdown(summary: dict) -> str:
+    """The table of groups, ready for a README; each share with its own 95 % interval."""
+    heading = ["group", *(column.heading for column in COLUMNS)]
+    lines = [heading, ["---", *("---:" for _ in COLUMNS)], *_rows(summary)]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
 def print_tables(summary: dict, console: Console) -> None:
     """Print all tables."""
     for table in (_groups_table(summary), _confusion_table(summary), _coverage_table(summary)):
         console.print(table)
-    console.print(_wrong_table(summary))
+    titles = {
+        "wrong": "Wrong answers",
+        "false": "False names",
+        "unbound": "Effects that the data do not bind",
+        "missed_floor": f"Explained, but above {EXPLAINED_MULTIPLE} floors",
+    }
+    for key, title in titles.items():
+        console.print(_entries_table(summary[key], title))
 
 
 def _groups_table(summary: dict) -> Table:
-    table = Table(title="Groups")
-    for heading in ("group", "cases", "right", "target", "verdicts", "spurious"):
-        table.add_column(heading)
-    for heading in ("held-out / floor: before", "median", "95 %", "coverage", "s median", "s max"):
-        table.add_column(heading, justify="right")
-    for group, f in summary["groups"].items():
-        target = summary["targets_right"].get(group)
-        table.add_row(
-            group,
-            str(f["cases"]),
-            f"{f['right']:.1%}",
-            f"{target:.0%}" if target else "",
-            ", ".join(f"{verdict} {n}" for verdict, n in sorted(f["verdicts"].items())),
-            f"{f['spurious_effects']:.0%}",
-            f"{f['held_out_over_floor_before_median']:.1f}",
-            f"{f['held_out_over_floor_median']:.2f}",
-            f"{f['held_out_over_floor_95_percent']:.2f}",
-            f"{f['interval_coverage']:.0%} of {f['intervals']}",
-            f"{f['seconds_median']:.1f}",
-            f"{f['seconds_max']:.1f}",
-        )
+    table = Table(title="Groups, each share with its 95 % interval")
+    table.add_column("group")
+    for column in COLUMNS:
+        table.add_column(column.heading, justify="right")
+    for row in _rows(summary):
+        table.add_row(*row)
     return table
 
 
 def _confusion_table(summary: dict) -> Table:
-    table = Table(title="Planted (rows) and named first (columns), single effects")
+    table = Table(title="Planted (rows) and named first (columns), one effect")
     table.add_column("planted")
     for number, _ in enumerate(FIRST_COLUMNS):
         table.add_column(str(number + 1), justify="right")
@@ -153,33 +239,51 @@ def _coverage_table(summary: dict) -> Table:
     table.add_column("parameter")
     table.add_column("inside", justify="right")
     table.add_column("of", justify="right")
-    for name, (inside, count) in summary["coverage"].items():
-        table.add_row(name, str(inside), str(count))
+    for name, found in summary["coverage"].items():
+        table.add_row(name, str(found.hits), str(found.of))
     return table
 
 
-def _wrong_table(summary: dict) -> Table:
-    table = Table(title="Wrong answers")
-    for heading in ("case", "over floor", "verdict", "named", "rivals", "message"):
-        table.add_column(heading, overflow="fold")
-    for entry in summary["wrong"]:
+def _entries_table(entries: list[dict], title: str) -> Table:
+    table = Table(title=title)
+    headings = ("case", "effects / floor", "verdict", "held-out / floor", "named", "linear")
+    for heading in (*headings, "rivals", "false, not bound", "message"):
+        table.add_column(heading)
+    for entry in entries:
+        multiple = entry["over_floor"]
         table.add_row(
             f"{entry['slot']} {entry['case']}",
             " ".join(f"{ratio:.0f}" for ratio in entry["ratios"]),
             entry["verdict"],
+            "-" if multiple is None else f"{multiple:.2f}",
             ", ".join(entry["families"]),
+            ", ".join(entry["linear"]),
             ", ".join(entry["ambiguous_with"]),
+            ", ".join([*entry["false_names"], *entry["unbound"]]),
             entry["message"],
         )
     return table
 
 
+def _plain(value: object) -> object:
+    """Rates as objects with names, for JSON."""
+    if isinstance(value, Rate):
+        return value._asdict()
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    return value
+
+
 def write_tables(results: list[Result], summary: dict, out: Path) -> None:
-    """Write ``summary.json``, and ``cases.csv`` with one row a case."""
-    (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
-    columns = ("slot", "case", "planted", "laws", "ratios", "verdict", "names", "ambiguous_with")
-    columns += ("right", "height_noise_m", "rmse_before_m", "rmse_after_m", "own_floor_m")
-    columns += ("duration_s", "message")
+    """Write ``summary.json``, ``table.md``, and ``cases.csv`` with one row a case."""
+    text = json.dumps(_plain(summary), indent=1, allow_nan=False)
+    (out / "summary.json").write_text(text + "\n", encoding="utf-8")
+    (out / "table.md").write_text(markdown(summary), encoding="utf-8")
+    columns = ("slot", "case", "planted", "laws", "ratios", "is_rough", "verdict", "names")
+    columns += ("linear", "ambiguous_with", "right", "false_names", "unbound", "unit")
+    columns += ("error_before", "error_after", "floor", "own_floor", "duration_s", "message")
     with (out / "cases.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(columns)

@@ -17,13 +17,13 @@ from dart_model.yaml_file import InputError
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfigError
 from rig.config import CONFIGS, load_setup
-from rig.identify.records import RecordError, read_csv
+from rig.diagnosis.recording import RecordingError, read_csv
 from rig.imports import load_mapping
 from rig.io.run_log import DBC_FILE, FRAMES_FILE, MODEL_FILE, RUN_FILE, STEPS_FILE
 from rig.replay import replay
 from tests.faults.test_machine import lockstep
 
-REFUSED = (InputError, DatabaseError, BenchConfigError, RecordError)
+REFUSED = (InputError, DatabaseError, BenchConfigError, RecordingError)
 """What a wrong input is allowed to raise."""
 
 OF_A_RUN = (RUN_FILE, FRAMES_FILE, STEPS_FILE, DBC_FILE, MODEL_FILE)

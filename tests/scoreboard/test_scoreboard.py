@@ -10,7 +10,7 @@ import pytest
 from dart_model.yaml_file import InputError
 from rig import scoreboard
 from rig.config import CONFIGS
-from rig.identify.records import Record
+from rig.diagnosis.recording import Recording
 from rig.imports import import_table, load_mapping
 from rig.scoreboard import (
     PUBLISHED,
@@ -30,7 +30,7 @@ SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 MASS_KG, DAMPING, STIFFNESS, LENGTH_M = 0.6, 9.0, 9000.0, 0.52
 
 
-def driven_record(samples: int = 4000, rate_hz: float = 600.0) -> Record:
+def driven_record(samples: int = 4000, rate_hz: float = 600.0) -> Recording:
     """A linear bench under a multisine, in closed form: every line has its own response."""
     rng = np.random.default_rng(5)
     t_s = np.arange(samples) / rate_hz
@@ -40,7 +40,7 @@ def driven_record(samples: int = 4000, rate_hz: float = 600.0) -> Record:
     turn = np.exp(1j * np.outer(t_s, omega))
     noise_m = 1e-6 * rng.standard_normal(samples)
     height_m = LENGTH_M + (turn @ response).real + noise_m
-    return Record("linear", t_s, height_m[:, np.newaxis], (turn @ force).real)
+    return Recording("linear", t_s, height_m[:, np.newaxis], (turn @ force).real)
 
 
 def test_the_linear_start_of_a_driven_bench_is_found_from_its_record() -> None:
@@ -64,7 +64,7 @@ def test_the_linear_start_of_a_dyno_is_found_from_its_record() -> None:
     height_m = 0.3 + 0.01 * np.sin(12.0 * t_s) + 0.004 * np.sin(31.0 * t_s)
     rate = 0.12 * np.cos(12.0 * t_s) + 0.124 * np.cos(31.0 * t_s)
     force_n = -4000.0 * (height_m - 0.31) - 700.0 * rate
-    spec = dyno_start([Record("dyno", t_s, height_m[:, np.newaxis], None, force_n)], "dyno")
+    spec = dyno_start([Recording("dyno", t_s, height_m[:, np.newaxis], None, force_n)], "dyno")
     (strut,) = spec.struts
     assert strut.stiffness_n_per_m == pytest.approx(4000.0, rel=1e-2)
     assert strut.damping_n_s_per_m == pytest.approx(700.0, rel=1e-2)

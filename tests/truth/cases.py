@@ -3,21 +3,28 @@
 Kinds: ``single`` (families in turn), any family's name, ``pair``, ``triple``, ``complete``,
 ``outside``, ``friction_and_cubic``, and ``foreign-FAMILY``: an effect of that family by a formula
 that no catalogue holds.
+
+``rough_KIND`` is such a case whose model file is rough in all that is linear, so that only what is
+not linear is planted; ``dyno_KIND`` is one whose motion is imposed, the model file rough or not.
 """
 
 import zlib
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
+from tests.truth import dyno
 from tests.truth.excitation import load_n
 from tests.truth.integrator import Motion
-from tests.truth.plant import Bench, Case, Excitation, Planted, RunPlan, Sensors
+from tests.truth.plant import Bench, Case, Excitation, Planted, Roughness, RunPlan, Sensors
 from tests.truth.planting import DRAWS, FOREIGN, OUTSIDE, START_C, Draw, Nominal, Rng, cubic_spring
 from tests.truth.simulation import true_motion
 
 FAMILIES = tuple(DRAWS)
 FOREIGN_KINDS = {f"foreign-{family}": family for family in FOREIGN}
+LINEAR_FAMILIES = ("preload", "stiffness", "damping", "inertia", "input_gain")
+NONLINEAR_FAMILIES = tuple(family for family in FAMILIES if family not in LINEAR_FAMILIES)
 KINDS = ("single", "pair", "triple", "complete", "outside", "friction_and_cubic", *FOREIGN_KINDS)
 SHAPES = ("multisine", "sweep", "noise")
 LOAD_LIMIT_N = 600.0
@@ -26,6 +33,8 @@ HEIGHT_HIGH_M = 1.0
 LEAST_SWING_M = 0.008
 PLANNING_RATE_HZ = 250
 ATTEMPTS = 400
+GAIN_ERROR_SHARE = 1.0 / 3.0
+DYNO_ROUGH_SHARE = 0.5
 
 
 class _UnfitError(Exception):
@@ -51,47 +60,123 @@ def make_case(seed: int, kind: str) -> Case:
     raise RuntimeError(f"no fit bench in {ATTEMPTS} draws for seed {seed}, kind {kind!r}")
 
 
+class _Recipe(NamedTuple):
+    """A kind, taken apart.
+
+    Attributes:
+        base: The kind of what is planted.
+        is_dyno: Whether the motion is imposed.
+        is_rough: Whether the model file is rough.
+    """
+
+    base: str
+    is_dyno: bool
+    is_rough: bool
+
+    @property
+    def families(self) -> tuple[str, ...]:
+        """What may be planted; roughness is linear already."""
+        shown = dyno.FAMILIES if self.is_dyno else FAMILIES
+        return tuple(f for f in shown if not self.is_rough or f in NONLINEAR_FAMILIES)
+
+
+def _recipe(rng: Rng, kind: str) -> _Recipe:
+    setting, _, base = kind.partition("_")
+    if setting == "rough":
+        return _Recipe(base, is_dyno=False, is_rough=True)
+    if setting == "dyno":
+        rough = rng.random() < DYNO_ROUGH_SHARE and base not in LINEAR_FAMILIES
+        return _Recipe(base, is_dyno=True, is_rough=rough)
+    return _Recipe(kind, is_dyno=False, is_rough=False)
+
+
 def _draw_case(rng: Rng, seed: int, kind: str) -> Case:
-    families = _families(rng, seed, kind)
-    laws = FOREIGN if kind in FOREIGN_KINDS else DRAWS | {"outside": OUTSIDE}
+    recipe = _recipe(rng, kind)
+    base = recipe.base
+    families = _families(rng, seed, recipe)
+    laws = FOREIGN if base in FOREIGN_KINDS else DRAWS | {"outside": OUTSIDE}
     draws = [_pick(rng, laws[family]) for family in families]
-    if kind == "friction_and_cubic":
+    if base == "friction_and_cubic":
         draws = [draws[0], cubic_spring]
-    bench = _bench(rng, centred="backlash" in families)
-    train = _run_plan(rng, bench, 1.0, centred="backlash" in families)
-    nominal = _nominal(bench, train)
-    effects = tuple(draw(rng, nominal, _strength(rng, len(draws), kind)) for draw in draws)
-    held_out = _held_out_plan(rng, bench, train)
-    sensors = Sensors(
-        sample_rate_hz=1000 if rng.random() < 0.75 else 500,
-        height_noise_m=float(10.0 ** rng.uniform(-6.0, -4.0)),
-        has_temperature=any(e.law == "thin_oil" for e in effects) or rng.random() < 0.1,
+    centred = "backlash" in families
+    bench, train, nominal = (_dyno if recipe.is_dyno else _free_bench)(rng, centred=centred)
+    effects = tuple(draw(rng, nominal, _strength(rng, len(draws), base)) for draw in draws)
+    if recipe.is_dyno:
+        held_out = dyno.draw_held_out(rng, train)
+    else:
+        held_out = _held_out_plan(rng, bench, train)
+    case = Case(
+        name=f"{kind}-{seed:04d}-{'+'.join(effect.law for effect in effects) or 'nothing'}",
+        kind=kind,
+        families=tuple(effect.family for effect in effects),
+        effects=effects,
+        bench=bench,
+        sensors=_sensors(rng, recipe, effects),
+        train=train,
+        held_out=held_out,
+        seed=seed,
+        roughness=_roughness(rng, recipe, nominal),
     )
     for plan in (train, held_out):
-        _refuse_unfit(bench, effects, plan)
-    planted_laws = "+".join(effect.law for effect in effects) or "nothing"
-    name = f"{kind}-{seed:04d}-{planted_laws}"
-    planted = tuple(effect.family for effect in effects)
-    return Case(name, kind, planted, effects, bench, sensors, train, held_out, seed)
+        _refuse_unfit(case, plan)
+    return case
 
 
-def _families(rng: Rng, seed: int, kind: str) -> tuple[str, ...]:
-    if kind in DRAWS:
+def _free_bench(rng: Rng, *, centred: bool) -> tuple[Bench, RunPlan, Nominal]:
+    bench = _bench(rng, centred=centred)
+    train = _run_plan(rng, bench, 1.0, centred=centred)
+    return bench, train, _nominal(bench, train)
+
+
+def _dyno(rng: Rng, *, centred: bool) -> tuple[Bench, RunPlan, Nominal]:
+    bench = dyno.draw_bench(rng)
+    train = dyno.draw_run(rng, bench, centred=centred)
+    return bench, train, dyno.nominal_of(bench, train)
+
+
+def _sensors(rng: Rng, recipe: _Recipe, effects: tuple[Planted, ...]) -> Sensors:
+    warms = any(e.law == "thin_oil" for e in effects)
+    if recipe.is_dyno:
+        return dyno.draw_sensors(rng, has_temperature=warms or rng.random() < 0.1)
+    return Sensors(
+        sample_rate_hz=1000 if rng.random() < 0.75 else 500,
+        height_noise_m=float(10.0 ** rng.uniform(-6.0, -4.0)),
+        has_temperature=warms or rng.random() < 0.1,
+    )
+
+
+def _roughness(rng: Rng, recipe: _Recipe, nominal: Nominal) -> Roughness:
+    """As a careful guess from a data sheet; on a dyno no mass and no load is in play."""
+    if not recipe.is_rough:
+        return Roughness()
+    stiffness, damping = float(rng.uniform(-0.2, 0.2)), float(rng.uniform(-0.4, 0.4))
+    share = float(rng.uniform(-0.05, 0.05))
+    if recipe.is_dyno:
+        return Roughness(stiffness=stiffness, damping=damping, preload_n=share * nominal.load_rms_n)
+    gain = float(rng.uniform(-0.02, 0.02)) if rng.random() < GAIN_ERROR_SHARE else 0.0
+    mass = float(rng.uniform(-0.05, 0.05))
+    return Roughness(mass, stiffness, damping, share * nominal.bench.weight_n, gain)
+
+
+def _families(rng: Rng, seed: int, recipe: _Recipe) -> tuple[str, ...]:
+    kind, families = recipe.base, recipe.families
+    if kind in families:
         return (kind,)
     if kind == "single":
-        return (FAMILIES[seed % len(FAMILIES)],)
+        return (families[seed % len(families)],)
     if kind in FOREIGN_KINDS:
         return (FOREIGN_KINDS[kind],)
     if kind in {"pair", "triple"}:
         count = 2 if kind == "pair" else 3
-        return tuple(str(f) for f in rng.choice(FAMILIES, count, replace=False))
+        return tuple(str(f) for f in rng.choice(families, count, replace=False))
     fixed = {
         "complete": (),
         "outside": ("outside",),
         "friction_and_cubic": ("friction", "nonlinear_stiffness"),
     }
     if kind not in fixed:
-        raise ValueError(f"kind {kind!r}: expected one of {', '.join([*KINDS, *DRAWS])}")
+        expected = ", ".join([*KINDS, *families])
+        raise ValueError(f"kind {kind!r}: expected one of {expected}, or rough_ or dyno_ before it")
     return fixed[kind]
 
 
@@ -167,16 +252,20 @@ def _dry(bristle: Planted) -> Planted:
     return replace(bristle, law="stick", truth=bristle.truth | {"hyperbolic": 0.0})
 
 
-def _rough_motion(bench: Bench, effects: tuple[Planted, ...], plan: RunPlan) -> Motion:
+def _coarse(effects: tuple[Planted, ...]) -> tuple[Planted, ...]:
+    """The effects as coarse steps can follow them."""
+    return tuple(_dry(effect) if effect.law == "bristle" else effect for effect in effects)
+
+
+def _coarse_motion(bench: Bench, effects: tuple[Planted, ...], plan: RunPlan) -> Motion:
     """The run in coarse steps, to plan with; stiff bristles are replaced by dry contact."""
-    coarse = tuple(_dry(effect) if effect.law == "bristle" else effect for effect in effects)
     steps = (5000 if effects else 2500) // PLANNING_RATE_HZ
-    return true_motion(bench, coarse, plan, PLANNING_RATE_HZ, steps)[1]
+    return true_motion(bench, _coarse(effects), plan, PLANNING_RATE_HZ, steps)[1]
 
 
 def _swing(bench: Bench, excitation: Excitation) -> float:
     """Half the stroke of the bench without effects."""
-    motion = _rough_motion(bench, (), RunPlan(excitation, 0.0, START_C, 0))
+    motion = _coarse_motion(bench, (), RunPlan(excitation, 0.0, START_C, 0))
     return float(np.ptp(motion.height_m)) / 2.0
 
 
@@ -195,7 +284,7 @@ def _scaled(bench: Bench, unit: Excitation, swing_m: float) -> Excitation:
 
 
 def _nominal(bench: Bench, plan: RunPlan) -> Nominal:
-    motion = _rough_motion(bench, (), plan)
+    motion = _coarse_motion(bench, (), plan)
     return Nominal(
         bench,
         plan.excitation,
@@ -206,8 +295,12 @@ def _nominal(bench: Bench, plan: RunPlan) -> Nominal:
     )
 
 
-def _refuse_unfit(bench: Bench, effects: tuple[Planted, ...], plan: RunPlan) -> None:
-    motion = _rough_motion(bench, effects, plan)
+def _refuse_unfit(case: Case, plan: RunPlan) -> None:
+    if case.is_dyno:
+        if not dyno.is_fit(case.bench, _coarse(case.effects), plan):
+            raise _UnfitError
+        return
+    motion = _coarse_motion(case.bench, case.effects, plan)
     z = motion.height_m
     if not np.all(np.isfinite(z)) or z.min() < HEIGHT_LOW_M or z.max() > HEIGHT_HIGH_M:
         raise _UnfitError

@@ -623,6 +623,80 @@ def run(system, steps, y):
     return states, accelerations, forces
 
 
+@numba.njit(cache=True, error_model="numpy")
+def _moment_on(system, path, half):
+    t = 0.5 * half * system.step_s
+    z, v, a = path[0, half], path[1, half], path[2, half]
+    return Moment(system.bench, t, z, v, a, system.gate[half])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _path_rates(system, path, half, y, out):
+    """Rates of all memories at a half step of an imposed motion."""
+    moment, at = _moment_on(system, path, half), system.at
+    for i in range(out.size):
+        out[i] = 0.0
+    for e in range(system.codes.size):
+        memory, rate = y[at[e] : at[e + 1]], out[at[e] : at[e + 1]]
+        memory_rate(system.codes[e], system.parameters[e], moment, memory, rate)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _advance_on(system, path, k, y, work):
+    """One step of all memories in place, the motion being imposed."""
+    h = system.step_s
+    trial = work[4]
+    for stage in range(4):
+        ahead = (stage + 1) // 2
+        for i in range(y.size):
+            trial[i] = y[i] + (0.5 * ahead * h * work[stage - 1, i] if stage > 0 else 0.0)
+        _path_rates(system, path, 2 * k + ahead, trial, work[stage])
+    for i in range(y.size):
+        y[i] += h / 6.0 * (work[0, i] + 2.0 * (work[1, i] + work[2, i]) + work[3, i])
+    for e in range(system.codes.size):
+        if system.codes[e] == _SLIP_ELEMENTS:
+            memory = y[system.at[e] : system.at[e + 1]]
+            settle_slip_elements(system.parameters[e], path[0, 2 * k + 2], memory)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _observe_on(system, path, half, y, forces):
+    moment = _moment_on(system, path, half)
+    for e in range(system.codes.size):
+        code, p = system.codes[e], system.parameters[e]
+        if code == _STICK:
+            v = moment.velocity_m_per_s
+            forces[e] = -_sign(v) * sliding_friction_n(p, v)
+        else:
+            forces[e] = force_n(code, p, moment, y[system.at[e] : system.at[e + 1]])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def run_along(system, path, steps, y):
+    """Follow all memories along an imposed motion; what acts through a mass gives no force.
+
+    Args:
+        system: The bench; its drive is not read.
+        path: (3, 2 n + 1) height, velocity and acceleration at steps and half steps.
+        steps: Steps between two samples.
+        y: Initial memories; overwritten.
+
+    Returns:
+        (n, memories) memories and (n, effects) forces at the samples.
+    """
+    samples = (path.shape[1] - 1) // (2 * steps) + 1
+    memories = np.empty((samples, y.size))
+    forces = np.empty((samples, system.codes.size))
+    work = np.zeros((5, y.size))
+    for i in range(samples):
+        memories[i] = y
+        _observe_on(system, path, 2 * i * steps, y, forces[i])
+        if i < samples - 1:
+            for s in range(steps):
+                _advance_on(system, path, i * steps + s, y, work)
+    return memories, forces
+
+
 def slip_memory(truth: dict[str, float], height_m: float) -> np.ndarray:
     """First memory of slip elements: no force, where the body stands, shares of the yield force."""
     shares = np.arange(1.0, SLIP_ELEMENTS + 1.0) ** truth["grading"]

@@ -1,9 +1,9 @@
-"""Loads as functions of continuous time, and forces that depend on time alone."""
+"""Loads and strokes as functions of continuous time, and forces that depend on time alone."""
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from tests.truth.plant import Bench, Excitation, Samples
+from tests.truth.plant import Bench, Excitation, Samples, Stroke
 
 RAMP_S = 0.5
 
@@ -73,6 +73,32 @@ def _noise(excitation: Excitation, bench: Bench, t_s: Samples) -> Samples:
     values = np.fft.irfft(spectrum, count)
     spline = CubicSpline(np.arange(count) / rate - 2.0, values / np.std(values))
     return np.asarray(spline(np.clip(t_s, -2.0, excitation.duration_s + 1.9)))
+
+
+def stroke_path(stroke: Stroke, t_s: Samples) -> Samples:
+    """(3, n) height, velocity and acceleration of an imposed motion at any times."""
+    rng = np.random.default_rng([stroke.seed, 7])
+    lines = int(rng.integers(7, 16))
+    edges = np.geomspace(stroke.low_hz, stroke.high_hz, lines + 1)
+    frequencies = rng.uniform(edges[:-1], edges[1:])
+    phases = rng.uniform(0.0, 2.0 * np.pi, lines)
+    amplitudes = frequencies**-stroke.tilt
+
+    def wave(at_s: Samples) -> Samples:
+        total = np.zeros((3, at_s.size))
+        for amplitude, frequency, phase in zip(amplitudes, frequencies, phases, strict=True):
+            omega = 2.0 * np.pi * frequency
+            angle = omega * at_s + phase
+            height = amplitude * np.sin(angle)
+            total[0] += height
+            total[1] += amplitude * omega * np.cos(angle)
+            total[2] -= omega**2 * height
+        return total
+
+    reach = np.ptp(wave(np.arange(0.0, stroke.duration_s, 0.002))[0])
+    path = stroke.stroke_m / reach * wave(t_s)
+    path[0] += stroke.middle_m
+    return path
 
 
 def tone_n(truth: dict[str, float], t_s: Samples) -> Samples:

@@ -56,28 +56,33 @@ class Drive(NamedTuple):
     steps: int
 
 
-def integrate(
-    bench: Bench, effects: tuple[Planted, ...], drive: Drive, height_m: float, ambient_c: float
-) -> Motion:
-    """Integrate a bench from rest.
+def _system_and_start(
+    bench: Bench,
+    effects: tuple[Planted, ...],
+    drive: Drive,
+    body: tuple[float, ...],
+    start: tuple[float, float],
+) -> tuple[compiled.System, Samples]:
+    """The bench as the compiled code wants it, and its first state.
 
     Args:
         bench: Body, spring, damper.
-        effects: What is planted; what depends on time alone must be in the drive.
+        effects: What is planted.
         drive: What is imposed.
-        height_m: Initial height.
-        ambient_c: Ambient temperature.
+        body: States before the memories.
+        start: Initial height, ambient temperature in °C.
     """
+    height_m, ambient_c = start
     codes = _numbers_of(effects)
     sizes = [compiled.MEMORY.get(effect.law, 0) + 1 for effect in effects]
-    at = 2 + np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    at = len(body) + np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     y = np.zeros(int(at[-1]))
-    y[0] = height_m
+    y[: len(body)] = body
     y[at[1:] - 1] = ambient_c
-    for effect, start in zip(effects, at, strict=False):
+    for effect, begin in zip(effects, at, strict=False):
         if effect.law == "slip_elements":
             memory = compiled.slip_memory(effect.truth, height_m)
-            y[start : start + memory.size] = memory
+            y[begin : begin + memory.size] = memory
     dry = np.flatnonzero(codes == compiled.STICK)
     system = compiled.System(
         bench=np.array(
@@ -99,5 +104,38 @@ def integrate(
         gate=drive.gate,
         step_s=drive.step_s,
     )
+    return system, y
+
+
+def integrate(
+    bench: Bench, effects: tuple[Planted, ...], drive: Drive, height_m: float, ambient_c: float
+) -> Motion:
+    """Integrate a bench from rest.
+
+    Args:
+        bench: Body, spring, damper.
+        effects: What is planted; what depends on time alone must be in the drive.
+        drive: What is imposed.
+        height_m: Initial height.
+        ambient_c: Ambient temperature.
+    """
+    system, y = _system_and_start(bench, effects, drive, (height_m, 0.0), (height_m, ambient_c))
     states, accelerations, forces = compiled.run(system, drive.steps, y)
     return Motion(states[:, 0], states[:, 1], accelerations, forces, states[:, 2:])
+
+
+def follow(
+    bench: Bench, effects: tuple[Planted, ...], drive: Drive, path: Samples, ambient_c: float
+) -> Motion:
+    """Follow the effects along a motion that is imposed.
+
+    Args:
+        bench: Spring and damper.
+        effects: What is planted; what depends on time alone has no force here.
+        drive: Steps; its force is not read.
+        path: (3, 2 n + 1) height, velocity and acceleration at steps and half steps.
+        ambient_c: Ambient temperature.
+    """
+    system, y = _system_and_start(bench, effects, drive, (), (float(path[0, 0]), ambient_c))
+    memories, forces = compiled.run_along(system, path, drive.steps, y)
+    return Motion(*path[:, :: 2 * drive.steps], forces, memories)

@@ -1,6 +1,6 @@
 """What a simulated bench consists of: body, spring and damper, planted effects, sensors, runs."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ Samples = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Bench:
-    """One body on a spring and a damper; what the model file says, and exactly so.
+    """One body on a spring and a damper; what the model file says, but for its roughness.
 
     m z'' = -K (z - free_length) - C z' + effects + load - m g
     """
@@ -77,11 +77,70 @@ class Excitation:
 
 
 @dataclass(frozen=True)
+class Stroke:
+    """A height that a dyno imposes: a sum of sines, as a function of continuous time.
+
+    Attributes:
+        stroke_m: Highest less lowest height of the run.
+        middle_m: Height about which the sines swing.
+        low_hz: Lower end of the band.
+        high_hz: Upper end of the band.
+        tilt: Amplitudes fall with the frequency to this power.
+        duration_s: Length of the run.
+        seed: Of phases and lines.
+    """
+
+    stroke_m: float
+    middle_m: float
+    low_hz: float
+    high_hz: float
+    tilt: float
+    duration_s: float
+    seed: int
+
+
+@dataclass(frozen=True)
+class Roughness:
+    """How far the model file is from the bench in what is linear; by default not at all.
+
+    Attributes:
+        mass: The file's mass over the bench's, less one.
+        stiffness: Likewise.
+        damping: Likewise.
+        preload_n: Force that the file's spring lacks at the bench's free length: the file's free
+            length is wrong.
+        input_gain: The load over what the sensor says of it, less one; no file holds it.
+    """
+
+    mass: float = 0.0
+    stiffness: float = 0.0
+    damping: float = 0.0
+    preload_n: float = 0.0
+    input_gain: float = 0.0
+
+    @property
+    def is_exact(self) -> bool:
+        return self == Roughness()
+
+    def applied(self, bench: Bench) -> Bench:
+        """The bench as the model file describes it."""
+        stiffness = bench.stiffness_n_per_m * (1.0 + self.stiffness)
+        return replace(
+            bench,
+            mass_kg=bench.mass_kg * (1.0 + self.mass),
+            stiffness_n_per_m=stiffness,
+            damping_n_s_per_m=bench.damping_n_s_per_m * (1.0 + self.damping),
+            free_length_m=bench.free_length_m - self.preload_n / stiffness,
+        )
+
+
+@dataclass(frozen=True)
 class Sensors:
-    """What the bench's electronics make of the truth."""
+    """What the bench's electronics make of the truth; a load cell is a dyno's."""
 
     sample_rate_hz: int
     height_noise_m: float
+    force_noise_n: float = 0.0
     height_step_m: float = 2e-6
     load_step_n: float = 0.01
     temperature_noise_k: float = 0.05
@@ -92,12 +151,17 @@ class Sensors:
         """RMS of noise and quantisation together."""
         return float(np.hypot(self.height_noise_m, self.height_step_m / np.sqrt(12)))
 
+    @property
+    def force_error_n(self) -> float:
+        """RMS of the load cell's noise and quantisation together."""
+        return float(np.hypot(self.force_noise_n, self.load_step_n / np.sqrt(12)))
+
 
 @dataclass(frozen=True)
 class RunPlan:
-    """One run: what is commanded and how the body is let go."""
+    """One run: what is commanded, and on a bench with a free body how that is let go."""
 
-    excitation: Excitation
+    excitation: Excitation | Stroke
     start_offset_m: float
     ambient_c: float
     noise_seed: int
@@ -112,11 +176,12 @@ class Case:
         kind: As given to `make_case`.
         families: Families of the planted effects, in the order of `effects`.
         effects: The truth.
-        bench: What the model file says.
+        bench: The true one; the model file describes it as the roughness has it.
         sensors: Noise, resolution, rate.
         train: The run that is diagnosed.
         held_out: Another run of the same bench.
         seed: From which all of it follows.
+        roughness: Of the model file.
     """
 
     name: str
@@ -128,6 +193,17 @@ class Case:
     train: RunPlan
     held_out: RunPlan
     seed: int
+    roughness: Roughness = Roughness()
+
+    @property
+    def is_dyno(self) -> bool:
+        """Whether the height is imposed and a load cell measures, on no free body."""
+        return isinstance(self.train.excitation, Stroke)
+
+    @property
+    def nominal(self) -> Bench:
+        """The bench as the model file describes it."""
+        return self.roughness.applied(self.bench)
 
 
 class Recording(NamedTuple):
@@ -136,7 +212,8 @@ class Recording(NamedTuple):
     Attributes:
         t_s: (n,) time.
         height_m: (n,) measured height: true, noisy, quantised.
-        applied_force_n: (n,) measured load: what was commanded, quantised.
+        applied_force_n: (n,) measured load: what was commanded, quantised; None on a dyno.
+        strut_force_n: (n,) measured by the load cell: true, noisy, quantised; None without one.
         temperature_c: (n,) measured temperature, or None.
         true_height_m: (n,)
         true_velocity_m_per_s: (n,)
@@ -146,7 +223,8 @@ class Recording(NamedTuple):
 
     t_s: Samples
     height_m: Samples
-    applied_force_n: Samples
+    applied_force_n: Samples | None
+    strut_force_n: Samples | None
     temperature_c: Samples | None
     true_height_m: Samples
     true_velocity_m_per_s: Samples

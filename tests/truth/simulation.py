@@ -4,8 +4,8 @@ import numpy as np
 
 from tests.truth import compiled
 from tests.truth import excitation as loads
-from tests.truth.integrator import MINIMUM_RATE_HZ, Drive, Motion, integrate
-from tests.truth.plant import Bench, Case, Planted, Recording, RunPlan, Samples, Sensors
+from tests.truth.integrator import MINIMUM_RATE_HZ, Drive, Motion, follow, integrate
+from tests.truth.plant import Bench, Case, Planted, Recording, RunPlan, Samples, Stroke
 
 BAND_HZ = 25.0
 FINE_LAWS = frozenset({"bristle"})
@@ -88,6 +88,32 @@ def true_motion(
     return t_s, motion
 
 
+def true_path(
+    bench: Bench, effects: tuple[Planted, ...], plan: RunPlan, sample_rate_hz: int, steps: int
+) -> tuple[Samples, Motion]:
+    """Follow one run of a dyno, with so many steps a sample.
+
+    Returns:
+        (n,) sample times in s, and the imposed motion with every effect's force.
+    """
+    samples = round(plan.excitation.duration_s * sample_rate_hz) + 1
+    half_steps = np.arange(2 * steps * (samples - 1) + 1) / (2.0 * steps * sample_rate_hz)
+    nothing = np.zeros_like(half_steps)
+    drive = Drive(nothing, nothing, 1.0 / (steps * sample_rate_hz), steps)
+    path = loads.stroke_path(plan.excitation, half_steps)
+    motion = follow(bench, effects, drive, path, plan.ambient_c)
+    t_s = half_steps[:: 2 * steps]
+    for column, effect in enumerate(effects):
+        motion.force_n[:, column] += timed_force_n(effect, np.zeros_like, t_s)
+    return t_s, motion
+
+
+def strut_force_n(bench: Bench, motion: Motion) -> Samples:
+    """(n,) force of spring, damper and effects together, positive where it pushes apart."""
+    spring = -bench.stiffness_n_per_m * (motion.height_m - bench.free_length_m)
+    return spring - bench.damping_n_s_per_m * motion.velocity_m_per_s + motion.force_n.sum(axis=1)
+
+
 def _quantised(values: Samples, step: float) -> Samples:
     return np.round(values / step) * step
 
@@ -104,24 +130,30 @@ def _temperature_c(
     return plan.ambient_c + 3.0 * (1.0 - np.exp(-t_s / 9.0)) + 0.5 * np.sin(0.7 * t_s)
 
 
-def record(
-    bench: Bench, effects: tuple[Planted, ...], plan: RunPlan, sensors: Sensors
-) -> Recording:
-    """Integrate and measure one run."""
+def record(case: Case, plan: RunPlan) -> Recording:
+    """Simulate and measure one run of a case."""
+    bench, effects, sensors = case.bench, case.effects, case.sensors
     rate_hz = sensors.sample_rate_hz
-    steps = steps_per_sample(effects, rate_hz)
-    t_s, motion = true_motion(bench, effects, plan, rate_hz, steps)
+    simulated = true_path if case.is_dyno else true_motion
+    t_s, motion = simulated(bench, effects, plan, rate_hz, steps_per_sample(effects, rate_hz))
     rng = np.random.default_rng([plan.noise_seed, 6])
     noise = sensors.height_noise_m * rng.standard_normal(t_s.size)
-    load = loads.load_n(plan.excitation, bench, t_s)
-    temperature = None
+    temperature = load = cell = None
     if sensors.has_temperature:
         wobble = sensors.temperature_noise_k * rng.standard_normal(t_s.size)
         temperature = _temperature_c(effects, motion, plan, t_s) + wobble
+    if isinstance(plan.excitation, Stroke):
+        cell = strut_force_n(bench, motion)
+        cell += sensors.force_noise_n * rng.standard_normal(t_s.size)
+        cell = _quantised(cell, sensors.load_step_n)
+    else:
+        load = loads.load_n(plan.excitation, bench, t_s) / (1.0 + case.roughness.input_gain)
+        load = _quantised(load, sensors.load_step_n)
     return Recording(
         t_s,
         _quantised(motion.height_m + noise, sensors.height_step_m),
-        _quantised(load, sensors.load_step_n),
+        load,
+        cell,
         temperature,
         motion.height_m,
         motion.velocity_m_per_s,
@@ -132,28 +164,30 @@ def record(
 
 def simulate(case: Case) -> tuple[Recording, Recording]:
     """Both runs of a case: the one to diagnose, and the held-out one."""
-    return (
-        record(case.bench, case.effects, case.train, case.sensors),
-        record(case.bench, case.effects, case.held_out, case.sensors),
-    )
+    return record(case, case.train), record(case, case.held_out)
 
 
-def force_noise_floor_n(bench: Bench, sensors: Sensors) -> float:
-    """RMS of the force that the height's noise alone feigns, between 0 and 25 Hz.
+def force_noise_floor_n(case: Case) -> float:
+    """RMS of the force that the sensors' noise alone feigns, between 0 and 25 Hz.
 
     White height noise of RMS s, sampled f_s times a second, has the one-sided spectral density
     2 s^2 / f_s. A smoother that knows m, C and K exactly reads a force by multiplying with the
     dynamic stiffness |K - m w^2 + j C w|; whatever it does, inside the band in which it wants to
     see forces this noise passes. 25 Hz is twice the highest frequency of any load and above any
     planted resonance or tone, so it is the least band in which all that is planted shows.
+
+    On a dyno no mass moves between height and load cell, and the cell's own white noise comes in.
     """
+    bench, sensors = case.bench, case.sensors
+    mass_kg, cell_n = (0.0, sensors.force_error_n) if case.is_dyno else (bench.mass_kg, 0.0)
     frequency = np.linspace(0.0, BAND_HZ, 2001)
     omega = 2.0 * np.pi * frequency
     stiffness = np.abs(
-        bench.stiffness_n_per_m - bench.mass_kg * omega**2 + 1j * bench.damping_n_s_per_m * omega
+        bench.stiffness_n_per_m - mass_kg * omega**2 + 1j * bench.damping_n_s_per_m * omega
     )
-    density = 2.0 * sensors.height_error_m**2 / sensors.sample_rate_hz
-    return float(np.sqrt(density * np.trapezoid(stiffness**2, frequency)))
+    squared = sensors.height_error_m**2 * np.trapezoid(stiffness**2, frequency)
+    squared += cell_n**2 * BAND_HZ
+    return float(np.sqrt(2.0 * squared / sensors.sample_rate_hz))
 
 
 def effect_force_rms_n(recording: Recording) -> Samples:
@@ -163,4 +197,4 @@ def effect_force_rms_n(recording: Recording) -> Samples:
 
 def floor_ratios(case: Case, recording: Recording) -> Samples:
     """(effects,) how far above the noise floor every planted force stands."""
-    return effect_force_rms_n(recording) / force_noise_floor_n(case.bench, case.sensors)
+    return effect_force_rms_n(recording) / force_noise_floor_n(case)

@@ -11,18 +11,21 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.truth.cases import FAMILIES, FOREIGN_KINDS, make_case
-from tests.truth.excitation import load_n
+from tests.truth import dyno
+from tests.truth.cases import FAMILIES, FOREIGN_KINDS, NONLINEAR_FAMILIES, make_case
+from tests.truth.excitation import load_n, stroke_path
 from tests.truth.files import write_case
-from tests.truth.integrator import Drive, Motion, integrate
-from tests.truth.plant import Bench, Case, Planted, RunPlan
+from tests.truth.integrator import Drive, Motion, follow, integrate
+from tests.truth.plant import Bench, Case, Planted, Roughness, RunPlan, Stroke
 from tests.truth.simulation import (
     BAND_HZ,
     floor_ratios,
     force_noise_floor_n,
     record,
     simulate,
+    strut_force_n,
     true_motion,
+    true_path,
 )
 
 BENCH = Bench(10.0, 1000.0, 20.0, 0.5)
@@ -117,7 +120,7 @@ def test_smooth_laws_converge_with_fourth_order():
 def test_forces_of_every_family_balance(kind, seed):
     """m z'' is the sum of all forces, and heights, velocities, accelerations belong together."""
     case = short_case(seed, kind)
-    run = record(case.bench, case.effects, case.train, case.sensors)
+    run = record(case, case.train)
     bench = case.bench
     forces = (
         -bench.stiffness_n_per_m * (run.true_height_m - bench.free_length_m)
@@ -266,7 +269,7 @@ def test_rigid_mass_is_a_bench_with_that_mass():
 
 def test_late_load_is_an_exact_shift():
     case = short_case(3, "delay")
-    run = record(case.bench, case.effects, case.train, case.sensors)
+    run = record(case, case.train)
     lag = case.effects[0].truth["lag_s"]
     excitation = case.train.excitation
     expected = load_n(excitation, case.bench, run.t_s - lag)
@@ -329,7 +332,7 @@ def test_kinds_plant_what_they_say():
 
 def test_cases_span_visibility_noise_and_rates():
     cases = [short_case(seed, "single") for seed in range(14)]
-    ratios = [floor_ratios(c, record(c.bench, c.effects, c.train, c.sensors))[0] for c in cases]
+    ratios = [floor_ratios(c, record(c, c.train))[0] for c in cases]
     assert min(ratios) < 2.0
     assert max(ratios) > 50.0
     noises = [case.sensors.height_noise_m for case in cases]
@@ -350,7 +353,7 @@ def test_floor_is_what_band_limited_inverse_dynamics_leave():
     stiffness = bench.stiffness_n_per_m - bench.mass_kg * omega**2
     stiffness = stiffness + 1j * bench.damping_n_s_per_m * omega
     force = np.fft.irfft(np.fft.rfft(noise) * stiffness * (frequency <= BAND_HZ), count)
-    assert np.std(force) == pytest.approx(force_noise_floor_n(bench, sensors), rel=0.05)
+    assert np.std(force) == pytest.approx(force_noise_floor_n(case), rel=0.05)
 
 
 def test_files_hold_the_model_without_the_effect(tmp_path):
@@ -366,6 +369,114 @@ def test_files_hold_the_model_without_the_effect(tmp_path):
     truth = json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))
     assert truth["families"] == ["friction"]
     assert truth["floor_ratios"][0] > 0.0
+
+
+ROUGH = Roughness(mass=0.04, stiffness=-0.13, damping=0.3, preload_n=4.0, input_gain=0.02)
+
+
+def test_rough_model_file_is_off_by_its_roughness(tmp_path):
+    case = replace(short_case(8, "friction", 1.0), roughness=ROUGH)
+    bench = case.bench
+    write_case(case, tmp_path)
+    model = yaml.safe_load((tmp_path / "model.yaml").read_text(encoding="utf-8"))
+    strut, body = model["struts"][0], model["skeleton"]["bodies"][0]
+    assert body["mass_kg"] == pytest.approx(1.04 * bench.mass_kg)
+    assert strut["stiffness_n_per_m"] == pytest.approx(0.87 * bench.stiffness_n_per_m)
+    assert strut["damping_n_s_per_m"] == pytest.approx(1.3 * bench.damping_n_s_per_m)
+    # At the true free length the file's spring pulls as hard as what it lacks pushes.
+    pull = strut["stiffness_n_per_m"] * (bench.free_length_m - strut["free_length_m"])
+    assert pull == pytest.approx(4.0, abs=0.02)
+
+
+def test_roughness_leaves_the_bench_as_it_is():
+    case = short_case(8, "friction", 1.0)
+    exact, rough = record(case, case.train), record(replace(case, roughness=ROUGH), case.train)
+    np.testing.assert_array_equal(exact.height_m, rough.height_m)
+    # The load's sensor reads too little of what acts.
+    np.testing.assert_allclose(exact.applied_force_n, 1.02 * rough.applied_force_n, atol=0.02)
+    assert case.roughness.is_exact
+    assert case.nominal == case.bench
+
+
+def test_rough_kinds_draw_roughness_and_plant_nothing_linear():
+    cases = [make_case(seed, "rough_complete") for seed in range(8)]
+    gains = [case.roughness.input_gain for case in cases]
+    assert 0 < np.count_nonzero(gains) < 8
+    for case in cases:
+        rough = case.roughness
+        assert not rough.is_exact
+        assert abs(rough.mass) <= 0.05
+        assert abs(rough.stiffness) <= 0.2
+        assert abs(rough.damping) <= 0.4
+        assert abs(rough.preload_n) <= 0.05 * case.bench.weight_n
+        assert abs(rough.input_gain) <= 0.02
+    triple = make_case(1, "rough_triple")
+    assert set(triple.families) <= set(NONLINEAR_FAMILIES)
+    assert triple == make_case(1, "rough_triple")
+    assert make_case(0, "rough_foreign-stop").effects[0].law == "rubber_bumper"
+    with pytest.raises(ValueError, match="kind 'preload'"):
+        make_case(0, "rough_preload")
+
+
+def test_imposed_motion_keeps_to_its_stroke_and_its_derivatives():
+    stroke = Stroke(0.08, 0.4, 0.3, 6.0, 0.8, 12.0, 5)
+    t_s = np.arange(0.0, 12.0, 1e-4)
+    height, velocity, acceleration = stroke_path(stroke, t_s)
+    assert np.ptp(height) == pytest.approx(0.08, rel=1e-4)
+    np.testing.assert_allclose(np.gradient(height, 1e-4)[1:-1], velocity[1:-1], atol=1e-5)
+    np.testing.assert_allclose(np.gradient(velocity, 1e-4)[1:-1], acceleration[1:-1], atol=1e-3)
+
+
+@pytest.mark.parametrize("family", [f for f in FAMILIES if f in dyno.FAMILIES])
+def test_dyno_gives_the_forces_of_a_free_bench_that_moves_likewise(family):
+    """A law along the motion of a free bench has the force that it had on that bench."""
+    case = short_case(5, family, 2.0)
+    steps = 60 if family == "friction" else 20
+    _, free = true_motion(case.bench, case.effects, case.train, 2 * steps * RATE_HZ, 1)
+    path = np.stack([free.height_m, free.velocity_m_per_s, free.acceleration_m_per_s2])
+    nothing = np.zeros(path.shape[1])
+    drive = Drive(nothing, nothing, 1 / (steps * RATE_HZ), steps)
+    along = follow(case.bench, case.effects, drive, path, case.train.ambient_c)
+    moving = np.abs(along.velocity_m_per_s) > 1e-3
+    expected = free.force_n[:: 2 * steps]
+    scale = np.abs(expected).max()
+    if case.effects[0].law in {"constant", "tone"}:
+        expected = np.zeros_like(expected)
+    np.testing.assert_allclose(along.force_n[moving], expected[moving], atol=1e-4 * scale)
+
+
+def test_dyno_measures_spring_damper_and_effects(tmp_path):
+    case = make_case(3, "dyno_preload")
+    run, _ = write_case(case, tmp_path)
+    bench, force = case.bench, case.effects[0].truth["force_n"]
+    spring = bench.stiffness_n_per_m * (run.true_height_m - bench.free_length_m)
+    expected = force - spring - bench.damping_n_s_per_m * run.true_velocity_m_per_s
+    error = run.strut_force_n - expected
+    assert np.std(error) == pytest.approx(case.sensors.force_error_n, rel=0.05)
+    assert abs(np.mean(error)) < 0.1 * case.sensors.force_error_n
+    header = (tmp_path / "train.csv").read_text(encoding="utf-8").splitlines()[0]
+    assert header.split(",")[:3] == ["t_s", "height_m", "strut_force_n"]
+    assert "applied_force_n" not in header
+    quiet, motion = true_path(bench, case.effects, case.train, 100, 10)
+    assert strut_force_n(bench, motion).shape == quiet.shape
+
+
+def test_dyno_kinds_are_what_they_say():
+    cases = [make_case(seed, "dyno_complete") for seed in range(8)]
+    assert 0 < sum(case.roughness.is_exact for case in cases) < 8
+    for case in cases:
+        assert case.is_dyno
+        assert (case.roughness.mass, case.roughness.input_gain) == (0.0, 0.0)
+        assert 0.03 <= case.train.excitation.stroke_m <= 0.12
+        assert 1e-6 <= case.sensors.height_noise_m <= 1e-5
+        assert 0.1 <= case.sensors.force_noise_n <= 1.0
+        assert case.held_out.excitation.seed != case.train.excitation.seed
+    assert all(make_case(seed, "dyno_stiffness").roughness.is_exact for seed in range(4))
+    pair = make_case(2, "dyno_pair")
+    assert len(set(pair.families)) == 2
+    assert set(pair.families) <= set(dyno.FAMILIES)
+    with pytest.raises(ValueError, match="kind 'delay'"):
+        make_case(0, "dyno_delay")
 
 
 def test_planning_steps_are_fine_enough_to_trust():

@@ -1,0 +1,1 @@
+"""From recordings and a nominal model to what the model lacks."""

@@ -1,0 +1,168 @@
+"""From recordings and a nominal model to a diagnosis."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from dart_model.spec import ModelSpec
+from rig.diagnosis.evaluate import Evaluated, evaluated, models_of
+from rig.diagnosis.outcome import Result
+from rig.diagnosis.problem.build import (
+    build,
+    build_held_out,
+    is_prescribed,
+    with_noise,
+    with_tones,
+)
+from rig.diagnosis.problem.contract import Parts, existing_values, nominal
+from rig.diagnosis.problem.free_run import FreeRun
+from rig.diagnosis.problem.prescribed import Prescribed
+from rig.diagnosis.recording import Recording, RecordingError
+from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
+from rig.diagnosis.search.fit import Fit, fit
+from rig.diagnosis.search.select import Found, Seed, search
+from rig.diagnosis.search.surface import surface
+from rig.diagnosis.write_up import judgement, written_up
+
+Progress = Callable[[str, float], None]
+"""Told what is being done, and the share of it that is done."""
+
+
+def _quiet(_what: str, _share: float) -> None:
+    return
+
+
+def diagnose(
+    spec: ModelSpec,
+    runs: Sequence[Recording],
+    held_out: Sequence[Recording] = (),
+    progress: Progress = _quiet,
+    criteria: SelectionCriteria = CRITERIA,
+) -> Result:
+    """Trace what a nominal model lacks to named effects, correct it, and judge the correction.
+
+    Args:
+        spec: The nominal model.
+        runs: Recordings to learn from.
+        held_out: Recordings to judge on; without them, blocks spread over `runs` are kept back.
+        progress: Told what is being done and the share that is done.
+        criteria: What decides.
+
+    Raises:
+        RecordingError: A recording or the model cannot be used; one line says why.
+    """
+    if not runs:
+        raise RecordingError("no run given, expected at least one")
+    is_prescribed((*runs, *held_out))
+    progress("reading runs", 0.01)
+    kept_every = None if held_out else criteria.kept_every
+    given, problem = build(spec, runs, criteria.blocks, kept_every)
+    judged = build_held_out(given, held_out) if held_out else problem
+    found, problem = _searched(problem, criteria, progress)
+    progress("judging on held-out data", 0.95)
+    judged = judged.renewed(_noise(judged), problem.motions)
+    recordings = tuple(held_out or runs)
+
+    def figures(chosen: Fit) -> tuple[Evaluated, ...]:
+        models = models_of(problem, found.linear.fit, chosen)
+        return evaluated(judged, models, recordings, kept=not held_out)
+
+    results = figures(found.chosen.fit)
+    verdict = judgement(results, found, criteria)
+    if verdict == "not_explained":
+        progress("tabulating what has no name", 0.97)
+        found, results = _tabulated(problem, found, results, figures)
+    result = written_up(problem, found, verdict, results, runs, criteria, blocks=not held_out)
+    progress("done", 1.0)
+    return result
+
+
+def _tabulated(
+    problem: FreeRun | Prescribed,
+    found: Found,
+    results: tuple[Evaluated, ...],
+    figures: Callable[[Fit], tuple[Evaluated, ...]],
+) -> tuple[Found, tuple[Evaluated, ...]]:
+    """A table as the correction where no law explains, if held-out data agree; else no law at all.
+
+    What was chosen and does not hold is no correction either.
+    """
+    linear = float(np.sqrt(np.mean([result.linear**2 for result in results])))
+    offered = surface(problem, found.linear.fit)
+    if offered is not None:
+        there = figures(offered)
+        if _error(there) < linear:
+            return found._replace(chosen=found.chosen._replace(fit=offered), rivals=()), there
+    if found.chosen.size and linear <= _error(results):
+        return found._replace(chosen=found.linear, rivals=()), figures(found.linear.fit)
+    return found, results
+
+
+def _error(results: Sequence[Evaluated]) -> float:
+    return float(np.sqrt(np.mean([result.counted.after**2 for result in results])))
+
+
+def _searched(
+    problem: FreeRun | Prescribed, criteria: SelectionCriteria, progress: Progress
+) -> tuple[Found, FreeRun | Prescribed]:
+    """Search, and once more about what was found: its free run is nearer to the measurement.
+
+    The noise, too, is only known once a model follows: what a poor one leaves is smooth and noise.
+    """
+    progress("fitting the linear part", 0.03)
+    given, linear = first_fits(problem)
+    problem = _sharpened(problem, linear)
+    found = search(problem, given, [_seed(linear)], criteria, _within(progress, 0.05, 0.55))
+    problem = _sharpened(problem, found.chosen.fit)
+    seeds = [_seed(scored.fit) for scored in (found.linear, *found.best)]
+    found = search(problem, found.given, seeds, criteria, _within(progress, 0.55, 0.95))
+    return found, problem
+
+
+def first_fits(problem: FreeRun | Prescribed) -> tuple[Fit, Fit]:
+    """The nominal model with its initial states fitted, and the best linear model.
+
+    Raises:
+        RecordingError: The nominal model runs away on the recordings.
+    """
+    base = nominal(problem)
+    starts = tuple(problem.start(k, base) for k in range(problem.recordings))
+    first = Parts(np.zeros(len(problem.linear)), existing_values(problem, base), starts)
+    none = np.zeros(len(problem.linear), dtype=np.bool_)
+    given = fit(problem, base, first, none, 8, effects=False)
+    if given is None:
+        raise RecordingError(
+            f"model {problem.spec.name}: runs away on the recordings, expected one that stays "
+            "near them: check its stiffness, its free length and the sign of the applied force"
+        )
+    # The gain of the applied force is degenerate with all else, and has a turn of its own.
+    free = np.array([p.kind != "gain" for p in problem.linear], dtype=np.bool_)
+    return given, fit(problem, base, given.parts, free, 12) or given
+
+
+def _sharpened(problem: FreeRun | Prescribed, result: Fit) -> FreeRun | Prescribed:
+    """The problem with the noise and the tones that a fit leaves."""
+    forces = [
+        there
+        for k in range(problem.recordings)
+        if (there := problem.residual_forces(k, result.candidate, result.parts)) is not None
+    ]
+    motions = with_tones(problem, forces) if forces else problem.motions
+    if isinstance(problem, FreeRun):
+        problem = with_noise(problem, result.candidate, result.parts)
+    return problem.renewed(_noise(problem), motions)
+
+
+def _noise(problem: FreeRun | Prescribed) -> "np.ndarray[tuple[int, ...], np.dtype[np.float64]]":
+    return problem.noise_m if isinstance(problem, FreeRun) else problem.noise_n
+
+
+def _seed(result: Fit) -> Seed:
+    return Seed(result.candidate, result.parts)
+
+
+def _within(progress: Progress, first: float, last: float) -> Progress:
+    def part(what: str, share: float) -> None:
+        progress(what, first + (last - first) * share)
+
+    return part

@@ -1,0 +1,1 @@
+"""Numerics of the diagnosis: compiled loops, smoothing, least squares."""

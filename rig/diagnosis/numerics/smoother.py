@@ -1,0 +1,253 @@
+"""Smoothing over the whole run: what force the model lacks, without an observer's lag.
+
+The difference between measured and simulated height is smoothed with a Rauch-Tung-Striebel smoother
+whose state is the difference, its first two derivatives and the slope of the second (an integrated
+random walk of the acceleration). Sensor noise and the walk's intensity come from the data by
+maximum likelihood. Times may be uneven and samples missing.
+
+References:
+    Rauch, Tung, Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA J. 3 (1965).
+    Särkkä, Bayesian Filtering and Smoothing (2013), 8.2.
+    Durbin and Koopman, Time Series Analysis by State Space Methods (2012), 2.10, for the
+    concentrated likelihood.
+"""
+
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from rig.diagnosis.numerics.compiled import compile_loop
+
+Array = NDArray[np.float64]
+
+_ORDER = 4
+_LONGEST_FOR_LIKELIHOOD = 12_000
+
+
+class Smoothed(NamedTuple):
+    """A smoothed signal.
+
+    Attributes:
+        states: Signal, first, second and third derivative at each time, shape (N, 4).
+        deviations: Their standard deviations, shape (N, 4).
+    """
+
+    states: Array
+    deviations: Array
+
+
+class Noise(NamedTuple):
+    """What the data say of themselves.
+
+    Attributes:
+        variance: Variance of the sensor's noise.
+        ratio: Intensity of the random walk over that variance.
+    """
+
+    variance: float
+    ratio: float
+
+
+def _transition(h: float, a: Array, q: Array) -> None:
+    h2 = h * h
+    h3 = h2 * h
+    a[0, 1] = a[1, 2] = a[2, 3] = h
+    a[0, 2] = a[1, 3] = 0.5 * h2
+    a[0, 3] = h3 / 6.0
+    h4 = h2 * h2
+    h5 = h4 * h
+    q[0, 0] = h5 * h2 / 252.0
+    q[0, 1] = q[1, 0] = h3 * h3 / 72.0
+    q[0, 2] = q[2, 0] = h5 / 30.0
+    q[0, 3] = q[3, 0] = h4 / 24.0
+    q[1, 1] = h5 / 20.0
+    q[1, 2] = q[2, 1] = h4 / 8.0
+    q[1, 3] = q[3, 1] = h3 / 6.0
+    q[2, 2] = h3 / 3.0
+    q[2, 3] = q[3, 2] = 0.5 * h2
+    q[3, 3] = h
+
+
+_F8: Any = types.float64
+_V: Any = types.Array(types.float64, 1, "C")
+_M: Any = types.Array(types.float64, 2, "C")
+_T3: Any = types.Array(types.float64, 3, "C")
+_transition_c = compile_loop(_transition, types.void(_F8, _M, _M))
+
+
+def _filter(
+    t: Array, y: Array, ratio: float, means: Array, covariances: Array, out: Array, keep: int
+) -> None:
+    # All covariances are in units of the noise variance, which is concentrated out.
+    m = np.zeros(4)
+    p = np.zeros((4, 4))
+    a = np.eye(4)
+    q = np.zeros((4, 4))
+    ap = np.zeros((4, 4))
+    m2 = np.zeros(4)
+    scale = 1.0
+    for i in range(4):
+        p[i, i] = 1e14 * scale
+        scale *= 1e3
+    squares = 0.0
+    logs = 0.0
+    count = 0
+    last = -1.0
+    for k in range(t.shape[0]):
+        if k > 0:
+            h = t[k] - t[k - 1]
+            if abs(h - last) > 1e-12:
+                _transition_c(h, a, q)
+                last = h
+            for i in range(4):
+                total = 0.0
+                for j in range(i, 4):
+                    total += a[i, j] * m[j]
+                m2[i] = total
+            for i in range(4):
+                m[i] = m2[i]
+            for i in range(4):
+                for j in range(4):
+                    total = 0.0
+                    for l in range(i, 4):
+                        total += a[i, l] * p[l, j]
+                    ap[i, j] = total
+            for i in range(4):
+                for j in range(i + 1):
+                    total = ratio * q[i, j]
+                    for l in range(j, 4):
+                        total += ap[i, l] * a[j, l]
+                    p[i, j] = total
+                    p[j, i] = total
+        if y[k] == y[k]:
+            s = p[0, 0] + 1.0
+            e = y[k] - m[0]
+            for i in range(4):
+                m2[i] = p[i, 0] / s
+            for i in range(4):
+                m[i] += m2[i] * e
+            for i in range(4):
+                for j in range(4):
+                    ap[i, j] = p[i, j] - m2[i] * p[0, j]
+            for i in range(4):
+                for j in range(i + 1):
+                    p[i, j] = 0.5 * (ap[i, j] + ap[j, i])
+                    p[j, i] = p[i, j]
+            count += 1
+            if count > 8:
+                squares += e * e / s
+                logs += np.log(s)
+        if keep == 1:
+            for i in range(4):
+                means[k, i] = m[i]
+                for j in range(4):
+                    covariances[k, i, j] = p[i, j]
+    out[0] = squares
+    out[1] = logs
+    out[2] = count - 8
+
+
+_filter_c = compile_loop(_filter, types.void(_V, _V, _F8, _M, _T3, _V, types.int64))
+
+
+def _smooth(t: Array, ratio: float, means: Array, covariances: Array) -> None:
+    a = np.eye(4)
+    q = np.zeros((4, 4))
+    last = -1.0
+    for k in range(t.shape[0] - 2, -1, -1):
+        h = t[k + 1] - t[k]
+        if abs(h - last) > 1e-12:
+            _transition_c(h, a, q)
+            last = h
+        p = covariances[k].copy()
+        m = means[k].copy()
+        ap = a @ p
+        ahead = ap @ a.T + ratio * q
+        # Scale to unit diagonal: the states differ by many orders of magnitude.
+        d = np.sqrt(np.diag(ahead))
+        for i in range(4):
+            for j in range(4):
+                ahead[i, j] /= d[i] * d[j]
+                ap[i, j] = ap[i, j]
+        for i in range(4):
+            for j in range(4):
+                ap[i, j] /= d[i]
+        g = np.linalg.solve(ahead, ap).T
+        for i in range(4):
+            for j in range(4):
+                g[i, j] /= d[j]
+        g = np.ascontiguousarray(g)
+        means[k] = m + g @ (means[k + 1] - a @ m)
+        full = a @ p @ a.T + ratio * q
+        covariances[k] = p + g @ (covariances[k + 1] - full) @ g.T
+
+
+_smooth_c = compile_loop(_smooth, types.void(_V, _F8, _M, _T3))
+
+
+def estimate_noise(t_s: Array, y: Array) -> Noise:
+    """Sensor noise and random walk of a signal, by maximum likelihood.
+
+    Args:
+        t_s: Times, shape (N,).
+        y: Signal, NaN where missing, shape (N,).
+    """
+    n = len(t_s)
+    if n > _LONGEST_FOR_LIKELIHOOD:
+        # A third from each part of the run says as much as the whole.
+        piece = _LONGEST_FOR_LIKELIHOOD // 3
+        parts = [slice(i, i + piece) for i in (0, (n - piece) // 2, n - piece)]
+    else:
+        parts = [slice(0, n)]
+    pieces = [(np.ascontiguousarray(t_s[p]), np.ascontiguousarray(y[p])) for p in parts]
+    step = float(t_s[-1] - t_s[0]) / (n - 1)
+    empty_means, empty_covariances, out = np.empty((0, 4)), np.empty((0, 4, 4)), np.empty(3)
+
+    def sums(log_ratio: float) -> tuple[float, float, float]:
+        total = np.zeros(3)
+        for t, part in pieces:
+            _filter_c(t, part, float(np.exp(log_ratio)), empty_means, empty_covariances, out, 0)
+            total += out
+        return float(total[0]), float(total[1]), float(total[2])
+
+    def deviance(log_ratio: float) -> float:
+        squares, logs, count = sums(log_ratio)
+        return count * np.log(max(squares, 1e-300) / count) + logs
+
+    # The smoother's time constant is about (1 / ratio) ** (1 / 7): from two steps to the whole run.
+    slowest, fastest = float(t_s[-1] - t_s[0]), 1.0 * step
+    low, high = -8.0 * np.log(slowest), -7.0 * np.log(fastest) - np.log(step)
+    grid = np.linspace(low, high, 25)
+    values = [deviance(x) for x in grid]
+    best = int(np.argmin(values))
+    left, right = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+    found: Any = minimize_scalar(
+        deviance, bounds=(left, right), method="bounded", options={"xatol": 0.02}
+    )
+    log_ratio = float(found.x)
+    squares, _, count = sums(log_ratio)
+    return Noise(squares / count, float(np.exp(log_ratio)))
+
+
+def smooth(t_s: Array, y: Array, noise: Noise) -> Smoothed:
+    """Smooth a signal over its whole length.
+
+    Args:
+        t_s: Times, shape (N,).
+        y: Signal, NaN where missing, shape (N,).
+        noise: From `estimate_noise`.
+    """
+    n = len(t_s)
+    means, covariances, out = np.empty((n, _ORDER)), np.empty((n, _ORDER, _ORDER)), np.empty(3)
+    t = np.ascontiguousarray(t_s)
+    _filter_c(t, np.ascontiguousarray(y), noise.ratio, means, covariances, out, 1)
+    _smooth_c(t, noise.ratio, means, covariances)
+    variances = np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0) * noise.variance
+    return Smoothed(means, np.sqrt(variances))

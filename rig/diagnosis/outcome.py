@@ -1,0 +1,321 @@
+"""What a diagnosis found, as a value, and its JSON."""
+
+import dataclasses
+import json
+import math
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dart_model.spec import ModelSpec, copy_skeleton, dump_model
+
+Array = NDArray[np.float64]
+Verdict = Literal["nothing_missing", "explained", "partly_explained", "ambiguous", "not_explained"]
+Change = Literal["refitted", "superfluous"]
+
+SCHEMA = 1
+DIAGNOSIS_FILE, CORRECTED_FILE = "diagnosis.json", "corrected.yaml"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value and its 95 % confidence interval; an end is None where the data do not bound it."""
+
+    value: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class LinearCorrection:
+    """What the data correct in the linear part of the nominal model.
+
+    Attributes:
+        strut: Strut that it belongs to.
+        parameter: ``mass_kg`` (all that the strut's upper body weighs), ``stiffness_n_per_m``,
+            ``damping_n_s_per_m``, ``preload_n`` or ``input_gain``.
+        nominal: As the model file has it, the preload about mid-stroke.
+        total: As the data have it.
+        about_height_m: Mid-stroke, about which stiffness and preload are taken; else None.
+    """
+
+    strut: str
+    parameter: str
+    nominal: float
+    total: Estimate
+    about_height_m: float | None
+
+
+@dataclass(frozen=True)
+class FoundEffect:
+    """An effect that the nominal model lacks.
+
+    Attributes:
+        family: Family.
+        name: Effect in the catalogue.
+        strut: Strut that it acts in.
+        explained_fraction: Share of the residual force's mean square that it explains, all other
+            corrections being in the model.
+        force_rms_n: Root mean square of its force along the recordings.
+        parameters: Estimates by name.
+    """
+
+    family: str
+    name: str
+    strut: str
+    explained_fraction: float
+    force_rms_n: float
+    parameters: dict[str, Estimate]
+
+
+@dataclass(frozen=True)
+class ExistingEffect:
+    """An effect that the nominal model has and that the data change.
+
+    Attributes:
+        name: Effect in the catalogue.
+        strut: Strut that it acts in.
+        change: ``refitted``: other parameters; ``superfluous``: the data are as well without it.
+        nominal: Its parameters in the model file.
+        parameters: Its parameters as the data have them; empty where it is superfluous.
+    """
+
+    name: str
+    strut: str
+    change: Change
+    nominal: dict[str, float]
+    parameters: dict[str, Estimate]
+
+
+@dataclass(frozen=True)
+class RejectedEffect:
+    """A candidate that was not chosen.
+
+    Attributes:
+        family: Family.
+        name: Effect in the catalogue.
+        strut: Strut on which it was tried.
+        why: One line.
+        left: Residual with it beside the corrected linear part alone, as a share of the residual of
+            the latter along the motion (1: it explains nothing); None where it was not tried.
+    """
+
+    family: str
+    name: str
+    strut: str
+    why: str
+    left: float | None
+
+
+@dataclass(frozen=True)
+class BeforeAfter:
+    """A figure of the nominal model, and of the corrected model."""
+
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class RunFigures:
+    """Figures of one held-out run.
+
+    Attributes:
+        run: Its name.
+        height_rmse_m: Open loop in DART; NaN where the motion is prescribed.
+        residual_force_rmse_n: Force that the model lacks along the smoothed motion.
+        strut_force_rmse_n: Against the load cell, where there is one.
+    """
+
+    run: str
+    height_rmse_m: BeforeAfter
+    residual_force_rmse_n: BeforeAfter
+    strut_force_rmse_n: BeforeAfter | None
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Figures over all held-out runs.
+
+    Attributes:
+        height_rmse_m: Open loop, with the applied force as the only input.
+        residual_force_rmse_n: Force that the model lacks along the motion.
+        strut_force_rmse_n: Against the load cell, where there is one.
+        runs: Each run.
+        source: ``runs``, or ``blocks`` where no run was held out and blocks of the recordings were.
+    """
+
+    height_rmse_m: BeforeAfter
+    residual_force_rmse_n: BeforeAfter
+    strut_force_rmse_n: BeforeAfter | None
+    runs: tuple[RunFigures, ...]
+    source: Literal["runs", "blocks"]
+
+
+@dataclass(frozen=True)
+class NoiseFloor:
+    """What a right model leaves on the held-out data."""
+
+    height_rmse_m: float
+    residual_force_rmse_n: float
+
+
+@dataclass(frozen=True)
+class White:
+    """Whether the residual passes the whiteness test."""
+
+    before: bool
+    after: bool
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What a nominal model lacks. Fields as in ``diagnosis.json``.
+
+    Attributes:
+        verdict: What can be said.
+        linear: Linear corrections.
+        effects: What is missing, strongest first; the linear families stand here too where linear
+            corrections are all that was found.
+        existing: Effects of the nominal model that the data change.
+        rejected: Candidates that were not chosen, best first.
+        ambiguous_with: Families that these recordings cannot tell from what was found.
+        suggested_excitation: What recording would tell them apart.
+        held_out: Figures on data that took no part in any choice or fit.
+        noise_floor: What a right model leaves there.
+        residual_white: Whether the residual is white.
+        notes: Whole sentences: what the data cannot separate, what was left out.
+        runs: Names of the recordings that were learnt from.
+        model: Name of the nominal model.
+    """
+
+    verdict: Verdict
+    linear: tuple[LinearCorrection, ...]
+    effects: tuple[FoundEffect, ...]
+    existing: tuple[ExistingEffect, ...]
+    rejected: tuple[RejectedEffect, ...]
+    ambiguous_with: tuple[str, ...]
+    suggested_excitation: str | None
+    held_out: HeldOut
+    noise_floor: NoiseFloor
+    residual_white: White
+    notes: tuple[str, ...]
+    runs: tuple[str, ...]
+    model: str
+
+
+@dataclass(frozen=True)
+class FittedSeries:
+    """Residual force of one strut along one recording that was fitted; arrays of shape (N,).
+
+    Attributes:
+        run: Name of the recording.
+        strut: Name of the strut.
+        t_s: Times in s, increasing.
+        height_m: Smoothed height.
+        velocity_m_per_s: Smoothed velocity.
+        residual_before_n: Force that the nominal model lacks.
+        residual_after_n: Force that the corrected model lacks.
+        residual_std_n: Standard deviation of either, from the smoother.
+    """
+
+    run: str
+    strut: str
+    t_s: Array
+    height_m: Array
+    velocity_m_per_s: Array
+    residual_before_n: Array
+    residual_after_n: Array
+    residual_std_n: Array
+
+
+@dataclass(frozen=True)
+class HeldOutSeries:
+    """One strut along one held-out run: heights, or forces where the motion is prescribed.
+
+    Attributes:
+        run: Name of the run.
+        strut: Name of the strut.
+        unit: ``m`` or ``N``, of the next three.
+        t_s: Times in s, increasing, shape (N,).
+        measured: Height or load-cell force; NaN where a sample is missing.
+        before: The nominal model, open loop (or driven along the motion).
+        after: The corrected model.
+        height_m: Measured height.
+        velocity_m_per_s: Smoothed velocity.
+    """
+
+    run: str
+    strut: str
+    unit: Literal["m", "N"]
+    t_s: Array
+    measured: Array
+    before: Array
+    after: Array
+    height_m: Array
+    velocity_m_per_s: Array
+
+
+@dataclass(frozen=True)
+class Result:
+    """All that a diagnosis gives.
+
+    Attributes:
+        diagnosis: What was found.
+        corrected: The corrected model.
+        fitted: Residual force along the recordings that were learnt from, for the report.
+        held_out: Held-out runs, for the report.
+    """
+
+    diagnosis: Diagnosis
+    corrected: ModelSpec
+    fitted: tuple[FittedSeries, ...]
+    held_out: tuple[HeldOutSeries, ...]
+
+
+def to_json(diagnosis: Diagnosis) -> str:
+    """The diagnosis as JSON text; numbers that are not finite become null."""
+    data = {"schema": SCHEMA} | dataclasses.asdict(diagnosis)
+    return json.dumps(_finite(data), indent=2, ensure_ascii=False) + "\n"
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, dict):
+        items = cast("dict[object, object]", value).items()
+        return {str(key): _finite(item) for key, item in items}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in cast("list[object]", value)]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def write_results(result: Result, nominal: ModelSpec, folder: Path) -> None:
+    """Write ``diagnosis.json`` and ``corrected.yaml``, each whole or not at all.
+
+    Raises:
+        OSError: The folder cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / CORRECTED_FILE, dump_model(result.corrected))
+    write_text(folder / DIAGNOSIS_FILE, to_json(result.diagnosis))
+    copy_skeleton(nominal, folder)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file so that nobody ever sees half of it."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(name).chmod(0o644)
+        Path(name).replace(path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise

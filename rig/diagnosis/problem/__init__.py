@@ -1,0 +1,1 @@
+"""A model held against recordings: one contract, two kinds of bench."""

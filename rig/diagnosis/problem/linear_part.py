@@ -1,0 +1,208 @@
+"""The linear part of a model: mass, stiffness, damping, preload and gain, never exact.
+
+Each has a prior, from the model file's `tolerance` or a default, which decides only where the data
+do not: a change of all of mass, stiffness and damping in one proportion against a change of the
+gain, for one.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dart_model.effects import Bench, Motion
+from dart_model.spec import WORLD, EffectSpec, InlineSkeleton, ModelSpec
+from rig.diagnosis.problem.contract import Kind, LinearParameter, middle_m
+from rig.diagnosis.problem.mechanism import Mechanism
+
+Array = NDArray[np.float64]
+
+TOLERANCES = {"mass": 0.05, "stiffness": 0.2, "damping": 0.4, "preload": 0.1, "gain": 0.02}
+"""Standard uncertainties where the model file states none, as shares of the nominal value; of the
+preload, of the spring's force over the stroke. A body can be weighed to a few percent with what
+moves along with it; springs are sold to 10 % and installed to 20; dampers vary by 30 % from warm to
+cold and from piece to piece (Dixon, The Shock Absorber Handbook, 2007, 9); a load cell in
+calibration is good to 2 %."""
+_LEAST_MASS = 0.1
+"""Lowest mass that a correction may leave, as a share of the nominal value. A spring may vanish
+altogether: a law with a stiffness of its own may take its place."""
+_SIGNIFICANT_DIGITS = 12
+
+PARAMETERS = {
+    "mass": "mass_kg",
+    "stiffness": "stiffness_n_per_m",
+    "damping": "damping_n_s_per_m",
+    "preload": "preload_n",
+    "gain": "input_gain",
+}
+"""Kinds as they are called in a diagnosis and in a model's `tolerance`."""
+EFFECTS = {
+    "mass": "added_mass",
+    "stiffness": "linear_stiffness",
+    "damping": "linear_damping",
+    "preload": "preload",
+    "gain": "input_gain",
+}
+"""Effects that stand for a change of each."""
+
+
+def parameters(
+    spec: ModelSpec, bench: Bench, motions: Sequence[Motion], mechanism: Mechanism
+) -> tuple[LinearParameter, ...]:
+    """Linear parameters of a model that a bench can show, with their priors.
+
+    Args:
+        spec: The nominal model.
+        bench: Kind of bench.
+        motions: What each strut did.
+        mechanism: For the masses, and for whether the applied force acts along a strut.
+    """
+    found: list[LinearParameter] = []
+    for i, (strut, motion) in enumerate(zip(spec.struts, motions, strict=True)):
+        stiffness, damping = strut.stiffness_n_per_m, strut.damping_n_s_per_m
+        # Of a nominal value of zero no share is left to speak of: what the motion would call large.
+        force = max(motion.force_n, 1e-300)
+        stiffness_scale = stiffness or force / motion.stroke_m
+        damping_scale = damping or force / motion.speed_m_per_s
+        preload_scale = max(stiffness * motion.stroke_m, force)
+        kinds: list[tuple[Kind, float, float, float]] = [
+            ("stiffness", stiffness, stiffness_scale, -stiffness),
+            ("damping", damping, damping_scale, -np.inf),
+            ("preload", 0.0, preload_scale, -np.inf),
+        ]
+        if bench == "force_given":
+            mass = moving_mass_kg(mechanism, i)
+            kinds.append(("mass", mass, mass, -(1.0 - _LEAST_MASS) * mass))
+        found += [
+            LinearParameter(i, kind, value, _deviation(spec, kind, scale), least)
+            for kind, value, scale, least in kinds
+        ]
+    if bench == "force_given" and _along_last_strut(mechanism):
+        found.append(
+            LinearParameter(len(motions) - 1, "gain", 1.0, _deviation(spec, "gain", 1.0), -0.95)
+        )
+    return tuple(found)
+
+
+def _deviation(spec: ModelSpec, kind: Kind, scale: float) -> float:
+    stated = None if spec.tolerance is None else getattr(spec.tolerance, PARAMETERS[kind])
+    if kind == "preload" and stated is not None:
+        return float(stated)
+    return (TOLERANCES[kind] if stated is None else float(stated)) * scale
+
+
+def moving_mass_kg(mechanism: Mechanism, strut: int) -> float:
+    """Mass that a strut's force moves directly: of its upper body with all that it carries."""
+    per_kg = mechanism.mass_by_kg[:, strut].mean(axis=0)
+    mass = mechanism.mass.mean(axis=0)
+    # Along the coordinates that a kg on this body loads.
+    at = int(np.argmax(np.diag(per_kg)))
+    return float(mass[at, at] / per_kg[at, at])
+
+
+def _along_last_strut(mechanism: Mechanism) -> bool:
+    """Whether the applied force acts as a force in the last strut would."""
+    return bool(np.allclose(mechanism.applied, mechanism.rows[:, -1], rtol=1e-9, atol=1e-12))
+
+
+def strut_force(kind: Kind, height_m: Array, velocity_m_per_s: Array, motion: Motion) -> Array:
+    """Strut force (N,) of a unit change of stiffness, damping or preload."""
+    if kind == "stiffness":
+        return -(height_m - middle_m(motion))
+    if kind == "damping":
+        return -velocity_m_per_s
+    return np.ones_like(height_m)
+
+
+def corrected(
+    mechanism: Mechanism, linear: Sequence[LinearParameter], changes: Array
+) -> Mechanism | None:
+    """The mechanism with masses and gain changed; None if the mass matrix is not positive."""
+    mass, bias, bias_q, applied = (
+        mechanism.mass, mechanism.bias, mechanism.bias_q, mechanism.applied
+    )  # fmt: skip
+    for parameter, change in zip(linear, changes, strict=True):
+        if parameter.kind == "mass" and change != 0.0:
+            mass = mass + change * mechanism.mass_by_kg[:, parameter.strut]
+            bias = bias + change * mechanism.bias_by_kg[:, parameter.strut]
+        elif parameter.kind == "gain" and change != 0.0:
+            applied = (1.0 + change) * applied
+    if float(np.min(np.linalg.eigvalsh(mass[:1]))) <= 0.0:
+        return None
+    return mechanism._replace(mass=mass, bias=bias, bias_q=bias_q, applied=applied)
+
+
+def corrected_spec(
+    spec: ModelSpec,
+    linear: Sequence[LinearParameter],
+    changes: Array,
+    motions: Sequence[Motion],
+) -> ModelSpec:
+    """The model with its linear part changed: where a field of the file says it, that field."""
+    for parameter, change in zip(linear, changes, strict=True):
+        if change == 0.0:
+            continue
+        strut = spec.struts[parameter.strut]
+        match parameter.kind:
+            case "stiffness":
+                # About mid-stroke: what the spring then carries more at its free length is a preload.
+                middle = middle_m(motions[parameter.strut]) - strut.free_length_m
+                spec = _with_field(spec, strut.name, "stiffness_n_per_m", change)
+                spec = _with_preload(spec, strut.name, change * middle)
+            case "damping" if strut.damping_n_s_per_m + change >= 0.0:
+                spec = _with_field(spec, strut.name, "damping_n_s_per_m", change)
+            case "preload":
+                spec = _with_preload(spec, strut.name, change)
+            case "mass":
+                spec = _with_mass(spec, strut.name, change)
+            case _:
+                spec = _with_sum(spec, strut.name, EFFECTS[parameter.kind], change)
+    return spec
+
+
+def _with_field(spec: ModelSpec, strut: str, field: str, change: float) -> ModelSpec:
+    struts = tuple(
+        item.model_copy(update={field: rounded(getattr(item, field) + change)})
+        if item.name == strut
+        else item
+        for item in spec.struts
+    )
+    return spec.model_copy(update={"struts": struts})
+
+
+def _with_preload(spec: ModelSpec, strut: str, force_n: float) -> ModelSpec:
+    return _with_sum(spec, strut, "preload", force_n)
+
+
+def _with_sum(spec: ModelSpec, strut: str, name: str, change: float) -> ModelSpec:
+    """An effect of one parameter more, or more of it where it is there already."""
+    effects = list(spec.strut(strut).effects)
+    for i, item in enumerate(effects):
+        if item.name == name:
+            ((key, value),) = item.parameters.items()
+            effects[i] = EffectSpec(name=name, parameters={key: rounded(value + change)})
+            return spec.with_effects(strut, effects)
+    key = {"preload": "force_n", "linear_damping": "damping_n_s_per_m", "input_gain": "gain"}
+    key["added_mass"] = "mass_kg"
+    new = EffectSpec(name=name, parameters={key[name]: rounded(change)})
+    return spec.with_effects(strut, (*effects, new))
+
+
+def _with_mass(spec: ModelSpec, strut: str, change: float) -> ModelSpec:
+    """More mass on the body that `added_mass` would load."""
+    between = spec.strut(strut).between
+    end = between[1] if between[1] != WORLD else between[0]
+    if not isinstance(spec.skeleton, InlineSkeleton):
+        return _with_sum(spec, strut, "added_mass", change)
+    bodies = tuple(
+        body.model_copy(update={"mass_kg": rounded(body.mass_kg + change)})
+        if body.name == end and body.mass_kg + change > 0.0
+        else body
+        for body in spec.skeleton.bodies
+    )
+    return spec.model_copy(update={"skeleton": InlineSkeleton(bodies=bodies)})
+
+
+def rounded(value: float) -> float:
+    """A number for a model file, with more digits than any data bind."""
+    return float(np.format_float_scientific(value, precision=_SIGNIFICANT_DIGITS))

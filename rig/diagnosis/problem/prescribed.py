@@ -1,0 +1,249 @@
+"""A strut whose motion is given: its residual is the load-cell force that its law misses.
+
+Nothing is simulated: the motion is smoothed over the whole recording, and a law's force along it
+takes one pass. What is left of initial states are the laws' internal ones.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dart_model.effects import Bench, Motion
+from dart_model.spec import ModelSpec
+from rig.diagnosis.numerics.smoother import estimate_noise
+from rig.diagnosis.problem import linear_part, track
+from rig.diagnosis.problem.contract import (
+    Candidate,
+    Existing,
+    Integers,
+    LinearParameter,
+    Parts,
+    ResidualForces,
+    Segment,
+    Track,
+    block_numbers,
+    placed,
+    state_scales,
+)
+from rig.diagnosis.problem.grid import Grid, smoothed
+from rig.diagnosis.recording import Recording
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+_UNCERTAIN = 1.5
+"""Times its median from which on the deviation of the smoothed velocity is that of a recording's
+end, where nothing follows to smooth with."""
+
+
+class Drive(NamedTuple):
+    """A prescribed motion and the forces that it took.
+
+    Attributes:
+        grid: Nodes of the recording.
+        along: The smoothed motion at the nodes.
+        accelerations_m_per_s2: Its second derivative, shape (struts, N).
+        cells_n: Load cells at the nodes, shape (struts, N); NaN where a strut has none.
+        certain: Nodes at which the motion is well known, shape (N,).
+        height_noise_m: Standard deviation of each height's noise, shape (struts,).
+        velocity_noise_m_per_s: Of the smoothed velocity, shape (struts,).
+        cell_noise_n: Of each load cell, shape (struts,).
+    """
+
+    grid: Grid
+    along: Track
+    accelerations_m_per_s2: Array
+    cells_n: Array
+    certain: Flags
+    height_noise_m: Array
+    velocity_noise_m_per_s: Array
+    cell_noise_n: Array
+
+    @property
+    def fitted(self) -> Flags:
+        """Nodes that take part in fits."""
+        return self.grid.fitted & self.certain
+
+
+def drive_of(grid: Grid, at: Integers, recording: Recording) -> Drive:
+    """A recording with load cells as a prescribed motion.
+
+    Args:
+        grid: Its nodes.
+        at: Which node each sample is.
+        recording: The recording.
+    """
+    middle = np.nanmean(grid.heights_m, axis=0)
+    states, noises = smoothed(grid, np.broadcast_to(middle, grid.heights_m.shape))
+    spread = np.array([s.deviations[:, 1] for s in states])
+    cells = np.full((len(states), len(grid.t_s)), np.nan)
+    noise_n = np.full(len(states), np.nan)
+    given = recording.strut_forces_n
+    for i in range(len(states)):
+        if given is not None and np.all(np.isfinite(given[:, i])):
+            cells[i] = np.interp(grid.t_s, grid.t_s[at], given[:, i])
+            noise_n[i] = np.sqrt(estimate_noise(grid.t_s, cells[i]).variance)
+    along = Track(
+        grid.t_s,
+        np.ascontiguousarray([s.states[:, 0] + m for s, m in zip(states, middle, strict=True)]),
+        np.ascontiguousarray([s.states[:, 1] for s in states]),
+        np.zeros(len(grid.t_s)),
+        grid.temperature_c,
+        track.substeps_for(grid.t_s),
+    )
+    return Drive(
+        grid,
+        along,
+        np.array([s.states[:, 2] for s in states]),
+        cells,
+        np.all(spread < _UNCERTAIN * np.median(spread, axis=1, keepdims=True), axis=0),
+        np.sqrt([noise.variance for noise in noises]),
+        np.median(spread, axis=1),
+        noise_n,
+    )
+
+
+class Prescribed:
+    """A model held against recordings of a displacement-controlled bench; see `Problem`.
+
+    Args:
+        spec: The nominal model.
+        drives: The recordings.
+        linear: Parameters of the linear part.
+        existing: Effects of the nominal model.
+        motions: What each strut did.
+        block_s: Length of the blocks of cross-validation.
+    """
+
+    bench: Bench = "motion_given"
+
+    def __init__(
+        self,
+        spec: ModelSpec,
+        drives: Sequence[Drive],
+        linear: tuple[LinearParameter, ...],
+        existing: tuple[Existing, ...],
+        motions: tuple[Motion, ...],
+        block_s: float,
+    ) -> None:
+        self.spec, self.linear, self.existing, self.motions = spec, linear, existing, motions
+        self.drives, self.block_s = tuple(drives), block_s
+        self.recordings = len(self.drives)
+        # Noise of the velocity passes through the damping, noise of the height through the spring.
+        slopes = np.array([(s.stiffness_n_per_m, s.damping_n_s_per_m) for s in spec.struts])
+        motion_n = [
+            np.hypot(slopes[:, 0] * d.height_noise_m, slopes[:, 1] * d.velocity_noise_m_per_s)
+            for d in self.drives
+        ]
+        cells_n = [d.cell_noise_n for d in self.drives]
+        self.noise_n = np.median(np.hypot(motion_n, cells_n), axis=0)
+        self._celled = np.flatnonzero(np.isfinite(self.noise_n))
+
+    def renewed(self, noise_n: Array, motions: tuple[Motion, ...]) -> "Prescribed":
+        """The same problem with other noise or with more known of the motions."""
+        other = Prescribed(
+            self.spec, self.drives, self.linear, self.existing, motions, self.block_s
+        )
+        other.noise_n = noise_n
+        return other
+
+    def _rows(self, k: int) -> Integers:
+        return np.flatnonzero(self.drives[k].fitted)
+
+    def blocks(self, k: int) -> Integers:
+        """Block of each row of a recording's residual."""
+        numbers = block_numbers(self.drives[k].grid.t_s, self.block_s)[self._rows(k)]
+        return np.repeat(numbers, len(self._celled))
+
+    def start(self, k: int, candidate: Candidate) -> Array:
+        """Internal states at zero."""
+        del k
+        return np.zeros(len(state_scales(placed(self, candidate))[0]))
+
+    def start_scales(self, candidate: Candidate) -> tuple[Array, Flags]:
+        """The laws' own scales."""
+        return state_scales(placed(self, candidate))
+
+    def states(self, k: int, candidate: Candidate, parts: Parts) -> Array:
+        """Internal states at the beginning of a recording."""
+        del candidate
+        return parts.starts[k]
+
+    def _missed_n(self, k: int, candidate: Candidate, parts: Parts) -> Array:
+        drive = self.drives[k]
+        forces = track.strut_forces(self, candidate, parts, drive.along, parts.starts[k])
+        return drive.cells_n - forces
+
+    def residual(self, k: int, candidate: Candidate, parts: Parts) -> Array | None:
+        """Load cells less the model's forces over the noise, at the fitted nodes, flat."""
+        missed = self._missed_n(k, candidate, parts)
+        return self._whitened(missed, self._rows(k))
+
+    def _whitened(self, forces: Array, rows: Integers) -> Array:
+        return (forces[np.ix_(self._celled, rows)].T / self.noise_n[self._celled]).ravel()
+
+    def residual_forces(self, k: int, candidate: Candidate, parts: Parts) -> ResidualForces | None:
+        """Load cells less the model's forces along the smoothed motion."""
+        missed = self._missed_n(k, candidate, parts)
+        deviation = np.broadcast_to(self.noise_n[:, np.newaxis], missed.shape)
+        return ResidualForces(self.drives[k].grid.name, self.drives[k].along, missed, deviation)
+
+    def segments(self, candidate: Candidate, parts: Parts) -> tuple[Segment, ...]:
+        """The regression about a model's force along the motion."""
+        samples = sum(len(drive.grid.t_s) for drive in self.drives)
+        found: list[Segment] = []
+        block = 0
+        for k, drive in enumerate(self.drives):
+            missed = self._missed_n(k, candidate, parts)
+            for first, last in track.pieces(len(drive.grid.t_s), samples):
+                found.append(self._segment(k, missed, slice(first, last), block))
+                block = int(found[-1].blocks.max()) + 1
+        return tuple(found)
+
+    def _segment(
+        self,
+        k: int,
+        missed: Array,
+        cut: slice,
+        first_block: int,
+    ) -> Segment:
+        drive = self.drives[k]
+        whole = drive.along
+        along = Track(
+            np.ascontiguousarray(whole.t_s[cut]),
+            np.ascontiguousarray(whole.heights_m[:, cut]),
+            np.ascontiguousarray(whole.velocities_m_per_s[:, cut]),
+            np.ascontiguousarray(whole.applied_n[cut]),
+            np.ascontiguousarray(whole.temperature_c[cut]),
+            whole.substeps,
+        )
+        rows = np.flatnonzero(drive.fitted[cut])
+        numbers = block_numbers(whole.t_s, self.block_s)[cut][rows]
+
+        def respond(strut: int, force: Array) -> Array:
+            forces = np.zeros((len(self.noise_n), len(force)))
+            forces[strut] = force
+            return self._whitened(forces, rows)
+
+        columns = [
+            respond(
+                p.strut,
+                linear_part.strut_force(
+                    p.kind, along.heights_m[p.strut], along.velocities_m_per_s[p.strut],
+                    self.motions[p.strut],
+                ),
+            )
+            for p in self.linear
+        ]  # fmt: skip
+        target = self._whitened(missed[:, cut], rows)
+        return Segment(
+            along,
+            along,
+            respond,
+            target,
+            np.column_stack(columns),
+            np.zeros((len(target), 0)),
+            np.repeat(numbers - numbers[0] + first_block, len(self._celled)),
+        )

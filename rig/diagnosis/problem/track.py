@@ -1,0 +1,106 @@
+"""Laws along a known motion."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.diagnosis.numerics.compiled import along, law
+from rig.diagnosis.problem.contract import (
+    Candidate,
+    Parts,
+    Track,
+    placed,
+    slots_of,
+    strut_constants,
+)
+
+if TYPE_CHECKING:
+    from rig.diagnosis.problem.contract import Problem
+
+Array = NDArray[np.float64]
+
+_LONGEST_STATE_STEP_S = 0.6e-3
+"""Longest step of an internal state along a motion: a bristle that settles at 2000 1/s needs it."""
+_MOST_STATE_STEPS = 8
+_MOST_SAMPLES = 12_000
+"""Samples of all recordings that the regression along the motion looks at: what a law explains is
+known to a part in a hundred with far fewer."""
+_PIECES = 8
+"""Parts of a recording that is too long for all of it to be looked at."""
+_NO_STATE = np.zeros(0)
+
+
+def substeps_for(t_s: Array) -> int:
+    """Steps of an internal state between the samples of a track."""
+    step = float(t_s[-1] - t_s[0]) / (len(t_s) - 1)
+    return int(np.clip(np.ceil(step / _LONGEST_STATE_STEP_S), 1, _MOST_STATE_STEPS))
+
+
+def pieces(nodes: int, samples: int) -> list[tuple[int, int]]:
+    """Parts of a recording that the regression looks at: all of it, or pieces spread over it.
+
+    Args:
+        nodes: Nodes of the recording.
+        samples: Nodes of all recordings.
+    """
+    share = _MOST_SAMPLES * nodes / samples
+    if nodes < 2.0 * share:
+        return [(0, nodes)]
+    length = max(int(share / _PIECES), 2)
+    firsts = [int(k * (nodes - length) / (_PIECES - 1)) for k in range(_PIECES)]
+    return [(first, first + length) for first in firsts]
+
+
+def law_force(
+    track: Track, strut: int, name: str, values: Array, constants: Array, state: Array = _NO_STATE
+) -> Array:
+    """Force (N,) of a law along a motion.
+
+    Args:
+        track: The motion.
+        strut: Index of the strut.
+        name: Name of the effect.
+        values: Its parameters.
+        constants: Free length, stiffness, damping and gravity of all struts, shape (struts, 4...).
+        state: Internal state at the beginning; at zero if absent.
+    """
+    functions = law(name)
+    out = np.empty(len(track.t_s))
+    along(
+        functions.force, functions.rate, np.ascontiguousarray(values), constants[strut],
+        track.t_s, track.heights_m[strut], track.velocities_m_per_s[strut],
+        track.applied_n, track.temperature_c, track.substeps,
+        state if len(state) else np.zeros(functions.states), out,
+    )  # fmt: skip
+    return out
+
+
+def effect_forces(
+    problem: "Problem", candidate: Candidate, parts: Parts, track: Track, states: Array
+) -> list[tuple[int, Array]]:
+    """Strut and force (N,) of each effect of a candidate along a motion."""
+    constants = strut_constants(problem, parts.linear)
+    index = slots_of(problem, candidate).index
+    return [
+        (
+            strut,
+            law_force(
+                track, strut, name, parts.effects[slot[1] : slot[2]], constants,
+                states[slot[3] : slot[4]],
+            ),
+        )
+        for (strut, name), slot in zip(placed(problem, candidate), index, strict=True)
+    ]  # fmt: skip
+
+
+def strut_forces(
+    problem: "Problem", candidate: Candidate, parts: Parts, track: Track, states: Array
+) -> Array:
+    """Force of every strut of a model along a motion, shape (struts, N)."""
+    constants = strut_constants(problem, parts.linear)
+    free, stiffness, damping, preload = constants[:, [0, 1, 2, 4], np.newaxis].transpose(1, 0, 2)
+    total = preload - stiffness * (track.heights_m - free) - damping * track.velocities_m_per_s
+    for strut, force in effect_forces(problem, candidate, parts, track, states):
+        total[strut] += force
+    return total

@@ -1,0 +1,468 @@
+"""Recordings of a bench: what was measured, read from CSV or from a run folder, and checked.
+
+A recording that cannot be diagnosed is refused here with one line that says what is wrong and what
+would help, before anything is computed from it.
+"""
+
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from can_dbc.codec import decode_log
+from can_dbc.database import Message
+from can_dbc.protection import check_crc_log
+from dart_model.yaml_file import InputError
+from rig.config import Setup, SignalName
+from rig.core.messages import Quantity
+from rig.io.run_log import RunFolder
+from rig.replay import setup_of_run
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+COLUMNS = ("t_s", "height_m", "applied_force_n", "strut_force_n", "temperature_c")
+"""Columns of a CSV file. Heights and strut forces may name their strut: ``height_m:tyre``."""
+
+_OF_A_STRUT = ("height_m", "strut_force_n")
+_LEAST_SAMPLES = 200
+_LEAST_DURATION_S = 0.5
+_LARGEST_BYTES = 2_000_000_000
+_LARGEST_SAMPLES = 5_000_000
+_LARGEST_HEIGHT_M = 100.0
+_MOST_MISSING = 0.3
+"""Share of missing heights above which a sensor is taken for broken."""
+_LONGEST_STEP_S = 0.05
+"""Usual time between samples above which a time in other units is more likely."""
+_LONGEST_PLATEAU = 0.002
+"""Share of the samples that a signal that is not clipped may stand at its extreme value on end."""
+_FULL_SPEED = 0.3
+"""Share of its usual speed with which a signal enters a plateau by being clipped: one that comes
+to rest slows down before."""
+
+
+class RecordingError(ValueError):
+    """A recording that cannot be diagnosed; one line: file, column, what was found and expected."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One run of a bench, as measured.
+
+    Attributes:
+        name: File or folder, for reports.
+        t_s: Times, increasing, shape (N,).
+        heights_m: Heights of the struts, shape (N, struts); NaN where a sample is missing.
+        applied_force_n: Applied force, shape (N,), or None where the bench has none.
+        strut_forces_n: Load-cell force of each strut, shape (N, struts), a column of NaN for a
+            strut without a cell; None where there is no cell.
+        temperature_c: Damper temperature, shape (N,), or None.
+    """
+
+    name: str
+    t_s: Array
+    heights_m: Array
+    applied_force_n: Array | None = None
+    strut_forces_n: Array | None = None
+    temperature_c: Array | None = None
+
+    @property
+    def duration_s(self) -> float:
+        """Time from first to last sample."""
+        return float(self.t_s[-1] - self.t_s[0])
+
+
+def read_recording(path: Path, struts: Sequence[str] | None = None) -> Recording:
+    """Recording from a run's folder or from a CSV file.
+
+    Args:
+        path: The folder or file.
+        struts: Names of the model's struts, for the columns of a CSV file that name them.
+
+    Raises:
+        InputError: There is no such run.
+        RecordingError: It holds nothing that can be diagnosed.
+    """
+    if path.is_dir():
+        return read_run(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such run, expected a run's folder or a CSV file")
+    return read_csv(path, struts)
+
+
+# --- CSV --------------------------------------------------------------------------------------
+
+
+def read_csv(path: Path, struts: Sequence[str] | None = None) -> Recording:
+    """Recording from a CSV file with units in its header.
+
+    Args:
+        path: The file.
+        struts: Names of the model's struts, in its order. Columns without a strut's name belong to
+            the only one.
+
+    Raises:
+        RecordingError: The file is no such table, or holds no run that can be diagnosed.
+    """
+    name = path.name
+    columns, table = _read_table(path)
+    for i, column in enumerate(columns):
+        bad = ~np.isfinite(table[:, i])
+        if np.any(bad):
+            raise RecordingError(
+                f"{name}: line {int(np.argmax(bad)) + 2}: {column} is no finite number "
+                f"({int(bad.sum())} such values), expected numbers: leave out rows without a "
+                "measurement, gaps in time are understood"
+            )
+    values = {column: table[:, i] for i, column in enumerate(columns)}
+    names = _struts_of(name, columns, struts)
+    heights = [_column_of(name, values, "height_m", strut, names) for strut in names]
+    if any(height is None for height in heights):
+        missing = names[[height is None for height in heights].index(True)]
+        raise RecordingError(f"{name}: header: expected a column height_m:{missing}")
+    cells = [_column_of(name, values, "strut_force_n", strut, names) for strut in names]
+    return checked(
+        Recording(
+            name,
+            values["t_s"],
+            np.column_stack([height for height in heights if height is not None]),
+            values.get("applied_force_n"),
+            _stacked(cells, len(table)),
+            values.get("temperature_c"),
+        )
+    )
+
+
+def _stacked(cells: Sequence[Array | None], samples: int) -> Array | None:
+    if all(cell is None for cell in cells):
+        return None
+    return np.column_stack([np.full(samples, np.nan) if cell is None else cell for cell in cells])
+
+
+def _column_of(
+    name: str, values: Mapping[str, Array], kind: str, strut: str, names: Sequence[str]
+) -> Array | None:
+    """The column of a strut; without a name it belongs to the only strut."""
+    named, plain = values.get(f"{kind}:{strut}"), values.get(kind)
+    if plain is not None and len(names) > 1:
+        raise RecordingError(
+            f"{name}: header: column {kind} of {len(names)} struts ({', '.join(names)}), "
+            f"expected {kind}:{strut}"
+        )
+    return plain if named is None else named
+
+
+def _struts_of(name: str, columns: Sequence[str], struts: Sequence[str] | None) -> list[str]:
+    named = [column.partition(":")[2] for column in columns if ":" in column]
+    if struts is None:
+        return list(dict.fromkeys(named)) or [""]
+    for strut in named:
+        if strut not in struts:
+            raise RecordingError(
+                f"{name}: header: strut {strut[:40]!r}: expected one of {', '.join(struts)}"
+            )
+    return list(struts)
+
+
+def _read_table(path: Path) -> tuple[list[str], Array]:
+    name = path.name
+    try:
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise RecordingError(
+                f"{name}: larger than {_LARGEST_BYTES} bytes, expected a shorter run"
+            )
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            first = next(csv.reader(file), None)
+            if first is None:
+                raise RecordingError(f"{name}: is empty, expected a header {','.join(COLUMNS[:3])}")
+            columns = [column.strip() for column in first]
+            _check_header(name, columns)
+            return columns, _read_rows(name, columns, file)
+    except OSError as error:
+        raise RecordingError(f"{name}: cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        reason = " ".join(str(error).split())
+        raise RecordingError(f"{name}: is no CSV text in UTF-8: {reason}") from error
+
+
+def _check_header(name: str, columns: list[str]) -> None:
+    kinds: list[str] = []
+    for column in columns:
+        kind, colon, strut = column.partition(":")
+        if kind not in COLUMNS or (colon and (kind not in _OF_A_STRUT or not strut)):
+            raise RecordingError(
+                f"{name}: header: column {column[:40]!r}: expected one of {', '.join(COLUMNS)}, "
+                "a height or strut force with its strut as in height_m:tyre"
+            )
+        if columns.count(column) > 1:
+            raise RecordingError(
+                f"{name}: header: column {column} stands there twice, expected once"
+            )
+        kinds.append(kind)
+    for column in COLUMNS[:2]:
+        if column not in kinds:
+            raise RecordingError(f"{name}: header: column {column} is missing, expected it")
+    if "applied_force_n" not in kinds and "strut_force_n" not in kinds:
+        raise RecordingError(
+            f"{name}: header: expected applied_force_n or strut_force_n beside t_s and height_m"
+        )
+
+
+def _read_rows(name: str, columns: list[str], lines: object) -> Array:
+    rows: list[list[str]] = []
+    for number, row in enumerate(csv.reader(cast("list[str]", lines)), start=2):
+        if not row:
+            continue
+        if len(row) != len(columns):
+            raise RecordingError(
+                f"{name}: line {number}: {len(row)} values, expected {len(columns)}"
+            )
+        rows.append(row)
+        if len(rows) > _LARGEST_SAMPLES:
+            raise RecordingError(f"{name}: more than {_LARGEST_SAMPLES} samples, expected fewer")
+    if not rows:
+        raise RecordingError(f"{name}: holds no samples, expected at least {_LEAST_SAMPLES}")
+    table = np.empty((len(rows), len(columns)))
+    for i, column in enumerate(columns):
+        cells = [row[i].strip() or "nan" for row in rows]
+        try:
+            table[:, i] = np.array(cells, dtype=np.float64)
+        except ValueError:
+            bad = next(k for k, cell in enumerate(cells) if not _is_number(cell))
+            raise RecordingError(
+                f"{name}: line {bad + 2}: {column} = {cells[bad][:40]!r}, expected a number"
+            ) from None
+    return table
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+# --- Run folders ------------------------------------------------------------------------------
+
+
+def read_run(folder: Path) -> Recording:
+    """What the bench sent in a run, on the time of the first strut's height.
+
+    Frames with a wrong CRC or length are left out; single missing heights are NaN, the other
+    channels are linear between their samples.
+
+    Args:
+        folder: Folder of the run.
+
+    Raises:
+        InputError: The run is damaged, or holds no height.
+        RecordingError: It holds nothing that can be diagnosed.
+    """
+    found, ready = setup_of_run(folder)
+    payloads = _payloads(found, ready)
+    signals = ready.config.signals
+    heights = [
+        _channel(ready, payloads, entry, Quantity.HEIGHT) for entry in signals.height.values()
+    ]
+    for (name, entry), (t_s, _) in zip(signals.height.items(), heights, strict=True):
+        if len(t_s) < 2:
+            raise InputError(f"{folder}: no {entry.message} with the height of strut {name}")
+    t_s = heights[0][0]
+    half_s = 0.5 * float(np.median(np.diff(t_s)))
+
+    def other(entry: SignalName | None, quantity: Quantity) -> Array | None:
+        if entry is None:
+            return None
+        own_t_s, values = _channel(ready, payloads, entry, quantity)
+        return np.interp(t_s, own_t_s, values) if len(own_t_s) else None
+
+    cell = other(signals.load_cell_force, Quantity.LOAD_CELL_FORCE)
+    # The bus carries one load cell; with several struts nothing says whose it is.
+    return checked(
+        Recording(
+            folder.name,
+            t_s,
+            np.column_stack([_nearest(t_s, *height, half_s) for height in heights]),
+            other(signals.applied_force, Quantity.APPLIED_FORCE),
+            None if cell is None or len(heights) > 1 else cell[:, np.newaxis],
+            other(signals.temperature, Quantity.TEMPERATURE),
+        )
+    )
+
+
+_Payloads = dict[tuple[int, bool], tuple[NDArray[np.int64], NDArray[np.uint8]]]
+
+
+def _payloads(found: RunFolder, ready: Setup) -> _Payloads:
+    """Times and payloads of every received message, wrong lengths left out."""
+    lengths = {
+        (message.arbitration_id, message.is_extended): message.length_bytes
+        for message in map(
+            ready.database.message, {entry.message for entry in ready.config.signals.named()}
+        )
+    }
+    times: dict[tuple[int, bool], list[int]] = {key: [] for key in lengths}
+    data: dict[tuple[int, bool], list[bytes]] = {key: [] for key in lengths}
+    for frame, direction in found.frames():
+        key = (frame.arbitration_id, frame.is_extended)
+        if direction == "R" and not frame.is_error and lengths.get(key) == len(frame.data):
+            times[key].append(frame.t_ns)
+            data[key].append(frame.data)
+    return {
+        key: (
+            np.array(times[key], dtype=np.int64),
+            np.frombuffer(b"".join(data[key]), dtype=np.uint8).reshape(-1, length),
+        )
+        for key, length in lengths.items()
+    }
+
+
+def _channel(
+    ready: Setup, payloads: _Payloads, entry: SignalName, quantity: Quantity
+) -> tuple[Array, Array]:
+    """Sample times in s and values of one signal."""
+    message = ready.database.message(entry.message)
+    t_ns, data = payloads[message.arbitration_id, message.is_extended]
+    good = np.ones(len(data), dtype=bool)
+    if message.protection is not None:
+        good = check_crc_log(data, message.protection)
+    values = decode_log(message, [entry.signal], [quantity.dimension], data)[entry.signal]
+    good &= np.isfinite(values)
+    t_s, first = np.unique(_sample_times_s(t_ns[good], message), return_index=True)
+    return t_s, values[good][first]
+
+
+def _sample_times_s(t_ns: NDArray[np.int64], message: Message) -> Array:
+    """Times of sampling: on the grid of the cycle time where arrivals say that there is one."""
+    cycle_ns = message.cycle_time_ns
+    if cycle_ns is None or len(t_ns) == 0:
+        return np.asarray(t_ns * 1e-9, dtype=np.float64)
+    index = np.rint((t_ns - t_ns[0]) / cycle_ns)
+    jitter_ns = t_ns - t_ns[0] - index * cycle_ns
+    if float(np.max(np.abs(jitter_ns - np.median(jitter_ns)))) > 0.4 * cycle_ns:
+        return np.asarray(t_ns * 1e-9, dtype=np.float64)
+    return (t_ns[0] + np.median(jitter_ns) + index * cycle_ns) * 1e-9
+
+
+def _nearest(t_s: Array, own_t_s: Array, values: Array, half_s: float) -> Array:
+    """Values at the times of another message; NaN where none is near."""
+    at = np.clip(np.searchsorted(own_t_s, t_s - half_s), 0, len(own_t_s) - 1)
+    return np.where(np.abs(own_t_s[at] - t_s) <= half_s, values[at], np.nan)
+
+
+# --- Checks -----------------------------------------------------------------------------------
+
+
+def checked(recording: Recording) -> Recording:
+    """The recording, or an error for what would mislead; single missing heights are allowed.
+
+    Raises:
+        RecordingError: See the module.
+    """
+    name, t_s = recording.name, recording.t_s
+    if len(t_s) < _LEAST_SAMPLES:
+        raise RecordingError(
+            f"{name}: {len(t_s)} samples, expected at least {_LEAST_SAMPLES}: record a longer run"
+        )
+    _check_times(name, t_s)
+    for height_m in recording.heights_m.T:
+        _check_height(name, height_m)
+    for label, channel, advice in _channels(recording):
+        bad = ~np.isfinite(channel)
+        if np.any(bad):
+            raise RecordingError(
+                f"{name}: {label} is no number in {int(bad.sum())} samples, first in sample "
+                f"{int(np.argmax(bad))}, expected numbers"
+            )
+        if advice and float(np.ptp(channel)) == 0.0:
+            raise RecordingError(
+                f"{name}: {label} is constant at {channel[0]:.6g} N, expected it to change: "
+                f"{advice}"
+            )
+        if label == "strut_force_n":
+            _check_clipped(name, label, "N", channel)
+    return recording
+
+
+def _channels(recording: Recording) -> Iterable[tuple[str, Array, str]]:
+    if recording.applied_force_n is not None:
+        yield "applied_force_n", recording.applied_force_n, "apply a force that changes"
+    if recording.strut_forces_n is not None:
+        for column in recording.strut_forces_n.T:
+            if not np.all(np.isnan(column)):
+                yield "strut_force_n", column, "is the load cell connected?"
+    if recording.temperature_c is not None:
+        yield "temperature_c", recording.temperature_c, ""
+
+
+def _check_times(name: str, t_s: Array) -> None:
+    if not np.all(np.isfinite(t_s)):
+        row = int(np.argmin(np.isfinite(t_s)))
+        raise RecordingError(f"{name}: t_s is no number in sample {row}, expected a time in s")
+    steps = np.diff(t_s)
+    if np.any(steps <= 0.0):
+        row = int(np.argmax(steps <= 0.0)) + 1
+        raise RecordingError(
+            f"{name}: t_s = {t_s[row]:.6g} in sample {row} after {t_s[row - 1]:.6g}, "
+            "expected times that increase"
+        )
+    if t_s[-1] - t_s[0] < _LEAST_DURATION_S:
+        raise RecordingError(
+            f"{name}: t_s spans {t_s[-1] - t_s[0]:.3g} s, "
+            f"expected at least {_LEAST_DURATION_S} s: is the time in s?"
+        )
+    usual = float(np.median(steps))
+    if usual > _LONGEST_STEP_S:
+        raise RecordingError(
+            f"{name}: t_s has one sample in {usual:.3g} s, expected "
+            f"{1.0 / _LONGEST_STEP_S:.0f} a second or more: is the time in s?"
+        )
+
+
+def _check_height(name: str, height_m: Array) -> None:
+    finite = np.isfinite(height_m)
+    if np.any(np.isinf(height_m)) or float(np.mean(~finite)) > _MOST_MISSING:
+        raise RecordingError(
+            f"{name}: height_m is no number in {int((~finite).sum())} of {len(finite)} samples, "
+            f"expected at most {100.0 * _MOST_MISSING:.0f} % missing"
+        )
+    heights = height_m[finite]
+    if float(np.max(np.abs(heights))) > _LARGEST_HEIGHT_M:
+        raise RecordingError(
+            f"{name}: height_m reaches {np.max(np.abs(heights)):.6g} m, expected less than "
+            f"{_LARGEST_HEIGHT_M:g} m: are the columns swapped, or the unit wrong?"
+        )
+    if float(np.ptp(heights)) == 0.0:
+        raise RecordingError(
+            f"{name}: height_m is constant at {heights[0]:.6g} m, "
+            "expected motion: is the sensor connected?"
+        )
+    _check_clipped(name, "height_m", "m", heights)
+
+
+def _check_clipped(name: str, label: str, unit: str, values: Array) -> None:
+    """Refuse a signal that stands at an extreme value which it entered at full speed."""
+    steps = np.diff(np.unique(values))
+    if len(steps) == 0 or float(np.ptp(values)) <= 50.0 * float(steps.min()):
+        return
+    usual = float(np.mean(np.abs(np.diff(values))))
+    for extreme, limit in (("lowest", float(values.min())), ("highest", float(values.max()))):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], values == limit, [0]])))
+        firsts, lasts = edges[::2], edges[1::2]
+        longest = int(np.argmax(lasts - firsts))
+        length, first = int(lasts[longest] - firsts[longest]), int(firsts[longest])
+        if length <= max(20, _LONGEST_PLATEAU * len(values)):
+            continue
+        before = values[max(first - 4, 0) : first]
+        if len(before) > 1 and float(np.mean(np.abs(np.diff(before)))) < _FULL_SPEED * usual:
+            continue  # It came to rest there.
+        raise RecordingError(
+            f"{name}: {label} stays at its {extreme} value {limit:.6g} {unit} for {length} "
+            "samples on end, expected a sensor that is not clipped: widen its range or reduce "
+            "the load"
+        )

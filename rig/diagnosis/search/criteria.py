@@ -1,0 +1,90 @@
+"""Every number that decides what is found, with its meaning and its source.
+
+`python -m tests.criteria_study` shows how the hit rate moves when each is halved and doubled.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class SelectionCriteria:
+    """What decides in a search.
+
+    Attributes:
+        blocks: Blocks of cross-validation over all recordings: the standard error of a sum over
+            them is then known to a tenth (1 / sqrt(2 * blocks)), and each still holds some periods.
+        kept_every: Without held-out runs, one block of so many is kept back to be judged on; a
+            fifth is usual (Hastie, Tibshirani, Friedman, The Elements of Statistical Learning,
+            2009, 7.10).
+        screened: Laws of each round whose parameters are refined before they are compared.
+        beam: Sets of laws that each round goes on from, so that an early choice can be revisited.
+        most_laws: Laws that a finding may consist of. A force needs three at most before a table
+            describes it as well (measured dampers: the fourth gains less than the scatter between
+            recordings).
+        finalists: Sets of each size that are fitted in full.
+        hopeless: Times the sum of squares of the best set of a size, along the motion, from which
+            on a set of that size is not fitted in full: smoothing the motion costs laws that switch
+            a factor of two at most.
+        standard_errors: Standard errors of the out-of-sample likelihood within which the smallest
+            set is preferred: one in the rule of Breiman et al. (Classification and Regression
+            Trees, 1984, 3.4.3), for independent blocks; two, because blocks of a motion are not.
+        least_likelihood_gain: Least gain of twice the out-of-sample log likelihood by a further
+            law. The best of some hundred useless starts gains 2 ln 100 = 9 by chance; a
+            coloured residual that much more often.
+        least_share: Least share of the mean square above the noise floor that a further law takes
+            away; 0.19 is a tenth of the RMS.
+        least_above_noise: Mean square above the noise floor, as a share of the floor, below which
+            no first law is looked for: integration and interpolation err by as much.
+        least_above_noise_later: The same for a further law: what a formula that is nearly right
+            leaves over is no effect. Its root is half of what `explained` allows.
+        formula: Share of the RMS residual of the best linear model below which what a law leaves is
+            put down to its formula, and no further law of the same kind (see `KINDS`) is looked
+            for: two formulas for one effect agree to a few percent, as seen on the foreign formulas
+            of `tests.truth`.
+        significant: Times its standard deviation that a linear correction, and the size of an
+            effect, is away from nothing.
+        cancelling: Correlation of two forces in one strut below which they cancel each other.
+        leftover: Share of a law's force along the motion that no change of the linear part could
+            give; with less the law is a linear correction in disguise.
+        passive: Share of the largest dissipated power that a corrected strut may feed in, for the
+            rounding of a fit.
+        explained: Multiple of the noise floor that a right model stays below on held-out data: the
+            scatter of an RMS over some hundred independent samples.
+        partly: Share of the RMS error of the best linear model on held-out data that laws have to
+            take away to be called a partial explanation.
+        white: Level of the whiteness test.
+    """
+
+    blocks: int = 32
+    kept_every: int = 5
+    screened: int = 6
+    beam: int = 3
+    most_laws: int = 3
+    finalists: int = 4
+    hopeless: float = 4.0
+    standard_errors: float = 2.0
+    least_likelihood_gain: float = 30.0
+    least_share: float = 0.19
+    least_above_noise: float = 0.01
+    least_above_noise_later: float = 0.2
+    formula: float = 0.03
+    significant: float = 4.0
+    cancelling: float = -0.9
+    leftover: float = 0.02
+    passive: float = 0.02
+    explained: float = 1.2
+    partly: float = 0.25
+    white: float = 0.001
+
+
+KINDS = (
+    ("nonlinear_stiffness", "stop", "backlash", "restoring_surface"),
+    ("nonlinear_damping", "friction", "hysteresis"),
+    ("fade", "periodic_force"),
+    ("delay", "unmodelled_mode"),
+)
+"""Families by what their force follows: height, velocity, time, the applied force. Laws of one kind
+can imitate one another's formulas, laws of different kinds cannot."""
+
+CRITERIA = SelectionCriteria()
+"""The criteria of `rig diagnose`."""

@@ -1,0 +1,378 @@
+"""Joint fit of effects, linear part and initial states, and what it says of data not fitted.
+
+References:
+    Ljung, System Identification (1999), 9.4, covariance of output-error estimates.
+    White, Maximum likelihood estimation of misspecified models, Econometrica 50 (1982), for
+    intervals where the residual is coloured.
+    Rad, Maleki, A scalable estimate of the out-of-sample prediction error via approximate
+    leave-one-out, J. R. Stat. Soc. B 82 (2020); here blocks are left out, and a step of Newton's
+    method stands for the fit without each.
+    Ljung, Box, On a measure of lack of fit in time series models, Biometrika 65 (1978).
+"""
+
+import functools
+import os
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from scipy.stats import t as student
+
+from dart_model.effects import Motion, effect
+from rig.diagnosis.numerics.least_squares import Rows, Solution, Space, joined, solve
+from rig.diagnosis.problem.contract import (
+    Candidate,
+    Integers,
+    Parts,
+    Problem,
+    placed,
+    slots_of,
+)
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+_EXISTING_PRIOR = 0.5
+"""Prior on the parameters of effects that the nominal model has: half their value, or e^0.5."""
+_STATE_PRIOR = 10.0
+"""Prior on internal states at the beginning, in units of their scale: wide."""
+_LAGS = 20
+"""Lags of the whiteness test."""
+
+
+class Fit(NamedTuple):
+    """A fitted model.
+
+    Attributes:
+        candidate: Its effects.
+        free: Which linear parameters were fitted, shape (L,).
+        parts: All that it consists of.
+        solution: The fit itself; its last rows are those of the priors.
+        space: Where it was searched.
+        fits_effects: Whether effects' parameters were fitted.
+        blocks: Block of each row of data, over all recordings, shape (m,).
+        recording: Recording of each row of data, shape (m,).
+    """
+
+    candidate: Candidate
+    free: Flags
+    fits_effects: bool
+    parts: Parts
+    solution: Solution
+    space: Space
+    blocks: Integers
+    recording: Integers
+
+    @property
+    def rows(self) -> int:
+        """Rows of data."""
+        return len(self.blocks)
+
+    @property
+    def residual(self) -> Array:
+        """Whitened residual, shape (m,)."""
+        return self.solution.residual[: self.rows]
+
+    @property
+    def mean_square(self) -> float:
+        """Mean square of the whitened residual; 1 at the noise floor."""
+        return float(np.mean(self.residual**2))
+
+
+def law_space(name: str, motion: Motion, values: Array) -> Space:
+    """Where an effect's parameters are searched, beginning at `values`."""
+    item = effect(name)
+    narrower = item.bounds(motion)
+    low = np.array([max(p.low, narrower.get(p.name, (p.low,))[0]) for p in item.parameters])
+    high = np.array([min(p.high, narrower.get(p.name, (0.0, p.high))[1]) for p in item.parameters])
+    scale = np.maximum(np.abs(values), 1e-12)
+    for i, parameter in enumerate(item.parameters):
+        if parameter.unit == "m":
+            scale[i] = motion.stroke_m
+        if parameter.unit == "rad":
+            scale[i] = 1.0
+    return Space(low, np.maximum(high, low), scale, low > 0.0)
+
+
+def _existing_space(name: str, values: Array, free: bool) -> Space:
+    parameters = effect(name).parameters
+    low = np.array([p.low for p in parameters])
+    high = np.array([p.high for p in parameters])
+    if not free:
+        low, high = values.copy(), values.copy()
+    return Space(low, high, np.maximum(np.abs(values), 1e-12), (low > 0.0) & free)
+
+
+class _Layout:
+    """How the search variables of a fit make up a model's parts."""
+
+    def __init__(
+        self, problem: Problem, candidate: Candidate, first: Parts, free: Flags, effects: bool
+    ) -> None:
+        self.problem, self.candidate, self.first, self.free = problem, candidate, first, free
+        linear = problem.linear
+        deviation = np.array([p.deviation for p in linear])
+        spaces = [
+            Space(
+                np.array([p.least for p in linear]),
+                np.full(len(linear), np.inf),
+                deviation,
+                np.zeros(len(linear), dtype=np.bool_),
+            )
+        ]
+        index = slots_of(problem, candidate).index
+        varied = [free]
+        for row, (strut, name) in enumerate(placed(problem, candidate)):
+            values = first.effects[index[row, 1] : index[row, 2]]
+            if row < len(candidate.kept):
+                is_free = problem.existing[candidate.kept[row]].free
+                spaces.append(_existing_space(name, values, is_free))
+                varied.append(np.full(len(values), is_free and effects))
+            else:
+                spaces.append(law_space(name, problem.motions[strut], values))
+                varied.append(np.full(len(values), effects))
+        scales, fitted = problem.start_scales(candidate)
+        endless = np.full(len(scales), np.inf)
+        for _ in first.starts:
+            spaces.append(Space(-endless, endless, scales, np.zeros(len(scales), dtype=np.bool_)))
+            varied.append(fitted)
+        self.whole = joined(spaces)
+        self.varied = np.concatenate(varied)
+        self.space = self.whole.part(self.varied)
+        self.full = np.concatenate([first.linear, first.effects, *first.starts])
+        self.start_size = len(scales)
+        self.prior = self._prior(len(linear), scales)
+
+    def _prior(self, linear: int, scales: Array) -> tuple[Array, Array]:
+        """Centre and weight of each search variable's prior."""
+        weight = np.zeros(len(self.full))
+        weight[:linear] = 1.0
+        existing = sum(len(self.problem.existing[i].values) for i in self.candidate.kept)
+        weight[linear : linear + existing] = 1.0 / _EXISTING_PRIOR
+        states = len(scales) - (self.start_size - slots_of(self.problem, self.candidate).states)
+        for k in range(len(self.first.starts)):
+            last = len(self.full) - (len(self.first.starts) - 1 - k) * self.start_size
+            weight[last - states : last] = 1.0 / _STATE_PRIOR
+        centre = np.zeros(len(self.full))
+        values = [v for i in self.candidate.kept for v in self.problem.existing[i].values]
+        centre[linear : linear + existing] = values
+        inner = self.whole.inner(np.clip(centre, self.whole.low, self.whole.high))
+        return np.where(weight > 0.0, inner, 0.0)[self.varied], weight[self.varied]
+
+    def parts(self, x: Array) -> Parts:
+        full = self.full.copy()
+        full[self.varied] = x
+        linear = len(self.first.linear)
+        effects = len(self.first.effects)
+        starts = full[linear + effects :].reshape(len(self.first.starts), self.start_size)
+        return Parts(
+            full[:linear], np.ascontiguousarray(full[linear : linear + effects]),
+            tuple(np.ascontiguousarray(row) for row in starts),
+        )  # fmt: skip
+
+    def residual_of(self, k: int, x: Array) -> Array | None:
+        return self.problem.residual(k, self.candidate, self.parts(x))
+
+    def residual(self, x: Array) -> Array | None:
+        parts = self.parts(x)
+        found: list[Array] = []
+        for k in range(self.problem.recordings):
+            there = self.problem.residual(k, self.candidate, parts)
+            if there is None:
+                return None
+            found.append(there)
+        centre, weight = self.prior
+        return np.concatenate([*found, weight * (self.space.inner(x) - centre)])
+
+    def rows(self, blocks: list[Integers]) -> dict[int, Rows]:
+        """Of each variable of a recording's initial vector, the rows that it moves.
+
+        The priors of these rows come after all data, where a difference would miss them: they are
+        left out of the map where there is only one recording, and of no weight elsewhere.
+        """
+        if len(blocks) < 2:
+            return {}
+        found: dict[int, Rows] = {}
+        varied = np.flatnonzero(self.varied)
+        before = len(self.first.linear) + len(self.first.effects)
+        at = 0
+        for k, block in enumerate(blocks):
+            rows = Rows(at, at + len(block), functools.partial(self.residual_of, k))
+            low, high = before + k * self.start_size, before + (k + 1) * self.start_size
+            for i in np.flatnonzero((varied >= low) & (varied < high)):
+                if self.prior[1][i] == 0.0:
+                    found[int(i)] = rows
+            at += len(block)
+        return found
+
+
+def fit(
+    problem: Problem,
+    candidate: Candidate,
+    first: Parts,
+    free: Flags,
+    iterations: int = 15,
+    tolerance: float = 1e-4,
+    *,
+    effects: bool = True,
+) -> Fit | None:
+    """Fit a candidate.
+
+    Args:
+        problem: Model and recordings.
+        candidate: Its effects.
+        first: Where to begin.
+        free: Which linear parameters are fitted, shape (L,); the others stay as in `first`.
+        iterations: Most steps.
+        tolerance: Relative gain below which the fit ends.
+        effects: Whether effects' parameters are fitted.
+
+    Returns:
+        The fit, or None if the model runs away where it begins.
+    """
+    layout = _Layout(problem, candidate, first, free, effects)
+    blocks = [problem.blocks(k) for k in range(problem.recordings)]
+    solution = solve(
+        layout.residual, layout.full[layout.varied], layout.space, iterations, tolerance,
+        layout.rows(blocks), os.cpu_count() or 1,
+    )  # fmt: skip
+    if solution is None:
+        return None
+    offsets = np.cumsum([0, *(int(block.max()) + 1 for block in blocks[:-1])])
+    return Fit(
+        candidate,
+        free,
+        effects,
+        layout.parts(solution.values),
+        solution,
+        layout.space,
+        np.concatenate([block + offset for block, offset in zip(blocks, offsets, strict=True)]),
+        np.concatenate([np.full(len(block), k) for k, block in enumerate(blocks)]),
+    )
+
+
+def left_out(residual: Array, jacobian: Array, blocks: Integers, prior: Array) -> Array:
+    """Sum of squares of each block's residual when it took no part in the fit, shape (blocks,).
+
+    Args:
+        residual: At the solution, shape (m,).
+        jacobian: Its derivative, shape (m, k).
+        blocks: Block of each row, shape (m,).
+        prior: Precision of the variables' priors, shape (k, k).
+    """
+    count = int(blocks.max()) + 1
+    size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + np.diag(prior), 1e-300))
+    scaled = jacobian / size
+    grams = np.zeros((count, len(size), len(size)))
+    scores = np.zeros((count, len(size)))
+    squares = np.bincount(blocks, residual**2, count)
+    for b in range(count):
+        part = blocks == b
+        grams[b] = scaled[part].T @ scaled[part]
+        scores[b] = scaled[part].T @ residual[part]
+    whole = grams.sum(axis=0) + prior / np.outer(size, size)
+    found = np.empty(count)
+    for b in range(count):
+        step = np.linalg.lstsq(whole - grams[b], scores[b], rcond=1e-9)[0]
+        found[b] = squares[b] + 2.0 * step @ scores[b] + step @ grams[b] @ step
+    return found
+
+
+def block_scores(problem: Problem, result: Fit) -> Array:
+    """Out-of-sample sum of squares of each block; initial states are held, since they belong to the
+    block that begins a recording.
+    """
+    starts = _start_variables(problem, result)
+    jacobian = result.solution.jacobian[:, ~starts]
+    priors = jacobian[result.rows :]
+    return left_out(result.residual, jacobian[: result.rows], result.blocks, priors.T @ priors)
+
+
+def _start_variables(problem: Problem, result: Fit) -> Flags:
+    _, fitted = problem.start_scales(result.candidate)
+    count = int(fitted.sum()) * problem.recordings
+    flags = np.zeros(result.solution.jacobian.shape[1], dtype=np.bool_)
+    flags[len(flags) - count :] = True
+    return flags
+
+
+class Spread(NamedTuple):
+    """What a fit does not know.
+
+    Attributes:
+        covariance: Of the search variables, shape (k, k).
+        factor: Half a 95 % confidence interval in standard deviations (Student).
+    """
+
+    covariance: Array
+    factor: float
+
+
+def spread(result: Fit) -> Spread:
+    """Covariance of a fit that takes the residual as coloured as it is (White's sandwich).
+
+    The smaller covariance of white noise is a lower limit.
+    """
+    jacobian, residual = result.solution.jacobian, result.solution.residual
+    size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0), 1e-300))
+    scaled = jacobian / size
+    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-13)
+    count = int(result.blocks.max()) + 1
+    meat = np.zeros_like(inverse)
+    for b in range(count):
+        part = np.flatnonzero(result.blocks == b)
+        score = scaled[part].T @ residual[part]
+        meat += np.outer(score, score)
+    variables = inverse.shape[0]
+    robust = inverse @ meat @ inverse * (count / max(count - min(variables, count // 2), 1))
+    white = inverse * max(1.0, result.mean_square)
+    larger = np.diag(white) > np.diag(robust)
+    # Where the sandwich is the smaller one, its row and column are stretched to the white variance.
+    stretch = np.where(
+        larger, np.sqrt(np.maximum(np.diag(white), 0.0) / np.maximum(np.diag(robust), 1e-300)), 1.0
+    )
+    covariance = robust * np.outer(stretch, stretch) / np.outer(size, size)
+    return Spread(covariance, float(student.ppf(0.975, max(count - 1, 2))))
+
+
+def effect_variables(problem: Problem, result: Fit) -> dict[int, Integers]:
+    """Search variables of each effect that was fitted, by its place among all of the candidate."""
+    index = slots_of(problem, result.candidate).index
+    found: dict[int, Integers] = {}
+    at = int(result.free.sum())
+    if not result.fits_effects:
+        return found
+    for row in range(len(index)):
+        if row < len(result.candidate.kept):
+            kept = problem.existing[result.candidate.kept[row]]
+            if not kept.free:
+                continue
+        count = int(index[row, 2] - index[row, 1])
+        found[row] = np.arange(at, at + count)
+        at += count
+    return found
+
+
+def is_white(problem: Problem, result: Fit, level: float) -> bool:
+    """Whether the residual passes the test of Ljung and Box, recording by recording.
+
+    The bound of the test knows the number of samples; the worst recording decides, at a level that
+    allows for their number.
+    """
+    struts = max(1, len(problem.spec.struts))
+    for k in range(problem.recordings):
+        rows = result.residual[result.recording == k]
+        columns = rows.reshape(-1, struts) if len(rows) % struts == 0 else rows[:, np.newaxis]
+        for column in columns.T:
+            n = len(column)
+            lags = min(_LAGS, n // 4)
+            centred = column - column.mean()
+            power = float(centred @ centred)
+            correlations = np.array(
+                [float(centred[lag:] @ centred[:-lag]) / power for lag in range(1, lags + 1)]
+            )
+            statistic = n * (n + 2) * np.sum(correlations**2 / (n - np.arange(1, lags + 1)))
+            if float(chi2.sf(statistic, lags)) < level / (problem.recordings * columns.shape[1]):
+                return False
+    return True

@@ -1,0 +1,363 @@
+"""Laws along the measured motion, the linear part projected out.
+
+Every law of the catalogue competes for what a reference leaves over, with the changes of the linear
+part, of existing effects and of initial states free beside it: they enter linearly and are
+projected out (Golub, Pereyra, SIAM J. Numer. Anal. 10, 1973). A law whose force is proportional to
+its size costs one pass a start; the best are then refined together with all else in their set.
+"""
+
+import itertools
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from os import cpu_count
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dart_model.effects import CATALOGUE, effect
+from rig.diagnosis.numerics.compiled import law
+from rig.diagnosis.numerics.least_squares import joined, solve
+from rig.diagnosis.problem.contract import (
+    Candidate,
+    Integers,
+    Parts,
+    Placed,
+    Problem,
+    Segment,
+    placed,
+    slots_of,
+    strut_constants,
+)
+from rig.diagnosis.problem.track import law_force
+from rig.diagnosis.search.fit import law_space, left_out
+
+Array = NDArray[np.float64]
+
+_REFINED_STARTS = 2
+"""Starts of a law that are refined: its best one may lie in a side valley."""
+_SIDE_VALLEY = 2.0
+"""Times a law's least cost up to which another of its starts is refined."""
+_REPEATABLE = ("stop", "nonlinear_damping")
+"""Families of which a strut may have two: stops at both ends; a damper's valves."""
+_STEPS = 7
+_REMEMBERED = 3
+"""Answers of a law that are kept for the next difference."""
+_RANK = 1e-10
+"""Singular values below this share of the largest are rounding."""
+_DIFFERENCE = 1e-4
+"""Share of a parameter by which it is moved for a tangent."""
+
+
+class Stage(NamedTuple):
+    """The regression along the motion, as all trials share it.
+
+    Attributes:
+        problem: Model and recordings.
+        segments: Recordings and parts of them.
+        constants: Strut constants of the reference, shape (struts, 5).
+        nuisance: Answers to the linear part (its counted parameters first), to existing effects'
+            parameters and to initial states, shape (m, c).
+        counted: Which linear parameters these are.
+        goal: What the reference and its laws leave over, shape (m,).
+        basis: Orthonormal columns that span `nuisance`, shape (m, c'): no law may claim them.
+        target: `goal` with these taken out, shape (m,).
+        blocks: Block of each row, shape (m,).
+    """
+
+    problem: Problem
+    segments: tuple[Segment, ...]
+    constants: Array
+    nuisance: Array
+    counted: tuple[int, ...]
+    goal: Array
+    basis: Array
+    target: Array
+    blocks: Integers
+
+
+class Trial(NamedTuple):
+    """Laws refined along the motion.
+
+    Attributes:
+        laws: The laws, each in its strut.
+        values: Parameters of each.
+        cost: Sum of squares that they leave.
+        scores: Out-of-sample sum of squares of each block.
+    """
+
+    laws: tuple[Placed, ...]
+    values: tuple[Array, ...]
+    cost: float
+    scores: Array
+
+    @property
+    def score(self) -> float:
+        """Out-of-sample sum of squares."""
+        return float(self.scores.sum())
+
+
+def stage_of(problem: Problem, candidate: Candidate, parts: Parts) -> Stage:
+    """The regression about a reference: a candidate that was fitted.
+
+    Raises:
+        FloatingPointError: The reference runs away.
+    """
+    segments = problem.segments(candidate, parts)
+    constants = strut_constants(problem, parts.linear)
+    index = slots_of(problem, candidate).index
+    target = [segment.target.copy() for segment in segments]
+    tangents: list[list[Array]] = [[] for _ in segments]
+    for row, (strut, name) in enumerate(placed(problem, candidate)):
+        values = parts.effects[index[row, 1] : index[row, 2]]
+        for k, segment in enumerate(segments):
+            # The reference's laws acted along its own motion; those of a trial along the measured.
+            force = law_force(segment.reference, strut, name, values, constants)
+            if row < len(candidate.kept):
+                measured = law_force(segment.track, strut, name, values, constants)
+                force = force - measured
+                if problem.existing[candidate.kept[row]].free:
+                    tangents[k] += _tangents(segment, strut, name, values, constants, measured)
+            target[k] += segment.respond(strut, force)
+    return _projected(problem, segments, constants, target, tangents, parts.linear)
+
+
+def _tangents(
+    segment: Segment, strut: int, name: str, values: Array, constants: Array, force: Array
+) -> list[Array]:
+    """Answers to a small change of each parameter of an existing effect."""
+    found: list[Array] = []
+    for i, value in enumerate(values):
+        moved = values.copy()
+        moved[i] += _DIFFERENCE * (abs(value) or 1.0)
+        there = law_force(segment.track, strut, name, moved, constants)
+        found.append(segment.respond(strut, there - force))
+    return found
+
+
+def _projected(
+    problem: Problem,
+    segments: tuple[Segment, ...],
+    constants: Array,
+    target: Sequence[Array],
+    tangents: Sequence[Sequence[Array]],
+    linear: Array,
+) -> Stage:
+    rows = [len(segment.target) for segment in segments]
+    # The gain of the applied force is degenerate with all else and has a turn of its own.
+    counted = [i for i, p in enumerate(problem.linear) if p.kind != "gain"]
+    prior = np.diag([1.0 / problem.linear[i].deviation for i in counted])
+    shared = [
+        np.column_stack([segment.linear[:, counted], *columns])
+        for segment, columns in zip(segments, tangents, strict=True)
+    ]
+    own = [segment.initial for segment in segments]
+    width, initial = shared[0].shape[1], sum(part.shape[1] for part in own)
+    whole = np.zeros((sum(rows) + len(counted), width + initial))
+    at, column = 0, width
+    for part, start, count in zip(shared, own, rows, strict=True):
+        whole[at : at + count, :width] = part
+        whole[at : at + count, column : column + start.shape[1]] = start
+        at, column = at + count, column + start.shape[1]
+    whole[at:, : len(counted)] = prior
+    size = np.linalg.norm(whole, axis=0)
+    scaled = whole[:, size > 0.0] / size[size > 0.0]
+    left, singular, _ = np.linalg.svd(scaled, full_matrices=False)
+    basis = left[:, singular > _RANK * singular[0]] if scaled.shape[1] else left[:, :0]
+    deviation = np.array([problem.linear[i].deviation for i in counted])
+    y = np.concatenate([*target, -linear[counted] / deviation])
+    blocks = np.concatenate([segment.blocks for segment in segments])
+    blocks = np.concatenate([blocks, np.zeros(len(counted), dtype=np.int64)])
+    target_left = y - basis @ (basis.T @ y)
+    return Stage(problem, segments, constants, whole, tuple(counted), y, basis, target_left, blocks)
+
+
+def answer(stage: Stage, strut: int, name: str, values: Array) -> Array:
+    """What a law adds to the whitened answer, shape (m,)."""
+    parts = [
+        segment.respond(strut, law_force(segment.track, strut, name, values, stage.constants))
+        for segment in stage.segments
+    ]
+    return np.concatenate([*parts, np.zeros(len(stage.target) - sum(map(len, parts)))])
+
+
+def response(stage: Stage, strut: int, name: str, values: Array) -> Array:
+    """The same less what the linear part could add."""
+    whole = answer(stage, strut, name, values)
+    return whole - stage.basis @ (stage.basis.T @ whole)
+
+
+def linear_beside(stage: Stage, trial: Trial) -> Array:
+    """Changes of the linear parameters against the reference beside a trial's laws, shape (L,)."""
+    left = stage.goal.copy()
+    for (strut, name), values in zip(trial.laws, trial.values, strict=True):
+        left -= answer(stage, strut, name, values)
+    size = np.maximum(np.linalg.norm(stage.nuisance, axis=0), 1e-300)
+    found = np.linalg.lstsq(stage.nuisance / size, left, rcond=_RANK)[0] / size
+    changes = np.zeros(len(stage.problem.linear))
+    changes[list(stage.counted)] = found[: len(stage.counted)]
+    return changes
+
+
+def plain(stage: Stage) -> Trial:
+    """No law at all."""
+    return Trial((), (), float(stage.target @ stage.target), _scores(stage, stage.target, None))
+
+
+def _scores(stage: Stage, residual: Array, jacobian: Array | None) -> Array:
+    if jacobian is None:
+        count = int(stage.blocks.max()) + 1
+        return np.bincount(stage.blocks, residual**2, count)
+    return left_out(residual, jacobian, stage.blocks, np.zeros((jacobian.shape[1],) * 2))
+
+
+def proposed(problem: Problem) -> list[Placed]:
+    """Laws that compete: those that this kind of bench can show, in every strut."""
+    return [
+        (strut, item.name)
+        for strut, motion in enumerate(problem.motions)
+        for item in CATALOGUE.values()
+        if not item.linear and problem.bench in item.benches and item.starts(motion)
+    ]
+
+
+def ranked(
+    stage: Stage,
+    base: Trial,
+    screened: int,
+    only: Sequence[Placed] | None = None,
+) -> list[Trial]:
+    """A set of laws with one more, for the best laws that there are; best first.
+
+    Args:
+        stage: The regression.
+        base: The set.
+        screened: How many laws are refined.
+        only: Laws that compete; all if absent.
+    """
+    columns = _columns(stage, base)
+    basis = np.linalg.qr(columns)[0] if columns.shape[1] else columns
+    residual = _residual(stage, base.laws, base.values)
+    residual = residual - basis @ (basis.T @ residual)
+    laws = proposed(stage.problem) if only is None else only
+    laws = [at for at in laws if _goes_with(at, base.laws)]
+    for _, name in laws:
+        law(name)  # Compiled here: numba's compiler is no place for two threads.
+
+    def first(at: Placed) -> list[tuple[float, Array]]:
+        starts = effect(at[1]).starts(stage.problem.motions[at[0]])
+        found = [_first(stage, at, np.array(start), residual, basis) for start in starts]
+        return sorted((one for one in found if one is not None), key=lambda one: one[0])
+
+    with ThreadPoolExecutor(cpu_count()) as pool:
+        tried = list(pool.map(first, laws))
+        order = sorted((t[0][0], i) for i, t in enumerate(tried) if t)[:screened]
+        jobs = [
+            (laws[i], values)
+            for least, i in order
+            for cost, values in tried[i][:_REFINED_STARTS]
+            if cost < _SIDE_VALLEY * least
+        ]
+
+        def refine(job: tuple[Placed, Array]) -> Trial | None:
+            return refined(stage, (*base.laws, job[0]), (*base.values, job[1]))
+
+        trials = [trial for trial in pool.map(refine, jobs) if trial is not None]
+    best: dict[tuple[Placed, ...], Trial] = {}
+    for trial in trials:
+        key = tuple(sorted(trial.laws))
+        if key not in best or trial.score < best[key].score:
+            best[key] = trial
+    rest = [
+        Trial((*base.laws, laws[i]), (), cost, np.array([cost]))
+        for cost, i in sorted((t[0][0], i) for i, t in enumerate(tried) if t)[screened:]
+    ]
+    return [*sorted(best.values(), key=lambda trial: trial.score), *rest]
+
+
+def _goes_with(at: Placed, laws: Sequence[Placed]) -> bool:
+    """Whether a law may stand beside others: two formulas of one family imitate a third."""
+    family = effect(at[1]).family
+    return at not in laws and (
+        family in _REPEATABLE
+        or all(strut != at[0] or effect(name).family != family for strut, name in laws)
+    )
+
+
+def _first(
+    stage: Stage, at: Placed, start: Array, residual: Array, basis: Array
+) -> tuple[float, Array] | None:
+    """Cost and parameters of a law at a start, its size by least squares where it has one."""
+    strut, name = at
+    item = effect(name)
+    column = response(stage, strut, name, start)
+    column = column - basis @ (basis.T @ column)
+    power = float(column @ column)
+    if not np.isfinite(power) or power <= 0.0:
+        return None
+    values = start.copy()
+    if item.scaled:
+        size = float(column @ residual) / power
+        for i in item.scaled:
+            values[i] = size * start[i]
+            if not item.parameters[i].low <= values[i] <= item.parameters[i].high:
+                return None
+        return float(residual @ residual) - size * size * power, values
+    left = residual - column
+    return float(left @ left), values
+
+
+def _residual(stage: Stage, laws: Sequence[Placed], values: Sequence[Array]) -> Array:
+    total = stage.target
+    for (strut, name), own in zip(laws, values, strict=True):
+        total = total - response(stage, strut, name, own)
+    return total
+
+
+def _columns(stage: Stage, base: Trial) -> Array:
+    """Answers to small changes of the parameters of a set's laws, shape (m, k)."""
+    found: list[Array] = []
+    for (strut, name), values in zip(base.laws, base.values, strict=True):
+        here = response(stage, strut, name, values)
+        space = law_space(name, stage.problem.motions[strut], values)
+        inner = space.inner(values)
+        for i in range(len(values)):
+            moved = inner.copy()
+            moved[i] += _DIFFERENCE * max(1.0, abs(inner[i]))
+            found.append(response(stage, strut, name, space.outer(moved)) - here)
+    used = [column / size for column in found if (size := float(np.linalg.norm(column))) > 0.0]
+    return np.column_stack(used) if used else np.zeros((len(stage.target), 0))
+
+
+def refined(stage: Stage, laws: Sequence[Placed], values: Sequence[Array]) -> Trial | None:
+    """All parameters of a set of laws, fitted together along the motion."""
+    lengths = np.cumsum([0, *(len(own) for own in values)])
+    known: list[dict[bytes, Array]] = [{} for _ in laws]
+
+    def split(x: Array) -> list[Array]:
+        return [x[a:b] for a, b in itertools.pairwise(lengths)]
+
+    def one(i: int, own: Array) -> Array:
+        # A difference moves one parameter: the other laws answer as before.
+        key = own.tobytes()
+        if key not in known[i]:
+            if len(known[i]) > _REMEMBERED:
+                known[i].clear()
+            known[i][key] = response(stage, *laws[i], own)
+        return known[i][key]
+
+    def residual(x: Array) -> Array | None:
+        there = stage.target - np.sum([one(i, own) for i, own in enumerate(split(x))], axis=0)
+        return there if np.all(np.isfinite(there)) else None
+
+    space = joined(
+        [
+            law_space(name, stage.problem.motions[strut], own)
+            for (strut, name), own in zip(laws, values, strict=True)
+        ]
+    )
+    found = solve(residual, np.concatenate(values), space, _STEPS, 1e-3)
+    if found is None:
+        return None
+    scores = _scores(stage, found.residual, found.jacobian)
+    return Trial(tuple(laws), tuple(split(found.values)), found.cost, scores)

@@ -1,0 +1,193 @@
+"""Which fitted models an engineer would use: passive, bounded, and nothing that cancels itself.
+
+Reference: van der Schaft, L2-Gain and Passivity Techniques in Nonlinear Control (2017), 2, for
+passivity; here power is looked at where the motion was.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dart_model.effects import effect
+from rig.diagnosis.problem.contract import Problem, Track, placed, slots_of, strut_constants
+from rig.diagnosis.problem.track import effect_forces, law_force
+from rig.diagnosis.search.criteria import SelectionCriteria
+from rig.diagnosis.search.fit import Fit, effect_variables, spread
+
+Array = NDArray[np.float64]
+
+_CELLS = 12
+"""Cells of height and of velocity in which power is looked at."""
+_CHANNELS = ("delay", "input_gain", "periodic_force", "unmodelled_mode")
+"""Families that are no property of the strut, or that store energy outside it."""
+
+
+def tracks(problem: Problem, result: Fit) -> list[Track]:
+    """The motion of each recording, smoothed."""
+    found: list[Track] = []
+    for k in range(problem.recordings):
+        forces = problem.residual_forces(k, result.candidate, result.parts)
+        if forces is not None:
+            found.append(forces.track)
+    return found
+
+
+def unsound(
+    problem: Problem, result: Fit, along: Sequence[Track], criteria: SelectionCriteria
+) -> str | None:
+    """Why a model is not to be used; None if it is.
+
+    Args:
+        problem: Model and recordings.
+        result: The fitted model.
+        along: The motion of each recording.
+        criteria: What decides.
+    """
+    forces = _forces(problem, result, along)
+    for check in (_unbound, _disguised, _cancelling):
+        why = check(problem, result, forces, along, criteria)
+        if why is not None:
+            return why
+    return _active(problem, result, along, criteria)
+
+
+def _forces(problem: Problem, result: Fit, along: Sequence[Track]) -> list[tuple[int, Array]]:
+    """Strut and force of each effect over all recordings."""
+    parts = [
+        effect_forces(
+            problem,
+            result.candidate,
+            result.parts,
+            track,
+            problem.states(k, result.candidate, result.parts),
+        )
+        for k, track in enumerate(along)
+    ]
+    return [
+        (rows[0][0], np.concatenate([force for _, force in rows]))
+        for rows in zip(*parts, strict=True)
+    ]
+
+
+def _new(problem: Problem, result: Fit) -> list[tuple[int, str]]:
+    """Place among all effects, and name, of those that the nominal model lacks."""
+    first = len(result.candidate.kept)
+    return [(first + i, name) for i, (_, name) in enumerate(result.candidate.new)]
+
+
+def _unbound(
+    problem: Problem,
+    result: Fit,
+    forces: list[tuple[int, Array]],
+    along: Sequence[Track],
+    criteria: SelectionCriteria,
+) -> str | None:
+    del forces, along
+    known = spread(result)
+    variables = effect_variables(problem, result)
+    for row, name in _new(problem, result):
+        item = effect(name)
+        own = variables[row]
+        if not item.scaled:
+            continue
+        space = result.space.part(np.isin(np.arange(len(result.space.low)), own))
+        values = result.solution.values[own]
+        deviation = np.sqrt(np.maximum(np.diag(known.covariance)[own], 0.0))
+        # One bounded size suffices: an asymmetric damper may have nothing on one side.
+        size = [
+            1.0 / max(deviation[i], 1e-300)
+            if space.logarithmic[i]
+            else abs(values[i] / space.scale[i]) / max(deviation[i], 1e-300)
+            for i in item.scaled
+        ]
+        if max(size) < criteria.significant:
+            return f"the data do not bound its size ({name})"
+    return None
+
+
+def _disguised(
+    problem: Problem,
+    result: Fit,
+    forces: list[tuple[int, Array]],
+    along: Sequence[Track],
+    criteria: SelectionCriteria,
+) -> str | None:
+    for row, name in _new(problem, result):
+        strut, force = forces[row]
+        columns = np.column_stack(
+            [
+                np.ones(len(force)),
+                np.concatenate([track.heights_m[strut] for track in along]),
+                np.concatenate([track.velocities_m_per_s[strut] for track in along]),
+            ]
+        )
+        columns = columns / np.linalg.norm(columns, axis=0)
+        left = force - columns @ np.linalg.lstsq(columns, force, rcond=None)[0]
+        power = float(np.linalg.norm(force))
+        if power <= 0.0 or float(np.linalg.norm(left)) < criteria.leftover * power:
+            return f"along this motion it is a linear spring and damper ({name})"
+    return None
+
+
+def _cancelling(
+    problem: Problem,
+    result: Fit,
+    forces: list[tuple[int, Array]],
+    along: Sequence[Track],
+    criteria: SelectionCriteria,
+) -> str | None:
+    del along
+    new = _new(problem, result)
+    for i, (row, name) in enumerate(new):
+        for other_row, other in new[i + 1 :]:
+            (strut, force), (other_strut, other_force) = forces[row], forces[other_row]
+            if strut != other_strut:
+                continue
+            a, b = force - force.mean(), other_force - other_force.mean()
+            size = float(np.linalg.norm(a) * np.linalg.norm(b))
+            if size > 0.0 and float(a @ b) < criteria.cancelling * size:
+                return f"{name} and {other} cancel each other"
+    return None
+
+
+def _active(
+    problem: Problem, result: Fit, along: Sequence[Track], criteria: SelectionCriteria
+) -> str | None:
+    """A strut that feeds energy in at a height and velocity that the motion went through."""
+    constants = strut_constants(problem, result.parts.linear)
+    index = slots_of(problem, result.candidate).index
+    effects = placed(problem, result.candidate)
+    for strut, motion in enumerate(problem.motions):
+        if not any(at == strut for at, _ in result.candidate.new):
+            continue
+        z = np.concatenate([track.heights_m[strut] for track in along])
+        w = np.concatenate([track.velocities_m_per_s[strut] for track in along])
+        cells = np.unique(np.column_stack([_cell(z), _cell(w)]), axis=0, return_index=True)[1]
+        here = _at_rest(z[cells], w[cells], len(problem.motions), strut)
+        still = here._replace(velocities_m_per_s=np.zeros_like(here.velocities_m_per_s))
+        force = -constants[strut, 2] * w[cells]
+        for (at, name), slot in zip(effects, index, strict=True):
+            if at == strut and effect(name).family not in _CHANNELS and not effect(name).state_size:
+                values = result.parts.effects[slot[1] : slot[2]]
+                force = force + law_force(here, strut, name, values, constants)
+                force = force - law_force(still, strut, name, values, constants)
+        power = force * w[cells]
+        if float(power.max()) > criteria.passive * max(-float(power.min()), 0.0):
+            name = problem.spec.struts[strut].name
+            return f"strut {name} would feed energy in (not passive)"
+        del motion
+    return None
+
+
+def _cell(values: Array) -> Array:
+    low, high = float(values.min()), float(values.max())
+    return np.minimum(((values - low) / max(high - low, 1e-300) * _CELLS).astype(int), _CELLS - 1)
+
+
+def _at_rest(z: Array, w: Array, struts: int, strut: int) -> Track:
+    """Points of height and velocity as a track, for laws without internal state."""
+    heights, velocities = np.zeros((struts, len(z))), np.zeros((struts, len(z)))
+    heights[strut], velocities[strut] = z, w
+    zero = np.zeros(len(z))
+    return Track(np.arange(len(z), dtype=np.float64), heights, velocities, zero, zero + 20.0, 1)

@@ -1,0 +1,437 @@
+"""What was found, as an outcome: verdict on held-out data, confidence intervals, corrected model."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dart_model.effects import CATALOGUE, effect
+from rig.diagnosis.evaluate import Evaluated, rms
+from rig.diagnosis.on_dart import corrected_model
+from rig.diagnosis.outcome import (
+    BeforeAfter,
+    Diagnosis,
+    Estimate,
+    ExistingEffect,
+    FittedSeries,
+    FoundEffect,
+    HeldOut,
+    LinearCorrection,
+    NoiseFloor,
+    RejectedEffect,
+    Result,
+    Verdict,
+    White,
+)
+from rig.diagnosis.problem.contract import (
+    LinearParameter,
+    Problem,
+    ResidualForces,
+    middle_m,
+    slots_of,
+)
+from rig.diagnosis.problem.free_run import FreeRun
+from rig.diagnosis.problem.linear_part import EFFECTS, PARAMETERS
+from rig.diagnosis.problem.prescribed import Prescribed
+from rig.diagnosis.problem.track import effect_forces
+from rig.diagnosis.recording import Recording
+from rig.diagnosis.search.criteria import SelectionCriteria
+from rig.diagnosis.search.fit import Fit, effect_variables, is_white, spread
+from rig.diagnosis.search.select import Found
+
+Array = NDArray[np.float64]
+
+_UNBOUND = 30.0
+"""Factor, or multiple of a value, beyond which an interval says nothing."""
+_HELD = 0.3
+"""Share of half a sampling interval within which a delay is what a held input looks like."""
+
+
+class _Known(NamedTuple):
+    """A fit and its covariance."""
+
+    fit: Fit
+    covariance: Array
+    factor: float
+
+    def estimate(self, variable: int) -> Estimate:
+        """A search variable's value and confidence interval."""
+        space, value = self.fit.space, float(self.fit.solution.values[variable])
+        half = self.factor * float(np.sqrt(max(self.covariance[variable, variable], 0.0)))
+        low, high = float(space.low[variable]), float(space.high[variable])
+        if space.logarithmic[variable]:
+            if half > np.log(_UNBOUND):
+                return Estimate(value, None, None)
+            return Estimate(value, value * float(np.exp(-half)), value * float(np.exp(half)))
+        half *= float(space.scale[variable])
+        if half > _UNBOUND * max(abs(value), 1e-300) and half > 0.5 * (high - low):
+            return Estimate(value, None, None)
+        return Estimate(value, max(value - half, low), min(value + half, high))
+
+
+def written_up(
+    problem: FreeRun | Prescribed,
+    found: Found,
+    verdict: Verdict,
+    results: Sequence[Evaluated],
+    runs: Sequence[Recording],
+    criteria: SelectionCriteria,
+    *,
+    blocks: bool,
+) -> Result:
+    """The outcome of a search.
+
+    Args:
+        problem: Model and recordings.
+        found: What the search found.
+        verdict: What held-out data allow to be said.
+        results: Held-out recordings, before and after.
+        runs: Recordings that were learnt from.
+        criteria: What decides.
+        blocks: Whether blocks were kept back, since no run was held out.
+    """
+    chosen = found.chosen.fit
+    before = [_forces(problem, k, found.given) for k in range(problem.recordings)]
+    after = [_forces(problem, k, chosen) for k in range(problem.recordings)]
+    known = _Known(chosen, *spread(chosen))
+    linear = _linear(problem, known)
+    effects = _effects(problem, known, after)
+    if not effects:
+        effects = _linear_effects(problem, known, after)
+    held_out = _held_out(results, blocks=blocks)
+    floor = NoiseFloor(
+        _mean([r.floor.height_rmse_m for r in results]),
+        _mean([r.floor.residual_force_rmse_n for r in results]),
+    )
+    rivals = [name for rival in found.rivals for _, name in rival.fit.candidate.new]
+    own = {effect(name).family for _, name in chosen.candidate.new}
+    other = tuple(dict.fromkeys(f for f in (effect(n).family for n in rivals) if f not in own))
+    ambiguous = verdict == "ambiguous"
+    diagnosis = Diagnosis(
+        verdict,
+        linear,
+        effects,
+        _existing(problem, found, known),
+        _rejected(problem, found),
+        other if ambiguous else (),
+        _suggestion(found) if ambiguous else None,
+        held_out,
+        floor,
+        White(
+            is_white(problem, found.given, criteria.white),
+            is_white(problem, chosen, criteria.white),
+        ),
+        _notes(problem, found, blocks=blocks),
+        tuple(recording.name for recording in runs),
+        problem.spec.name,
+    )
+    series = tuple(
+        item
+        for k in range(problem.recordings)
+        for item in _fitted_series(problem, before[k], after[k])
+    )
+    return Result(
+        diagnosis,
+        corrected_model(problem, chosen.candidate, chosen.parts),
+        series,
+        tuple(item for result in results for item in result.series),
+    )
+
+
+def judgement(results: Sequence[Evaluated], found: Found, criteria: SelectionCriteria) -> Verdict:
+    """What held-out data allow to be said.
+
+    A finding explains where every held-out run is left at the noise floor; it is partial where laws
+    take away a good share of what the best linear model leaves there. How bad the nominal model was
+    does not count.
+    """
+    ratios = [r.counted.after / max(_floor(r), 1e-300) for r in results]
+    if all(ratio <= criteria.explained for ratio in ratios):
+        if not (found.chosen.fit.candidate.new or np.any(found.chosen.fit.free)):
+            return "nothing_missing"
+        return "ambiguous" if found.rivals else "explained"
+    if found.chosen.fit.candidate.new and all(np.isfinite(ratios)):
+        left = _mean([r.counted.after for r in results])
+        linear = _mean([r.linear for r in results])
+        if left < (1.0 - criteria.partly) * linear:
+            return "ambiguous" if found.rivals else "partly_explained"
+    return "not_explained"
+
+
+def _floor(result: Evaluated) -> float:
+    height = result.floor.height_rmse_m
+    return height if np.isfinite(height) else result.floor.residual_force_rmse_n
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _forces(problem: Problem, k: int, result: Fit) -> ResidualForces | None:
+    return problem.residual_forces(k, result.candidate, result.parts)
+
+
+def _linear(problem: Problem, known: _Known) -> tuple[LinearCorrection, ...]:
+    found: list[LinearCorrection] = []
+    for variable, p in enumerate(_free(problem, known.fit)):
+        change = known.estimate(variable)
+        nominal_value = p.nominal + (_existing_preload(problem, p) if p.kind == "preload" else 0.0)
+        about = p.kind in ("stiffness", "preload")
+        found.append(
+            LinearCorrection(
+                problem.spec.struts[p.strut].name,
+                PARAMETERS[p.kind],
+                nominal_value,
+                _shifted(change, nominal_value),
+                middle_m(problem.motions[p.strut]) if about else None,
+            )
+        )
+    return tuple(found)
+
+
+def _free(problem: Problem, result: Fit) -> list[LinearParameter]:
+    return [p for p, free in zip(problem.linear, result.free, strict=True) if free]
+
+
+def _shifted(estimate: Estimate, by: float) -> Estimate:
+    low, high = estimate.low, estimate.high
+    return Estimate(
+        estimate.value + by, None if low is None else low + by, None if high is None else high + by
+    )
+
+
+def _existing_preload(problem: Problem, parameter: LinearParameter) -> float:
+    return sum(
+        e.values[0] for e in problem.existing if e.strut == parameter.strut and e.name == "preload"
+    )
+
+
+def _effects(
+    problem: Problem, known: _Known, after: Sequence[ResidualForces | None]
+) -> tuple[FoundEffect, ...]:
+    result = known.fit
+    first = len(result.candidate.kept)
+    found: list[FoundEffect] = []
+    per_recording = [
+        effect_forces(
+            problem, result.candidate, result.parts, forces.track,
+            problem.states(k, result.candidate, result.parts),
+        )
+        for k, forces in enumerate(after)
+        if forces is not None
+    ]  # fmt: skip
+    for i, (strut, name) in enumerate(result.candidate.new):
+        force = np.concatenate([rows[first + i][1] for rows in per_recording])
+        left = np.concatenate([f.force_n[strut] for f in after if f is not None])
+        found.append(
+            FoundEffect(
+                effect(name).family,
+                name,
+                problem.spec.struts[strut].name,
+                _explained(left, force),
+                rms(force),
+                _estimates(problem, known, first + i, name),
+            )
+        )
+    return tuple(sorted(found, key=lambda item: -item.force_rms_n))
+
+
+def _estimates(problem: Problem, known: _Known, row: int, name: str) -> dict[str, Estimate]:
+    """Parameters of an effect by name; those of a table have no interval."""
+    result = known.fit
+    variables = effect_variables(problem, result).get(row)
+    if variables is not None:
+        return {
+            p.name: known.estimate(int(v))
+            for p, v in zip(effect(name).parameters, variables, strict=True)
+        }
+    slot = slots_of(problem, result.candidate).index[row]
+    values = result.parts.effects[slot[1] : slot[2]]
+    return {
+        p.name: Estimate(float(value), None, None)
+        for p, value in zip(effect(name).parameters, values, strict=True)
+    }
+
+
+def _explained(left: Array, force: Array) -> float:
+    """Share of a residual force's mean square that a force takes away, means apart."""
+    there = np.isfinite(left)
+    a, b = left[there], (left + force)[there]
+    with_it, without_it = float(np.mean(a**2)), float(np.mean(b**2))
+    return float(np.clip(1.0 - with_it / max(without_it, 1e-300), 0.0, 1.0))
+
+
+def _linear_effects(
+    problem: Problem, known: _Known, after: Sequence[ResidualForces | None]
+) -> tuple[FoundEffect, ...]:
+    """Linear corrections as effects, where they are all that was found."""
+    result = known.fit
+    found: list[FoundEffect] = []
+    places = np.flatnonzero(result.free)
+    for variable, (place, p) in enumerate(zip(places, _free(problem, result), strict=True)):
+        linear = result.parts.linear.copy()
+        linear[place] = 0.0
+        parts = result.parts._replace(linear=linear)
+        forces: list[Array] = []
+        left: list[Array] = []
+        for k, there in enumerate(after):
+            without = problem.residual_forces(k, result.candidate, parts)
+            if there is not None and without is not None:
+                forces.append(without.force_n[p.strut] - there.force_n[p.strut])
+                left.append(there.force_n[p.strut])
+        force = np.concatenate(forces) if forces else np.zeros(1)
+        item = effect(EFFECTS[p.kind])
+        found.append(
+            FoundEffect(
+                item.family,
+                item.name,
+                problem.spec.struts[p.strut].name,
+                _explained(np.concatenate(left) if left else np.zeros(1), force),
+                rms(force),
+                {item.parameters[0].name: known.estimate(variable)},
+            )
+        )
+    return tuple(sorted(found, key=lambda item: -item.force_rms_n))
+
+
+def _existing(problem: Problem, found: Found, known: _Known) -> tuple[ExistingEffect, ...]:
+    """Existing effects that are superfluous, or whose file values lie outside their intervals."""
+    result = known.fit
+    variables = effect_variables(problem, result)
+    listed: list[ExistingEffect] = []
+    for row, kept in enumerate(result.candidate.kept):
+        item = problem.existing[kept]
+        parameters = effect(item.name).parameters
+        nominal_values = dict(zip((p.name for p in parameters), item.values, strict=True))
+        strut = problem.spec.struts[item.strut].name
+        if kept in found.superfluous:
+            listed.append(ExistingEffect(item.name, strut, "superfluous", nominal_values, {}))
+        elif row in variables:
+            estimates = {
+                p.name: known.estimate(int(v))
+                for p, v in zip(parameters, variables[row], strict=True)
+            }
+            if any(_outside(estimates[name], value) for name, value in nominal_values.items()):
+                listed.append(
+                    ExistingEffect(item.name, strut, "refitted", nominal_values, estimates)
+                )
+    return tuple(listed)
+
+
+def _outside(estimate: Estimate, value: float) -> bool:
+    if estimate.low is None or estimate.high is None:
+        return False
+    return not estimate.low <= value <= estimate.high
+
+
+def _rejected(problem: Problem, found: Found) -> tuple[RejectedEffect, ...]:
+    listed = [
+        RejectedEffect(
+            effect(r.placed[1]).family,
+            r.placed[1],
+            problem.spec.struts[r.placed[0]].name,
+            r.why,
+            r.left,
+        )
+        for r in found.rejected
+    ]
+    bench = "a prescribed motion" if problem.bench == "motion_given" else "this kind of bench"
+    for item in CATALOGUE.values():
+        if problem.bench not in item.benches:
+            listed.append(
+                RejectedEffect(
+                    item.family,
+                    item.name,
+                    problem.spec.struts[0].name,
+                    f"{bench} does not show it",
+                    None,
+                )
+            )
+    return tuple(listed)
+
+
+def _suggestion(found: Found) -> str:
+    candidates = [found.chosen, *found.rivals]
+    names = [name for scored in candidates for _, name in scored.fit.candidate.new]
+    wanted = dict.fromkeys(effect(name).excitation for name in names)
+    return "a run with " + "; and ".join(wanted)
+
+
+def _held_out(results: Sequence[Evaluated], *, blocks: bool) -> HeldOut:
+    figures = [result.figures for result in results]
+
+    def mean(pairs: Sequence[BeforeAfter | None]) -> BeforeAfter:
+        there = [pair for pair in pairs if pair is not None]
+        return BeforeAfter(_mean([p.before for p in there]), _mean([p.after for p in there]))
+
+    cells = [f.strut_force_rmse_n for f in figures]
+    return HeldOut(
+        mean([f.height_rmse_m for f in figures]),
+        mean([f.residual_force_rmse_n for f in figures]),
+        mean(cells) if any(cell is not None for cell in cells) else None,
+        tuple(figures),
+        "blocks" if blocks else "runs",
+    )
+
+
+def _fitted_series(
+    problem: Problem, before: ResidualForces | None, after: ResidualForces | None
+) -> list[FittedSeries]:
+    if before is None or after is None:
+        return []
+    return [
+        FittedSeries(
+            after.name,
+            strut.name,
+            after.track.t_s,
+            after.track.heights_m[i],
+            after.track.velocities_m_per_s[i],
+            before.force_n[i],
+            after.force_n[i],
+            after.deviation_n[i],
+        )
+        for i, strut in enumerate(problem.spec.struts)
+        if np.all(np.isfinite(after.force_n[i]))
+    ]
+
+
+def _notes(problem: FreeRun | Prescribed, found: Found, *, blocks: bool) -> tuple[str, ...]:
+    notes: list[str] = []
+    if problem.bench == "force_given":
+        notes.append(
+            "The initial state of every recording is fitted, for both models; between samples the "
+            "applied force is a cubic spline."
+        )
+        grids = [run.grid for run in problem.runs] if isinstance(problem, FreeRun) else []
+    else:
+        notes.append("The motion is smoothed over the whole recording.")
+        grids = [drive.grid for drive in problem.drives] if isinstance(problem, Prescribed) else []
+    if outliers := sum(grid.outliers for grid in grids):
+        notes.append(f"{outliers} single false heights were found and left out.")
+    if found.gain_alike:
+        notes.append(
+            "Mass, stiffness and damping changed in one proportion: these data cannot separate "
+            "that from the gain of the applied force; a weighed mass (`tolerance`) would."
+        )
+    if _looks_held(problem, found.chosen.fit):
+        notes.append(
+            "The delay found is half a sampling interval: that is what an applied force looks like "
+            "that is held between samples. If the bench holds it, nothing is wrong with it."
+        )
+    if blocks:
+        notes.append(
+            "No run was held out: blocks spread over the recordings took no part in any choice or "
+            "fit; the initial states are those of the fit."
+        )
+    return tuple(notes)
+
+
+def _looks_held(problem: Problem, result: Fit) -> bool:
+    """Whether a delay was found that a force held between samples would feign."""
+    half_s = 0.5 * problem.motions[0].step_s
+    index = slots_of(problem, result.candidate).index[len(result.candidate.kept) :]
+    return any(
+        name == "delay" and abs(result.parts.effects[slot[1]] / half_s - 1.0) < _HELD
+        for (_, name), slot in zip(result.candidate.new, index, strict=True)
+    )

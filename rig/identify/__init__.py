@@ -1,1 +1,0 @@
-"""From a logged run to the effect that the model lacks."""

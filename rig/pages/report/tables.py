@@ -1,0 +1,123 @@
+"""The tables of a report: text, ready to be shown."""
+
+import math
+from typing import NamedTuple
+
+from dart_model.effects import CATALOGUE, Effect, effect
+from dart_model.effects.restoring_surface import FIRST_FORCE, RESTORING_SURFACE
+from rig.diagnosis.outcome import BeforeAfter, Diagnosis, Estimate, RunFigures
+from rig.pages.report.quantities import change, label, percent, quantity, ratio, value_and_interval
+from rig.pages.report.words import LINEAR, difference, is_prescribed, linear_label, missing
+
+Row = tuple[str, ...]
+"""Cells of a row, ready to be shown."""
+
+
+class EffectTable(NamedTuple):
+    """One effect; a row holds a parameter's name, nominal value, value, interval, meaning, key."""
+
+    law: Effect
+    note: str
+    rows: tuple[Row, ...]
+
+
+def errors(found: Diagnosis) -> tuple[Row, ...]:
+    """Name, before, after, change, noise floor and ratio of each error that was measured."""
+    held_out, floor = found.held_out, found.noise_floor
+    cell = "Strut force against the load cell"
+    if is_prescribed(found):
+        # The residual force is then what the load cell shows beyond the model.
+        floor_n = floor.residual_force_rmse_n
+        rows = ((f"{cell}, motion prescribed", held_out.strut_force_rmse_n, floor_n, "N"),)
+    else:
+        rows = (
+            ("Height, free-run simulation", held_out.height_rmse_m, floor.height_rmse_m, "m"),
+            ("Residual force", held_out.residual_force_rmse_n, floor.residual_force_rmse_n, "N"),
+            (cell, held_out.strut_force_rmse_n, math.nan, "N"),
+        )
+    return tuple(
+        (name, *_pair(x, unit), change(x), quantity(least, unit), ratio(x.after, least))
+        for name, x, least, unit in rows
+        if x is not None and math.isfinite(x.before)
+    )
+
+
+def run_columns(found: Diagnosis) -> Row:
+    """What `run_cells` shows of each run, before and after."""
+    return ("Height, free run", "Residual force", "Strut force")[2 * is_prescribed(found) :]
+
+
+def run_cells(run: RunFigures, columns: int) -> Row:
+    """Errors on one held-out run: the last columns, before and after."""
+    heights, forces = _pair(run.height_rmse_m, "m"), _pair(run.residual_force_rmse_n, "N")
+    return (*heights, *forces, *_pair(run.strut_force_rmse_n, "N"))[-2 * columns :]
+
+
+def _pair(figure: BeforeAfter | None, unit: str) -> tuple[str, str]:
+    if figure is None:
+        return "–", "–"
+    return quantity(figure.before, unit), quantity(figure.after, unit)
+
+
+def linear(found: Diagnosis) -> tuple[Row, ...]:
+    """Name, key, strut, nominal, value, interval and difference of each linear correction."""
+    rows: list[Row] = []
+    for item in found.linear:
+        unit = LINEAR[item.parameter][1]
+        values = quantity(item.nominal, unit), *value_and_interval(item.total, unit)
+        rows.append((linear_label(item), item.parameter, item.strut, *values, difference(item)))
+    return tuple(rows)
+
+
+def effects(found: Diagnosis) -> tuple[EffectTable, ...]:
+    """Effects that are missing, with their parameters."""
+    tables: list[EffectTable] = []
+    for item in missing(found):
+        law = effect(item.name)
+        note = (
+            f"family {item.family}, strut {item.strut}, {quantity(item.force_rms_n, 'N')} RMS, "
+            f"explains {percent(item.explained_fraction, 0)} of the residual force without it"
+        )
+        tables.append(EffectTable(law, note, _parameters(law, item.parameters, {})))
+    return tuple(tables)
+
+
+def existing(found: Diagnosis) -> tuple[EffectTable, ...]:
+    """Effects of the nominal model that the data change."""
+    tables: list[EffectTable] = []
+    for item in found.existing:
+        law = effect(item.name)
+        superfluous = "superfluous: the data are as well explained without it"
+        note = f"strut {item.strut}, {'refitted' if item.change == 'refitted' else superfluous}"
+        tables.append(EffectTable(law, note, _parameters(law, item.parameters, item.nominal)))
+    return tuple(tables)
+
+
+def _parameters(
+    law: Effect, estimates: dict[str, Estimate], nominal: dict[str, float]
+) -> tuple[Row, ...]:
+    is_table = law is RESTORING_SURFACE
+    rows: list[Row] = []
+    for parameter in law.parameters[: FIRST_FORCE if is_table else None]:
+        if parameter.name in estimates:
+            before = quantity(nominal.get(parameter.name, math.nan), parameter.unit)
+            values = value_and_interval(estimates[parameter.name], parameter.unit)
+            rows.append((label(parameter), before, *values, parameter.meaning, parameter.name))
+    names = [parameter.name for parameter in law.parameters[FIRST_FORCE:]]
+    forces = [estimates[name].value for name in names if name in estimates]
+    if is_table and forces:
+        reach = f"{quantity(min(forces), 'N')} to {quantity(max(forces), 'N')}"
+        meaning = f"{len(forces)} forces over height and velocity, listed in corrected.yaml"
+        rows.append(("forces", "–", reach, "–", meaning, "force_…_n"))
+    return tuple(rows)
+
+
+def listed_excitations(family: str) -> str:
+    """What a recording must contain for the laws of a family to be seen."""
+    texts = {law.excitation: None for law in CATALOGUE.values() if law.family == family}
+    return "; ".join(texts) or "–"
+
+
+def capital(text: str) -> str:
+    """The text with a capital first letter."""
+    return text[:1].upper() + text[1:]

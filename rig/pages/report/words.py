@@ -1,0 +1,233 @@
+"""What was found, said as a test engineer would say it."""
+
+import math
+from collections.abc import Sequence
+
+from dart_model.effects import FAMILY_WORDS, effect
+from rig.diagnosis.outcome import Diagnosis, FoundEffect, LinearCorrection
+from rig.pages.report.quantities import (
+    decimals_of,
+    label,
+    number,
+    quantity,
+    times,
+    value_and_interval,
+)
+
+AT_THE_FLOOR = 1.3
+"""Errors up to this multiple of the noise floor count as being at it."""
+
+LINEAR = {
+    "mass_kg": ("mass", "kg"),
+    "stiffness_n_per_m": ("stiffness", "N/m"),
+    "damping_n_s_per_m": ("damping", "N·s/m"),
+    "preload_n": ("preload", "N"),
+    "input_gain": ("input gain", ""),
+}
+"""What a linear correction may correct, in words, and its unit."""
+
+_AS_EFFECT = {
+    "added_mass": "mass_kg",
+    "linear_stiffness": "stiffness_n_per_m",
+    "linear_damping": "damping_n_s_per_m",
+    "preload": "preload_n",
+    "input_gain": "input_gain",
+}
+
+BLOCKS = "blocks of the recordings, spread over them, were kept back"
+
+
+def listed(items: Sequence[str], last: str) -> str:
+    """Items with commas, and a word before the last one."""
+    if len(items) < 2:
+        return "".join(items)
+    return f"{', '.join(items[:-1])} {last} {items[-1]}"
+
+
+def missing(found: Diagnosis) -> tuple[FoundEffect, ...]:
+    """Effects that are missing, without those that stand among the linear corrections too."""
+    linear = {(item.strut, item.parameter) for item in found.linear}
+    return tuple(
+        item for item in found.effects if (item.strut, _AS_EFFECT.get(item.name)) not in linear
+    )
+
+
+def is_prescribed(found: Diagnosis) -> bool:
+    """Whether the motion is prescribed, so that there is no height error."""
+    return not math.isfinite(found.held_out.height_rmse_m.before)
+
+
+def difference(item: LinearCorrection) -> str:
+    """How far a linear correction goes: in per cent, or in its unit where that means nothing."""
+    change = item.total.value - item.nominal
+    if change == 0.0 or not math.isfinite(change):
+        return "as in the file"
+    if item.parameter == "preload_n" or item.nominal == 0.0:
+        amount = quantity(abs(change), LINEAR[item.parameter][1])
+    else:
+        percent = 100.0 * abs(change / item.nominal)
+        amount = f"{number(percent, decimals_of(percent))}\u00a0%"
+    return f"{amount} {'above' if change > 0.0 else 'below'} the file's"
+
+
+def linear_label(item: LinearCorrection) -> str:
+    """Name of what is corrected, with the height about which it is taken."""
+    name, _ = LINEAR[item.parameter]
+    if item.about_height_m is None:
+        return name
+    return f"{name} about mid-stroke ({number(item.about_height_m, 2)}\u00a0m)"
+
+
+def sentence(found: Diagnosis, struts: int) -> str:
+    """What was found, in one sentence.
+
+    Args:
+        found: The diagnosis.
+        struts: Number of struts in the model; with one, its name is not said.
+    """
+    match found.verdict:
+        case "nothing_missing":
+            name, _, before, _ = _error(found)
+            return f"Nothing is missing: with the nominal model {name} is {before}."
+        case "explained":
+            no_more = "" if missing(found) else "; nothing is missing"
+            return f"{_finding(found, struts)}{no_more}: {_error_falls(found)}"
+        case "partly_explained":
+            return (
+                f"{_finding(found, struts)}, and there is something more that is not explained: "
+                f"{_error_falls(found)}"
+            )
+        case "ambiguous":
+            others = [FAMILY_WORDS[item] for item in found.ambiguous_with]
+            rivals = listed(others, "or") or "another effect that fits as well"
+            return (
+                f"{_finding(found, struts)}, or else {rivals}; these recordings cannot tell "
+                f"them apart{_what_would_tell(found)}; {_error_falls(found, 'the former')}"
+            )
+        case "not_explained":
+            return _not_explained(found)
+
+
+def _finding(found: Diagnosis, struts: int) -> str:
+    lacking = missing(found)
+    if lacking:
+        effects = listed([_effect(item, struts) for item in lacking], "and")
+        return _one_interval(f"The model lacks {effects}{_besides(found, struts)}")
+    parts: list[str] = []
+    if found.linear:
+        corrections = listed([_linear(item, struts) for item in found.linear], "and")
+        parts.append(f"linear part is off: {corrections}")
+    parts += [f"effect “{item.name}” is {item.change}" for item in found.existing]
+    return _one_interval(f"The model's {'; its '.join(parts) or 'parameters are off'}")
+
+
+def _besides(found: Diagnosis, struts: int) -> str:
+    parts: list[str] = []
+    if found.linear:
+        offs = [
+            f"{LINEAR[item.parameter][0]} {difference(item)}{_where(item.strut, struts)}"
+            for item in found.linear
+        ]
+        parts.append(f"linear corrections ({', '.join(offs)})")
+    if found.existing:
+        changes = [f"“{item.name}” {item.change}" for item in found.existing]
+        parts.append(f"changes of its own effects ({', '.join(changes)})")
+    return f", besides {listed(parts, 'and')}" if parts else ""
+
+
+def _one_interval(text: str) -> str:
+    # Said once; the other brackets are then understood.
+    return text.replace("(95 %: ", "(95 % interval ", 1).replace("(95 %: ", "(")
+
+
+def _where(strut: str, struts: int) -> str:
+    return f" in strut “{strut}”" if struts > 1 else ""
+
+
+def _effect(item: FoundEffect, struts: int) -> str:
+    law = effect(item.name)
+    parts: list[str] = []
+    for parameter in law.parameters:
+        if parameter.name in law.shown and parameter.name in item.parameters:
+            value, interval = value_and_interval(item.parameters[parameter.name], parameter.unit)
+            parts.append(f"{label(parameter)} {value} (95 %: {interval})")
+    described = f", {' and '.join(parts)}" if parts else ""
+    return f"{law.words}{_where(item.strut, struts)}{described}"
+
+
+def _linear(item: LinearCorrection, struts: int) -> str:
+    name, unit = LINEAR[item.parameter]
+    if item.parameter == "preload_n":
+        name = linear_label(item)
+    value, interval = value_and_interval(item.total, unit)
+    where = _where(item.strut, struts)
+    return f"{name} {difference(item)}{where}, {value} (95 %: {interval})"
+
+
+def _error(found: Diagnosis) -> tuple[str, bool, str, str]:
+    """The error that a verdict is about: name, whether it falls, before, from before to after."""
+    # Height is what the corrected model is judged by; a prescribed motion leaves only the force.
+    held_out, floor = found.held_out, found.noise_floor
+    name, unit, figure = "free-run height error", "m", held_out.height_rmse_m
+    floor_rms = floor.height_rmse_m
+    if is_prescribed(found):
+        name, unit, figure = "residual force", "N", held_out.residual_force_rmse_n
+        floor_rms = floor.residual_force_rmse_n
+    before, after = quantity(figure.before, unit), quantity(figure.after, unit)
+    return (
+        f"the RMS {name} on held-out data",
+        figure.after < figure.before,
+        f"{before}, {_against_floor(figure.before, floor_rms, unit)}",
+        f"from {before} to {after}, {_against_floor(figure.after, floor_rms, unit)}",
+    )
+
+
+def _against_floor(value: float, floor: float, unit: str) -> str:
+    if not floor > 0.0:
+        return "with a noise floor that is not known"
+    if value <= AT_THE_FLOOR * floor:
+        return f"at the noise floor of {quantity(floor, unit)}"
+    return f"{times(value / floor)} times the noise floor of {quantity(floor, unit)}"
+
+
+def _error_falls(found: Diagnosis, subject: str = "") -> str:
+    name, falls, _, change = _error(found)
+    corrections = len(found.linear) + len(found.existing)
+    single = len(missing(found)) + corrections == 1
+    if corrections:
+        plain = "this correction" if single else "these corrections"
+    else:
+        plain = "it" if single else "them"
+    goes, or_else = "falls" if falls else "goes", "" if subject else _or_else(found)
+    return f"with {subject or plain} {name} {goes} {change}{or_else}."
+
+
+def _or_else(found: Diagnosis) -> str:
+    if not found.ambiguous_with:
+        return ""
+    others = listed([FAMILY_WORDS[item] for item in found.ambiguous_with], "or")
+    return f"; it could also be {others}{_what_would_tell(found)}"
+
+
+def _what_would_tell(found: Diagnosis) -> str:
+    # The excitation comes as a phrase or as a sentence; here it stands inside one.
+    bare = (found.suggested_excitation or "").strip().rstrip(".")
+    if not bare:
+        return ""
+    clause = bare if bare[1:2].isupper() else bare[:1].lower() + bare[1:]
+    return f" (what would tell: {clause})"
+
+
+def _not_explained(found: Diagnosis) -> str:
+    start = "The model lacks a force that no law in the catalogue describes"
+    name, falls, before, change = _error(found)
+    corrected = found.effects or found.linear or found.existing
+    if not (corrected and falls):
+        return f"{start}: {name} is {before}{_or_else(found)}."
+    words = listed([effect(item.name).words for item in found.effects], "and")
+    nearest = f"the nearest, {words or 'a correction of what it has'}, takes"
+    if found.effects and found.effects[0].family == "restoring_surface":
+        nearest = (
+            "a table of force over height and velocity, which names no cause, is offered and takes"
+        )
+    return f"{start}: {nearest} {name} {change}{_or_else(found)}."

@@ -1,0 +1,228 @@
+"""Effects planted in a dyno are found by their load cell; a complete model lacks none."""
+
+import math
+
+import pytest
+
+from rig.diagnosis.diagnose import diagnose
+from tests.diagnosis import little_dyno as dyno
+from tests.diagnosis.answers import (
+    LINEAR_FAMILIES,
+    correction,
+    holds,
+    is_at_the_floor,
+    missing,
+    named,
+)
+from tests.diagnosis.little_dyno import DAMPING, FREE, MIDDLE, STIFFNESS, Nothing
+
+
+class Preload(Nothing):
+    def force(self, t, z, v, state, warm):
+        return 35.0
+
+
+class Stiffness(Nothing):
+    def force(self, t, z, v, state, warm):
+        return -900.0 * (z - FREE)
+
+
+class Damping(Nothing):
+    def force(self, t, z, v, state, warm):
+        return -150.0 * v
+
+
+class Hardening(Nothing):
+    def force(self, t, z, v, state, warm):
+        return -4e6 * (z - FREE) ** 3
+
+
+class GasColumn(Nothing):
+    def force(self, t, z, v, state, warm):
+        column = 0.12 + (z - FREE)
+        return 400.0 * (0.12 / column) ** 1.3
+
+
+class Stop(Nothing):
+    def force(self, t, z, v, state, warm):
+        depth = 0.286 - z
+        return max(0.0, 1.5e5 * depth - 200.0 * v) if depth > 0.0 else 0.0
+
+
+class Friction(Nothing):
+    def force(self, t, z, v, state, warm):
+        return -60.0 * math.copysign(1.0, v) * (1.0 - math.exp(-abs(v) / 2e-3))
+
+
+class Orifice(Nothing):
+    def force(self, t, z, v, state, warm):
+        return -1500.0 * v * abs(v)
+
+
+class Digressive(Nothing):
+    def force(self, t, z, v, state, warm):
+        return -900.0 * v / (1.0 + abs(v) / 0.15)
+
+
+class Yielding(Nothing):
+    """Bouc and Wen's loop in the form with stiffness, alpha, beta and gamma."""
+
+    size = 1
+
+    def force(self, t, z, v, state, warm):
+        return -120.0 * state[0]
+
+    def rate(self, t, z, v, state):
+        s = state[0]
+        return ((v - 0.6 * abs(v) * s * abs(s) - 0.4 * v * abs(s) ** 2) / 8e-4,)
+
+
+class Relaxing(Nothing):
+    """A damper and a spring in series; the state is the damper's travel."""
+
+    size = 1
+
+    def force(self, t, z, v, state, warm):
+        return -4000.0 * (z - MIDDLE - state[0])
+
+    def rate(self, t, z, v, state):
+        return (4000.0 * (z - MIDDLE - state[0]) / 200.0,)
+
+
+class Fade(Nothing):
+    def force(self, t, z, v, state, warm):
+        return DAMPING * v * 0.35 * (1.0 - math.exp(-t / 4.0))
+
+
+class Ripple(Nothing):
+    def force(self, t, z, v, state, warm):
+        return 12.0 * math.cos(2.0 * math.pi * 13.7 * t + 0.4)
+
+
+PLANTED = {
+    "preload": (Preload, {"force_n": 35.0}),
+    "stiffness": (Stiffness, {"stiffness_n_per_m": 900.0}),
+    "damping": (Damping, {"damping_n_s_per_m": 150.0}),
+    "nonlinear_stiffness": (Hardening, {"stiffness_n_per_m3": 4e6}),
+    "gas": (GasColumn, {"gas_length_m": 0.12, "polytropic_exponent": 1.3}),
+    "stop": (Stop, {"contact_height_m": 0.286, "stiffness_n_per_m": 1.5e5}),
+    "friction": (Friction, {"coulomb_force_n": 60.0}),
+    "nonlinear_damping": (Orifice, {"damping_n_s2_per_m2": 1500.0}),
+    "digressive": (Digressive, {"damping_n_s_per_m": 900.0, "knee_velocity_m_per_s": 0.15}),
+    "hysteresis": (Yielding, {"yield_force_n": 120.0, "yield_displacement_m": 8e-4}),
+    "maxwell": (Relaxing, {"stiffness_n_per_m": 4000.0, "relaxation_time_s": 0.05}),
+    "fade": (Fade, {"final_fraction": 0.65, "time_constant_s": 4.0}),
+    "periodic_force": (Ripple, {"amplitude_n": 12.0, "frequency_hz": 13.7}),
+}
+FAMILY = {
+    "gas": "nonlinear_stiffness",
+    "digressive": "nonlinear_damping",
+    "maxwell": "hysteresis",
+}
+LONG = {"preload", "damping", "gas", "digressive", "maxwell", "fade", "periodic_force"}
+CASES = [pytest.param(case, marks=pytest.mark.long if case in LONG else ()) for case in PLANTED]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_planted_effect_is_named_first(case):
+    effect, truth = PLANTED[case]
+    train, test = dyno.run(effect()), dyno.run(effect(), seed=2, duration_s=6.0, motion=dyno.later)
+    found = diagnose(dyno.model(), [train], [test]).diagnosis
+    family = FAMILY.get(case, case)
+    assert found.effects[0].family == family
+    assert {e.family for e in found.effects} - LINEAR_FAMILIES <= {family}
+    assert found.verdict == "explained"
+    force = found.held_out.strut_force_rmse_n
+    assert force is not None
+    assert is_at_the_floor(found)
+    assert force.before > 2.0 * force.after
+    estimates = found.effects[0].parameters
+    for name, value in truth.items():
+        assert estimates[name].value == pytest.approx(value, rel=0.05)
+        assert holds(estimates[name], value)
+
+
+def test_a_complete_model_lacks_nothing():
+    found = diagnose(dyno.model(), [dyno.run(Nothing())], [dyno.run(Nothing(), seed=2)])
+    assert found.diagnosis.verdict == "nothing_missing"
+    assert found.diagnosis.effects == ()
+    assert found.diagnosis.linear == ()
+    assert found.diagnosis.residual_white.before
+    assert is_at_the_floor(found.diagnosis)
+    assert found.corrected.struts == dyno.model().struts
+
+
+@pytest.mark.long
+def test_the_corrected_model_lacks_nothing():
+    runs = [dyno.run(Yielding()), dyno.run(Yielding(), seed=2, motion=dyno.later)]
+    corrected = diagnose(dyno.model(), runs[:1], runs[1:]).corrected
+    again = diagnose(corrected, runs[1:], runs[:1]).diagnosis
+    assert again.verdict == "nothing_missing"
+
+
+class FrictionAndHardening(Nothing):
+    def force(self, t, z, v, state, warm):
+        friction = -60.0 * v / math.sqrt(v * v + 4e-6)
+        return friction + Hardening().force(t, z, v, state, warm)
+
+
+def test_friction_beside_a_hardening_spring_is_found_as_two():
+    runs = [dyno.run(FrictionAndHardening()), dyno.run(FrictionAndHardening(), seed=2)]
+    found = diagnose(dyno.model(), runs[:1], runs[1:]).diagnosis
+    assert {e.family for e in found.effects} == {"friction", "nonlinear_stiffness"}
+    assert len(found.effects) == 2
+    assert found.verdict == "explained"
+
+
+class WrongConstantsAndFriction(Nothing):
+    def force(self, t, z, v, state, warm):
+        friction = -20.0 * v / math.sqrt(v * v + 4e-6)
+        return friction - 700.0 * (z - FREE) - 90.0 * v + 25.0
+
+
+def test_linear_constants_are_corrected_beside_a_law():
+    runs = [dyno.run(WrongConstantsAndFriction()), dyno.run(WrongConstantsAndFriction(), seed=2)]
+    found = diagnose(dyno.model(), runs[:1], runs[1:]).diagnosis
+    assert [e.family for e in found.effects] == ["friction"]
+    assert len(missing(found)) == 1
+    friction = named(found, "friction")
+    assert friction.parameters["coulomb_force_n"].value == pytest.approx(20.0, rel=0.02)
+    assert {item.parameter for item in found.linear} == {
+        "stiffness_n_per_m",
+        "damping_n_s_per_m",
+        "preload_n",
+    }
+    stiffness = correction(found, "stiffness_n_per_m")
+    assert stiffness.nominal == STIFFNESS
+    assert stiffness.total.value - STIFFNESS == pytest.approx(700.0, rel=0.02)
+    damping = correction(found, "damping_n_s_per_m")
+    assert damping.nominal == DAMPING
+    assert damping.total.value - DAMPING == pytest.approx(90.0, rel=0.03)
+    preload = correction(found, "preload_n")
+    assert preload.about_height_m == pytest.approx(MIDDLE, abs=0.01)
+    # About mid-stroke, to which the stiffness adds.
+    added_n = 25.0 - 700.0 * (preload.about_height_m - FREE)
+    assert preload.total.value - preload.nominal == pytest.approx(added_n, rel=0.02)
+
+
+class Cogging(Nothing):
+    def force(self, t, z, v, state, warm):
+        return 40.0 * math.sin(2.0 * math.pi * z / 0.004)
+
+
+@pytest.mark.long
+def test_a_force_outside_the_catalogue_is_not_explained():
+    runs = [dyno.run(Cogging()), dyno.run(Cogging(), seed=2, motion=dyno.later)]
+    found = diagnose(dyno.model(), runs[:1], runs[1:]).diagnosis
+    assert found.verdict in {"not_explained", "partly_explained"}
+
+
+@pytest.mark.long
+def test_an_interval_holds_the_truth():
+    inside = 0
+    for seed in range(20):
+        runs = [dyno.run(Damping(), seed=seed, duration_s=5.0), dyno.run(Damping(), seed=99)]
+        found = diagnose(dyno.model(), runs[:1], runs[1:]).diagnosis
+        (effect,) = found.effects
+        inside += holds(effect.parameters["damping_n_s_per_m"], 150.0, slack=0.0)
+    assert inside >= 17

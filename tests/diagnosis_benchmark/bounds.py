@@ -1,0 +1,57 @@
+"""What the figures must be; all numbers that decide whether a benchmark passes.
+
+A share counts as outside only where its own 95 % interval lies there as a whole, so the same bounds
+hold for a tenth of the cases, and bind harder the more there are.
+"""
+
+from typing import NamedTuple
+
+from tests.diagnosis_benchmark.summary import Rate
+
+
+class Bound(NamedTuple):
+    """What one figure of one pool must be.
+
+    Attributes:
+        pool: One of ``POOLS`` or of ``GROUPS``.
+        figure: A key of `figures`.
+        least: Lower end.
+        most: Upper end.
+        meaning: What it stands for.
+    """
+
+    pool: str
+    figure: str
+    least: float
+    most: float
+    meaning: str
+
+
+BOUNDS = (
+    Bound("one effect", "right", 0.97, 1.0, "the family of a single effect is named first"),
+    Bound("several effects", "right", 0.90, 1.0, "all of two or three families are named"),
+    Bound("nothing planted", "right", 0.99, 1.0, "a model that lacks nothing is left alone"),
+    Bound("foreign formula", "right", 0.85, 1.0, "a family is known by a formula nobody wrote"),
+    Bound("outside", "right", 0.95, 1.0, "no law is claimed for what no catalogue holds"),
+    Bound("all but outside", "false_names", 0.0, 0.01, "no family is named that is not there"),
+    Bound("all", "explained_within", 1.0, 1.0, "explained means at the floor on held-out data"),
+    Bound("all", "coverage", 0.90, 0.98, "95 % intervals are honest, and not idle"),
+    Bound("all", "unbound", 0.0, 0.0, "no effect is named that may be nothing"),
+    Bound("rough", "seconds_median", 0.0, 15.0, "one effect, rough nominal model"),
+    Bound("all", "seconds_worst", 0.0, 60.0, "any case, three effects and stiff benches too"),
+)
+
+
+def violations(summary: dict, bounds: tuple[Bound, ...] = BOUNDS) -> list[str]:
+    """One line for each bound that a summary violates; what was not run violates none."""
+    every = summary["groups"] | summary["pools"]
+    found = []
+    for bound in bounds:
+        value = every.get(bound.pool, {}).get(bound.figure)
+        low, high = (value.low, value.high) if isinstance(value, Rate) else (value, value)
+        if low is None or (bound.least <= high and low <= bound.most):
+            continue
+        wanted = f"{bound.least:g} to {bound.most:g}"
+        shown = str(value) if isinstance(value, Rate) else f"{value:.1f}"
+        found.append(f"{bound.pool}: {bound.figure} {shown}, not {wanted}: {bound.meaning}")
+    return found
