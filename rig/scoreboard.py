@@ -242,7 +242,9 @@ def _silverbox(source: Path, out: Path, progress: Progress) -> list[Row]:
     model = driven_start(record, "silverbox", _RESONANCE_HZ)
     began_s = time.monotonic()
     told = _within(progress, SILVERBOX, 0.05, 0.95)
-    specs = [("rig, rough start", model, f"here: resonance at {_RESONANCE_HZ:g} Hz, damping ratio 0.05")]
+    specs = [
+        ("rig, rough start", model, f"here: resonance at {_RESONANCE_HZ:g} Hz, damping ratio 0.05")
+    ]
     try:
         result = diagnose_runs([training], model, tests, out / "diagnosis", told)
     except RecordingError as error:

@@ -1,7 +1,8 @@
 """The catalogue's laws as machine code, and the loops that run them over whole logs.
 
 The very functions that the plant calls tick by tick are compiled here with one signature each, so
-that the loops below take them as values and are compiled once for all effects.
+that the loops below take them as values (numba's first-class functions) and are compiled once for
+all effects.
 
 Reference: Hairer, Nørsett, Wanner, Solving Ordinary Differential Equations I (1993), II.1, for the
 classical Runge-Kutta method.
@@ -11,14 +12,15 @@ classical Runge-Kutta method.
 # pyright: basic, reportCallIssue=false
 
 import functools
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 import numba
 import numpy as np
-from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic
+from numba.core.errors import NumbaExperimentalFeatureWarning
+from numba.typed import List
 from numpy.typing import NDArray
 
 from dart_model.effects import CATALOGUE, effect
@@ -28,29 +30,39 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Cube = NDArray[np.float64]
 
+SLOTS = 10
+"""Most effects that a simulation carries: the loops know their number when they are compiled."""
 
 _F8: Any = types.float64
 _I8: Any = types.int64
 _VECTOR: Any = types.Array(types.float64, 1, "C")
 _MATRIX: Any = types.Array(types.float64, 2, "C")
 _CUBE: Any = types.Array(types.float64, 3, "C")
+_INTEGERS: Any = types.Array(types.int64, 1, "C")
 _INDEX: Any = types.Array(types.int64, 2, "C")
 _POINTER: Any = types.CPointer(types.float64)
 _FORCE_SIGNATURE: Any = _F8(*(_F8,) * 5, *(_POINTER,) * 3)
 _RATE_SIGNATURE: Any = types.void(*(_F8,) * 5, *(_POINTER,) * 4)
+_FORCE: Any = types.FunctionType(_FORCE_SIGNATURE)
+_RATE: Any = types.FunctionType(_RATE_SIGNATURE)
+_FORCES: Any = types.ListType(_FORCE)
+_RATES: Any = types.ListType(_RATE)
+_TEN_FORCES: Any = types.UniTuple(_FORCE, SLOTS)
+_TEN_RATES: Any = types.UniTuple(_RATE, SLOTS)
+_TEN_POINTERS: Any = types.UniTuple(_POINTER, SLOTS)
 
 
 class Law(NamedTuple):
     """A law as machine code.
 
     Attributes:
-        force: Address of its force.
-        rate: Address of its internal state's rate.
+        forces: Its force, a list of one.
+        rates: Its internal state's rate, a list of one.
         states: Number of internal states.
     """
 
-    force: int
-    rate: int
+    forces: Any
+    rates: Any
     states: int
 
 
@@ -64,33 +76,6 @@ def _compile_law(function: Callable[..., Any], signature: Any) -> Any:
     # A law only reads and writes by index, so bare pointers do, which cost least in a call.
     compiler = cast("Any", numba.cfunc)
     return compiler(signature, cache=True, error_model="numpy")(function)
-
-
-def _call(builder: Any, arguments: Any, result: Any, pointers: int) -> Any:
-    """Call a law by its address: five numbers, then pointers."""
-    number = ir.DoubleType()
-    pointer = number.as_pointer()
-    kind = ir.FunctionType(result, [number] * 5 + [pointer] * pointers)
-    function = builder.inttoptr(arguments[0], kind.as_pointer())
-    places = [builder.inttoptr(value, pointer) for value in arguments[6:]]
-    return builder.call(function, [*arguments[1:6], *places])
-
-
-@intrinsic
-def _call_force(_typing, address, t, z, w, applied, temperature, state, p, strut):  # noqa: ANN001, ANN202
-    def generate(_context, builder, _signature, arguments):  # noqa: ANN001, ANN202
-        return _call(builder, arguments, ir.DoubleType(), 3)
-
-    return _F8(_I8, *(_F8,) * 5, *(_I8,) * 3), generate
-
-
-@intrinsic
-def _call_rate(_typing, address, t, z, w, applied, temperature, state, p, strut, out):  # noqa: ANN001, ANN202
-    def generate(context, builder, _signature, arguments):  # noqa: ANN001, ANN202
-        _call(builder, arguments, ir.VoidType(), 4)
-        return context.get_dummy_value()
-
-    return types.void(_I8, *(_F8,) * 5, *(_I8,) * 4), generate
 
 
 def _no_state(
@@ -108,17 +93,46 @@ def _no_state(
 
 
 _KEPT: list[Any] = []
-"""Machine code whose addresses are in use."""
+"""Machine code whose addresses are in use: the lists below hold no references."""
+
+
+@functools.cache
+def _compiled(name: str) -> tuple[Any, Any]:
+    item = effect(name)
+    force = _compile_law(item.force, _FORCE_SIGNATURE)
+    rate = _compile_law(item.rate or _no_state, _RATE_SIGNATURE)
+    _KEPT.extend([force, rate])
+    return force, rate
+
+
+def _empty() -> tuple[Any, Any]:
+    return List.empty_list(_FORCE), List.empty_list(_RATE)
+
+
+def _append(forces: Any, rates: Any, force: Any, rate: Any) -> None:
+    forces.append(force)
+    rates.append(rate)
+
+
+_empty = compile_loop(_empty, types.Tuple((_FORCES, _RATES))())
+_append = compile_loop(_append, types.void(_FORCES, _RATES, _FORCE, _RATE))
+
+
+def _listed(names: tuple[str, ...]) -> tuple[Any, Any]:
+    # The interpreter is asked for a function's address once, here; it would be at every call of a
+    # loop that took functions themselves, for longer than a short loop runs. They are appended one
+    # by one, because numba warns of a tuple of functions, and a thread cannot silence warnings
+    # without silencing other threads'.
+    forces, rates = _empty()
+    for name in names:
+        _append(forces, rates, *_compiled(name))
+    return forces, rates
 
 
 @functools.cache
 def law(name: str) -> Law:
     """The law of an effect as machine code, compiled on first use and kept on disk."""
-    item = effect(name)
-    force = _compile_law(item.force, _FORCE_SIGNATURE)
-    rate = _compile_law(item.rate or _no_state, _RATE_SIGNATURE)
-    _KEPT.extend([force, rate])
-    return Law(force.address, rate.address, item.state_size)
+    return Law(*_listed((name,)), effect(name).state_size)
 
 
 def compile_all() -> None:
@@ -131,27 +145,66 @@ class Slots(NamedTuple):
     """Placed effects as the loops read them.
 
     Attributes:
+        forces: Their forces, a list filled up to `SLOTS`.
+        rates: Their internal states' rates, likewise.
         index: For each effect its strut, first parameter, past the last parameter, first internal
-            state, past the last one, and the addresses of force and rate, shape (effects, 7).
+            state and past the last one, shape (effects, 5).
         parameters: Number of parameters of all.
         states: Number of internal states of all.
     """
 
+    forces: Any
+    rates: Any
     index: Integers
     parameters: int
     states: int
 
 
-def slots(effects: Sequence[tuple[int, str]]) -> Slots:
-    """Slots for effects, each given by its strut and name."""
-    index = np.zeros((len(effects), 7), dtype=np.int64)
+@functools.lru_cache(maxsize=4096)
+def slots(effects: tuple[tuple[int, str], ...]) -> Slots:
+    """Slots for effects, each given by its strut and name.
+
+    Raises:
+        ValueError: There are more than `SLOTS`.
+    """
+    if len(effects) > SLOTS:
+        raise ValueError(f"{len(effects)} effects in one simulation, which carries at most {SLOTS}")
+    index = np.zeros((len(effects), 5), dtype=np.int64)
     parameter = state = 0
     for row, (strut, name) in enumerate(effects):
         item = effect(name)
         past_parameter, past_state = parameter + len(item.parameters), state + item.state_size
-        index[row] = (strut, parameter, past_parameter, state, past_state, *law(name)[:2])
+        index[row] = strut, parameter, past_parameter, state, past_state
         parameter, state = past_parameter, past_state
-    return Slots(index, parameter, state)
+    names = tuple(name for _, name in effects) + ("none",) * (SLOTS - len(effects))
+    return Slots(*_listed(names), index, parameter, state)
+
+
+def _ten(f: Any) -> Any:
+    return f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9]
+
+
+with warnings.catch_warnings():
+    # While numba compiles this, not once it is on disk, it warns that functions as values are new.
+    warnings.simplefilter("ignore", NumbaExperimentalFeatureWarning)
+    _ten = compile_loop(_ten, [_TEN_FORCES(_FORCES), _TEN_RATES(_RATES)])
+
+
+def _pointer(array: Array, first: int) -> Any:
+    return array[first:].ctypes
+
+
+def _pointers(a: Array, at: Integers) -> Any:
+    return (
+        a[at[0] :].ctypes, a[at[1] :].ctypes, a[at[2] :].ctypes, a[at[3] :].ctypes,
+        a[at[4] :].ctypes, a[at[5] :].ctypes, a[at[6] :].ctypes, a[at[7] :].ctypes,
+        a[at[8] :].ctypes, a[at[9] :].ctypes,
+    )  # fmt: skip
+
+
+# An array's `ctypes` becomes a bare pointer only where a signature asks for one.
+_pointer = compile_loop(_pointer, _POINTER(_VECTOR, _I8))
+_pointers = compile_loop(_pointers, _TEN_POINTERS(_VECTOR, _INTEGERS))
 
 
 _PIECES = 32
@@ -162,21 +215,23 @@ _LARGEST_ERROR = 5e-8
 step is cut: a tenth of the resolution of usual height sensors over their range."""
 
 
-def _simulate(
-    index: Integers, p: Array, struts: Array,
+def _march(
+    forces: Any, rates: Any, own: Any, slopes: Any, values: Any, constants: Any,
+    y: Array, dy: Array, index: Integers, struts: Array,
     mass_inverse: Cube, bias: Array, bias_q: Cube, bias_v: Cube, rows: Cube, heights0: Array,
     applied: Array, q0: Array, v0: Array,
     t: Array, fine: Array, temperature: Array, substeps: int, bend: float, stroke: float,
     start: Array, heights: Array, velocities: Array, accelerations: Array,
 ) -> bool:  # fmt: skip
+    # Laws take bare pointers, because an array would be counted as held and released at each call.
+    # The pointers come as arguments: numba has no arithmetic to make them of others in the loop,
+    # and to cut an array there for each call takes longer than most laws.
     n = rows.shape[2]
     count = rows.shape[1]
     tabulated = rows.shape[0] > 1
     size = start.shape[0]
     x = start.copy()
     began = start.copy()
-    y = start.copy()
-    dy = np.zeros(size)
     total = np.zeros(size)
     twist = np.zeros(n)
     z = np.zeros(count)
@@ -185,11 +240,6 @@ def _simulate(
     general = np.zeros(n)
     q = q0[0].copy()
     v = v0[0].copy()
-    state_at = y.ctypes.data + 16 * n
-    rate_at = dy.ctypes.data + 16 * n
-    p_at = p.ctypes.data
-    struts_at = struts.ctypes.data
-    width = 8 * struts.shape[1]
     least = _LARGEST_ERROR * stroke
     for k in range(t.shape[0]):
         last = k + 1 == t.shape[0]
@@ -243,7 +293,7 @@ def _simulate(
                     for i in range(count):
                         height = heights0[a, i]
                         if tabulated:
-                            # Heights follow the reference by their own cubic, to first order beside.
+                            # Heights follow the reference by a cubic, to first order beside it.
                             rise = heights0[b, i] - heights0[a, i]
                             early = 0.0
                             late = 0.0
@@ -265,18 +315,18 @@ def _simulate(
                             - struts[i, 1] * (height - struts[i, 0])
                             - struts[i, 2] * velocity
                         )
-                    for slot in range(index.shape[0]):
+                    for slot in range(SLOTS):
+                        # A fixed number of turns is unrolled, so that no tuple is searched.
+                        if slot >= index.shape[0]:
+                            break
                         i = index[slot, 0]
-                        own = state_at + 8 * index[slot, 3]
-                        values = p_at + 8 * index[slot, 1]
-                        strut = struts_at + width * i
                         if index[slot, 4] > index[slot, 3]:
-                            _call_rate(
-                                index[slot, 6], now, z[i], w[i], load, warm, own, values, strut,
-                                rate_at + 8 * index[slot, 3],
+                            rates[slot](
+                                now, z[i], w[i], load, warm,
+                                own[slot], values[slot], constants[slot], slopes[slot],
                             )  # fmt: skip
-                        force[i] += _call_force(
-                            index[slot, 5], now, z[i], w[i], load, warm, own, values, strut
+                        force[i] += forces[slot](
+                            now, z[i], w[i], load, warm, own[slot], values[slot], constants[slot]
                         )
                     for j in range(n):
                         sum_n = bias[a, j] + share * (bias[b, j] - bias[a, j])
@@ -339,44 +389,78 @@ def _simulate(
     return True
 
 
-simulate = compile_loop(
-    _simulate,
+_MECHANISM = (_CUBE, _MATRIX, _CUBE, _CUBE, _CUBE, _MATRIX, _MATRIX, _MATRIX, _MATRIX)
+_RUN = (_VECTOR, _VECTOR, _VECTOR, _I8, _F8, _F8, _VECTOR, _MATRIX, _MATRIX, _MATRIX)
+
+_march = compile_loop(
+    _march,
     types.boolean(
-        _INDEX, _VECTOR, _MATRIX,
-        _CUBE, _MATRIX, _CUBE, _CUBE, _CUBE, _MATRIX, _MATRIX, _MATRIX, _MATRIX,
-        _VECTOR, _VECTOR, _VECTOR, types.int64, types.float64, types.float64,
-        _VECTOR, *(_MATRIX,) * 3,
+        _TEN_FORCES, _TEN_RATES, *(_TEN_POINTERS,) * 4,
+        _VECTOR, _VECTOR, _INDEX, _MATRIX, *_MECHANISM, *_RUN,
     ),
 )  # fmt: skip
+
+
+def _simulate(
+    forces: Any, rates: Any,
+    index: Integers, p: Array, struts: Array,
+    mass_inverse: Cube, bias: Array, bias_q: Cube, bias_v: Cube, rows: Cube, heights0: Array,
+    applied: Array, q0: Array, v0: Array,
+    t: Array, fine: Array, temperature: Array, substeps: int, bend: float, stroke: float,
+    start: Array, heights: Array, velocities: Array, accelerations: Array,
+) -> bool:  # fmt: skip
+    # Pointers hold nothing: what they lead to is held by this function or by its caller.
+    y = start.copy()
+    dy = np.zeros(start.shape[0])
+    states = np.zeros(SLOTS, dtype=np.int64)
+    parameters = np.zeros(SLOTS, dtype=np.int64)
+    strut = np.zeros(SLOTS, dtype=np.int64)
+    for slot in range(index.shape[0]):
+        states[slot] = 2 * rows.shape[2] + index[slot, 3]
+        parameters[slot] = index[slot, 1]
+        strut[slot] = index[slot, 0] * struts.shape[1]
+    return _march(
+        _ten(forces), _ten(rates), _pointers(y, states), _pointers(dy, states),
+        _pointers(p, parameters), _pointers(struts.ravel(), strut),
+        y, dy, index, struts,
+        mass_inverse, bias, bias_q, bias_v, rows, heights0, applied, q0, v0,
+        t, fine, temperature, substeps, bend, stroke, start, heights, velocities, accelerations,
+    )  # fmt: skip
+
+
+simulate = compile_loop(
+    _simulate,
+    types.boolean(_FORCES, _RATES, _INDEX, _VECTOR, _MATRIX, *_MECHANISM, *_RUN),
+)
 """Free-run simulation.
 
-Args: index of the slots; parameters; strut constants (struts, 5), the last one a preload; then the
-mechanism, constant (K = 1) or tabulated at the nodes (K = N): inverse mass matrix (K, n, n), bias
-force (K, n), its derivatives by coordinates and velocities (K, n, n), Jacobian of the struts
-(K, struts, n), heights (K, struts), generalised force per applied newton (K, n), coordinates and
-velocities to which these belong (K, n); times of the nodes (N,), applied force at half sub-steps
-(2 * substeps * (N - 1) + 1,), temperature (N,), sub-steps, share by which a smooth acceleration
-bends within one, stroke, start (2 n + states,); heights, velocities and accelerations of the struts
-(N, struts), written. Returns whether the motion stayed finite.
+Args: forces, rates and index of the slots; parameters; strut constants (struts, 5), the last one a
+preload; then the mechanism, constant (K = 1) or tabulated at the nodes (K = N): inverse mass matrix
+(K, n, n), bias force (K, n), its derivatives by coordinates and velocities (K, n, n), Jacobian of
+the struts (K, struts, n), heights (K, struts), generalised force per applied newton (K, n),
+coordinates and velocities to which these belong (K, n); times of the nodes (N,), applied force at
+half sub-steps (2 * substeps * (N - 1) + 1,), temperature (N,), sub-steps, share by which a smooth
+acceleration bends within one, stroke, start (2 n + states,); heights, velocities and accelerations
+of the struts (N, struts), written. Returns whether the motion stayed finite.
 """
 
 
 def _along(
-    force: int, rate: int, p: Array, strut: Array, t: Array, z: Array, w: Array,
+    forces: Any, rates: Any, p: Array, strut: Array, t: Array, z: Array, w: Array,
     applied: Array, temperature: Array, substeps: int, start: Array, out: Array,
 ) -> None:  # fmt: skip
+    force = forces[0]
+    rate = rates[0]
     size = start.shape[0]
     s = start.copy()
     y = np.empty(size)
     k1 = np.zeros(size)
     k2 = np.zeros(size)
-    s_at, y_at = s.ctypes.data, y.ctypes.data
-    k1_at, k2_at = k1.ctypes.data, k2.ctypes.data
-    p_at, strut_at = p.ctypes.data, strut.ctypes.data
+    s_at, y_at = _pointer(s, 0), _pointer(y, 0)
+    k1_at, k2_at = _pointer(k1, 0), _pointer(k2, 0)
+    p_at, strut_at = _pointer(p, 0), _pointer(strut, 0)
     for k in range(t.shape[0]):
-        out[k] = _call_force(
-            force, t[k], z[k], w[k], applied[k], temperature[k], s_at, p_at, strut_at
-        )
+        out[k] = force(t[k], z[k], w[k], applied[k], temperature[k], s_at, p_at, strut_at)
         if size == 0 or k + 1 == t.shape[0]:
             continue
         h = (t[k + 1] - t[k]) / substeps
@@ -386,14 +470,14 @@ def _along(
         for step in range(substeps):
             a = float(step)
             b = step + 0.5
-            _call_rate(
-                rate, t[k] + a * h, z[k] + a * dz, w[k] + a * dw, applied[k] + a * da,
+            rate(
+                t[k] + a * h, z[k] + a * dz, w[k] + a * dw, applied[k] + a * da,
                 temperature[k], s_at, p_at, strut_at, k1_at,
             )  # fmt: skip
             for i in range(size):
                 y[i] = s[i] + 0.5 * h * k1[i]
-            _call_rate(
-                rate, t[k] + b * h, z[k] + b * dz, w[k] + b * dw, applied[k] + b * da,
+            rate(
+                t[k] + b * h, z[k] + b * dz, w[k] + b * dw, applied[k] + b * da,
                 temperature[k], y_at, p_at, strut_at, k2_at,
             )  # fmt: skip
             for i in range(size):
@@ -403,13 +487,13 @@ def _along(
 along = compile_loop(
     _along,
     types.void(
-        _I8, _I8, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, types.int64,
+        _FORCES, _RATES, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _I8,
         _VECTOR, _VECTOR,
     ),
 )  # fmt: skip
-"""Force of one law along a known motion: addresses of force and rate, parameters, strut constants
-(4,), then times, heights, velocities, applied force and temperature (N,), sub-steps for the memory,
-its start; force, written.
+"""Force of one law along a known motion: its force and rate, each a list of one, parameters, strut
+constants (4,), then times, heights, velocities, applied force and temperature (N,), sub-steps for
+the memory, its start; force, written.
 """
 
 

@@ -162,8 +162,7 @@ def solve(
             fresh = False
         else:
             jacobian, fresh = _jacobian(residual_of, x, r, space, rows, threads), True
-    if not fresh:
-        jacobian = _jacobian(residual_of, x, r, space, rows, threads)
+    jacobian = _jacobian(residual_of, x, r, space, rows, threads, both=True)
     return Solution(space.outer(x), r, jacobian, cost)
 
 
@@ -194,7 +193,13 @@ def _jacobian(
     space: Space,
     rows: Mapping[int, Rows],
     threads: int,
+    *,
+    both: bool = False,
 ) -> Array:
+    """Derivatives (m, k) by differences; of `both` sides the smaller.
+
+    Where a law switches, a difference of one side may catch a jump that is no derivative.
+    """
     columns = np.zeros((len(r), len(x)))
     everything = Rows(0, len(r), residual_of)
 
@@ -202,6 +207,7 @@ def _jacobian(
         there = rows.get(i, everything)
         part = slice(there.first, there.last)
         size = _DIFFERENCE * (1.0 if space.logarithmic[i] else max(1.0, abs(x[i])))
+        found: list[Array] = []
         for step in (size, -size):
             trial = x.copy()
             trial[i] += step
@@ -210,8 +216,11 @@ def _jacobian(
                 continue
             moved = there.residual_of(space.outer(trial))
             if moved is not None and np.all(np.isfinite(moved)):
-                columns[part, i] = (moved - r[part]) / moved_by
-                return
+                found.append((moved - r[part]) / moved_by)
+                if not both:
+                    break
+        if found:
+            columns[part, i] = min(found, key=lambda column: float(column @ column))
 
     if threads == 1:
         for i in range(len(x)):

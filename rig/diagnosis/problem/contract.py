@@ -123,6 +123,8 @@ class Segment(NamedTuple):
     Attributes:
         track: The measured motion, smoothed.
         reference: The motion along which the reference's laws acted.
+        lead: Both motions over the whole recording, of which this is a part, for laws that remember
+            where they have been; None where this is all of it.
         respond: What a force (N,) in a strut adds to the whitened answer, shape (m,).
         target: Whitened answer that the reference leaves over, shape (m,).
         linear: Whitened answers to a unit change of each linear parameter, shape (m, L).
@@ -132,6 +134,7 @@ class Segment(NamedTuple):
 
     track: Track
     reference: Track
+    lead: tuple[Track, Track] | None
     respond: Callable[[int, Array], Array]
     target: Array
     linear: Array
@@ -212,8 +215,13 @@ class Problem(Protocol):
         """Internal states at the beginning of a recording."""
         ...
 
-    def segments(self, candidate: Candidate, parts: Parts) -> tuple[Segment, ...]:
-        """The regression along the motion about a model: its free run, or its force."""
+    def segments(
+        self, candidate: Candidate, parts: Parts, most_samples: int, *, thin: bool
+    ) -> tuple[Segment, ...]:
+        """The regression along the motion about a model: its free run, or its force.
+
+        Of longer recordings it takes some parts as they are, or all of them thinned out.
+        """
         ...
 
 

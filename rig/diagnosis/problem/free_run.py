@@ -194,8 +194,11 @@ class FreeRun:
             return None
         shape = (len(run.grid.t_s), len(self.noise_m))
         there = Trajectory(np.empty(shape), np.empty(shape), np.empty(shape))
+        slots = slots_of(self, candidate)
         finite = simulate(
-            slots_of(self, candidate).index,
+            slots.forces,
+            slots.rates,
+            slots.index,
             parts.effects,
             strut_constants(self, parts.linear),
             np.ascontiguousarray(np.linalg.inv(m.mass)),
@@ -270,7 +273,9 @@ class FreeRun:
 
     # --- the regression along the motion ------------------------------------------------------
 
-    def segments(self, candidate: Candidate, parts: Parts) -> tuple[Segment, ...]:
+    def segments(
+        self, candidate: Candidate, parts: Parts, most_samples: int, *, thin: bool
+    ) -> tuple[Segment, ...]:
         """The regression about a free run of a model, which becomes the reference.
 
         Raises:
@@ -284,9 +289,11 @@ class FreeRun:
             if there is None:
                 raise FloatingPointError(run.grid.name)
             miss, _ = smoothed(run.grid, there.heights_m)
-            for first, last in track.pieces(len(run.grid.t_s), samples):
-                dynamics = _Dynamics(self, run, parts.linear, last - first)
-                found.append(self._segment(run, there, miss, (first, last), dynamics, block))
+            pieces = track.pieces(len(run.grid.t_s), samples, most_samples, thin=thin)
+            lead = self._whole(run, there, miss) if len(pieces) > 1 else None
+            for cut in pieces:
+                dynamics = _Dynamics(self, run, parts.linear, cut)
+                found.append(self._segment(run, there, miss, lead, cut, dynamics, block))
                 block = int(found[-1].blocks.max()) + 1
         return tuple(found)
 
@@ -295,11 +302,11 @@ class FreeRun:
         run: Run,
         there: Trajectory,
         miss: Sequence[Smoothed],
-        part: tuple[int, int],
+        lead: tuple[Track, Track] | None,
+        cut: slice,
         dynamics: "_Dynamics",
         first_block: int,
     ) -> Segment:
-        cut = slice(*part)
         grid = run.grid
         states = [np.column_stack([s.states[cut, i] for s in miss]) for i in range(3)]
         motion = [a[cut] + b for a, b in zip(there, states, strict=True)]
@@ -325,7 +332,7 @@ class FreeRun:
             """Whitened heights (m,) under generalised forces (N, n)."""
             return (dynamics.heights(forces)[rows * every] * weight).ravel()
 
-        tables = _Tables(run.mechanism.cut(*part), grid.t_s[cut], t_s)
+        tables = _Tables(run.mechanism.cut(cut), grid.t_s[cut], t_s)
 
         def respond_to(strut: int, force: Array) -> Array:
             return answer(tables.rows[:, strut] * force[:, np.newaxis])
@@ -348,12 +355,30 @@ class FreeRun:
         return Segment(
             along,
             reference,
+            lead,
             respond_to,
             target,
             np.column_stack(columns),
             np.column_stack(initial),
             blocks,
         )
+
+    def _whole(self, run: Run, there: Trajectory, miss: Sequence[Smoothed]) -> tuple[Track, Track]:
+        """Measured and reference motion of a whole recording, at its nodes."""
+        reference = Track(
+            run.grid.t_s,
+            np.ascontiguousarray(there.heights_m.T),
+            np.ascontiguousarray(there.velocities_m_per_s.T),
+            run.applied_n,
+            run.grid.temperature_c,
+            track.substeps_for(run.grid.t_s),
+        )
+        measured = reference._replace(
+            heights_m=reference.heights_m + np.array([s.states[:, 0] for s in miss]),
+            velocities_m_per_s=reference.velocities_m_per_s
+            + np.array([s.states[:, 1] for s in miss]),
+        )
+        return measured, reference
 
 
 def _spline_through(nodes_s: Array, values: Array, t_s: Array) -> Array:
@@ -414,7 +439,7 @@ class _Tables:
 class _Dynamics:
     """The linear dynamics of a model about its mean configuration, discretised."""
 
-    def __init__(self, problem: FreeRun, run: Run, linear: Array, nodes: int) -> None:
+    def __init__(self, problem: FreeRun, run: Run, linear: Array, cut: slice) -> None:
         m = linear_part.corrected(run.mechanism, problem.linear, linear)
         if m is None:
             raise FloatingPointError(run.grid.name)
@@ -424,14 +449,15 @@ class _Dynamics:
         mass = m.mass.mean(axis=0)
         stiffness = rows.T @ np.diag(constants[:, 1]) @ rows - m.bias_q.mean(axis=0)
         damping = rows.T @ np.diag(constants[:, 2]) @ rows - m.bias_v.mean(axis=0)
-        duration = nodes * run.grid.step_s
+        duration = (cut.stop - cut.start) * run.grid.step_s
+        coarse_s = run.grid.step_s * cut.step
         self.more_stiffness, self.more_damping = _settling(
             mass, stiffness, damping, 1.0 / (_SETTLES_WITHIN * duration)
         )
         a = system(mass, stiffness + self.more_stiffness, damping + self.more_damping)
         fastest = float(np.max(np.abs(np.linalg.eigvals(a))))
-        self.finer = max(1, int(np.ceil(fastest * run.grid.step_s / _FILTER_ANGLE)))
-        step = run.grid.step_s / self.finer
+        self.finer = max(1, int(np.ceil(fastest * coarse_s / _FILTER_ANGLE)))
+        step = coarse_s / self.finer
         b = np.vstack([np.zeros((n, n)), np.linalg.inv(mass)])
         augmented = np.zeros((4 * n, 4 * n))
         augmented[: 2 * n, : 2 * n] = a * step

@@ -59,9 +59,9 @@ class Mechanism(NamedTuple):
         """Number of coordinates."""
         return self.q.shape[1]
 
-    def cut(self, first: int, last: int) -> "Mechanism":
-        """Nodes `first` to `last`, the last one excluded."""
-        return self if len(self.q) == 1 else Mechanism(*(part[first:last] for part in self))
+    def cut(self, nodes: slice) -> "Mechanism":
+        """The mechanism at some of the nodes."""
+        return self if len(self.q) == 1 else Mechanism(*(part[nodes] for part in self))
 
 
 class Readers(NamedTuple):

@@ -190,15 +190,17 @@ class Prescribed:
         deviation = np.broadcast_to(self.noise_n[:, np.newaxis], missed.shape)
         return ResidualForces(self.drives[k].grid.name, self.drives[k].along, missed, deviation)
 
-    def segments(self, candidate: Candidate, parts: Parts) -> tuple[Segment, ...]:
+    def segments(
+        self, candidate: Candidate, parts: Parts, most_samples: int, *, thin: bool
+    ) -> tuple[Segment, ...]:
         """The regression about a model's force along the motion."""
         samples = sum(len(drive.grid.t_s) for drive in self.drives)
         found: list[Segment] = []
         block = 0
         for k, drive in enumerate(self.drives):
             missed = self._missed_n(k, candidate, parts)
-            for first, last in track.pieces(len(drive.grid.t_s), samples):
-                found.append(self._segment(k, missed, slice(first, last), block))
+            for cut in track.pieces(len(drive.grid.t_s), samples, most_samples, thin=thin):
+                found.append(self._segment(k, missed, cut, block))
                 block = int(found[-1].blocks.max()) + 1
         return tuple(found)
 
@@ -217,7 +219,7 @@ class Prescribed:
             np.ascontiguousarray(whole.velocities_m_per_s[:, cut]),
             np.ascontiguousarray(whole.applied_n[cut]),
             np.ascontiguousarray(whole.temperature_c[cut]),
-            whole.substeps,
+            track.substeps_for(whole.t_s[cut]),
         )
         rows = np.flatnonzero(drive.fitted[cut])
         numbers = block_numbers(whole.t_s, self.block_s)[cut][rows]
@@ -241,6 +243,7 @@ class Prescribed:
         return Segment(
             along,
             along,
+            None if cut == slice(0, len(whole.t_s), cut.step) else (whole, whole),
             respond,
             target,
             np.column_stack(columns),

@@ -1,5 +1,6 @@
 """Laws along a known motion."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,6 +10,7 @@ from rig.diagnosis.numerics.compiled import along, law
 from rig.diagnosis.problem.contract import (
     Candidate,
     Parts,
+    Segment,
     Track,
     placed,
     slots_of,
@@ -23,9 +25,6 @@ Array = NDArray[np.float64]
 _LONGEST_STATE_STEP_S = 0.6e-3
 """Longest step of an internal state along a motion: a bristle that settles at 2000 1/s needs it."""
 _MOST_STATE_STEPS = 8
-_MOST_SAMPLES = 12_000
-"""Samples of all recordings that the regression along the motion looks at: what a law explains is
-known to a part in a hundred with far fewer."""
 _PIECES = 8
 """Parts of a recording that is too long for all of it to be looked at."""
 _NO_STATE = np.zeros(0)
@@ -37,19 +36,23 @@ def substeps_for(t_s: Array) -> int:
     return int(np.clip(np.ceil(step / _LONGEST_STATE_STEP_S), 1, _MOST_STATE_STEPS))
 
 
-def pieces(nodes: int, samples: int) -> list[tuple[int, int]]:
-    """Parts of a recording that the regression looks at: all of it, or pieces spread over it.
+def pieces(nodes: int, samples: int, most: int, *, thin: bool) -> list[slice]:
+    """Parts of a recording that the regression looks at.
 
     Args:
         nodes: Nodes of the recording.
         samples: Nodes of all recordings.
+        most: Nodes of all that are looked at.
+        thin: The whole recording, thinned out, instead of pieces spread over it.
     """
-    share = _MOST_SAMPLES * nodes / samples
+    if thin:
+        return [slice(0, nodes, max(1, round(samples / most)))]
+    share = most * nodes / samples
     if nodes < 2.0 * share:
-        return [(0, nodes)]
+        return [slice(0, nodes, 1)]
     length = max(int(share / _PIECES), 2)
     firsts = [int(k * (nodes - length) / (_PIECES - 1)) for k in range(_PIECES)]
-    return [(first, first + length) for first in firsts]
+    return [slice(first, first + length, 1) for first in firsts]
 
 
 def law_force(
@@ -68,12 +71,45 @@ def law_force(
     functions = law(name)
     out = np.empty(len(track.t_s))
     along(
-        functions.force, functions.rate, np.ascontiguousarray(values), constants[strut],
+        functions.forces, functions.rates, np.ascontiguousarray(values), constants[strut],
         track.t_s, track.heights_m[strut], track.velocities_m_per_s[strut],
         track.applied_n, track.temperature_c, track.substeps,
         state if len(state) else np.zeros(functions.states), out,
     )  # fmt: skip
     return out
+
+
+def segment_forces(
+    segments: Sequence[Segment],
+    strut: int,
+    name: str,
+    values: Array,
+    constants: Array,
+    *,
+    reference: bool,
+) -> list[Array]:
+    """Force (N,) of a law along each segment; internal states come from the whole recordings.
+
+    Args:
+        segments: The segments.
+        strut: Index of the strut.
+        name: Name of the effect.
+        values: Its parameters.
+        constants: Strut constants.
+        reference: Along the reference's motion, not the measured one.
+    """
+    found: list[Array] = []
+    known: dict[int, Array] = {}
+    for segment in segments:
+        own = segment.reference if reference else segment.track
+        if segment.lead is None or law(name).states == 0:
+            found.append(law_force(own, strut, name, values, constants))
+            continue
+        whole = segment.lead[1] if reference else segment.lead[0]
+        if id(whole) not in known:
+            known[id(whole)] = law_force(whole, strut, name, values, constants)
+        found.append(np.interp(own.t_s, whole.t_s, known[id(whole)]))
+    return found
 
 
 def effect_forces(

@@ -67,7 +67,7 @@ class SelectionCriteria:
     least_share: float = 0.19
     least_above_noise: float = 0.01
     least_above_noise_later: float = 0.2
-    formula: float = 0.03
+    formula: float = 0.06
     significant: float = 4.0
     cancelling: float = -0.9
     leftover: float = 0.02

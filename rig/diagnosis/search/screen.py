@@ -29,11 +29,16 @@ from rig.diagnosis.problem.contract import (
     slots_of,
     strut_constants,
 )
-from rig.diagnosis.problem.track import law_force
+from rig.diagnosis.problem.track import segment_forces
 from rig.diagnosis.search.fit import law_space, left_out
 
 Array = NDArray[np.float64]
 
+_MOST_SAMPLES = 12_000
+"""Samples of all recordings that the regression along the motion looks at: what a law explains is
+known to a part in a hundred with far fewer."""
+_COARSE_SAMPLES = 4_000
+"""Samples on which starts are compared."""
 _REFINED_STARTS = 2
 """Starts of a law that are refined: its best one may lie in a side valley."""
 _SIDE_VALLEY = 2.0
@@ -63,6 +68,7 @@ class Stage(NamedTuple):
         basis: Orthonormal columns that span `nuisance`, shape (m, c'): no law may claim them.
         target: `goal` with these taken out, shape (m,).
         blocks: Block of each row, shape (m,).
+        coarse: The same of the recordings thinned out, where starts are compared; None in itself.
     """
 
     problem: Problem
@@ -74,6 +80,7 @@ class Stage(NamedTuple):
     basis: Array
     target: Array
     blocks: Integers
+    coarse: "Stage | None"
 
 
 class Trial(NamedTuple):
@@ -103,35 +110,54 @@ def stage_of(problem: Problem, candidate: Candidate, parts: Parts) -> Stage:
     Raises:
         FloatingPointError: The reference runs away.
     """
-    segments = problem.segments(candidate, parts)
+    coarse = problem.segments(candidate, parts, _COARSE_SAMPLES, thin=True)
+    fine = problem.segments(candidate, parts, _MOST_SAMPLES, thin=False)
+    return _stage(problem, candidate, parts, fine, _stage(problem, candidate, parts, coarse, None))
+
+
+def _stage(
+    problem: Problem,
+    candidate: Candidate,
+    parts: Parts,
+    segments: tuple[Segment, ...],
+    coarse: Stage | None,
+) -> Stage:
     constants = strut_constants(problem, parts.linear)
     index = slots_of(problem, candidate).index
     target = [segment.target.copy() for segment in segments]
     tangents: list[list[Array]] = [[] for _ in segments]
     for row, (strut, name) in enumerate(placed(problem, candidate)):
         values = parts.effects[index[row, 1] : index[row, 2]]
-        for k, segment in enumerate(segments):
-            # The reference's laws acted along its own motion; those of a trial along the measured.
-            force = law_force(segment.reference, strut, name, values, constants)
-            if row < len(candidate.kept):
-                measured = law_force(segment.track, strut, name, values, constants)
-                force = force - measured
-                if problem.existing[candidate.kept[row]].free:
-                    tangents[k] += _tangents(segment, strut, name, values, constants, measured)
+        # The reference's laws acted along its own motion; those of a trial along the measured.
+        forces = segment_forces(segments, strut, name, values, constants, reference=True)
+        if row < len(candidate.kept):
+            measured = segment_forces(segments, strut, name, values, constants, reference=False)
+            forces = [a - b for a, b in zip(forces, measured, strict=True)]
+            if problem.existing[candidate.kept[row]].free:
+                new = _tangents(segments, strut, name, values, constants, measured)
+                tangents = [old + more for old, more in zip(tangents, new, strict=True)]
+        for k, (segment, force) in enumerate(zip(segments, forces, strict=True)):
             target[k] += segment.respond(strut, force)
-    return _projected(problem, segments, constants, target, tangents, parts.linear)
+    stage = _projected(problem, segments, constants, target, tangents, parts.linear)
+    return stage._replace(coarse=coarse)
 
 
 def _tangents(
-    segment: Segment, strut: int, name: str, values: Array, constants: Array, force: Array
-) -> list[Array]:
-    """Answers to a small change of each parameter of an existing effect."""
-    found: list[Array] = []
+    segments: Sequence[Segment],
+    strut: int,
+    name: str,
+    values: Array,
+    constants: Array,
+    forces: Sequence[Array],
+) -> list[list[Array]]:
+    """Answers of each segment to a small change of each parameter of an existing effect."""
+    found: list[list[Array]] = [[] for _ in segments]
     for i, value in enumerate(values):
         moved = values.copy()
         moved[i] += _DIFFERENCE * (abs(value) or 1.0)
-        there = law_force(segment.track, strut, name, moved, constants)
-        found.append(segment.respond(strut, there - force))
+        there = segment_forces(segments, strut, name, moved, constants, reference=False)
+        for k, segment in enumerate(segments):
+            found[k].append(segment.respond(strut, there[k] - forces[k]))
     return found
 
 
@@ -169,14 +195,16 @@ def _projected(
     blocks = np.concatenate([segment.blocks for segment in segments])
     blocks = np.concatenate([blocks, np.zeros(len(counted), dtype=np.int64)])
     target_left = y - basis @ (basis.T @ y)
-    return Stage(problem, segments, constants, whole, tuple(counted), y, basis, target_left, blocks)
+    return Stage(
+        problem, segments, constants, whole, tuple(counted), y, basis, target_left, blocks, None
+    )
 
 
 def answer(stage: Stage, strut: int, name: str, values: Array) -> Array:
     """What a law adds to the whitened answer, shape (m,)."""
+    forces = segment_forces(stage.segments, strut, name, values, stage.constants, reference=False)
     parts = [
-        segment.respond(strut, law_force(segment.track, strut, name, values, stage.constants))
-        for segment in stage.segments
+        segment.respond(strut, force) for segment, force in zip(stage.segments, forces, strict=True)
     ]
     return np.concatenate([*parts, np.zeros(len(stage.target) - sum(map(len, parts)))])
 
@@ -235,9 +263,10 @@ def ranked(
         screened: How many laws are refined.
         only: Laws that compete; all if absent.
     """
-    columns = _columns(stage, base)
+    coarse = stage.coarse or stage
+    columns = _columns(coarse, base)
     basis = np.linalg.qr(columns)[0] if columns.shape[1] else columns
-    residual = _residual(stage, base.laws, base.values)
+    residual = _residual(coarse, base.laws, base.values)
     residual = residual - basis @ (basis.T @ residual)
     laws = proposed(stage.problem) if only is None else only
     laws = [at for at in laws if _goes_with(at, base.laws)]
@@ -246,7 +275,7 @@ def ranked(
 
     def first(at: Placed) -> list[tuple[float, Array]]:
         starts = effect(at[1]).starts(stage.problem.motions[at[0]])
-        found = [_first(stage, at, np.array(start), residual, basis) for start in starts]
+        found = [_first(coarse, at, np.array(start), residual, basis) for start in starts]
         return sorted((one for one in found if one is not None), key=lambda one: one[0])
 
     with ThreadPoolExecutor(cpu_count()) as pool:
@@ -268,8 +297,10 @@ def ranked(
         key = tuple(sorted(trial.laws))
         if key not in best or trial.score < best[key].score:
             best[key] = trial
+    # Coarse costs in terms of fine ones, for laws that are not refined.
+    scale = base.cost / max(float(residual @ residual), 1e-300)
     rest = [
-        Trial((*base.laws, laws[i]), (), cost, np.array([cost]))
+        Trial((*base.laws, laws[i]), (), scale * cost, np.array([scale * cost]))
         for cost, i in sorted((t[0][0], i) for i, t in enumerate(tried) if t)[screened:]
     ]
     return [*sorted(best.values(), key=lambda trial: trial.score), *rest]

@@ -193,8 +193,10 @@ class _Search:
         criteria, above = self.criteria, smaller.score - smaller.fit.rows
         if self.at_floor(smaller) and (larger.size > smaller.size or not smaller.size):
             return False
-        if larger.size > smaller.size and self._is_formula(smaller) and _more_of_a_kind(
-            smaller, larger
+        if (
+            larger.size > smaller.size
+            and self._is_formula(smaller)
+            and _more_of_a_kind(smaller, larger)
         ):
             return False
         gain = smaller.score - larger.score
@@ -480,7 +482,7 @@ class _Search:
         """The chosen model with those linear corrections alone that the data call for."""
         needed = self._needed(chosen.fit)
         parts = chosen.fit.parts._replace(linear=np.where(needed, chosen.fit.parts.linear, 0.0))
-        fewer = fit(self.problem, chosen.fit.candidate, parts, needed)
+        fewer = fit(self.problem, chosen.fit.candidate, parts, needed, 30, 1e-6)
         result = chosen
         if fewer is not None and not self.worth(self._scored(fewer), chosen):
             result = self._scored(fewer)
