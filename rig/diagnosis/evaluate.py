@@ -4,6 +4,10 @@ A free run's heights are DART's, with the applied force as the only input; only 
 which nobody measured, is fitted. An observer with a high gain would hide any model error.
 """
 
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
+
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +37,7 @@ _DRAWS = 3
 _LARGEST_INPUT_NOISE = 0.01
 """Share of an applied force's range above which what is not smooth is not noise but excitation."""
 _AGREEMENT, _ACCURACY = 0.1, 0.01
-"""Share of the sensor's noise, or of the error if that is more, to which DART's steps are settled."""
+"""Share of the noise, or of the error if that is more, to which DART's steps are settled."""
 
 
 class Evaluated(NamedTuple):
@@ -253,7 +257,7 @@ def _prescribed(problem: Prescribed, k: int, models: Models, kept: bool) -> Eval
 def _motion_floor_n(
     problem: Prescribed, drive: Drive, k: int, model: tuple[Candidate, Parts]
 ) -> float:
-    """RMS force that a right model leaves: the cell's noise, and that of the motion through the law.
+    """RMS force that a right model leaves: noise of the cell, and of the motion through the law.
 
     The motion's is found by drawing the sensor's noise again and smoothing it anew (a parametric
     bootstrap; Efron and Tibshirani, An Introduction to the Bootstrap, 1993, 6.5).

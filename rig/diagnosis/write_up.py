@@ -1,4 +1,8 @@
-"""What was found, as an outcome: verdict on held-out data, confidence intervals, corrected model."""
+"""What was found, as an outcome: verdict on held-out data, intervals, corrected model."""
+
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -337,17 +341,13 @@ def _rejected(problem: Problem, found: Found) -> tuple[RejectedEffect, ...]:
         for r in found.rejected
     ]
     bench = "a prescribed motion" if problem.bench == "motion_given" else "this kind of bench"
-    for item in CATALOGUE.values():
-        if problem.bench not in item.benches:
-            listed.append(
-                RejectedEffect(
-                    item.family,
-                    item.name,
-                    problem.spec.struts[0].name,
-                    f"{bench} does not show it",
-                    None,
-                )
-            )
+    listed += [
+        RejectedEffect(
+            item.family, item.name, problem.spec.struts[0].name, f"{bench} does not show it", None
+        )
+        for item in CATALOGUE.values()
+        if problem.bench not in item.benches
+    ]
     return tuple(listed)
 
 

@@ -10,6 +10,10 @@ References:
     Kanzow, Yamashita, Fukushima, J. Comput. Appl. Math. 172 (2004), projected variant.
 """
 
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
+
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from types import MappingProxyType
@@ -60,7 +64,9 @@ class Space(NamedTuple):
 
     def part(self, chosen: NDArray[np.bool_]) -> "Space":
         """Some of the parameters."""
-        return Space(*(entry[chosen] for entry in self))
+        return Space(
+            self.low[chosen], self.high[chosen], self.scale[chosen], self.logarithmic[chosen]
+        )
 
 
 def joined(spaces: list[Space]) -> Space:
@@ -122,48 +128,73 @@ def solve(
         The solution, or None if there is no residual at the start.
     """
     x = space.inner(start)
-    r = residual_of(space.outer(x))
-    if r is None or not np.all(np.isfinite(r)):
+    begin = residual_of(space.outer(x))
+    if begin is None or not np.all(np.isfinite(begin)):
         return None
-    cost = float(r @ r)
-    damping = _FIRST_DAMPING
-    largest = np.where(space.logarithmic, _LARGEST_LOGARITHMIC_STEP, np.inf)
-    jacobian, fresh = _jacobian(residual_of, x, r, space, rows, threads), True
+    r = begin
+    cost, damping = float(r @ r), _FIRST_DAMPING
+
+    def tangent(*, both: bool = False) -> Array:
+        return _jacobian(residual_of, x, r, space, rows, threads, both=both)
+
+    jacobian, fresh = tangent(), True
     for _ in range(iterations):
-        products, gradient = jacobian.T @ jacobian, jacobian.T @ r
-        diagonal = np.maximum(np.diag(products), 1e-300)
-        gained = False
-        while damping < _LARGEST_DAMPING:
-            step = _step(products, gradient, diagonal * damping, ~_pressed(x, gradient, space))
-            if step is None:
-                return Solution(space.outer(x), r, jacobian, cost)
-            trial = space.inner(space.outer(x + np.clip(step, -largest, largest)))
-            moved = residual_of(space.outer(trial))
-            if moved is not None and float(moved @ moved) < cost:
-                gained = True
-                break
-            if not fresh:
-                break
-            damping *= 10.0
-        if not gained:
+        moved = _moved(residual_of, x, r, space, jacobian, damping, patient=fresh)
+        if moved is None:
             if fresh:
                 break
-            jacobian, fresh = _jacobian(residual_of, x, r, space, rows, threads), True
+            jacobian, fresh = tangent(), True
             continue
-        change, move = moved - r, trial - x
+        change, move = moved.residual - r, moved.x - x
         error = change - jacobian @ move
-        before, x, r, cost = cost, trial, moved, float(moved @ moved)
-        damping = max(damping * 0.1, 1e-12)
-        if before - cost < tolerance * before and fresh:
+        gain, x, r, damping = cost - moved.cost, moved.x, moved.residual, moved.damping
+        small, cost = gain < tolerance * cost, moved.cost
+        if small and fresh:
             break
-        if before - cost >= tolerance * before and error @ error < _TRUE * (change @ change):
+        if not small and error @ error < _TRUE * (change @ change):
             # Near to the truth: a rank of one mends it, at the cost of nothing.
-            jacobian = jacobian + np.outer(error, move) / float(move @ move)
-            fresh = False
+            jacobian, fresh = jacobian + np.outer(error, move) / float(move @ move), False
         else:
-            jacobian, fresh = _jacobian(residual_of, x, r, space, rows, threads), True
-    jacobian = _jacobian(residual_of, x, r, space, rows, threads, both=True)
-    return Solution(space.outer(x), r, jacobian, cost)
+            jacobian, fresh = tangent(), True
+    return Solution(space.outer(x), r, tangent(both=True), cost)
+
+
+class _Moved(NamedTuple):
+    """A step that lowered the cost."""
+
+    x: Array
+    residual: Array
+    cost: float
+    damping: float
+
+
+def _moved(
+    residual_of: ResidualOf,
+    x: Array,
+    r: Array,
+    space: Space,
+    jacobian: Array,
+    damping: float,
+    *,
+    patient: bool,
+) -> _Moved | None:
+    """A step with as little damping as lowers the cost; without patience one is tried."""
+    products, gradient, cost = jacobian.T @ jacobian, jacobian.T @ r, float(r @ r)
+    diagonal = np.maximum(np.diag(products), 1e-300)
+    largest = np.where(space.logarithmic, _LARGEST_LOGARITHMIC_STEP, np.inf)
+    free = ~_pressed(x, gradient, space)
+    while damping < _LARGEST_DAMPING:
+        step = _step(products, gradient, diagonal * damping, free)
+        if step is None:
+            return None
+        trial = space.inner(space.outer(x + np.clip(step, -largest, largest)))
+        there = residual_of(space.outer(trial))
+        if there is not None and float(there @ there) < cost:
+            return _Moved(trial, there, float(there @ there), max(damping * 0.1, 1e-12))
+        if not patient:
+            return None
+        damping *= 10.0
+    return None
 
 
 def _step(

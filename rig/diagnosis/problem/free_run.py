@@ -7,6 +7,10 @@ sensor noise as it is: an equation error that passes through the model's own dyn
 of an output error (Young 2011, 8.2). The measured motion itself comes from a smoother.
 """
 
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
+
 from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
@@ -269,6 +273,7 @@ class FreeRun:
 
     def states(self, k: int, candidate: Candidate, parts: Parts) -> Array:
         """Internal states at the beginning of a recording."""
+        del candidate
         return parts.starts[k][2 * self.runs[k].mechanism.coordinates :]
 
     # --- the regression along the motion ------------------------------------------------------

@@ -4,11 +4,14 @@ Reference: Hampel, The influence curve and its role in robust estimation, JASA 6
 median absolute deviation as a scale that outliers do not move.
 """
 
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
+
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from rig.diagnosis.numerics.smoother import Noise, Smoothed, estimate_noise, smooth
 from rig.diagnosis.problem.contract import block_numbers
@@ -69,7 +72,7 @@ class Grid(NamedTuple):
         return block_numbers(self.t_s, length_s)[self.fitted]
 
 
-def grid_of(recording: Recording) -> tuple[Grid, Array]:
+def grid_of(recording: Recording) -> tuple[Grid, NDArray[np.int64]]:
     """A recording on nodes, and which node each sample is, shape (samples,)."""
     t_s, at = _nodes(recording.t_s)
     heights = np.full((len(t_s), recording.heights_m.shape[1]), np.nan)
@@ -138,7 +141,7 @@ def _nodes(t_s: Array) -> tuple[Array, NDArray[np.int64]]:
     first = np.repeat(t_s[:-1], pieces)
     part = np.concatenate([np.arange(count) for count in pieces]) if pieces.max() > 1 else 0.0
     nodes = np.append(first + part * np.repeat(steps / pieces, pieces), t_s[-1])
-    return np.ascontiguousarray(nodes), np.concatenate([[0], np.cumsum(pieces)])
+    return np.ascontiguousarray(nodes), np.concatenate([[0], np.cumsum(pieces)]).astype(np.int64)
 
 
 def _outliers(height_m: Array) -> Flags:
@@ -167,8 +170,3 @@ def _smooth_temperature(own_t_s: Array, temperature_c: Array, t_s: Array) -> Arr
         return np.full(len(t_s), float(temperature_c[0]))
     states = smooth(own_t_s, temperature_c, estimate_noise(own_t_s, temperature_c)).states
     return np.interp(t_s, own_t_s, states[:, 0])
-
-
-def spline(grid: Grid, at: Array, values: Array, times_s: Array) -> Array:
-    """A channel between its samples, as a cubic spline."""
-    return CubicSpline(grid.t_s[at], values)(times_s)

@@ -5,6 +5,10 @@ do not: a change of all of mass, stiffness and damping in one proportion against
 gain, for one.
 """
 
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
+
 from collections.abc import Sequence
 
 import numpy as np
@@ -145,7 +149,7 @@ def corrected_spec(
         strut = spec.struts[parameter.strut]
         match parameter.kind:
             case "stiffness":
-                # About mid-stroke: what the spring then carries more at its free length is a preload.
+                # About mid-stroke: what the spring then carries at its free length is a preload.
                 middle = middle_m(motions[parameter.strut]) - strut.free_length_m
                 spec = _with_field(spec, strut.name, "stiffness_n_per_m", change)
                 spec = _with_preload(spec, strut.name, change * middle)

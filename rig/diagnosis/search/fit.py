@@ -10,6 +10,10 @@ References:
     Ljung, Box, On a measure of lack of fit in time series models, Biometrika 65 (1978).
 """
 
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
+
 import functools
 import os
 from typing import NamedTuple
@@ -280,8 +284,9 @@ def left_out(residual: Array, jacobian: Array, blocks: Integers, prior: Array) -
 
 
 def block_scores(problem: Problem, result: Fit) -> Array:
-    """Out-of-sample sum of squares of each block; initial states are held, since they belong to the
-    block that begins a recording.
+    """Out-of-sample sum of squares of each block.
+
+    Initial states are held, since they belong to the block that begins a recording.
     """
     starts = _start_variables(problem, result)
     jacobian = result.solution.jacobian[:, ~starts]
@@ -327,11 +332,9 @@ def spread(result: Fit) -> Spread:
     variables = inverse.shape[0]
     robust = inverse @ meat @ inverse * (count / max(count - min(variables, count // 2), 1))
     white = inverse * max(1.0, result.mean_square)
-    larger = np.diag(white) > np.diag(robust)
-    # Where the sandwich is the smaller one, its row and column are stretched to the white variance.
-    stretch = np.where(
-        larger, np.sqrt(np.maximum(np.diag(white), 0.0) / np.maximum(np.diag(robust), 1e-300)), 1.0
-    )
+    # Where the sandwich is the smaller one, it is stretched to the variance of white noise.
+    ratio = np.maximum(np.diag(white), 0.0) / np.maximum(np.diag(robust), 1e-300)
+    stretch = np.sqrt(np.maximum(ratio, 1.0))
     covariance = robust * np.outer(stretch, stretch) / np.outer(size, size)
     return Spread(covariance, float(student.ppf(0.975, max(count - 1, 2))))
 

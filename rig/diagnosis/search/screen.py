@@ -6,6 +6,10 @@ projected out (Golub, Pereyra, SIAM J. Numer. Anal. 10, 1973). A law whose force
 its size costs one pass a start; the best are then refined together with all else in their set.
 """
 
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
+
 import itertools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -235,7 +239,7 @@ def plain(stage: Stage) -> Trial:
 def _scores(stage: Stage, residual: Array, jacobian: Array | None) -> Array:
     if jacobian is None:
         count = int(stage.blocks.max()) + 1
-        return np.bincount(stage.blocks, residual**2, count)
+        return np.asarray(np.bincount(stage.blocks, residual**2, count), dtype=np.float64)
     return left_out(residual, jacobian, stage.blocks, np.zeros((jacobian.shape[1],) * 2))
 
 

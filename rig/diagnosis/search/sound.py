@@ -4,6 +4,10 @@ Reference: van der Schaft, L2-Gain and Passivity Techniques in Nonlinear Control
 passivity; here power is looked at where the motion was.
 """
 
+# numba and scipy ship no types for what is used here.
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
+
 from collections.abc import Sequence
 
 import numpy as np
@@ -70,7 +74,7 @@ def _forces(problem: Problem, result: Fit, along: Sequence[Track]) -> list[tuple
     ]
 
 
-def _new(problem: Problem, result: Fit) -> list[tuple[int, str]]:
+def _new(result: Fit) -> list[tuple[int, str]]:
     """Place among all effects, and name, of those that the nominal model lacks."""
     first = len(result.candidate.kept)
     return [(first + i, name) for i, (_, name) in enumerate(result.candidate.new)]
@@ -86,7 +90,7 @@ def _unbound(
     del forces, along
     known = spread(result)
     variables = effect_variables(problem, result)
-    for row, name in _new(problem, result):
+    for row, name in _new(result):
         item = effect(name)
         own = variables[row]
         if not item.scaled:
@@ -113,7 +117,8 @@ def _disguised(
     along: Sequence[Track],
     criteria: SelectionCriteria,
 ) -> str | None:
-    for row, name in _new(problem, result):
+    del problem
+    for row, name in _new(result):
         strut, force = forces[row]
         columns = np.column_stack(
             [
@@ -137,8 +142,8 @@ def _cancelling(
     along: Sequence[Track],
     criteria: SelectionCriteria,
 ) -> str | None:
-    del along
-    new = _new(problem, result)
+    del problem, along
+    new = _new(result)
     for i, (row, name) in enumerate(new):
         for other_row, other in new[i + 1 :]:
             (strut, force), (other_strut, other_force) = forces[row], forces[other_row]
