@@ -48,6 +48,8 @@ Array = NDArray[np.float64]
 
 _UNBOUND = 30.0
 """Factor, or multiple of a value, beyond which an interval says nothing."""
+_NEARLY = 0.02
+"""Share of a preload up to which it counts as brought along by a change of stiffness."""
 _HELD = 0.3
 """Share of half a sampling interval within which a delay is what a held input looks like."""
 
@@ -273,7 +275,10 @@ def _linear_effects(
     result = known.fit
     found: list[FoundEffect] = []
     places = np.flatnonzero(result.free)
+    implied = _implied_preloads(problem, known)
     for variable, (place, p) in enumerate(zip(places, _free(problem, result), strict=True)):
+        if variable in implied:
+            continue
         linear = result.parts.linear.copy()
         linear[place] = 0.0
         parts = result.parts._replace(linear=linear)
@@ -297,6 +302,28 @@ def _linear_effects(
             )
         )
     return tuple(sorted(found, key=lambda item: -item.force_rms_n))
+
+
+def _implied_preloads(problem: Problem, known: _Known) -> set[int]:
+    """Preloads about mid-stroke that a change of stiffness about the free length brings along."""
+    free = _free(problem, known.fit)
+    found: set[int] = set()
+    for i, preload in enumerate(free):
+        for j, spring in enumerate(free):
+            if (preload.kind, spring.kind) != ("preload", "stiffness"):
+                continue
+            if preload.strut != spring.strut:
+                continue
+            strut = problem.spec.struts[spring.strut]
+            lever = middle_m(problem.motions[spring.strut]) - strut.free_length_m
+            weights = np.zeros(len(known.covariance))
+            weights[i], weights[j] = preload.deviation, lever * spring.deviation
+            values = known.fit.solution.values
+            left = float(values[i] + lever * values[j])
+            half = known.factor * float(np.sqrt(max(weights @ known.covariance @ weights, 0.0)))
+            if abs(left) < max(half, _NEARLY * abs(float(values[i]))):
+                found.add(i)
+    return found
 
 
 def _existing(problem: Problem, found: Found, known: _Known) -> tuple[ExistingEffect, ...]:
@@ -408,7 +435,7 @@ def _notes(problem: FreeRun | Prescribed, found: Found, *, blocks: bool) -> tupl
         notes.append("The motion is smoothed over the whole recording.")
         grids = [drive.grid for drive in problem.drives] if isinstance(problem, Prescribed) else []
     if outliers := sum(grid.outliers for grid in grids):
-        notes.append(f"{outliers} single false heights were found and left out.")
+        notes.append(f"{outliers} heights were found to be outliers and left out.")
     if found.gain_alike:
         notes.append(
             "Mass, stiffness and damping changed in one proportion: these data cannot separate "

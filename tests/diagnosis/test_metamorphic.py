@@ -151,6 +151,8 @@ def check_scaled(case, scale):
         back = scaled_back(after.name, after.parameters, scale)
         for name, estimate in before.parameters.items():
             # The last digits of a sum may decide where a fit stops, within its interval.
+            if estimate.low is None or estimate.high is None:
+                continue  # The data do not bind it.
             width = estimate.high - estimate.low
             assert back[name] == pytest.approx(estimate.value, rel=0.005, abs=0.5 * width), name
         assert after.force_rms_n == pytest.approx(before.force_rms_n * scale.force, rel=0.02)

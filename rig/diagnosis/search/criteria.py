@@ -26,8 +26,9 @@ class SelectionCriteria:
             on a set of that size is not fitted in full: smoothing the motion costs laws that switch
             a factor of two at most.
         standard_errors: Standard errors of the out-of-sample likelihood within which the smallest
-            set is preferred: one in the rule of Breiman et al. (Classification and Regression
-            Trees, 1984, 3.4.3), for independent blocks; two, because blocks of a motion are not.
+            set is preferred: the one-standard-error rule (Breiman et al., Classification and
+            Regression Trees, 1984, 3.4.3). More would lose what shows in few blocks: of an effect
+            that acts in k of them alone the gain is sqrt(k) standard errors.
         least_likelihood_gain: Least gain of twice the out-of-sample log likelihood by a further
             law. The best of some hundred useless starts gains 2 ln 100 = 9 by chance; a
             coloured residual that much more often.
@@ -62,7 +63,7 @@ class SelectionCriteria:
     most_laws: int = 3
     finalists: int = 4
     hopeless: float = 4.0
-    standard_errors: float = 2.0
+    standard_errors: float = 1.0
     least_likelihood_gain: float = 30.0
     least_share: float = 0.19
     least_above_noise: float = 0.01

@@ -41,6 +41,8 @@ _EXISTING_PRIOR = 0.5
 """Prior on the parameters of effects that the nominal model has: half their value, or e^0.5."""
 _STATE_PRIOR = 10.0
 """Prior on internal states at the beginning, in units of their scale: wide."""
+_TINY = 1e-100
+"""Stands for nothing in a quotient; its square is still a number."""
 _LAGS = 20
 """Lags of the whiteness test."""
 
@@ -266,7 +268,7 @@ def left_out(residual: Array, jacobian: Array, blocks: Integers, prior: Array) -
         prior: Precision of the variables' priors, shape (k, k).
     """
     count = int(blocks.max()) + 1
-    size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + np.diag(prior), 1e-300))
+    size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + np.diag(prior), _TINY))
     scaled = jacobian / size
     grams = np.zeros((count, len(size), len(size)))
     scores = np.zeros((count, len(size)))
@@ -320,7 +322,7 @@ def spread(result: Fit) -> Spread:
     The smaller covariance of white noise is a lower limit.
     """
     jacobian, residual = result.solution.jacobian, result.solution.residual
-    size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0), 1e-300))
+    size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0), _TINY))
     scaled = jacobian / size
     inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-13)
     count = int(result.blocks.max()) + 1
@@ -333,7 +335,7 @@ def spread(result: Fit) -> Spread:
     robust = inverse @ meat @ inverse * (count / max(count - min(variables, count // 2), 1))
     white = inverse * max(1.0, result.mean_square)
     # Where the sandwich is the smaller one, it is stretched to the variance of white noise.
-    ratio = np.maximum(np.diag(white), 0.0) / np.maximum(np.diag(robust), 1e-300)
+    ratio = np.maximum(np.diag(white), 0.0) / np.maximum(np.diag(robust), _TINY)
     stretch = np.sqrt(np.maximum(ratio, 1.0))
     covariance = robust * np.outer(stretch, stretch) / np.outer(size, size)
     return Spread(covariance, float(student.ppf(0.975, max(count - 1, 2))))

@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 
 _CELLS = 12
 """Cells of height and of velocity in which power is looked at."""
+_TINY = 1e-100
+"""Stands for nothing in a quotient."""
 _CHANNELS = ("delay", "input_gain", "periodic_force", "unmodelled_mode")
 """Families that are no property of the strut, or that store energy outside it."""
 
@@ -100,9 +102,9 @@ def _unbound(
         deviation = np.sqrt(np.maximum(np.diag(known.covariance)[own], 0.0))
         # One bounded size suffices: an asymmetric damper may have nothing on one side.
         size = [
-            1.0 / max(deviation[i], 1e-300)
+            1.0 / max(deviation[i], _TINY)
             if space.logarithmic[i]
-            else abs(values[i] / space.scale[i]) / max(deviation[i], 1e-300)
+            else abs(values[i] / space.scale[i]) / max(deviation[i], _TINY)
             for i in item.scaled
         ]
         if max(size) < criteria.significant:
@@ -187,7 +189,7 @@ def _active(
 
 def _cell(values: Array) -> Array:
     low, high = float(values.min()), float(values.max())
-    return np.minimum(((values - low) / max(high - low, 1e-300) * _CELLS).astype(int), _CELLS - 1)
+    return np.minimum(((values - low) / max(high - low, _TINY) * _CELLS).astype(int), _CELLS - 1)
 
 
 def _at_rest(z: Array, w: Array, struts: int, strut: int) -> Track:
