@@ -22,7 +22,7 @@ from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
 from rig.diagnosis.search.fit import Fit, fit
 from rig.diagnosis.search.select import Found, Seed, search
 from rig.diagnosis.search.surface import surface
-from rig.diagnosis.write_up import judgement, written_up
+from rig.diagnosis.write_up import holds, judgement, written_up
 
 Progress = Callable[[str, float], None]
 """Told what is being done, and the share of it that is done."""
@@ -68,6 +68,9 @@ def diagnose(
         return evaluated(judged, models, recordings, kept=not held_out)
 
     results = figures(found.chosen.fit)
+    if found.chosen.size and not holds(results, criteria):
+        found = found._replace(chosen=found.plain, rivals=())
+        results = figures(found.chosen.fit)
     verdict = judgement(results, found, criteria)
     if verdict == "not_explained":
         progress("tabulating what has no name", 0.97)
@@ -94,7 +97,7 @@ def _tabulated(
         if _error(there) < linear:
             return found._replace(chosen=found.chosen._replace(fit=offered), rivals=()), there
     if found.chosen.size and linear <= _error(results):
-        return found._replace(chosen=found.linear, rivals=()), figures(found.linear.fit)
+        return found._replace(chosen=found.plain, rivals=()), figures(found.plain.fit)
     return found, results
 
 

@@ -40,6 +40,8 @@ _LONGEST_STEP_S = 0.05
 """Usual time between samples above which a time in other units is more likely."""
 _LONGEST_PLATEAU = 0.002
 """Share of the samples that a signal that is not clipped may stand at its extreme value on end."""
+_STANDS = 4
+"""Samples on end at an extreme value that are no coincidence."""
 _FULL_SPEED = 0.3
 """Share of its usual speed with which a signal enters a plateau by being clipped: one that comes
 to rest slows down before."""
@@ -454,12 +456,15 @@ def _check_clipped(name: str, label: str, unit: str, values: Array) -> None:
     for extreme, limit in (("lowest", float(values.min())), ("highest", float(values.max()))):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], values == limit, [0]])))
         firsts, lasts = edges[::2], edges[1::2]
-        longest = int(np.argmax(lasts - firsts))
-        length, first = int(lasts[longest] - firsts[longest]), int(firsts[longest])
+        length = int(np.max(lasts - firsts))
         if length <= max(20, _LONGEST_PLATEAU * len(values)):
             continue
-        before = values[max(first - 4, 0) : first]
-        if len(before) > 1 and float(np.mean(np.abs(np.diff(before)))) < _FULL_SPEED * usual:
+        speeds = [
+            float(np.mean(np.abs(np.diff(values[max(first - 4, 0) : first + 1]))))
+            for first in firsts[lasts - firsts > _STANDS]
+            if first > 0
+        ]
+        if not speeds or float(np.median(speeds)) < _FULL_SPEED * usual:
             continue  # It came to rest there.
         raise RecordingError(
             f"{name}: {label} stays at its {extreme} value {limit:.6g} {unit} for {length} "

@@ -145,6 +145,15 @@ def written_up(
     )
 
 
+def holds(results: Sequence[Evaluated], criteria: SelectionCriteria) -> bool:
+    """Whether laws do on held-out data what they do where they were found: leave less."""
+    after = _mean([r.counted.after for r in results]) ** 2
+    linear = _mean([r.linear for r in results]) ** 2
+    floor = _mean([_floor(r) for r in results]) ** 2
+    least = max(criteria.least_above_noise * floor, criteria.least_share * (linear - floor))
+    return linear - after > least
+
+
 def judgement(results: Sequence[Evaluated], found: Found, criteria: SelectionCriteria) -> Verdict:
     """What held-out data allow to be said.
 

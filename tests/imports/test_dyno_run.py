@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
+from rig.diagnose import diagnose_runs, read_record
 
 from dart_model.spec import load_model
 from rig.bench.config import load_bench_config
@@ -12,7 +13,6 @@ from rig.bench.trajectory import simulate
 from rig.check import check
 from rig.config import CONFIGS, InputError, load_setup
 from rig.demo import run_case
-from rig.diagnose import diagnose_runs, read_record
 from rig.replay import replay
 from rig.runs import with_bench
 

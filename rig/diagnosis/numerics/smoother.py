@@ -28,6 +28,8 @@ from rig.diagnosis.numerics.compiled import compile_loop
 Array = NDArray[np.float64]
 
 _ORDER = 4
+_AS_LIKELY = 2.0
+"""Twice the log likelihood by which a smoother signal may be less likely."""
 _LONGEST_FOR_LIKELIHOOD = 12_000
 
 
@@ -226,7 +228,8 @@ def estimate_noise(t_s: Array, y: Array) -> Noise:
     low, high = -8.0 * np.log(slowest), -7.0 * np.log(fastest) - np.log(step)
     grid = np.linspace(low, high, 25)
     values = [deviance(x) for x in grid]
-    best = int(np.argmin(values))
+    # Where the likelihood hardly tells, the smoothest: a white signal has no best one.
+    best = int(np.argmax(np.array(values) <= min(values) + _AS_LIKELY))
     left, right = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
     found: Any = minimize_scalar(
         deviance, bounds=(left, right), method="bounded", options={"xatol": 0.02}

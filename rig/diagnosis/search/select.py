@@ -92,6 +92,7 @@ class Found(NamedTuple):
     Attributes:
         given: The nominal model, only initial states fitted.
         linear: The best linear model.
+        plain: The same with those corrections alone that the data call for.
         chosen: The model that was chosen.
         rivals: Models with other families that the data cannot tell from it.
         best: The best sets of laws, whether chosen or not.
@@ -103,6 +104,7 @@ class Found(NamedTuple):
 
     given: Fit
     linear: Scored
+    plain: Scored
     chosen: Scored
     rivals: tuple[Scored, ...]
     best: tuple[Scored, ...]
@@ -150,9 +152,11 @@ def search(
     rivals = searching.rivals(chosen)
     superfluous = searching.superfluous(chosen)
     chosen, alike = searching.with_few_linear(chosen)
+    plain_model = chosen if not chosen.size else searching.with_few_linear(searching.linear)[0]
     return Found(
         given,
         searching.linear,
+        plain_model,
         chosen,
         rivals,
         searching.best(),

@@ -1,0 +1,1 @@
+"""How the answers of `rig diagnose` move with each number that decides."""
