@@ -22,7 +22,7 @@ from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
 from rig.diagnosis.search.fit import Fit, fit
 from rig.diagnosis.search.select import Found, Seed, search
 from rig.diagnosis.search.surface import surface
-from rig.diagnosis.write_up import holds, judgement, written_up
+from rig.diagnosis.write_up import judgement, needless, written_up
 
 Progress = Callable[[str, float], None]
 """Told what is being done, and the share of it that is done."""
@@ -68,7 +68,7 @@ def diagnose(
         return evaluated(judged, models, recordings, kept=not held_out)
 
     results = figures(found.chosen.fit)
-    if found.chosen.size and not holds(results, criteria):
+    if found.chosen.size and needless(results, criteria):
         found = found._replace(chosen=found.plain, rivals=())
         results = figures(found.chosen.fit)
     verdict = judgement(results, found, criteria)
@@ -86,17 +86,17 @@ def _tabulated(
     results: tuple[Evaluated, ...],
     figures: Callable[[Fit], tuple[Evaluated, ...]],
 ) -> tuple[Found, tuple[Evaluated, ...]]:
-    """A table as the correction where no law explains, if held-out data agree; else no law at all.
+    """A table as the correction where no law explains, if it does better on held-out data.
 
-    What was chosen and does not hold is no correction either.
+    Laws that leave more there than the best linear model are no correction either.
     """
     linear = float(np.sqrt(np.mean([result.linear**2 for result in results])))
     offered = surface(problem, found.linear.fit)
     if offered is not None:
         there = figures(offered)
-        if _error(there) < linear:
+        if _error(there) < min(linear, _error(results)):
             return found._replace(chosen=found.chosen._replace(fit=offered), rivals=()), there
-    if found.chosen.size and linear <= _error(results):
+    if found.chosen.size and linear < _error(results):
         return found._replace(chosen=found.plain, rivals=()), figures(found.plain.fit)
     return found, results
 

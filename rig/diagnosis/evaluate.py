@@ -46,6 +46,7 @@ class Evaluated(NamedTuple):
     Attributes:
         figures: Its figures.
         linear: The figure that counts (height or load-cell error) of the best linear model.
+        linear_force_n: Residual force of the best linear model.
         counted: The same before and after.
         floor: What a right model leaves.
         series: For the report.
@@ -53,6 +54,7 @@ class Evaluated(NamedTuple):
 
     figures: RunFigures
     linear: float
+    linear_force_n: float
     counted: BeforeAfter
     floor: NoiseFloor
     series: tuple[HeldOutSeries, ...]
@@ -151,7 +153,9 @@ def _free_run(
         on_dart.append(
             dart_heights(problem, run, model, parts.starts[k], motion.heights_m, tolerance)
         )
-    forces = [problem.residual_forces(k, c, p) for c, p in (models.given, models.chosen)]
+    forces = [problem.residual_forces(k, *model) for model in (models.given, models.chosen)]
+    between = problem.residual_forces(k, *models.linear)
+    linear_n = np.nan if between is None else rms(np.where(rows, between.force_n, np.nan))
     residual = [np.where(rows, f.force_n, np.nan) for f in forces if f is not None]
     heights = BeforeAfter(rms(measured - on_dart[0]), rms(measured - on_dart[1]))
     deviation = forces[1].deviation_n if forces[1] is not None else np.full((1, 1), np.nan)
@@ -171,7 +175,7 @@ def _free_run(
         _strut_force(problem, k, models, (before.heights_m, after.heights_m), recording),
     )
     return Evaluated(
-        figures, rms(measured - linear.heights_m), heights,
+        figures, rms(measured - linear.heights_m), linear_n, heights,
         NoiseFloor(floor_m, rms(deviation)), series,
     )  # fmt: skip
 
@@ -251,7 +255,8 @@ def _prescribed(problem: Prescribed, k: int, models: Models, kept: bool) -> Eval
     )  # fmt: skip
     floor = NoiseFloor(float("nan"), _motion_floor_n(problem, drive, k, models.chosen))
     figures = RunFigures(drive.grid.name, nothing, error, error)
-    return Evaluated(figures, rms(measured - forces[1]), error, floor, series)
+    left = rms(measured - forces[1])
+    return Evaluated(figures, left, left, error, floor, series)
 
 
 def _motion_floor_n(

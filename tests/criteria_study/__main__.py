@@ -10,45 +10,18 @@ import os
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
-from typing import NamedTuple
 
 from rich.console import Console
 from rich.markdown import Markdown
 from rich.progress import Progress
 
 from rig.diagnosis.search.criteria import CRITERIA
-from tests.criteria_study.cases import CASES, Answer, answer
+from tests.criteria_study.cases import CASES, Answer
+from tests.criteria_study.execute import FACTORS, Task, moved, run
 
-FACTORS = {"half": 0.5, "as is": 1.0, "double": 2.0}
 NAMES = tuple(field.name for field in fields(CRITERIA))
-
-
-class Task(NamedTuple):
-    """One diagnosis: a case with a criterion times a factor; with all as they are if absent."""
-
-    case: str
-    criterion: str | None
-    factor: str
-
-
-def moved(criterion: str, factor: str) -> float:
-    """A criterion's value times a factor; an integer stays one, and at least 1."""
-    value = getattr(CRITERIA, criterion)
-    product = FACTORS[factor] * value
-    return max(1, int(product + 0.5)) if isinstance(value, int) else product
-
-
-def run(task: Task) -> Answer:
-    """The answer of one diagnosis; one that breaks off is an answer too."""
-    criteria = CRITERIA
-    if task.criterion is not None:
-        criteria = replace(CRITERIA, **{task.criterion: moved(task.criterion, task.factor)})
-    try:
-        return answer(task.case, criteria)
-    except Exception as error:
-        return Answer(f"failed: {error!r}", frozenset(), white=False)
 
 
 def _tasks(criteria: list[str]) -> list[Task]:

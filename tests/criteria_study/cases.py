@@ -12,8 +12,6 @@ from tests.diagnosis import little_dyno as dyno
 from tests.diagnosis import test_planted_effects as on_bench
 from tests.diagnosis import test_prescribed as on_dyno
 
-NO_CAUSE = "restoring_surface"
-
 
 class Sum(dyno.Nothing):
     """Several forces without internal state at once."""
@@ -52,8 +50,9 @@ class Answer(NamedTuple):
 
     Attributes:
         verdict: Its verdict.
-        families: Families that it names as missing. A preload beside a stiffness is left out: a
-            stiffness is corrected about mid-stroke, which brings one along.
+        families: Families that it names as missing; none if its verdict is that nothing explains.
+            A preload beside a stiffness is left out: a stiffness is corrected about mid-stroke,
+            which brings one along.
         white: Whether it calls the nominal model's residual white.
     """
 
@@ -138,7 +137,9 @@ def _made(name):
 def answer(name: str, criteria: SelectionCriteria) -> Answer:
     """The answer to a case."""
     found = diagnose(*_made(name), criteria=criteria).diagnosis
-    families = {effect.family for effect in found.effects} - {NO_CAUSE}
+    families = {effect.family for effect in found.effects}
+    if found.verdict == "not_explained":
+        families = set()
     if "stiffness" in families:
         families -= {"preload"}
     return Answer(found.verdict, frozenset(families), found.residual_white.before)
