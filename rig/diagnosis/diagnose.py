@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from dart_model.spec import ModelSpec
-from rig.diagnosis.evaluate import Evaluated, evaluated, models_of
+from rig.diagnosis.evaluate import Evaluated, evaluated, models_of, with_floor_below
 from rig.diagnosis.outcome import Result
 from rig.diagnosis.problem.build import (
     build,
@@ -65,7 +65,11 @@ def diagnose(
 
     def figures(chosen: Fit) -> tuple[Evaluated, ...]:
         models = models_of(problem, found.linear.fit, chosen)
-        return evaluated(judged, models, recordings, kept=not held_out)
+        results = evaluated(judged, models, recordings, kept=not held_out)
+        if isinstance(problem, FreeRun):
+            return results
+        noise_n = float(np.sqrt(np.nanmean(problem.noise_n**2)))
+        return with_floor_below(results, float(np.sqrt(chosen.mean_square)) * noise_n)
 
     results = figures(found.chosen.fit)
     if found.chosen.size and needless(results, criteria):

@@ -60,6 +60,21 @@ class Evaluated(NamedTuple):
     series: tuple[HeldOutSeries, ...]
 
 
+def with_floor_below(results: tuple[Evaluated, ...], left_n: float) -> tuple[Evaluated, ...]:
+    """A floor of the force that is no higher than what a model leaves where it was fitted.
+
+    Near a reversal a redrawn motion changes the sign of friction; a smoothed one does not.
+    """
+    return tuple(
+        result._replace(
+            floor=NoiseFloor(
+                result.floor.height_rmse_m, min(result.floor.residual_force_rmse_n, left_n)
+            )
+        )
+        for result in results
+    )
+
+
 class Models(NamedTuple):
     """The models that are compared, as candidate and parts.
 

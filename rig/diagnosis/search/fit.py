@@ -321,6 +321,11 @@ def spread(result: Fit) -> Spread:
 
     The smaller covariance of white noise is a lower limit.
     """
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _sandwich(result)
+
+
+def _sandwich(result: Fit) -> Spread:
     jacobian, residual = result.solution.jacobian, result.solution.residual
     size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0), _TINY))
     scaled = jacobian / size

@@ -97,17 +97,15 @@ def _unbound(
         own = variables[row]
         if not item.scaled:
             continue
+        # All sizes of a law together: what one side of a damper shares with the linear damping is
+        # bounded by nothing but the prior, what it has more than the other side is.
         space = result.space.part(np.isin(np.arange(len(result.space.low)), own))
-        values = result.solution.values[own]
-        deviation = np.sqrt(np.maximum(np.diag(known.covariance)[own], 0.0))
-        # One bounded size suffices: an asymmetric damper may have nothing on one side.
-        size = [
-            1.0 / max(deviation[i], _TINY)
-            if space.logarithmic[i]
-            else abs(values[i] / space.scale[i]) / max(deviation[i], _TINY)
-            for i in item.scaled
-        ]
-        if max(size) < criteria.significant:
+        sizes = np.where(
+            space.logarithmic, 1.0, result.solution.values[own] / np.maximum(space.scale, _TINY)
+        )[list(item.scaled)]
+        which = own[list(item.scaled)]
+        inverse = np.linalg.pinv(known.covariance[np.ix_(which, which)], rcond=1e-12)
+        if float(sizes @ inverse @ sizes) < criteria.significant**2:
             return f"the data do not bound its size ({name})"
     return None
 
