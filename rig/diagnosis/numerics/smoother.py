@@ -28,6 +28,8 @@ from rig.diagnosis.numerics.compiled import compile_loop
 Array = NDArray[np.float64]
 
 _ORDER = 4
+_SLOWER, _FASTER = 2.5, 7.0
+"""Logarithms by which the ratio may lie beyond a time constant of the whole run, and of a step."""
 _AS_LIKELY = 2.0
 """Twice the log likelihood by which a smoother signal may be less likely."""
 _LONGEST_FOR_LIKELIHOOD = 12_000
@@ -223,9 +225,10 @@ def estimate_noise(t_s: Array, y: Array) -> Noise:
         squares, logs, count = sums(log_ratio)
         return count * np.log(max(squares, 1e-300) / count) + logs
 
-    # The smoother's time constant is about (1 / ratio) ** (1 / 7): from two steps to the whole run.
-    slowest, fastest = float(t_s[-1] - t_s[0]), 1.0 * step
-    low, high = -8.0 * np.log(slowest), -7.0 * np.log(fastest) - np.log(step)
+    # The smoother's time constant is about (1 / ratio) ** (1 / 7): from less than half a step to
+    # more than the whole run.
+    low = -7.0 * np.log(float(t_s[-1] - t_s[0])) - _SLOWER
+    high = -7.0 * np.log(step) + _FASTER
     grid = np.linspace(low, high, 25)
     values = [deviance(x) for x in grid]
     # Where the likelihood hardly tells, the smoothest: a white signal has no best one.

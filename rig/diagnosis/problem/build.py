@@ -29,7 +29,7 @@ from rig.diagnosis.problem.free_run import FreeRun, Run, run_of, system
 from rig.diagnosis.problem.grid import Grid, grid_of, with_blocks_kept
 from rig.diagnosis.problem.mechanism import Mechanism, Readers, constant, readers, tabulated
 from rig.diagnosis.problem.prescribed import Drive, Prescribed, drive_of
-from rig.diagnosis.recording import Recording, RecordingError
+from rig.diagnosis.recording import Recording, RecordingError, checked
 
 Array = NDArray[np.float64]
 
@@ -317,6 +317,7 @@ def _existing(spec: ModelSpec, tracks: Sequence[Track]) -> tuple[Existing, ...]:
 
 
 def _check_fits(recording: Recording, spec: ModelSpec) -> None:
+    checked(recording)
     struts = len(spec.struts)
     if recording.heights_m.shape[1] != struts:
         raise RecordingError(

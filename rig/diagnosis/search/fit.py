@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from scipy.stats import t as student
 
-from dart_model.effects import Motion, effect
+from dart_model.effects import Effect, Motion, effect
 from rig.diagnosis.numerics.least_squares import Rows, Solution, Space, joined, solve
 from rig.diagnosis.problem.contract import (
     Candidate,
@@ -43,6 +43,8 @@ _STATE_PRIOR = 10.0
 """Prior on internal states at the beginning, in units of their scale: wide."""
 _TINY = 1e-100
 """Stands for nothing in a quotient; its square is still a number."""
+_NIL = 1e-2
+"""Share of a like parameter below which one is searched in that one's units."""
 _LAGS = 20
 """Lags of the whiteness test."""
 
@@ -92,13 +94,23 @@ def law_space(name: str, motion: Motion, values: Array) -> Space:
     narrower = item.bounds(motion)
     low = np.array([max(p.low, narrower.get(p.name, (p.low,))[0]) for p in item.parameters])
     high = np.array([min(p.high, narrower.get(p.name, (0.0, p.high))[1]) for p in item.parameters])
-    scale = np.maximum(np.abs(values), 1e-12)
+    scale = np.array([_size(item, i, values) for i in range(len(values))])
     for i, parameter in enumerate(item.parameters):
         if parameter.unit == "m":
             scale[i] = motion.stroke_m
         if parameter.unit == "rad":
             scale[i] = 1.0
     return Space(low, np.maximum(high, low), scale, low > 0.0)
+
+
+def _size(item: Effect, i: int, values: Array) -> float:
+    """Size of a parameter, or of the largest one with its unit: one side of a damper may be nil."""
+    alike = [
+        abs(float(value))
+        for parameter, value in zip(item.parameters, values, strict=True)
+        if parameter.unit == item.parameters[i].unit
+    ]
+    return max(abs(float(values[i])), _NIL * max(alike), 1e-12)
 
 
 def _existing_space(name: str, values: Array, free: bool) -> Space:

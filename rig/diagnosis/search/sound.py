@@ -104,8 +104,10 @@ def _unbound(
             space.logarithmic, 1.0, result.solution.values[own] / np.maximum(space.scale, _TINY)
         )[list(item.scaled)]
         which = own[list(item.scaled)]
-        inverse = np.linalg.pinv(known.covariance[np.ix_(which, which)], rcond=1e-12)
-        if float(sizes @ inverse @ sizes) < criteria.significant**2:
+        part = known.covariance[np.ix_(which, which)]
+        deviation = np.sqrt(np.maximum(np.diag(part), _TINY))
+        inverse = np.linalg.pinv(part / np.outer(deviation, deviation), rcond=1e-10)
+        if float(sizes / deviation @ inverse @ (sizes / deviation)) < criteria.significant**2:
             return f"the data do not bound its size ({name})"
     return None
 
