@@ -69,7 +69,8 @@ class _Known(NamedTuple):
         if space.logarithmic[variable]:
             if half > np.log(_UNBOUND):
                 return Estimate(value, None, None)
-            return Estimate(value, value * float(np.exp(-half)), value * float(np.exp(half)))
+            growth = float(np.exp(half))
+            return Estimate(value, max(value / growth, low), min(value * growth, high))
         half *= float(space.scale[variable])
         if half > _UNBOUND * max(abs(value), 1e-300) and half > 0.5 * (high - low):
             return Estimate(value, None, None)

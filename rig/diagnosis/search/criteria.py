@@ -42,8 +42,8 @@ class SelectionCriteria:
             put down to its formula, and no further law of the same kind (see `KINDS`) is looked
             for: two formulas for one effect agree to a few percent, as seen on the foreign formulas
             of `tests.truth`.
-        significant: Times its standard deviation that a linear correction, and the size of an
-            effect, is away from nothing.
+        significant: Times its standard deviation that a linear correction is away from nothing.
+        bounded: The same for the size of an effect, beyond what the linear part could give.
         cancelling: Correlation of two forces in one strut below which they cancel each other.
         leftover: Share of a law's force along the motion that no change of the linear part could
             give; with less the law is a linear correction in disguise.
@@ -70,6 +70,7 @@ class SelectionCriteria:
     least_above_noise_later: float = 0.2
     formula: float = 0.06
     significant: float = 4.0
+    bounded: float = 4.0
     cancelling: float = -0.9
     leftover: float = 0.02
     passive: float = 0.02

@@ -302,13 +302,14 @@ def block_scores(problem: Problem, result: Fit) -> Array:
 
     Initial states are held, since they belong to the block that begins a recording.
     """
-    starts = _start_variables(problem, result)
+    starts = start_variables(problem, result)
     jacobian = result.solution.jacobian[:, ~starts]
     priors = jacobian[result.rows :]
     return left_out(result.residual, jacobian[: result.rows], result.blocks, priors.T @ priors)
 
 
-def _start_variables(problem: Problem, result: Fit) -> Flags:
+def start_variables(problem: Problem, result: Fit) -> Flags:
+    """Which search variables are those of initial vectors."""
     _, fitted = problem.start_scales(result.candidate)
     count = int(fitted.sum()) * problem.recordings
     flags = np.zeros(result.solution.jacobian.shape[1], dtype=np.bool_)

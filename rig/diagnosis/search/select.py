@@ -572,12 +572,12 @@ def _diverse(level: Sequence[Trial], count: int) -> list[Trial]:
     chosen: list[Trial] = []
     seen: dict[tuple[str, ...], int] = {}
     for trial in level:
+        if len(chosen) >= count:
+            break
         families = tuple(sorted(effect(name).family for _, name in trial.laws))
         if seen.get(families, 0) < 2:
             chosen.append(trial)
             seen[families] = seen.get(families, 0) + 1
-        if len(chosen) == count:
-            break
     return chosen
 
 

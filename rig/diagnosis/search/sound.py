@@ -17,7 +17,7 @@ from dart_model.effects import effect
 from rig.diagnosis.problem.contract import Problem, Track, placed, slots_of, strut_constants
 from rig.diagnosis.problem.track import effect_forces, law_force
 from rig.diagnosis.search.criteria import SelectionCriteria
-from rig.diagnosis.search.fit import Fit, effect_variables, spread
+from rig.diagnosis.search.fit import Fit, effect_variables, start_variables
 
 Array = NDArray[np.float64]
 
@@ -89,25 +89,31 @@ def _unbound(
     along: Sequence[Track],
     criteria: SelectionCriteria,
 ) -> str | None:
+    """A law whose size, beyond what the linear part could give, is not away from nothing."""
     del forces, along
-    known = spread(result)
     variables = effect_variables(problem, result)
+    jacobian, residual = result.solution.jacobian, result.solution.residual
+    starts = start_variables(problem, result)
+    linear = np.arange(jacobian.shape[1]) < int(result.free.sum())
+    nuisance = jacobian[:, linear | starts]
+    nuisance = nuisance[:, np.linalg.norm(nuisance, axis=0) > 0.0]
+    basis = np.linalg.qr(nuisance / np.linalg.norm(nuisance, axis=0))[0]
     for row, name in _new(result):
-        item = effect(name)
-        own = variables[row]
-        if not item.scaled:
+        scaled = variables[row][list(effect(name).scaled)]
+        if not len(scaled):
             continue
-        # All sizes of a law together: what one side of a damper shares with the linear damping is
-        # bounded by nothing but the prior, what it has more than the other side is.
-        space = result.space.part(np.isin(np.arange(len(result.space.low)), own))
+        space = result.space
         sizes = np.where(
-            space.logarithmic, 1.0, result.solution.values[own] / np.maximum(space.scale, _TINY)
-        )[list(item.scaled)]
-        which = own[list(item.scaled)]
-        part = known.covariance[np.ix_(which, which)]
-        deviation = np.sqrt(np.maximum(np.diag(part), _TINY))
-        inverse = np.linalg.pinv(part / np.outer(deviation, deviation), rcond=1e-10)
-        if float(sizes / deviation @ inverse @ (sizes / deviation)) < criteria.significant**2:
+            space.logarithmic[scaled], 1.0, result.solution.values[scaled] / space.scale[scaled]
+        )
+        # What the whole law adds to the residual, all its sizes in one proportion.
+        answer = jacobian[:, scaled] @ sizes
+        answer = answer - basis @ (basis.T @ answer)
+        power = float(answer @ answer)
+        scores = np.bincount(result.blocks, (answer * residual)[: result.rows])
+        white = np.sqrt(power / max(result.mean_square, 1.0))
+        robust = power / max(float(np.linalg.norm(scores)), _TINY)
+        if min(float(white), robust) < criteria.bounded:
             return f"the data do not bound its size ({name})"
     return None
 
