@@ -122,8 +122,11 @@ def _searched(
     found = search(problem, given, [_seed(linear)], criteria, _within(progress, 0.05, 0.55))
     problem = _sharpened(problem, found.chosen.fit)
     seeds = [_seed(scored.fit) for scored in (found.linear, *found.best)]
+    first = found.rejected
     found = search(problem, found.given, seeds, criteria, _within(progress, 0.55, 0.95))
-    return found, problem
+    # The ranking is that of the first search, about the linear model alone.
+    taken = found.chosen.fit.candidate.new
+    return found._replace(rejected=tuple(r for r in first if r.placed not in taken)), problem
 
 
 def first_fits(problem: FreeRun | Prescribed) -> tuple[Fit, Fit]:

@@ -554,7 +554,7 @@ class _Search:
                 return f"its out-of-sample residual is {ratio:.3g} times that of the chosen model"
             return f"alone it leaves {ratio:.3g} times the out-of-sample residual of the chosen set"
         share = 100.0 * (1.0 - min(left, 1.0))
-        return f"along the motion it takes {share:.2g} % off the residual of the linear model"
+        return f"along the motion it takes {share:.3g} % off the residual of the linear model"
 
 
 def _score(trial: Trial) -> float:
