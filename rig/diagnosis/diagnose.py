@@ -66,9 +66,10 @@ def diagnose(
     def figures(chosen: Fit) -> tuple[Evaluated, ...]:
         models = models_of(problem, found.linear.fit, chosen)
         results = evaluated(judged, models, recordings, kept=not held_out)
-        noise = float(np.sqrt(np.nanmean(_noise(problem) ** 2)))
-        left = float(np.sqrt(chosen.mean_square)) * noise
-        return with_floor_below(results, left, height=isinstance(problem, FreeRun))
+        if isinstance(problem, FreeRun):
+            return results
+        noise_n = float(np.sqrt(np.nanmean(problem.noise_n**2)))
+        return with_floor_below(results, float(np.sqrt(chosen.mean_square)) * noise_n)
 
     results = figures(found.chosen.fit)
     if found.chosen.size and needless(results, criteria):

@@ -60,26 +60,19 @@ class Evaluated(NamedTuple):
     series: tuple[HeldOutSeries, ...]
 
 
-def with_floor_below(
-    results: tuple[Evaluated, ...], left: float, *, height: bool
-) -> tuple[Evaluated, ...]:
-    """A floor that is no higher than what the model leaves where it was fitted.
+def with_floor_below(results: tuple[Evaluated, ...], left_n: float) -> tuple[Evaluated, ...]:
+    """A floor of the force that is no higher than what a model leaves where it was fitted.
 
-    An excitation without a band limit looks like noise of the applied force; and near a reversal a
-    redrawn motion changes the sign of friction, where a smoothed one does not.
-
-    Args:
-        results: Figures.
-        left: Residual where it was fitted, root mean square.
-        height: Whether it is a height, else a force.
+    Near a reversal a redrawn motion changes the sign of friction; a smoothed one does not.
     """
-
-    def lower(floor: NoiseFloor) -> NoiseFloor:
-        if height:
-            return NoiseFloor(min(floor.height_rmse_m, left), floor.residual_force_rmse_n)
-        return NoiseFloor(floor.height_rmse_m, min(floor.residual_force_rmse_n, left))
-
-    return tuple(result._replace(floor=lower(result.floor)) for result in results)
+    return tuple(
+        result._replace(
+            floor=NoiseFloor(
+                result.floor.height_rmse_m, min(result.floor.residual_force_rmse_n, left_n)
+            )
+        )
+        for result in results
+    )
 
 
 class Models(NamedTuple):
