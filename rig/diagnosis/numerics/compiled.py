@@ -23,7 +23,7 @@ from numba.core.errors import NumbaExperimentalFeatureWarning
 from numba.typed import List
 from numpy.typing import NDArray
 
-from dart_model.effects import CATALOGUE, effect
+from dart_model.effects import effect
 from dart_model.effects.contract import Floats, Writable
 
 Array = NDArray[np.float64]
@@ -133,12 +133,6 @@ def _listed(names: tuple[str, ...]) -> tuple[Any, Any]:
 def law(name: str) -> Law:
     """The law of an effect as machine code, compiled on first use and kept on disk."""
     return Law(*_listed((name,)), effect(name).state_size)
-
-
-def compile_all() -> None:
-    """Compile the whole catalogue."""
-    for name in CATALOGUE:
-        law(name)
 
 
 class Slots(NamedTuple):

@@ -75,16 +75,6 @@ class Run(NamedTuple):
     angle: float
     mechanism: Mechanism
 
-    def finer(self) -> "Run":
-        """The same run in half as long steps, the applied force a parabola over each step."""
-        whole = self.fine_n
-        first, middle, last = whole[:-2:2], whole[1:-1:2], whole[2::2]
-        fine = np.empty(2 * (len(whole) - 1) + 1)
-        fine[::2] = whole
-        fine[1::4] = 0.375 * first + 0.75 * middle - 0.125 * last
-        fine[3::4] = -0.125 * first + 0.75 * middle + 0.375 * last
-        return self._replace(fine_n=fine, substeps=2 * self.substeps, angle=0.5 * self.angle)
-
 
 class Trajectory(NamedTuple):
     """Strut motions at the nodes, each of shape (N, struts)."""

@@ -171,7 +171,7 @@ def _active(
     constants = strut_constants(problem, result.parts.linear)
     index = slots_of(problem, result.candidate).index
     effects = placed(problem, result.candidate)
-    for strut, motion in enumerate(problem.motions):
+    for strut in range(len(problem.motions)):
         if not any(at == strut for at, _ in result.candidate.new):
             continue
         z = np.concatenate([track.heights_m[strut] for track in along])
@@ -189,7 +189,6 @@ def _active(
         if float(power.max()) > criteria.passive * max(-float(power.min()), 0.0):
             name = problem.spec.struts[strut].name
             return f"strut {name} would feed energy in (not passive)"
-        del motion
     return None
 
 
