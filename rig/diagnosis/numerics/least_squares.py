@@ -31,6 +31,8 @@ _FIRST_DAMPING = 1e-3
 _LARGEST_DAMPING = 1e9
 _TRUE = 0.05
 """Share of the change of a residual, squared, that its tangent may miss and still be mended."""
+_SETTLED = 0.9
+"""Share of a residual's level that is left by a step that is called the last."""
 _LARGEST_LOGARITHMIC_STEP = 1.5
 """A factor of 4.5: beyond it a law's shape is another one, and its tangent says nothing."""
 
@@ -74,6 +76,21 @@ def joined(spaces: list[Space]) -> Space:
     return Space(*(np.concatenate(entries) for entries in zip(*spaces, strict=True)))
 
 
+class Prior(NamedTuple):
+    """What is known of the search variables before.
+
+    Attributes:
+        centre: Their most likely values, shape (k,).
+        weight: Inverse standard deviations; zero where nothing is known; shape (k,).
+        level_of: Variance that a residual (m,) stands for, one at the noise floor. The larger it
+            is, the more a prior weighs.
+    """
+
+    centre: Array
+    weight: Array
+    level_of: Callable[[Array], float]
+
+
 class Solution(NamedTuple):
     """Result of a fit.
 
@@ -82,12 +99,16 @@ class Solution(NamedTuple):
         residual: Residual there, shape (m,).
         jacobian: Derivative of the residual by the search variables, shape (m, k).
         cost: Sum of squares.
+        level: Variance that the residual stands for.
+        prior: Precision of the prior in units of that variance, shape (k,).
     """
 
     values: Array
     residual: Array
     jacobian: Array
     cost: float
+    level: float
+    prior: Array
 
 
 class Rows(NamedTuple):
@@ -112,6 +133,7 @@ def solve(
     tolerance: float = 1e-4,
     rows: Mapping[int, Rows] = MappingProxyType({}),
     threads: int = 1,
+    prior: Prior | None = None,
 ) -> Solution | None:
     """Least squares from a start.
 
@@ -123,6 +145,7 @@ def solve(
         tolerance: Relative gain below which the search ends.
         rows: Parameters, by index, that move some rows only; their derivatives then cost less.
         threads: Differences that are taken at a time.
+        prior: What is known before; nothing if absent.
 
     Returns:
         The solution, or None if there is no residual at the start.
@@ -131,24 +154,31 @@ def solve(
     begin = residual_of(space.outer(x))
     if begin is None or not np.all(np.isfinite(begin)):
         return None
-    r = begin
-    cost, damping = float(r @ r), _FIRST_DAMPING
+    r, damping = begin, _FIRST_DAMPING
+    known = prior or Prior(np.zeros_like(x), np.zeros_like(x), lambda _: 1.0)
+    level = known.level_of(r)
 
     def tangent(*, both: bool = False) -> Array:
         return _jacobian(residual_of, x, r, space, rows, threads, both=both)
 
     jacobian, fresh = tangent(), True
     for _ in range(iterations):
-        moved = _moved(residual_of, x, r, space, jacobian, damping, patient=fresh)
+        precision = level * known.weight**2
+        here = _Point(x, r, known.centre, precision)
+        moved = _moved(residual_of, here, space, jacobian, damping, patient=fresh)
         if moved is None:
             if fresh:
                 break
             jacobian, fresh = tangent(), True
             continue
-        change, move = moved.residual - r, moved.x - x
+        there, damping = moved
+        change, move = there.residual - r, there.x - x
         error = change - jacobian @ move
-        gain, x, r, damping = cost - moved.cost, moved.x, moved.residual, moved.damping
-        small, cost = gain < tolerance * cost, moved.cost
+        small = here.cost - there.cost < tolerance * here.cost
+        x, r = there.x, there.residual
+        # A residual that has fallen leaves less weight to the prior: there may be more to gain.
+        lower = min(level, known.level_of(r))
+        small, level = small and lower > _SETTLED * level, lower
         if small and fresh:
             break
         if not small and error @ error < _TRUE * (change @ change):
@@ -156,41 +186,50 @@ def solve(
             jacobian, fresh = jacobian + np.outer(error, move) / float(move @ move), False
         else:
             jacobian, fresh = tangent(), True
-    return Solution(space.outer(x), r, tangent(both=True), cost)
+    precision = level * known.weight**2
+    return Solution(space.outer(x), r, tangent(both=True), float(r @ r), level, precision)
 
 
-class _Moved(NamedTuple):
-    """A step that lowered the cost."""
+class _Point(NamedTuple):
+    """Where a search is."""
 
     x: Array
     residual: Array
-    cost: float
-    damping: float
+    centre: Array
+    precision: Array
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares, the prior's with it."""
+        away = self.x - self.centre
+        return float(self.residual @ self.residual + away @ (self.precision * away))
 
 
 def _moved(
     residual_of: ResidualOf,
-    x: Array,
-    r: Array,
+    here: _Point,
     space: Space,
     jacobian: Array,
     damping: float,
     *,
     patient: bool,
-) -> _Moved | None:
+) -> tuple[_Point, float] | None:
     """A step with as little damping as lowers the cost; without patience one is tried."""
-    products, gradient, cost = jacobian.T @ jacobian, jacobian.T @ r, float(r @ r)
+    products = jacobian.T @ jacobian + np.diag(here.precision)
+    gradient = jacobian.T @ here.residual + here.precision * (here.x - here.centre)
     diagonal = np.maximum(np.diag(products), 1e-300)
     largest = np.where(space.logarithmic, _LARGEST_LOGARITHMIC_STEP, np.inf)
-    free = ~_pressed(x, gradient, space)
+    free = ~_pressed(here.x, gradient, space)
     while damping < _LARGEST_DAMPING:
         step = _step(products, gradient, diagonal * damping, free)
         if step is None:
             return None
-        trial = space.inner(space.outer(x + np.clip(step, -largest, largest)))
-        there = residual_of(space.outer(trial))
-        if there is not None and float(there @ there) < cost:
-            return _Moved(trial, there, float(there @ there), max(damping * 0.1, 1e-12))
+        trial = space.inner(space.outer(here.x + np.clip(step, -largest, largest)))
+        residual = residual_of(space.outer(trial))
+        if residual is not None:
+            there = here._replace(x=trial, residual=residual)
+            if there.cost < here.cost:
+                return there, max(damping * 0.1, 1e-12)
         if not patient:
             return None
         damping *= 10.0

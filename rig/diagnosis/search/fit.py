@@ -24,7 +24,7 @@ from scipy.stats import chi2
 from scipy.stats import t as student
 
 from dart_model.effects import Effect, Motion, effect
-from rig.diagnosis.numerics.least_squares import Rows, Solution, Space, joined, solve
+from rig.diagnosis.numerics.least_squares import Prior, Rows, Solution, Space, joined, solve
 from rig.diagnosis.problem.contract import (
     Candidate,
     Integers,
@@ -56,7 +56,7 @@ class Fit(NamedTuple):
         candidate: Its effects.
         free: Which linear parameters were fitted, shape (L,).
         parts: All that it consists of.
-        solution: The fit itself; its last rows are those of the priors.
+        solution: The fit itself.
         space: Where it was searched.
         fits_effects: Whether effects' parameters were fitted.
         blocks: Block of each row of data, over all recordings, shape (m,).
@@ -80,7 +80,7 @@ class Fit(NamedTuple):
     @property
     def residual(self) -> Array:
         """Whitened residual, shape (m,)."""
-        return self.solution.residual[: self.rows]
+        return self.solution.residual
 
     @property
     def mean_square(self) -> float:
@@ -161,9 +161,9 @@ class _Layout:
         self.full = np.concatenate([first.linear, first.effects, *first.starts])
         self.start_size = len(scales)
         self.prior = self._prior(len(linear), scales)
+        self.least_samples = sum(int(problem.blocks(k).max()) + 1 for k in range(problem.recordings))
 
-    def _prior(self, linear: int, scales: Array) -> tuple[Array, Array]:
-        """Centre and weight of each search variable's prior."""
+    def _prior(self, linear: int, scales: Array) -> Prior:
         weight = np.zeros(len(self.full))
         weight[:linear] = 1.0
         existing = sum(len(self.problem.existing[i].values) for i in self.candidate.kept)
@@ -176,7 +176,9 @@ class _Layout:
         values = [v for i in self.candidate.kept for v in self.problem.existing[i].values]
         centre[linear : linear + existing] = values
         inner = self.whole.inner(np.clip(centre, self.whole.low, self.whole.high))
-        return np.where(weight > 0.0, inner, 0.0)[self.varied], weight[self.varied]
+        return Prior(
+            np.where(weight > 0.0, inner, 0.0)[self.varied], weight[self.varied], self.level
+        )
 
     def parts(self, x: Array) -> Parts:
         full = self.full.copy()
@@ -193,6 +195,7 @@ class _Layout:
         return self.problem.residual(k, self.candidate, self.parts(x))
 
     def residual(self, x: Array) -> Array | None:
+        """Whitened residual of all recordings, shape (m,)."""
         parts = self.parts(x)
         found: list[Array] = []
         for k in range(self.problem.recordings):
@@ -200,15 +203,24 @@ class _Layout:
             if there is None:
                 return None
             found.append(there)
-        centre, weight = self.prior
-        return np.concatenate([*found, weight * (self.space.inner(x) - centre)])
+        return np.concatenate(found)
+
+    def level(self, residual: Array) -> float:
+        """Variance that a whitened residual stands for, as coloured as it is; one if it is white.
+
+        What a wrong model leaves says less of its parameters than as many independent samples:
+        by the effective number of a first-order process (Bayley, Hammersley, J. R. Stat. Soc.
+        Suppl. 8, 1946), which no colour brings below a sample a block.
+        """
+        struts = len(self.problem.motions)
+        mean_square = float(np.mean(residual**2))
+        like = float(residual[struts:] @ residual[:-struts]) / max(len(residual) * mean_square, _TINY)
+        like = min(max(like, 0.0), 1.0 - 1e-9)
+        samples = max(len(residual) * (1.0 - like) / (1.0 + like), float(self.least_samples))
+        return max(1.0, mean_square * len(residual) / samples)
 
     def rows(self, blocks: list[Integers]) -> dict[int, Rows]:
-        """Of each variable of a recording's initial vector, the rows that it moves.
-
-        The priors of these rows come after all data, where a difference would miss them: they are
-        left out of the map where there is only one recording, and of no weight elsewhere.
-        """
+        """Of each variable of a recording's initial vector, the rows that it moves."""
         if len(blocks) < 2:
             return {}
         found: dict[int, Rows] = {}
@@ -219,8 +231,7 @@ class _Layout:
             rows = Rows(at, at + len(block), functools.partial(self.residual_of, k))
             low, high = before + k * self.start_size, before + (k + 1) * self.start_size
             for i in np.flatnonzero((varied >= low) & (varied < high)):
-                if self.prior[1][i] == 0.0:
-                    found[int(i)] = rows
+                found[int(i)] = rows
             at += len(block)
         return found
 
@@ -253,7 +264,7 @@ def fit(
     blocks = [problem.blocks(k) for k in range(problem.recordings)]
     solution = solve(
         layout.residual, layout.full[layout.varied], layout.space, iterations, tolerance,
-        layout.rows(blocks), os.cpu_count() or 1,
+        layout.rows(blocks), os.cpu_count() or 1, layout.prior,
     )  # fmt: skip
     if solution is None:
         return None
@@ -303,9 +314,8 @@ def block_scores(problem: Problem, result: Fit) -> Array:
     Initial states are held, since they belong to the block that begins a recording.
     """
     starts = start_variables(problem, result)
-    jacobian = result.solution.jacobian[:, ~starts]
-    priors = jacobian[result.rows :]
-    return left_out(result.residual, jacobian[: result.rows], result.blocks, priors.T @ priors)
+    prior = np.diag(result.solution.prior[~starts])
+    return left_out(result.residual, result.solution.jacobian[:, ~starts], result.blocks, prior)
 
 
 def start_variables(problem: Problem, result: Fit) -> Flags:
@@ -340,11 +350,13 @@ def spread(result: Fit) -> Spread:
 
 def _sandwich(result: Fit) -> Spread:
     jacobian, residual = result.solution.jacobian, result.solution.residual
-    size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0), _TINY))
+    prior = result.solution.prior
+    size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + prior, _TINY))
     scaled = jacobian / size
-    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-13)
+    inverse = np.linalg.pinv(scaled.T @ scaled + np.diag(prior / size**2), rcond=1e-13)
     count = int(result.blocks.max()) + 1
-    meat = np.zeros_like(inverse)
+    # What the prior's own uncertainty adds.
+    meat = np.diag(result.solution.level * prior / size**2)
     for b in range(count):
         part = np.flatnonzero(result.blocks == b)
         score = scaled[part].T @ residual[part]

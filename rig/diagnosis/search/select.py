@@ -45,8 +45,20 @@ Flags = NDArray[np.bool_]
 Progress = Callable[[str, float], None]
 
 
-_STEPS, _ROUGHLY = 8, 1e-3
-"""Steps and relative gain of a fit that is only compared; what is chosen is fitted to its end."""
+class Effort(NamedTuple):
+    """How far a fit goes.
+
+    Attributes:
+        steps: Most steps.
+        gain: Relative gain below which it ends.
+    """
+
+    steps: int
+    gain: float
+
+
+_ROUGH, _FULL = Effort(8, 1e-3), Effort(30, 1e-5)
+"""Fits that are screened among themselves, and fits that decide."""
 
 
 class Scored(NamedTuple):
@@ -147,6 +159,7 @@ def search(
         searching.again()
     else:
         searching.run()
+    searching.settle()
     chosen = searching.without_needless(searching.chosen())
     progress("comparing rivals", 0.85)
     rivals = searching.rivals(chosen)
@@ -343,8 +356,10 @@ class _Search:
                         found.append(less)
         return found
 
-    def _fitted(self, stage: Stage, reference: Scored, trial: Trial) -> None:
-        """Fit a trial's laws in full, from what it found along the motion."""
+    def _fitted(
+        self, stage: Stage, reference: Scored, trial: Trial, effort: Effort = _ROUGH
+    ) -> None:
+        """Fit a trial's laws in simulation, from what it found along the motion."""
         order = sorted(range(len(trial.laws)), key=lambda i: trial.laws[i])
         base = nominal(self.problem)
         candidate = base.added(*trial.laws)
@@ -361,7 +376,7 @@ class _Search:
             np.concatenate(values),
             self._starts(reference.fit, candidate),
         )
-        self._try(candidate, parts)
+        self._try(candidate, parts, effort)
 
     def _starts(self, reference: Fit, candidate: Candidate) -> tuple[Array, ...]:
         """Initial vectors of a reference, for another candidate: internal states at zero."""
@@ -374,9 +389,16 @@ class _Search:
             found.append(new)
         return tuple(found)
 
-    def _try(self, candidate: Candidate, parts: Parts) -> Scored | None:
-        """Fit a candidate in full and keep the better of this and an earlier fit."""
-        result = fit(self.problem, candidate, parts, self.free, _STEPS, _ROUGHLY)
+    def settle(self) -> None:
+        """Fit to their end those sets that may be chosen."""
+        best = self.best()
+        for scored in best:
+            if scored.score <= self.criteria.hopeless * best[0].score:
+                self._try(scored.fit.candidate, scored.fit.parts, _FULL)
+
+    def _try(self, candidate: Candidate, parts: Parts, effort: Effort = _ROUGH) -> Scored | None:
+        """Fit a candidate in simulation and keep the better of this and an earlier fit."""
+        result = fit(self.problem, candidate, parts, self.free, *effort)
         if result is None:
             return self.fits.get(candidate)
         scored = self._scored(result)
@@ -425,6 +447,8 @@ class _Search:
             candidate = less.added(other)
             if candidate not in self.fits:
                 self._fit_beside(chosen, less, other)
+            elif self.fits[candidate].score <= self.criteria.hopeless * chosen.score:
+                self._try(candidate, self.fits[candidate].fit.parts, _FULL)
             if candidate in self.fits and candidate not in self.unsound:
                 yield self.fits[candidate]
 
@@ -439,7 +463,7 @@ class _Search:
             if whole is None or trial.score > self.criteria.hopeless * whole.score:
                 continue
             if trial.values:
-                self._fitted(stage, self.linear, trial)
+                self._fitted(stage, self.linear, trial, _FULL)
 
     def _refit(self, chosen: Scored, candidate: Candidate) -> Iterable[Scored]:
         """Fewer laws, from where the chosen set has them."""
@@ -448,7 +472,8 @@ class _Search:
             first = slots_of(self.problem, nominal(self.problem)).parameters
             effects = [chosen.fit.parts.effects[:first], *(known[law] for law in candidate.new)]
             starts = self._starts(chosen.fit, candidate)
-            self._try(candidate, Parts(chosen.fit.parts.linear, np.concatenate(effects), starts))
+            parts = Parts(chosen.fit.parts.linear, np.concatenate(effects), starts)
+            self._try(candidate, parts, _FULL)
         if candidate in self.fits and candidate not in self.unsound:
             yield self.fits[candidate]
 
@@ -487,10 +512,13 @@ class _Search:
     # --- the linear part ----------------------------------------------------------------------
 
     def with_few_linear(self, chosen: Scored) -> tuple[Scored, bool]:
-        """The chosen model with those linear corrections alone that the data call for."""
+        """The chosen model, fitted to its end, with those linear corrections that data call for."""
+        settled = fit(self.problem, chosen.fit.candidate, chosen.fit.parts, chosen.fit.free, *_FULL)
+        if settled is not None:
+            chosen = self._scored(settled)
         needed = self._needed(chosen.fit)
         parts = chosen.fit.parts._replace(linear=np.where(needed, chosen.fit.parts.linear, 0.0))
-        fewer = fit(self.problem, chosen.fit.candidate, parts, needed, 30, 1e-6)
+        fewer = fit(self.problem, chosen.fit.candidate, parts, needed, *_FULL)
         result = chosen
         if fewer is not None and not self.worth(self._scored(fewer), chosen):
             result = self._scored(fewer)

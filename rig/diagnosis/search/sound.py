@@ -110,7 +110,7 @@ def _unbound(
         answer = jacobian[:, scaled] @ sizes
         answer = answer - basis @ (basis.T @ answer)
         power = float(answer @ answer)
-        scores = np.bincount(result.blocks, (answer * residual)[: result.rows])
+        scores = np.bincount(result.blocks, answer * residual)
         white = np.sqrt(power / max(result.mean_square, 1.0))
         robust = power / max(float(np.linalg.norm(scores)), _TINY)
         if min(float(white), robust) < criteria.bounded:
