@@ -138,10 +138,11 @@ def test_candumps_record_is_our_log(recorded, files):
     logged = list(found.frames())
     ours = contents([frame for frame, direction in logged if direction == "T"])
     theirs = contents(dumped(record))
-    sent = [item for item in theirs if item[0] in {number for number, _ in ours}]
+    bridge_ids, bench_ids = {number for number, _ in ours}, {int(text, 16) for text in BENCH_IDS}
+    sent = [item for item in theirs if item[0] in bridge_ids]
     assert ours == sent
     received = contents([frame for frame, direction in logged if direction == "R"])
-    bench = [item for item in theirs if item[0] in {int(text, 16) for text in BENCH_IDS}]
+    bench = [item for item in theirs if item[0] in bench_ids]
     start = bench.index(received[0])
     assert received == bench[start : start + len(received)]
     # And cantools reads in candump's record what the bridge computed.
