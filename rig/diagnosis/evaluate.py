@@ -36,6 +36,9 @@ _DRAWS = 3
 """Draws of the noise from which a floor is taken; the third changes it by a few percent."""
 _LARGEST_INPUT_NOISE = 0.01
 """Share of an applied force's range above which what is not smooth is not noise but excitation."""
+_TOP = 0.8
+"""Share of the sampled band above which a bench excites nothing: anti-aliasing filters and the
+actuator end below, so what is there is noise."""
 _AGREEMENT, _ACCURACY = 0.1, 0.01
 """Share of the noise, or of the error if that is more, to which DART's steps are settled."""
 
@@ -246,9 +249,17 @@ def _input_floor_m(problem: FreeRun, k: int, model: tuple[Candidate, Parts]) -> 
 
 
 def input_noise_n(run: Run) -> float:
-    """Standard deviation of the applied force's noise and resolution: what is not smooth in it."""
-    variance = estimate_noise(run.grid.t_s, run.applied_n).variance
-    return min(float(np.sqrt(variance)), _LARGEST_INPUT_NOISE * float(np.ptp(run.applied_n)))
+    """Standard deviation of the applied force's noise and resolution.
+
+    White noise is in all of the band. What is not smooth, but not at its top either, is excitation.
+    """
+    force = run.applied_n - run.applied_n.mean()
+    variance = estimate_noise(run.grid.t_s, force).variance
+    window = np.hanning(len(force))
+    power = np.abs(np.fft.rfft(force * window)) ** 2 / float(window @ window)
+    # Lines of a periodogram are exponentially distributed: their median is ln 2 of their mean.
+    top = float(np.median(power[int(_TOP * len(power)) :])) / np.log(2.0)
+    return min(float(np.sqrt(min(variance, top))), _LARGEST_INPUT_NOISE * float(np.ptp(force)))
 
 
 def _prescribed(problem: Prescribed, k: int, models: Models, kept: bool) -> Evaluated:
