@@ -4,10 +4,6 @@ A free run's heights are DART's, with the applied force as the only input; only 
 which nobody measured, is fitted. An observer with a high gain would hide any model error.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from typing import NamedTuple
 
 import numpy as np

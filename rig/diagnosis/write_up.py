@@ -1,9 +1,5 @@
 """What was found, as an outcome: verdict on held-out data, intervals, corrected model."""
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -10,10 +10,6 @@ References:
     Kanzow, Yamashita, Fukushima, J. Comput. Appl. Math. 172 (2004), projected variant.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from types import MappingProxyType

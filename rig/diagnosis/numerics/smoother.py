@@ -12,10 +12,6 @@ References:
     concentrated likelihood.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,9 +1,5 @@
 """From recordings and a nominal model to a problem."""
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -9,10 +9,6 @@ References:
     through the model's own dynamics.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, Protocol
 

@@ -7,10 +7,6 @@ sensor noise as it is: an equation error that passes through the model's own dyn
 of an output error (Young 2011, 8.2). The measured motion itself comes from a smoother.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple

@@ -4,10 +4,6 @@ Reference: Hampel, The influence curve and its role in robust estimation, JASA 6
 median absolute deviation as a scale that outliers do not move.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from typing import NamedTuple
 
 import numpy as np

@@ -5,10 +5,6 @@ do not: a change of all of mass, stiffness and damping in one proportion against
 gain, for one.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,10 +5,6 @@ straight guides) they are read once; else they are tabulated along the measured 
 about it, so that a simulation which comes to follow the measurement follows DART.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from typing import NamedTuple
 
 import numpy as np

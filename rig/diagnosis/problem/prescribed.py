@@ -4,10 +4,6 @@ Nothing is simulated: the motion is smoothed over the whole recording, and a law
 takes one pass. What is left of initial states are the laws' internal ones.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

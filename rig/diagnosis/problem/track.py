@@ -1,9 +1,5 @@
 """Laws along a known motion."""
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 

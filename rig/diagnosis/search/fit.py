@@ -10,10 +10,6 @@ References:
     Ljung, Box, On a measure of lack of fit in time series models, Biometrika 65 (1978).
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 import functools
 import os
 from typing import NamedTuple
@@ -161,7 +157,8 @@ class _Layout:
         self.full = np.concatenate([first.linear, first.effects, *first.starts])
         self.start_size = len(scales)
         self.prior = self._prior(len(linear), scales)
-        self.least_samples = sum(int(problem.blocks(k).max()) + 1 for k in range(problem.recordings))
+        counts = (int(problem.blocks(k).max()) + 1 for k in range(problem.recordings))
+        self.least_samples = float(sum(counts))
 
     def _prior(self, linear: int, scales: Array) -> Prior:
         weight = np.zeros(len(self.full))
@@ -213,11 +210,11 @@ class _Layout:
         Suppl. 8, 1946), which no colour brings below a sample a block.
         """
         struts = len(self.problem.motions)
-        mean_square = float(np.mean(residual**2))
-        like = float(residual[struts:] @ residual[:-struts]) / max(len(residual) * mean_square, _TINY)
-        like = min(max(like, 0.0), 1.0 - 1e-9)
-        samples = max(len(residual) * (1.0 - like) / (1.0 + like), float(self.least_samples))
-        return max(1.0, mean_square * len(residual) / samples)
+        power = float(residual @ residual)
+        alike = float(residual[struts:] @ residual[:-struts]) / max(power, _TINY)
+        alike = min(max(alike, 0.0), 1.0)
+        samples = max(len(residual) * (1.0 - alike) / (1.0 + alike), self.least_samples)
+        return max(1.0, power / samples)
 
     def rows(self, blocks: list[Integers]) -> dict[int, Rows]:
         """Of each variable of a recording's initial vector, the rows that it moves."""

@@ -6,10 +6,6 @@ projected out (Golub, Pereyra, SIAM J. Numer. Anal. 10, 1973). A law whose force
 its size costs one pass a start; the best are then refined together with all else in their set.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 import itertools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -6,10 +6,6 @@ References:
     Miller, Subset Selection in Regression (2002), 3, forward and backward search.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 

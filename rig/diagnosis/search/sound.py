@@ -4,10 +4,6 @@ Reference: van der Schaft, L2-Gain and Passivity Techniques in Nonlinear Control
 passivity; here power is looked at where the motion was.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -51,11 +47,12 @@ def unsound(
         criteria: What decides.
     """
     forces = _forces(problem, result, along)
-    for check in (_unbound, _disguised, _cancelling):
-        why = check(problem, result, forces, along, criteria)
-        if why is not None:
-            return why
-    return _active(problem, result, along, criteria)
+    return (
+        _unbound(problem, result, criteria)
+        or _disguised(result, forces, along, criteria)
+        or _cancelling(result, forces, criteria)
+        or _active(problem, result, along, criteria)
+    )
 
 
 def _forces(problem: Problem, result: Fit, along: Sequence[Track]) -> list[tuple[int, Array]]:
@@ -82,15 +79,8 @@ def _new(result: Fit) -> list[tuple[int, str]]:
     return [(first + i, name) for i, (_, name) in enumerate(result.candidate.new)]
 
 
-def _unbound(
-    problem: Problem,
-    result: Fit,
-    forces: list[tuple[int, Array]],
-    along: Sequence[Track],
-    criteria: SelectionCriteria,
-) -> str | None:
+def _unbound(problem: Problem, result: Fit, criteria: SelectionCriteria) -> str | None:
     """A law whose size, beyond what the linear part could give, is not away from nothing."""
-    del forces, along
     variables = effect_variables(problem, result)
     jacobian, residual = result.solution.jacobian, result.solution.residual
     starts = start_variables(problem, result)
@@ -119,13 +109,12 @@ def _unbound(
 
 
 def _disguised(
-    problem: Problem,
     result: Fit,
     forces: list[tuple[int, Array]],
     along: Sequence[Track],
     criteria: SelectionCriteria,
 ) -> str | None:
-    del problem
+    """A law that is a linear spring and damper along this motion."""
     for row, name in _new(result):
         strut, force = forces[row]
         columns = np.column_stack(
@@ -144,13 +133,9 @@ def _disguised(
 
 
 def _cancelling(
-    problem: Problem,
-    result: Fit,
-    forces: list[tuple[int, Array]],
-    along: Sequence[Track],
-    criteria: SelectionCriteria,
+    result: Fit, forces: list[tuple[int, Array]], criteria: SelectionCriteria
 ) -> str | None:
-    del problem, along
+    """Two laws of one strut, each of which takes back what the other gives."""
     new = _new(result)
     for i, (row, name) in enumerate(new):
         for other_row, other in new[i + 1 :]:

@@ -5,10 +5,6 @@ problems, J. Appl. Mech. 46 (1979), the restoring-force surface; Eilers and Marx
 with B-splines and penalties, Stat. Sci. 11 (1996), for the penalty on second differences.
 """
 
-# numba and scipy ship no types for what is used here.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
-
 import numpy as np
 from numpy.typing import NDArray
 
