@@ -204,6 +204,7 @@ class Tolerance(_Frozen):
         damping_n_s_per_m: Share of each strut's damping.
         preload_n: Constant force in each strut, in N.
         input_gain: Share of the applied force.
+        free_length_m: Free length of each strut, in m.
     """
 
     mass_kg: Share | None = None
@@ -211,6 +212,7 @@ class Tolerance(_Frozen):
     damping_n_s_per_m: Share | None = None
     preload_n: Positive | None = None
     input_gain: Share | None = None
+    free_length_m: Positive | None = None
 
 
 class ModelSpec(_Frozen):

@@ -159,6 +159,8 @@ class Effect:
         simpler: Effects to which this one degenerates at the ends of its parameters.
         benches: Kinds of bench on which it can be seen.
         shown: Parameters that a sentence about it states.
+        about_free_length: Whether another free length changes its force by more than a linear
+            spring and damper could.
     """
 
     name: str
@@ -179,6 +181,7 @@ class Effect:
     simpler: tuple[str, ...] = ()
     benches: tuple[Bench, ...] = ("force_given", "motion_given")
     shown: tuple[str, ...] = ()
+    about_free_length: bool = False
 
     @property
     def state_size(self) -> int:

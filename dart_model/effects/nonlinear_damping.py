@@ -364,6 +364,7 @@ POSITION_DEPENDENT_DAMPING = Effect(
     starts=always((1.0,)),
     simpler=("linear_damping",),
     shown=("damping_n_s_per_m3",),
+    about_free_length=True,
 )
 
 ZONE_DAMPING = Effect(

@@ -171,6 +171,7 @@ CUBIC_STIFFNESS = Effect(
     starts=always((1.0,)),
     simpler=("linear_stiffness",),
     shown=("stiffness_n_per_m3",),
+    about_free_length=True,
 )
 
 CENTRED_CUBIC_STIFFNESS = Effect(
@@ -204,6 +205,7 @@ POWER_STIFFNESS = Effect(
     starts=always((1.0, 1.5), (1.0, 2.5), (1.0, 3.5), (1.0, 5.0)),
     simpler=("linear_stiffness", "cubic_stiffness"),
     shown=("force_at_100_mm_n",),
+    about_free_length=True,
 )
 
 PROGRESSIVE_STIFFNESS = Effect(
@@ -221,6 +223,7 @@ PROGRESSIVE_STIFFNESS = Effect(
     bounds=within(length_m=of_stroke(0.04, 4.0)),
     simpler=("linear_stiffness", "cubic_stiffness"),
     shown=("force_n",),
+    about_free_length=True,
 )
 
 EXPONENTIAL_STIFFNESS = Effect(

@@ -14,7 +14,7 @@ from rig.diagnosis.problem.build import (
     with_noise,
     with_tones,
 )
-from rig.diagnosis.problem.contract import Parts, existing_values, nominal
+from rig.diagnosis.problem.contract import Parts, existing_values, free_beside, nominal
 from rig.diagnosis.problem.free_run import FreeRun
 from rig.diagnosis.problem.prescribed import Prescribed
 from rig.diagnosis.recording import Recording, RecordingError
@@ -145,9 +145,7 @@ def first_fits(problem: FreeRun | Prescribed) -> tuple[Fit, Fit]:
             f"model {problem.spec.name}: runs away on the recordings, expected one that stays "
             "near them: check its stiffness, its free length and the sign of the applied force"
         )
-    # The gain of the applied force is degenerate with all else, and has a turn of its own.
-    free = np.array([p.kind != "gain" for p in problem.linear], dtype=np.bool_)
-    return given, fit(problem, base, given.parts, free, 12) or given
+    return given, fit(problem, base, given.parts, free_beside(problem, base), 12) or given
 
 
 def _sharpened(problem: FreeRun | Prescribed, result: Fit) -> FreeRun | Prescribed:

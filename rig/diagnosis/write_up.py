@@ -287,7 +287,7 @@ def _linear_effects(
     places = np.flatnonzero(result.free)
     implied = _implied_preloads(problem, known)
     for variable, (place, p) in enumerate(zip(places, _free(problem, result), strict=True)):
-        if variable in implied:
+        if variable in implied or p.kind not in EFFECTS:
             continue
         linear = result.parts.linear.copy()
         linear[place] = 0.0

@@ -25,7 +25,7 @@ Integers = NDArray[np.int64]
 Placed = tuple[int, str]
 """Index of a strut, and the name of an effect in it."""
 
-Kind = Literal["mass", "stiffness", "damping", "preload", "gain"]
+Kind = Literal["mass", "stiffness", "damping", "preload", "gain", "free_length"]
 
 
 class LinearParameter(NamedTuple):
@@ -33,7 +33,8 @@ class LinearParameter(NamedTuple):
 
     Attributes:
         strut: Index of the strut.
-        kind: What it is. Stiffness and preload are taken about mid-stroke.
+        kind: What it is. Stiffness and preload are taken about mid-stroke; the free length is that
+            from which laws are taken, its share in the linear spring's force counts as preload.
         nominal: As the model file has it.
         deviation: Standard deviation of the prior on its change.
         least: Lowest change; mass and stiffness stay positive.
@@ -268,7 +269,24 @@ def strut_constants(problem: Problem, linear: Array) -> Array:
             row[2] += change
         elif parameter.kind == "preload":
             row[4] += change
+    for parameter, change in zip(problem.linear, linear, strict=True):
+        if parameter.kind == "free_length":
+            constants[parameter.strut, 0] += change
+            constants[parameter.strut, 4] -= constants[parameter.strut, 1] * change
     return constants
+
+
+def free_beside(problem: Problem, candidate: Candidate) -> NDArray[np.bool_]:
+    """Linear parameters that are free beside a candidate's laws, shape (L,).
+
+    The gain of the applied force is degenerate with all else, and has a turn of its own. The free
+    length is seen only where a law is taken from it.
+    """
+    seen = {strut for strut, name in placed(problem, candidate) if effect(name).about_free_length}
+    return np.array(
+        [p.kind != "gain" and (p.kind != "free_length" or p.strut in seen) for p in problem.linear],
+        dtype=np.bool_,
+    )
 
 
 def middle_m(motion: Motion) -> float:

@@ -1,4 +1,4 @@
-"""The linear part of a model: mass, stiffness, damping, preload and gain, never exact.
+"""The linear part of a model: mass, stiffness, damping, preload, gain, free length, never exact.
 
 Each has a prior, from the model file's `tolerance` or a default, which decides only where the data
 do not: a change of all of mass, stiffness and damping in one proportion against a change of the
@@ -17,12 +17,14 @@ from rig.diagnosis.problem.mechanism import Mechanism
 
 Array = NDArray[np.float64]
 
-TOLERANCES = {"mass": 0.05, "stiffness": 0.2, "damping": 0.4, "preload": 0.1, "gain": 0.02}
+TOLERANCES = {
+    "mass": 0.05, "stiffness": 0.2, "damping": 0.4, "preload": 0.1, "gain": 0.02, "free_length": 0.1
+}  # fmt: skip
 """Standard uncertainties where the model file states none, as shares of the nominal value; of the
-preload, of the spring's force over the stroke. A body can be weighed to a few percent with what
-moves along with it; springs are sold to 10 % and installed to 20; dampers vary by 30 % from warm to
-cold and from piece to piece (Dixon, The Shock Absorber Handbook, 2007, 9); a load cell in
-calibration is good to 2 %."""
+preload, of the spring's force over the stroke, and of the free length, of the stroke. A body can be
+weighed to a few percent with what moves along with it; springs are sold to 10 % and installed to
+20; dampers vary by 30 % from warm to cold and from piece to piece (Dixon, The Shock Absorber
+Handbook, 2007, 9); a load cell in calibration is good to 2 %."""
 _LEAST_MASS = 0.1
 """Lowest mass that a correction may leave, as a share of the nominal value. A spring may vanish
 altogether: a law with a stiffness of its own may take its place."""
@@ -34,6 +36,7 @@ PARAMETERS = {
     "damping": "damping_n_s_per_m",
     "preload": "preload_n",
     "gain": "input_gain",
+    "free_length": "free_length_m",
 }
 """Kinds as they are called in a diagnosis and in a model's `tolerance`."""
 EFFECTS = {
@@ -69,6 +72,7 @@ def parameters(
             ("stiffness", stiffness, stiffness_scale, -stiffness),
             ("damping", damping, damping_scale, -np.inf),
             ("preload", 0.0, preload_scale, -np.inf),
+            ("free_length", strut.free_length_m, motion.stroke_m, -np.inf),
         ]
         if bench == "force_given":
             mass = moving_mass_kg(mechanism, i)
@@ -86,7 +90,7 @@ def parameters(
 
 def _deviation(spec: ModelSpec, kind: Kind, scale: float) -> float:
     stated = None if spec.tolerance is None else getattr(spec.tolerance, PARAMETERS[kind])
-    if kind == "preload" and stated is not None:
+    if kind in ("preload", "free_length") and stated is not None:
         return float(stated)
     return (TOLERANCES[kind] if stated is None else float(stated)) * scale
 
@@ -111,7 +115,7 @@ def strut_force(kind: Kind, height_m: Array, velocity_m_per_s: Array, motion: Mo
         return -(height_m - middle_m(motion))
     if kind == "damping":
         return -velocity_m_per_s
-    return np.ones_like(height_m)
+    return np.full_like(height_m, 1.0 if kind == "preload" else 0.0)
 
 
 def corrected(
@@ -155,6 +159,9 @@ def corrected_spec(
                 spec = _with_preload(spec, strut.name, change)
             case "mass":
                 spec = _with_mass(spec, strut.name, change)
+            case "free_length":
+                spec = _with_field(spec, strut.name, "free_length_m", change)
+                spec = _with_preload(spec, strut.name, -strut.stiffness_n_per_m * change)
             case _:
                 spec = _with_sum(spec, strut.name, EFFECTS[parameter.kind], change)
     return spec

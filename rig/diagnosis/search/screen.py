@@ -171,7 +171,7 @@ def _projected(
 ) -> Stage:
     rows = [len(segment.target) for segment in segments]
     # The gain of the applied force is degenerate with all else and has a turn of its own.
-    counted = [i for i, p in enumerate(problem.linear) if p.kind != "gain"]
+    counted = [i for i, p in enumerate(problem.linear) if p.kind not in ("gain", "free_length")]
     prior = np.diag([1.0 / problem.linear[i].deviation for i in counted])
     shared = [
         np.column_stack([segment.linear[:, counted], *columns])

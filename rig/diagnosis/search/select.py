@@ -19,6 +19,7 @@ from rig.diagnosis.problem.contract import (
     Placed,
     Problem,
     existing_values,
+    free_beside,
     nominal,
     slots_of,
 )
@@ -53,8 +54,8 @@ class Effort(NamedTuple):
     gain: float
 
 
-_ROUGH, _FULL = Effort(8, 1e-3), Effort(30, 1e-5)
-"""Fits that are screened among themselves, and fits that decide."""
+_ROUGH, _FULL, _FINAL = Effort(8, 1e-3), Effort(20, 1e-4), Effort(30, 1e-6)
+"""Fits that are screened among themselves, fits that decide, and the one that is reported."""
 
 
 class Scored(NamedTuple):
@@ -187,10 +188,10 @@ class _Search:
         progress: Progress,
     ) -> None:
         self.problem, self.criteria, self.progress = problem, criteria, progress
-        self.free = np.array([p.kind != "gain" for p in problem.linear], dtype=np.bool_)
         self.along = tracks(problem, given)
         self.fits: dict[Candidate, Scored] = {}
         self.unsound: dict[Candidate, str] = {}
+        self.settled: set[Candidate] = set()
         for seed in seeds:
             self._try(seed.candidate, seed.parts)
         base = nominal(problem)
@@ -213,7 +214,7 @@ class _Search:
         if (
             larger.size > smaller.size
             and self._is_formula(smaller)
-            and _more_of_a_kind(smaller, larger)
+            and not _adds_a_kind(smaller, larger)
         ):
             return False
         gain = smaller.score - larger.score
@@ -256,11 +257,14 @@ class _Search:
             levels.append(level)
             self._fit_all(stage, reference, finalists, 0.5 * (begin + end), end)
             before = min(beam, key=_score).score
-            if self.at_floor(self._least()):
+            if self.at_floor(self._settled_best()):
                 return
             if before - level[0].score < self.criteria.least_likelihood_gain:
                 return
-            beam = _diverse(level, self.criteria.beam)
+            beam, best = _diverse(level, self.criteria.beam), self.chosen()
+            if best.size and self._is_formula(best):
+                # Nearly right: worth going on from alone, if it is of this round.
+                beam = [trial for trial in level if set(trial.laws) == set(best.fit.candidate.new)]
 
     def again(self) -> None:
         """Add to, and exchange laws of, the best set: its free run is near the measurement."""
@@ -272,6 +276,8 @@ class _Search:
         values = _values(self.problem, reference.fit)
         laws = reference.fit.candidate.new
         bases = [tuple(other for other in laws if other != law) for law in laws]
+        if self._is_formula(reference):
+            bases = []
         if len(laws) < self.criteria.most_laws:
             bases.insert(0, laws)
         for i, base in enumerate(bases):
@@ -280,7 +286,7 @@ class _Search:
             level = self._next_level(stage, [trial], begin, 0.5 * (begin + end))
             finalists = self._finalists(level)
             self._fit_all(stage, reference, finalists, 0.5 * (begin + end), end)
-            if self.at_floor(self._least()):
+            if self.at_floor(self._settled_best()):
                 return
 
     def _fit_all(
@@ -303,6 +309,12 @@ class _Search:
 
     def _least(self) -> Scored:
         return min(self._sound(), key=lambda s: s.score)
+
+    def _settled_best(self) -> Scored:
+        """The best set, fitted to its end: whether it is at the floor decides on going on."""
+        best = self._least()
+        self._settle(best, best)
+        return self._least()
 
     def best(self) -> tuple[Scored, ...]:
         """The best sound sets, to begin another search with."""
@@ -332,8 +344,8 @@ class _Search:
         known = self.fits.get(nominal(self.problem).added(*base.laws))
         if known is None or not self._is_formula(known):
             return everything
-        taken = {_kind(name) for _, name in base.laws}
-        return [at for at in everything if _kind(at[1]) not in taken]
+        taken = set().union(*(_kinds(name) for _, name in base.laws))
+        return [at for at in everything if not _kinds(at[1]) & taken]
 
     def _backward(
         self, stage: Stage, levels: Sequence[Sequence[Trial]], best: Sequence[Trial]
@@ -385,16 +397,29 @@ class _Search:
             found.append(new)
         return tuple(found)
 
+    def _fit(self, candidate: Candidate, parts: Parts, effort: Effort) -> Fit | None:
+        free = free_beside(self.problem, candidate)
+        parts = parts._replace(linear=np.where(free, parts.linear, 0.0))
+        return fit(self.problem, candidate, parts, free, *effort)
+
     def settle(self) -> None:
         """Fit to their end those sets that may be chosen."""
         best = self.best()
         for scored in best:
-            if scored.score <= self.criteria.hopeless * best[0].score:
-                self._try(scored.fit.candidate, scored.fit.parts, _FULL)
+            self._settle(scored, best[0])
+
+    def _settle(self, scored: Scored, best: Scored) -> None:
+        """Fit a set to its end if it comes near the best one."""
+        candidate = scored.fit.candidate
+        is_near = scored.score <= self.criteria.hopeless * best.score
+        if scored.size and is_near and candidate not in self.settled:
+            self._try(candidate, scored.fit.parts, _FULL)
 
     def _try(self, candidate: Candidate, parts: Parts, effort: Effort = _ROUGH) -> Scored | None:
         """Fit a candidate in simulation and keep the better of this and an earlier fit."""
-        result = fit(self.problem, candidate, parts, self.free, *effort)
+        result = self._fit(candidate, parts, effort)
+        if effort is _FULL:
+            self.settled.add(candidate)
         if result is None:
             return self.fits.get(candidate)
         scored = self._scored(result)
@@ -443,10 +468,10 @@ class _Search:
             candidate = less.added(other)
             if candidate not in self.fits:
                 self._fit_beside(chosen, less, other)
-            elif self.fits[candidate].score <= self.criteria.hopeless * chosen.score:
-                self._try(candidate, self.fits[candidate].fit.parts, _FULL)
-            if candidate in self.fits and candidate not in self.unsound:
-                yield self.fits[candidate]
+            if candidate in self.fits:
+                self._settle(self.fits[candidate], chosen)
+                if candidate not in self.unsound:
+                    yield self.fits[candidate]
 
     def _fit_beside(self, chosen: Scored, less: Candidate, placed: Placed) -> None:
         """Fit a law beside those of a chosen set less another, from the best linear model on."""
@@ -500,7 +525,7 @@ class _Search:
             effects = [values[j] for j in kept] + [chosen.fit.parts.effects[new:]]
             starts = self._starts(chosen.fit, candidate)
             parts = Parts(chosen.fit.parts.linear, np.concatenate(effects), starts)
-            result = fit(self.problem, candidate, parts, self.free)
+            result = self._fit(candidate, parts, _FULL)
             if result is not None and not self.worth(self._scored(result), chosen):
                 found.append(i)
         return tuple(found)
@@ -509,12 +534,14 @@ class _Search:
 
     def with_few_linear(self, chosen: Scored) -> tuple[Scored, bool]:
         """The chosen model, fitted to its end, with those linear corrections that data call for."""
-        settled = fit(self.problem, chosen.fit.candidate, chosen.fit.parts, chosen.fit.free, *_FULL)
+        settled = fit(
+            self.problem, chosen.fit.candidate, chosen.fit.parts, chosen.fit.free, *_FINAL
+        )
         if settled is not None:
             chosen = self._scored(settled)
         needed = self._needed(chosen.fit)
         parts = chosen.fit.parts._replace(linear=np.where(needed, chosen.fit.parts.linear, 0.0))
-        fewer = fit(self.problem, chosen.fit.candidate, parts, needed, *_FULL)
+        fewer = fit(self.problem, chosen.fit.candidate, parts, needed, *_FINAL)
         result = chosen
         if fewer is not None and not self.worth(self._scored(fewer), chosen):
             result = self._scored(fewer)
@@ -615,16 +642,17 @@ def _families(scored: Scored) -> tuple[str, ...]:
     return tuple(sorted(effect(name).family for _, name in scored.fit.candidate.new))
 
 
-def _kind(name: str) -> int:
-    """What a law's force follows, by number."""
+def _kinds(name: str) -> set[int]:
+    """What a law's force follows, by number; what is in no list is a kind of its own."""
     family = effect(name).family
-    return next((i for i, kind in enumerate(KINDS) if family in kind), len(KINDS))
+    return {i for i, kind in enumerate(KINDS) if family in kind} or {len(KINDS)}
 
 
-def _more_of_a_kind(smaller: Scored, larger: Scored) -> bool:
-    """Whether a larger set only has more laws of kinds that the smaller one has."""
-    kinds = {_kind(name) for _, name in smaller.fit.candidate.new}
-    return all(_kind(name) in kinds for _, name in larger.fit.candidate.new)
+def _adds_a_kind(smaller: Scored, larger: Scored) -> bool:
+    """Whether a larger set is the smaller one with a law of a kind that this one has not."""
+    few, many = set(smaller.fit.candidate.new), set(larger.fit.candidate.new)
+    kinds = set().union(*(_kinds(name) for _, name in few))
+    return few < many and any(not _kinds(name) & kinds for _, name in many - few)
 
 
 def _degenerate(other: Scored, chosen: Scored) -> bool:

@@ -23,6 +23,7 @@ LINEAR = {
     "damping_n_s_per_m": ("damping", "N·s/m"),
     "preload_n": ("preload", "N"),
     "input_gain": ("input gain", ""),
+    "free_length_m": ("free length", "m"),
 }
 """What a linear correction may correct, in words, and its unit."""
 
@@ -62,7 +63,7 @@ def difference(item: LinearCorrection) -> str:
     change = item.total.value - item.nominal
     if change == 0.0 or not math.isfinite(change):
         return "as in the file"
-    if item.parameter == "preload_n" or item.nominal == 0.0:
+    if item.parameter in ("preload_n", "free_length_m") or item.nominal == 0.0:
         amount = quantity(abs(change), LINEAR[item.parameter][1])
     else:
         percent = 100.0 * abs(change / item.nominal)
