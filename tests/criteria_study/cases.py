@@ -116,6 +116,10 @@ CASES = {
     "friction_too": _case(
         "explained", ["nonlinear_stiffness", "friction"], _on_dyno, on_dyno.FrictionAndHardening()
     ),
+    "three_kinds": _case(
+        "explained", ["nonlinear_stiffness", "stop", "nonlinear_damping"], _on_dyno,
+        Sum(_HARDENING, _STOP, _ORIFICE),
+    ),
     # Held-out runs with a force that the others have not.
     "some_left": _case(
         "partly_explained", ["nonlinear_stiffness"], _on_dyno,

@@ -13,7 +13,7 @@ ABSURD = [
     ("blocks", 2, "nothing"),
     ("kept_every", 1, "kept_back"),
     ("screened", 0, "one_kind"),
-    ("beam", 0, "two_kinds"),
+    ("beam", 0, "three_kinds"),
     ("most_laws", 0, "hardening"),
     ("most_laws", 1, "two_kinds"),
     ("finalists", 0, "exponential"),
