@@ -20,7 +20,7 @@ from rig.diagnosis.problem.prescribed import Prescribed
 from rig.diagnosis.recording import Recording, RecordingError
 from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
 from rig.diagnosis.search.fit import Fit, fit
-from rig.diagnosis.search.select import Found, Seed, search
+from rig.diagnosis.search.select import Found, Scored, Seed, search
 from rig.diagnosis.search.surface import surface
 from rig.diagnosis.write_up import judgement, needless, written_up
 
@@ -124,9 +124,18 @@ def _searched(
     seeds = [_seed(scored.fit) for scored in (found.linear, *found.best)]
     first = found.rejected
     found = search(problem, found.given, seeds, criteria, _within(progress, 0.55, 0.95))
+    if isinstance(problem, FreeRun):
+        found = found._replace(chosen=_polished(problem, found.chosen))
     # The ranking is that of the first search, about the linear model alone.
     taken = found.chosen.fit.candidate.new
     return found._replace(rejected=tuple(r for r in first if r.placed not in taken)), problem
+
+
+def _polished(problem: FreeRun, chosen: Scored) -> Scored:
+    """What was chosen, fitted with finer steps: intervals are narrower than the usual ones err."""
+    model = chosen.fit
+    result = fit(problem.finer(), model.candidate, model.parts, model.free, 10, 1e-6)
+    return chosen if result is None else chosen._replace(fit=result)
 
 
 def first_fits(problem: FreeRun | Prescribed) -> tuple[Fit, Fit]:

@@ -261,10 +261,9 @@ class _Search:
                 return
             if before - level[0].score < self.criteria.least_likelihood_gain:
                 return
-            beam, best = _diverse(level, self.criteria.beam), self.chosen()
-            if best.size and self._is_formula(best):
-                # Nearly right: worth going on from alone, if it is of this round.
-                beam = [trial for trial in level if set(trial.laws) == set(best.fit.candidate.new)]
+            if self._is_formula(self._least()):
+                return  # Nearly right: what is left is looked for about it, not the linear model.
+            beam = _diverse(level, self.criteria.beam)
 
     def again(self) -> None:
         """Add to, and exchange laws of, the best set: its free run is near the measurement."""
