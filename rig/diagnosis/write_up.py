@@ -171,7 +171,7 @@ def judgement(results: Sequence[Evaluated], found: Found, criteria: SelectionCri
         # Where heights drift, as those of an axis without a spring do, the force is what counts.
         by_force = force < share * linear_force and left < criteria.explained * linear
         if left < share * linear or by_force:
-            return "ambiguous" if found.rivals else "partly_explained"
+            return "partly_explained"
     return "not_explained"
 
 

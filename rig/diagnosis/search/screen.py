@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import CATALOGUE, effect
 from rig.diagnosis.numerics.compiled import law
-from rig.diagnosis.numerics.least_squares import joined, solve
+from rig.diagnosis.numerics.least_squares import Prior, Space, joined, solve
 from rig.diagnosis.problem.contract import (
     Candidate,
     Integers,
@@ -88,7 +88,8 @@ class Trial(NamedTuple):
 
     Attributes:
         laws: The laws, each in its strut.
-        values: Parameters of each.
+        values: Parameters of each; where it is taken from the strut's free length, then by how much
+            that is another one than the reference's.
         cost: Sum of squares that they leave.
         scores: Out-of-sample sum of squares of each block.
     """
@@ -202,11 +203,41 @@ def _projected(
 
 def answer(stage: Stage, strut: int, name: str, values: Array) -> Array:
     """What a law adds to the whitened answer, shape (m,)."""
-    forces = segment_forces(stage.segments, strut, name, values, stage.constants, reference=False)
+    constants, (own, shift) = stage.constants, law_and_shift(name, values)
+    if shift:
+        constants = constants.copy()
+        constants[strut, 0] += shift
+    forces = segment_forces(stage.segments, strut, name, own, constants, reference=False)
     parts = [
         segment.respond(strut, force) for segment, force in zip(stage.segments, forces, strict=True)
     ]
     return np.concatenate([*parts, np.zeros(len(stage.target) - sum(map(len, parts)))])
+
+
+def law_and_shift(name: str, values: Array) -> tuple[Array, float]:
+    """Parameters of a law in a trial, and by how much the free length is another one."""
+    count = len(effect(name).parameters)
+    return values[:count], float(values[count]) if len(values) > count else 0.0
+
+
+def _with_shift(name: str, values: Array) -> Array:
+    own, shift = law_and_shift(name, values)
+    return np.append(own, shift) if effect(name).about_free_length else own
+
+
+def _space(stage: Stage, at: Placed, values: Array) -> tuple[Space, Array]:
+    """Where a law's parameters in a trial are searched, and the weights of their priors."""
+    strut, name = at
+    own, _ = law_and_shift(name, values)
+    space = law_space(name, stage.problem.motions[strut], own)
+    if len(values) == len(own):
+        return space, np.zeros(len(own))
+    scales = [
+        p.deviation for p in stage.problem.linear if (p.strut, p.kind) == (strut, "free_length")
+    ]
+    endless = np.array([np.inf])
+    shift = Space(-endless, endless, np.array(scales), np.array([False]))
+    return joined([space, shift]), np.append(np.zeros(len(own)), 1.0)
 
 
 def response(stage: Stage, strut: int, name: str, values: Array) -> Array:
@@ -350,7 +381,7 @@ def _columns(stage: Stage, base: Trial) -> Array:
     found: list[Array] = []
     for (strut, name), values in zip(base.laws, base.values, strict=True):
         here = response(stage, strut, name, values)
-        space = law_space(name, stage.problem.motions[strut], values)
+        space, _ = _space(stage, (strut, name), values)
         inner = space.inner(values)
         for i in range(len(values)):
             moved = inner.copy()
@@ -362,6 +393,7 @@ def _columns(stage: Stage, base: Trial) -> Array:
 
 def refined(stage: Stage, laws: Sequence[Placed], values: Sequence[Array]) -> Trial | None:
     """All parameters of a set of laws, fitted together along the motion."""
+    values = [_with_shift(name, own) for (_, name), own in zip(laws, values, strict=True)]
     lengths = np.cumsum([0, *(len(own) for own in values)])
     known: list[dict[bytes, Array]] = [{} for _ in laws]
 
@@ -381,13 +413,11 @@ def refined(stage: Stage, laws: Sequence[Placed], values: Sequence[Array]) -> Tr
         there = stage.target - np.sum([one(i, own) for i, own in enumerate(split(x))], axis=0)
         return there if np.all(np.isfinite(there)) else None
 
-    space = joined(
-        [
-            law_space(name, stage.problem.motions[strut], own)
-            for (strut, name), own in zip(laws, values, strict=True)
-        ]
-    )
-    found = solve(residual, np.concatenate(values), space, _STEPS, 1e-3)
+    spaces = [_space(stage, at, own) for at, own in zip(laws, values, strict=True)]
+    weights = np.concatenate([weight for _, weight in spaces])
+    prior = Prior(np.zeros(len(weights)), weights, lambda _: 1.0)
+    space = joined([space for space, _ in spaces])
+    found = solve(residual, np.concatenate(values), space, _STEPS, 1e-3, prior=prior)
     if found is None:
         return None
     scores = _scores(stage, found.residual, found.jacobian)

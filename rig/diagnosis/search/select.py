@@ -24,10 +24,11 @@ from rig.diagnosis.problem.contract import (
     slots_of,
 )
 from rig.diagnosis.search.criteria import KINDS, SelectionCriteria
-from rig.diagnosis.search.fit import Fit, block_scores, fit, spread
+from rig.diagnosis.search.fit import Fit, block_scores, effect_variables, fit, spread
 from rig.diagnosis.search.screen import (
     Stage,
     Trial,
+    law_and_shift,
     linear_beside,
     plain,
     proposed,
@@ -56,6 +57,11 @@ class Effort(NamedTuple):
 
 _ROUGH, _FULL, _FINAL = Effort(8, 1e-3), Effort(20, 1e-4), Effort(30, 1e-6)
 """Fits that are screened among themselves, fits that decide, and the one that is reported."""
+
+
+_INSEPARABLE = 0.995
+"""Correlation from which on to fix one of two parameters would cut the interval of the other to a
+tenth."""
 
 
 class Scored(NamedTuple):
@@ -275,10 +281,9 @@ class _Search:
         values = _values(self.problem, reference.fit)
         laws = reference.fit.candidate.new
         bases = [tuple(other for other in laws if other != law) for law in laws]
-        if self._is_formula(reference):
-            bases = []
         if len(laws) < self.criteria.most_laws:
-            bases.insert(0, laws)
+            # What is nearly right more likely has a wrong formula than one law too few.
+            bases.insert(len(bases) if self._is_formula(reference) else 0, laws)
         for i, base in enumerate(bases):
             trial = Trial(base, tuple(values[law] for law in base), 0.0, np.zeros(1))
             begin, end = 0.85 * i / len(bases), 0.85 * (i + 1) / len(bases)
@@ -375,8 +380,14 @@ class _Search:
             if reference.fit.candidate.kept != base.kept
             else reference.fit.parts.effects[: len(existing_values(self.problem, base))]
         ]
-        values += [trial.values[i] for i in order]
         linear = reference.fit.parts.linear + linear_beside(stage, trial)
+        for i in order:
+            own, shift = law_and_shift(trial.laws[i][1], trial.values[i])
+            values.append(own)
+            linear = linear + [
+                shift * ((p.strut, p.kind) == (trial.laws[i][0], "free_length"))
+                for p in self.problem.linear
+            ]
         least = np.array([p.least for p in self.problem.linear])
         parts = Parts(
             np.maximum(linear, least),
@@ -544,25 +555,36 @@ class _Search:
         result = chosen
         if fewer is not None and not self.worth(self._scored(fewer), chosen):
             result = self._scored(fewer)
-        if not _alike(self.problem, result.fit):
+        share = _alike(self.problem, result.fit)
+        if share is None:
             return result, False
         only = np.array([p.kind == "gain" for p in self.problem.linear], dtype=np.bool_)
-        start = result.fit.parts._replace(linear=np.zeros(len(only)))
+        start = result.fit.parts._replace(linear=np.where(only, 1.0 / (1.0 + share) - 1.0, 0.0))
         gain = fit(self.problem, chosen.fit.candidate, start, only)
         if gain is not None and not self.worth(self._scored(gain), result):
             return self._scored(gain), True
         return result, True
 
     def _needed(self, result: Fit) -> Flags:
-        """Backward elimination by Wald's test with the covariance of a coloured residual."""
+        """Backward elimination by Wald's test with the covariance of a coloured residual.
+
+        What an effect's parameter cannot be told from stays free: without it the interval of that
+        parameter would claim that it can.
+        """
         variables = np.flatnonzero(result.free)
         count = len(variables)
-        known = spread(result).covariance[:count, :count].copy()
+        whole = spread(result).covariance
+        effects = np.concatenate([[], *effect_variables(self.problem, result).values()]).astype(int)
+        size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
+        alike = np.abs(whole / np.outer(size, size))[:count, effects]
+        bound = np.max(alike, axis=1, initial=0.0) > _INSEPARABLE
+        known = whole[:count, :count].copy()
         x = result.space.inner(result.solution.values)[:count].copy()
         left = list(range(count))
         while left:
             part = np.array(left)
             sizes = np.abs(x[part]) / np.sqrt(np.maximum(np.diag(known)[part], 1e-300))
+            sizes[bound[part]] = np.inf
             worst = int(part[np.argmin(sizes)])
             if float(np.min(sizes)) >= self.criteria.significant:
                 break
@@ -683,10 +705,10 @@ def _existing(problem: Problem, result: Fit) -> dict[int, Array]:
     }
 
 
-def _alike(problem: Problem, result: Fit) -> bool:
-    """Whether mass, stiffness and damping changed in one proportion, within their intervals."""
+def _alike(problem: Problem, result: Fit) -> float | None:
+    """Share by which mass, stiffness and damping all changed, if it is one within intervals."""
     if not any(p.kind == "gain" for p in problem.linear):
-        return False
+        return None
     known = spread(result)
     free = [p for p, is_free in zip(problem.linear, result.free, strict=True) if is_free]
     changes = result.solution.values[: len(free)]
@@ -699,6 +721,7 @@ def _alike(problem: Problem, result: Fit) -> bool:
             )
     least = sum(1 for p in problem.linear if p.kind in ("mass", "stiffness", "damping"))
     if len(shares) < least:
-        return False
+        return None
     middle = float(np.median([share for share, _ in shares]))
-    return all(abs(share - middle) < max(half, 0.01) for share, half in shares)
+    is_one = all(abs(share - middle) < max(half, 0.01) for share, half in shares)
+    return middle if is_one else None
