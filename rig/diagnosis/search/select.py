@@ -24,7 +24,7 @@ from rig.diagnosis.problem.contract import (
     slots_of,
 )
 from rig.diagnosis.search.criteria import KINDS, SelectionCriteria
-from rig.diagnosis.search.fit import Fit, block_scores, effect_variables, fit, spread
+from rig.diagnosis.search.fit import Fit, block_scores, fit, spread
 from rig.diagnosis.search.screen import (
     Stage,
     Trial,
@@ -57,11 +57,6 @@ class Effort(NamedTuple):
 
 _ROUGH, _FULL, _FINAL = Effort(8, 1e-3), Effort(20, 1e-4), Effort(30, 1e-6)
 """Fits that are screened among themselves, fits that decide, and the one that is reported."""
-
-
-_INSEPARABLE = 0.995
-"""Correlation from which on to fix one of two parameters would cut the interval of the other to a
-tenth."""
 
 
 class Scored(NamedTuple):
@@ -566,25 +561,15 @@ class _Search:
         return result, True
 
     def _needed(self, result: Fit) -> Flags:
-        """Backward elimination by Wald's test with the covariance of a coloured residual.
-
-        What an effect's parameter cannot be told from stays free: without it the interval of that
-        parameter would claim that it can.
-        """
+        """Backward elimination by Wald's test with the covariance of a coloured residual."""
         variables = np.flatnonzero(result.free)
         count = len(variables)
-        whole = spread(result).covariance
-        effects = np.concatenate([[], *effect_variables(self.problem, result).values()]).astype(int)
-        size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
-        alike = np.abs(whole / np.outer(size, size))[:count, effects]
-        bound = np.max(alike, axis=1, initial=0.0) > _INSEPARABLE
-        known = whole[:count, :count].copy()
+        known = spread(result).covariance[:count, :count].copy()
         x = result.space.inner(result.solution.values)[:count].copy()
         left = list(range(count))
         while left:
             part = np.array(left)
             sizes = np.abs(x[part]) / np.sqrt(np.maximum(np.diag(known)[part], 1e-300))
-            sizes[bound[part]] = np.inf
             worst = int(part[np.argmin(sizes)])
             if float(np.min(sizes)) >= self.criteria.significant:
                 break
