@@ -154,7 +154,10 @@ def first_fits(problem: FreeRun | Prescribed) -> tuple[Fit, Fit]:
             f"model {problem.spec.name}: runs away on the recordings, expected one that stays "
             "near them: check its stiffness, its free length and the sign of the applied force"
         )
-    return given, fit(problem, base, given.parts, free_beside(problem, base), 12) or given
+    free = free_beside(problem, base)
+    # A prior that weighs by what is left where a fit begins would hold it there.
+    near = fit(problem, base, given.parts, free, 12, coloured=False) or given
+    return given, fit(problem, base, near.parts, free, 12) or near
 
 
 def _sharpened(problem: FreeRun | Prescribed, result: Fit) -> FreeRun | Prescribed:

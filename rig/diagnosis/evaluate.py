@@ -28,8 +28,10 @@ from rig.diagnosis.search.fit import Fit, fit
 
 Array = NDArray[np.float64]
 
-_DRAWS = 3
-"""Draws of the noise from which a floor is taken; the third changes it by a few percent."""
+_DRAWS, _INPUT_DRAWS = 3, 8
+"""Draws of the noise from which a floor is taken: of the motion's the third changes it by a few
+percent; of the applied force's the largest counts, since a lightly damped motion answers to it in
+so few independent swings that their RMS scatters by a third."""
 _LARGEST_INPUT_NOISE = 0.01
 """Share of an applied force's range above which what is not smooth is not noise but excitation."""
 _TOP = 0.8
@@ -48,6 +50,7 @@ class Evaluated(NamedTuple):
         linear_force_n: Residual force of the best linear model.
         counted: The same before and after.
         floor: What a right model leaves.
+        drift_m: What noise of the applied force alone leaves of it; zero on a dyno.
         series: For the report.
     """
 
@@ -56,6 +59,7 @@ class Evaluated(NamedTuple):
     linear_force_n: float
     counted: BeforeAfter
     floor: NoiseFloor
+    drift_m: float
     series: tuple[HeldOutSeries, ...]
 
 
@@ -173,7 +177,8 @@ def _free_run(
     residual = [np.where(rows, f.force_n, np.nan) for f in forces if f is not None]
     heights = BeforeAfter(rms(measured - on_dart[0]), rms(measured - on_dart[1]))
     deviation = forces[1].deviation_n if forces[1] is not None else np.full((1, 1), np.nan)
-    floor_m = float(np.hypot(rms(noise), _input_floor_m(problem, k, models.chosen)))
+    drift_m = _input_floor_m(problem, k, models.chosen)
+    floor_m = float(np.hypot(rms(noise), drift_m))
     series = tuple(
         HeldOutSeries(
             run.grid.name, strut.name, "m", run.grid.t_s, measured[:, i], on_dart[0][:, i],
@@ -190,7 +195,7 @@ def _free_run(
     )
     return Evaluated(
         figures, rms(measured - linear.heights_m), linear_n, heights,
-        NoiseFloor(floor_m, rms(deviation)), series,
+        NoiseFloor(floor_m, rms(deviation)), drift_m, series,
     )  # fmt: skip
 
 
@@ -233,7 +238,7 @@ def _input_floor_m(problem: FreeRun, k: int, model: tuple[Candidate, Parts]) -> 
         return 0.0
     rng = np.random.default_rng(0)
     squares: list[float] = []
-    for _ in range(_DRAWS):
+    for _ in range(_INPUT_DRAWS):
         # White between samples: what the recorded force is wrong by is held over a sample or so.
         nodes = noise * rng.standard_normal(len(run.grid.t_s))
         fine = np.append(np.repeat(nodes[:-1], 2 * run.substeps), nodes[-1])
@@ -241,7 +246,7 @@ def _input_floor_m(problem: FreeRun, k: int, model: tuple[Candidate, Parts]) -> 
         moved = problem.simulated(other, candidate, parts, parts.starts[k])
         if moved is not None:
             squares.append(float(np.mean((moved.heights_m - there.heights_m) ** 2)))
-    return float(np.sqrt(np.mean(squares))) if squares else 0.0
+    return float(np.sqrt(max(squares, default=0.0)))
 
 
 def input_noise_n(run: Run) -> float:
@@ -278,7 +283,7 @@ def _prescribed(problem: Prescribed, k: int, models: Models, kept: bool) -> Eval
     floor = NoiseFloor(float("nan"), _motion_floor_n(problem, drive, k, models.chosen))
     figures = RunFigures(drive.grid.name, nothing, error, error)
     left = rms(measured - forces[1])
-    return Evaluated(figures, left, left, error, floor, series)
+    return Evaluated(figures, left, left, error, floor, 0.0, series)
 
 
 def _motion_floor_n(

@@ -143,11 +143,15 @@ def written_up(
 
 
 def needless(results: Sequence[Evaluated], criteria: SelectionCriteria) -> bool:
-    """Whether held-out data are at the floor without any law, and no nearer to it with the laws."""
+    """Whether held-out data are at the floor without any law, and no nearer to it with the laws.
+
+    By less than what noise of the applied force alone causes is no nearer.
+    """
     after = _mean([r.counted.after for r in results]) ** 2
     linear = _mean([r.linear for r in results]) ** 2
     floor = _mean([_floor(r) for r in results]) ** 2
-    least = max(criteria.least_above_noise * floor, criteria.least_share * (linear - floor))
+    drift = _mean([r.drift_m for r in results]) ** 2
+    least = max(criteria.least_above_noise * floor, criteria.least_share * (linear - floor), drift)
     return linear <= criteria.explained**2 * floor and linear - after <= least
 
 
