@@ -2,9 +2,8 @@
 
 References:
     Ljung, System Identification (1999), 9.4, covariance of output-error estimates.
-    White, Maximum likelihood estimation of misspecified models, Econometrica 50 (1982), and Newey,
-    West, A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent
-    covariance matrix, Econometrica 55 (1987), for intervals where the residual is coloured.
+    White, Maximum likelihood estimation of misspecified models, Econometrica 50 (1982), for
+    intervals where the residual is coloured.
     Rad, Maleki, A scalable estimate of the out-of-sample prediction error via approximate
     leave-one-out, J. R. Stat. Soc. B 82 (2020); here blocks are left out, and a step of Newton's
     method stands for the fit without each.
@@ -42,8 +41,6 @@ _TINY = 1e-100
 """Stands for nothing in a quotient; its square is still a number."""
 _NIL = 1e-2
 """Share of a like parameter below which one is searched in that one's units."""
-_NEIGHBOURS = 3
-"""Blocks next to one another whose scores may be alike: lightly damped motion outlasts a block."""
 _LAGS = 20
 """Lags of the whiteness test."""
 
@@ -360,13 +357,10 @@ def _sandwich(result: Fit) -> Spread:
     count = int(result.blocks.max()) + 1
     # What the prior's own uncertainty adds.
     meat = np.diag(result.solution.level * prior / size**2)
-    scores = np.array(
-        [scaled[result.blocks == b].T @ residual[result.blocks == b] for b in range(count)]
-    )
-    meat += scores.T @ scores
-    for lag in range(1, min(_NEIGHBOURS, count - 1) + 1):
-        across = scores[lag:].T @ scores[:-lag]
-        meat += (1.0 - lag / (_NEIGHBOURS + 1.0)) * (across + across.T)
+    for b in range(count):
+        part = np.flatnonzero(result.blocks == b)
+        score = scaled[part].T @ residual[part]
+        meat += np.outer(score, score)
     variables = inverse.shape[0]
     robust = inverse @ meat @ inverse * (count / max(count - min(variables, count // 2), 1))
     white = inverse * max(1.0, result.mean_square)
