@@ -5,8 +5,6 @@ import math
 from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start, Writable
 from dart_model.effects.ranges import geometric, grid, moving, within
 
-_STANDARD_GRAVITY_M_PER_S2 = 9.81
-
 
 def _hidden_mass(
     _t_s: float,
@@ -16,11 +14,13 @@ def _hidden_mass(
     _temperature_c: float,
     state: Floats,
     p: Floats,
-    _strut: Floats,
+    strut: Floats,
 ) -> float:
-    # The state is the spring's deflection in m and the hidden mass's own velocity in m/s.
+    # The deflection is counted from rest, where the spring carries the mass: its weight acts on
+    # the body. The state is that deflection in m and the hidden mass's own velocity in m/s.
     omega = 2.0 * math.pi * p[1]
-    return p[0] * omega * (omega * state[0] + 2.0 * p[2] * (state[1] - velocity_m_per_s)) - p[3]
+    spring_and_damper = omega * (omega * state[0] + 2.0 * p[2] * (state[1] - velocity_m_per_s))
+    return p[0] * (spring_and_damper - strut[3])
 
 
 def _hidden_mass_rate(
@@ -48,7 +48,7 @@ def _hidden_mass_starts(motion: Motion) -> list[Start]:
         low_hz, high_hz = max(low_hz, 0.2 * natural_hz), min(high_hz, 15.0 * natural_hz)
     mass_kg = 0.1 * motion.mass_kg
     frequencies = geometric(low_hz, high_hz, 16)
-    return grid([mass_kg], frequencies, [0.01, 0.06], [_STANDARD_GRAVITY_M_PER_S2 * mass_kg])
+    return grid([mass_kg], frequencies, [0.01, 0.06])
 
 
 def _masses(motion: Motion) -> tuple[float, float]:
@@ -67,13 +67,11 @@ HIDDEN_MASS = Effect(
         Parameter("mass_kg", "kg", 1e-12, 1e9, "mass on the spring"),
         Parameter("frequency_hz", "Hz", 1e-9, 1e9, "natural frequency of the mass on its spring"),
         Parameter("damping_ratio", "", 0.0, 2.0, "damping over critical damping"),
-        Parameter("weight_n", "N", -1e12, 1e12, "weight the mass adds at rest"),
     ),
     force=_hidden_mass,
     excitation="frequencies around the mass's own resonance",
     reference="Den Hartog, Mechanical Vibrations (1956), 3.2, dynamic absorber",
     rate=_hidden_mass_rate,
-    scaled=(0, 3),
     state_scales=(0.01, 0.01),
     fits_state=True,
     starts=_hidden_mass_starts,

@@ -20,7 +20,7 @@ from rig.diagnosis.problem.prescribed import Prescribed
 from rig.diagnosis.recording import Recording, RecordingError
 from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
 from rig.diagnosis.search.fit import Fit, fit
-from rig.diagnosis.search.select import Found, Scored, Seed, search
+from rig.diagnosis.search.select import Found, Scored, Search, Seed
 from rig.diagnosis.search.surface import surface
 from rig.diagnosis.write_up import judgement, needless, written_up
 
@@ -119,16 +119,16 @@ def _searched(
     progress("fitting the linear part", 0.03)
     given, linear = first_fits(problem)
     problem = _sharpened(problem, linear)
-    found = search(problem, given, [_seed(linear)], criteria, _within(progress, 0.05, 0.55))
-    problem = _sharpened(problem, found.chosen.fit)
-    seeds = [_seed(scored.fit) for scored in (found.linear, *found.best)]
-    first = found.rejected
-    found = search(problem, found.given, seeds, criteria, _within(progress, 0.55, 0.95))
+    first = Search(problem, given, [_seed(linear)], criteria, _within(progress, 0.05, 0.55))
+    first.explore()
+    problem = _sharpened(problem, first.chosen().fit)
+    seeds = [_seed(scored.fit) for scored in (first.linear, *first.best())]
+    second = Search(problem, given, seeds, criteria, _within(progress, 0.55, 0.95))
+    second.explore()
+    found = second.found(first)
     if isinstance(problem, FreeRun):
         found = found._replace(chosen=_polished(problem, found.chosen))
-    # The ranking is that of the first search, about the linear model alone.
-    taken = found.chosen.fit.candidate.new
-    return found._replace(rejected=tuple(r for r in first if r.placed not in taken)), problem
+    return found, problem
 
 
 def _polished(problem: FreeRun, chosen: Scored) -> Scored:

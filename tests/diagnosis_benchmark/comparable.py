@@ -168,7 +168,6 @@ COMPARABLE: dict[str, tuple[Same, ...]] = {
         _of("hidden_mass", "mass_kg", "mass_kg"),
         _of("hidden_mass", "frequency_hz", "frequency_hz"),
         _of("hidden_mass", "damping_ratio", "damping_ratio"),
-        Same("hidden_mass", "weight_n", lambda t, b: t["mass_kg"] * b.gravity_m_per_s2),
     ),
 }
 """Planted law -> the parameters of a diagnosis that can be held against it.

@@ -130,6 +130,7 @@ def solve(
     rows: Mapping[int, Rows] = MappingProxyType({}),
     threads: int = 1,
     prior: Prior | None = None,
+    sides: int = 1,
 ) -> Solution | None:
     """Least squares from a start.
 
@@ -142,6 +143,9 @@ def solve(
         rows: Parameters, by index, that move some rows only; their derivatives then cost less.
         threads: Differences that are taken at a time.
         prior: What is known before; nothing if absent.
+        sides: Sides on which the last differences are taken. With two the smaller counts: where a
+            law switches, one may catch a jump that is no derivative. With one the last tangent of
+            the search is kept.
 
     Returns:
         The solution, or None if there is no residual at the start.
@@ -154,8 +158,8 @@ def solve(
     known = prior or Prior(np.zeros_like(x), np.zeros_like(x), lambda _: 1.0)
     level = known.level_of(r)
 
-    def tangent(*, both: bool = False) -> Array:
-        return _jacobian(residual_of, x, r, space, rows, threads, both=both)
+    def tangent(sides: int = 1) -> Array:
+        return _jacobian(residual_of, x, r, space, rows, threads, sides)
 
     jacobian, fresh = tangent(), True
     for _ in range(iterations):
@@ -183,7 +187,9 @@ def solve(
         else:
             jacobian, fresh = tangent(), True
     precision = level * known.weight**2
-    return Solution(space.outer(x), r, tangent(both=True), float(r @ r), level, precision)
+    if sides > 1 or not fresh:
+        jacobian = tangent(sides)
+    return Solution(space.outer(x), r, jacobian, float(r @ r), level, precision)
 
 
 class _Point(NamedTuple):
@@ -259,13 +265,9 @@ def _jacobian(
     space: Space,
     rows: Mapping[int, Rows],
     threads: int,
-    *,
-    both: bool = False,
+    sides: int,
 ) -> Array:
-    """Derivatives (m, k) by differences; of `both` sides the smaller.
-
-    Where a law switches, a difference of one side may catch a jump that is no derivative.
-    """
+    """Derivatives (m, k) by differences; of two sides the smaller."""
     columns = np.zeros((len(r), len(x)))
     everything = Rows(0, len(r), residual_of)
 
@@ -283,8 +285,8 @@ def _jacobian(
             moved = there.residual_of(space.outer(trial))
             if moved is not None and np.all(np.isfinite(moved)):
                 found.append((moved - r[part]) / moved_by)
-                if not both:
-                    break
+            if len(found) == sides:
+                break
         if found:
             columns[part, i] = min(found, key=lambda column: float(column @ column))
 

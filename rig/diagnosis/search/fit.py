@@ -240,6 +240,7 @@ def fit(
     free: Flags,
     iterations: int = 15,
     tolerance: float = 1e-4,
+    sides: int = 2,
     *,
     effects: bool = True,
     coloured: bool = True,
@@ -253,6 +254,7 @@ def fit(
         free: Which linear parameters are fitted, shape (L,); the others stay as in `first`.
         iterations: Most steps.
         tolerance: Relative gain below which the fit ends.
+        sides: Sides on which the last differences are taken, see `solve`.
         effects: Whether effects' parameters are fitted.
         coloured: Whether priors weigh by the colour of the residual, not as beside white noise.
 
@@ -264,7 +266,7 @@ def fit(
     blocks = [problem.blocks(k) for k in range(problem.recordings)]
     solution = solve(
         layout.residual, layout.full[layout.varied], layout.space, iterations, tolerance,
-        layout.rows(blocks), os.cpu_count() or 1, prior,
+        layout.rows(blocks), os.cpu_count() or 1, prior, sides,
     )  # fmt: skip
     if solution is None:
         return None

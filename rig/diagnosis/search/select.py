@@ -49,13 +49,15 @@ class Effort(NamedTuple):
     Attributes:
         steps: Most steps.
         gain: Relative gain below which it ends.
+        sides: Sides on which its last differences are taken.
     """
 
     steps: int
     gain: float
+    sides: int
 
 
-_ROUGH, _FULL, _FINAL = Effort(8, 1e-3), Effort(20, 1e-4), Effort(30, 1e-6)
+_ROUGH, _FULL, _FINAL = Effort(8, 1e-3, 1), Effort(20, 1e-4, 2), Effort(30, 1e-6, 2)
 """Fits that are screened among themselves, fits that decide, and the one that is reported."""
 
 
@@ -105,7 +107,6 @@ class Found(NamedTuple):
         plain: The same with those corrections alone that the data call for.
         chosen: The model that was chosen.
         rivals: Models with other families that the data cannot tell from it.
-        best: The best sets of laws, whether chosen or not.
         superfluous: Existing effects, by index, without which the data are as well described.
         rejected: Laws that were not chosen, best first.
         gain_alike: Whether mass, stiffness and damping changed in one proportion, as they would by
@@ -117,7 +118,6 @@ class Found(NamedTuple):
     plain: Scored
     chosen: Scored
     rivals: tuple[Scored, ...]
-    best: tuple[Scored, ...]
     superfluous: tuple[int, ...]
     rejected: tuple[Rejected, ...]
     gain_alike: bool
@@ -135,14 +135,8 @@ class Seed(NamedTuple):
     parts: Parts
 
 
-def search(
-    problem: Problem,
-    given: Fit,
-    seeds: Sequence[Seed],
-    criteria: SelectionCriteria,
-    progress: Progress,
-) -> Found:
-    """Find what a nominal model lacks.
+class Search:
+    """A search for what a nominal model lacks.
 
     Args:
         problem: Model and recordings.
@@ -152,33 +146,6 @@ def search(
         criteria: What decides.
         progress: Told what is being done and the share that is done.
     """
-    searching = _Search(problem, given, seeds, criteria, progress)
-    if len(seeds) > 1:
-        searching.again()
-    else:
-        searching.run()
-    searching.settle()
-    chosen = searching.without_needless(searching.chosen())
-    progress("comparing rivals", 0.85)
-    rivals = searching.rivals(chosen)
-    superfluous = searching.superfluous(chosen)
-    chosen, alike = searching.with_few_linear(chosen)
-    plain_model = chosen if not chosen.size else searching.with_few_linear(searching.linear)[0]
-    return Found(
-        given,
-        searching.linear,
-        plain_model,
-        chosen,
-        rivals,
-        searching.best(),
-        superfluous,
-        searching.rejected(chosen, rivals),
-        alike,
-    )
-
-
-class _Search:
-    """The state of one search."""
 
     def __init__(
         self,
@@ -188,7 +155,7 @@ class _Search:
         criteria: SelectionCriteria,
         progress: Progress,
     ) -> None:
-        self.problem, self.criteria, self.progress = problem, criteria, progress
+        self.problem, self.given, self.criteria, self.progress = problem, given, criteria, progress
         self.along = tracks(problem, given)
         self.fits: dict[Candidate, Scored] = {}
         self.unsound: dict[Candidate, str] = {}
@@ -202,15 +169,42 @@ class _Search:
         self.nothing: Trial | None = None
         self.linear_stage: Stage | None = None
 
+    def explore(self) -> None:
+        """Fit sets of laws that may be chosen, about the linear model or the best seed."""
+        if len(self.fits) > 1:
+            self._about_the_best()
+        else:
+            self._from_nothing()
+        best = self.best()
+        for scored in best:
+            self._settle(scored, best[0])
+
+    def found(self, first: "Search") -> Found:
+        """What was found, once explored.
+
+        Args:
+            first: The search about the linear model, for what was not chosen.
+        """
+        chosen = self._without_needless(self.chosen())
+        self.progress("comparing rivals", 0.85)
+        rivals = self._rivals(chosen)
+        superfluous = self._superfluous(chosen)
+        chosen, alike = self._with_few_linear(chosen)
+        plain_model = self._with_few_linear(self.linear)[0] if chosen.size else chosen
+        rejected = first.rejected(chosen, rivals)
+        return Found(
+            self.given, self.linear, plain_model, chosen, rivals, superfluous, rejected, alike
+        )
+
     def _scored(self, result: Fit) -> Scored:
         return Scored(result, block_scores(self.problem, result))
 
     # --- whether one model is worth more than another ---------------------------------------------
 
-    def worth(self, smaller: Scored, larger: Scored) -> bool:
+    def _worth(self, smaller: Scored, larger: Scored) -> bool:
         """Whether a larger model is worth its further laws."""
         criteria, above = self.criteria, smaller.score - smaller.fit.rows
-        if self.at_floor(smaller) and (larger.size > smaller.size or not smaller.size):
+        if self._at_floor(smaller) and (larger.size > smaller.size or not smaller.size):
             return False
         if (
             larger.size > smaller.size
@@ -225,7 +219,7 @@ class _Search:
             and gain > criteria.least_share * above
         )
 
-    def at_floor(self, result: Scored) -> bool:
+    def _at_floor(self, result: Scored) -> bool:
         """Whether nothing is left that a law could be looked for in."""
         first, later = self.criteria.least_above_noise, self.criteria.least_above_noise_later
         share = later if result.size else first
@@ -239,10 +233,10 @@ class _Search:
 
     # --- the search ---------------------------------------------------------------------------
 
-    def run(self) -> None:
+    def _from_nothing(self) -> None:
         """Explore sets of one law, of two, ..., and fit the best of each size in full."""
         reference = self.linear
-        if self.at_floor(reference):
+        if self._at_floor(reference):
             return
         stage = self._linear_stage()
         self.nothing = plain(stage)
@@ -258,7 +252,7 @@ class _Search:
             levels.append(level)
             self._fit_all(stage, reference, finalists, 0.5 * (begin + end), end)
             before = min(beam, key=_score).score
-            if self.at_floor(self._settled_best()):
+            if self._at_floor(self._settled_best()):
                 return
             if before - level[0].score < self.criteria.least_likelihood_gain:
                 return
@@ -266,10 +260,10 @@ class _Search:
                 return  # Nearly right: what is left is looked for about it, not the linear model.
             beam = _diverse(level, self.criteria.beam)
 
-    def again(self) -> None:
+    def _about_the_best(self) -> None:
         """Add to, and exchange laws of, the best set: its free run is near the measurement."""
         reference = self._least()
-        if self.at_floor(reference):
+        if self._at_floor(reference):
             return
         stage = stage_of(self.problem, reference.fit.candidate, reference.fit.parts)
         self.nothing = self.nothing or plain(stage)
@@ -285,7 +279,7 @@ class _Search:
             level = self._next_level(stage, [trial], begin, 0.5 * (begin + end))
             finalists = self._finalists(level)
             self._fit_all(stage, reference, finalists, 0.5 * (begin + end), end)
-            if self.at_floor(self._settled_best()):
+            if self._at_floor(self._settled_best()):
                 return
 
     def _fit_all(
@@ -316,9 +310,10 @@ class _Search:
         return self._least()
 
     def best(self) -> tuple[Scored, ...]:
-        """The best sound sets, to begin another search with."""
-        order = sorted(self._sound(), key=lambda s: s.score)
-        return tuple(s for s in order if s.size > 0)[: self.criteria.finalists]
+        """The best sound sets that come near the best one."""
+        order = sorted((s for s in self._sound() if s.size > 0), key=lambda s: s.score)
+        near = (s for s in order if self._is_near(s, order[0]))
+        return tuple(near)[: self.criteria.finalists]
 
     def _sound(self) -> Iterable[Scored]:
         return (s for c, s in self.fits.items() if c not in self.unsound)
@@ -407,18 +402,15 @@ class _Search:
         parts = parts._replace(linear=np.where(free, parts.linear, 0.0))
         return fit(self.problem, candidate, parts, free, *effort)
 
-    def settle(self) -> None:
-        """Fit to their end those sets that may be chosen."""
-        best = self.best()
-        for scored in best:
-            self._settle(scored, best[0])
-
     def _settle(self, scored: Scored, best: Scored) -> None:
         """Fit a set to its end if it comes near the best one."""
         candidate = scored.fit.candidate
-        is_near = scored.score <= self.criteria.hopeless * best.score
+        is_near = self._is_near(scored, best)
         if scored.size and is_near and candidate not in self.settled:
             self._try(candidate, scored.fit.parts, _FULL)
+
+    def _is_near(self, scored: Scored, best: Scored) -> bool:
+        return scored.score <= self.criteria.hopeless * best.score
 
     def _try(self, candidate: Candidate, parts: Parts, effort: Effort = _ROUGH) -> Scored | None:
         """Fit a candidate in simulation and keep the better of this and an earlier fit."""
@@ -442,20 +434,20 @@ class _Search:
         """The smallest set that no larger one is worth more than."""
         current = self.linear
         while True:
-            larger = [s for s in self._sound() if s.size > current.size and self.worth(current, s)]
+            larger = [s for s in self._sound() if s.size > current.size and self._worth(current, s)]
             if not larger:
                 return current
             least = min(s.size for s in larger)
             current = min((s for s in larger if s.size == least), key=lambda s: s.score)
 
-    def without_needless(self, chosen: Scored) -> Scored:
+    def _without_needless(self, chosen: Scored) -> Scored:
         """Each law left out, or replaced by a simpler one, where that loses nothing."""
         again = True
         while again:
             again = False
             for placed in chosen.fit.candidate.new:
                 for rival in self._simpler(chosen, placed):
-                    if not self.worth(rival, chosen):
+                    if not self._worth(rival, chosen):
                         chosen, again = rival, True
                         break
                 if again:
@@ -482,28 +474,39 @@ class _Search:
         """Fit a law beside those of a chosen set less another, from the best linear model on."""
         stage = self._linear_stage()
         kept = _values(self.problem, chosen.fit)
-        laws = chosen.fit.candidate.new
-        whole = refined(stage, laws, [kept[law] for law in laws])
         base = Trial(less.new, tuple(kept[law] for law in less.new), 0.0, np.zeros(1))
         for trial in ranked(stage, base, 1, [placed]):
-            if whole is None or trial.score > self.criteria.hopeless * whole.score:
-                continue
-            if trial.values:
+            if trial.values and self._is_near_along(chosen, trial):
                 self._fitted(stage, self.linear, trial, _FULL)
+
+    def _may_do(self, chosen: Scored, candidate: Candidate) -> bool:
+        """Whether fewer laws are not hopeless along the motion."""
+        known = _values(self.problem, chosen.fit)
+        laws = candidate.new
+        trial = refined(self._linear_stage(), laws, [known[law] for law in laws])
+        return trial is not None and self._is_near_along(chosen, trial)
+
+    def _is_near_along(self, chosen: Scored, trial: Trial) -> bool:
+        known = _values(self.problem, chosen.fit)
+        laws = chosen.fit.candidate.new
+        whole = refined(self._linear_stage(), laws, [known[law] for law in laws])
+        return whole is not None and trial.score <= self.criteria.hopeless * whole.score
 
     def _refit(self, chosen: Scored, candidate: Candidate) -> Iterable[Scored]:
         """Fewer laws, from where the chosen set has them."""
-        if candidate not in self.fits:
-            known = _values(self.problem, chosen.fit)
+        known = _values(self.problem, chosen.fit)
+        if candidate not in self.fits and self._may_do(chosen, candidate):
             first = slots_of(self.problem, nominal(self.problem)).parameters
             effects = [chosen.fit.parts.effects[:first], *(known[law] for law in candidate.new)]
             starts = self._starts(chosen.fit, candidate)
             parts = Parts(chosen.fit.parts.linear, np.concatenate(effects), starts)
-            self._try(candidate, parts, _FULL)
+            self._try(candidate, parts)
+        if candidate in self.fits:
+            self._settle(self.fits[candidate], chosen)
         if candidate in self.fits and candidate not in self.unsound:
             yield self.fits[candidate]
 
-    def rivals(self, chosen: Scored) -> tuple[Scored, ...]:
+    def _rivals(self, chosen: Scored) -> tuple[Scored, ...]:
         """Sets of the same size and other families that the data cannot tell from the chosen."""
         families = _families(chosen)
         found: dict[tuple[str, ...], Scored] = {}
@@ -517,7 +520,7 @@ class _Search:
                 found[_families(other)] = other
         return tuple(found.values())
 
-    def superfluous(self, chosen: Scored) -> tuple[int, ...]:
+    def _superfluous(self, chosen: Scored) -> tuple[int, ...]:
         """Existing effects that act on the recordings and without which nothing is lost."""
         found: list[int] = []
         values = _existing(self.problem, chosen.fit)
@@ -531,13 +534,13 @@ class _Search:
             starts = self._starts(chosen.fit, candidate)
             parts = Parts(chosen.fit.parts.linear, np.concatenate(effects), starts)
             result = self._fit(candidate, parts, _FULL)
-            if result is not None and not self.worth(self._scored(result), chosen):
+            if result is not None and not self._worth(self._scored(result), chosen):
                 found.append(i)
         return tuple(found)
 
     # --- the linear part ----------------------------------------------------------------------
 
-    def with_few_linear(self, chosen: Scored) -> tuple[Scored, bool]:
+    def _with_few_linear(self, chosen: Scored) -> tuple[Scored, bool]:
         """The chosen model, fitted to its end, with those linear corrections that data call for."""
         settled = fit(
             self.problem, chosen.fit.candidate, chosen.fit.parts, chosen.fit.free, *_FINAL
@@ -548,7 +551,7 @@ class _Search:
         parts = chosen.fit.parts._replace(linear=np.where(needed, chosen.fit.parts.linear, 0.0))
         fewer = fit(self.problem, chosen.fit.candidate, parts, needed, *_FINAL)
         result = chosen
-        if fewer is not None and not self.worth(self._scored(fewer), chosen):
+        if fewer is not None and not self._worth(self._scored(fewer), chosen):
             result = self._scored(fewer)
         share = _alike(self.problem, result.fit)
         if share is None:
@@ -556,7 +559,7 @@ class _Search:
         only = np.array([p.kind == "gain" for p in self.problem.linear], dtype=np.bool_)
         start = result.fit.parts._replace(linear=np.where(only, 1.0 / (1.0 + share) - 1.0, 0.0))
         gain = fit(self.problem, chosen.fit.candidate, start, only)
-        if gain is not None and not self.worth(self._scored(gain), result):
+        if gain is not None and not self._worth(self._scored(gain), result):
             return self._scored(gain), True
         return result, True
 
