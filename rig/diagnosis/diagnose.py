@@ -155,8 +155,7 @@ def first_fits(problem: FreeRun | Prescribed) -> tuple[Fit, Fit]:
             "near them: check its stiffness, its free length and the sign of the applied force"
         )
     free = free_beside(problem, base)
-    # A prior that weighs by what is left where a fit begins would hold it there.
-    near = fit(problem, base, given.parts, free, 12, coloured=False) or given
+    near = fit(problem, base, given.parts, free, 12, most_level=1.0) or given
     return given, fit(problem, base, near.parts, free, 12) or near
 
 

@@ -58,7 +58,7 @@ class SelectionCriteria:
 
     blocks: int = 32
     kept_every: int = 5
-    screened: int = 6
+    screened: int = 10
     beam: int = 3
     most_laws: int = 3
     finalists: int = 4

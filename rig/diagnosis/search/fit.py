@@ -243,7 +243,7 @@ def fit(
     sides: int = 2,
     *,
     effects: bool = True,
-    coloured: bool = True,
+    most_level: float = np.inf,
 ) -> Fit | None:
     """Fit a candidate.
 
@@ -256,13 +256,14 @@ def fit(
         tolerance: Relative gain below which the fit ends.
         sides: Sides on which the last differences are taken, see `solve`.
         effects: Whether effects' parameters are fitted.
-        coloured: Whether priors weigh by the colour of the residual, not as beside white noise.
+        most_level: Variance of the residual up to which priors gain weight with it. One that weighs
+            by what is left where a fit begins would hold it there.
 
     Returns:
         The fit, or None if the model runs away where it begins.
     """
     layout = _Layout(problem, candidate, first, free, effects)
-    prior = layout.prior if coloured else layout.prior._replace(level_of=lambda _: 1.0)
+    prior = layout.prior._replace(level_of=lambda r: min(layout.level(r), most_level))
     blocks = [problem.blocks(k) for k in range(problem.recordings)]
     solution = solve(
         layout.residual, layout.full[layout.varied], layout.space, iterations, tolerance,

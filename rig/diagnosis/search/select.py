@@ -57,8 +57,10 @@ class Effort(NamedTuple):
     sides: int
 
 
-_ROUGH, _FULL, _FINAL = Effort(8, 1e-3, 1), Effort(20, 1e-4, 2), Effort(30, 1e-6, 2)
-"""Fits that are screened among themselves, fits that decide, and the one that is reported."""
+_BEGUN, _ROUGH = Effort(8, 1e-2, 1), Effort(8, 1e-3, 1)
+_FULL, _FINAL = Effort(20, 1e-4, 2), Effort(15, 1e-6, 2)
+"""Fits of initial states alone, fits that are compared among themselves, fits that decide, and the
+one that is reported."""
 
 
 class Scored(NamedTuple):
@@ -379,12 +381,20 @@ class Search:
                 for p in self.problem.linear
             ]
         least = np.array([p.least for p in self.problem.linear])
-        parts = Parts(
-            np.maximum(linear, least),
-            np.concatenate(values),
-            self._starts(reference.fit, candidate),
+        parts = self._begun(
+            candidate,
+            Parts(np.maximum(linear, least), np.concatenate(values), reference.fit.parts.starts),
         )
-        self._try(candidate, parts, effort)
+        # Priors weigh as they did there: a free run may begin far off with the right parameters.
+        self._try(candidate, parts, effort, max(1.0, trial.cost / len(stage.target)))
+
+    def _begun(self, candidate: Candidate, parts: Parts) -> Parts:
+        """The same with initial states of its own: those of a poorer model make up for it."""
+        recordings = range(self.problem.recordings)
+        own = parts._replace(starts=tuple(self.problem.start(k, candidate) for k in recordings))
+        none = np.zeros(len(self.problem.linear), dtype=np.bool_)
+        result = fit(self.problem, candidate, own, none, *_BEGUN, effects=False)
+        return own if result is None else result.parts
 
     def _starts(self, reference: Fit, candidate: Candidate) -> tuple[Array, ...]:
         """Initial vectors of a reference, for another candidate: internal states at zero."""
@@ -397,10 +407,12 @@ class Search:
             found.append(new)
         return tuple(found)
 
-    def _fit(self, candidate: Candidate, parts: Parts, effort: Effort) -> Fit | None:
+    def _fit(
+        self, candidate: Candidate, parts: Parts, effort: Effort, most_level: float = np.inf
+    ) -> Fit | None:
         free = free_beside(self.problem, candidate)
         parts = parts._replace(linear=np.where(free, parts.linear, 0.0))
-        return fit(self.problem, candidate, parts, free, *effort)
+        return fit(self.problem, candidate, parts, free, *effort, most_level=most_level)
 
     def _settle(self, scored: Scored, best: Scored) -> None:
         """Fit a set to its end if it comes near the best one."""
@@ -412,9 +424,15 @@ class Search:
     def _is_near(self, scored: Scored, best: Scored) -> bool:
         return scored.score <= self.criteria.hopeless * best.score
 
-    def _try(self, candidate: Candidate, parts: Parts, effort: Effort = _ROUGH) -> Scored | None:
+    def _try(
+        self,
+        candidate: Candidate,
+        parts: Parts,
+        effort: Effort = _ROUGH,
+        most_level: float = np.inf,
+    ) -> Scored | None:
         """Fit a candidate in simulation and keep the better of this and an earlier fit."""
-        result = self._fit(candidate, parts, effort)
+        result = self._fit(candidate, parts, effort, most_level)
         if effort is _FULL:
             self.settled.add(candidate)
         if result is None:
