@@ -9,6 +9,7 @@ _FAMILY = "fade"
 _REFERENCE = "Dixon, The Shock Absorber Handbook (2007), 7.12, temperature effects"
 _FINAL = Parameter("final_fraction", "", 0.0, 3.0, "share of the damping that stays")
 _COLD = Parameter("reference_c", "°C", -273.15, 2000.0, "temperature with full damping")
+_STANDARD_C = 20.0
 _LARGEST_EXPONENT = 40.0
 
 
@@ -90,14 +91,19 @@ def _shows_temperature(motion: Motion) -> bool:
 def _temperature_starts(motion: Motion) -> list[Start]:
     if not _shows_temperature(motion):
         return []
-    return grid([0.003, 0.015, -0.005], [motion.temperatures_c[0], 20.0])
+    return grid([0.003, 0.015, -0.005], [_STANDARD_C])
 
 
 @moving
 def _linear_temperature_starts(motion: Motion) -> list[Start]:
     if not _shows_temperature(motion):
         return []
-    return grid([0.01], [motion.temperatures_c[0], 20.0])
+    return grid([0.01], [_STANDARD_C])
+
+
+def _standard(_: Motion) -> tuple[float, float]:
+    # Another reference temperature is another damping: the data cannot tell one from the other.
+    return _STANDARD_C, _STANDARD_C
 
 
 @moving
@@ -137,6 +143,7 @@ TEMPERATURE_FADE = Effect(
     reference=_REFERENCE,
     scaled=(),
     starts=_temperature_starts,
+    bounds=within(reference_c=_standard),
     simpler=("linear_damping", "linear_temperature_fade"),
     shown=("fraction_per_k",),
 )
@@ -153,6 +160,7 @@ LINEAR_TEMPERATURE_FADE = Effect(
     excitation="a measured temperature that changes by several kelvin",
     reference=_REFERENCE,
     starts=_linear_temperature_starts,
+    bounds=within(reference_c=_standard),
     simpler=("linear_damping",),
     shown=("fraction_per_k",),
 )

@@ -196,7 +196,9 @@ def _hertz_ends_starts(motion: Motion) -> list[Start]:
 
 
 # A stop that is never touched has no force; one that is always touched is a spring.
-_TOUCHED = height(-0.02, 1.02)
+# A stop that is touched over all but a fifth of the stroke is a spring.
+_TOUCHED_BELOW = height(-0.02, 0.8)
+_TOUCHED_ABOVE = height(0.2, 1.02)
 _LOW_END = height(-0.02, 0.3)
 _HIGH_END = height(0.7, 1.02)
 
@@ -231,7 +233,7 @@ BUMP_STOP = Effect(
     reference=_KELVIN_VOIGT,
     scaled=(1, 2),
     starts=_stop_starts(0.03, 0.07, 0.12, 0.18, 0.26, 0.36),
-    bounds=within(contact_height_m=_TOUCHED),
+    bounds=within(contact_height_m=_TOUCHED_BELOW),
     shown=("contact_height_m", "stiffness_n_per_m"),
 )
 
@@ -245,7 +247,7 @@ REBOUND_STOP = Effect(
     reference=_KELVIN_VOIGT,
     scaled=(1, 2),
     starts=_stop_starts(0.97, 0.93, 0.88, 0.82, 0.74, 0.64),
-    bounds=within(contact_height_m=_TOUCHED),
+    bounds=within(contact_height_m=_TOUCHED_ABOVE),
     shown=("contact_height_m", "stiffness_n_per_m"),
 )
 
@@ -259,7 +261,7 @@ HERTZ_BUMP_STOP = Effect(
     reference=_HUNT_CROSSLEY,
     scaled=(1,),
     starts=_hertz_starts(0.04, 0.1, 0.16, 0.24, 0.36),
-    bounds=within(contact_height_m=_TOUCHED, dissipation_s_per_m=dissipation),
+    bounds=within(contact_height_m=_TOUCHED_BELOW, dissipation_s_per_m=dissipation),
     shown=("contact_height_m",),
 )
 
@@ -273,7 +275,7 @@ HERTZ_REBOUND_STOP = Effect(
     reference=_HUNT_CROSSLEY,
     scaled=(1,),
     starts=_hertz_starts(0.96, 0.9, 0.84, 0.76, 0.64),
-    bounds=within(contact_height_m=_TOUCHED, dissipation_s_per_m=dissipation),
+    bounds=within(contact_height_m=_TOUCHED_ABOVE, dissipation_s_per_m=dissipation),
     shown=("contact_height_m",),
 )
 
@@ -287,7 +289,7 @@ POWER_BUMP_STOP = Effect(
     reference=_HUNT_CROSSLEY,
     scaled=(1,),
     starts=_power_starts(0.05, 0.15, 0.3),
-    bounds=within(contact_height_m=_TOUCHED, dissipation_s_per_m=dissipation),
+    bounds=within(contact_height_m=_TOUCHED_BELOW, dissipation_s_per_m=dissipation),
     simpler=("bump_stop", "hertz_bump_stop"),
     shown=("contact_height_m", "force_at_10_mm_n"),
 )
@@ -302,7 +304,7 @@ POWER_REBOUND_STOP = Effect(
     reference=_HUNT_CROSSLEY,
     scaled=(1,),
     starts=_power_starts(0.95, 0.85, 0.7),
-    bounds=within(contact_height_m=_TOUCHED, dissipation_s_per_m=dissipation),
+    bounds=within(contact_height_m=_TOUCHED_ABOVE, dissipation_s_per_m=dissipation),
     simpler=("rebound_stop", "hertz_rebound_stop"),
     shown=("contact_height_m", "force_at_10_mm_n"),
 )

@@ -78,13 +78,17 @@ class Prior(NamedTuple):
     Attributes:
         centre: Their most likely values, shape (k,).
         weight: Inverse standard deviations; zero where nothing is known; shape (k,).
-        level_of: Variance that a residual (m,) stands for, one at the noise floor. The larger it
-            is, the more a prior weighs.
+        most_level: Mean square of the residual up to which a prior gains weight with it: what a
+            wrong model leaves tells less of its parameters than noise would.
     """
 
     centre: Array
     weight: Array
-    level_of: Callable[[Array], float]
+    most_level: float = np.inf
+
+    def level(self, residual: Array) -> float:
+        """Variance that a whitened residual stands for, one at the noise floor."""
+        return min(max(1.0, float(np.mean(residual**2))), self.most_level)
 
 
 class Solution(NamedTuple):
@@ -155,8 +159,8 @@ def solve(
     if begin is None or not np.all(np.isfinite(begin)):
         return None
     r, damping = begin, _FIRST_DAMPING
-    known = prior or Prior(np.zeros_like(x), np.zeros_like(x), lambda _: 1.0)
-    level = known.level_of(r)
+    known = prior or Prior(np.zeros_like(x), np.zeros_like(x))
+    level = known.level(r)
 
     def tangent(sides: int = 1) -> Array:
         return _jacobian(residual_of, x, r, space, rows, threads, sides)
@@ -177,7 +181,7 @@ def solve(
         small = here.cost - there.cost < tolerance * here.cost
         x, r = there.x, there.residual
         # A residual that has fallen leaves less weight to the prior: there may be more to gain.
-        lower = min(level, known.level_of(r))
+        lower = min(level, known.level(r))
         small, level = small and lower > _SETTLED * level, lower
         if small and fresh:
             break

@@ -72,7 +72,7 @@ class SelectionCriteria:
     significant: float = 4.0
     bounded: float = 4.0
     cancelling: float = -0.9
-    leftover: float = 0.02
+    leftover: float = 0.005
     passive: float = 0.02
     explained: float = 1.2
     partly: float = 0.25

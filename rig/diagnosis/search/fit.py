@@ -157,8 +157,6 @@ class _Layout:
         self.full = np.concatenate([first.linear, first.effects, *first.starts])
         self.start_size = len(scales)
         self.prior = self._prior(len(linear), scales)
-        counts = (int(problem.blocks(k).max()) + 1 for k in range(problem.recordings))
-        self.least_samples = float(sum(counts))
 
     def _prior(self, linear: int, scales: Array) -> Prior:
         weight = np.zeros(len(self.full))
@@ -173,9 +171,7 @@ class _Layout:
         values = [v for i in self.candidate.kept for v in self.problem.existing[i].values]
         centre[linear : linear + existing] = values
         inner = self.whole.inner(np.clip(centre, self.whole.low, self.whole.high))
-        return Prior(
-            np.where(weight > 0.0, inner, 0.0)[self.varied], weight[self.varied], self.level
-        )
+        return Prior(np.where(weight > 0.0, inner, 0.0)[self.varied], weight[self.varied])
 
     def parts(self, x: Array) -> Parts:
         full = self.full.copy()
@@ -201,20 +197,6 @@ class _Layout:
                 return None
             found.append(there)
         return np.concatenate(found)
-
-    def level(self, residual: Array) -> float:
-        """Variance that a whitened residual stands for, as coloured as it is; one if it is white.
-
-        What a wrong model leaves says less of its parameters than as many independent samples:
-        by the effective number of a first-order process (Bayley, Hammersley, J. R. Stat. Soc.
-        Suppl. 8, 1946), which no colour brings below a sample a block.
-        """
-        struts = len(self.problem.motions)
-        power = float(residual @ residual)
-        alike = float(residual[struts:] @ residual[:-struts]) / max(power, _TINY)
-        alike = min(max(alike, 0.0), 1.0)
-        samples = max(len(residual) * (1.0 - alike) / (1.0 + alike), self.least_samples)
-        return max(1.0, power / samples)
 
     def rows(self, blocks: list[Integers]) -> dict[int, Rows]:
         """Of each variable of a recording's initial vector, the rows that it moves."""
@@ -263,11 +245,11 @@ def fit(
         The fit, or None if the model runs away where it begins.
     """
     layout = _Layout(problem, candidate, first, free, effects)
-    prior = layout.prior._replace(level_of=lambda r: min(layout.level(r), most_level))
     blocks = [problem.blocks(k) for k in range(problem.recordings)]
     solution = solve(
         layout.residual, layout.full[layout.varied], layout.space, iterations, tolerance,
-        layout.rows(blocks), os.cpu_count() or 1, prior, sides,
+        layout.rows(blocks), os.cpu_count() or 1, layout.prior._replace(most_level=most_level),
+        sides,
     )  # fmt: skip
     if solution is None:
         return None

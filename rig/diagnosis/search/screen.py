@@ -7,9 +7,10 @@ its size costs one pass a start; the best are then refined together with all els
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from os import cpu_count
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -81,6 +82,10 @@ class Stage(NamedTuple):
     target: Array
     blocks: Integers
     coarse: "Stage | None"
+
+
+_Start = tuple[float, Array]
+"""Cost of a law at a start, and its parameters there."""
 
 
 class Trial(NamedTuple):
@@ -304,9 +309,11 @@ def ranked(
     for _, name in laws:
         law(name)  # Compiled here: numba's compiler is no place for two threads.
 
-    def first(at: Placed) -> list[tuple[float, Array]]:
-        starts = effect(at[1]).starts(stage.problem.motions[at[0]])
-        found = [_first(coarse, at, np.array(start), residual, basis) for start in starts]
+    def first(at: Placed, known: Mapping[str, float] = MappingProxyType({})) -> list[_Start]:
+        found = [
+            _first(coarse, at, start, residual, basis)
+            for start in _starts(stage.problem, at, known)
+        ]
         return sorted((one for one in found if one is not None), key=lambda one: one[0])
 
     with ThreadPoolExecutor(cpu_count()) as pool:
@@ -323,6 +330,10 @@ def ranked(
             return refined(stage, (*base.laws, job[0]), (*base.values, job[1]))
 
         trials = [trial for trial in pool.map(refine, jobs) if trial is not None]
+        # A law begins no worse than a simpler one that is known.
+        nested = list(pool.map(lambda job: (job[0], first(*job)[:1]), _nested(trials, laws)))
+        jobs = [(at, values) for at, starts in nested for _, values in starts]
+        trials += [trial for trial in pool.map(refine, jobs) if trial is not None]
     best: dict[tuple[Placed, ...], Trial] = {}
     for trial in trials:
         key = tuple(sorted(trial.laws))
@@ -337,6 +348,36 @@ def ranked(
     return [*sorted(best.values(), key=lambda trial: trial.score), *rest]
 
 
+def _starts(problem: Problem, at: Placed, known: Mapping[str, float]) -> list[Array]:
+    """A law's starts, with those of its parameters that are known; its size is found anyway."""
+    item = effect(at[1])
+    fixed = {
+        i: known[parameter.name]
+        for i, parameter in enumerate(item.parameters)
+        if i not in item.scaled and parameter.name in known
+    }
+    starts = [list(start) for start in item.starts(problem.motions[at[0]])]
+    for start in starts:
+        for i, value in fixed.items():
+            start[i] = value
+    return [np.array(start) for start in sorted({tuple(start) for start in starts})]
+
+
+def _nested(
+    trials: Sequence[Trial], laws: Sequence[Placed]
+) -> list[tuple[Placed, dict[str, float]]]:
+    """Laws that have a refined one as their simpler case, with what this one's parameters are."""
+    found: list[tuple[Placed, dict[str, float]]] = []
+    for trial in trials:
+        strut, name = trial.laws[-1]
+        known = {
+            p.name: float(value)
+            for p, value in zip(effect(name).parameters, trial.values[-1], strict=False)
+        }
+        found += [(at, known) for at in laws if at[0] == strut and name in effect(at[1]).simpler]
+    return found
+
+
 def _goes_with(at: Placed, laws: Sequence[Placed]) -> bool:
     """Whether a law may stand beside others: two formulas of one family imitate a third."""
     family = effect(at[1]).family
@@ -346,9 +387,7 @@ def _goes_with(at: Placed, laws: Sequence[Placed]) -> bool:
     )
 
 
-def _first(
-    stage: Stage, at: Placed, start: Array, residual: Array, basis: Array
-) -> tuple[float, Array] | None:
+def _first(stage: Stage, at: Placed, start: Array, residual: Array, basis: Array) -> _Start | None:
     """Cost and parameters of a law at a start, its size by least squares where it has one."""
     strut, name = at
     item = effect(name)
@@ -415,7 +454,7 @@ def refined(stage: Stage, laws: Sequence[Placed], values: Sequence[Array]) -> Tr
 
     spaces = [_space(stage, at, own) for at, own in zip(laws, values, strict=True)]
     weights = np.concatenate([weight for _, weight in spaces])
-    prior = Prior(np.zeros(len(weights)), weights, lambda _: 1.0)
+    prior = Prior(np.zeros(len(weights)), weights, 1.0)
     space = joined([space for space, _ in spaces])
     found = solve(residual, np.concatenate(values), space, _STEPS, 1e-3, prior=prior)
     if found is None:

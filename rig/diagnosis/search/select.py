@@ -456,7 +456,17 @@ class Search:
             if not larger:
                 return current
             least = min(s.size for s in larger)
-            current = min((s for s in larger if s.size == least), key=lambda s: s.score)
+            current = self._plainest([s for s in larger if s.size == least])
+
+    def _plainest(self, sets: Sequence[Scored]) -> Scored:
+        """Of the sets that the data cannot tell from the best, that with the fewest parameters."""
+        best = min(sets, key=lambda s: s.score)
+        alike = [s for s in sets if self._is_alike(s, best)]
+        return min(alike, key=lambda s: (len(s.fit.parts.effects), s.score))
+
+    def _is_alike(self, other: Scored, best: Scored) -> bool:
+        lost = other.score - best.score
+        return lost <= self.criteria.standard_errors * _standard_error(other, best)
 
     def _without_needless(self, chosen: Scored) -> Scored:
         """Each law left out, or replaced by a simpler one, where that loses nothing."""
@@ -533,8 +543,7 @@ class Search:
                 continue
             if _degenerate(other, chosen) or _families(other) in found:
                 continue
-            lost = other.score - chosen.score
-            if lost <= self.criteria.standard_errors * _standard_error(other, chosen):
+            if self._is_alike(other, chosen):
                 found[_families(other)] = other
         return tuple(found.values())
 
