@@ -14,7 +14,7 @@ import importlib
 import importlib.util
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -365,7 +365,9 @@ def open_loop_rmse_m(spec: ModelSpec, record: Recording, skipped: int) -> float:
         raise InputError(f"{record.name}: has no applied_force_n, expected a force-driven bench")
     (run,) = problem.runs
     head = np.arange(len(run.grid.t_s)) < skipped
-    heads = problem.with_runs([run._replace(grid=run.grid._replace(fitted=run.grid.fitted & head))])
+    heads = replace(
+        problem, runs=(run._replace(grid=run.grid._replace(fitted=run.grid.fitted & head)),)
+    )
     base = nominal(heads)
     none = np.zeros(len(given.linear))
     first = Parts(none, existing_values(heads, base), (heads.start(0, base),))

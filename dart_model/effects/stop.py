@@ -196,9 +196,9 @@ def _hertz_ends_starts(motion: Motion) -> list[Start]:
 
 
 # A stop that is never touched has no force; one that is always touched is a spring.
-# A stop that is touched over all but a fifth of the stroke is a spring.
-_TOUCHED_BELOW = height(-0.02, 0.8)
-_TOUCHED_ABOVE = height(0.2, 1.02)
+# A stop belongs to an end: what is touched over more than half of the stroke is a spring.
+_TOUCHED_BELOW = height(-0.02, 0.5)
+_TOUCHED_ABOVE = height(0.5, 1.02)
 _LOW_END = height(-0.02, 0.3)
 _HIGH_END = height(0.7, 1.02)
 

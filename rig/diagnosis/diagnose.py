@@ -1,6 +1,7 @@
 """From recordings and a nominal model to a diagnosis."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -60,7 +61,7 @@ def diagnose(
     judged = build_held_out(given, held_out) if held_out else problem
     found, problem = _searched(problem, criteria, progress)
     progress("judging on held-out data", 0.95)
-    judged = judged.renewed(_noise(judged), problem.motions)
+    judged = replace(judged, motions=problem.motions)
     recordings = tuple(held_out or runs)
 
     def figures(chosen: Fit) -> tuple[Evaluated, ...]:
@@ -169,11 +170,7 @@ def _sharpened(problem: FreeRun | Prescribed, result: Fit) -> FreeRun | Prescrib
     motions = with_tones(problem, forces) if forces else problem.motions
     if isinstance(problem, FreeRun):
         problem = with_noise(problem, result.candidate, result.parts)
-    return problem.renewed(_noise(problem), motions)
-
-
-def _noise(problem: FreeRun | Prescribed) -> "np.ndarray[tuple[int, ...], np.dtype[np.float64]]":
-    return problem.noise_m if isinstance(problem, FreeRun) else problem.noise_n
+    return replace(problem, motions=motions)
 
 
 def _seed(result: Fit) -> Seed:

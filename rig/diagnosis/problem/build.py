@@ -1,6 +1,7 @@
 """From recordings and a nominal model to a problem."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +25,7 @@ from rig.diagnosis.problem.contract import (
 from rig.diagnosis.problem.free_run import FreeRun, Run, run_of, system
 from rig.diagnosis.problem.grid import Grid, grid_of, with_blocks_kept
 from rig.diagnosis.problem.mechanism import Mechanism, Readers, constant, readers, tabulated
-from rig.diagnosis.problem.prescribed import Drive, Prescribed, drive_of
+from rig.diagnosis.problem.prescribed import Drive, Prescribed, drive_of, noise_of
 from rig.diagnosis.recording import Recording, RecordingError, checked
 
 Array = NDArray[np.float64]
@@ -138,11 +139,11 @@ def _problem(
     spec = given.spec
     shared = (given.linear, given.existing, given.motions, given.block_s)
     if is_prescribed(recordings):
-        drives = [
+        drives = tuple(
             drive_of(grid, at, recording)
             for (grid, at), recording in zip(pairs, recordings, strict=True)
-        ]
-        problem = Prescribed(spec, drives, *shared)
+        )
+        problem = Prescribed(spec, drives, noise_of(spec, drives), *shared)
         for drive in drives:
             _check_drive(drive, _nominal_forces(problem, drive))
         return problem
@@ -154,7 +155,7 @@ def _problem(
             raise RecordingError(f"{recording.name}: expected a column applied_force_n")
         applied = (recording.t_s, recording.applied_force_n)
         runs.append(run_of(grid, applied, mechanism, _fastest(given, mechanism)))
-    problem = FreeRun(spec, runs, np.ones(len(spec.struts)), *shared)
+    problem = FreeRun(spec, tuple(runs), np.ones(len(spec.struts)), *shared)
     for run in runs:
         _check_swing(run.grid)
     return with_noise(problem, nominal(problem), None)
@@ -183,7 +184,7 @@ def with_noise(problem: FreeRun, candidate: Candidate, parts: Parts | None) -> F
             np.array([estimate_noise(run.grid.t_s, column).variance for column in left.T])
         )
     noise = np.sqrt(np.median(variances, axis=0))
-    return problem.renewed(np.maximum(noise, 1e-300), problem.motions)
+    return replace(problem, noise_m=np.maximum(noise, 1e-300))
 
 
 def with_tones(problem: Problem, residual: Sequence[ResidualForces]) -> tuple[Motion, ...]:

@@ -10,7 +10,7 @@ References:
 """
 
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple, Protocol
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,12 +160,13 @@ class ResidualForces(NamedTuple):
 
 
 class Problem(Protocol):
-    """A model held against recordings."""
+    """A model held against recordings.
 
-    @property
-    def bench(self) -> Bench:
-        """Kind of bench."""
-        ...
+    Attributes:
+        bench: Kind of bench.
+    """
+
+    bench: ClassVar[Bench]
 
     @property
     def spec(self) -> ModelSpec:

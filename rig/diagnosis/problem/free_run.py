@@ -8,8 +8,9 @@ of an output error (Young 2011, 8.2). The measured motion itself comes from a sm
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,10 +113,11 @@ def _finer(run: Run) -> Run:
     return run._replace(fine_n=fine_n, substeps=steps, angle=0.5 * run.angle)
 
 
+@dataclass(frozen=True, eq=False)
 class FreeRun:
     """A model held against recordings of a force-driven bench; see `Problem`.
 
-    Args:
+    Attributes:
         spec: The nominal model.
         runs: The recordings.
         noise_m: Standard deviation of each height's noise, shape (struts,).
@@ -125,37 +127,23 @@ class FreeRun:
         block_s: Length of the blocks of cross-validation.
     """
 
-    bench: Bench = "force_given"
+    bench: ClassVar[Bench] = "force_given"
+    spec: ModelSpec
+    runs: tuple[Run, ...]
+    noise_m: Array
+    linear: tuple[LinearParameter, ...]
+    existing: tuple[Existing, ...]
+    motions: tuple[Motion, ...]
+    block_s: float
 
-    def __init__(
-        self,
-        spec: ModelSpec,
-        runs: Sequence[Run],
-        noise_m: Array,
-        linear: tuple[LinearParameter, ...],
-        existing: tuple[Existing, ...],
-        motions: tuple[Motion, ...],
-        block_s: float,
-    ) -> None:
-        self.spec, self.linear, self.existing, self.motions = spec, linear, existing, motions
-        self.runs, self.noise_m, self.block_s = tuple(runs), noise_m, block_s
-        self.recordings = len(self.runs)
-
-    def renewed(self, noise_m: Array, motions: tuple[Motion, ...]) -> "FreeRun":
-        """The same problem with other noise or with more known of the motions."""
-        return FreeRun(
-            self.spec, self.runs, noise_m, self.linear, self.existing, motions, self.block_s
-        )
-
-    def with_runs(self, runs: Sequence[Run]) -> "FreeRun":
-        """The same model held against other runs."""
-        return FreeRun(
-            self.spec, runs, self.noise_m, self.linear, self.existing, self.motions, self.block_s
-        )
+    @property
+    def recordings(self) -> int:
+        """Number of recordings."""
+        return len(self.runs)
 
     def finer(self) -> "FreeRun":
         """The same problem with steps half as long: the integrator then errs a sixteenth."""
-        return self.with_runs([_finer(run) for run in self.runs])
+        return replace(self, runs=tuple(_finer(run) for run in self.runs))
 
     @cached_property
     def _stroke_m(self) -> float:

@@ -5,7 +5,9 @@ takes one pass. What is left of initial states are the laws' internal ones.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,49 +107,51 @@ def drive_of(grid: Grid, at: Integers, recording: Recording) -> Drive:
     )
 
 
+def noise_of(spec: ModelSpec, drives: Sequence[Drive]) -> Array:
+    """Standard deviation of each load cell's residual (struts,); NaN where a strut has no cell.
+
+    Noise of the velocity passes through the damping, noise of the height through the spring.
+    """
+    slopes = np.array([(s.stiffness_n_per_m, s.damping_n_s_per_m) for s in spec.struts])
+    motion_n = [
+        np.hypot(slopes[:, 0] * d.height_noise_m, slopes[:, 1] * d.velocity_noise_m_per_s)
+        for d in drives
+    ]
+    cells_n = [d.cell_noise_n for d in drives]
+    return np.median(np.hypot(motion_n, cells_n), axis=0)
+
+
+@dataclass(frozen=True, eq=False)
 class Prescribed:
     """A model held against recordings of a displacement-controlled bench; see `Problem`.
 
-    Args:
+    Attributes:
         spec: The nominal model.
         drives: The recordings.
+        noise_n: Standard deviation of each load cell's residual, shape (struts,).
         linear: Parameters of the linear part.
         existing: Effects of the nominal model.
         motions: What each strut did.
         block_s: Length of the blocks of cross-validation.
     """
 
-    bench: Bench = "motion_given"
+    bench: ClassVar[Bench] = "motion_given"
+    spec: ModelSpec
+    drives: tuple[Drive, ...]
+    noise_n: Array
+    linear: tuple[LinearParameter, ...]
+    existing: tuple[Existing, ...]
+    motions: tuple[Motion, ...]
+    block_s: float
 
-    def __init__(
-        self,
-        spec: ModelSpec,
-        drives: Sequence[Drive],
-        linear: tuple[LinearParameter, ...],
-        existing: tuple[Existing, ...],
-        motions: tuple[Motion, ...],
-        block_s: float,
-    ) -> None:
-        self.spec, self.linear, self.existing, self.motions = spec, linear, existing, motions
-        self.drives, self.block_s = tuple(drives), block_s
-        self.recordings = len(self.drives)
-        # Noise of the velocity passes through the damping, noise of the height through the spring.
-        slopes = np.array([(s.stiffness_n_per_m, s.damping_n_s_per_m) for s in spec.struts])
-        motion_n = [
-            np.hypot(slopes[:, 0] * d.height_noise_m, slopes[:, 1] * d.velocity_noise_m_per_s)
-            for d in self.drives
-        ]
-        cells_n = [d.cell_noise_n for d in self.drives]
-        self.noise_n = np.median(np.hypot(motion_n, cells_n), axis=0)
-        self._celled = np.flatnonzero(np.isfinite(self.noise_n))
+    @property
+    def recordings(self) -> int:
+        """Number of recordings."""
+        return len(self.drives)
 
-    def renewed(self, noise_n: Array, motions: tuple[Motion, ...]) -> "Prescribed":
-        """The same problem with other noise or with more known of the motions."""
-        other = Prescribed(
-            self.spec, self.drives, self.linear, self.existing, motions, self.block_s
-        )
-        other.noise_n = noise_n
-        return other
+    @cached_property
+    def _celled(self) -> Integers:
+        return np.flatnonzero(np.isfinite(self.noise_n))
 
     def _rows(self, k: int) -> Integers:
         return np.flatnonzero(self.drives[k].fitted)
