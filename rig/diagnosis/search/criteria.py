@@ -81,12 +81,12 @@ class SelectionCriteria:
 
 KINDS = (
     ("nonlinear_stiffness", "stop", "backlash", "restoring_surface", "hysteresis"),
-    ("nonlinear_damping", "friction", "hysteresis", "stop"),
+    ("nonlinear_damping", "friction", "hysteresis"),
     ("fade", "periodic_force"),
     ("delay", "unmodelled_mode"),
 )
-"""Families by what their force follows: height, velocity, time, applied force; hysteresis and stops,
-which damp in contact, both of the first. Laws of one kind can imitate one another's formulas, laws of different kinds cannot."""
+"""Families by what their force follows: height, velocity, time, applied force; hysteresis both of
+the first. Laws of one kind can imitate one another's formulas, laws of different kinds cannot."""
 
 CRITERIA = SelectionCriteria()
 """The criteria of `rig diagnose`."""
