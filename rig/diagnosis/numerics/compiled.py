@@ -234,16 +234,9 @@ def _march(
     w = np.zeros(count)
     force = np.zeros(count)
     general = np.zeros(n)
-    # The mechanism at this instant.
-    m_inverse = mass_inverse[0].copy()
-    m_bias = bias[0].copy()
-    m_rows = rows[0].copy()
-    m_heights = heights0[0].copy()
-    m_applied = applied[0].copy()
     q = q0[0].copy()
     v = v0[0].copy()
     least = _LARGEST_ERROR * stroke
-    per_step = 1.0 / substeps
     for k in range(t.shape[0]):
         last = k + 1 == t.shape[0]
         after = k if last else k + 1
@@ -261,8 +254,7 @@ def _march(
             pieces = 1
             piece = 0
             while piece < pieces:
-                per_piece = 1.0 / pieces
-                h = whole * per_piece
+                h = whole / pieces
                 for stage in range(4):
                     # Classical Runge-Kutta: nodes 0, 1/2, 1/2, 1; weights 1, 2, 2, 1.
                     half = (stage + 1) // 2
@@ -273,8 +265,8 @@ def _march(
                         reach = h if stage == 3 else 0.5 * h
                         for i in range(size):
                             y[i] = x[i] + reach * dy[i]
-                    u = (piece + 0.5 * half) * per_piece
-                    share = (step + u) * per_step
+                    u = (piece + 0.5 * half) / pieces
+                    share = (step + u) / substeps
                     now = t[k] + (step + u) * whole
                     warm = temperature[k] + share * (temperature[after] - temperature[k])
                     load = (
@@ -294,7 +286,9 @@ def _march(
                             v[j] = v0[a, j]
                             if gap > 0.0:
                                 v[j] = (early + share * (2.0 * sag + 3.0 * share * turn)) / gap
-                        for i in range(count):
+                    for i in range(count):
+                        height = heights0[a, i]
+                        if tabulated:
                             # Heights follow the reference by a cubic, to first order beside it.
                             rise = heights0[b, i] - heights0[a, i]
                             early = 0.0
@@ -302,26 +296,14 @@ def _march(
                             for j in range(n):
                                 early += gap * rows[a, i, j] * v0[a, j]
                                 late += gap * rows[b, i, j] * v0[b, j]
-                                step_up = rows[b, i, j] - rows[a, i, j]
-                                m_rows[i, j] = rows[a, i, j] + share * step_up
                             turn = early + late - 2.0 * rise
                             sag = 3.0 * rise - 2.0 * early - late
-                            bend_up = early + share * (sag + share * turn)
-                            m_heights[i] = heights0[a, i] + share * bend_up
-                        for j in range(n):
-                            m_bias[j] = bias[a, j] + share * (bias[b, j] - bias[a, j])
-                            m_applied[j] = applied[a, j] + share * (applied[b, j] - applied[a, j])
-                            for i in range(n):
-                                inverse = mass_inverse[a, j, i]
-                                m_inverse[j, i] = inverse + share * (
-                                    mass_inverse[b, j, i] - inverse
-                                )
-                    for i in range(count):
-                        height = m_heights[i]
+                            height += share * (early + share * (sag + share * turn))
                         velocity = 0.0
                         for j in range(n):
-                            height += m_rows[i, j] * (y[j] - q[j])
-                            velocity += m_rows[i, j] * y[n + j]
+                            row = rows[a, i, j] + share * (rows[b, i, j] - rows[a, i, j])
+                            height += row * (y[j] - q[j])
+                            velocity += row * y[n + j]
                         z[i] = height
                         w[i] = velocity
                         force[i] = (
@@ -343,9 +325,11 @@ def _march(
                             now, z[i], w[i], load, warm, own[slot], values[slot], constants[slot]
                         )
                     for j in range(n):
-                        sum_n = m_bias[j] + m_applied[j] * load
+                        sum_n = bias[a, j] + share * (bias[b, j] - bias[a, j])
+                        sum_n += (applied[a, j] + share * (applied[b, j] - applied[a, j])) * load
                         for i in range(count):
-                            sum_n += m_rows[i, j] * force[i]
+                            row = rows[a, i, j] + share * (rows[b, i, j] - rows[a, i, j])
+                            sum_n += row * force[i]
                         for i in range(n):
                             sum_n += bias_q[a, j, i] * (y[i] - q[i])
                             sum_n += bias_v[a, j, i] * (y[n + i] - v[i])
@@ -353,7 +337,9 @@ def _march(
                     for j in range(n):
                         acceleration = 0.0
                         for i in range(n):
-                            acceleration += m_inverse[j, i] * general[i]
+                            inverse = mass_inverse[a, j, i]
+                            inverse += share * (mass_inverse[b, j, i] - inverse)
+                            acceleration += inverse * general[i]
                         dy[j] = y[n + j]
                         dy[n + j] = acceleration
                         if stage == 0:
