@@ -1,8 +1,7 @@
 """From recordings and a nominal model to a problem."""
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +13,16 @@ from rig.diagnosis.problem import linear_part, track
 from rig.diagnosis.problem.contract import (
     Candidate,
     Existing,
-    LinearParameter,
     Parts,
     Problem,
     ResidualForces,
+    Shared,
     Track,
     existing_values,
     nominal,
 )
 from rig.diagnosis.problem.free_run import FreeRun, Run, run_of, system
-from rig.diagnosis.problem.grid import Grid, grid_of, with_blocks_kept
+from rig.diagnosis.problem.grid import NO_TEMPERATURE_C, Grid, grid_of, with_blocks_kept
 from rig.diagnosis.problem.mechanism import Mechanism, Readers, constant, readers, tabulated
 from rig.diagnosis.problem.prescribed import Drive, Prescribed, drive_of, noise_of
 from rig.diagnosis.recording import Recording, RecordingError, checked
@@ -46,24 +45,15 @@ _TONES = 4
 _LEAST_BLOCK_S = 0.1
 
 
-class Given(NamedTuple):
-    """What all problems of one diagnosis share.
+@dataclass(frozen=True, eq=False)
+class Given(Shared):
+    """The same with the means to read further recordings.
 
     Attributes:
-        spec: The nominal model.
-        read: DART with it.
-        linear: Parameters of the linear part.
-        existing: Effects of the nominal model.
-        motions: What each strut did on the recordings that are learnt from.
-        block_s: Length of the blocks of cross-validation.
+        read: DART with the nominal model.
     """
 
-    spec: ModelSpec
     read: Readers
-    linear: tuple[LinearParameter, ...]
-    existing: tuple[Existing, ...]
-    motions: tuple[Motion, ...]
-    block_s: float
 
 
 def is_prescribed(recordings: Sequence[Recording]) -> bool:
@@ -114,7 +104,7 @@ def build(
     bench = "motion_given" if is_prescribed(recordings) else "force_given"
     linear = linear_part.parameters(spec, bench, motions, mechanism)
     existing = _existing(spec, smooth_motions)
-    given = Given(spec, read, linear, existing, motions, block_s)
+    given = Given(spec, linear, existing, motions, block_s, read)
     return given, _problem(given, recordings, pairs, smooth_motions)
 
 
@@ -137,13 +127,13 @@ def _problem(
     motions: Sequence[Track],
 ) -> "FreeRun | Prescribed":
     spec = given.spec
-    shared = (given.linear, given.existing, given.motions, given.block_s)
+    shared = (spec, given.linear, given.existing, given.motions, given.block_s)
     if is_prescribed(recordings):
         drives = tuple(
             drive_of(grid, at, recording)
             for (grid, at), recording in zip(pairs, recordings, strict=True)
         )
-        problem = Prescribed(spec, drives, noise_of(spec, drives), *shared)
+        problem = Prescribed(*shared, drives, noise_of(spec, drives))
         for drive in drives:
             _check_drive(drive, _nominal_forces(problem, drive))
         return problem
@@ -155,14 +145,14 @@ def _problem(
             raise RecordingError(f"{recording.name}: expected a column applied_force_n")
         applied = (recording.t_s, recording.applied_force_n)
         runs.append(run_of(grid, applied, mechanism, _fastest(given, mechanism)))
-    problem = FreeRun(spec, tuple(runs), np.ones(len(spec.struts)), *shared)
+    problem = FreeRun(*shared, tuple(runs), np.full(len(spec.struts), np.inf))
     for run in runs:
         _check_swing(run.grid)
     return with_noise(problem, nominal(problem), None)
 
 
 def with_noise(problem: FreeRun, candidate: Candidate, parts: Parts | None) -> FreeRun:
-    """The problem with the sensors' noise as a model's free run leaves it.
+    """The problem with the sensors' noise as a model's free run leaves it, or an earlier one's.
 
     Args:
         problem: The problem.
@@ -183,7 +173,9 @@ def with_noise(problem: FreeRun, candidate: Candidate, parts: Parts | None) -> F
         variances.append(
             np.array([estimate_noise(run.grid.t_s, column).variance for column in left.T])
         )
-    noise = np.sqrt(np.median(variances, axis=0))
+    # A residual is noise and what the model errs by, of which a part looks like noise: whichever
+    # model leaves least is nearest.
+    noise = np.minimum(np.sqrt(np.median(variances, axis=0)), problem.noise_m)
     return replace(problem, noise_m=np.maximum(noise, 1e-300))
 
 
@@ -242,7 +234,7 @@ def _smooth_motion(grid: Grid) -> Track:
 
 def _motions(spec: ModelSpec, grids: Sequence[Grid], tracks: Sequence[Track]) -> tuple[Motion, ...]:
     warm = [grid.temperature_c for grid in grids if grid.has_temperature]
-    celsius = (20.0, 20.0)
+    celsius = (NO_TEMPERATURE_C, NO_TEMPERATURE_C)
     if warm:
         celsius = (float(min(w.min() for w in warm)), float(max(w.max() for w in warm)))
     found: list[Motion] = []

@@ -10,6 +10,7 @@ References:
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -157,6 +158,25 @@ class ResidualForces(NamedTuple):
     track: Track
     force_n: Array
     deviation_n: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """What all problems of one diagnosis share.
+
+    Attributes:
+        spec: The nominal model.
+        linear: Parameters of the linear part.
+        existing: Effects of the nominal model.
+        motions: What each strut did on the recordings that are learnt from.
+        block_s: Length of the blocks of cross-validation.
+    """
+
+    spec: ModelSpec
+    linear: tuple[LinearParameter, ...]
+    existing: tuple[Existing, ...]
+    motions: tuple[Motion, ...]
+    block_s: float
 
 
 class Problem(Protocol):

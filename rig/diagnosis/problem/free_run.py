@@ -18,18 +18,17 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.linalg import expm
 
 from dart_model.effects import Bench, Motion
-from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.compiled import respond, simulate
 from rig.diagnosis.numerics.smoother import Smoothed
 from rig.diagnosis.problem import linear_part, track
 from rig.diagnosis.problem.contract import (
     Candidate,
-    Existing,
     Integers,
     LinearParameter,
     Parts,
     ResidualForces,
     Segment,
+    Shared,
     Track,
     placed,
     slots_of,
@@ -114,27 +113,17 @@ def _finer(run: Run) -> Run:
 
 
 @dataclass(frozen=True, eq=False)
-class FreeRun:
+class FreeRun(Shared):
     """A model held against recordings of a force-driven bench; see `Problem`.
 
     Attributes:
-        spec: The nominal model.
         runs: The recordings.
         noise_m: Standard deviation of each height's noise, shape (struts,).
-        linear: Parameters of the linear part.
-        existing: Effects of the nominal model.
-        motions: What each strut did.
-        block_s: Length of the blocks of cross-validation.
     """
 
     bench: ClassVar[Bench] = "force_given"
-    spec: ModelSpec
     runs: tuple[Run, ...]
     noise_m: Array
-    linear: tuple[LinearParameter, ...]
-    existing: tuple[Existing, ...]
-    motions: tuple[Motion, ...]
-    block_s: float
 
     @property
     def recordings(self) -> int:

@@ -12,18 +12,17 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.effects import Bench, Motion
+from dart_model.effects import Bench
 from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.smoother import estimate_noise
 from rig.diagnosis.problem import linear_part, track
 from rig.diagnosis.problem.contract import (
     Candidate,
-    Existing,
     Integers,
-    LinearParameter,
     Parts,
     ResidualForces,
     Segment,
+    Shared,
     Track,
     block_numbers,
     placed,
@@ -122,27 +121,17 @@ def noise_of(spec: ModelSpec, drives: Sequence[Drive]) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Prescribed:
+class Prescribed(Shared):
     """A model held against recordings of a displacement-controlled bench; see `Problem`.
 
     Attributes:
-        spec: The nominal model.
         drives: The recordings.
         noise_n: Standard deviation of each load cell's residual, shape (struts,).
-        linear: Parameters of the linear part.
-        existing: Effects of the nominal model.
-        motions: What each strut did.
-        block_s: Length of the blocks of cross-validation.
     """
 
     bench: ClassVar[Bench] = "motion_given"
-    spec: ModelSpec
     drives: tuple[Drive, ...]
     noise_n: Array
-    linear: tuple[LinearParameter, ...]
-    existing: tuple[Existing, ...]
-    motions: tuple[Motion, ...]
-    block_s: float
 
     @property
     def recordings(self) -> int:

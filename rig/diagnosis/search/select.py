@@ -340,8 +340,8 @@ class Search:
         known = self.fits.get(nominal(self.problem).added(*base.laws))
         if known is None or not self._is_formula(known):
             return everything
-        taken = set().union(*(_kinds(name) for _, name in base.laws))
-        return [at for at in everything if not _kinds(at[1]) & taken]
+        taken = set().union(*(_kinds(effect(name).family) for _, name in base.laws))
+        return [at for at in everything if not _kinds(effect(at[1]).family) & taken]
 
     def _backward(
         self, stage: Stage, levels: Sequence[Sequence[Trial]], best: Sequence[Trial]
@@ -678,17 +678,16 @@ def _families(scored: Scored) -> tuple[str, ...]:
     return tuple(sorted(effect(name).family for _, name in scored.fit.candidate.new))
 
 
-def _kinds(name: str) -> set[int]:
-    """What a law's force follows, by number; what is in no list is a kind of its own."""
-    family = effect(name).family
+def _kinds(family: str) -> set[int]:
+    """What a family's force follows, by number; what is in no list is a kind of its own."""
     return {i for i, kind in enumerate(KINDS) if family in kind} or {len(KINDS)}
 
 
 def _adds_a_kind(smaller: Scored, larger: Scored) -> bool:
-    """Whether a larger set is the smaller one with a law of a kind that this one has not."""
-    few, many = set(smaller.fit.candidate.new), set(larger.fit.candidate.new)
-    kinds = set().union(*(_kinds(name) for _, name in few))
-    return few < many and any(not _kinds(name) & kinds for _, name in many - few)
+    """Whether a larger set is the smaller one, in its families, with a law of a further kind."""
+    few, many = set(_families(smaller)), set(_families(larger))
+    kinds = set().union(*(_kinds(family) for family in few))
+    return few < many and any(not _kinds(family) & kinds for family in many - few)
 
 
 def _degenerate(other: Scored, chosen: Scored) -> bool:
