@@ -103,12 +103,12 @@ def _elastoplastic_rate(
     _strut: Floats,
     out: Writable,
 ) -> None:
-    # Elastic up to the limit, then sliding; a step that overshoots the limit is led back to it.
-    beyond = abs(state[0]) - 1.0
-    if beyond > 0.0 and velocity_m_per_s * state[0] > 0.0:
-        out[0] = -math.copysign(min(beyond * 300.0, 1e5), state[0])
-    else:
-        out[0] = velocity_m_per_s / p[1]
+    # Elastic up to the limit, then sliding. Near the limit it settles instead of stopping: a force
+    # that jumped by where in a step it slips would have no derivative by the parameters.
+    speed = min(abs(velocity_m_per_s) / p[1], _FASTEST_SETTLING_PER_S)
+    if velocity_m_per_s * state[0] > 0.0:
+        speed = min(speed, max(_FASTEST_SETTLING_PER_S * (1.0 - abs(state[0])), 0.0))
+    out[0] = math.copysign(speed, velocity_m_per_s)
 
 
 def _lugre(

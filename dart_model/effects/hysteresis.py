@@ -110,15 +110,15 @@ def _iwan_rate(
     out: Writable,
 ) -> None:
     # Elements of equal stiffness slip one after another; each state is an element's share of the
-    # force, elastic up to its limit. A step that overshoots the limit is led back to it.
+    # force, elastic up to its limit. Near there it settles instead of stopping: a force that jumped
+    # by where in a step it slips would have no derivative by the parameters.
     speed = velocity_m_per_s / (p[1] * ELEMENTS)
     for i in range(ELEMENTS):
         limit = 2.0 * (i + 1.0) / (ELEMENTS * (ELEMENTS + 1.0))
-        beyond = abs(state[i]) - limit
-        if beyond > 0.0 and velocity_m_per_s * state[i] > 0.0:
-            out[i] = -math.copysign(300.0 * beyond, state[i])
-        else:
-            out[i] = speed
+        room = math.inf
+        if velocity_m_per_s * state[i] > 0.0:
+            room = max(_FASTEST_SETTLING_PER_S * (limit - abs(state[i])), 0.0)
+        out[i] = math.copysign(min(abs(speed), room), speed)
 
 
 def _maxwell(
@@ -260,7 +260,7 @@ def _dahl_starts(motion: Motion) -> list[Start]:
 
 @moving
 def _iwan_starts(motion: Motion) -> list[Start]:
-    return grid([1.0], [_shortest_m(motion), *_bends_m(motion)])
+    return grid([1.0], geometric(_shortest_m(motion), 0.5 * motion.stroke_m, 8))
 
 
 @moving

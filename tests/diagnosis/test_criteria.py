@@ -10,7 +10,7 @@ from rig.diagnosis.search.criteria import CRITERIA
 from tests.criteria_study.cases import CASES, answer
 
 ABSURD = [
-    ("blocks", 2, "nothing"),
+    ("blocks", 2, "kept_back"),
     ("kept_every", 1, "kept_back"),
     ("screened", 0, "one_kind"),
     ("beam", 0, "three_kinds"),
@@ -26,7 +26,7 @@ ABSURD = [
     ("formula", 1e9, "one_kind"),
     ("bounded", 1e9, "hardening"),
     ("significant", 1e9, "stiffness"),
-    ("significant", 0.0, "nothing"),
+    ("significant", 0.0, "stiffness"),
     ("cancelling", 1.0, "two_kinds"),
     ("leftover", 1.0, "hardening"),
     ("passive", -1.0, "hardening"),

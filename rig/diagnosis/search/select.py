@@ -580,6 +580,10 @@ class Search:
         result = chosen
         if fewer is not None and not self._worth(self._scored(fewer), chosen):
             result = self._scored(fewer)
+        as_given = self._scored(self.given)
+        if not result.size and not self._worth(as_given, result):
+            # Corrections that are away from nothing and change nothing that can be measured.
+            return as_given, False
         share = _alike(self.problem, result.fit)
         if share is None:
             return result, False
