@@ -87,6 +87,7 @@ _ALL = (
     nonlinear_damping.QUADRATIC_DAMPING,
     nonlinear_damping.POWER_DAMPING,
     nonlinear_damping.ASYMMETRIC_DAMPING,
+    nonlinear_damping.DIRECTIONAL_DAMPING,
     nonlinear_damping.DIGRESSIVE_DAMPING,
     nonlinear_damping.SATURATING_DAMPING,
     nonlinear_damping.ARCTAN_DAMPING,

@@ -60,6 +60,21 @@ def _asymmetric(
     return -(p[1] if velocity_m_per_s > 0.0 else p[0]) * velocity_m_per_s
 
 
+def _directional(
+    _t_s: float,
+    _height_m: float,
+    velocity_m_per_s: float,
+    _applied_force_n: float,
+    _temperature_c: float,
+    _state: Floats,
+    p: Floats,
+    _strut: Floats,
+) -> float:
+    if velocity_m_per_s > 0.0:
+        return -p[2] * velocity_m_per_s ** p[3]
+    return p[0] * (-velocity_m_per_s) ** p[1]
+
+
 def _digressive(
     _t_s: float,
     _height_m: float,
@@ -260,6 +275,32 @@ ASYMMETRIC_DAMPING = Effect(
     starts=always((1.0, 0.0), (0.0, 1.0), (1.0, -1.0)),
     simpler=("linear_damping",),
     shown=("compression_n_s_per_m", "rebound_n_s_per_m"),
+)
+
+DIRECTIONAL_DAMPING = Effect(
+    name="directional_damping",
+    family=_FAMILY,
+    words="a non-linear damper (rebound and compression, each by a power law)",
+    parameters=(
+        Parameter("compression_at_1_m_per_s_n", "N", -1e18, 1e18, "force as heights fall by 1 m/s"),
+        Parameter("compression_exponent", "", 0.3, 4.0, "exponent of the velocity there"),
+        Parameter("rebound_at_1_m_per_s_n", "N", -1e18, 1e18, "force as heights rise by 1 m/s"),
+        Parameter("rebound_exponent", "", 0.3, 4.0, "exponent of the velocity there"),
+    ),
+    force=_directional,
+    excitation=_SPEEDS,
+    reference="Dixon, The Shock Absorber Handbook (2007), 6.9 and 7.2, valves of each direction",
+    scaled=(0, 2),
+    starts=always(
+        (1.0, 0.5, 1.0, 2.0),
+        (1.0, 2.0, 1.0, 0.5),
+        (1.0, 0.5, 0.0, 1.0),
+        (0.0, 1.0, 1.0, 0.5),
+        (1.0, 2.0, 0.0, 1.0),
+        (0.0, 1.0, 1.0, 2.0),
+    ),
+    simpler=("asymmetric_damping", "power_damping"),
+    shown=("compression_at_1_m_per_s_n", "rebound_at_1_m_per_s_n"),
 )
 
 DIGRESSIVE_DAMPING = Effect(

@@ -69,6 +69,7 @@ CLOSED_FORMS = [
     ("quadratic_damping", [4.0], {"velocity": -0.5}, 1.0),
     ("power_damping", [4.0, 0.5], {"velocity": -0.25}, 2.0),
     ("asymmetric_damping", [4.0, 10.0], {"velocity": 0.5}, -5.0),
+    ("directional_damping", [4.0, 0.5, 6.0, 2.0], {"velocity": -0.25}, 2.0),
     ("digressive_damping", [4.0, 0.5], {"velocity": 0.5}, -2.0 / math.sqrt(2.0)),
     ("saturating_damping", [4.0, 0.5, 1.0], {"velocity": 0.5}, -1.0),
     ("arctan_damping", [4.0, 0.5], {"velocity": 0.5}, -0.5 * math.pi),
