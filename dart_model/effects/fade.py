@@ -9,6 +9,7 @@ _FAMILY = "fade"
 _REFERENCE = "Dixon, The Shock Absorber Handbook (2007), 7.12, temperature effects"
 _FINAL = Parameter("final_fraction", "", 0.0, 3.0, "share of the damping that stays")
 _COLD = Parameter("reference_c", "°C", -273.15, 2000.0, "temperature with full damping")
+# ISO 1, the reference temperature of geometrical specifications; a bench hall has about as much.
 _STANDARD_C = 20.0
 _LARGEST_EXPONENT = 40.0
 

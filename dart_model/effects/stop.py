@@ -195,8 +195,8 @@ def _hertz_ends_starts(motion: Motion) -> list[Start]:
     return [(*ends, 1.0, 0.05 * slowness_s_per_m(motion)) for ends in _both_ends_m(motion)]
 
 
-# A stop that is never touched has no force; one that is always touched is a spring.
-# A stop belongs to an end: what is touched over more than half of the stroke is a spring.
+# A stop that is never touched has no force. One that is touched over more than half of the stroke
+# is a spring there, and belongs to no end.
 _TOUCHED_BELOW = height(-0.02, 0.5)
 _TOUCHED_ABOVE = height(0.5, 1.02)
 _LOW_END = height(-0.02, 0.3)

@@ -19,14 +19,13 @@ from rig.diagnosis.problem.contract import Parts, existing_values, free_beside, 
 from rig.diagnosis.problem.free_run import FreeRun
 from rig.diagnosis.problem.prescribed import Prescribed
 from rig.diagnosis.recording import Recording, RecordingError
+from rig.diagnosis.search.conclude import Found, conclude
 from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
+from rig.diagnosis.search.explore import Progress, explore, within
 from rig.diagnosis.search.fit import Fit, fit
-from rig.diagnosis.search.select import Found, Scored, Search, Seed
+from rig.diagnosis.search.pool import Pool, Scored
 from rig.diagnosis.search.surface import surface
 from rig.diagnosis.write_up import judgement, needless, written_up
-
-Progress = Callable[[str, float], None]
-"""Told what is being done, and the share of it that is done."""
 
 
 def _quiet(_what: str, _share: float) -> None:
@@ -120,13 +119,13 @@ def _searched(
     progress("fitting the linear part", 0.03)
     given, linear = first_fits(problem)
     problem = _sharpened(problem, linear)
-    first = Search(problem, given, [_seed(linear)], criteria, _within(progress, 0.05, 0.55))
-    first.explore()
+    first = Pool(problem, given, [linear], criteria)
+    seen = explore(first, within(progress, 0.05, 0.55))
     problem = _sharpened(problem, first.chosen().fit)
-    seeds = [_seed(scored.fit) for scored in (first.linear, *first.best())]
-    second = Search(problem, given, seeds, criteria, _within(progress, 0.55, 0.95))
-    second.explore()
-    found = second.found(first)
+    seeds = [scored.fit for scored in (first.linear, *first.best())]
+    second, told = Pool(problem, given, seeds, criteria), within(progress, 0.55, 0.95)
+    explore(second, told)
+    found = conclude(second, first, seen, told)
     if isinstance(problem, FreeRun):
         found = found._replace(chosen=_polished(problem, found.chosen))
     return found, problem
@@ -171,14 +170,3 @@ def _sharpened(problem: FreeRun | Prescribed, result: Fit) -> FreeRun | Prescrib
     if isinstance(problem, FreeRun):
         problem = with_noise(problem, result.candidate, result.parts)
     return replace(problem, motions=motions)
-
-
-def _seed(result: Fit) -> Seed:
-    return Seed(result.candidate, result.parts)
-
-
-def _within(progress: Progress, first: float, last: float) -> Progress:
-    def part(what: str, share: float) -> None:
-        progress(what, first + (last - first) * share)
-
-    return part

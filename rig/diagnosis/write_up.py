@@ -36,9 +36,9 @@ from rig.diagnosis.problem.linear_part import EFFECTS, PARAMETERS
 from rig.diagnosis.problem.prescribed import Prescribed
 from rig.diagnosis.problem.track import effect_forces
 from rig.diagnosis.recording import Recording
+from rig.diagnosis.search.conclude import Found
 from rig.diagnosis.search.criteria import SelectionCriteria
 from rig.diagnosis.search.fit import Fit, effect_variables, is_white, spread
-from rig.diagnosis.search.select import Found
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,8 @@ class SelectionCriteria:
         kept_every: Without held-out runs, one block of so many is kept back to be judged on; a
             fifth is usual (Hastie, Tibshirani, Friedman, The Elements of Statistical Learning,
             2009, 7.10).
-        screened: Laws of each round whose parameters are refined before they are compared.
+        screened: Laws of each round whose parameters are refined before they are compared: their
+            order at starts that nothing has adapted is rough, and a round costs as much as it has.
         beam: Sets of laws that each round goes on from, so that an early choice can be revisited.
         most_laws: Laws that a finding may consist of. A force needs three at most before a table
             describes it as well (measured dampers: the fourth gains less than the scatter between
@@ -46,7 +47,8 @@ class SelectionCriteria:
         bounded: The same for the size of an effect, beyond what the linear part could give.
         cancelling: Correlation of two forces in one strut below which they cancel each other.
         leftover: Share of a law's force along the motion that no change of the linear part could
-            give; with less the law is a linear correction in disguise.
+            give; with less the law is a linear correction in disguise. A force
+            is seldom known to less (class 0.5 of ISO 7500-1 is half a percent).
         passive: Share of the largest dissipated power that a corrected strut may feed in, for the
             rounding of a fit.
         explained: Multiple of the noise floor that a right model stays below on held-out data: the

@@ -25,6 +25,7 @@ from rig.diagnosis.problem.contract import (
     Candidate,
     Integers,
     Parts,
+    Placed,
     Problem,
     placed,
     slots_of,
@@ -396,3 +397,21 @@ def is_white(problem: Problem, result: Fit, level: float) -> bool:
             if float(chi2.sf(statistic, lags)) < level / (problem.recordings * columns.shape[1]):
                 return False
     return True
+
+
+def law_values(problem: Problem, result: Fit) -> dict[Placed, Array]:
+    """Parameters of the laws that the nominal model lacks."""
+    index = slots_of(problem, result.candidate).index[len(result.candidate.kept) :]
+    return {
+        law: result.parts.effects[slot[1] : slot[2]]
+        for law, slot in zip(result.candidate.new, index, strict=True)
+    }
+
+
+def existing_law_values(problem: Problem, result: Fit) -> dict[int, Array]:
+    """Parameters of the effects that the nominal model has, by index."""
+    index = slots_of(problem, result.candidate).index
+    return {
+        kept: result.parts.effects[slot[1] : slot[2]]
+        for kept, slot in zip(result.candidate.kept, index, strict=False)
+    }

@@ -356,11 +356,11 @@ def _starts(problem: Problem, at: Placed, known: Mapping[str, float]) -> list[Ar
         for i, parameter in enumerate(item.parameters)
         if i not in item.scaled and parameter.name in known
     }
-    starts = [list(start) for start in item.starts(problem.motions[at[0]])]
-    for start in starts:
-        for i, value in fixed.items():
-            start[i] = value
-    return [np.array(start) for start in sorted({tuple(start) for start in starts})]
+    starts = {
+        tuple(fixed.get(i, value) for i, value in enumerate(start))
+        for start in item.starts(problem.motions[at[0]])
+    }
+    return [np.array(start) for start in sorted(starts)]
 
 
 def _nested(
@@ -370,10 +370,8 @@ def _nested(
     found: list[tuple[Placed, dict[str, float]]] = []
     for trial in trials:
         strut, name = trial.laws[-1]
-        known = {
-            p.name: float(value)
-            for p, value in zip(effect(name).parameters, trial.values[-1], strict=False)
-        }
+        values, _ = law_and_shift(name, trial.values[-1])
+        known = {p.name: float(v) for p, v in zip(effect(name).parameters, values, strict=True)}
         found += [(at, known) for at in laws if at[0] == strut and name in effect(at[1]).simpler]
     return found
 

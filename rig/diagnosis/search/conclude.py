@@ -1,0 +1,309 @@
+"""From the models that were fitted to what is reported: no law and no correction too many."""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dart_model.effects import effect
+from rig.diagnosis.problem.contract import (
+    Candidate,
+    Parts,
+    Placed,
+    Problem,
+    nominal,
+    slots_of,
+)
+from rig.diagnosis.search.explore import FirstRound, Progress
+from rig.diagnosis.search.fit import Fit, existing_law_values, fit, law_values, spread
+from rig.diagnosis.search.pool import FINAL, FULL, Pool, Scored
+from rig.diagnosis.search.screen import Trial, ranked, refined
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+class Rejected(NamedTuple):
+    """A law that was not chosen.
+
+    Attributes:
+        placed: The law.
+        why: One line.
+        left: Residual with it beside the linear part along the motion, as a share of the residual
+            of the linear part alone.
+    """
+
+    placed: Placed
+    why: str
+    left: float | None
+
+
+class Found(NamedTuple):
+    """What a search found.
+
+    Attributes:
+        given: The nominal model, only initial states fitted.
+        linear: The best linear model.
+        plain: The same with those corrections alone that the data call for.
+        chosen: The model that was chosen.
+        rivals: Models with other families that the data cannot tell from it.
+        superfluous: Existing effects, by index, without which the data are as well described.
+        rejected: Laws that were not chosen, best first.
+        gain_alike: Whether mass, stiffness and damping changed in one proportion, as they would by
+            a change of the applied force's gain.
+    """
+
+    given: Fit
+    linear: Scored
+    plain: Scored
+    chosen: Scored
+    rivals: tuple[Scored, ...]
+    superfluous: tuple[int, ...]
+    rejected: tuple[Rejected, ...]
+    gain_alike: bool
+
+
+def conclude(pool: Pool, first: Pool, seen: FirstRound | None, progress: Progress) -> Found:
+    """What was found.
+
+    Args:
+        pool: Models to choose from.
+        first: Those about the linear model, for what was not chosen.
+        seen: Single laws there.
+        progress: Told what is being done and the share that is done.
+    """
+    chosen = _without_needless(pool, pool.chosen())
+    progress("comparing rivals", 0.85)
+    rivals = _rivals(pool, chosen)
+    superfluous = _superfluous(pool, chosen)
+    chosen, alike = _with_few_linear(pool, chosen)
+    plain = _with_few_linear(pool, pool.linear)[0] if chosen.size else chosen
+    rejected = () if seen is None else _rejected(first, seen, chosen, rivals)
+    return Found(pool.given, pool.linear, plain, chosen, rivals, superfluous, rejected, alike)
+
+
+# --- no law too many ------------------------------------------------------------------------------
+
+
+def _without_needless(pool: Pool, chosen: Scored) -> Scored:
+    """Each law left out, or replaced by a simpler one, where that loses nothing."""
+    while True:
+        simpler = (
+            rival
+            for placed in chosen.fit.candidate.new
+            for rival in _simpler(pool, chosen, placed)
+            if not pool.worth(rival, chosen)
+        )
+        rival = next(simpler, None)
+        if rival is None:
+            return chosen
+        chosen = rival
+
+
+def _simpler(pool: Pool, chosen: Scored, placed: Placed) -> Iterable[Scored]:
+    """Models without a law of a chosen one, or with a simpler one for it; fitted as asked for."""
+    stage, known = pool.linear_stage, law_values(pool.problem, chosen.fit)
+    laws = chosen.fit.candidate.new
+    less = chosen.fit.candidate.without(placed)
+
+    def is_hopeful(trial: Trial | None) -> bool:
+        """Whether laws come near the chosen ones along the motion, where a fit costs little."""
+        whole = refined(stage, laws, [known[law] for law in laws])
+        if trial is None or whole is None:
+            return False
+        return trial.score <= pool.criteria.hopeless * whole.score
+
+    if chosen.size > 1:
+        if less not in pool.fits and is_hopeful(
+            refined(stage, less.new, [known[law] for law in less.new])
+        ):
+            first = slots_of(pool.problem, nominal(pool.problem)).parameters
+            effects = [chosen.fit.parts.effects[:first], *(known[law] for law in less.new)]
+            pool.attempt(less, _moved(pool.problem, chosen.fit, less, np.concatenate(effects)))
+        yield from _settled(pool, less, chosen)
+    for name in effect(placed[1]).simpler:
+        other = (placed[0], name)
+        if effect(name).linear or other in less.new:
+            continue
+        candidate = less.added(other)
+        if candidate not in pool.fits:
+            base = Trial(less.new, tuple(known[law] for law in less.new), 0.0, np.zeros(1))
+            for trial in ranked(stage, base, 1, [other]):
+                if trial.values and is_hopeful(trial):
+                    pool.attempt_trial(stage, pool.linear, trial, FULL)
+        yield from _settled(pool, candidate, chosen)
+
+
+def _settled(pool: Pool, candidate: Candidate, chosen: Scored) -> Iterable[Scored]:
+    """A set, fitted to its end if it is near the chosen one; none where there is no sound fit."""
+    if candidate in pool.fits:
+        pool.settle(pool.fits[candidate], chosen)
+        if candidate not in pool.unsound:
+            yield pool.fits[candidate]
+
+
+def _moved(problem: Problem, reference: Fit, candidate: Candidate, effects: Array) -> Parts:
+    """A reference's linear part and motion with other effects, internal states at zero."""
+    states = slots_of(problem, reference.candidate).states
+    starts: list[Array] = []
+    for k, start in enumerate(reference.parts.starts):
+        new = problem.start(k, candidate)
+        motion = len(start) - states
+        new[:motion] = start[:motion]
+        starts.append(new)
+    return Parts(reference.parts.linear, effects, tuple(starts))
+
+
+def _rivals(pool: Pool, chosen: Scored) -> tuple[Scored, ...]:
+    """Sets of the same size and other families that the data cannot tell from the chosen."""
+    found: dict[tuple[str, ...], Scored] = {}
+    for other in sorted(pool.sound(), key=lambda s: s.score):
+        if other.size != chosen.size or other.families in (chosen.families, *found):
+            continue
+        if not _degenerate(other, chosen) and pool.is_alike(other, chosen):
+            found[other.families] = other
+    return tuple(found.values())
+
+
+def _degenerate(other: Scored, chosen: Scored) -> bool:
+    """Whether a set is the chosen one with a law that only degenerates to one of its laws."""
+    more = set(other.fit.candidate.new) - set(chosen.fit.candidate.new)
+    less = set(chosen.fit.candidate.new) - set(other.fit.candidate.new)
+    return all(any(at == s and n in _simpler_names(name) for s, n in less) for at, name in more)
+
+
+def _simpler_names(name: str) -> set[str]:
+    direct = set(effect(name).simpler)
+    return direct.union(*(_simpler_names(other) for other in direct)) if direct else direct
+
+
+def _superfluous(pool: Pool, chosen: Scored) -> tuple[int, ...]:
+    """Existing effects that act on the recordings and without which nothing is lost."""
+    found: list[int] = []
+    problem, reference = pool.problem, chosen.fit
+    values = existing_law_values(problem, reference)
+    new = slots_of(problem, nominal(problem)).parameters
+    for i in reference.candidate.kept:
+        if not problem.existing[i].free:
+            continue
+        kept = tuple(j for j in reference.candidate.kept if j != i)
+        candidate = Candidate(kept, reference.candidate.new)
+        effects = np.concatenate([*(values[j] for j in kept), reference.parts.effects[new:]])
+        result = pool.refit(candidate, _moved(problem, reference, candidate, effects), FULL)
+        if result is not None and not pool.worth(pool.scored(result), chosen):
+            found.append(i)
+    return tuple(found)
+
+
+# --- no linear correction too many ----------------------------------------------------------------
+
+
+def _with_few_linear(pool: Pool, chosen: Scored) -> tuple[Scored, bool]:
+    """The chosen model, fitted to its end, with those linear corrections that data call for."""
+    problem = pool.problem
+    settled = fit(problem, chosen.fit.candidate, chosen.fit.parts, chosen.fit.free, *FINAL)
+    if settled is not None:
+        chosen = pool.scored(settled)
+    needed = _needed(chosen.fit, pool.criteria.significant)
+    parts = chosen.fit.parts._replace(linear=np.where(needed, chosen.fit.parts.linear, 0.0))
+    fewer = fit(problem, chosen.fit.candidate, parts, needed, *FINAL)
+    result = chosen
+    if fewer is not None and not pool.worth(pool.scored(fewer), chosen):
+        result = pool.scored(fewer)
+    as_given = pool.scored(pool.given)
+    if not result.size and not pool.worth(as_given, result):
+        # Corrections that are away from nothing and change nothing that can be measured.
+        return as_given, False
+    share = _alike(problem, result.fit)
+    if share is None:
+        return result, False
+    only = np.array([p.kind == "gain" for p in problem.linear], dtype=np.bool_)
+    start = result.fit.parts._replace(linear=np.where(only, 1.0 / (1.0 + share) - 1.0, 0.0))
+    gain = fit(problem, chosen.fit.candidate, start, only)
+    if gain is not None and not pool.worth(pool.scored(gain), result):
+        return pool.scored(gain), True
+    return result, True
+
+
+def _needed(result: Fit, significant: float) -> Flags:
+    """Backward elimination by Wald's test with the covariance of a coloured residual."""
+    variables = np.flatnonzero(result.free)
+    count = len(variables)
+    known = spread(result).covariance[:count, :count].copy()
+    x = result.space.inner(result.solution.values)[:count].copy()
+    left = list(range(count))
+    while left:
+        part = np.array(left)
+        sizes = np.abs(x[part]) / np.sqrt(np.maximum(np.diag(known)[part], 1e-300))
+        worst = int(part[np.argmin(sizes)])
+        if float(np.min(sizes)) >= significant:
+            break
+        # The others, given that this one is nothing.
+        x = x - known[:, worst] / max(known[worst, worst], 1e-300) * x[worst]
+        outer = np.outer(known[:, worst], known[worst]) / max(known[worst, worst], 1e-300)
+        known = known - outer
+        left.remove(worst)
+    needed = np.zeros_like(result.free)
+    needed[variables[left]] = True
+    return needed
+
+
+def _alike(problem: Problem, result: Fit) -> float | None:
+    """Share by which mass, stiffness and damping all changed, if it is one within intervals."""
+    if not any(p.kind == "gain" for p in problem.linear):
+        return None
+    known = spread(result)
+    free = [p for p, is_free in zip(problem.linear, result.free, strict=True) if is_free]
+    changes = result.solution.values[: len(free)]
+    deviations = np.sqrt(np.maximum(np.diag(known.covariance)[: len(free)], 0.0))
+    shares: list[tuple[float, float]] = []
+    for i, p in enumerate(free):
+        if p.kind in ("mass", "stiffness", "damping") and p.nominal > 0.0:
+            shares.append(
+                (changes[i] / p.nominal, deviations[i] * p.deviation / p.nominal * known.factor)
+            )
+    least = sum(1 for p in problem.linear if p.kind in ("mass", "stiffness", "damping"))
+    if len(shares) < least:
+        return None
+    middle = float(np.median([share for share, _ in shares]))
+    is_one = all(abs(share - middle) < max(half, 0.01) for share, half in shares)
+    return middle if is_one else None
+
+
+# --- what was not chosen --------------------------------------------------------------------------
+
+
+def _rejected(
+    first: Pool, seen: FirstRound, chosen: Scored, rivals: Sequence[Scored]
+) -> tuple[Rejected, ...]:
+    """Laws that were not chosen, with one line each, best first."""
+    found: dict[Placed, Rejected] = {}
+    taken = set(chosen.fit.candidate.new)
+    tied = {placed for rival in rivals for placed in rival.fit.candidate.new} - taken
+    for trial in seen.trials:
+        placed = trial.laws[-1]
+        if placed in taken or placed in found:
+            continue
+        left = float(np.sqrt(max(trial.cost, 0.0) / max(seen.nothing.cost, 1e-300)))
+        why = (
+            "cannot be told from what was chosen by these data"
+            if placed in tied
+            else _why(first, chosen, placed, left)
+        )
+        found[placed] = Rejected(placed, why, min(left, 1.0))
+    return tuple(sorted(found.values(), key=lambda r: 1.0 if r.left is None else r.left))
+
+
+def _why(first: Pool, chosen: Scored, placed: Placed, left: float) -> str:
+    candidate = nominal(first.problem).added(placed)
+    if candidate in first.unsound:
+        return first.unsound[candidate]
+    if candidate in first.fits and chosen.size > 0:
+        alone = first.fits[candidate]
+        ratio = float(np.sqrt(alone.score / max(chosen.score, 1e-300)))
+        if chosen.size == 1:
+            return f"its out-of-sample residual is {ratio:.3g} times that of the chosen model"
+        return f"alone it leaves {ratio:.3g} times the out-of-sample residual of the chosen set"
+    share = 100.0 * (1.0 - min(left, 1.0))
+    return f"along the motion it takes {share:.3g} % off the residual of the linear model"

@@ -1,0 +1,192 @@
+"""Forward and backward over a beam of sets of laws.
+
+Reference: Miller, Subset Selection in Regression (2002), 3, forward and backward search.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from dart_model.effects import effect
+from rig.diagnosis.problem.contract import Placed, nominal
+from rig.diagnosis.search.fit import law_values
+from rig.diagnosis.search.pool import Pool, Scored, kinds
+from rig.diagnosis.search.screen import Stage, Trial, plain, proposed, ranked, refined, stage_of
+
+Progress = Callable[[str, float], None]
+"""Told what is being done and the share that is done."""
+
+_EXPLORED = 0.85
+"""Share of a search's time after which it compares rivals."""
+
+
+class FirstRound(NamedTuple):
+    """Single laws beside the linear part, along the motion.
+
+    Attributes:
+        nothing: No law at all.
+        trials: The laws, best first.
+    """
+
+    nothing: Trial
+    trials: tuple[Trial, ...]
+
+
+def explore(pool: Pool, progress: Progress) -> FirstRound | None:
+    """Fit sets of laws that may be chosen, about the linear model or the best of several seeds.
+
+    Returns:
+        The first round about the linear model, where there was one.
+    """
+    seen = None
+    if len(pool.fits) > 1:
+        _about_the_best(pool, progress)
+    else:
+        seen = _from_nothing(pool, progress)
+    best = pool.best()
+    for scored in best:
+        pool.settle(scored, best[0])
+    return seen
+
+
+def _from_nothing(pool: Pool, progress: Progress) -> FirstRound | None:
+    """Explore sets of one law, of two, ..., and fit the best of each size."""
+    reference, criteria = pool.linear, pool.criteria
+    if pool.at_floor(reference):
+        return None
+    stage = pool.linear_stage
+    nothing = plain(stage)
+    beam, seen = [nothing], FirstRound(nothing, ())
+    levels: list[list[Trial]] = []
+    for size in range(1, criteria.most_laws + 1):
+        begin = _EXPLORED * (size - 1) / criteria.most_laws
+        end = _EXPLORED * size / criteria.most_laws
+        rounds = _rounds(pool, stage, beam, within(progress, begin, 0.5 * (begin + end)))
+        if not levels:
+            seen = seen._replace(trials=tuple(rounds[0]))
+        level = _best_of_each(rounds)
+        if not level:
+            break
+        finalists = _finalists(pool, level) + _backward(stage, levels, level[:2])
+        levels.append(level)
+        _fit_all(pool, stage, reference, finalists, within(progress, 0.5 * (begin + end), end))
+        before = min(beam, key=_score).score
+        if (
+            pool.at_floor(pool.settled_least())
+            or before - level[0].score < criteria.least_likelihood_gain
+            # Nearly right: what is left is looked for about it, not the linear model.
+            or pool.is_formula(pool.least())
+        ):
+            break
+        beam = _diverse(level, criteria.beam)
+    return seen
+
+
+def _about_the_best(pool: Pool, progress: Progress) -> None:
+    """Add to, and exchange laws of, the best set: its free run is near the measurement."""
+    reference = pool.least()
+    if pool.at_floor(reference):
+        return
+    stage = stage_of(pool.problem, reference.fit.candidate, reference.fit.parts)
+    values = law_values(pool.problem, reference.fit)
+    laws = reference.fit.candidate.new
+    bases = [tuple(other for other in laws if other != law) for law in laws]
+    if len(laws) < pool.criteria.most_laws:
+        # What is nearly right more likely has a wrong formula than one law too few.
+        bases.insert(len(bases) if pool.is_formula(reference) else 0, laws)
+    for i, base in enumerate(bases):
+        trial = Trial(base, tuple(values[law] for law in base), 0.0, np.zeros(1))
+        begin, end = _EXPLORED * i / len(bases), _EXPLORED * (i + 1) / len(bases)
+        rounds = _rounds(pool, stage, [trial], within(progress, begin, 0.5 * (begin + end)))
+        finalists = _finalists(pool, _best_of_each(rounds))
+        _fit_all(pool, stage, reference, finalists, within(progress, 0.5 * (begin + end), end))
+        if pool.at_floor(pool.settled_least()):
+            return
+
+
+def _rounds(
+    pool: Pool, stage: Stage, beam: Sequence[Trial], progress: Progress
+) -> list[list[Trial]]:
+    """For each set of a beam, that set with one law more, best first."""
+    found: list[list[Trial]] = []
+    for i, base in enumerate(beam):
+        progress("screening laws", i / len(beam))
+        found.append(ranked(stage, base, pool.criteria.screened, _open_to(pool, base)))
+    return found
+
+
+def _best_of_each(rounds: Sequence[Sequence[Trial]]) -> list[Trial]:
+    """Sets that were refined along the motion, each at its best, best first."""
+    found: dict[frozenset[Placed], Trial] = {}
+    for trial in (trial for trials in rounds for trial in trials if trial.values):
+        key = frozenset(trial.laws)
+        if key not in found or trial.score < found[key].score:
+            found[key] = trial
+    return sorted(found.values(), key=_score)
+
+
+def _open_to(pool: Pool, base: Trial) -> list[Placed]:
+    """Laws that may be added to a set: where it is nearly right, those of other kinds alone."""
+    everything = proposed(pool.problem)
+    known = pool.fits.get(nominal(pool.problem).added(*base.laws))
+    if known is None or not pool.is_formula(known):
+        return everything
+    taken = set().union(*(kinds(effect(name).family) for _, name in base.laws))
+    return [at for at in everything if not kinds(effect(at[1]).family) & taken]
+
+
+def _backward(
+    stage: Stage, levels: Sequence[Sequence[Trial]], best: Sequence[Trial]
+) -> list[Trial]:
+    """The best sets less one of their laws, where that set has not been tried."""
+    found: list[Trial | None] = []
+    for trial in best:
+        if len(trial.laws) < 2:
+            continue
+        known = {frozenset(t.laws) for t in levels[len(trial.laws) - 2]}
+        for i in range(len(trial.laws)):
+            laws = trial.laws[:i] + trial.laws[i + 1 :]
+            if frozenset(laws) not in known:
+                found.append(refined(stage, laws, trial.values[:i] + trial.values[i + 1 :]))
+    return [trial for trial in found if trial is not None]
+
+
+def _fit_all(
+    pool: Pool, stage: Stage, reference: Scored, trials: Sequence[Trial], progress: Progress
+) -> None:
+    for i, trial in enumerate(trials):
+        progress(f"fitting {', '.join(name for _, name in trial.laws)}", i / len(trials))
+        pool.attempt_trial(stage, reference, trial)
+
+
+def _finalists(pool: Pool, level: Sequence[Trial]) -> list[Trial]:
+    least = pool.criteria.hopeless * min((trial.score for trial in level), default=0.0)
+    return [trial for trial in _diverse(level, pool.criteria.finalists) if trial.score <= least]
+
+
+def _diverse(level: Sequence[Trial], count: int) -> list[Trial]:
+    """The best sets, at most two of which are of the same families."""
+    chosen: list[Trial] = []
+    seen: dict[tuple[str, ...], int] = {}
+    for trial in level:
+        if len(chosen) >= count:
+            break
+        families = tuple(sorted(effect(name).family for _, name in trial.laws))
+        if seen.get(families, 0) < 2:
+            chosen.append(trial)
+            seen[families] = seen.get(families, 0) + 1
+    return chosen
+
+
+def _score(trial: Trial) -> float:
+    return trial.score
+
+
+def within(progress: Progress, first: float, last: float) -> Progress:
+    """Progress of a part of something, told as shares of the whole."""
+
+    def part(what: str, share: float) -> None:
+        progress(what, first + (last - first) * share)
+
+    return part

@@ -1,0 +1,282 @@
+"""Models that were fitted, and which of them is worth more than another.
+
+Reference: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees (1984), 3.4.3, the
+one-standard-error rule.
+"""
+
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dart_model.effects import effect
+from rig.diagnosis.problem.contract import (
+    Candidate,
+    Parts,
+    Problem,
+    existing_values,
+    free_beside,
+    nominal,
+)
+from rig.diagnosis.search.criteria import KINDS, SelectionCriteria
+from rig.diagnosis.search.fit import Fit, block_scores, fit
+from rig.diagnosis.search.screen import Stage, Trial, law_and_shift, linear_beside, stage_of
+from rig.diagnosis.search.sound import tracks, unsound
+
+Array = NDArray[np.float64]
+
+
+class Effort(NamedTuple):
+    """How far a fit goes.
+
+    Attributes:
+        steps: Most steps.
+        gain: Relative gain below which it ends.
+        sides: Sides on which its last differences are taken.
+    """
+
+    steps: int
+    gain: float
+    sides: int
+
+
+_BEGUN = Effort(8, 1e-2, 1)
+"""Fits of initial states alone."""
+ROUGH = Effort(8, 1e-3, 1)
+"""Fits that are compared among themselves."""
+FULL = Effort(20, 1e-4, 2)
+"""Fits that decide."""
+FINAL = Effort(15, 1e-6, 2)
+"""The fit that is reported."""
+
+
+class Scored(NamedTuple):
+    """A fitted model and what it does on blocks that took no part.
+
+    Attributes:
+        fit: The model.
+        scores: Out-of-sample sum of squares of each block.
+    """
+
+    fit: Fit
+    scores: Array
+
+    @property
+    def score(self) -> float:
+        """Out-of-sample sum of squares."""
+        return float(self.scores.sum())
+
+    @property
+    def size(self) -> int:
+        """Number of laws."""
+        return len(self.fit.candidate.new)
+
+    @property
+    def families(self) -> tuple[str, ...]:
+        """Families of its laws."""
+        return tuple(sorted(effect(name).family for _, name in self.fit.candidate.new))
+
+
+class Pool:
+    """Models that were fitted, by their effects; of two fits of one the better is kept.
+
+    Args:
+        problem: Model and recordings.
+        given: The nominal model, initial states fitted.
+        seeds: Models to begin with, the best linear one first.
+        criteria: What decides.
+    """
+
+    def __init__(
+        self, problem: Problem, given: Fit, seeds: Sequence[Fit], criteria: SelectionCriteria
+    ) -> None:
+        self.problem, self.given, self.criteria = problem, given, criteria
+        self.along = tracks(problem, given)
+        self.fits: dict[Candidate, Scored] = {}
+        self.unsound: dict[Candidate, str] = {}
+        self.settled: set[Candidate] = set()
+        for seed in seeds:
+            self.attempt(seed.candidate, seed.parts)
+        base = nominal(problem)
+        self.linear = self.fits.setdefault(base, self.scored(given))
+
+    @cached_property
+    def linear_stage(self) -> Stage:
+        """The regression about the best linear model."""
+        return stage_of(self.problem, self.linear.fit.candidate, self.linear.fit.parts)
+
+    # --- fits ---------------------------------------------------------------------------------
+
+    def scored(self, result: Fit) -> Scored:
+        """A fit with its scores."""
+        return Scored(result, block_scores(self.problem, result))
+
+    def refit(
+        self, candidate: Candidate, parts: Parts, effort: Effort, most_level: float = np.inf
+    ) -> Fit | None:
+        """Fit a candidate with all of its linear part that may be free beside it."""
+        free = free_beside(self.problem, candidate)
+        parts = parts._replace(linear=np.where(free, parts.linear, 0.0))
+        return fit(self.problem, candidate, parts, free, *effort, most_level=most_level)
+
+    def attempt(
+        self,
+        candidate: Candidate,
+        parts: Parts,
+        effort: Effort = ROUGH,
+        most_level: float = np.inf,
+    ) -> None:
+        """Fit a candidate in simulation and keep the better of this and an earlier fit."""
+        result = self.refit(candidate, parts, effort, most_level)
+        if effort is FULL:
+            self.settled.add(candidate)
+        if result is None:
+            return
+        scored = self.scored(result)
+        if candidate in self.fits and scored.score >= self.fits[candidate].score:
+            return
+        self.fits[candidate] = scored
+        self.unsound.pop(candidate, None)
+        why = unsound(self.problem, result, self.along, self.criteria)
+        if why is not None:
+            self.unsound[candidate] = why
+
+    def attempt_trial(
+        self, stage: Stage, reference: Scored, trial: Trial, effort: Effort = ROUGH
+    ) -> None:
+        """Fit a trial's laws in simulation, from what it found along the motion.
+
+        Args:
+            stage: Where it was found.
+            reference: The model that stage is about.
+            trial: The laws.
+            effort: How far to go.
+        """
+        base, known = nominal(self.problem), reference.fit
+        existing = existing_values(self.problem, base)
+        if known.candidate.kept == base.kept:
+            existing = known.parts.effects[: len(existing)]
+        values, linear = [existing], known.parts.linear + linear_beside(stage, trial)
+        for at, own in sorted(zip(trial.laws, trial.values, strict=True), key=lambda law: law[0]):
+            parameters, shift = law_and_shift(at[1], own)
+            values.append(parameters)
+            here = [(p.strut, p.kind) == (at[0], "free_length") for p in self.problem.linear]
+            linear = linear + shift * np.array(here)
+        least = np.array([p.least for p in self.problem.linear])
+        candidate = base.added(*trial.laws)
+        parts = self._begun(candidate, np.maximum(linear, least), np.concatenate(values))
+        # Priors weigh as they did there: a free run may begin far off with the right parameters.
+        self.attempt(candidate, parts, effort, max(1.0, trial.cost / len(stage.target)))
+
+    def _begun(self, candidate: Candidate, linear: Array, effects: Array) -> Parts:
+        """With initial states of its own: those of a poorer model make up for what it lacks."""
+        recordings = range(self.problem.recordings)
+        starts = tuple(self.problem.start(k, candidate) for k in recordings)
+        own, none = Parts(linear, effects, starts), np.zeros(len(linear), dtype=np.bool_)
+        result = fit(self.problem, candidate, own, none, *_BEGUN, effects=False)
+        return own if result is None else result.parts
+
+    def settle(self, scored: Scored, best: Scored) -> None:
+        """Fit a set to its end if it comes near the best one."""
+        candidate = scored.fit.candidate
+        if scored.size and self.is_near(scored, best) and candidate not in self.settled:
+            self.attempt(candidate, scored.fit.parts, FULL)
+
+    # --- what may be chosen -------------------------------------------------------------------
+
+    def sound(self) -> Iterable[Scored]:
+        """Models that an engineer would use."""
+        return (s for c, s in self.fits.items() if c not in self.unsound)
+
+    def least(self) -> Scored:
+        """The best sound one."""
+        return min(self.sound(), key=lambda s: s.score)
+
+    def settled_least(self) -> Scored:
+        """The same, fitted to its end: whether it is at the floor decides on going on."""
+        best = self.least()
+        self.settle(best, best)
+        return self.least()
+
+    def best(self) -> tuple[Scored, ...]:
+        """The best sound sets that come near the best one."""
+        order = sorted((s for s in self.sound() if s.size > 0), key=lambda s: s.score)
+        near = (s for s in order if self.is_near(s, order[0]))
+        return tuple(near)[: self.criteria.finalists]
+
+    def chosen(self) -> Scored:
+        """The smallest set that no larger one is worth more than."""
+        current = self.linear
+        while True:
+            larger = [s for s in self.sound() if s.size > current.size and self.worth(current, s)]
+            if not larger:
+                return current
+            least = min(s.size for s in larger)
+            current = self._plainest([s for s in larger if s.size == least])
+
+    def _plainest(self, sets: Sequence[Scored]) -> Scored:
+        """Of the sets that the data cannot tell from the best, that with the fewest parameters."""
+        best = min(sets, key=lambda s: s.score)
+        alike = [s for s in sets if self.is_alike(s, best)]
+        return min(alike, key=lambda s: (len(s.fit.parts.effects), s.score))
+
+    # --- whether one model is worth more than another -------------------------------------------
+
+    def worth(self, smaller: Scored, larger: Scored) -> bool:
+        """Whether a larger model is worth its further laws."""
+        criteria, above = self.criteria, smaller.score - smaller.fit.rows
+        if self.at_floor(smaller) and (larger.size > smaller.size or not smaller.size):
+            return False
+        if (
+            larger.size > smaller.size
+            and self.is_formula(smaller)
+            and not _adds_a_kind(smaller, larger)
+        ):
+            return False
+        gain = smaller.score - larger.score
+        return (
+            gain > criteria.standard_errors * _standard_error(smaller, larger)
+            and gain > criteria.least_likelihood_gain
+            and gain > criteria.least_share * above
+        )
+
+    def at_floor(self, result: Scored) -> bool:
+        """Whether nothing is left that a law could be looked for in."""
+        first, later = self.criteria.least_above_noise, self.criteria.least_above_noise_later
+        share = later if result.size else first
+        return result.score - result.fit.rows < share * result.fit.rows
+
+    def is_formula(self, result: Scored) -> bool:
+        """Whether what laws leave is so little that it may be their formulas' fault."""
+        linear = self.linear.score - self.linear.fit.rows
+        above = result.score - result.fit.rows
+        return bool(result.size) and above < self.criteria.formula**2 * linear
+
+    def is_near(self, scored: Scored, best: Scored) -> bool:
+        """Whether a set is not hopeless beside the best one."""
+        return scored.score <= self.criteria.hopeless * best.score
+
+    def is_alike(self, other: Scored, best: Scored) -> bool:
+        """Whether the data cannot tell a set from the best one."""
+        lost = other.score - best.score
+        return lost <= self.criteria.standard_errors * _standard_error(other, best)
+
+
+def kinds(family: str) -> set[int]:
+    """What a family's force follows, by number; what is in no list is a kind of its own."""
+    return {i for i, kind in enumerate(KINDS) if family in kind} or {len(KINDS)}
+
+
+def _adds_a_kind(smaller: Scored, larger: Scored) -> bool:
+    """Whether a larger set is the smaller one, in its families, with a law of a further kind."""
+    few, many = set(smaller.families), set(larger.families)
+    known = set().union(*(kinds(family) for family in few))
+    return few < many and any(not kinds(family) & known for family in many - few)
+
+
+def _standard_error(one: Scored, other: Scored) -> float:
+    """Standard error of the difference of two out-of-sample sums over blocks."""
+    difference = one.scores - other.scores
+    return float(np.sqrt(len(difference)) * np.std(difference, ddof=1))
