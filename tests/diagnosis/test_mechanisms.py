@@ -15,6 +15,7 @@ from tests.diagnosis.mechanisms import (
 )
 
 
+@pytest.mark.long
 def test_a_bump_stop_of_a_trailing_arm_is_found(tmp_path):
     arm = ArmWithStop()
     train, test = arm.recording(), arm.recording(2, arm.later_n, duration_s=8.0)
@@ -48,6 +49,7 @@ def quarter_car(car, folder):
     return diagnose(model, [train], [test]).diagnosis
 
 
+@pytest.mark.long
 def test_friction_in_the_suspension_of_a_quarter_car_is_found(tmp_path):
     found = quarter_car(QuarterCarWithFriction(), tmp_path)
     assert [(effect.family, effect.strut) for effect in found.effects] == [

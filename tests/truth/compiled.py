@@ -554,6 +554,28 @@ def _slip_direction(y, others_n, parameters):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _turn(system, k, z, v, y, work):
+    """End of a step, from `z` and `v`, in which a sliding body stops: it may stick or turn round.
+
+    Friction changes sign where the body stands still, not at the end of the step.
+    """
+    h, a = system.step_s, work[0, 1]
+    bend = (y[1] - v - a * h) / (h * h)
+    t = h * v / (v - y[1])
+    for _ in range(3):
+        slope = a + 2.0 * bend * t
+        if slope != 0.0:
+            t = min(max(t - (v + t * (a + t * bend)) / slope, 0.0), h)
+    y[0], y[1] = z + t * (v + t * (0.5 * a + t * bend / 3.0)), 0.0
+    others = _derivative(system, 2 * k + 2, y, 0.0, work[0])
+    slip = _slip_direction(y, others, system.parameters[system.stick])
+    if slip != 0.0:
+        mass = system.bench[0] + system.extra_mass_kg
+        back = _acceleration(others + _sliding_n(system, slip, 0.0), mass, system.quadratic)
+        y[0], y[1] = y[0] + 0.5 * back * (h - t) ** 2, back * (h - t)
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _advance(system, k, y, work):
     """One step of `y` in place."""
     slip = 0.0
@@ -563,10 +585,10 @@ def _advance(system, k, y, work):
         if slip == 0.0:
             _stuck_step(system, k, others, y, work)
             return
+    z, v = y[0], y[1]
     _runge_kutta(system, k, slip, y, work)
-    # A sliding body that would turn round stops first, and then shows whether it sticks.
     if slip * y[1] < 0.0:
-        y[1] = 0.0
+        _turn(system, k, z, v, y, work)
     for e in range(system.codes.size):
         if system.codes[e] == _SLIP_ELEMENTS:
             memory = y[system.at[e] : system.at[e + 1]]
