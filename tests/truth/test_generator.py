@@ -141,20 +141,27 @@ def test_forces_of_every_family_balance(kind, seed):
     assert np.max(np.abs(travelled)) < 2e-6
 
 
+SWITCHING = ("hysteresis", "backlash", "stop", "foreign-friction", "foreign-backlash")
+"""Kinds with laws that switch."""
+
+
 @pytest.mark.parametrize(
     ("kind", "seed"),
-    [*((kind, 5) for kind in (*FAMILIES, *FOREIGN_KINDS)), *(("friction", k) for k in range(4))],
+    [*(("friction", k) for k in range(4)), *((kind, 5) for kind in SWITCHING)],
 )
 def test_the_integrator_errs_less_than_the_sensors(kind, seed, monkeypatch):
-    """Else the floor that a right model is held to would be the bench's own error."""
+    """Else the floor that a right model is held to would be the bench's own error.
+
+    Smooth laws converge with the fourth order; an error of the first order halves with the step.
+    """
     case = short_case(seed, kind)
     usual = record(case, case.train).true_height_m
     steps = simulation.steps_per_sample
     monkeypatch.setattr(
-        simulation, "steps_per_sample", lambda effects, rate_hz: 4 * steps(effects, rate_hz)
+        simulation, "steps_per_sample", lambda effects, rate_hz: 2 * steps(effects, rate_hz)
     )
     error = usual - record(case, case.train).true_height_m
-    assert np.sqrt(np.mean(error**2)) < 0.1 * case.sensors.height_noise_m
+    assert np.sqrt(np.mean(error**2)) < 0.05 * case.sensors.height_noise_m
 
 
 def test_dry_contact_sticks_below_breakaway_and_slides_above():
