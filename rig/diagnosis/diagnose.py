@@ -123,9 +123,9 @@ def _searched(
     seen = explore(first, within(progress, 0.05, 0.55))
     problem = _sharpened(problem, first.chosen().fit)
     seeds = [scored.fit for scored in (first.linear, *first.best())]
-    second, told = Pool(problem, given, seeds, criteria), within(progress, 0.55, 0.95)
-    explore(second, told)
-    found = conclude(second, first, seen, told)
+    second, rest = Pool(problem, given, seeds, criteria), within(progress, 0.55, 0.95)
+    explore(second, rest)
+    found = conclude(second, first, seen, rest)
     if isinstance(problem, FreeRun):
         found = found._replace(chosen=_polished(problem, found.chosen))
     return found, problem

@@ -1,6 +1,7 @@
 """From the models that were fitted to what is reported: no law and no correction too many."""
 
 from collections.abc import Iterable, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -107,12 +108,14 @@ def _simpler(pool: Pool, chosen: Scored, placed: Placed) -> Iterable[Scored]:
     laws = chosen.fit.candidate.new
     less = chosen.fit.candidate.without(placed)
 
-    def is_hopeful(trial: Trial | None) -> bool:
-        """Whether laws come near the chosen ones along the motion, where a fit costs little."""
+    @cache
+    def most() -> float:
+        """What is hopeful beside the chosen laws along the motion, where a fit costs little."""
         whole = refined(stage, laws, [known[law] for law in laws])
-        if trial is None or whole is None:
-            return False
-        return trial.score <= pool.criteria.hopeless * whole.score
+        return -np.inf if whole is None else pool.criteria.hopeless * whole.score
+
+    def is_hopeful(trial: Trial | None) -> bool:
+        return trial is not None and trial.score <= most()
 
     if chosen.size > 1:
         if less not in pool.fits and is_hopeful(
@@ -209,10 +212,9 @@ def _with_few_linear(pool: Pool, chosen: Scored) -> tuple[Scored, bool]:
     parts = chosen.fit.parts._replace(linear=np.where(needed, chosen.fit.parts.linear, 0.0))
     fewer = fit(problem, chosen.fit.candidate, parts, needed, *FINAL)
     result = chosen
-    if fewer is not None and not pool.worth(pool.scored(fewer), chosen):
-        result = pool.scored(fewer)
-    as_given = pool.scored(pool.given)
-    if not result.size and not pool.worth(as_given, result):
+    if fewer is not None and not pool.worth(lean := pool.scored(fewer), chosen):
+        result = lean
+    if not result.size and not pool.worth(as_given := pool.scored(pool.given), result):
         # Corrections that are away from nothing and change nothing that can be measured.
         return as_given, False
     share = _alike(problem, result.fit)
@@ -221,8 +223,8 @@ def _with_few_linear(pool: Pool, chosen: Scored) -> tuple[Scored, bool]:
     only = np.array([p.kind == "gain" for p in problem.linear], dtype=np.bool_)
     start = result.fit.parts._replace(linear=np.where(only, 1.0 / (1.0 + share) - 1.0, 0.0))
     gain = fit(problem, chosen.fit.candidate, start, only)
-    if gain is not None and not pool.worth(pool.scored(gain), result):
-        return pool.scored(gain), True
+    if gain is not None and not pool.worth(lean := pool.scored(gain), result):
+        return lean, True
     return result, True
 
 

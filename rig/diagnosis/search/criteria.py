@@ -47,8 +47,8 @@ class SelectionCriteria:
         bounded: The same for the size of an effect, beyond what the linear part could give.
         cancelling: Correlation of two forces in one strut below which they cancel each other.
         leftover: Share of a law's force along the motion that no change of the linear part could
-            give; with less the law is a linear correction in disguise. A force
-            is seldom known to less (class 0.5 of ISO 7500-1 is half a percent).
+            give; with less the law is a linear correction in disguise. A force is seldom known to
+            less (class 0.5 of ISO 7500-1 is half a percent).
         passive: Share of the largest dissipated power that a corrected strut may feed in, for the
             rounding of a fit.
         explained: Multiple of the noise floor that a right model stays below on held-out data: the

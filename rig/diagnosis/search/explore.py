@@ -184,7 +184,7 @@ def _score(trial: Trial) -> float:
 
 
 def within(progress: Progress, first: float, last: float) -> Progress:
-    """Progress of a part of something, told as shares of the whole."""
+    """Progress of a part, in shares of the whole."""
 
     def part(what: str, share: float) -> None:
         progress(what, first + (last - first) * share)
