@@ -4,7 +4,8 @@ The measure is the bare DART loop: read position and velocity, set a force, step
 with DART's array functions (`getPositions`) and with its cheaper scalar ones (`getPosition(0)`).
 The body moves, as under the seed's applied force: for one at rest DART skips a fifth of its work.
 Rounds of all subjects alternate, so that what disturbs this machine disturbs all of them; CPU time
-is taken, the fastest round counts, and the spread is printed (`pytest -s`).
+is taken, the fastest round counts, and the spread is printed (`pytest -s`). A ratio of two memory
+patterns is another one beside a test that fills the cache: `.ci/run` runs these by themselves.
 """
 
 import math
@@ -35,6 +36,8 @@ ROUNDS = 50
 TIMES_NS = tuple(tick * MS for tick in range(TICKS))
 APPLIED_N = tuple(100.0 * math.sin(0.01 * tick) for tick in range(TICKS))
 HEIGHTS_M = tuple(0.4 + 0.02 * math.sin(0.02 * tick) for tick in range(TICKS))
+
+pytestmark = pytest.mark.long
 
 Subject = Callable[[], None]
 
@@ -182,9 +185,7 @@ def test_a_whole_tick_against_the_bare_dart_loop(capsys):
         capsys,
     )
     tick = found["whole tick, frame in and frame out"]
-    # Measured: 2.5, and 5.0 to 5.2 (4.6 to 4.9 by a Python built with its optimisations).
-    assert tick / found["DART, array functions"] <= 3.2
-    # The budget is 9: beside other work 7.7 was seen.
+    # Measured: 5.0 to 5.2 (4.6 to 4.9 by a Python built with its optimisations).
     assert tick / found["DART, scalar functions"] <= 9.0
 
 
