@@ -235,11 +235,13 @@ class Pool:
             and not _adds_a_kind(smaller, larger)
         ):
             return False
+        # A law has to take its share; a better formula for one need only be better.
+        share = 0.0 if larger.size == smaller.size > 0 else criteria.least_share
         gain = smaller.score - larger.score
         return (
             gain > criteria.standard_errors * _standard_error(smaller, larger)
             and gain > criteria.least_likelihood_gain
-            and gain > criteria.least_share * above
+            and gain > share * above
         )
 
     def at_floor(self, result: Scored) -> bool:
