@@ -59,6 +59,12 @@ def _frequencies(motion: Motion) -> tuple[float, float]:
     return 1.0 / motion.duration_s, 0.25 / motion.step_s
 
 
+def _damping_ratios(_: Motion) -> tuple[float, float]:
+    # The least logarithmic decrement of EN 1991-1-4:2005, table F.2 (welded steel) is 0.012; with
+    # less, a free vibration lasts as long as a run and passes for a tone of whatever cause.
+    return 0.012 / (2.0 * math.pi), 2.0
+
+
 HIDDEN_MASS = Effect(
     name="hidden_mass",
     family="unmodelled_mode",
@@ -75,7 +81,7 @@ HIDDEN_MASS = Effect(
     state_scales=(0.01, 0.01),
     fits_state=True,
     starts=_hidden_mass_starts,
-    bounds=within(mass_kg=_masses, frequency_hz=_frequencies),
+    bounds=within(mass_kg=_masses, frequency_hz=_frequencies, damping_ratio=_damping_ratios),
     simpler=("added_mass",),
     benches=("force_given",),
     shown=("mass_kg", "frequency_hz"),

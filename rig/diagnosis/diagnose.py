@@ -122,7 +122,7 @@ def _searched(
     first = Pool(problem, given, [linear], criteria)
     seen = explore(first, within(progress, 0.05, 0.55))
     problem = _sharpened(problem, first.chosen().fit)
-    seeds = [scored.fit for scored in (first.linear, *first.best())]
+    seeds = [scored.fit for scored in (first.linear, *first.best_and_less())]
     second, rest = Pool(problem, given, seeds, criteria), within(progress, 0.55, 0.95)
     explore(second, rest)
     found = conclude(second, first, seen, rest)

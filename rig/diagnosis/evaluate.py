@@ -21,7 +21,7 @@ from rig.diagnosis.problem.contract import (
     existing_values,
     nominal,
 )
-from rig.diagnosis.problem.free_run import FreeRun, Run
+from rig.diagnosis.problem.free_run import FreeRun
 from rig.diagnosis.problem.prescribed import Drive, Prescribed
 from rig.diagnosis.recording import Recording, RecordingError
 from rig.diagnosis.search.fit import Fit, fit
@@ -32,11 +32,6 @@ _DRAWS, _INPUT_DRAWS = 3, 8
 """Draws of the noise from which a floor is taken: of the motion's the third changes it by a few
 percent; of the applied force's the largest counts, since a lightly damped motion answers to it in
 so few independent swings that their RMS scatters by a third."""
-_LARGEST_INPUT_NOISE = 0.01
-"""Share of an applied force's range above which what is not smooth is not noise but excitation."""
-_TOP = 0.8
-"""Share of the sampled band above which a bench excites nothing: anti-aliasing filters and the
-actuator end below, so what is there is noise."""
 _AGREEMENT, _ACCURACY = 0.1, 0.01
 """Share of the noise, or of the error if that is more, to which DART's steps are settled."""
 
@@ -177,7 +172,8 @@ def _free_run(
     residual = [np.where(rows, f.force_n, np.nan) for f in forces if f is not None]
     heights = BeforeAfter(rms(measured - on_dart[0]), rms(measured - on_dart[1]))
     deviation = forces[1].deviation_n if forces[1] is not None else np.full((1, 1), np.nan)
-    drift_m = _input_floor_m(problem, k, models.chosen)
+    disturbed = problem.disturbances_m(k, *models.chosen, _INPUT_DRAWS)
+    drift_m = max((rms(heights_m) for heights_m in disturbed), default=0.0)
     floor_m = float(np.hypot(rms(noise), drift_m))
     series = tuple(
         HeldOutSeries(
@@ -226,41 +222,6 @@ def _strut_force(
         at = np.column_stack([np.interp(recording.t_s, run.grid.t_s, force) for force in forces])
         found.append(rms(cells - at))
     return BeforeAfter(*found)
-
-
-def _input_floor_m(problem: FreeRun, k: int, model: tuple[Candidate, Parts]) -> float:
-    """RMS height that noise of the applied force causes, drift of springless axes included."""
-    run = problem.runs[k]
-    candidate, parts = model
-    noise = input_noise_n(run)
-    there = problem.simulated(run, candidate, parts, parts.starts[k])
-    if noise == 0.0 or there is None:
-        return 0.0
-    rng = np.random.default_rng(0)
-    squares: list[float] = []
-    for _ in range(_INPUT_DRAWS):
-        # White between samples: what the recorded force is wrong by is held over a sample or so.
-        nodes = noise * rng.standard_normal(len(run.grid.t_s))
-        fine = np.append(np.repeat(nodes[:-1], 2 * run.substeps), nodes[-1])
-        other = run._replace(fine_n=run.fine_n + fine)
-        moved = problem.simulated(other, candidate, parts, parts.starts[k])
-        if moved is not None:
-            squares.append(float(np.mean((moved.heights_m - there.heights_m) ** 2)))
-    return float(np.sqrt(max(squares, default=0.0)))
-
-
-def input_noise_n(run: Run) -> float:
-    """Standard deviation of the applied force's noise and resolution.
-
-    White noise is in all of the band. What is not smooth, but not at its top either, is excitation.
-    """
-    force = run.applied_n - run.applied_n.mean()
-    variance = estimate_noise(run.grid.t_s, force).variance
-    window = np.hanning(len(force))
-    power = np.abs(np.fft.rfft(force * window)) ** 2 / float(window @ window)
-    # Lines of a periodogram are exponentially distributed: their median is ln 2 of their mean.
-    top = float(np.median(power[int(_TOP * len(power)) :])) / np.log(2.0)
-    return min(float(np.sqrt(min(variance, top))), _LARGEST_INPUT_NOISE * float(np.ptp(force)))
 
 
 def _prescribed(problem: Prescribed, k: int, models: Models, kept: bool) -> Evaluated:
@@ -313,4 +274,4 @@ def _motion_floor_n(
     return float(np.sqrt(np.mean(squares) + np.mean(cell**2)))
 
 
-__all__ = ["Evaluated", "Models", "evaluated", "input_noise_n", "models_of", "rms"]
+__all__ = ["Evaluated", "Models", "evaluated", "models_of", "rms"]

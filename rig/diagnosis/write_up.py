@@ -38,12 +38,10 @@ from rig.diagnosis.problem.track import effect_forces
 from rig.diagnosis.recording import Recording
 from rig.diagnosis.search.conclude import Found
 from rig.diagnosis.search.criteria import SelectionCriteria
-from rig.diagnosis.search.fit import Fit, effect_variables, is_white, spread
+from rig.diagnosis.search.fit import UNBOUND, Fit, effect_variables, is_white, spread
 
 Array = NDArray[np.float64]
 
-_UNBOUND = 30.0
-"""Factor, or multiple of a value, beyond which an interval says nothing."""
 _NEARLY = 0.02
 """Share of a preload up to which it counts as brought along by a change of stiffness."""
 _HELD = 0.3
@@ -63,12 +61,12 @@ class _Known(NamedTuple):
         half = self.factor * float(np.sqrt(max(self.covariance[variable, variable], 0.0)))
         low, high = float(space.low[variable]), float(space.high[variable])
         if space.logarithmic[variable]:
-            if half > np.log(_UNBOUND):
+            if half > np.log(UNBOUND):
                 return Estimate(value, None, None)
             growth = float(np.exp(half))
             return Estimate(value, max(value / growth, low), min(value * growth, high))
         half *= float(space.scale[variable])
-        if half > _UNBOUND * max(abs(value), 1e-300) and half > 0.5 * (high - low):
+        if half > UNBOUND * max(abs(value), 1e-300) and half > 0.5 * (high - low):
             return Estimate(value, None, None)
         return Estimate(value, max(value - half, low), min(value + half, high))
 

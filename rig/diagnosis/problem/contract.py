@@ -221,6 +221,10 @@ class Problem(Protocol):
         """Whitened residual of a recording, or None where the model runs away."""
         ...
 
+    def input_level(self, candidate: Candidate, parts: Parts) -> float:
+        """Mean square that noise of what drives the model adds to a right one's residual."""
+        ...
+
     def start(self, k: int, candidate: Candidate) -> Array:
         """First guess of a recording's initial vector."""
         ...

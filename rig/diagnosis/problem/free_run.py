@@ -19,7 +19,7 @@ from scipy.linalg import expm
 
 from dart_model.effects import Bench, Motion
 from rig.diagnosis.numerics.compiled import respond, simulate
-from rig.diagnosis.numerics.smoother import Smoothed
+from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise
 from rig.diagnosis.problem import linear_part, track
 from rig.diagnosis.problem.contract import (
     Candidate,
@@ -112,6 +112,29 @@ def _finer(run: Run) -> Run:
     return run._replace(fine_n=fine_n, substeps=steps, angle=0.5 * run.angle)
 
 
+_INPUT_DRAWS = 3
+"""Draws of the applied force's noise: their mean square is known to a third."""
+_LARGEST_INPUT_NOISE = 0.01
+"""Share of an applied force's range above which what is not smooth is not noise but excitation."""
+_TOP = 0.8
+"""Share of the sampled band above which a bench excites nothing: anti-aliasing filters and the
+actuator end below, so what is there is noise."""
+
+
+def input_noise_n(run: Run) -> float:
+    """Standard deviation of the applied force's noise and resolution.
+
+    White noise is in all of the band. What is not smooth, but not at its top either, is excitation.
+    """
+    force = run.applied_n - run.applied_n.mean()
+    variance = estimate_noise(run.grid.t_s, force).variance
+    window = np.hanning(len(force))
+    power = np.abs(np.fft.rfft(force * window)) ** 2 / float(window @ window)
+    # Lines of a periodogram are exponentially distributed: their median is ln 2 of their mean.
+    top = float(np.median(power[int(_TOP * len(power)) :])) / np.log(2.0)
+    return min(float(np.sqrt(min(variance, top))), _LARGEST_INPUT_NOISE * float(np.ptp(force)))
+
+
 @dataclass(frozen=True, eq=False)
 class FreeRun(Shared):
     """A model held against recordings of a force-driven bench; see `Problem`.
@@ -162,6 +185,37 @@ class FreeRun(Shared):
             np.concatenate([np.full(n, q), np.full(n, v), scales]),
             np.concatenate([np.ones(2 * n, dtype=np.bool_), fitted]),
         )
+
+    def input_level(self, candidate: Candidate, parts: Parts) -> float:
+        """Mean square that noise of the applied forces adds to a right model's residual."""
+        squares = [
+            float(np.mean((heights_m / self.noise_m) ** 2))
+            for k in range(self.recordings)
+            for heights_m in self.disturbances_m(k, candidate, parts, _INPUT_DRAWS)
+        ]
+        return float(np.mean(squares)) if squares else 0.0
+
+    def disturbances_m(self, k: int, candidate: Candidate, parts: Parts, draws: int) -> list[Array]:
+        """Heights that draws of the applied force's noise cause, drift of springless axes included.
+
+        Each of shape (n, struts); none where there is no noise, or the model runs away.
+        """
+        run = self.runs[k]
+        noise = input_noise_n(run)
+        there = self.simulated(run, candidate, parts, parts.starts[k]) if noise > 0.0 else None
+        if there is None:
+            return []
+        rng = np.random.default_rng(0)
+        found: list[Array] = []
+        for _ in range(draws):
+            # White between samples: what the force is wrong by is held over a sample or so.
+            nodes = noise * rng.standard_normal(len(run.grid.t_s))
+            fine = np.append(np.repeat(nodes[:-1], 2 * run.substeps), nodes[-1])
+            other = run._replace(fine_n=run.fine_n + fine)
+            moved = self.simulated(other, candidate, parts, parts.starts[k])
+            if moved is not None:
+                found.append(moved.heights_m - there.heights_m)
+        return found
 
     def simulated(
         self, run: Run, candidate: Candidate, parts: Parts, start: Array

@@ -177,6 +177,11 @@ class Prescribed(Shared):
     def _whitened(self, forces: Array, rows: Integers) -> Array:
         return (forces[np.ix_(self._celled, rows)].T / self.noise_n[self._celled]).ravel()
 
+    def input_level(self, candidate: Candidate, parts: Parts) -> float:
+        """Nothing: noise of the motion is in what whitens the residual."""
+        del candidate, parts
+        return 0.0
+
     def residual_forces(self, k: int, candidate: Candidate, parts: Parts) -> ResidualForces | None:
         """Load cells less the model's forces along the smoothed motion."""
         missed = self._missed_n(k, candidate, parts)

@@ -19,7 +19,8 @@ from rig.diagnosis.problem.contract import (
 from rig.diagnosis.search.explore import FirstRound, Progress
 from rig.diagnosis.search.fit import Fit, existing_law_values, fit, law_values, spread
 from rig.diagnosis.search.pool import FINAL, FULL, Pool, Scored
-from rig.diagnosis.search.screen import Trial, ranked, refined
+from rig.diagnosis.search.screen import Trial, plain, ranked, refined
+from rig.diagnosis.search.sound import unmeasured
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -76,9 +77,14 @@ def conclude(pool: Pool, first: Pool, seen: FirstRound | None, progress: Progres
     """
     chosen = _without_needless(pool, pool.chosen())
     progress("comparing rivals", 0.85)
+    final, alike = _with_few_linear(pool, chosen)
+    while final.size and (why := unmeasured(pool.problem, final.fit)) is not None:
+        pool.reject(chosen.fit.candidate, why)
+        chosen = _without_needless(pool, pool.chosen())
+        final, alike = _with_few_linear(pool, chosen)
     rivals = _rivals(pool, chosen)
     superfluous = _superfluous(pool, chosen)
-    chosen, alike = _with_few_linear(pool, chosen)
+    chosen = final
     plain = _with_few_linear(pool, pool.linear)[0] if chosen.size else chosen
     rejected = () if seen is None else _rejected(first, seen, chosen, rivals)
     return Found(pool.given, pool.linear, plain, chosen, rivals, superfluous, rejected, alike)
@@ -112,7 +118,9 @@ def _simpler(pool: Pool, chosen: Scored, placed: Placed) -> Iterable[Scored]:
     def most() -> float:
         """What is hopeful beside the chosen laws along the motion, where a fit costs little."""
         whole = refined(stage, laws, [known[law] for law in laws])
-        return -np.inf if whole is None else pool.criteria.hopeless * whole.score
+        criteria, nothing = pool.criteria, plain(stage).score
+        near = 0.0 if whole is None else criteria.hopeless * whole.score
+        return max(near, criteria.formula**2 * nothing)
 
     def is_hopeful(trial: Trial | None) -> bool:
         return trial is not None and trial.score <= most()

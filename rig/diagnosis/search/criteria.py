@@ -43,6 +43,9 @@ class SelectionCriteria:
             put down to its formula, and no further law of the same kind (see `KINDS`) is looked
             for: two formulas for one effect agree to a few percent, as seen on the foreign formulas
             of `tests.truth`.
+        imitation: Share of the RMS that such a law leaves below which two laws of one kind have to
+            stay, to be more than a better formula for it. Seen on benches that developed the
+            method: pairs that one law imitated left up to 0.15, foreign formulas 0.29 and more.
         significant: Times its standard deviation that a linear correction is away from nothing.
         bounded: The same for the size of an effect, beyond what the linear part could give.
         cancelling: Correlation of two forces in one strut below which they cancel each other.
@@ -70,7 +73,8 @@ class SelectionCriteria:
     least_share: float = 0.19
     least_above_noise: float = 0.01
     least_above_noise_later: float = 0.2
-    formula: float = 0.06
+    formula: float = 0.1
+    imitation: float = 0.2
     significant: float = 4.0
     bounded: float = 4.0
     cancelling: float = -0.9

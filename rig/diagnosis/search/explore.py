@@ -9,10 +9,17 @@ from typing import NamedTuple
 import numpy as np
 
 from dart_model.effects import effect
-from rig.diagnosis.problem.contract import Placed, nominal
+from rig.diagnosis.problem.contract import Candidate, Placed
 from rig.diagnosis.search.fit import law_values
-from rig.diagnosis.search.pool import Pool, Scored, kinds
-from rig.diagnosis.search.screen import Stage, Trial, plain, proposed, ranked, refined, stage_of
+from rig.diagnosis.search.pool import Pool, Scored
+from rig.diagnosis.search.screen import (
+    Stage,
+    Trial,
+    plain,
+    ranked,
+    refined,
+    stage_of,
+)
 
 Progress = Callable[[str, float], None]
 """Told what is being done and the share that is done."""
@@ -66,28 +73,38 @@ def _from_nothing(pool: Pool, progress: Progress) -> FirstRound | None:
         if not levels:
             seen = seen._replace(trials=tuple(rounds[0]))
         level = _best_of_each(rounds)
-        if not level:
+        if not level or not _gains(pool, min(beam, key=_score), level[0]):
             break
         finalists = _finalists(pool, level) + _backward(stage, levels, level[:2])
         levels.append(level)
         _fit_all(pool, stage, reference, finalists, within(progress, 0.5 * (begin + end), end))
-        before = min(beam, key=_score).score
-        if (
-            pool.at_floor(pool.settled_least())
-            or before - level[0].score < criteria.least_likelihood_gain
-            # Nearly right: what is left is looked for about it, not the linear model.
-            or pool.is_formula(pool.least())
-        ):
+        # One law may imitate two. What a pair leaves is looked for about it, not the linear model.
+        if pool.at_floor(pool.settled_least()) or (size > 1 and pool.is_formula(pool.least())):
             break
         beam = _diverse(level, criteria.beam)
     return seen
 
 
+def _gains(pool: Pool, before: Trial, after: Trial) -> bool:
+    """Whether a further law could be worth its while, as far as is seen along the motion."""
+    gain, above = before.score - after.score, before.score - len(pool.linear_stage.target)
+    return gain > max(pool.criteria.least_likelihood_gain, pool.criteria.least_share * above)
+
+
 def _about_the_best(pool: Pool, progress: Progress) -> None:
-    """Add to, and exchange laws of, the best set: its free run is near the measurement."""
-    reference = pool.least()
-    if pool.at_floor(reference):
-        return
+    """Add to, and exchange laws of, the best set, then of the best that this finds."""
+    seen: set[Candidate] = set()
+    turns = pool.criteria.most_laws
+    for turn in range(turns):
+        reference = pool.nearest()
+        if pool.at_floor(pool.settled_least()) or reference.fit.candidate in seen:
+            return
+        seen.add(reference.fit.candidate)
+        _exchanged(pool, reference, within(progress, turn / turns, (turn + 1) / turns))
+
+
+def _exchanged(pool: Pool, reference: Scored, progress: Progress) -> None:
+    """Sets with one law more than a set, or with another one for one of its laws."""
     stage = stage_of(pool.problem, reference.fit.candidate, reference.fit.parts)
     values = law_values(pool.problem, reference.fit)
     laws = reference.fit.candidate.new
@@ -112,7 +129,7 @@ def _rounds(
     found: list[list[Trial]] = []
     for i, base in enumerate(beam):
         progress("screening laws", i / len(beam))
-        found.append(ranked(stage, base, pool.criteria.screened, _open_to(pool, base)))
+        found.append(ranked(stage, base, pool.criteria.screened))
     return found
 
 
@@ -124,16 +141,6 @@ def _best_of_each(rounds: Sequence[Sequence[Trial]]) -> list[Trial]:
         if key not in found or trial.score < found[key].score:
             found[key] = trial
     return sorted(found.values(), key=_score)
-
-
-def _open_to(pool: Pool, base: Trial) -> list[Placed]:
-    """Laws that may be added to a set: where it is nearly right, those of other kinds alone."""
-    everything = proposed(pool.problem)
-    known = pool.fits.get(nominal(pool.problem).added(*base.laws))
-    if known is None or not pool.is_formula(known):
-        return everything
-    taken = set().union(*(kinds(effect(name).family) for _, name in base.laws))
-    return [at for at in everything if not kinds(effect(at[1]).family) & taken]
 
 
 def _backward(

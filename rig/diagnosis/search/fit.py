@@ -313,6 +313,10 @@ def start_variables(problem: Problem, result: Fit) -> Flags:
     return flags
 
 
+UNBOUND = 30.0
+"""Factor, or multiple of a value, beyond which an interval says nothing."""
+
+
 class Spread(NamedTuple):
     """What a fit does not know.
 

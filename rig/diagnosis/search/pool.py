@@ -97,6 +97,7 @@ class Pool:
         self.fits: dict[Candidate, Scored] = {}
         self.unsound: dict[Candidate, str] = {}
         self.settled: set[Candidate] = set()
+        self.floors: dict[Candidate, tuple[Scored, float]] = {}
         for seed in seeds:
             self.attempt(seed.candidate, seed.parts)
         base = nominal(problem)
@@ -178,6 +179,11 @@ class Pool:
         result = fit(self.problem, candidate, own, none, *_BEGUN, effects=False)
         return own if result is None else result.parts
 
+    def reject(self, candidate: Candidate, why: str) -> None:
+        """Leave out a set that its last fit shows to be none that an engineer would use."""
+        self.unsound[candidate] = why
+        self.settled.add(candidate)
+
     def settle(self, scored: Scored, best: Scored) -> None:
         """Fit a set to its end if it comes near the best one."""
         candidate = scored.fit.candidate
@@ -194,6 +200,11 @@ class Pool:
         """The best sound one."""
         return min(self.sound(), key=lambda s: s.score)
 
+    def nearest(self) -> Scored:
+        """The best one to look about: an unsound one that is far better lacks one exchange."""
+        best, sound = min(self.fits.values(), key=lambda s: s.score), self.least()
+        return sound if self.is_near(sound, best) else best
+
     def settled_least(self) -> Scored:
         """The same, fitted to its end: whether it is at the floor decides on going on."""
         best = self.least()
@@ -205,6 +216,13 @@ class Pool:
         order = sorted((s for s in self.sound() if s.size > 0), key=lambda s: s.score)
         near = (s for s in order if self.is_near(s, order[0]))
         return tuple(near)[: self.criteria.finalists]
+
+    def best_and_less(self) -> list[Scored]:
+        """The best sets and what they hold: a smaller one may be all that can be defended."""
+        best = [set(s.fit.candidate.new) for s in self.best()]
+        return [
+            s for s in self.sound() if s.size and any(set(s.fit.candidate.new) <= b for b in best)
+        ]
 
     def chosen(self) -> Scored:
         """The smallest set that no larger one is worth more than."""
@@ -233,6 +251,7 @@ class Pool:
             larger.size > smaller.size
             and self.is_formula(smaller)
             and not _adds_a_kind(smaller, larger)
+            and not self.is_right_beside(larger, smaller)
         ):
             return False
         # A law has to take its share; a better formula for one need only be better.
@@ -248,13 +267,27 @@ class Pool:
         """Whether nothing is left that a law could be looked for in."""
         first, later = self.criteria.least_above_noise, self.criteria.least_above_noise_later
         share = later if result.size else first
-        return result.score - result.fit.rows < share * result.fit.rows
+        return result.score < (1.0 + share) * self.floor(result)
+
+    def floor(self, result: Scored) -> float:
+        """Sum of squares that a right model leaves: noise of the heights, and of what drives it."""
+        candidate = result.fit.candidate
+        if candidate not in self.floors or self.floors[candidate][0] is not result:
+            level = 1.0 + self.problem.input_level(candidate, result.fit.parts)
+            self.floors[candidate] = result, level * result.fit.rows
+        return self.floors[candidate][1]
 
     def is_formula(self, result: Scored) -> bool:
         """Whether what laws leave is so little that it may be their formulas' fault."""
         linear = self.linear.score - self.linear.fit.rows
         above = result.score - result.fit.rows
         return bool(result.size) and above < self.criteria.formula**2 * linear
+
+    def is_right_beside(self, larger: Scored, smaller: Scored) -> bool:
+        """Whether a set leaves so little of what a smaller one leaves that this imitates it."""
+        most = self.criteria.imitation**2 * (smaller.score - smaller.fit.rows)
+        is_right = self.at_floor(larger) or larger.score - larger.fit.rows < most
+        return is_right and not self.is_near(smaller, larger)
 
     def is_near(self, scored: Scored, best: Scored) -> bool:
         """Whether a set is not hopeless beside the best one."""

@@ -46,6 +46,8 @@ _SIDE_VALLEY = 2.0
 """Times a law's least cost up to which another of its starts is refined."""
 _REPEATABLE = ("stop", "nonlinear_damping")
 """Families of which a strut may have two: stops at both ends; a damper's valves."""
+_FINE = 5
+"""Laws of a round that are refined on all samples, one more than are fitted (see `finalists`)."""
 _STEPS = 7
 _REMEMBERED = 3
 """Answers of a law that are kept for the next difference."""
@@ -326,26 +328,36 @@ def ranked(
             if cost < _SIDE_VALLEY * least
         ]
 
-        def refine(job: tuple[Placed, Array]) -> Trial | None:
-            return refined(stage, (*base.laws, job[0]), (*base.values, job[1]))
+        def roughly(job: tuple[Placed, Array]) -> Trial | None:
+            return refined(coarse, (*base.laws, job[0]), (*base.values, job[1]))
 
-        trials = [trial for trial in pool.map(refine, jobs) if trial is not None]
+        def refine(trial: Trial) -> Trial | None:
+            return refined(stage, trial.laws, trial.values)
+
+        rough = _best([trial for trial in pool.map(roughly, jobs) if trial is not None])
         # A law begins no worse than a simpler one that is known.
-        nested = list(pool.map(lambda job: (job[0], first(*job)[:1]), _nested(trials, laws)))
+        nested = list(pool.map(lambda job: (job[0], first(*job)[:1]), _nested(rough, laws)))
         jobs = [(at, values) for at, starts in nested for _, values in starts]
-        trials += [trial for trial in pool.map(refine, jobs) if trial is not None]
-    best: dict[tuple[Placed, ...], Trial] = {}
-    for trial in trials:
-        key = tuple(sorted(trial.laws))
-        if key not in best or trial.score < best[key].score:
-            best[key] = trial
-    # Coarse costs in terms of fine ones, for laws that are not refined.
-    scale = base.cost / max(float(residual @ residual), 1e-300)
+        rough = _best([*rough, *(t for t in pool.map(roughly, jobs) if t is not None)])
+        best = [trial for trial in pool.map(refine, rough[:_FINE]) if trial is not None]
+    # Coarse costs in terms of fine ones, for laws that are not refined there.
+    scale = len(stage.target) / len(coarse.target)
+    best += [t._replace(cost=scale * t.cost, scores=scale * t.scores) for t in rough[_FINE:]]
     rest = [
         Trial((*base.laws, laws[i]), (), scale * cost, np.array([scale * cost]))
         for cost, i in sorted((t[0][0], i) for i, t in enumerate(tried) if t)[screened:]
     ]
-    return [*sorted(best.values(), key=lambda trial: trial.score), *rest]
+    return [*sorted(best, key=lambda trial: trial.score), *rest]
+
+
+def _best(trials: Sequence[Trial]) -> list[Trial]:
+    """Each set of laws at its best, best first."""
+    found: dict[tuple[Placed, ...], Trial] = {}
+    for trial in trials:
+        key = tuple(sorted(trial.laws))
+        if key not in found or trial.score < found[key].score:
+            found[key] = trial
+    return sorted(found.values(), key=lambda trial: trial.score)
 
 
 def _starts(problem: Problem, at: Placed, known: Mapping[str, float]) -> list[Array]:

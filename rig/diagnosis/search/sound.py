@@ -13,7 +13,7 @@ from dart_model.effects import effect
 from rig.diagnosis.problem.contract import Problem, Track, placed, slots_of, strut_constants
 from rig.diagnosis.problem.track import effect_forces, law_force
 from rig.diagnosis.search.criteria import SelectionCriteria
-from rig.diagnosis.search.fit import Fit, effect_variables, start_variables
+from rig.diagnosis.search.fit import UNBOUND, Fit, effect_variables, spread, start_variables
 
 Array = NDArray[np.float64]
 
@@ -104,6 +104,26 @@ def _unbound(problem: Problem, result: Fit, criteria: SelectionCriteria) -> str 
         white = np.sqrt(power / max(result.mean_square, 1.0))
         robust = power / max(float(np.linalg.norm(scores)), _TINY)
         if min(float(white), robust) < criteria.bounded:
+            return f"the data do not bound its size ({name})"
+    return None
+
+
+def unmeasured(problem: Problem, result: Fit) -> str | None:
+    """A law none of whose sizes has an interval that leaves out nothing; None if there is none.
+
+    Args:
+        problem: Model and recordings.
+        result: The model, fitted to its end.
+    """
+    known, variables = spread(result), effect_variables(problem, result)
+    half = known.factor * np.sqrt(np.maximum(np.diag(known.covariance), 0.0))
+    space = result.space
+    sizes = np.where(
+        space.logarithmic, np.log(UNBOUND), np.abs(result.solution.values) / space.scale
+    )
+    for row, name in _new(result):
+        scaled = variables[row][list(effect(name).scaled or (0,))]
+        if not np.any(half[scaled] < sizes[scaled]):
             return f"the data do not bound its size ({name})"
     return None
 
