@@ -104,7 +104,8 @@ CASES = {
     "stop": _case("explained", ["stop"], _on_dyno, _STOP),
     "orifice": _case("explained", ["nonlinear_damping"], _on_dyno, _ORIFICE),
     "orifice_on_bench": _case("explained", ["nonlinear_damping"], _on_bench, on_bench.Orifice()),
-    # A formula that the catalogue has not.
+    # Formulas that the catalogue has not.
+    "foreign_friction": _case("explained", ["friction"], _on_bench, on_bench.Friction()),
     "foreign_loop": _case("explained", ["hysteresis"], _on_dyno, on_dyno.Yielding()),
     "two_kinds": _case(
         "explained", ["nonlinear_stiffness", "nonlinear_damping"], _on_dyno,

@@ -6,14 +6,17 @@ from functools import cache
 
 import pytest
 
+from rig.diagnosis.diagnose import first_fits
+from rig.diagnosis.problem.build import build
 from rig.diagnosis.search.criteria import CRITERIA
+from rig.diagnosis.search.explore import explore
+from rig.diagnosis.search.pool import Pool
 from tests.criteria_study.cases import CASES, answer
 
 ABSURD = [
     ("blocks", 2, "kept_back"),
     ("kept_every", 1, "kept_back"),
     ("screened", 0, "one_kind"),
-    ("beam", 0, "three_kinds"),
     ("most_laws", 0, "hardening"),
     ("most_laws", 1, "two_kinds"),
     ("finalists", 0, "exponential"),
@@ -23,7 +26,7 @@ ABSURD = [
     ("least_share", 2.0, "hardening"),
     ("least_above_noise", 1e9, "hardening"),
     ("least_above_noise_later", 1e9, "two_kinds"),
-    ("formula", 1e9, "one_kind"),
+    ("formula", 0.0, "foreign_friction"),
     ("bounded", 1e9, "hardening"),
     ("significant", 1e9, "stiffness"),
     ("significant", 0.0, "stiffness"),
@@ -47,7 +50,8 @@ def usual(case):
 
 
 def test_every_criterion_has_an_absurd_value():
-    assert {name for name, _, _ in ABSURD} == {field.name for field in fields(CRITERIA)}
+    absurd = {name for name, _, _ in ABSURD} | {"beam", "imitation"}
+    assert absurd == {field.name for field in fields(CRITERIA)}
 
 
 @pytest.mark.parametrize("case", sorted({case for _, _, case in ABSURD}))
@@ -63,3 +67,37 @@ def test_an_absurd_criterion_gives_another_answer(name, value, case):
         found = answer(case, replace(CRITERIA, **{name: value}))
     assert found != CASES[case].right
     assert usual(case) == CASES[case].right
+
+
+def explored(criteria):
+    """What a first search of a case with two laws of one kind has fitted."""
+    spec, runs, _ = CASES["one_kind"].make()
+    _, problem = build(spec, runs, criteria.blocks, None)
+    given, linear = first_fits(problem)
+    pool = Pool(problem, given, [linear], criteria)
+    explore(pool, lambda _what, _share: None)
+    return pool
+
+
+def test_without_a_beam_no_pair_is_looked_for():
+    assert max(scored.size for scored in explored(CRITERIA).fits.values()) == 2
+    assert max(scored.size for scored in explored(replace(CRITERIA, beam=0)).fits.values()) == 1
+
+
+@pytest.mark.parametrize(("imitation", "worth"), [(CRITERIA.imitation, False), (1e9, True)])
+def test_a_pair_that_is_but_a_better_formula_for_one_law_is_not_worth_it(imitation, worth):
+    pool = explored(replace(CRITERIA, imitation=imitation))
+    pair = next(s for s in pool.fits.values() if s.size == 2 and not pool.unsound)
+    one = next(s for s in pool.fits.values() if s.size and set(s.families) < set(pair.families))
+    rows = one.fit.rows
+
+    def leaving(scored, above):
+        share = (rows + above) / scored.scores.sum()
+        return scored._replace(scores=share * scored.scores)
+
+    nearly = leaving(one, 1e-3 * pool.linear.score)
+    assert pool.is_formula(nearly)
+    better = leaving(pair, 0.1 * (nearly.score - rows))
+    assert not pool.at_floor(better)
+    assert pool.worth(nearly, better) is worth
+    assert pool.worth(nearly, leaving(pair, 1e-3 * (nearly.score - rows)))

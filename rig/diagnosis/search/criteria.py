@@ -40,9 +40,9 @@ class SelectionCriteria:
         least_above_noise_later: The same for a further law: what a formula that is nearly right
             leaves over is no effect. Its root is half of what `explained` allows.
         formula: Share of the RMS residual of the best linear model below which what a law leaves is
-            put down to its formula, and no further law of the same kind (see `KINDS`) is looked
-            for: two formulas for one effect agree to a few percent, as seen on the foreign formulas
-            of `tests.truth`.
+            put down to its formula, and a further law of the same kind (see `KINDS`) has to do far
+            more than a better formula would (`imitation`): two formulas for one effect agree to a
+            few percent, at worst to 0.09, as seen on the foreign formulas of `tests.truth`.
         imitation: Share of the RMS that such a law leaves below which two laws of one kind have to
             stay, to be more than a better formula for it. Seen on benches that developed the
             method: pairs that one law imitated left up to 0.15, foreign formulas 0.29 and more.
