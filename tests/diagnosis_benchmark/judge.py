@@ -13,6 +13,7 @@ from tests.diagnosis_benchmark.comparable import (
 )
 from tests.truth.cases import LINEAR_FAMILIES
 from tests.truth.plant import Case
+from tests.truth.simulation import height_floor_m
 
 NAMES_A_CAUSE = frozenset({"explained", "partly_explained", "ambiguous"})
 NO_CAUSE = "restoring_surface"
@@ -45,8 +46,8 @@ class Result:
         unit: ``m`` or ``N``, of the next four.
         error_before: Held-out error of the nominal model: open-loop height, on a dyno strut force.
         error_after: That of the corrected model.
-        floor: What a right model leaves: the height sensor's true noise; on a dyno the floor that
-            the diagnosis claims.
+        floor: What a right model leaves: the height sensor's true error, and what the resolution
+            of the measured load moves; on a dyno the floor that the diagnosis claims.
         own_floor: The floor that the diagnosis claims.
         intervals: Parameters that the truth can be held against.
         duration_s: Wall time of the diagnosis.
@@ -173,7 +174,7 @@ def _errors(case: Case, diagnosis: dict) -> dict[str, str | float]:
     else:
         error = held_out.get("height_rmse_m") or {}
         own_floor = _number(claimed.get("height_rmse_m"))
-        floor, unit = case.sensors.height_error_m, "m"
+        floor, unit = height_floor_m(case), "m"
     return {
         "unit": unit,
         "error_before": _number(error.get("before")),

@@ -57,17 +57,23 @@ def true_motion(
     plan: RunPlan,
     sample_rate_hz: int,
     steps: int,
+    resolution_n: float = 0.0,
 ) -> tuple[Samples, Motion]:
     """Integrate one run, with so many steps a sample.
+
+    The load is what was commanded, or, with a resolution, what its sensor makes of that.
 
     Returns:
         (n,) sample times in s, and the motion with every effect's force.
     """
     samples = round(plan.excitation.duration_s * sample_rate_hz) + 1
     half_steps = np.arange(2 * steps * (samples - 1) + 1) / (2.0 * steps * sample_rate_hz)
+    t_s = half_steps[:: 2 * steps]
+    sampled = loads.load_n(plan.excitation, bench, t_s)
+    error = _quantised(sampled, resolution_n) - sampled if resolution_n else np.zeros_like(t_s)
 
-    def load_at(t_s: Samples) -> Samples:
-        return loads.load_n(plan.excitation, bench, t_s)
+    def load_at(any_s: Samples) -> Samples:
+        return loads.load_n(plan.excitation, bench, any_s) + np.interp(any_s, t_s, error)
 
     drive = _gain(effects) * load_at(half_steps - _lag_s(effects))
     for effect in effects:
@@ -82,7 +88,6 @@ def true_motion(
         bench.free_length_m + rest + plan.start_offset_m,
         plan.ambient_c,
     )
-    t_s = half_steps[:: 2 * steps]
     for column, effect in enumerate(effects):
         motion.force_n[:, column] += timed_force_n(effect, load_at, t_s)
     return t_s, motion
@@ -165,6 +170,22 @@ def record(case: Case, plan: RunPlan) -> Recording:
 def simulate(case: Case) -> tuple[Recording, Recording]:
     """Both runs of a case: the one to diagnose, and the held-out one."""
     return record(case, case.train), record(case, case.held_out)
+
+
+def height_floor_m(case: Case) -> float:
+    """RMS height that a right model leaves on the held-out run of a case, which is no dyno.
+
+    The height sensor's error, and what the resolution of the measured load moves: nothing on most
+    benches, but a body that rattles in its play answers to it with another motion.
+    """
+    rate_hz = case.sensors.sample_rate_hz
+    steps = steps_per_sample(case.effects, rate_hz)
+    heights = [
+        true_motion(case.bench, case.effects, case.held_out, rate_hz, steps, step_n)[1].height_m
+        for step_n in (0.0, case.sensors.load_step_n)
+    ]
+    moved = float(np.sqrt(np.mean((heights[1] - heights[0]) ** 2)))
+    return float(np.hypot(case.sensors.height_error_m, moved))
 
 
 def force_noise_floor_n(case: Case) -> float:

@@ -21,6 +21,7 @@ from tests.truth.simulation import (
     BAND_HZ,
     floor_ratios,
     force_noise_floor_n,
+    height_floor_m,
     record,
     simulate,
     strut_force_n,
@@ -379,6 +380,20 @@ def test_floor_is_what_band_limited_inverse_dynamics_leave():
     stiffness = stiffness + 1j * bench.damping_n_s_per_m * omega
     force = np.fft.irfft(np.fft.rfft(noise) * stiffness * (frequency <= BAND_HZ), count)
     assert np.std(force) == pytest.approx(force_noise_floor_n(case), rel=0.05)
+
+
+def test_a_right_model_leaves_the_sensors_error_and_what_the_loads_resolution_moves():
+    case = make_case(2, "complete")
+
+    def floor(load_step_n):
+        sensors = replace(case.sensors, load_step_n=load_step_n)
+        return height_floor_m(replace(case, sensors=sensors))
+
+    error = case.sensors.height_error_m
+    assert floor(1e-9) == pytest.approx(error, rel=1e-6)
+    # A linear bench answers in proportion; the rounding errors of two steps are alike in size.
+    moved = [np.sqrt(floor(step) ** 2 - error**2) for step in (0.1, 0.4)]
+    assert moved[1] / moved[0] == pytest.approx(4.0, rel=0.3)
 
 
 def test_files_hold_the_model_without_the_effect(tmp_path):
