@@ -2,7 +2,7 @@
 
 Results are kept in ``--out``, so an interrupted run goes on where it stopped; after a change of the
 program, give a new folder. The folder then holds ``summary.json``, ``table.md`` and ``cases.csv``.
-``--tenth --bounds`` is what CI runs. ``--write KIND SEED`` only writes one case's files.
+``--tenth --bounds`` is a quick look. ``--write KIND SEED`` only writes one case's files.
 """
 
 import argparse
