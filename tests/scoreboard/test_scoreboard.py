@@ -8,22 +8,15 @@ import numpy as np
 import pytest
 
 from dart_model.yaml_file import InputError
-from rig import scoreboard
 from rig.config import CONFIGS
 from rig.diagnosis.recording import Recording
 from rig.imports import import_table, load_mapping
-from rig.scoreboard import (
-    PUBLISHED,
-    SILVERBOX_TESTS,
-    SILVERBOX_TRAINING,
-    Row,
-    driven_start,
-    dyno_start,
-    open_loop_rmse_m,
-    page,
-    run_scoreboard,
-    write_scoreboard,
-)
+from rig.scoreboard import silverbox
+from rig.scoreboard.run import run_scoreboard
+from rig.scoreboard.silverbox import PUBLISHED, TESTS, TRAINING, open_loop_rmse_m
+from rig.scoreboard.starts import driven_start, dyno_start
+from rig.scoreboard.table import PAGE_FILE, TABLE_FILE, Row, page, write_scoreboard
+from tests.diagnosis import little_dyno as dyno
 
 # Measured data lie beside the checkout, never in it.
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -84,8 +77,8 @@ def test_the_linear_start_of_a_dyno_is_found_from_its_record() -> None:
 
 
 def test_the_split_is_the_published_one() -> None:
-    assert SILVERBOX_TRAINING[1:] == (40_650, 105_712)
-    assert [part[1:] for part in SILVERBOX_TESTS] == [
+    assert TRAINING[1:] == (40_650, 105_712)
+    assert [part[1:] for part in TESTS] == [
         (105_712, 127_400),
         (100, 40_575),
         (100, 32_100),
@@ -104,15 +97,15 @@ def test_a_page_has_a_table_a_set_and_the_file_holds_every_row(tmp_path: Path) -
     assert "| theirs | - | 0.3 | paper |" in text
     assert text.count("## ") == 2
     write_scoreboard(rows, tmp_path)
-    with (tmp_path / scoreboard.TABLE_FILE).open(newline="") as file:
+    with (tmp_path / TABLE_FILE).open(newline="") as file:
         table = list(csv.DictReader(file))
     assert len(table) == len(rows)
     assert table[1]["value"] == ""
-    assert (tmp_path / scoreboard.PAGE_FILE).read_text() == text
+    assert (tmp_path / PAGE_FILE).read_text() == text
 
 
 def test_published_figures_cover_the_tests() -> None:
-    assert {len(values) for _, values in PUBLISHED} == {len(SILVERBOX_TESTS)}
+    assert {len(values) for _, values in PUBLISHED} == {len(TESTS)}
 
 
 def without_package_data(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
@@ -146,7 +139,7 @@ def test_the_package_is_a_source_where_it_has_kept_the_set(
 
     data = Data(u=np.array([0.01, 0.02, 0.03]), y=np.array([0.1, 0.2, 0.3]))
     monkeypatch.setattr(package, "Silverbox", lambda **_: [Data(u=[1.0], y=[1.0]), data])
-    table = scoreboard._silverbox_source(None, tmp_path)
+    table = silverbox._table(None, tmp_path)
     assert table is not None
     mapping = load_mapping(CONFIGS / "silverbox_mapping.yaml")
     report = import_table(table, mapping, tmp_path / "made.csv")
@@ -166,3 +159,29 @@ def test_the_measured_damper_is_read_as_its_file_says(tmp_path: Path) -> None:
     np.testing.assert_allclose(made[:, 1], 0.3 + 1e-3 * raw[:, 1], atol=1e-10)
     np.testing.assert_allclose(made[:, 2], -raw[:, 3], rtol=1e-9)
     assert report.rate_hz == pytest.approx(1000.0)
+
+
+def test_a_set_that_is_none_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="set 'duffing': expected one of silverbox, emps, brfd"):
+        run_scoreboard(tmp_path, tmp_path / "out", lambda _what, _share: None, ["duffing"])
+
+
+def test_each_damper_record_is_told_from_the_others_of_its_current(tmp_path: Path) -> None:
+    folder = tmp_path / "mr_damper"
+    folder.mkdir()
+    for seed, name in enumerate(("1mm1Hz1A", "2mm1Hz1A", "1mm1Hz0A"), start=1):
+        record = dyno.run(dyno.Nothing(), seed=seed, duration_s=6.0)
+        z_mm = 1e3 * record.heights_m[:, 0] - 300.0
+        columns = [record.t_s, z_mm, np.gradient(z_mm, record.t_s), -record.strut_forces_n[:, 0]]
+        np.savetxt(folder / f"{name}.txt", np.column_stack(columns), "%.9g")
+    rows = run_scoreboard(tmp_path, tmp_path / "out", lambda _what, _share: None, ["mr_damper"])
+    assert [(row.test, row.model) for row in rows] == [
+        (test, model)
+        for test in ("1mm1Hz1A", "2mm1Hz1A")
+        for model in ("rig, spring and damper", "rig, corrected")
+    ]
+    assert "from 2mm1Hz1A: nothing missing" in rows[1].source
+    size = float(np.std(record.strut_forces_n))
+    for row in rows:
+        assert row.value is not None
+        assert row.value / 100.0 * size == pytest.approx(1.0, rel=0.2)  # The load cell's noise.

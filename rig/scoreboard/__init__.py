@@ -1,0 +1,1 @@
+"""Measured benches that nobody here made: our figures beside the published ones."""
