@@ -196,7 +196,7 @@ class StrutSpec(_Frozen):
 class Tolerance(_Frozen):
     """How far the bench may be from the model's own numbers: one standard deviation each.
 
-    A diagnosis takes it as what is known before the recordings; what is not given is not known.
+    A diagnosis takes it as what is known before the recordings; what is not given has a default.
 
     Attributes:
         mass_kg: Share of each mass.

@@ -15,6 +15,8 @@ from dart_model.effects.ranges import (
 )
 
 _FAMILY = "nonlinear_damping"
+_FRICTION = "coulomb_friction"
+"""What a damper with a knee is where the motion is hardly ever as slow as that."""
 _SPEEDS = "velocities that differ by a factor of three or more, in both directions"
 _PLACES = "the same velocities at different heights"
 _DAMPING = Parameter("damping_n_s_per_m", "N·s/m", -1e12, 1e12, "damping")
@@ -313,7 +315,7 @@ DIGRESSIVE_DAMPING = Effect(
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
     starts=_knees(0.2, 0.6, 1.5),
     bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
-    simpler=("linear_damping",),
+    simpler=("linear_damping", _FRICTION),
     shown=("damping_n_s_per_m",),
 )
 
@@ -327,7 +329,7 @@ SATURATING_DAMPING = Effect(
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
     starts=_saturating_starts,
     bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
-    simpler=("linear_damping", "digressive_damping"),
+    simpler=("linear_damping", _FRICTION, "digressive_damping"),
     shown=("damping_n_s_per_m",),
 )
 
@@ -341,7 +343,7 @@ ARCTAN_DAMPING = Effect(
     reference="Duym, Vehicle Syst. Dyn. 33 (2000), simulation tools for shock absorbers",
     starts=_knees(0.2, 0.6, 1.5),
     bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
-    simpler=("linear_damping",),
+    simpler=("linear_damping", _FRICTION),
     shown=("damping_n_s_per_m",),
 )
 
@@ -358,7 +360,7 @@ BLOW_OFF_DAMPING = Effect(
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
     starts=_knees(0.2, 0.5, 1.0, 1.8),
     bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
-    simpler=("linear_damping",),
+    simpler=("linear_damping", _FRICTION),
     shown=("lost_damping_n_s_per_m",),
 )
 
@@ -375,7 +377,7 @@ SMOOTH_BLOW_OFF_DAMPING = Effect(
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
     starts=_knees(0.2, 0.6, 1.5),
     bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
-    simpler=("linear_damping",),
+    simpler=("linear_damping", _FRICTION),
     shown=("lost_damping_n_s_per_m",),
 )
 

@@ -5,6 +5,10 @@ import math
 from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start
 from dart_model.effects.ranges import within
 
+_LEAST_PERIODS = 5.0
+"""Least number of periods in the longest recording: fewer look like a drift, or like what a formula
+of a damper errs by, as the size of the motion changes."""
+
 
 def _force(
     t_s: float,
@@ -36,6 +40,6 @@ PERIODIC_FORCE = Effect(
     excitation="many of its periods, at another frequency than the applied force",
     reference="Rao, Mechanical Vibrations (2017), 3.7, rotating unbalance",
     starts=_starts,
-    bounds=within(frequency_hz=lambda m: (0.5 / m.duration_s, 0.5 / m.step_s)),
+    bounds=within(frequency_hz=lambda m: (_LEAST_PERIODS / m.duration_s, 0.5 / m.step_s)),
     shown=("amplitude_n", "frequency_hz"),
 )
