@@ -396,22 +396,28 @@ def export_command(
 
 @app.command(
     name="scoreboard",
-    epilog="Example: `rig scoreboard --data measured --out scores`",
+    epilog="Example: `rig scoreboard --data measured --set emps --out scores`",
 )
 def scoreboard_command(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
     data: Annotated[
         Path | None,
         typer.Option(
-            "--data", metavar="DIR", help="Folder with silverbox/SNLS80mV.csv and mr_damper/*.txt."
+            "--data",
+            metavar="DIR",
+            help="Folder with folders silverbox, emps, brfd, mr_damper, any of them.",
         ),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME", help="Only this set; may be given several times."),
     ] = None,
 ) -> None:
     """Diagnose published measured sets and print our figures beside the published ones."""
-    from rig.scoreboard import run_scoreboard
+    from rig.scoreboard.run import run_scoreboard
 
     with _bar() as bar:
-        rows = run_scoreboard(data, out, bar)
+        rows = run_scoreboard(data, out, bar, only or ())
     table = Table("set", "test", "model", "figure", "source", title="Measured sets")
     for row in rows:
         figure = "-" if row.value is None else f"{row.value:.4g} {row.unit}"

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from dart_model.spec import ModelSpec
-from rig.diagnosis.evaluate import Evaluated, evaluated, models_of, with_floor_below
+from rig.diagnosis.evaluate import Evaluated, evaluated, models_of
+from rig.diagnosis.numerics.compiled import SLOTS
 from rig.diagnosis.outcome import Result
 from rig.diagnosis.problem.build import (
     build,
@@ -53,11 +54,14 @@ def diagnose(
     """
     if not runs:
         raise RecordingError("no run given, expected at least one")
+    existing, most = sum(len(s.effects) for s in spec.struts), SLOTS - criteria.most_laws
+    if existing > most:
+        raise RecordingError(f"model {spec.name}: {existing} effects, expected at most {most}")
     is_prescribed((*runs, *held_out))
     progress("reading runs", 0.01)
     kept_every = None if held_out else criteria.kept_every
-    given, problem = build(spec, runs, criteria.blocks, kept_every)
-    judged = build_held_out(given, held_out) if held_out else problem
+    problem = build(spec, runs, criteria.blocks, kept_every)
+    judged = build_held_out(problem, held_out) if held_out else problem
     found, problem = _searched(problem, criteria, progress)
     progress("judging on held-out data", 0.95)
     judged = replace(judged, motions=problem.motions)
@@ -65,17 +69,15 @@ def diagnose(
 
     def figures(chosen: Fit) -> tuple[Evaluated, ...]:
         models = models_of(problem, found.linear.fit, chosen)
-        results = evaluated(judged, models, recordings, kept=not held_out)
-        if isinstance(problem, FreeRun):
-            return results
-        noise_n = float(np.sqrt(np.nanmean(problem.noise_n**2)))
-        return with_floor_below(results, float(np.sqrt(chosen.mean_square)) * noise_n)
+        variance = np.nan if isinstance(problem, FreeRun) else np.nanmean(problem.noise_n**2)
+        left_n = float(np.sqrt(chosen.mean_square * variance))
+        return evaluated(judged, models, recordings, left_n, kept=not held_out)
 
     results = figures(found.chosen.fit)
-    if found.chosen.size and needless(results, criteria):
+    if found.chosen.size and needless(problem, found.linear.fit, results, criteria):
         found = found._replace(chosen=found.plain, rivals=())
         results = figures(found.chosen.fit)
-    verdict = judgement(results, found, criteria)
+    verdict = judgement(problem, results, found, criteria)
     if verdict == "not_explained":
         progress("tabulating what has no name", 0.97)
         found, results = _tabulated(problem, found, results, figures)

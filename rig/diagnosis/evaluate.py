@@ -10,18 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
-from rig.diagnosis.on_dart import Simulated, corrected_model, dart_heights
+from rig.diagnosis.on_dart import dart_heights
 from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem import track
 from rig.diagnosis.problem.contract import (
     Candidate,
     Parts,
     Problem,
-    Track,
     existing_values,
     nominal,
 )
-from rig.diagnosis.problem.free_run import FreeRun
+from rig.diagnosis.problem.free_run import FreeRun, Trajectory, track_of
 from rig.diagnosis.problem.prescribed import Drive, Prescribed
 from rig.diagnosis.recording import Recording, RecordingError
 from rig.diagnosis.search.fit import Fit, fit
@@ -58,21 +57,6 @@ class Evaluated(NamedTuple):
     series: tuple[HeldOutSeries, ...]
 
 
-def with_floor_below(results: tuple[Evaluated, ...], left_n: float) -> tuple[Evaluated, ...]:
-    """A floor of the force that is no higher than what a model leaves where it was fitted.
-
-    Near a reversal a redrawn motion changes the sign of friction; a smoothed one does not.
-    """
-    return tuple(
-        result._replace(
-            floor=NoiseFloor(
-                result.floor.height_rmse_m, min(result.floor.residual_force_rmse_n, left_n)
-            )
-        )
-        for result in results
-    )
-
-
 class Models(NamedTuple):
     """The models that are compared, as candidate and parts.
 
@@ -101,7 +85,12 @@ def rms(values: Array) -> float:
 
 
 def evaluated(
-    problem: FreeRun | Prescribed, models: Models, recordings: tuple[Recording, ...], *, kept: bool
+    problem: FreeRun | Prescribed,
+    models: Models,
+    recordings: tuple[Recording, ...],
+    left_n: float,
+    *,
+    kept: bool,
 ) -> tuple[Evaluated, ...]:
     """Figures of every recording.
 
@@ -109,6 +98,7 @@ def evaluated(
         problem: Held-out recordings, or those that blocks of were kept back from.
         models: What is compared.
         recordings: As measured.
+        left_n: Load-cell force that the corrected model leaves where it was fitted; NaN without.
         kept: The figures are those of the blocks kept back; initial states are then known.
 
     Raises:
@@ -119,7 +109,7 @@ def evaluated(
         return tuple(
             _free_run(problem, k, fitted, recordings[k], kept) for k in range(problem.recordings)
         )
-    return tuple(_prescribed(problem, k, fitted, kept) for k in range(problem.recordings))
+    return tuple(_prescribed(problem, k, fitted, left_n, kept) for k in range(problem.recordings))
 
 
 def _with_starts(
@@ -160,12 +150,9 @@ def _free_run(
     )
     on_dart: list[Array] = []
     for (candidate, parts), motion in ((models.given, before), (models.chosen, after)):
-        model = Simulated(corrected_model(problem, candidate, parts), candidate, parts)
         left = rms(measured - motion.heights_m)
         tolerance = max(_AGREEMENT * float(noise.min()), _ACCURACY * left)
-        on_dart.append(
-            dart_heights(problem, run, model, parts.starts[k], motion.heights_m, tolerance)
-        )
+        on_dart.append(dart_heights(problem, k, candidate, parts, motion.heights_m, tolerance))
     forces = [problem.residual_forces(k, *model) for model in (models.given, models.chosen)]
     between = problem.residual_forces(k, *models.linear)
     linear_n = np.nan if between is None else rms(np.where(rows, between.force_n, np.nan))
@@ -187,7 +174,7 @@ def _free_run(
         run.grid.name,
         heights,
         BeforeAfter(rms(residual[0]), rms(residual[1])),
-        _strut_force(problem, k, models, (before.heights_m, after.heights_m), recording),
+        _strut_force(problem, k, models, (before, after), recording),
     )
     return Evaluated(
         figures, rms(measured - linear.heights_m), linear_n, heights,
@@ -199,7 +186,7 @@ def _strut_force(
     problem: FreeRun,
     k: int,
     models: Models,
-    heights: tuple[Array, Array],
+    motions: tuple[Trajectory, Trajectory],
     recording: Recording,
 ) -> BeforeAfter | None:
     """Error against the load cell, the models in free run."""
@@ -208,15 +195,8 @@ def _strut_force(
         return None
     run = problem.runs[k]
     found: list[float] = []
-    for (candidate, parts), _ in zip((models.given, models.chosen), heights, strict=True):
-        there = problem.simulated(run, candidate, parts, parts.starts[k])
-        if there is None:
-            return None
-        along = Track(
-            run.grid.t_s, np.ascontiguousarray(there.heights_m.T),
-            np.ascontiguousarray(there.velocities_m_per_s.T), run.applied_n,
-            run.grid.temperature_c, track.substeps_for(run.grid.t_s),
-        )  # fmt: skip
+    for (candidate, parts), motion in zip((models.given, models.chosen), motions, strict=True):
+        along = track_of(run, motion)
         states = problem.states(k, candidate, parts)
         forces = track.strut_forces(problem, candidate, parts, along, states)
         at = np.column_stack([np.interp(recording.t_s, run.grid.t_s, force) for force in forces])
@@ -224,7 +204,9 @@ def _strut_force(
     return BeforeAfter(*found)
 
 
-def _prescribed(problem: Prescribed, k: int, models: Models, kept: bool) -> Evaluated:
+def _prescribed(
+    problem: Prescribed, k: int, models: Models, left_n: float, kept: bool
+) -> Evaluated:
     drive = problem.drives[k]
     rows = _judged(drive.grid.kept, kept) & drive.certain
     measured = np.where(rows, drive.cells_n, np.nan)
@@ -232,7 +214,6 @@ def _prescribed(problem: Prescribed, k: int, models: Models, kept: bool) -> Eval
         track.strut_forces(problem, c, p, drive.along, problem.states(k, c, p)) for c, p in models
     ]
     error = BeforeAfter(rms(measured - forces[0]), rms(measured - forces[2]))
-    nothing = BeforeAfter(float("nan"), float("nan"))
     celled = [i for i in range(len(measured)) if np.any(np.isfinite(measured[i]))]
     series = tuple(
         HeldOutSeries(
@@ -241,10 +222,11 @@ def _prescribed(problem: Prescribed, k: int, models: Models, kept: bool) -> Eval
         )
         for i in celled
     )  # fmt: skip
-    floor = NoiseFloor(float("nan"), _motion_floor_n(problem, drive, k, models.chosen))
-    figures = RunFigures(drive.grid.name, nothing, error, error)
+    # Near a reversal a redrawn motion changes the sign of friction; a smoothed one does not.
+    floor_n = min(left_n, _motion_floor_n(problem, drive, k, models.chosen))
+    figures = RunFigures(drive.grid.name, BeforeAfter(np.nan, np.nan), error, error)
     left = rms(measured - forces[1])
-    return Evaluated(figures, left, left, error, floor, 0.0, series)
+    return Evaluated(figures, left, left, error, NoiseFloor(np.nan, floor_n), 0.0, series)
 
 
 def _motion_floor_n(
@@ -272,6 +254,3 @@ def _motion_floor_n(
         squares.append(float(np.mean(change[:, drive.certain] ** 2)))
     cell = drive.cell_noise_n[np.isfinite(drive.cell_noise_n)]
     return float(np.sqrt(np.mean(squares) + np.mean(cell**2)))
-
-
-__all__ = ["Evaluated", "Models", "evaluated", "models_of", "rms"]

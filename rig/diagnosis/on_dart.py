@@ -1,7 +1,5 @@
 """The corrected model, and its figures on DART itself."""
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
@@ -10,7 +8,7 @@ from dart_model.effects import effect
 from dart_model.plant import DartPlant
 from dart_model.spec import EffectSpec, ModelSpec
 from rig.diagnosis.problem.contract import Candidate, Parts, Problem, slots_of
-from rig.diagnosis.problem.free_run import Run
+from rig.diagnosis.problem.free_run import FreeRun, Run
 from rig.diagnosis.problem.linear_part import corrected_spec, rounded
 
 Array = NDArray[np.float64]
@@ -53,37 +51,29 @@ def _named(name: str, values: Array) -> dict[str, float]:
     return named
 
 
-class Simulated(NamedTuple):
-    """A model in DART on one recording.
-
-    Attributes:
-        spec: The model.
-        candidate: Its effects as the problem has them.
-        parts: Its parameters, and the initial vectors.
-    """
-
-    spec: ModelSpec
-    candidate: Candidate
-    parts: Parts
-
-
 def dart_heights(
-    problem: Problem, run: Run, model: Simulated, start: Array, wanted_m: Array, tolerance_m: float
+    problem: FreeRun,
+    k: int,
+    candidate: Candidate,
+    parts: Parts,
+    wanted_m: Array,
+    tolerance_m: float,
 ) -> Array:
     """Heights of a model in free run in DART, shape (N, struts).
 
     Args:
-        problem: Model and recordings.
-        run: The recording.
-        model: The model.
-        start: Its initial vector.
+        problem: Nominal model and recordings.
+        k: Index of the recording.
+        candidate: The model's effects.
+        parts: Its parameters and initial vectors.
         wanted_m: Heights of the same model as the diagnosis simulates it, shape (N, struts).
         tolerance_m: Root mean square by which the two may differ; DART's steps follow from it.
     """
-    plant = DartPlant(model.spec)
+    plant = DartPlant(corrected_model(problem, candidate, parts))
+    run, start = problem.runs[k], parts.starts[k]
     nodes = len(run.grid.t_s)
     count = min(nodes, max(50, int(_TRIED_S / run.grid.step_s)))
-    states = _states(problem, model, plant, start)
+    states = _states(problem, candidate, start[2 * plant.coordinates :])
     steps = 2 if run.substeps == 1 else 2 * run.substeps
     while steps < _MOST_STEPS and 2 * steps * nodes <= _MOST_STEPS_IN_ALL:
         there = _heights(plant, run, states, start, count, steps)
@@ -93,12 +83,9 @@ def dart_heights(
     return _heights(plant, run, states, start, nodes, steps)
 
 
-def _states(
-    problem: Problem, model: Simulated, plant: DartPlant, start: Array
-) -> tuple[float, ...]:
+def _states(problem: Problem, candidate: Candidate, given: Array) -> tuple[float, ...]:
     """Internal states in the order of DART's model: strut after strut, existing effects first."""
-    index = slots_of(problem, model.candidate).index
-    given = start[2 * plant.coordinates :]
+    index = slots_of(problem, candidate).index
     order = np.argsort(index[:, 0], kind="stable") if len(index) else []
     return tuple(float(s) for row in order for s in given[index[row, 3] : index[row, 4]])
 

@@ -38,7 +38,7 @@ class LinearCorrection:
     Attributes:
         strut: Strut that it belongs to.
         parameter: ``mass_kg`` (all that the strut's upper body weighs), ``stiffness_n_per_m``,
-            ``damping_n_s_per_m``, ``preload_n`` or ``input_gain``.
+            ``damping_n_s_per_m``, ``preload_n``, ``free_length_m`` or ``input_gain``.
         nominal: As the model file has it, the preload about mid-stroke.
         total: As the data have it.
         about_height_m: Mid-stroke, about which stiffness and preload are taken; else None.

@@ -34,41 +34,46 @@ from rig.diagnosis.problem.contract import (
 from rig.diagnosis.problem.free_run import FreeRun
 from rig.diagnosis.problem.linear_part import EFFECTS, PARAMETERS
 from rig.diagnosis.problem.prescribed import Prescribed
-from rig.diagnosis.problem.track import effect_forces
+from rig.diagnosis.problem.track import forces_along
 from rig.diagnosis.recording import Recording
 from rig.diagnosis.search.conclude import Found
 from rig.diagnosis.search.criteria import SelectionCriteria
-from rig.diagnosis.search.fit import UNBOUND, Fit, effect_variables, is_white, spread
+from rig.diagnosis.search.fit import UNBOUND, Fit, Spread, effect_variables, is_white, spread
 
 Array = NDArray[np.float64]
 
 _NEARLY = 0.02
 """Share of a preload up to which it counts as brought along by a change of stiffness."""
+_CLOCK = 5e-5
+"""Half-width that an interval has at least, as a share of the value: clocks of sensors and loggers
+run right to 50 ppm (a usual crystal), which shifts a mass as a frequency; integration errs less."""
 _HELD = 0.3
 """Share of half a sampling interval within which a delay is what a held input looks like."""
 
 
 class _Known(NamedTuple):
-    """A fit and its covariance."""
+    """A fit and what it does not know."""
 
     fit: Fit
-    covariance: Array
-    factor: float
+    spread: Spread
 
-    def estimate(self, variable: int) -> Estimate:
-        """A search variable's value and confidence interval."""
+    def estimate(self, variable: int, nominal: float = 0.0) -> Estimate:
+        """A search variable's value, with what it is a change of, and its confidence interval."""
         space, value = self.fit.space, float(self.fit.solution.values[variable])
-        half = self.factor * float(np.sqrt(max(self.covariance[variable, variable], 0.0)))
+        half = float(self.spread.half[variable])
         low, high = float(space.low[variable]), float(space.high[variable])
         if space.logarithmic[variable]:
             if half > np.log(UNBOUND):
                 return Estimate(value, None, None)
-            growth = float(np.exp(half))
+            growth = float(np.exp(np.hypot(half, _CLOCK)))
             return Estimate(value, max(value / growth, low), min(value * growth, high))
         half *= float(space.scale[variable])
         if half > UNBOUND * max(abs(value), 1e-300) and half > 0.5 * (high - low):
-            return Estimate(value, None, None)
-        return Estimate(value, max(value - half, low), min(value + half, high))
+            return Estimate(value + nominal, None, None)
+        half = float(np.hypot(half, _CLOCK * abs(value + nominal)))
+        return Estimate(
+            value + nominal, max(value - half, low) + nominal, min(value + half, high) + nominal
+        )
 
 
 def written_up(
@@ -95,7 +100,7 @@ def written_up(
     chosen = found.chosen.fit
     before = [_forces(problem, k, found.given) for k in range(problem.recordings)]
     after = [_forces(problem, k, chosen) for k in range(problem.recordings)]
-    known = _Known(chosen, *spread(chosen))
+    known = _Known(chosen, spread(chosen))
     linear = _linear(problem, known)
     effects = _effects(problem, known, after)
     if not effects:
@@ -114,7 +119,7 @@ def written_up(
         linear,
         effects,
         _existing(problem, found, known),
-        _rejected(problem, found),
+        found.rejected + _unseen(problem),
         other if ambiguous else (),
         _suggestion(found) if ambiguous else None,
         held_out,
@@ -140,30 +145,44 @@ def written_up(
     )
 
 
-def needless(results: Sequence[Evaluated], criteria: SelectionCriteria) -> bool:
-    """Whether held-out data are at the floor without any law, and no nearer to it with the laws.
+def needless(
+    problem: Problem, linear: Fit, results: Sequence[Evaluated], criteria: SelectionCriteria
+) -> bool:
+    """Whether all data are at the floor without any law, and held-out ones no nearer with the laws.
 
-    By less than what noise of the applied force alone causes is no nearer.
+    By less than what noise of the applied force alone causes is no nearer. A law that the data call
+    for may not act on held-out ones, as a stop that is not reached: they say nothing of it.
     """
+    if not _is_left_at_floor(problem, linear, criteria):
+        return False
     after = _mean([r.counted.after for r in results]) ** 2
-    linear = _mean([r.linear for r in results]) ** 2
+    lawless = _mean([r.linear for r in results]) ** 2
     floor = _mean([_floor(r) for r in results]) ** 2
     drift = _mean([r.drift_m for r in results]) ** 2
-    least = max(criteria.least_above_noise * floor, criteria.least_share * (linear - floor), drift)
-    return linear <= criteria.explained**2 * floor and linear - after <= least
+    least = max(criteria.least_above_noise * floor, criteria.least_share * (lawless - floor), drift)
+    return lawless <= criteria.explained**2 * floor and lawless - after <= least
 
 
-def judgement(results: Sequence[Evaluated], found: Found, criteria: SelectionCriteria) -> Verdict:
+def _is_left_at_floor(problem: Problem, result: Fit, criteria: SelectionCriteria) -> bool:
+    """Whether a model leaves no more than noise of the recordings that were learnt from."""
+    floor = problem.floor_level(result.candidate, result.parts)
+    return result.mean_square <= criteria.explained**2 * floor
+
+
+def judgement(
+    problem: Problem, results: Sequence[Evaluated], found: Found, criteria: SelectionCriteria
+) -> Verdict:
     """What held-out data allow to be said.
 
     A finding explains where every held-out run is left at the noise floor; it is partial where laws
     take away a good share of what the best linear model leaves there. How bad the nominal model was
-    does not count.
+    does not count. Nothing is missing only where that holds of what was learnt from, too.
     """
     ratios = [r.counted.after / max(_floor(r), 1e-300) for r in results]
     if all(ratio <= criteria.explained for ratio in ratios):
         if not (found.chosen.fit.candidate.new or np.any(found.chosen.fit.free)):
-            return "nothing_missing"
+            at_floor = _is_left_at_floor(problem, found.chosen.fit, criteria)
+            return "nothing_missing" if at_floor else "not_explained"
         return "ambiguous" if found.rivals else "explained"
     if found.chosen.fit.candidate.new and all(np.isfinite(ratios)):
         share = 1.0 - criteria.partly
@@ -193,7 +212,6 @@ def _forces(problem: Problem, k: int, result: Fit) -> ResidualForces | None:
 def _linear(problem: Problem, known: _Known) -> tuple[LinearCorrection, ...]:
     found: list[LinearCorrection] = []
     for variable, p in enumerate(_free(problem, known.fit)):
-        change = known.estimate(variable)
         nominal_value = p.nominal + (_existing_preload(problem, p) if p.kind == "preload" else 0.0)
         about = p.kind in ("stiffness", "preload")
         found.append(
@@ -201,7 +219,7 @@ def _linear(problem: Problem, known: _Known) -> tuple[LinearCorrection, ...]:
                 problem.spec.struts[p.strut].name,
                 PARAMETERS[p.kind],
                 nominal_value,
-                _shifted(change, nominal_value),
+                known.estimate(variable, nominal_value),
                 middle_m(problem.motions[p.strut]) if about else None,
             )
         )
@@ -210,13 +228,6 @@ def _linear(problem: Problem, known: _Known) -> tuple[LinearCorrection, ...]:
 
 def _free(problem: Problem, result: Fit) -> list[LinearParameter]:
     return [p for p, free in zip(problem.linear, result.free, strict=True) if free]
-
-
-def _shifted(estimate: Estimate, by: float) -> Estimate:
-    low, high = estimate.low, estimate.high
-    return Estimate(
-        estimate.value + by, None if low is None else low + by, None if high is None else high + by
-    )
 
 
 def _existing_preload(problem: Problem, parameter: LinearParameter) -> float:
@@ -228,31 +239,34 @@ def _existing_preload(problem: Problem, parameter: LinearParameter) -> float:
 def _effects(
     problem: Problem, known: _Known, after: Sequence[ResidualForces | None]
 ) -> tuple[FoundEffect, ...]:
-    result = known.fit
-    first = len(result.candidate.kept)
+    model, there = known.fit, [(k, f) for k, f in enumerate(after) if f is not None]
+    first = len(model.candidate.kept)
+    tracks = [(k, f.track) for k, f in there]
+    forces = forces_along(problem, model.candidate, model.parts, tracks)
     found: list[FoundEffect] = []
-    per_recording = [
-        effect_forces(
-            problem, result.candidate, result.parts, forces.track,
-            problem.states(k, result.candidate, result.parts),
-        )
-        for k, forces in enumerate(after)
-        if forces is not None
-    ]  # fmt: skip
-    for i, (strut, name) in enumerate(result.candidate.new):
-        force = np.concatenate([rows[first + i][1] for rows in per_recording])
-        left = np.concatenate([f.force_n[strut] for f in after if f is not None])
-        found.append(
-            FoundEffect(
-                effect(name).family,
-                name,
-                problem.spec.struts[strut].name,
-                _explained(left, force),
-                rms(force),
-                _estimates(problem, known, first + i, name),
-            )
-        )
+    for row, (strut, name) in enumerate(model.candidate.new, first):
+        left = np.concatenate([f.force_n[strut] for _, f in there])
+        estimates = _estimates(problem, known, row, name)
+        found.append(_found(problem, strut, name, left, forces[row][1], estimates))
     return tuple(sorted(found, key=lambda item: -item.force_rms_n))
+
+
+def _found(
+    problem: Problem,
+    strut: int,
+    name: str,
+    left: Array,
+    force: Array,
+    estimates: dict[str, Estimate],
+) -> FoundEffect:
+    """An effect by its force and by what is left with it."""
+    there = np.isfinite(left)
+    without = float(np.mean((left + force)[there] ** 2))
+    share = 1.0 - float(np.mean(left[there] ** 2)) / max(without, 1e-300)
+    where = problem.spec.struts[strut].name
+    return FoundEffect(
+        effect(name).family, name, where, float(np.clip(share, 0.0, 1.0)), rms(force), estimates
+    )
 
 
 def _estimates(problem: Problem, known: _Known, row: int, name: str) -> dict[str, Estimate]:
@@ -270,14 +284,6 @@ def _estimates(problem: Problem, known: _Known, row: int, name: str) -> dict[str
         p.name: Estimate(float(value), None, None)
         for p, value in zip(effect(name).parameters, values, strict=True)
     }
-
-
-def _explained(left: Array, force: Array) -> float:
-    """Share of a residual force's mean square that a force takes away, means apart."""
-    there = np.isfinite(left)
-    a, b = left[there], (left + force)[there]
-    with_it, without_it = float(np.mean(a**2)), float(np.mean(b**2))
-    return float(np.clip(1.0 - with_it / max(without_it, 1e-300), 0.0, 1.0))
 
 
 def _linear_effects(
@@ -301,18 +307,10 @@ def _linear_effects(
             if there is not None and without is not None:
                 forces.append(without.force_n[p.strut] - there.force_n[p.strut])
                 left.append(there.force_n[p.strut])
-        force = np.concatenate(forces) if forces else np.zeros(1)
-        item = effect(EFFECTS[p.kind])
-        found.append(
-            FoundEffect(
-                item.family,
-                item.name,
-                problem.spec.struts[p.strut].name,
-                _explained(np.concatenate(left) if left else np.zeros(1), force),
-                rms(force),
-                {item.parameters[0].name: known.estimate(variable)},
-            )
-        )
+        name = EFFECTS[p.kind]
+        estimates = {effect(name).parameters[0].name: known.estimate(variable)}
+        all_left, force = (np.concatenate(rows) if rows else np.zeros(1) for rows in (left, forces))
+        found.append(_found(problem, p.strut, name, all_left, force, estimates))
     return tuple(sorted(found, key=lambda item: -item.force_rms_n))
 
 
@@ -328,11 +326,12 @@ def _implied_preloads(problem: Problem, known: _Known) -> set[int]:
                 continue
             strut = problem.spec.struts[spring.strut]
             lever = middle_m(problem.motions[spring.strut]) - strut.free_length_m
-            weights = np.zeros(len(known.covariance))
+            covariance = known.spread.covariance
+            weights = np.zeros(len(covariance))
             weights[i], weights[j] = preload.deviation, lever * spring.deviation
             values = known.fit.solution.values
             left = float(values[i] + lever * values[j])
-            half = known.factor * float(np.sqrt(max(weights @ known.covariance @ weights, 0.0)))
+            half = known.spread.factor * float(np.sqrt(max(weights @ covariance @ weights, 0.0)))
             if abs(left) < max(half, _NEARLY * abs(float(values[i]))):
                 found.add(i)
     return found
@@ -351,10 +350,7 @@ def _existing(problem: Problem, found: Found, known: _Known) -> tuple[ExistingEf
         if kept in found.superfluous:
             listed.append(ExistingEffect(item.name, strut, "superfluous", nominal_values, {}))
         elif row in variables:
-            estimates = {
-                p.name: known.estimate(int(v))
-                for p, v in zip(parameters, variables[row], strict=True)
-            }
+            estimates = _estimates(problem, known, row, item.name)
             if any(_outside(estimates[name], value) for name, value in nominal_values.items()):
                 listed.append(
                     ExistingEffect(item.name, strut, "refitted", nominal_values, estimates)
@@ -368,26 +364,15 @@ def _outside(estimate: Estimate, value: float) -> bool:
     return not estimate.low <= value <= estimate.high
 
 
-def _rejected(problem: Problem, found: Found) -> tuple[RejectedEffect, ...]:
-    listed = [
-        RejectedEffect(
-            effect(r.placed[1]).family,
-            r.placed[1],
-            problem.spec.struts[r.placed[0]].name,
-            r.why,
-            r.left,
-        )
-        for r in found.rejected
-    ]
+def _unseen(problem: Problem) -> tuple[RejectedEffect, ...]:
+    """Effects that this kind of bench does not show."""
     bench = "a prescribed motion" if problem.bench == "motion_given" else "this kind of bench"
-    listed += [
-        RejectedEffect(
-            item.family, item.name, problem.spec.struts[0].name, f"{bench} does not show it", None
-        )
+    strut, why = problem.spec.struts[0].name, f"{bench} does not show it"
+    return tuple(
+        RejectedEffect(item.family, item.name, strut, why, None)
         for item in CATALOGUE.values()
         if problem.bench not in item.benches
-    ]
-    return tuple(listed)
+    )
 
 
 def _suggestion(found: Found) -> str:
@@ -450,8 +435,8 @@ def _notes(problem: FreeRun | Prescribed, found: Found, *, blocks: bool) -> tupl
         notes.append(f"{outliers} heights were found to be outliers and left out.")
     if found.gain_alike:
         notes.append(
-            "Mass, stiffness and damping changed in one proportion: these data cannot separate "
-            "that from the gain of the applied force; a weighed mass (`tolerance`) would."
+            "A gain of the applied force looks the same as a change of mass, stiffness and damping "
+            "in one proportion: these data cannot separate the two; weighing the mass would."
         )
     if _looks_held(problem, found.chosen.fit):
         notes.append(

@@ -72,7 +72,7 @@ def test_an_absurd_criterion_gives_another_answer(name, value, case):
 def explored(criteria):
     """What a first search of a case with two laws of one kind has fitted."""
     spec, runs, _ = CASES["one_kind"].make()
-    _, problem = build(spec, runs, criteria.blocks, None)
+    problem = build(spec, runs, criteria.blocks, None)
     given, linear = first_fits(problem)
     pool = Pool(problem, given, [linear], criteria)
     explore(pool, lambda _what, _share: None)
@@ -101,3 +101,27 @@ def test_a_pair_that_is_but_a_better_formula_for_one_law_is_not_worth_it(imitati
     assert not pool.at_floor(better)
     assert pool.worth(nearly, better) is worth
     assert pool.worth(nearly, leaving(pair, 1e-3 * (nearly.score - rows)))
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "worth"),
+    [
+        ("cubic_stiffness", "quadratic_damping", True),
+        ("coulomb_friction", "free_play", True),
+        ("coulomb_friction", "quadratic_damping", False),
+        ("coulomb_friction", "hidden_mass", False),
+    ],
+)
+def test_beside_a_nearly_right_law_storing_and_dissipating_ones_take_a_share(one, other, worth):
+    pool = explored(CRITERIA)
+    fitted = pool.linear
+    candidate = fitted.fit.candidate
+
+    def leaving(laws, above):
+        rows = fitted.fit.rows
+        fit = fitted.fit._replace(candidate=candidate._replace(new=tuple((0, law) for law in laws)))
+        return fitted._replace(fit=fit, scores=(rows + above) / fitted.score * fitted.scores)
+
+    above = 5e-3 * fitted.score
+    assert pool.is_formula(leaving([one], above))
+    assert pool.worth(leaving([one], above), leaving([one, other], 0.5 * above)) is worth

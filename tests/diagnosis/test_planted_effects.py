@@ -208,6 +208,38 @@ def test_friction_beside_a_hardening_spring_is_found_as_two():
     assert len(found.effects) <= 3
 
 
+class GainAndPreload(Nothing):
+    gain = 1.07
+
+    def force(self, t, z, v, state):
+        return 8.0
+
+
+def test_a_gain_beside_a_preload_is_found_as_one():
+    runs = [bench.run(GainAndPreload()), bench.run(GainAndPreload(), seed=2)]
+    found = diagnose(bench.model(), runs[:1], runs[1:]).diagnosis
+    assert {e.family for e in found.effects} == {"input_gain", "preload"}
+    assert named(found, "input_gain").parameters["gain"].value == pytest.approx(0.07, rel=0.01)
+
+
+class GainAndSpring(Nothing):
+    gain = 1.07
+
+    def force(self, t, z, v, state):
+        return -200.0 * (z - FREE)
+
+
+def test_a_gain_beside_another_spring_is_not_a_mass_and_a_damper():
+    runs = [
+        bench.run(GainAndSpring(), gravity=0.0),
+        bench.run(GainAndSpring(), seed=2, gravity=0.0),
+    ]
+    found = diagnose(bench.model(gravity=0.0), runs[:1], runs[1:]).diagnosis
+    assert {e.family for e in found.effects} == {"input_gain", "stiffness"}
+    assert named(found, "input_gain").parameters["gain"].value == pytest.approx(0.07, rel=0.01)
+    assert any("gain" in note for note in found.notes)
+
+
 class StopAndRipple(Nothing):
     def force(self, t, z, v, state):
         return 3.0 * Stop().force(t, z, v, state) + Ripple().force(t, z, v, state)

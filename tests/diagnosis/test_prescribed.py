@@ -5,6 +5,7 @@ import math
 import pytest
 
 from rig.diagnosis.diagnose import diagnose
+from rig.diagnosis.recording import RecordingError
 from tests.diagnosis import little_dyno as dyno
 from tests.diagnosis.answers import (
     LINEAR_FAMILIES,
@@ -203,6 +204,32 @@ def test_linear_constants_are_corrected_beside_a_law():
     # About mid-stroke, to which the stiffness adds.
     added_n = 25.0 - 700.0 * (preload.about_height_m - FREE)
     assert preload.total.value - preload.nominal == pytest.approx(added_n, rel=0.02)
+
+
+def test_no_interval_is_finer_than_a_clock():
+    exact = {"height_noise_m": 1e-12, "resolution_m": 1e-12, "force_noise_n": 1e-6}
+    exact["duration_s"] = 4.0
+    runs = [dyno.run(Stiffness(), **exact), dyno.run(Stiffness(), seed=2, **exact)]
+    found = diagnose(dyno.model(), runs[:1], runs[1:]).diagnosis
+    total = correction(found, "stiffness_n_per_m").total
+    assert total.value == pytest.approx(STIFFNESS + 900.0, rel=1e-3)
+    assert total.high - total.value == pytest.approx(5e-5 * total.value, rel=0.3)
+
+
+def test_a_model_without_spring_and_damper_gets_both():
+    runs = [dyno.run(Nothing()), dyno.run(Nothing(), seed=2, motion=dyno.later)]
+    found = diagnose(dyno.model(stiffness=0.0, damping=0.0), runs[:1], runs[1:]).diagnosis
+    assert found.verdict == "explained"
+    assert missing(found) == []
+    for parameter, truth in (("stiffness_n_per_m", STIFFNESS), ("damping_n_s_per_m", DAMPING)):
+        assert holds(correction(found, parameter).total, truth)
+
+
+def test_more_effects_than_a_simulation_carries_are_one_line():
+    effects = ", ".join(11 * ["{name: preload, parameters: {force_n: 1.0}}"])
+    model = dyno.model(effects=f"[{effects}]")
+    with pytest.raises(RecordingError, match="little_dyno: 11 effects, expected at most 7"):
+        diagnose(model, [dyno.run(Nothing())])
 
 
 class Cogging(Nothing):

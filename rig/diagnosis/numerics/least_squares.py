@@ -221,8 +221,9 @@ def _moved(
     patient: bool,
 ) -> tuple[_Point, float] | None:
     """A step with as little damping as lowers the cost; without patience one is tried."""
-    products = jacobian.T @ jacobian + np.diag(here.precision)
-    gradient = jacobian.T @ here.residual + here.precision * (here.x - here.centre)
+    with np.errstate(over="ignore", invalid="ignore"):  # No step is taken from what overflows.
+        products = jacobian.T @ jacobian + np.diag(here.precision)
+        gradient = jacobian.T @ here.residual + here.precision * (here.x - here.centre)
     diagonal = np.maximum(np.diag(products), 1e-300)
     largest = np.where(space.logarithmic, _LARGEST_LOGARITHMIC_STEP, np.inf)
     free = ~_pressed(here.x, gradient, space)
@@ -292,7 +293,8 @@ def _jacobian(
             if len(found) == sides:
                 break
         if found:
-            columns[part, i] = min(found, key=lambda column: float(column @ column))
+            with np.errstate(over="ignore"):  # A column that overflows is the larger one.
+                columns[part, i] = min(found, key=lambda column: float(column @ column))
 
     if threads == 1:
         for i in range(len(x)):

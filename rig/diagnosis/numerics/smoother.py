@@ -172,18 +172,8 @@ def _smooth(t: Array, ratio: float, means: Array, covariances: Array) -> None:
         ahead = ap @ a.T + ratio * q
         # Scale to unit diagonal: the states differ by many orders of magnitude.
         d = np.sqrt(np.diag(ahead))
-        for i in range(4):
-            for j in range(4):
-                ahead[i, j] /= d[i] * d[j]
-                ap[i, j] = ap[i, j]
-        for i in range(4):
-            for j in range(4):
-                ap[i, j] /= d[i]
-        g = np.linalg.solve(ahead, ap).T
-        for i in range(4):
-            for j in range(4):
-                g[i, j] /= d[j]
-        g = np.ascontiguousarray(g)
+        scaled = np.linalg.solve(ahead / np.outer(d, d), ap / d.reshape(4, 1))
+        g = np.ascontiguousarray((scaled / d.reshape(4, 1)).T)
         means[k] = m + g @ (means[k + 1] - a @ m)
         full = a @ p @ a.T + ratio * q
         covariances[k] = p + g @ (covariances[k + 1] - full) @ g.T

@@ -1,28 +1,35 @@
 """From recordings and a nominal model to a problem."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import Motion, effect
 from dart_model.spec import ModelSpec
-from rig.diagnosis.numerics.smoother import estimate_noise, smooth
+from rig.diagnosis.numerics.smoother import estimate_noise
 from rig.diagnosis.problem import linear_part, track
 from rig.diagnosis.problem.contract import (
     Candidate,
     Existing,
+    LinearParameter,
     Parts,
     Problem,
     ResidualForces,
-    Shared,
     Track,
     existing_values,
     nominal,
 )
 from rig.diagnosis.problem.free_run import FreeRun, Run, run_of, system
-from rig.diagnosis.problem.grid import NO_TEMPERATURE_C, Grid, grid_of, with_blocks_kept
+from rig.diagnosis.problem.grid import (
+    NO_TEMPERATURE_C,
+    Grid,
+    SmoothMotion,
+    grid_of,
+    smooth_motion,
+    with_blocks_kept,
+)
 from rig.diagnosis.problem.mechanism import Mechanism, Readers, constant, readers, tabulated
 from rig.diagnosis.problem.prescribed import Drive, Prescribed, drive_of, noise_of
 from rig.diagnosis.recording import Recording, RecordingError, checked
@@ -45,15 +52,10 @@ _TONES = 4
 _LEAST_BLOCK_S = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class Given(Shared):
-    """The same with the means to read further recordings.
-
-    Attributes:
-        read: DART with the nominal model.
-    """
-
-    read: Readers
+_Shared = tuple[
+    ModelSpec, tuple[LinearParameter, ...], tuple[Existing, ...], tuple[Motion, ...], float, Readers
+]
+"""What problems of one diagnosis share, as they take it."""
 
 
 def is_prescribed(recordings: Sequence[Recording]) -> bool:
@@ -75,7 +77,7 @@ def is_prescribed(recordings: Sequence[Recording]) -> bool:
 
 def build(
     spec: ModelSpec, recordings: Sequence[Recording], blocks: int, kept_every: int | None
-) -> tuple[Given, "FreeRun | Prescribed"]:
+) -> FreeRun | Prescribed:
     """The problem of recordings that are learnt from.
 
     Args:
@@ -96,55 +98,57 @@ def build(
         pairs = [(with_blocks_kept(grid, block_s, kept_every), at) for grid, at in pairs]
     grids = [grid for grid, _ in pairs]
     read = readers(spec)
-    smooth_motions = [_smooth_motion(grid) for grid in grids]
-    motions = _motions(spec, grids, smooth_motions)
-    mechanism = _mechanism(read, smooth_motions[0])
+    smoothed = [smooth_motion(grid) for grid in grids]
+    tracks = [motion for motion, _, _ in smoothed]
+    motions = _motions(spec, grids, tracks, _measured_n(recordings))
+    mechanism = _mechanism(read, tracks[0])
     masses = [linear_part.moving_mass_kg(mechanism, i) for i in range(len(motions))]
     motions = tuple(m._replace(mass_kg=mass) for m, mass in zip(motions, masses, strict=True))
     bench = "motion_given" if is_prescribed(recordings) else "force_given"
     linear = linear_part.parameters(spec, bench, motions, mechanism)
-    existing = _existing(spec, smooth_motions)
-    given = Given(spec, linear, existing, motions, block_s, read)
-    return given, _problem(given, recordings, pairs, smooth_motions)
+    existing = _existing(spec, tracks)
+    return _problem((spec, linear, existing, motions, block_s, read), recordings, pairs, smoothed)
 
 
-def build_held_out(given: Given, recordings: Sequence[Recording]) -> "FreeRun | Prescribed":
+def build_held_out(learnt: Problem, recordings: Sequence[Recording]) -> FreeRun | Prescribed:
     """The problem of recordings that are judged on, in terms of those that were learnt from.
 
     Raises:
         RecordingError: A recording cannot be used.
     """
     for recording in recordings:
-        _check_fits(recording, given.spec)
+        _check_fits(recording, learnt.spec)
     pairs = [grid_of(recording) for recording in recordings]
-    return _problem(given, recordings, pairs, [_smooth_motion(grid) for grid, _ in pairs])
+    shared = (
+        learnt.spec, learnt.linear, learnt.existing, learnt.motions, learnt.block_s, learnt.read
+    )  # fmt: skip
+    return _problem(shared, recordings, pairs, [smooth_motion(grid) for grid, _ in pairs])
 
 
 def _problem(
-    given: Given,
+    shared: _Shared,
     recordings: Sequence[Recording],
     pairs: Sequence[tuple[Grid, NDArray[np.int64]]],
-    motions: Sequence[Track],
-) -> "FreeRun | Prescribed":
-    spec = given.spec
-    shared = (spec, given.linear, given.existing, given.motions, given.block_s)
+    smoothed: Sequence[SmoothMotion],
+) -> FreeRun | Prescribed:
+    spec, *_, read = shared
     if is_prescribed(recordings):
         drives = tuple(
-            drive_of(grid, at, recording)
-            for (grid, at), recording in zip(pairs, recordings, strict=True)
+            drive_of(grid, at, recording, smooth)
+            for (grid, at), recording, smooth in zip(pairs, recordings, smoothed, strict=True)
         )
         problem = Prescribed(*shared, drives, noise_of(spec, drives))
         for drive in drives:
             _check_drive(drive, _nominal_forces(problem, drive))
         return problem
     runs: list[Run] = []
-    for (grid, _), recording, motion in zip(pairs, recordings, motions, strict=True):
-        mechanism = _mechanism(given.read, motion)
+    for (grid, _), recording, (motion, _, _) in zip(pairs, recordings, smoothed, strict=True):
+        mechanism = _mechanism(read, motion)
         _check_columns(spec, recording, mechanism)
         if recording.applied_force_n is None:
             raise RecordingError(f"{recording.name}: expected a column applied_force_n")
         applied = (recording.t_s, recording.applied_force_n)
-        runs.append(run_of(grid, applied, mechanism, _fastest(given, mechanism)))
+        runs.append(run_of(grid, applied, mechanism, _fastest(spec, mechanism)))
     problem = FreeRun(*shared, tuple(runs), np.full(len(spec.struts), np.inf))
     for run in runs:
         _check_swing(run.grid)
@@ -189,50 +193,44 @@ def with_tones(problem: Problem, residual: Sequence[ResidualForces]) -> tuple[Mo
             found.append(motion)
             continue
         rms = float(np.sqrt(np.mean(force**2)))
-        found.append(motion._replace(force_n=rms, tones=_tones(longest.track.t_s, force)))
+        least_hz, _ = effect("periodic_force").bounds(motion)["frequency_hz"]
+        found.append(motion._replace(force_n=rms, tones=_tones(longest.track.t_s, force, least_hz)))
     return tuple(found)
 
 
-def _tones(t_s: Array, force: Array) -> tuple[tuple[float, float], ...]:
-    """Frequency (Hz) and phase (rad) of the strongest lines of a force.
+def _tones(t_s: Array, force: Array, least_hz: float) -> tuple[tuple[float, float], ...]:
+    """Frequency (Hz, at least so much) and phase (rad) of the strongest lines of a force.
 
-    One after another, each taken out before the next: a window's side lobes are no lines.
+    One after another, each taken out before the next, slower ones too: a window's side lobes are no
+    lines.
     """
     step = float(t_s[-1] - t_s[0]) / (len(t_s) - 1)
     left = force - force.mean()
     found: list[tuple[float, float]] = []
     window = np.hanning(len(left))
-    for _ in range(_TONES):
-        size = 4 * len(left)
+    size = 4 * len(left)
+    for _ in range(2 * _TONES):
         spectrum = np.fft.rfft(left * window, size)
         best = 4 + int(np.argmax(np.abs(spectrum[4:-4])))
         frequency = best / (size * step)
         carrier = 2.0 * np.pi * frequency * t_s
         columns = np.column_stack([np.sin(carrier), np.cos(carrier)])
         (sine, cosine), *_ = np.linalg.lstsq(columns, left, rcond=None)
-        found.append((frequency, float(np.arctan2(cosine, sine))))
+        if frequency >= least_hz:
+            found.append((frequency, float(np.arctan2(cosine, sine))))
         left = left - columns @ np.array([sine, cosine])
-    return tuple(found)
+    return tuple(found[:_TONES])
 
 
-def _smooth_motion(grid: Grid) -> Track:
-    """Measured motion of all struts, smoothed without any model."""
-    middle = np.nanmean(grid.heights_m, axis=0)
-    states = [
-        smooth(grid.t_s, column, estimate_noise(grid.t_s, column)).states
-        for column in (grid.heights_m - middle).T
-    ]
-    return Track(
-        grid.t_s,
-        np.ascontiguousarray([s[:, 0] + m for s, m in zip(states, middle, strict=True)]),
-        np.ascontiguousarray([s[:, 1] for s in states]),
-        np.zeros(len(grid.t_s)),
-        grid.temperature_c,
-        track.substeps_for(grid.t_s),
-    )
+def _measured_n(recordings: Sequence[Recording]) -> float:
+    """Largest standard deviation of a measured force."""
+    channels = ((r.applied_force_n, r.strut_forces_n) for r in recordings)
+    return max(float(np.nanstd(c)) for pair in channels for c in pair if c is not None)
 
 
-def _motions(spec: ModelSpec, grids: Sequence[Grid], tracks: Sequence[Track]) -> tuple[Motion, ...]:
+def _motions(
+    spec: ModelSpec, grids: Sequence[Grid], tracks: Sequence[Track], measured_n: float
+) -> tuple[Motion, ...]:
     warm = [grid.temperature_c for grid in grids if grid.has_temperature]
     celsius = (NO_TEMPERATURE_C, NO_TEMPERATURE_C)
     if warm:
@@ -256,7 +254,7 @@ def _motions(spec: ModelSpec, grids: Sequence[Grid], tracks: Sequence[Track]) ->
                 strut.stiffness_n_per_m,
                 strut.damping_n_s_per_m,
                 1.0,
-                force,
+                force or measured_n,
                 celsius,
                 (),
             )
@@ -270,9 +268,9 @@ def _mechanism(read: Readers, motion: Track) -> Mechanism:
     return tabulated(read, motion.heights_m.T, motion.velocities_m_per_s.T)
 
 
-def _fastest(given: Given, m: Mechanism) -> float:
+def _fastest(spec: ModelSpec, m: Mechanism) -> float:
     """Largest eigenvalue of the model without effects, by size."""
-    constants = np.array([(s.stiffness_n_per_m, s.damping_n_s_per_m) for s in given.spec.struts])
+    constants = np.array([(s.stiffness_n_per_m, s.damping_n_s_per_m) for s in spec.struts])
     rows, mass = m.rows.mean(axis=0), m.mass.mean(axis=0)
     stiffness = rows.T @ np.diag(constants[:, 0]) @ rows - m.bias_q.mean(axis=0)
     damping = rows.T @ np.diag(constants[:, 1]) @ rows - m.bias_v.mean(axis=0)

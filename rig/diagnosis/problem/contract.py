@@ -9,9 +9,10 @@ References:
     through the model's own dynamics.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple, Protocol
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from dart_model.effects import effect
 from dart_model.effects.contract import Bench, Motion
 from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.compiled import Slots, slots
+from rig.diagnosis.problem.mechanism import Readers
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -38,7 +40,7 @@ class LinearParameter(NamedTuple):
             from which laws are taken, its share in the linear spring's force counts as preload.
         nominal: As the model file has it.
         deviation: Standard deviation of the prior on its change.
-        least: Lowest change; mass and stiffness stay positive.
+        least: Lowest change; mass stays positive, no spring or damper turns negative.
     """
 
     strut: int
@@ -108,7 +110,6 @@ class Track(NamedTuple):
         velocities_m_per_s: Their rates, shape (struts, N).
         applied_n: Applied force, shape (N,); zero where there is none.
         temperature_c: Temperature, shape (N,).
-        substeps: Steps for internal states between samples.
     """
 
     t_s: Array
@@ -116,7 +117,19 @@ class Track(NamedTuple):
     velocities_m_per_s: Array
     applied_n: Array
     temperature_c: Array
-    substeps: int
+
+    @classmethod
+    def of_columns(
+        cls,
+        t_s: Array,
+        heights_m: Array,
+        velocities_m_per_s: Array,
+        applied_n: Array,
+        temperature_c: Array,
+    ) -> "Track":
+        """A motion whose heights and velocities come as columns, shape (N, struts)."""
+        rows = t_s, heights_m.T, velocities_m_per_s.T, applied_n, temperature_c
+        return cls(*(np.ascontiguousarray(row) for row in rows))
 
 
 class Segment(NamedTuple):
@@ -131,7 +144,7 @@ class Segment(NamedTuple):
         target: Whitened answer that the reference leaves over, shape (m,).
         linear: Whitened answers to a unit change of each linear parameter, shape (m, L).
         initial: Whitened answers to initial states, shape (m, c).
-        blocks: Block of each row, shape (m,).
+        blocks: Block of each row, counted within it, shape (m,).
     """
 
     track: Track
@@ -161,94 +174,69 @@ class ResidualForces(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Shared:
-    """What all problems of one diagnosis share.
+class Problem(ABC):
+    """A model held against recordings.
 
     Attributes:
+        bench: Kind of bench.
         spec: The nominal model.
         linear: Parameters of the linear part.
         existing: Effects of the nominal model.
         motions: What each strut did on the recordings that are learnt from.
         block_s: Length of the blocks of cross-validation.
+        read: DART with the nominal model.
     """
 
+    bench: ClassVar[Bench]
     spec: ModelSpec
     linear: tuple[LinearParameter, ...]
     existing: tuple[Existing, ...]
     motions: tuple[Motion, ...]
     block_s: float
-
-
-class Problem(Protocol):
-    """A model held against recordings.
-
-    Attributes:
-        bench: Kind of bench.
-    """
-
-    bench: ClassVar[Bench]
+    read: Readers
 
     @property
-    def spec(self) -> ModelSpec:
-        """The nominal model."""
-        ...
-
-    @property
-    def linear(self) -> tuple[LinearParameter, ...]:
-        """Parameters of the linear part."""
-        ...
-
-    @property
-    def existing(self) -> tuple[Existing, ...]:
-        """Effects of the nominal model."""
-        ...
-
-    @property
-    def motions(self) -> tuple[Motion, ...]:
-        """What each strut did on the recordings."""
-        ...
-
-    @property
+    @abstractmethod
     def recordings(self) -> int:
         """Number of recordings."""
-        ...
 
+    @abstractmethod
     def blocks(self, k: int) -> Integers:
         """Block of each row of a recording's residual, counted within it."""
-        ...
 
+    @abstractmethod
     def residual(self, k: int, candidate: Candidate, parts: Parts) -> Array | None:
         """Whitened residual of a recording, or None where the model runs away."""
-        ...
 
-    def input_level(self, candidate: Candidate, parts: Parts) -> float:
-        """Mean square that noise of what drives the model adds to a right one's residual."""
-        ...
+    @abstractmethod
+    def floor_level(self, candidate: Candidate, parts: Parts) -> float:
+        """Mean square of a right model's residual: noise of the sensors and the applied force."""
 
+    @abstractmethod
     def start(self, k: int, candidate: Candidate) -> Array:
         """First guess of a recording's initial vector."""
-        ...
 
+    @abstractmethod
     def start_scales(self, candidate: Candidate) -> tuple[Array, NDArray[np.bool_]]:
         """Usual sizes of an initial vector's entries, and which of them are fitted."""
-        ...
 
+    @abstractmethod
     def residual_forces(self, k: int, candidate: Candidate, parts: Parts) -> ResidualForces | None:
         """The residual force of a recording, or None where the model runs away."""
-        ...
 
+    @abstractmethod
     def states(self, k: int, candidate: Candidate, parts: Parts) -> Array:
         """Internal states at the beginning of a recording."""
-        ...
 
+    @abstractmethod
     def segments(
-        self, candidate: Candidate, parts: Parts, most_samples: int, *, thin: bool
+        self, candidate: Candidate, parts: Parts, most_samples: int, most_thinned: int
     ) -> tuple[Segment, ...]:
         """The regression along the motion about a model: its free run, or its force.
 
-        Of longer recordings it takes some parts as they are, or all of them thinned out.
+        Of longer recordings it takes one node of `most_thinned` at least, and where that leaves too
+        many, parts of them.
         """
-        ...
 
 
 def placed(problem: Problem, candidate: Candidate) -> tuple[Placed, ...]:
@@ -326,6 +314,12 @@ def state_scales(candidate_effects: Sequence[Placed]) -> tuple[Array, NDArray[np
         effect(name).fits_state for _, name in candidate_effects for _ in effect(name).state_scales
     ]
     return np.array(scales, dtype=np.float64), np.array(fitted, dtype=np.bool_)
+
+
+def numbered_on(blocks: Sequence[Integers]) -> Integers:
+    """Blocks of several parts as those of all, one part after another."""
+    firsts = np.cumsum([0, *(int(part.max()) + 1 for part in blocks[:-1])])
+    return np.concatenate([part + first for part, first in zip(blocks, firsts, strict=True)])
 
 
 def block_numbers(t_s: Array, length_s: float) -> Integers:

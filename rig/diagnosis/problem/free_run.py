@@ -26,10 +26,11 @@ from rig.diagnosis.problem.contract import (
     Integers,
     LinearParameter,
     Parts,
+    Problem,
     ResidualForces,
     Segment,
-    Shared,
     Track,
+    block_numbers,
     placed,
     slots_of,
     state_scales,
@@ -112,7 +113,7 @@ def _finer(run: Run) -> Run:
     return run._replace(fine_n=fine_n, substeps=steps, angle=0.5 * run.angle)
 
 
-_INPUT_DRAWS = 3
+_LEVEL_DRAWS = 3
 """Draws of the applied force's noise: their mean square is known to a third."""
 _LARGEST_INPUT_NOISE = 0.01
 """Share of an applied force's range above which what is not smooth is not noise but excitation."""
@@ -136,8 +137,8 @@ def input_noise_n(run: Run) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class FreeRun(Shared):
-    """A model held against recordings of a force-driven bench; see `Problem`.
+class FreeRun(Problem):
+    """A model held against recordings of a force-driven bench.
 
     Attributes:
         runs: The recordings.
@@ -161,6 +162,10 @@ class FreeRun(Shared):
     def _stroke_m(self) -> float:
         return max(motion.stroke_m for motion in self.motions)
 
+    @cached_property
+    def _input_noise_n(self) -> tuple[float, ...]:
+        return tuple(input_noise_n(run) for run in self.runs)
+
     def blocks(self, k: int) -> Integers:
         """Block of each row of a recording's residual."""
         return np.repeat(self.runs[k].grid.blocks(self.block_s), len(self.noise_m))
@@ -175,7 +180,7 @@ class FreeRun(Shared):
         return np.concatenate([q, v, np.zeros(slots_of(self, candidate).states)])
 
     def start_scales(self, candidate: Candidate) -> tuple[Array, NDArray[np.bool_]]:
-        """A thousandth of the stroke and of the speed, and the laws' own scales."""
+        """A thousandth of the stroke, a hundredth of the speed, and the laws' own scales."""
         row = float(np.max(np.abs(self.runs[0].mechanism.rows)))
         q = 1e-3 * self._stroke_m / row
         v = 1e-2 * max(motion.speed_m_per_s for motion in self.motions) / row
@@ -186,14 +191,14 @@ class FreeRun(Shared):
             np.concatenate([np.ones(2 * n, dtype=np.bool_), fitted]),
         )
 
-    def input_level(self, candidate: Candidate, parts: Parts) -> float:
-        """Mean square that noise of the applied forces adds to a right model's residual."""
+    def floor_level(self, candidate: Candidate, parts: Parts) -> float:
+        """One for the heights' noise, and what noise of the applied forces adds in simulation."""
         squares = [
             float(np.mean((heights_m / self.noise_m) ** 2))
             for k in range(self.recordings)
-            for heights_m in self.disturbances_m(k, candidate, parts, _INPUT_DRAWS)
+            for heights_m in self.disturbances_m(k, candidate, parts, _LEVEL_DRAWS)
         ]
-        return float(np.mean(squares)) if squares else 0.0
+        return 1.0 + (float(np.mean(squares)) if squares else 0.0)
 
     def disturbances_m(self, k: int, candidate: Candidate, parts: Parts, draws: int) -> list[Array]:
         """Heights that draws of the applied force's noise cause, drift of springless axes included.
@@ -201,7 +206,7 @@ class FreeRun(Shared):
         Each of shape (n, struts); none where there is no noise, or the model runs away.
         """
         run = self.runs[k]
-        noise = input_noise_n(run)
+        noise = self._input_noise_n[k]
         there = self.simulated(run, candidate, parts, parts.starts[k]) if noise > 0.0 else None
         if there is None:
             return []
@@ -271,14 +276,7 @@ class FreeRun(Shared):
         miss, _ = smoothed(run.grid, there.heights_m)
         z, w, a = (b + np.column_stack([s.states[:, i] for s in miss]) for i, b in enumerate(there))
         spread = [np.column_stack([s.deviations[:, i] for s in miss]) for i in range(3)]
-        along = Track(
-            run.grid.t_s,
-            np.ascontiguousarray(z.T),
-            np.ascontiguousarray(w.T),
-            run.applied_n,
-            run.grid.temperature_c,
-            track.substeps_for(run.grid.t_s),
-        )
+        along = Track.of_columns(run.grid.t_s, z, w, run.applied_n, run.grid.temperature_c)
         states = self.states(k, candidate, parts)
         forces = track.strut_forces(self, candidate, parts, along, states)
         every = np.arange(len(z)) if len(m.q) > 1 else np.zeros(len(z), dtype=np.int64)
@@ -307,7 +305,7 @@ class FreeRun(Shared):
     # --- the regression along the motion ------------------------------------------------------
 
     def segments(
-        self, candidate: Candidate, parts: Parts, most_samples: int, *, thin: bool
+        self, candidate: Candidate, parts: Parts, most_samples: int, most_thinned: int
     ) -> tuple[Segment, ...]:
         """The regression about a free run of a model, which becomes the reference.
 
@@ -316,18 +314,18 @@ class FreeRun(Shared):
         """
         samples = sum(len(run.grid.t_s) for run in self.runs)
         found: list[Segment] = []
-        block = 0
         for k, run in enumerate(self.runs):
             there = self.simulated(run, candidate, parts, parts.starts[k])
             if there is None:
                 raise FloatingPointError(run.grid.name)
             miss, _ = smoothed(run.grid, there.heights_m)
-            pieces = track.pieces(len(run.grid.t_s), samples, most_samples, thin=thin)
+            pieces = track.pieces(len(run.grid.t_s), samples, most_samples, most_thinned)
             lead = self._whole(run, there, miss) if len(pieces) > 1 else None
             for cut in pieces:
+                if not np.any(run.grid.fitted[cut]):
+                    continue  # All of it is kept back.
                 dynamics = _Dynamics(self, run, parts.linear, cut)
-                found.append(self._segment(run, there, miss, lead, cut, dynamics, block))
-                block = int(found[-1].blocks.max()) + 1
+                found.append(self._segment(run, there, miss, lead, cut, dynamics))
         return tuple(found)
 
     def _segment(
@@ -338,7 +336,6 @@ class FreeRun(Shared):
         lead: tuple[Track, Track] | None,
         cut: slice,
         dynamics: "_Dynamics",
-        first_block: int,
     ) -> Segment:
         grid = run.grid
         states = [np.column_stack([s.states[cut, i] for s in miss]) for i in range(3)]
@@ -349,14 +346,8 @@ class FreeRun(Shared):
         w = CubicHermiteSpline(grid.t_s[cut], motion[1], motion[2])(t_s)
         acceleration = CubicSpline(grid.t_s[cut], motion[2])(t_s)
         applied = CubicSpline(grid.t_s, run.applied_n)(t_s)
-        along = Track(
-            np.ascontiguousarray(t_s),
-            np.ascontiguousarray(z.T),
-            np.ascontiguousarray(w.T),
-            np.ascontiguousarray(applied),
-            np.interp(t_s, grid.t_s, grid.temperature_c),
-            track.substeps_for(t_s),
-        )
+        temperature_c = np.interp(t_s, grid.t_s, grid.temperature_c)
+        along = Track.of_columns(t_s, z, w, applied, temperature_c)
         rows = np.flatnonzero(grid.fitted[cut])
         every = dynamics.finer
         weight = 1.0 / self.noise_m
@@ -378,9 +369,8 @@ class FreeRun(Shared):
             for parameter in self.linear
         ]
         initial = [(h[rows * every] * weight).ravel() for h in dynamics.free_motions(len(t_s))]
-        blocks = np.repeat(
-            _block_part(grid, self.block_s, cut)[rows] + first_block, len(self.noise_m)
-        )
+        numbers = block_numbers(grid.t_s, self.block_s)[cut][rows]
+        blocks = np.repeat(numbers - numbers[0], len(self.noise_m))
         reference = along._replace(
             heights_m=_spline_through(grid.t_s[cut], there.heights_m[cut], t_s),
             velocities_m_per_s=_spline_through(grid.t_s[cut], there.velocities_m_per_s[cut], t_s),
@@ -398,14 +388,7 @@ class FreeRun(Shared):
 
     def _whole(self, run: Run, there: Trajectory, miss: Sequence[Smoothed]) -> tuple[Track, Track]:
         """Measured and reference motion of a whole recording, at its nodes."""
-        reference = Track(
-            run.grid.t_s,
-            np.ascontiguousarray(there.heights_m.T),
-            np.ascontiguousarray(there.velocities_m_per_s.T),
-            run.applied_n,
-            run.grid.temperature_c,
-            track.substeps_for(run.grid.t_s),
-        )
+        reference = track_of(run, there)
         measured = reference._replace(
             heights_m=reference.heights_m + np.array([s.states[:, 0] for s in miss]),
             velocities_m_per_s=reference.velocities_m_per_s
@@ -414,14 +397,15 @@ class FreeRun(Shared):
         return measured, reference
 
 
+def track_of(run: Run, there: Trajectory) -> Track:
+    """A simulated motion of a recording as a track."""
+    z, w, _ = there
+    return Track.of_columns(run.grid.t_s, z, w, run.applied_n, run.grid.temperature_c)
+
+
 def _spline_through(nodes_s: Array, values: Array, t_s: Array) -> Array:
     """Columns (N, struts) at other times, as rows."""
     return np.ascontiguousarray(CubicSpline(nodes_s, values)(t_s).T)
-
-
-def _block_part(grid: Grid, block_s: float, cut: slice) -> Integers:
-    numbers = grid._replace(fitted=np.ones_like(grid.fitted)).blocks(block_s)[cut]
-    return numbers - numbers[0]
 
 
 def first_motion(grid: Grid) -> tuple[Array, Array]:
@@ -548,6 +532,3 @@ def _settling(mass: Array, stiffness: Array, damping: Array, slowest: float) -> 
     if float(np.max(poles)) > -slowest:
         more_damping = mass * 2.0 * (slowest + max(float(np.max(poles)), 0.0))
     return more_stiffness, more_damping
-
-
-__all__ = ["FreeRun", "Run", "Trajectory", "first_motion", "run_of", "system"]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.diagnosis.numerics.smoother import Noise, Smoothed, estimate_noise, smooth
-from rig.diagnosis.problem.contract import block_numbers
+from rig.diagnosis.problem.contract import Track, block_numbers
 from rig.diagnosis.recording import Recording
 
 Array = NDArray[np.float64]
@@ -121,6 +121,24 @@ def smoothed(grid: Grid, reference_m: Array) -> tuple[list[Smoothed], list[Noise
         smooth(grid.t_s, column, noise) for column, noise in zip(difference.T, noises, strict=True)
     ]
     return states, noises
+
+
+SmoothMotion = tuple[Track, list[Smoothed], list[Noise]]
+"""A smoothed motion, and of each strut its deviations and its sensor's noise."""
+
+
+def smooth_motion(grid: Grid) -> SmoothMotion:
+    """Measured motion, smoothed without any model."""
+    middle_m = np.nanmean(grid.heights_m, axis=0)
+    found, noises = smoothed(grid, np.broadcast_to(middle_m, grid.heights_m.shape))
+    heights_m, velocities_m_per_s = (
+        np.column_stack([s.states[:, i] for s in found]) for i in (0, 1)
+    )
+    none_n = np.zeros(len(grid.t_s))
+    motion = Track.of_columns(
+        grid.t_s, heights_m + middle_m, velocities_m_per_s, none_n, grid.temperature_c
+    )
+    return motion, found, noises
 
 
 def fine_times(t_s: Array, parts: int) -> Array:

@@ -26,8 +26,8 @@ weighed to a few percent with what moves along with it; springs are sold to 10 %
 20; dampers vary by 30 % from warm to cold and from piece to piece (Dixon, The Shock Absorber
 Handbook, 2007, 9); a load cell in calibration is good to 2 %."""
 _LEAST_MASS = 0.1
-"""Lowest mass that a correction may leave, as a share of the nominal value. A spring may vanish
-altogether: a law with a stiffness of its own may take its place."""
+"""Lowest mass that a correction may leave, as a share of the nominal value. Springs and dampers
+may vanish altogether: a law with a stiffness or damping of its own may take their place."""
 _SIGNIFICANT_DIGITS = 12
 
 PARAMETERS = {
@@ -70,7 +70,7 @@ def parameters(
         preload_scale = max(stiffness * motion.stroke_m, force)
         kinds: list[tuple[Kind, float, float, float]] = [
             ("stiffness", stiffness, stiffness_scale, -stiffness),
-            ("damping", damping, damping_scale, -np.inf),
+            ("damping", damping, damping_scale, -damping),
             ("preload", 0.0, preload_scale, -np.inf),
             ("free_length", strut.free_length_m, motion.stroke_m, -np.inf),
         ]

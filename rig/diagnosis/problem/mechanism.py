@@ -68,7 +68,7 @@ class Readers(NamedTuple):
     """DART with the model, and with a kg more on the body of each strut.
 
     Attributes:
-        plain: The model without effects.
+        plain: The model without effects other than inertia.
         heavier: One for each strut.
     """
 

@@ -20,15 +20,15 @@ from rig.diagnosis.problem.contract import (
     Candidate,
     Integers,
     Parts,
+    Problem,
     ResidualForces,
     Segment,
-    Shared,
     Track,
     block_numbers,
     placed,
     state_scales,
 )
-from rig.diagnosis.problem.grid import Grid, smoothed
+from rig.diagnosis.problem.grid import Grid, SmoothMotion
 from rig.diagnosis.recording import Recording
 
 Array = NDArray[np.float64]
@@ -45,7 +45,6 @@ class Drive(NamedTuple):
     Attributes:
         grid: Nodes of the recording.
         along: The smoothed motion at the nodes.
-        accelerations_m_per_s2: Its second derivative, shape (struts, N).
         cells_n: Load cells at the nodes, shape (struts, N); NaN where a strut has none.
         certain: Nodes at which the motion is well known, shape (N,).
         height_noise_m: Standard deviation of each height's noise, shape (struts,).
@@ -55,7 +54,6 @@ class Drive(NamedTuple):
 
     grid: Grid
     along: Track
-    accelerations_m_per_s2: Array
     cells_n: Array
     certain: Flags
     height_noise_m: Array
@@ -68,16 +66,16 @@ class Drive(NamedTuple):
         return self.grid.fitted & self.certain
 
 
-def drive_of(grid: Grid, at: Integers, recording: Recording) -> Drive:
+def drive_of(grid: Grid, at: Integers, recording: Recording, smooth: SmoothMotion) -> Drive:
     """A recording with load cells as a prescribed motion.
 
     Args:
         grid: Its nodes.
         at: Which node each sample is.
         recording: The recording.
+        smooth: Its motion.
     """
-    middle = np.nanmean(grid.heights_m, axis=0)
-    states, noises = smoothed(grid, np.broadcast_to(middle, grid.heights_m.shape))
+    motion, states, noises = smooth
     spread = np.array([s.deviations[:, 1] for s in states])
     cells = np.full((len(states), len(grid.t_s)), np.nan)
     noise_n = np.full(len(states), np.nan)
@@ -86,18 +84,9 @@ def drive_of(grid: Grid, at: Integers, recording: Recording) -> Drive:
         if given is not None and np.all(np.isfinite(given[:, i])):
             cells[i] = np.interp(grid.t_s, grid.t_s[at], given[:, i])
             noise_n[i] = np.sqrt(estimate_noise(grid.t_s, cells[i]).variance)
-    along = Track(
-        grid.t_s,
-        np.ascontiguousarray([s.states[:, 0] + m for s, m in zip(states, middle, strict=True)]),
-        np.ascontiguousarray([s.states[:, 1] for s in states]),
-        np.zeros(len(grid.t_s)),
-        grid.temperature_c,
-        track.substeps_for(grid.t_s),
-    )
     return Drive(
         grid,
-        along,
-        np.array([s.states[:, 2] for s in states]),
+        motion,
         cells,
         np.all(spread < _UNCERTAIN * np.median(spread, axis=1, keepdims=True), axis=0),
         np.sqrt([noise.variance for noise in noises]),
@@ -121,8 +110,8 @@ def noise_of(spec: ModelSpec, drives: Sequence[Drive]) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Prescribed(Shared):
-    """A model held against recordings of a displacement-controlled bench; see `Problem`.
+class Prescribed(Problem):
+    """A model held against recordings of a displacement-controlled bench.
 
     Attributes:
         drives: The recordings.
@@ -177,10 +166,10 @@ class Prescribed(Shared):
     def _whitened(self, forces: Array, rows: Integers) -> Array:
         return (forces[np.ix_(self._celled, rows)].T / self.noise_n[self._celled]).ravel()
 
-    def input_level(self, candidate: Candidate, parts: Parts) -> float:
-        """Nothing: noise of the motion is in what whitens the residual."""
+    def floor_level(self, candidate: Candidate, parts: Parts) -> float:
+        """One: noise of the motion is in what whitens the residual."""
         del candidate, parts
-        return 0.0
+        return 1.0
 
     def residual_forces(self, k: int, candidate: Candidate, parts: Parts) -> ResidualForces | None:
         """Load cells less the model's forces along the smoothed motion."""
@@ -189,36 +178,21 @@ class Prescribed(Shared):
         return ResidualForces(self.drives[k].grid.name, self.drives[k].along, missed, deviation)
 
     def segments(
-        self, candidate: Candidate, parts: Parts, most_samples: int, *, thin: bool
+        self, candidate: Candidate, parts: Parts, most_samples: int, most_thinned: int
     ) -> tuple[Segment, ...]:
         """The regression about a model's force along the motion."""
-        samples = sum(len(drive.grid.t_s) for drive in self.drives)
+        nodes = [len(drive.grid.t_s) for drive in self.drives]
         found: list[Segment] = []
-        block = 0
         for k, drive in enumerate(self.drives):
             missed = self._missed_n(k, candidate, parts)
-            for cut in track.pieces(len(drive.grid.t_s), samples, most_samples, thin=thin):
-                found.append(self._segment(k, missed, cut, block))
-                block = int(found[-1].blocks.max()) + 1
+            cuts = track.pieces(nodes[k], sum(nodes), most_samples, most_thinned)
+            found += [self._segment(k, missed, cut) for cut in cuts if np.any(drive.fitted[cut])]
         return tuple(found)
 
-    def _segment(
-        self,
-        k: int,
-        missed: Array,
-        cut: slice,
-        first_block: int,
-    ) -> Segment:
+    def _segment(self, k: int, missed: Array, cut: slice) -> Segment:
         drive = self.drives[k]
         whole = drive.along
-        along = Track(
-            np.ascontiguousarray(whole.t_s[cut]),
-            np.ascontiguousarray(whole.heights_m[:, cut]),
-            np.ascontiguousarray(whole.velocities_m_per_s[:, cut]),
-            np.ascontiguousarray(whole.applied_n[cut]),
-            np.ascontiguousarray(whole.temperature_c[cut]),
-            track.substeps_for(whole.t_s[cut]),
-        )
+        along = Track(*(np.ascontiguousarray(part[..., cut]) for part in whole))
         rows = np.flatnonzero(drive.fitted[cut])
         numbers = block_numbers(whole.t_s, self.block_s)[cut][rows]
 
@@ -246,5 +220,5 @@ class Prescribed(Shared):
             target,
             np.column_stack(columns),
             np.zeros((len(target), 0)),
-            np.repeat(numbers - numbers[0] + first_block, len(self._celled)),
+            np.repeat(numbers - numbers[0], len(self._celled)),
         )

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
+from rig.diagnosis.outcome import RejectedEffect
 from rig.diagnosis.problem.contract import (
     Candidate,
     Parts,
@@ -19,26 +20,16 @@ from rig.diagnosis.problem.contract import (
 from rig.diagnosis.search.explore import FirstRound, Progress
 from rig.diagnosis.search.fit import Fit, existing_law_values, fit, law_values, spread
 from rig.diagnosis.search.pool import FINAL, FULL, Pool, Scored
-from rig.diagnosis.search.screen import Trial, plain, ranked, refined
+from rig.diagnosis.search.screen import Trial, plain, proposed, ranked, refined
 from rig.diagnosis.search.sound import unmeasured
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-
-class Rejected(NamedTuple):
-    """A law that was not chosen.
-
-    Attributes:
-        placed: The law.
-        why: One line.
-        left: Residual with it beside the linear part along the motion, as a share of the residual
-            of the linear part alone.
-    """
-
-    placed: Placed
-    why: str
-    left: float | None
+_SCALED_BY_GAIN = ("mass", "stiffness", "damping")
+"""Linear parameters that, changed in one proportion, are another gain of the applied force."""
+_ALIKE = 0.01
+"""Difference of two shares up to which they count as one, however narrow their intervals."""
 
 
 class Found(NamedTuple):
@@ -52,8 +43,8 @@ class Found(NamedTuple):
         rivals: Models with other families that the data cannot tell from it.
         superfluous: Existing effects, by index, without which the data are as well described.
         rejected: Laws that were not chosen, best first.
-        gain_alike: Whether mass, stiffness and damping changed in one proportion, as they would by
-            a change of the applied force's gain.
+        gain_alike: Whether a gain of the applied force stands for mass, stiffness and damping, or
+            two of them, that changed in one proportion.
     """
 
     given: Fit
@@ -62,7 +53,7 @@ class Found(NamedTuple):
     chosen: Scored
     rivals: tuple[Scored, ...]
     superfluous: tuple[int, ...]
-    rejected: tuple[Rejected, ...]
+    rejected: tuple[RejectedEffect, ...]
     gain_alike: bool
 
 
@@ -75,19 +66,21 @@ def conclude(pool: Pool, first: Pool, seen: FirstRound | None, progress: Progres
         seen: Single laws there.
         progress: Told what is being done and the share that is done.
     """
-    chosen = _without_needless(pool, pool.chosen())
-    progress("comparing rivals", 0.85)
-    final, alike = _with_few_linear(pool, chosen)
-    while final.size and (why := unmeasured(pool.problem, final.fit)) is not None:
-        pool.reject(chosen.fit.candidate, why)
+    progress("leaving out what is needless", 0.85)
+    while True:
         chosen = _without_needless(pool, pool.chosen())
         final, alike = _with_few_linear(pool, chosen)
+        why = unmeasured(pool.problem, final.fit) if final.size else None
+        if why is None:
+            break
+        pool.reject(chosen.fit.candidate, why)
+        _try_plainer(pool, chosen)
+    progress("comparing rivals", 0.9)
     rivals = _rivals(pool, chosen)
     superfluous = _superfluous(pool, chosen)
-    chosen = final
-    plain = _with_few_linear(pool, pool.linear)[0] if chosen.size else chosen
-    rejected = () if seen is None else _rejected(first, seen, chosen, rivals)
-    return Found(pool.given, pool.linear, plain, chosen, rivals, superfluous, rejected, alike)
+    lawless = _with_few_linear(pool, pool.linear)[0] if final.size else final
+    rejected = () if seen is None else _rejected(first, seen, final, rivals)
+    return Found(pool.given, pool.linear, lawless, final, rivals, superfluous, rejected, alike)
 
 
 # --- no law too many ------------------------------------------------------------------------------
@@ -126,9 +119,10 @@ def _simpler(pool: Pool, chosen: Scored, placed: Placed) -> Iterable[Scored]:
         return trial is not None and trial.score <= most()
 
     if chosen.size > 1:
-        if less not in pool.fits and is_hopeful(
-            refined(stage, less.new, [known[law] for law in less.new])
-        ):
+        # Its own fit may have ended in a side valley, which the larger set has left.
+        is_fitted = less in pool.fits and pool.is_near(pool.fits[less], chosen)
+        is_fitted |= less in pool.settled and less in pool.unsound
+        if not is_fitted and is_hopeful(refined(stage, less.new, [known[law] for law in less.new])):
             first = slots_of(pool.problem, nominal(pool.problem)).parameters
             effects = [chosen.fit.parts.effects[:first], *(known[law] for law in less.new)]
             pool.attempt(less, _moved(pool.problem, chosen.fit, less, np.concatenate(effects)))
@@ -152,6 +146,27 @@ def _settled(pool: Pool, candidate: Candidate, chosen: Scored) -> Iterable[Score
         pool.settle(pool.fits[candidate], chosen)
         if candidate not in pool.unsound:
             yield pool.fits[candidate]
+
+
+def _try_plainer(pool: Pool, unbound: Scored) -> None:
+    """Fit laws of the same families with fewer parameters, of which data bind more."""
+    known = law_values(pool.problem, unbound.fit)
+    for placed in unbound.fit.candidate.new:
+        less = unbound.fit.candidate.without(placed).new
+        base = Trial(less, tuple(known[law] for law in less), 0.0, np.zeros(1))
+        plainer = [at for at in proposed(pool.problem) if _is_plainer(at, placed)]
+        for trial in ranked(pool.linear_stage, base, len(plainer), plainer)[
+            : pool.criteria.finalists
+        ]:
+            if trial.values:
+                pool.attempt_trial(pool.linear_stage, pool.linear, trial, FULL)
+
+
+def _is_plainer(one: Placed, other: Placed) -> bool:
+    (strut, law), (other_strut, other_law) = one, other
+    a, b = effect(law), effect(other_law)
+    alike = strut == other_strut and a.family == b.family
+    return alike and len(a.parameters) < len(b.parameters)
 
 
 def _moved(problem: Problem, reference: Fit, candidate: Candidate, effects: Array) -> Parts:
@@ -216,24 +231,29 @@ def _with_few_linear(pool: Pool, chosen: Scored) -> tuple[Scored, bool]:
     settled = fit(problem, chosen.fit.candidate, chosen.fit.parts, chosen.fit.free, *FINAL)
     if settled is not None:
         chosen = pool.scored(settled)
-    needed = _needed(chosen.fit, pool.criteria.significant)
-    parts = chosen.fit.parts._replace(linear=np.where(needed, chosen.fit.parts.linear, 0.0))
-    fewer = fit(problem, chosen.fit.candidate, parts, needed, *FINAL)
-    result = chosen
-    if fewer is not None and not pool.worth(lean := pool.scored(fewer), chosen):
-        result = lean
+    result = _called_for(pool, chosen)
     if not result.size and not pool.worth(as_given := pool.scored(pool.given), result):
         # Corrections that are away from nothing and change nothing that can be measured.
         return as_given, False
-    share = _alike(problem, result.fit)
-    if share is None:
+    found = _as_gain(problem, result.fit)
+    if found is None:
         return result, False
-    only = np.array([p.kind == "gain" for p in problem.linear], dtype=np.bool_)
-    start = result.fit.parts._replace(linear=np.where(only, 1.0 / (1.0 + share) - 1.0, 0.0))
-    gain = fit(problem, chosen.fit.candidate, start, only)
+    linear, free = found
+    gain = fit(problem, chosen.fit.candidate, result.fit.parts._replace(linear=linear), free)
     if gain is not None and not pool.worth(lean := pool.scored(gain), result):
-        return lean, True
-    return result, True
+        return _called_for(pool, lean), True
+    return result, False
+
+
+def _called_for(pool: Pool, chosen: Scored) -> Scored:
+    """A model with those of its linear corrections alone that are away from nothing."""
+    model = chosen.fit
+    needed = _needed(model, pool.criteria.significant)
+    parts = model.parts._replace(linear=np.where(needed, model.parts.linear, 0.0))
+    fewer = fit(pool.problem, model.candidate, parts, needed, *FINAL)
+    if fewer is not None and not pool.worth(lean := pool.scored(fewer), chosen):
+        return lean
+    return chosen
 
 
 def _needed(result: Fit, significant: float) -> Flags:
@@ -259,26 +279,47 @@ def _needed(result: Fit, significant: float) -> Flags:
     return needed
 
 
-def _alike(problem: Problem, result: Fit) -> float | None:
-    """Share by which mass, stiffness and damping all changed, if it is one within intervals."""
-    if not any(p.kind == "gain" for p in problem.linear):
+def _as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] | None:
+    """Fewer corrections, one of which is the gain of the applied force; None where it saves none.
+
+    The gain is degenerate with mass, stiffness and damping changed in one proportion. Those of them
+    that changed so, within their intervals, are then as the model has them. With several struts a
+    mass carries others, and nothing is that simple.
+
+    Returns:
+        Where to begin, and which linear parameters are free, shapes (L,).
+    """
+    linear = problem.linear
+    if len(problem.motions) > 1 or not any(p.kind == "gain" for p in linear):
         return None
-    known = spread(result)
-    free = [p for p, is_free in zip(problem.linear, result.free, strict=True) if is_free]
-    changes = result.solution.values[: len(free)]
-    deviations = np.sqrt(np.maximum(np.diag(known.covariance)[: len(free)], 0.0))
-    shares: list[tuple[float, float]] = []
-    for i, p in enumerate(free):
-        if p.kind in ("mass", "stiffness", "damping") and p.nominal > 0.0:
-            shares.append(
-                (changes[i] / p.nominal, deviations[i] * p.deviation / p.nominal * known.factor)
-            )
-    least = sum(1 for p in problem.linear if p.kind in ("mass", "stiffness", "damping"))
-    if len(shares) < least:
+    half, values = spread(result).half, result.solution.values
+    scaled = {i for i, p in enumerate(linear) if p.kind in _SCALED_BY_GAIN and p.nominal > 0.0}
+    shares: dict[int, tuple[float, float]] = {}
+    for i, place in enumerate(np.flatnonzero(result.free).tolist()):
+        p = linear[place]
+        if place in scaled and values[i] > p.least:
+            known = max(half[i] * p.deviation / p.nominal, _ALIKE)
+            shares[place] = float(values[i]) / p.nominal, float(known)
+    alike: set[int] = set()
+    for middle, _ in shares.values():
+        same = {i for i, (share, known) in shares.items() if abs(share - middle) < known}
+        alike = max(alike, same, key=len)
+    # What did not change would have to, for the gain to stand for the others.
+    unchanged = sum(1 for i in scaled if not result.free[i])
+    if len(alike) < 2 + unchanged:
         return None
-    middle = float(np.median([share for share, _ in shares]))
-    is_one = all(abs(share - middle) < max(half, 0.01) for share, half in shares)
-    return middle if is_one else None
+    share = float(np.median([shares[i][0] for i in alike]))
+    changes, free = result.parts.linear.copy(), result.free.copy()
+    for i, p in enumerate(linear):
+        if p.kind == "gain":
+            changes[i], free[i] = 1.0 / (1.0 + share) - 1.0, True
+        elif i in alike:
+            changes[i], free[i] = 0.0, False
+        elif p.kind != "free_length":
+            own = p.nominal if i in scaled else 0.0
+            changes[i] = (own + changes[i]) / (1.0 + share) - own
+            free[i] |= p.kind == "preload"
+    return changes, free
 
 
 # --- what was not chosen --------------------------------------------------------------------------
@@ -286,9 +327,9 @@ def _alike(problem: Problem, result: Fit) -> float | None:
 
 def _rejected(
     first: Pool, seen: FirstRound, chosen: Scored, rivals: Sequence[Scored]
-) -> tuple[Rejected, ...]:
+) -> tuple[RejectedEffect, ...]:
     """Laws that were not chosen, with one line each, best first."""
-    found: dict[Placed, Rejected] = {}
+    found: dict[Placed, RejectedEffect] = {}
     taken = set(chosen.fit.candidate.new)
     tied = {placed for rival in rivals for placed in rival.fit.candidate.new} - taken
     for trial in seen.trials:
@@ -301,7 +342,8 @@ def _rejected(
             if placed in tied
             else _why(first, chosen, placed, left)
         )
-        found[placed] = Rejected(placed, why, min(left, 1.0))
+        strut, name = first.problem.spec.struts[placed[0]].name, placed[1]
+        found[placed] = RejectedEffect(effect(name).family, name, strut, why, min(left, 1.0))
     return tuple(sorted(found.values(), key=lambda r: 1.0 if r.left is None else r.left))
 
 

@@ -12,7 +12,7 @@ class SelectionCriteria:
 
     Attributes:
         blocks: Blocks of cross-validation over all recordings: the standard error of a sum over
-            them is then known to a tenth (1 / sqrt(2 * blocks)), and each still holds some periods.
+            them is then known to an eighth (1 / sqrt(2 * blocks)), and each holds some periods.
         kept_every: Without held-out runs, one block of so many is kept back to be judged on; a
             fifth is usual (Hastie, Tibshirani, Friedman, The Elements of Statistical Learning,
             2009, 7.10).
@@ -22,10 +22,10 @@ class SelectionCriteria:
         most_laws: Laws that a finding may consist of. A force needs three at most before a table
             describes it as well (measured dampers: the fourth gains less than the scatter between
             recordings).
-        finalists: Sets of each size that are fitted in full.
+        finalists: Sets of each size that are fitted in full, smaller ones of theirs apart.
         hopeless: Times the sum of squares of the best set of a size, along the motion, from which
-            on a set of that size is not fitted in full: smoothing the motion costs laws that switch
-            a factor of two at most.
+            on a set of that size is not fitted in full, and no longer near the best where sets were
+            fitted: smoothing the motion costs laws that switch a factor of two at most.
         standard_errors: Standard errors of the out-of-sample likelihood within which the smallest
             set is preferred: the one-standard-error rule (Breiman et al., Classification and
             Regression Trees, 1984, 3.4.3). More would lose what shows in few blocks: of an effect
@@ -40,12 +40,14 @@ class SelectionCriteria:
         least_above_noise_later: The same for a further law: what a formula that is nearly right
             leaves over is no effect. Its root is half of what `explained` allows.
         formula: Share of the RMS residual of the best linear model below which what a law leaves is
-            put down to its formula, and a further law of the same kind (see `KINDS`) has to do far
-            more than a better formula would (`imitation`): two formulas for one effect agree to a
-            few percent, at worst to 0.09, as seen on the foreign formulas of `tests.truth`.
-        imitation: Share of the RMS that such a law leaves below which two laws of one kind have to
-            stay, to be more than a better formula for it. Seen on benches that developed the
-            method: pairs that one law imitated left up to 0.15, foreign formulas 0.29 and more.
+            put down to its formula, and a further law has to do far more than a better formula
+            would (`imitation`), unless one stores and one dissipates: two formulas for one effect
+            agree to a few percent, at worst to 0.09, as seen on the foreign formulas of
+            `tests.truth`.
+        imitation: Factor by which each further law then has to lower the RMS that is left, to be
+            more than a part of a better formula; at the noise floor any factor will do.
+            Seen on benches that developed the method: pairs that one law imitated left up to 0.15,
+            a second law beside a foreign formula 0.29 and more, two of them 0.16.
         significant: Times its standard deviation that a linear correction is away from nothing.
         bounded: The same for the size of an effect, beyond what the linear part could give.
         cancelling: Correlation of two forces in one strut below which they cancel each other.
@@ -85,14 +87,11 @@ class SelectionCriteria:
     white: float = 0.001
 
 
-KINDS = (
-    ("nonlinear_stiffness", "stop", "backlash", "restoring_surface", "hysteresis"),
-    ("nonlinear_damping", "friction", "hysteresis"),
-    ("fade", "periodic_force"),
-    ("delay", "unmodelled_mode"),
-)
-"""Families by what their force follows: height, velocity, time, applied force; hysteresis both of
-the first. Laws of one kind can imitate one another's formulas, laws of different kinds cannot."""
+STORING = {"nonlinear_stiffness", "backlash"}
+"""Families whose force follows the height alone, and gives back what it takes."""
+DISSIPATING = {"nonlinear_damping", "friction", "fade"}
+"""Families with which a damper takes energy; bristles store a little. They hardly imitate those
+that store it; stops that damp, hysteresis, delays, hidden masses and forces over time do."""
 
 CRITERIA = SelectionCriteria()
 """The criteria of `rig diagnose`."""

@@ -9,17 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from dart_model.effects import effect
-from rig.diagnosis.problem.contract import Candidate, Placed
+from rig.diagnosis.problem.contract import Candidate
 from rig.diagnosis.search.fit import law_values
 from rig.diagnosis.search.pool import Pool, Scored
-from rig.diagnosis.search.screen import (
-    Stage,
-    Trial,
-    plain,
-    ranked,
-    refined,
-    stage_of,
-)
+from rig.diagnosis.search.screen import Stage, Trial, best_of_each, plain, ranked, refined, stage_of
 
 Progress = Callable[[str, float], None]
 """Told what is being done and the share that is done."""
@@ -59,40 +52,49 @@ def explore(pool: Pool, progress: Progress) -> FirstRound | None:
 
 def _from_nothing(pool: Pool, progress: Progress) -> FirstRound | None:
     """Explore sets of one law, of two, ..., and fit the best of each size."""
-    reference, criteria = pool.linear, pool.criteria
-    if pool.at_floor(reference):
+    criteria = pool.criteria
+    if pool.at_floor(pool.linear):
         return None
-    stage = pool.linear_stage
-    nothing = plain(stage)
-    beam, seen = [nothing], FirstRound(nothing, ())
+    seen = _singles(pool, progress)
+    best = _refined([seen.trials])[:1]
+    if not any(_gains(pool, pool.linear_stage, seen.nothing, trial) for trial in best):
+        pool.look_closer()
+        seen = _singles(pool, progress)
+    stage, beam = pool.linear_stage, [seen.nothing]
+    rounds: Sequence[Sequence[Trial]] = [seen.trials]
     levels: list[list[Trial]] = []
     for size in range(1, criteria.most_laws + 1):
         begin = _EXPLORED * (size - 1) / criteria.most_laws
         end = _EXPLORED * size / criteria.most_laws
-        rounds = _rounds(pool, stage, beam, within(progress, begin, 0.5 * (begin + end)))
-        if not levels:
-            seen = seen._replace(trials=tuple(rounds[0]))
-        level = _best_of_each(rounds)
-        if not level or not _gains(pool, min(beam, key=_score), level[0]):
+        if levels:
+            beam = _diverse(levels[-1], criteria.beam)
+            rounds = _rounds(pool, stage, beam, within(progress, begin, 0.5 * (begin + end)))
+        level = _refined(rounds)
+        if not level or not _gains(pool, stage, min(beam, key=_score), level[0]):
             break
-        finalists = _finalists(pool, level) + _backward(stage, levels, level[:2])
+        finalists = _finalists(pool, level) + _backward(pool, levels, level[:2])
         levels.append(level)
-        _fit_all(pool, stage, reference, finalists, within(progress, 0.5 * (begin + end), end))
+        _fit_all(pool, stage, pool.linear, finalists, within(progress, 0.5 * (begin + end), end))
         # One law may imitate two. What a pair leaves is looked for about it, not the linear model.
         if pool.at_floor(pool.settled_least()) or (size > 1 and pool.is_formula(pool.least())):
             break
-        beam = _diverse(level, criteria.beam)
     return seen
 
 
-def _gains(pool: Pool, before: Trial, after: Trial) -> bool:
+def _singles(pool: Pool, progress: Progress) -> FirstRound:
+    nothing = plain(pool.linear_stage)
+    (trials,) = _rounds(pool, pool.linear_stage, [nothing], progress)
+    return FirstRound(nothing, tuple(trials))
+
+
+def _gains(pool: Pool, stage: Stage, before: Trial, after: Trial) -> bool:
     """Whether a further law could be worth its while, as far as is seen along the motion."""
-    gain, above = before.score - after.score, before.score - len(pool.linear_stage.target)
+    gain, above = before.score - after.score, before.score - len(stage.target)
     return gain > max(pool.criteria.least_likelihood_gain, pool.criteria.least_share * above)
 
 
 def _about_the_best(pool: Pool, progress: Progress) -> None:
-    """Add to, and exchange laws of, the best set, then of the best that this finds."""
+    """Add to, and exchange laws of, the best set, then of what this finds, three times at most."""
     seen: set[Candidate] = set()
     turns = pool.criteria.most_laws
     for turn in range(turns):
@@ -116,7 +118,11 @@ def _exchanged(pool: Pool, reference: Scored, progress: Progress) -> None:
         trial = Trial(base, tuple(values[law] for law in base), 0.0, np.zeros(1))
         begin, end = _EXPLORED * i / len(bases), _EXPLORED * (i + 1) / len(bases)
         rounds = _rounds(pool, stage, [trial], within(progress, begin, 0.5 * (begin + end)))
-        finalists = _finalists(pool, _best_of_each(rounds))
+        level = [other for other in _refined(rounds) if set(other.laws) != set(laws)]
+        if base == laws:
+            own = refined(stage, laws, trial.values) if laws else plain(stage)
+            level = [more for more in level if own is None or _gains(pool, stage, own, more)]
+        finalists = _finalists(pool, level)
         _fit_all(pool, stage, reference, finalists, within(progress, 0.5 * (begin + end), end))
         if pool.at_floor(pool.settled_least()):
             return
@@ -133,30 +139,28 @@ def _rounds(
     return found
 
 
-def _best_of_each(rounds: Sequence[Sequence[Trial]]) -> list[Trial]:
+def _refined(rounds: Sequence[Sequence[Trial]]) -> list[Trial]:
     """Sets that were refined along the motion, each at its best, best first."""
-    found: dict[frozenset[Placed], Trial] = {}
-    for trial in (trial for trials in rounds for trial in trials if trial.values):
-        key = frozenset(trial.laws)
-        if key not in found or trial.score < found[key].score:
-            found[key] = trial
-    return sorted(found.values(), key=_score)
+    return best_of_each(trial for trials in rounds for trial in trials if trial.values)
 
 
-def _backward(
-    stage: Stage, levels: Sequence[Sequence[Trial]], best: Sequence[Trial]
-) -> list[Trial]:
-    """The best sets less one of their laws, where that set has not been tried."""
-    found: list[Trial | None] = []
+def _backward(pool: Pool, levels: Sequence[Sequence[Trial]], best: Sequence[Trial]) -> list[Trial]:
+    """The best sets less one of their laws, where that set is hopeful and has not been tried."""
+    found: list[Trial] = []
     for trial in best:
         if len(trial.laws) < 2:
             continue
-        known = {frozenset(t.laws) for t in levels[len(trial.laws) - 2]}
+        less = levels[len(trial.laws) - 2]
+        known = {frozenset(t.laws) for t in less}
         for i in range(len(trial.laws)):
             laws = trial.laws[:i] + trial.laws[i + 1 :]
-            if frozenset(laws) not in known:
-                found.append(refined(stage, laws, trial.values[:i] + trial.values[i + 1 :]))
-    return [trial for trial in found if trial is not None]
+            if frozenset(laws) in known:
+                continue
+            values = trial.values[:i] + trial.values[i + 1 :]
+            smaller = refined(pool.linear_stage, laws, values)
+            if smaller is not None and smaller.score <= pool.criteria.hopeless * less[0].score:
+                found.append(smaller)
+    return found
 
 
 def _fit_all(

@@ -27,6 +27,7 @@ from rig.diagnosis.problem.contract import (
     Parts,
     Placed,
     Problem,
+    numbered_on,
     placed,
     slots_of,
 )
@@ -101,7 +102,7 @@ def law_space(name: str, motion: Motion, values: Array) -> Space:
 
 
 def _size(item: Effect, i: int, values: Array) -> float:
-    """Size of a parameter, or of the largest one with its unit: one side of a damper may be nil."""
+    """Size of a parameter, at least a share of one with its unit: a side of a damper may be nil."""
     alike = [
         abs(float(value))
         for parameter, value in zip(item.parameters, values, strict=True)
@@ -254,7 +255,6 @@ def fit(
     )  # fmt: skip
     if solution is None:
         return None
-    offsets = np.cumsum([0, *(int(block.max()) + 1 for block in blocks[:-1])])
     return Fit(
         candidate,
         free,
@@ -262,7 +262,7 @@ def fit(
         layout.parts(solution.values),
         solution,
         layout.space,
-        np.concatenate([block + offset for block, offset in zip(blocks, offsets, strict=True)]),
+        numbered_on(blocks),
         np.concatenate([np.full(len(block), k) for k, block in enumerate(blocks)]),
     )
 
@@ -327,6 +327,11 @@ class Spread(NamedTuple):
 
     covariance: Array
     factor: float
+
+    @property
+    def half(self) -> Array:
+        """Half-widths of the search variables' intervals, shape (k,)."""
+        return self.factor * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
 def spread(result: Fit) -> Spread:

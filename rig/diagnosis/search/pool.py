@@ -4,6 +4,7 @@ Reference: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees
 one-standard-error rule.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import NamedTuple
@@ -20,9 +21,16 @@ from rig.diagnosis.problem.contract import (
     free_beside,
     nominal,
 )
-from rig.diagnosis.search.criteria import KINDS, SelectionCriteria
+from rig.diagnosis.search.criteria import DISSIPATING, STORING, SelectionCriteria
 from rig.diagnosis.search.fit import Fit, block_scores, fit
-from rig.diagnosis.search.screen import Stage, Trial, law_and_shift, linear_beside, stage_of
+from rig.diagnosis.search.screen import (
+    Stage,
+    Trial,
+    law_and_shift,
+    linear_beside,
+    stage_of,
+    whole_stage_of,
+)
 from rig.diagnosis.search.sound import tracks, unsound
 
 Array = NDArray[np.float64]
@@ -49,7 +57,7 @@ ROUGH = Effort(8, 1e-3, 1)
 FULL = Effort(20, 1e-4, 2)
 """Fits that decide."""
 FINAL = Effort(15, 1e-6, 2)
-"""The fit that is reported."""
+"""The fit that is reported; that of a free run once more with finer steps."""
 
 
 class Scored(NamedTuple):
@@ -107,6 +115,11 @@ class Pool:
     def linear_stage(self) -> Stage:
         """The regression about the best linear model."""
         return stage_of(self.problem, self.linear.fit.candidate, self.linear.fit.parts)
+
+    def look_closer(self) -> None:
+        """Let the regression about the best linear model look at every sample."""
+        linear = self.linear.fit
+        self.linear_stage = whole_stage_of(self.problem, linear.candidate, linear.parts)
 
     # --- fits ---------------------------------------------------------------------------------
 
@@ -206,7 +219,7 @@ class Pool:
         return sound if self.is_near(sound, best) else best
 
     def settled_least(self) -> Scored:
-        """The same, fitted to its end: whether it is at the floor decides on going on."""
+        """The best sound one, fitted to its end: whether it is at the floor decides on going on."""
         best = self.least()
         self.settle(best, best)
         return self.least()
@@ -270,10 +283,10 @@ class Pool:
         return result.score < (1.0 + share) * self.floor(result)
 
     def floor(self, result: Scored) -> float:
-        """Sum of squares that a right model leaves: noise of the heights, and of what drives it."""
+        """Sum of squares that a right model leaves: noise of the sensors, and of what drives it."""
         candidate = result.fit.candidate
         if candidate not in self.floors or self.floors[candidate][0] is not result:
-            level = 1.0 + self.problem.input_level(candidate, result.fit.parts)
+            level = self.problem.floor_level(candidate, result.fit.parts)
             self.floors[candidate] = result, level * result.fit.rows
         return self.floors[candidate][1]
 
@@ -285,7 +298,8 @@ class Pool:
 
     def is_right_beside(self, larger: Scored, smaller: Scored) -> bool:
         """Whether a set leaves so little of what a smaller one leaves that this imitates it."""
-        most = self.criteria.imitation**2 * (smaller.score - smaller.fit.rows)
+        share = self.criteria.imitation ** (2 * (larger.size - smaller.size))
+        most = share * (smaller.score - smaller.fit.rows)
         is_right = self.at_floor(larger) or larger.score - larger.fit.rows < most
         return is_right and not self.is_near(smaller, larger)
 
@@ -299,16 +313,13 @@ class Pool:
         return lost <= self.criteria.standard_errors * _standard_error(other, best)
 
 
-def kinds(family: str) -> set[int]:
-    """What a family's force follows, by number; what is in no list is a kind of its own."""
-    return {i for i, kind in enumerate(KINDS) if family in kind} or {len(KINDS)}
-
-
 def _adds_a_kind(smaller: Scored, larger: Scored) -> bool:
-    """Whether a larger set is the smaller one, in its families, with a law of a further kind."""
-    few, many = set(smaller.families), set(larger.families)
-    known = set().union(*(kinds(family) for family in few))
-    return few < many and any(not kinds(family) & known for family in many - few)
+    """Whether what dissipates is added to what stores energy, or the other way round."""
+    few, many = Counter(smaller.families), Counter(larger.families)
+    old, new = set(few), set(many - few)
+    return few < many and (
+        (old <= STORING and new <= DISSIPATING) or (old <= DISSIPATING and new <= STORING)
+    )
 
 
 def _standard_error(one: Scored, other: Scored) -> float:

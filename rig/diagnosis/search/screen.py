@@ -1,13 +1,14 @@
 """Laws along the measured motion, the linear part projected out.
 
-Every law of the catalogue competes for what a reference leaves over, with the changes of the linear
-part, of existing effects and of initial states free beside it: they enter linearly and are
-projected out (Golub, Pereyra, SIAM J. Numer. Anal. 10, 1973). A law whose force is proportional to
-its size costs one pass a start; the best are then refined together with all else in their set.
+Every law that the bench can show competes for what a reference leaves over, with the changes of
+the linear part (but gain and free length), of existing effects and of initial states free beside
+it: they enter linearly and are projected out (Golub, Pereyra, SIAM J. Numer. Anal. 10, 1973). A
+law whose force is proportional to its size costs one pass a start; the best are then refined
+together with all else in their set.
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from os import cpu_count
 from types import MappingProxyType
@@ -26,11 +27,12 @@ from rig.diagnosis.problem.contract import (
     Placed,
     Problem,
     Segment,
+    numbered_on,
     placed,
     slots_of,
     strut_constants,
 )
-from rig.diagnosis.problem.track import segment_forces
+from rig.diagnosis.problem.track import most_thinned, segment_forces
 from rig.diagnosis.search.fit import law_space, left_out
 
 Array = NDArray[np.float64]
@@ -40,6 +42,8 @@ _MOST_SAMPLES = 12_000
 known to a part in a hundred with far fewer."""
 _COARSE_SAMPLES = 4_000
 """Samples on which starts are compared."""
+_EVERY_SAMPLE = 1_000_000_000
+"""More than a recording may hold, so that none is left out."""
 _REFINED_STARTS = 2
 """Starts of a law that are refined: its best one may lie in a side valley."""
 _SIDE_VALLEY = 2.0
@@ -91,14 +95,14 @@ _Start = tuple[float, Array]
 
 
 class Trial(NamedTuple):
-    """Laws refined along the motion.
+    """Laws along the motion, refined or (without values) at their best start.
 
     Attributes:
         laws: The laws, each in its strut.
         values: Parameters of each; where it is taken from the strut's free length, then by how much
             that is another one than the reference's.
         cost: Sum of squares that they leave.
-        scores: Out-of-sample sum of squares of each block.
+        scores: Out-of-sample sum of squares of each block; the cost where nothing was refined.
     """
 
     laws: tuple[Placed, ...]
@@ -118,9 +122,20 @@ def stage_of(problem: Problem, candidate: Candidate, parts: Parts) -> Stage:
     Raises:
         FloatingPointError: The reference runs away.
     """
-    coarse = problem.segments(candidate, parts, _COARSE_SAMPLES, thin=True)
-    fine = problem.segments(candidate, parts, _MOST_SAMPLES, thin=False)
+    thinned = most_thinned(problem.motions)
+    coarse = problem.segments(candidate, parts, _COARSE_SAMPLES, thinned)
+    fine = problem.segments(candidate, parts, _MOST_SAMPLES, 1)
     return _stage(problem, candidate, parts, fine, _stage(problem, candidate, parts, coarse, None))
+
+
+def whole_stage_of(problem: Problem, candidate: Candidate, parts: Parts) -> Stage:
+    """The same about every sample: between those of thinned recordings a brief contact is missed.
+
+    Raises:
+        FloatingPointError: The reference runs away.
+    """
+    every = problem.segments(candidate, parts, _EVERY_SAMPLE, 1)
+    return _stage(problem, candidate, parts, every, None)
 
 
 def _stage(
@@ -200,7 +215,7 @@ def _projected(
     basis = left[:, singular > _RANK * singular[0]] if scaled.shape[1] else left[:, :0]
     deviation = np.array([problem.linear[i].deviation for i in counted])
     y = np.concatenate([*target, -linear[counted] / deviation])
-    blocks = np.concatenate([segment.blocks for segment in segments])
+    blocks = numbered_on([segment.blocks for segment in segments])
     blocks = np.concatenate([blocks, np.zeros(len(counted), dtype=np.int64)])
     target_left = y - basis @ (basis.T @ y)
     return Stage(
@@ -248,7 +263,7 @@ def _space(stage: Stage, at: Placed, values: Array) -> tuple[Space, Array]:
 
 
 def response(stage: Stage, strut: int, name: str, values: Array) -> Array:
-    """The same less what the linear part could add."""
+    """What a law adds to the whitened answer, less what the linear part could, shape (m,)."""
     whole = answer(stage, strut, name, values)
     return whole - stage.basis @ (stage.basis.T @ whole)
 
@@ -334,11 +349,11 @@ def ranked(
         def refine(trial: Trial) -> Trial | None:
             return refined(stage, trial.laws, trial.values)
 
-        rough = _best([trial for trial in pool.map(roughly, jobs) if trial is not None])
+        rough = best_of_each(trial for trial in pool.map(roughly, jobs) if trial is not None)
         # A law begins no worse than a simpler one that is known.
         nested = list(pool.map(lambda job: (job[0], first(*job)[:1]), _nested(rough, laws)))
         jobs = [(at, values) for at, starts in nested for _, values in starts]
-        rough = _best([*rough, *(t for t in pool.map(roughly, jobs) if t is not None)])
+        rough = best_of_each([*rough, *(t for t in pool.map(roughly, jobs) if t is not None)])
         best = [trial for trial in pool.map(refine, rough[:_FINE]) if trial is not None]
     # Coarse costs in terms of fine ones, for laws that are not refined there.
     scale = len(stage.target) / len(coarse.target)
@@ -350,11 +365,11 @@ def ranked(
     return [*sorted(best, key=lambda trial: trial.score), *rest]
 
 
-def _best(trials: Sequence[Trial]) -> list[Trial]:
+def best_of_each(trials: Iterable[Trial]) -> list[Trial]:
     """Each set of laws at its best, best first."""
-    found: dict[tuple[Placed, ...], Trial] = {}
+    found: dict[frozenset[Placed], Trial] = {}
     for trial in trials:
-        key = tuple(sorted(trial.laws))
+        key = frozenset(trial.laws)
         if key not in found or trial.score < found[key].score:
             found[key] = trial
     return sorted(found.values(), key=lambda trial: trial.score)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import effect
 from rig.diagnosis.problem.contract import Problem, Track, placed, slots_of, strut_constants
-from rig.diagnosis.problem.track import effect_forces, law_force
+from rig.diagnosis.problem.track import forces_along, law_force
 from rig.diagnosis.search.criteria import SelectionCriteria
 from rig.diagnosis.search.fit import UNBOUND, Fit, effect_variables, spread, start_variables
 
@@ -25,52 +25,34 @@ _CHANNELS = ("delay", "input_gain", "periodic_force", "unmodelled_mode")
 """Families that are no property of the strut, or that store energy outside it."""
 
 
-def tracks(problem: Problem, result: Fit) -> list[Track]:
-    """The motion of each recording, smoothed."""
-    found: list[Track] = []
-    for k in range(problem.recordings):
-        forces = problem.residual_forces(k, result.candidate, result.parts)
-        if forces is not None:
-            found.append(forces.track)
-    return found
+def tracks(problem: Problem, result: Fit) -> list[tuple[int, Track]]:
+    """The motion of each recording, by its index, smoothed."""
+    forces = (
+        problem.residual_forces(k, result.candidate, result.parts)
+        for k in range(problem.recordings)
+    )
+    return [(k, there.track) for k, there in enumerate(forces) if there is not None]
 
 
 def unsound(
-    problem: Problem, result: Fit, along: Sequence[Track], criteria: SelectionCriteria
+    problem: Problem, result: Fit, motions: Sequence[tuple[int, Track]], criteria: SelectionCriteria
 ) -> str | None:
     """Why a model is not to be used; None if it is.
 
     Args:
         problem: Model and recordings.
         result: The fitted model.
-        along: The motion of each recording.
+        motions: The motion of recordings, by their index.
         criteria: What decides.
     """
-    forces = _forces(problem, result, along)
+    forces = forces_along(problem, result.candidate, result.parts, motions)
+    along = [track for _, track in motions]
     return (
         _unbound(problem, result, criteria)
         or _disguised(result, forces, along, criteria)
         or _cancelling(result, forces, criteria)
         or _active(problem, result, along, criteria)
     )
-
-
-def _forces(problem: Problem, result: Fit, along: Sequence[Track]) -> list[tuple[int, Array]]:
-    """Strut and force of each effect over all recordings."""
-    parts = [
-        effect_forces(
-            problem,
-            result.candidate,
-            result.parts,
-            track,
-            problem.states(k, result.candidate, result.parts),
-        )
-        for k, track in enumerate(along)
-    ]
-    return [
-        (rows[0][0], np.concatenate([force for _, force in rows]))
-        for rows in zip(*parts, strict=True)
-    ]
 
 
 def _new(result: Fit) -> list[tuple[int, str]]:
@@ -115,8 +97,7 @@ def unmeasured(problem: Problem, result: Fit) -> str | None:
         problem: Model and recordings.
         result: The model, fitted to its end.
     """
-    known, variables = spread(result), effect_variables(problem, result)
-    half = known.factor * np.sqrt(np.maximum(np.diag(known.covariance), 0.0))
+    half, variables = spread(result).half, effect_variables(problem, result)
     space = result.space
     sizes = np.where(
         space.logarithmic, np.log(UNBOUND), np.abs(result.solution.values) / space.scale
@@ -207,4 +188,4 @@ def _at_rest(z: Array, w: Array, struts: int, strut: int) -> Track:
     heights, velocities = np.zeros((struts, len(z))), np.zeros((struts, len(z)))
     heights[strut], velocities[strut] = z, w
     zero = np.zeros(len(z))
-    return Track(np.arange(len(z), dtype=np.float64), heights, velocities, zero, zero + 20.0, 1)
+    return Track(np.arange(len(z), dtype=np.float64), heights, velocities, zero, zero + 20.0)

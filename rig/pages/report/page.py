@@ -39,13 +39,13 @@ _BADGES = {
 
 _ASSUMPTIONS = (
     "Height is the length of the strut; forces are positive where they push its two bodies apart.",
-    "Gravity and free length are those of the nominal model; a constant force shows as preload.",
+    "Gravity is that of the nominal model; a constant force shows as preload.",
     "Spring, damper and effect act between the same two bodies, so only their sum can be seen: a "
     "share is given to one of them because of the law it follows.",
-    "The sensor's noise is estimated from the data and taken as white; the noise floor is what it "
-    "alone would leave.",
+    "The sensors' noise is estimated from the data and taken as white; the noise floor is what it, "
+    "and the applied force's, would leave.",
     "95 % intervals hold if the law that is named is the right one.",
-    "Held-out data took no part in any choice or fit.",
+    "Held-out data took part in no fit; what does not hold on them is taken back.",
 )
 _OF_A_FREE_RUN = ("The free-run simulation has the applied force as its only input.",)
 

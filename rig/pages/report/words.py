@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from dart_model.effects import FAMILY_WORDS, effect
 from rig.diagnosis.outcome import Diagnosis, FoundEffect, LinearCorrection
+from rig.diagnosis.search.criteria import CRITERIA
 from rig.pages.report.quantities import (
     decimals_of,
     label,
@@ -13,9 +14,6 @@ from rig.pages.report.quantities import (
     times,
     value_and_interval,
 )
-
-AT_THE_FLOOR = 1.3
-"""Errors up to this multiple of the noise floor count as being at it."""
 
 LINEAR = {
     "mass_kg": ("mass", "kg"),
@@ -88,7 +86,9 @@ def sentence(found: Diagnosis, struts: int) -> str:
     """
     match found.verdict:
         case "nothing_missing":
-            name, _, before, _ = _error(found)
+            name, _, before, change = _error(found)
+            if found.existing:
+                return f"Nothing is missing; with its own effects refitted, {name} goes {change}."
             return f"Nothing is missing: with the nominal model {name} is {before}."
         case "explained":
             no_more = "" if missing(found) else "; nothing is missing"
@@ -186,7 +186,7 @@ def _error(found: Diagnosis) -> tuple[str, bool, str, str]:
 def _against_floor(value: float, floor: float, unit: str) -> str:
     if not floor > 0.0:
         return "with a noise floor that is not known"
-    if value <= AT_THE_FLOOR * floor:
+    if value <= CRITERIA.explained * floor:
         return f"at the noise floor of {quantity(floor, unit)}"
     return f"{times(value / floor)} times the noise floor of {quantity(floor, unit)}"
 
