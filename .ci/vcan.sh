@@ -93,7 +93,7 @@ build_images
 write_guest_script "$@"
 kernel=$(ls -v /boot/vmlinuz-*-amd64 | tail -n 1)
 timeout -k 10 "$limit_s" vng --run "$kernel" --user root --cpus 1 --memory 3G --force-9p --disable-kvm \
-    --qemu-opts="-icount shift=0,sleep=on" \
+    --qemu-opts="-icount shift=0,sleep=off" \
     "${disks[@]}" --rwdir "$work/out" --exec "bash $work/guest.sh" </dev/null 2>&1 | grep --line-buffered -v "Image format was not\|detecting the format\|raw. format explicitly" || true
 if [ ! -s "$work/out/exit_code" ]; then
     echo "vcan: the booted kernel did not finish within $limit_s s" >&2
