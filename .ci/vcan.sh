@@ -7,7 +7,8 @@
 # `test` extra. The kernel is emulated, with this machine's own files under it, read-only. Python goes
 # onto disk images, because reading it file by file would take minutes, and what numba compiles is
 # compiled here, because it would take longer still in there. The clock in there counts instructions,
-# one a ns, so that a tick takes as long whatever else this machine does.
+# one a ns, and jumps to the next timer where it idles, so that a tick takes as long, and none is
+# missed, whatever else this machine does.
 set -euo pipefail
 
 project=$(cd "$(dirname "$0")/.." && pwd)

@@ -153,7 +153,7 @@ def _coulomb_starts(motion: Motion) -> list[Start]:
 
 @moving
 def _stribeck_starts(motion: Motion) -> list[Start]:
-    falls = [share * motion.speed_m_per_s for share in (0.05, 0.1, 0.3)]
+    falls = [share * motion.speed_m_per_s for share in (0.05, 0.1, 0.3, 1.0)]
     roundings = [share * motion.speed_m_per_s for share in (0.01, 0.03)]
     return grid([1.0], [1.3], falls, roundings)
 
@@ -178,7 +178,7 @@ def _lugre_starts(motion: Motion) -> list[Start]:
     ]
 
 
-_FALLS = of_speed(0.01, 1.0)
+_FALLS = of_speed(0.01, 2.0)
 # Friction that is rounded off, or bends, by more than this is damping or hysteresis.
 _ROUNDINGS = of_speed(5e-4, 0.12)
 _DEFLECTIONS = of_stroke(1e-5, 0.012)

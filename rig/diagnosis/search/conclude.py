@@ -11,14 +11,12 @@ from dart_model.effects import effect
 from rig.diagnosis.outcome import RejectedEffect
 from rig.diagnosis.problem.contract import (
     Candidate,
-    Parts,
     Placed,
     Problem,
     nominal,
-    slots_of,
 )
 from rig.diagnosis.search.explore import FirstRound, Progress
-from rig.diagnosis.search.fit import Fit, existing_law_values, fit, law_values, spread
+from rig.diagnosis.search.fit import Fit, fit, law_values, parts_for, spread
 from rig.diagnosis.search.pool import FINAL, FULL, Pool, Scored
 from rig.diagnosis.search.screen import Trial, plain, proposed, ranked, refined
 from rig.diagnosis.search.sound import unmeasured
@@ -123,9 +121,7 @@ def _simpler(pool: Pool, chosen: Scored, placed: Placed) -> Iterable[Scored]:
         is_fitted = less in pool.fits and pool.is_near(pool.fits[less], chosen)
         is_fitted |= less in pool.settled and less in pool.unsound
         if not is_fitted and is_hopeful(refined(stage, less.new, [known[law] for law in less.new])):
-            first = slots_of(pool.problem, nominal(pool.problem)).parameters
-            effects = [chosen.fit.parts.effects[:first], *(known[law] for law in less.new)]
-            pool.attempt(less, _moved(pool.problem, chosen.fit, less, np.concatenate(effects)))
+            pool.attempt(less, parts_for(pool.problem, chosen.fit, less))
         yield from _settled(pool, less, chosen)
     for name in effect(placed[1]).simpler:
         other = (placed[0], name)
@@ -169,18 +165,6 @@ def _is_plainer(one: Placed, other: Placed) -> bool:
     return alike and len(a.parameters) < len(b.parameters)
 
 
-def _moved(problem: Problem, reference: Fit, candidate: Candidate, effects: Array) -> Parts:
-    """A reference's linear part and motion with other effects, internal states at zero."""
-    states = slots_of(problem, reference.candidate).states
-    starts: list[Array] = []
-    for k, start in enumerate(reference.parts.starts):
-        new = problem.start(k, candidate)
-        motion = len(start) - states
-        new[:motion] = start[:motion]
-        starts.append(new)
-    return Parts(reference.parts.linear, effects, tuple(starts))
-
-
 def _rivals(pool: Pool, chosen: Scored) -> tuple[Scored, ...]:
     """Sets of the same size and other families that the data cannot tell from the chosen."""
     found: dict[tuple[str, ...], Scored] = {}
@@ -208,15 +192,12 @@ def _superfluous(pool: Pool, chosen: Scored) -> tuple[int, ...]:
     """Existing effects that act on the recordings and without which nothing is lost."""
     found: list[int] = []
     problem, reference = pool.problem, chosen.fit
-    values = existing_law_values(problem, reference)
-    new = slots_of(problem, nominal(problem)).parameters
     for i in reference.candidate.kept:
         if not problem.existing[i].free:
             continue
         kept = tuple(j for j in reference.candidate.kept if j != i)
         candidate = Candidate(kept, reference.candidate.new)
-        effects = np.concatenate([*(values[j] for j in kept), reference.parts.effects[new:]])
-        result = pool.refit(candidate, _moved(problem, reference, candidate, effects), FULL)
+        result = pool.refit(candidate, parts_for(problem, reference, candidate), FULL)
         if result is not None and not pool.worth(pool.scored(result), chosen):
             found.append(i)
     return tuple(found)

@@ -4,16 +4,16 @@ Reference: Miller, Subset Selection in Regression (2002), 3, forward and backwar
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
-
-import numpy as np
+from typing import NamedTuple, TypeVar
 
 from dart_model.effects import effect
-from rig.diagnosis.problem.contract import Candidate
-from rig.diagnosis.search.fit import law_values
+from rig.diagnosis.problem.contract import Candidate, Placed, nominal
+from rig.diagnosis.search.fit import parts_for
 from rig.diagnosis.search.pool import Pool, Scored
+from rig.diagnosis.search.score import Change, changes
 from rig.diagnosis.search.screen import Stage, Trial, best_of_each, plain, ranked, refined, stage_of
 
+Tried = TypeVar("Tried", Trial, Change)
 Progress = Callable[[str, float], None]
 """Told what is being done and the share that is done."""
 
@@ -107,25 +107,52 @@ def _about_the_best(pool: Pool, progress: Progress) -> None:
 
 def _exchanged(pool: Pool, reference: Scored, progress: Progress) -> None:
     """Sets with one law more than a set, or with another one for one of its laws."""
-    stage = stage_of(pool.problem, reference.fit.candidate, reference.fit.parts)
-    values = law_values(pool.problem, reference.fit)
     laws = reference.fit.candidate.new
     bases = [tuple(other for other in laws if other != law) for law in laws]
-    if len(laws) < pool.criteria.most_laws:
-        # What is nearly right more likely has a wrong formula than one law too few.
-        bases.insert(len(bases) if pool.is_formula(reference) else 0, laws)
+    # What is nearly right more likely has a wrong formula than one law too few.
+    bases.insert(len(bases) if pool.is_formula(reference) else 0, laws)
     for i, base in enumerate(bases):
-        trial = Trial(base, tuple(values[law] for law in base), 0.0, np.zeros(1))
         begin, end = _EXPLORED * i / len(bases), _EXPLORED * (i + 1) / len(bases)
-        rounds = _rounds(pool, stage, [trial], within(progress, begin, 0.5 * (begin + end)))
-        level = [other for other in _refined(rounds) if set(other.laws) != set(laws)]
-        if base == laws:
-            own = refined(stage, laws, trial.values) if laws else plain(stage)
-            level = [more for more in level if own is None or _gains(pool, stage, own, more)]
-        finalists = _finalists(pool, level)
-        _fit_all(pool, stage, reference, finalists, within(progress, 0.5 * (begin + end), end))
+        part = within(progress, begin, end)
+        if base:
+            _in_simulation(pool, reference, base, part)
+        else:
+            _along_the_motion(pool, reference, part)
         if pool.at_floor(pool.settled_least()):
             return
+
+
+def _along_the_motion(pool: Pool, reference: Scored, progress: Progress) -> None:
+    """Single laws as the regression about a model's motion ranks them."""
+    stage = stage_of(pool.problem, reference.fit.candidate, reference.fit.parts)
+    rounds = _rounds(pool, stage, [plain(stage)], within(progress, 0.0, 0.5))
+    level = [t for t in _refined(rounds) if t.laws != reference.fit.candidate.new]
+    _fit_all(pool, stage, reference, _finalists(pool, level), within(progress, 0.5, 1.0))
+
+
+def _in_simulation(
+    pool: Pool, reference: Scored, base: Sequence[Placed], progress: Progress
+) -> None:
+    """Some laws of a set, fitted, with a further or a more general one, as a score test ranks."""
+    candidate = nominal(pool.problem).added(*base)
+    if candidate != reference.fit.candidate:
+        # Its own fit may have ended in a side valley, which the larger set has left.
+        pool.attempt(candidate, parts_for(pool.problem, reference.fit, candidate))
+    if candidate not in pool.fits:
+        return
+    progress("screening laws", 0.0)
+    model = pool.fits[candidate].fit
+    least = model.solution.cost - pool.criteria.least_likelihood_gain
+    known = {c: scored.fit.solution.cost for c, scored in pool.fits.items()}
+    found = [
+        change
+        for change in changes(pool.problem, model, pool.along)
+        if len(change.laws) <= pool.criteria.most_laws
+        and change.left < min(least, known.get(change.candidate, least))
+    ]
+    for change in _diverse(found, pool.criteria.finalists):
+        progress(f"fitting {', '.join(name for _, name in change.laws)}", 0.5)
+        pool.attempt(change.candidate, change.parts)
 
 
 def _rounds(
@@ -176,9 +203,9 @@ def _finalists(pool: Pool, level: Sequence[Trial]) -> list[Trial]:
     return [trial for trial in _diverse(level, pool.criteria.finalists) if trial.score <= least]
 
 
-def _diverse(level: Sequence[Trial], count: int) -> list[Trial]:
+def _diverse(level: Sequence[Tried], count: int) -> list[Tried]:
     """The best sets, at most two of which are of the same families."""
-    chosen: list[Trial] = []
+    chosen: list[Tried] = []
     seen: dict[tuple[str, ...], int] = {}
     for trial in level:
         if len(chosen) >= count:

@@ -12,6 +12,8 @@ References:
 
 import functools
 import os
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -84,6 +86,17 @@ class Fit(NamedTuple):
     def mean_square(self) -> float:
         """Mean square of the whitened residual; 1 at the noise floor."""
         return float(np.mean(self.residual**2))
+
+
+def residual(problem: Problem, candidate: Candidate, parts: Parts) -> Array | None:
+    """Whitened residual of all recordings, shape (m,), or None where the model runs away."""
+    found: list[Array] = []
+    for k in range(problem.recordings):
+        there = problem.residual(k, candidate, parts)
+        if there is None:
+            return None
+        found.append(there)
+    return np.concatenate(found)
 
 
 def law_space(name: str, motion: Motion, values: Array) -> Space:
@@ -190,15 +203,7 @@ class _Layout:
         return self.problem.residual(k, self.candidate, self.parts(x))
 
     def residual(self, x: Array) -> Array | None:
-        """Whitened residual of all recordings, shape (m,)."""
-        parts = self.parts(x)
-        found: list[Array] = []
-        for k in range(self.problem.recordings):
-            there = self.problem.residual(k, self.candidate, parts)
-            if there is None:
-                return None
-            found.append(there)
-        return np.concatenate(found)
+        return residual(self.problem, self.candidate, self.parts(x))
 
     def rows(self, blocks: list[Integers]) -> dict[int, Rows]:
         """Of each variable of a recording's initial vector, the rows that it moves."""
@@ -417,10 +422,33 @@ def law_values(problem: Problem, result: Fit) -> dict[Placed, Array]:
     }
 
 
-def existing_law_values(problem: Problem, result: Fit) -> dict[int, Array]:
-    """Parameters of the effects that the nominal model has, by index."""
-    index = slots_of(problem, result.candidate).index
-    return {
-        kept: result.parts.effects[slot[1] : slot[2]]
-        for kept, slot in zip(result.candidate.kept, index, strict=False)
-    }
+def parts_for(
+    problem: Problem,
+    result: Fit,
+    candidate: Candidate,
+    further: Mapping[int | Placed, Array] = MappingProxyType({}),
+) -> Parts:
+    """A fitted model as another candidate: the effects of both, and further laws from rest.
+
+    Args:
+        problem: Model and recordings.
+        result: The fitted model.
+        candidate: The other candidate.
+        further: Parameters of its laws that the fitted model lacks.
+    """
+    old, new = slots_of(problem, result.candidate), slots_of(problem, candidate)
+    rows = dict(zip((*result.candidate.kept, *result.candidate.new), old.index, strict=True))
+    effects: list[Array] = []
+    states: list[Array] = [np.zeros((problem.recordings, 0))]
+    internal = np.array([start[len(start) - old.states :] for start in result.parts.starts])
+    for key, row in zip((*candidate.kept, *candidate.new), new.index, strict=True):
+        if key in rows:
+            _, first, past, first_state, past_state = rows[key]
+            effects.append(result.parts.effects[first:past])
+            states.append(internal[:, first_state:past_state])
+        else:
+            effects.append(further[key])
+            states.append(np.zeros((problem.recordings, row[4] - row[3])))
+    motions = (start[: len(start) - old.states] for start in result.parts.starts)
+    starts = (np.append(*both) for both in zip(motions, np.hstack(states), strict=True))
+    return Parts(result.parts.linear, np.concatenate([np.zeros(0), *effects]), tuple(starts))

@@ -322,14 +322,13 @@ def ranked(
     residual = _residual(coarse, base.laws, base.values)
     residual = residual - basis @ (basis.T @ residual)
     laws = proposed(stage.problem) if only is None else only
-    laws = [at for at in laws if _goes_with(at, base.laws)]
+    laws = [at for at in laws if goes_with(at, base.laws)]
     for _, name in laws:
         law(name)  # Compiled here: numba's compiler is no place for two threads.
 
     def first(at: Placed, known: Mapping[str, float] = MappingProxyType({})) -> list[_Start]:
         found = [
-            _first(coarse, at, start, residual, basis)
-            for start in _starts(stage.problem, at, known)
+            _first(coarse, at, start, residual, basis) for start in starts(stage.problem, at, known)
         ]
         return sorted((one for one in found if one is not None), key=lambda one: one[0])
 
@@ -375,7 +374,7 @@ def best_of_each(trials: Iterable[Trial]) -> list[Trial]:
     return sorted(found.values(), key=lambda trial: trial.score)
 
 
-def _starts(problem: Problem, at: Placed, known: Mapping[str, float]) -> list[Array]:
+def starts(problem: Problem, at: Placed, known: Mapping[str, float]) -> list[Array]:
     """A law's starts, with those of its parameters that are known; its size is found anyway."""
     item = effect(at[1])
     fixed = {
@@ -403,7 +402,7 @@ def _nested(
     return found
 
 
-def _goes_with(at: Placed, laws: Sequence[Placed]) -> bool:
+def goes_with(at: Placed, laws: Sequence[Placed]) -> bool:
     """Whether a law may stand beside others: two formulas of one family imitate a third."""
     family = effect(at[1]).family
     return at not in laws and (
