@@ -94,9 +94,9 @@ def _gains(pool: Pool, stage: Stage, before: Trial, after: Trial) -> bool:
 
 
 def _about_the_best(pool: Pool, progress: Progress) -> None:
-    """Add to, and exchange laws of, the best set, then of what this finds, three times at most."""
+    """Add to, and exchange laws of, the best set, then of what this finds, and so on."""
     seen: set[Candidate] = set()
-    turns = pool.criteria.most_laws
+    turns = 2 * pool.criteria.most_laws
     for turn in range(turns):
         reference = pool.nearest()
         if pool.at_floor(pool.settled_least()) or reference.fit.candidate in seen:
@@ -118,7 +118,8 @@ def _exchanged(pool: Pool, reference: Scored, progress: Progress) -> None:
             _in_simulation(pool, reference, base, part)
         else:
             _along_the_motion(pool, reference, part)
-        if pool.at_floor(pool.settled_least()):
+        is_hopeless = not pool.is_near(reference, pool.nearest())
+        if is_hopeless or pool.at_floor(pool.settled_least()):
             return
 
 
@@ -133,7 +134,7 @@ def _along_the_motion(pool: Pool, reference: Scored, progress: Progress) -> None
 def _in_simulation(
     pool: Pool, reference: Scored, base: Sequence[Placed], progress: Progress
 ) -> None:
-    """Some laws of a set, fitted, with a further or a more general one, as a score test ranks."""
+    """Some laws of a set with a further or a like one, as a score test about their fit ranks."""
     candidate = nominal(pool.problem).added(*base)
     if candidate != reference.fit.candidate:
         # Its own fit may have ended in a side valley, which the larger set has left.

@@ -13,6 +13,7 @@ References:
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from operator import attrgetter
 from os import cpu_count
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import effect
 from rig.diagnosis.numerics.compiled import law
+from rig.diagnosis.numerics.least_squares import solve
 from rig.diagnosis.problem.contract import (
     Candidate,
     Parts,
@@ -30,19 +32,21 @@ from rig.diagnosis.problem.contract import (
     strut_constants,
 )
 from rig.diagnosis.problem.track import law_force
-from rig.diagnosis.search.fit import Fit, law_values, parts_for, residual
+from rig.diagnosis.search.fit import Fit, law_space, law_values, parts_for, residual
 from rig.diagnosis.search.screen import goes_with, proposed, starts
 
 Array = NDArray[np.float64]
 
 _SMALL = 0.02
 """Force of a law that is tried, as a share of what the linear part leaves over."""
+_STEPS = 10
+"""Steps by which a law is brought near to another one's force."""
 _TINY = 1e-100
 """Stands for nothing in a quotient."""
 
 
 class Change(NamedTuple):
-    """A law that may be added to a model, or stand for one that degenerates to it.
+    """A law that may be added to a model, or stand for a like one.
 
     Attributes:
         candidate: The changed model.
@@ -83,17 +87,20 @@ class _Base(NamedTuple):
 def changes(
     problem: Problem, result: Fit, motions: Sequence[tuple[int, Track]]
 ) -> tuple[Change, ...]:
-    """Fitted models with one law more, or a more general one, each at its best start, best first.
+    """Fitted models with one law more, or a like one for one of theirs, at its best start.
 
     Args:
         problem: Model and recordings.
         result: The model.
         motions: The motion of recordings, by their index.
+
+    Returns:
+        The changes, best first.
     """
     constants = strut_constants(problem, result.parts.linear)
     tracks, laws = tuple(track for _, track in motions), law_values(problem, result)
     base = _Base(problem, result, tracks, laws, constants, *_without_fitted(result))
-    jobs = [*_additions(base), *_generalisations(base)]
+    jobs = [*_additions(base), *_likenesses(base)]
     for job in jobs:
         law(job.law[1])  # Compiled here: numba's compiler is no place for two threads.
     with ThreadPoolExecutor(cpu_count()) as pool:
@@ -118,16 +125,49 @@ def _additions(base: _Base) -> list[_Job]:
     return [_Job(at, start) for at in laws for start in starts(base.problem, at, {})]
 
 
-def _generalisations(base: _Base) -> list[_Job]:
+def _likenesses(base: _Base) -> list[_Job]:
+    """For each law of the model those of its family, and those that degenerate to it."""
     found: list[_Job] = []
-    for simple, values in base.laws.items():
-        known = dict(zip((p.name for p in effect(simple[1]).parameters), values, strict=True))
-        others = base.fit.candidate.without(simple).new
+    for old in base.laws:
+        others = base.fit.candidate.without(old).new
         for at in proposed(base.problem):
-            is_general = at[0] == simple[0] and simple[1] in effect(at[1]).simpler
-            if is_general and goes_with(at, others):
-                found += [_Job(at, start, simple) for start in starts(base.problem, at, known)]
+            item = effect(at[1])
+            is_alike = item.family == effect(old[1]).family or old[1] in item.simpler
+            if at[0] == old[0] and at != old and is_alike and goes_with(at, others):
+                found += [_Job(at, values, old) for values in _matched(base, at, old)]
     return found
+
+
+def _matched(base: _Base, at: Placed, old: Placed) -> list[Array]:
+    """Parameters with which a law's force is nearest to another one's, but for a linear force."""
+    strut, item = at[0], effect(at[1])
+    linear = [
+        np.concatenate([rows(track)[strut] for track in base.tracks])
+        for rows in (attrgetter("heights_m"), attrgetter("velocities_m_per_s"))
+    ]
+    basis = np.linalg.qr(np.column_stack([np.ones_like(linear[0]), *linear]))[0]
+    whole = _forces(base, old, base.laws[old])
+    goal = whole - basis @ (basis.T @ whole)
+    unit = max(float(np.linalg.norm(goal)), _TINY)
+
+    def missed(values: Array) -> Array:
+        force = _forces(base, at, values)
+        return (goal - force + basis @ (basis.T @ force)) / unit
+
+    known = dict(zip((p.name for p in effect(old[1]).parameters), base.laws[old], strict=True))
+    begins: list[tuple[float, Array]] = []
+    for start in starts(base.problem, at, known):
+        force = goal / unit - missed(start)
+        size = float(force @ goal) / unit / max(float(force @ force), _TINY)
+        values = start.copy()
+        values[list(item.scaled)] *= size
+        left = missed(values)
+        begins.append((float(left @ left), values))
+    if not begins:
+        return []
+    first = min(begins, key=lambda begin: begin[0])[1]
+    found = solve(missed, first, law_space(at[1], base.problem.motions[strut], first), _STEPS)
+    return [] if found is None else [found.values]
 
 
 def _tried(base: _Base, job: _Job) -> Change | None:
@@ -139,8 +179,6 @@ def _tried(base: _Base, job: _Job) -> Change | None:
     candidate, share = base.fit.candidate, 1.0
     if job.stands_for is not None:
         candidate = candidate.without(job.stands_for)
-        replaced = _forces(base, job.stands_for, base.laws[job.stands_for])
-        values[scaled] *= float(forces @ replaced) / power
     elif scaled:
         force_n = base.problem.motions[job.law[0]].force_n
         share = _SMALL * force_n / np.sqrt(power / len(forces))
