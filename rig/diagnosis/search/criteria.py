@@ -22,7 +22,8 @@ class SelectionCriteria:
         most_laws: Laws that a finding may consist of. A force needs three at most before a table
             describes it as well (measured dampers: the fourth gains less than the scatter between
             recordings).
-        finalists: Sets of each size that are fitted in full, smaller ones of theirs apart.
+        finalists: Sets of each size that are fitted in full, smaller ones of theirs apart; changes
+            of a fitted set likewise.
         hopeless: Times the sum of squares of the best set of a size, along the motion, from which
             on a set of that size is not fitted in full, and no longer near the best where sets were
             fitted: smoothing the motion costs laws that switch a factor of two at most.

@@ -1,6 +1,9 @@
-"""Forward and backward over a beam of sets of laws.
+"""Forward and backward over sets of laws: first along the motion, then about what was fitted.
 
-Reference: Miller, Subset Selection in Regression (2002), 3, forward and backward search.
+References:
+    Miller, Subset Selection in Regression (2002), 3, forward and backward search.
+    Pudil, Novovičová, Kittler, Floating search methods in feature selection, Pattern Recognition
+    Letters 15 (1994): what lowers the residual most is gone on from at once.
 """
 
 from collections.abc import Callable, Sequence
@@ -118,8 +121,8 @@ def _exchanged(pool: Pool, reference: Scored, progress: Progress) -> None:
             _in_simulation(pool, reference, base, part)
         else:
             _along_the_motion(pool, reference, part)
-        is_hopeless = not pool.is_near(reference, pool.nearest())
-        if is_hopeless or pool.at_floor(pool.settled_least()):
+        is_left_behind = not pool.is_near(reference, pool.nearest())
+        if is_left_behind or pool.at_floor(pool.settled_least()):
             return
 
 
