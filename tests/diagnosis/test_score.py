@@ -1,0 +1,70 @@
+"""The score test about a fitted model: what it promises, and what it sees beside dry friction."""
+
+import numpy as np
+import pytest
+
+from dart_model.effects import effect
+from rig.diagnosis.diagnose import first_fits
+from rig.diagnosis.problem.build import build
+from rig.diagnosis.problem.contract import nominal
+from rig.diagnosis.search.criteria import CRITERIA
+from rig.diagnosis.search.fit import law_values, parts_for
+from rig.diagnosis.search.pool import FULL, Pool
+from rig.diagnosis.search.score import changes
+from tests.diagnosis import little_bench, little_dyno
+from tests.diagnosis.test_planted_effects import FrictionAndHardening
+from tests.diagnosis.test_prescribed import Orifice
+
+
+def pool_of(bench, force):
+    problem = build(bench.model(), [bench.run(force)], CRITERIA.blocks, None)
+    given, linear = first_fits(problem)
+    return Pool(problem, given, [linear], CRITERIA)
+
+
+def with_laws(pool, **laws):
+    """The model with laws that were fitted from where they are said to begin."""
+    at = {(0, name): np.array(values) for name, values in laws.items()}
+    candidate = nominal(pool.problem).added(*at)
+    pool.attempt(candidate, parts_for(pool.problem, pool.linear.fit, candidate, at), FULL)
+    return pool.fits[candidate].fit
+
+
+def test_where_the_answer_is_linear_the_promise_is_what_a_fit_reaches():
+    pool = pool_of(little_dyno, Orifice())
+    found = changes(pool.problem, pool.linear.fit, pool.along)
+    change = next(c for c in found if c.laws == ((0, "quadratic_damping"),))
+    assert change is found[0] or found[0].left > 0.5 * change.left
+    pool.attempt(change.candidate, change.parts, FULL)
+    cost = pool.fits[change.candidate].fit.solution.cost
+    assert change.left == pytest.approx(cost, rel=0.02)
+    (reached,) = law_values(pool.problem, pool.fits[change.candidate].fit).values()
+    assert change.parts.effects == pytest.approx(reached, rel=0.02)
+
+
+def test_what_lies_beside_dry_friction_is_seen():
+    pool = pool_of(little_bench, FrictionAndHardening())
+    fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3])
+    best = next(c for c in changes(pool.problem, fitted, pool.along) if len(c.laws) == 2)
+    families = {effect(name).family for _, name in best.laws}
+    assert families == {"friction", "nonlinear_stiffness"}
+    assert best.left < 0.3 * fitted.solution.cost
+
+
+def test_a_like_law_begins_where_its_force_is_the_other_ones():
+    pool = pool_of(little_bench, FrictionAndHardening())
+    fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3])
+    found = changes(pool.problem, fitted, pool.along)
+    like = next(c for c in found if c.laws == ((0, "stribeck_friction"),))
+    assert like.left < 1.5 * fitted.solution.cost
+    assert like.parts.effects[0] == pytest.approx(fitted.parts.effects[0], rel=0.3)
+
+
+def test_no_change_holds_a_family_twice_or_the_law_it_stands_for():
+    pool = pool_of(little_bench, FrictionAndHardening())
+    fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3])
+    for change in changes(pool.problem, fitted, pool.along):
+        families = [effect(name).family for _, name in change.laws]
+        assert change.candidate != fitted.candidate
+        assert families.count("friction") <= 1
+        assert change.left >= 0.0
