@@ -123,7 +123,7 @@ def _searched(
     problem = _sharpened(problem, linear)
     first = Pool(problem, given, [linear], criteria)
     seen = explore(first, within(progress, 0.05, 0.55))
-    problem = _sharpened(problem, first.chosen().fit)
+    problem = _sharpened(problem, first.chosen(criteria.most_laws).fit)
     seeds = [scored.fit for scored in (first.linear, *first.best_and_less())]
     second, rest = Pool(problem, given, seeds, criteria), within(progress, 0.55, 0.95)
     explore(second, rest)

@@ -65,13 +65,16 @@ def conclude(pool: Pool, first: Pool, seen: FirstRound | None, progress: Progres
         progress: Told what is being done and the share that is done.
     """
     progress("leaving out what is needless", 0.85)
+    most_laws = pool.criteria.most_laws
     while True:
-        chosen = _without_needless(pool, pool.chosen())
+        chosen = _without_needless(pool, pool.chosen(most_laws))
         final, alike = _with_few_linear(pool, chosen)
         why = unmeasured(pool.problem, final.fit) if final.size else None
         if why is None:
             break
         pool.reject(chosen.fit.candidate, why)
+        # Data that do not bind so many laws bind no larger number of others.
+        most_laws = chosen.size
         _try_plainer(pool, chosen)
     progress("comparing rivals", 0.9)
     rivals = _rivals(pool, chosen)

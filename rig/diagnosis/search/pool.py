@@ -237,11 +237,12 @@ class Pool:
             s for s in self.sound() if s.size and any(set(s.fit.candidate.new) <= b for b in best)
         ]
 
-    def chosen(self) -> Scored:
-        """The smallest set that no larger one is worth more than."""
+    def chosen(self, most_laws: int) -> Scored:
+        """The smallest set that no larger one is worth more than, of so many laws at most."""
+        sets = [s for s in self.sound() if s.size <= most_laws]
         current = self.linear
         while True:
-            larger = [s for s in self.sound() if s.size > current.size and self.worth(current, s)]
+            larger = [s for s in sets if s.size > current.size and self.worth(current, s)]
             if not larger:
                 return current
             least = min(s.size for s in larger)
