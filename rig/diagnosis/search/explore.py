@@ -142,7 +142,8 @@ def _in_simulation(
     if candidate != reference.fit.candidate:
         # Its own fit may have ended in a side valley, which the larger set has left.
         pool.attempt(candidate, parts_for(pool.problem, reference.fit, candidate))
-    if candidate not in pool.fits:
+    # What explains nothing alone has the linear model's tangent, and that had its round.
+    if candidate not in pool.fits or not pool.worth(pool.linear, pool.fits[candidate]):
         return
     progress("screening laws", 0.0)
     model = pool.fits[candidate].fit
