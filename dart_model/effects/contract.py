@@ -5,11 +5,12 @@ a search for its parameters begins and ends, what it degenerates to, where it ca
 it is said.
 """
 
-from collections.abc import Callable, Mapping, MutableSequence, Sequence
+from collections.abc import Callable, Iterable, Mapping, MutableSequence, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
+_Value = TypeVar("_Value")
 Floats = Sequence[float]
 Writable = MutableSequence[float]
 
@@ -187,3 +188,8 @@ class Effect:
     def state_size(self) -> int:
         """Number of internal states."""
         return len(self.state_scales)
+
+    def named(self, values: Iterable[_Value]) -> dict[str, _Value]:
+        """What belongs to each parameter, in their order, by the parameter's name."""
+        names = (parameter.name for parameter in self.parameters)
+        return dict(zip(names, values, strict=True))

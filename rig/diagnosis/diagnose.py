@@ -19,10 +19,11 @@ from rig.diagnosis.problem.build import (
 from rig.diagnosis.problem.contract import Parts, existing_values, free_beside, nominal
 from rig.diagnosis.problem.free_run import FreeRun
 from rig.diagnosis.problem.prescribed import Prescribed
+from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.recording import Recording, RecordingError
 from rig.diagnosis.search.conclude import Found, conclude
 from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
-from rig.diagnosis.search.explore import Progress, explore, within
+from rig.diagnosis.search.explore import explore
 from rig.diagnosis.search.fit import Fit, fit
 from rig.diagnosis.search.pool import Pool, Scored
 from rig.diagnosis.search.surface import surface

@@ -274,16 +274,10 @@ def _estimates(problem: Problem, known: _Known, row: int, name: str) -> dict[str
     result = known.fit
     variables = effect_variables(problem, result).get(row)
     if variables is not None:
-        return {
-            p.name: known.estimate(int(v))
-            for p, v in zip(effect(name).parameters, variables, strict=True)
-        }
+        return effect(name).named(known.estimate(int(v)) for v in variables)
     slot = slots_of(problem, result.candidate).index[row]
     values = result.parts.effects[slot[1] : slot[2]]
-    return {
-        p.name: Estimate(float(value), None, None)
-        for p, value in zip(effect(name).parameters, values, strict=True)
-    }
+    return effect(name).named(Estimate(float(value), None, None) for value in values)
 
 
 def _linear_effects(
@@ -344,8 +338,7 @@ def _existing(problem: Problem, found: Found, known: _Known) -> tuple[ExistingEf
     listed: list[ExistingEffect] = []
     for row, kept in enumerate(result.candidate.kept):
         item = problem.existing[kept]
-        parameters = effect(item.name).parameters
-        nominal_values = dict(zip((p.name for p in parameters), item.values, strict=True))
+        nominal_values = effect(item.name).named(item.values)
         strut = problem.spec.struts[item.strut].name
         if kept in found.superfluous:
             listed.append(ExistingEffect(item.name, strut, "superfluous", nominal_values, {}))

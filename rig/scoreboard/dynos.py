@@ -13,12 +13,13 @@ import numpy as np
 
 from rig.config import CONFIGS
 from rig.diagnosis.command import diagnose_runs
+from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.recording import RecordingError, read_recording
 from rig.imports import load_mapping
 from rig.pages.report import write_report
 from rig.scoreboard.parts import Part, imported
 from rig.scoreboard.starts import dyno_start
-from rig.scoreboard.table import CORRECTED, Progress, Row, findings, within
+from rig.scoreboard.table import CORRECTED, Row, findings
 
 _UNIT = "RMSE in % of the force's standard deviation"
 _LINEAR = "rig, spring and damper"
@@ -92,7 +93,7 @@ def _one_left_out(files: Mapping[str, Path]) -> Iterable[_Split]:
 def _rows(dataset: str, splits: Sequence[_Split], folder: Path, progress: Progress) -> list[Row]:
     rows: list[Row] = []
     for i, split in enumerate(splits):
-        share = within(progress, dataset, i / len(splits), (i + 1) / len(splits))
+        share = within(progress, i / len(splits), (i + 1) / len(splits), dataset)
         rows += _split_rows(dataset, split, folder / f"split_{i + 1}", share)
     return rows
 

@@ -10,10 +10,11 @@ References:
 from pathlib import Path
 
 from rig.diagnosis.command import diagnose_runs
+from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.recording import RecordingError
 from rig.pages.report import write_report
 from rig.scoreboard.starts import one_body
-from rig.scoreboard.table import CORRECTED, START, Progress, Row, findings, within
+from rig.scoreboard.table import CORRECTED, START, Row, findings
 
 _NAME, _UNIT = "EMPS", "RMSE in mm"
 _RUNS = ("train", "pulses")
@@ -34,7 +35,7 @@ def emps_rows(data_folder: Path | None, out: Path, progress: Progress) -> list[R
     rows = [Row(_NAME, "pulses", "dynoNet", 2.64, _UNIT, "Forgione, Piga 2021")]
     model = one_body(_NAME, (_MASS_KG, _DAMPING_N_S_PER_M, 0.0), _MIDDLE_M)
     for i, (learnt, test) in enumerate((_RUNS, _RUNS[::-1])):
-        share = within(progress, f"{_NAME}, {test}", 0.5 * i, 0.5 * (i + 1))
+        share = within(progress, 0.5 * i, 0.5 * (i + 1), f"{_NAME}, {test}")
         folder = out / "emps" / test
         try:
             result = diagnose_runs([files[learnt]], model, [files[test]], folder, share)

@@ -7,10 +7,11 @@ from collections.abc import Collection
 from pathlib import Path
 
 from dart_model.yaml_file import InputError
+from rig.diagnosis.progress import Progress
 from rig.scoreboard.dynos import brfd_rows, mr_damper_rows
 from rig.scoreboard.emps import emps_rows
 from rig.scoreboard.silverbox import silverbox_rows
-from rig.scoreboard.table import Progress, Row, write_scoreboard
+from rig.scoreboard.table import Row, write_scoreboard
 
 SETS = {
     "silverbox": silverbox_rows,

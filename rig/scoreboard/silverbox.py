@@ -26,13 +26,14 @@ from rig.diagnosis.outcome import CORRECTED_FILE
 from rig.diagnosis.problem.build import build
 from rig.diagnosis.problem.contract import Parts, existing_values, nominal
 from rig.diagnosis.problem.free_run import FreeRun
+from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.recording import Recording, RecordingError, read_recording
 from rig.diagnosis.search.fit import fit
 from rig.imports import load_mapping
 from rig.pages.report import write_report
 from rig.scoreboard.parts import Part, imported
 from rig.scoreboard.starts import driven_start
-from rig.scoreboard.table import CORRECTED, START, Progress, Row, findings, within
+from rig.scoreboard.table import CORRECTED, START, Row, findings
 
 SILVERBOX = "Silverbox"
 _FILE = Path("silverbox") / "SNLS80mV.csv"
@@ -109,7 +110,7 @@ def silverbox_rows(data_folder: Path | None, out: Path, progress: Progress) -> l
     record = read_recording(training)
     model = driven_start(record, "silverbox", _RESONANCE_HZ)
     began_s = time.monotonic()
-    share = within(progress, SILVERBOX, 0.05, 0.95)
+    share = within(progress, 0.05, 0.95, SILVERBOX)
     specs = [(START, model, f"here: resonance at {_RESONANCE_HZ:g} Hz, damping ratio 0.05")]
     try:
         result = diagnose_runs([training], model, tests, out / "diagnosis", share)

@@ -1,14 +1,11 @@
 """Figures on measured sets, and how they are written."""
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
 from rig.diagnosis.outcome import Diagnosis
-
-Progress = Callable[[str, float], None]
-"""Told what is being done, and the share of it that is done."""
 
 TABLE_FILE, PAGE_FILE = "scoreboard.csv", "scoreboard.md"
 START, CORRECTED = "rig, rough start", "rig, corrected"
@@ -65,15 +62,6 @@ def page(rows: Sequence[Row]) -> str:
 
 def _cell(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
-
-
-def within(progress: Progress, what: str, first: float, last: float) -> Progress:
-    """Progress of a part, in shares of the whole."""
-
-    def part(step: str, share: float) -> None:
-        progress(f"{what}: {step}", first + (last - first) * share)
-
-    return part
 
 
 def findings(diagnosis: Diagnosis) -> str:

@@ -30,9 +30,13 @@ def with_laws(pool, **laws):
     return pool.fits[candidate].fit
 
 
+def changes_of(pool, fitted):
+    return changes(pool.problem, fitted, pool.along, CRITERIA.most_laws)
+
+
 def test_where_the_answer_is_linear_the_promise_is_what_a_fit_reaches():
     pool = pool_of(little_dyno, Orifice())
-    found = changes(pool.problem, pool.linear.fit, pool.along)
+    found = changes_of(pool, pool.linear.fit)
     change = next(c for c in found if c.laws == ((0, "quadratic_damping"),))
     assert change is found[0] or found[0].left > 0.5 * change.left
     pool.attempt(change.candidate, change.parts, FULL)
@@ -45,7 +49,7 @@ def test_where_the_answer_is_linear_the_promise_is_what_a_fit_reaches():
 def test_what_lies_beside_dry_friction_is_seen():
     pool = pool_of(little_bench, FrictionAndHardening())
     fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3])
-    best = next(c for c in changes(pool.problem, fitted, pool.along) if len(c.laws) == 2)
+    best = next(c for c in changes_of(pool, fitted) if len(c.laws) == 2)
     families = {effect(name).family for _, name in best.laws}
     assert families == {"friction", "nonlinear_stiffness"}
     assert best.left < 0.3 * fitted.solution.cost
@@ -54,7 +58,7 @@ def test_what_lies_beside_dry_friction_is_seen():
 def test_a_like_law_begins_where_its_force_is_the_other_ones():
     pool = pool_of(little_bench, FrictionAndHardening())
     fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3])
-    found = changes(pool.problem, fitted, pool.along)
+    found = changes_of(pool, fitted)
     like = next(c for c in found if c.laws == ((0, "stribeck_friction"),))
     assert like.left < 1.5 * fitted.solution.cost
     assert like.parts.effects[0] == pytest.approx(fitted.parts.effects[0], rel=0.3)
@@ -63,8 +67,15 @@ def test_a_like_law_begins_where_its_force_is_the_other_ones():
 def test_no_change_holds_a_family_twice_or_the_law_it_stands_for():
     pool = pool_of(little_bench, FrictionAndHardening())
     fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3])
-    for change in changes(pool.problem, fitted, pool.along):
+    for change in changes_of(pool, fitted):
         families = [effect(name).family for _, name in change.laws]
         assert change.candidate != fitted.candidate
         assert families.count("friction") <= 1
         assert change.left >= 0.0
+
+
+def test_a_model_with_as_many_laws_as_may_be_is_not_added_to():
+    pool = pool_of(little_bench, FrictionAndHardening())
+    fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3])
+    for change in changes(pool.problem, fitted, pool.along, 1):
+        assert len(change.laws) == 1

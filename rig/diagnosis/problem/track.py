@@ -87,6 +87,18 @@ def law_force(
     return out
 
 
+def linear_forces(tracks: Sequence[Track], strut: int) -> Array:
+    """An orthonormal basis of a strut's linear forces along motions one after another.
+
+    Returns:
+        Of a constant force, a spring's and a damper's, shape (N, 3).
+    """
+    heights_m = np.concatenate([track.heights_m[strut] for track in tracks])
+    velocities = np.concatenate([track.velocities_m_per_s[strut] for track in tracks])
+    columns = np.column_stack([np.ones_like(heights_m), heights_m, velocities])
+    return np.asarray(np.linalg.qr(columns)[0], dtype=np.float64)
+
+
 def segment_forces(
     segments: Sequence[Segment],
     strut: int,

@@ -1,6 +1,6 @@
 """From the models that were fitted to what is reported: no law and no correction too many."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -15,7 +15,8 @@ from rig.diagnosis.problem.contract import (
     Problem,
     nominal,
 )
-from rig.diagnosis.search.explore import FirstRound, Progress
+from rig.diagnosis.progress import Progress
+from rig.diagnosis.search.explore import FirstRound
 from rig.diagnosis.search.fit import Fit, fit, law_values, parts_for, spread
 from rig.diagnosis.search.pool import FINAL, FULL, Pool, Scored
 from rig.diagnosis.search.screen import Trial, plain, proposed, ranked, refined
@@ -132,11 +133,15 @@ def _simpler(pool: Pool, chosen: Scored, placed: Placed) -> Iterable[Scored]:
             continue
         candidate = less.added(other)
         if candidate not in pool.fits:
-            base = Trial(less.new, tuple(known[law] for law in less.new), 0.0, np.zeros(1))
-            for trial in ranked(stage, base, 1, [other]):
+            for trial in ranked(stage, _as_trial(less.new, known), 1, [other]):
                 if trial.values and is_hopeful(trial):
                     pool.attempt_trial(stage, pool.linear, trial, FULL)
         yield from _settled(pool, candidate, chosen)
+
+
+def _as_trial(laws: Sequence[Placed], known: Mapping[Placed, Array]) -> Trial:
+    """Fitted laws as a set that others are tried beside."""
+    return Trial(tuple(laws), tuple(known[law] for law in laws), 0.0, np.zeros(1))
 
 
 def _settled(pool: Pool, candidate: Candidate, chosen: Scored) -> Iterable[Scored]:
@@ -152,7 +157,7 @@ def _try_plainer(pool: Pool, unbound: Scored) -> None:
     known = law_values(pool.problem, unbound.fit)
     for placed in unbound.fit.candidate.new:
         less = unbound.fit.candidate.without(placed).new
-        base = Trial(less, tuple(known[law] for law in less), 0.0, np.zeros(1))
+        base = _as_trial(less, known)
         plainer = [at for at in proposed(pool.problem) if _is_plainer(at, placed)]
         for trial in ranked(pool.linear_stage, base, len(plainer), plainer)[
             : pool.criteria.finalists

@@ -6,20 +6,18 @@ References:
     Letters 15 (1994): what lowers the residual most is gone on from at once.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
 from dart_model.effects import effect
 from rig.diagnosis.problem.contract import Candidate, Placed, nominal
+from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.search.fit import parts_for
 from rig.diagnosis.search.pool import Pool, Scored
-from rig.diagnosis.search.score import Change, changes
+from rig.diagnosis.search.score import Change
 from rig.diagnosis.search.screen import Stage, Trial, best_of_each, plain, ranked, refined, stage_of
 
 Tried = TypeVar("Tried", Trial, Change)
-Progress = Callable[[str, float], None]
-"""Told what is being done and the share that is done."""
-
 _EXPLORED = 0.85
 """Share of a search's time after which it compares rivals."""
 
@@ -146,14 +144,13 @@ def _in_simulation(
     if candidate not in pool.fits or not pool.worth(pool.linear, pool.fits[candidate]):
         return
     progress("screening laws", 0.0)
-    model = pool.fits[candidate].fit
-    least = model.solution.cost - pool.criteria.least_likelihood_gain
+    model = pool.fits[candidate]
+    least = model.fit.solution.cost - pool.criteria.least_likelihood_gain
     known = {c: scored.fit.solution.cost for c, scored in pool.fits.items()}
     found = [
         change
-        for change in changes(pool.problem, model, pool.along)
-        if len(change.laws) <= pool.criteria.most_laws
-        and change.left < min(least, known.get(change.candidate, least))
+        for change in pool.changes(model)
+        if change.left < min(least, known.get(change.candidate, least))
     ]
     for change in _diverse(found, pool.criteria.finalists):
         progress(f"fitting {', '.join(name for _, name in change.laws)}", 0.5)
@@ -224,12 +221,3 @@ def _diverse(level: Sequence[Tried], count: int) -> list[Tried]:
 
 def _score(trial: Trial) -> float:
     return trial.score
-
-
-def within(progress: Progress, first: float, last: float) -> Progress:
-    """Progress of a part, in shares of the whole."""
-
-    def part(what: str, share: float) -> None:
-        progress(what, first + (last - first) * share)
-
-    return part

@@ -23,6 +23,7 @@ from rig.diagnosis.problem.contract import (
 )
 from rig.diagnosis.search.criteria import DISSIPATING, STORING, SelectionCriteria
 from rig.diagnosis.search.fit import Fit, block_scores, fit
+from rig.diagnosis.search.score import Change, changes
 from rig.diagnosis.search.screen import (
     Stage,
     Trial,
@@ -106,6 +107,7 @@ class Pool:
         self.unsound: dict[Candidate, str] = {}
         self.settled: set[Candidate] = set()
         self.floors: dict[Candidate, tuple[Scored, float]] = {}
+        self.tested: dict[Candidate, tuple[Scored, tuple[Change, ...]]] = {}
         for seed in seeds:
             self.attempt(seed.candidate, seed.parts)
         base = nominal(problem)
@@ -253,6 +255,14 @@ class Pool:
         best = min(sets, key=lambda s: s.score)
         alike = [s for s in sets if self.is_alike(s, best)]
         return min(alike, key=lambda s: (len(s.fit.parts.effects), s.score))
+
+    def changes(self, result: Scored) -> tuple[Change, ...]:
+        """What a score test about a fit finds, best first."""
+        candidate = result.fit.candidate
+        if candidate not in self.tested or self.tested[candidate][0] is not result:
+            most = self.criteria.most_laws
+            self.tested[candidate] = result, changes(self.problem, result.fit, self.along, most)
+        return self.tested[candidate][1]
 
     # --- whether one model is worth more than another -------------------------------------------
 

@@ -11,9 +11,8 @@ References:
     Econometrics 2 (1984).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from operator import attrgetter
 from os import cpu_count
 from typing import NamedTuple
 
@@ -31,9 +30,9 @@ from rig.diagnosis.problem.contract import (
     Track,
     strut_constants,
 )
-from rig.diagnosis.problem.track import law_force
+from rig.diagnosis.problem.track import law_force, linear_forces
 from rig.diagnosis.search.fit import Fit, law_space, law_values, parts_for, residual
-from rig.diagnosis.search.screen import goes_with, proposed, starts
+from rig.diagnosis.search.screen import goes_with, proposed, sized, starts
 
 Array = NDArray[np.float64]
 
@@ -64,28 +63,44 @@ class Change(NamedTuple):
         return self.candidate.new
 
 
-class _Job(NamedTuple):
-    """A law at a start; where it stands for another one, with what it stands for."""
-
-    law: Placed
-    start: Array
-    stands_for: Placed | None = None
-
-
 class _Base(NamedTuple):
-    """A fitted model, as all that is tried beside it needs it."""
+    """A fitted model, as all that is tried beside it needs it.
+
+    Attributes:
+        problem: Model and recordings.
+        fit: The fitted model.
+        tracks: The motion of recordings.
+        constants: The struts' constants as fitted.
+        basis: Orthonormal, of what the fitted variables can do, shape (m, k).
+        left: The residual without that, shape (m,).
+    """
 
     problem: Problem
     fit: Fit
     tracks: tuple[Track, ...]
-    laws: dict[Placed, Array]
     constants: Array
     basis: Array
     left: Array
 
 
+class _Old(NamedTuple):
+    """A law of a model that others may stand for.
+
+    Attributes:
+        law: The law.
+        values: Its parameters.
+        linear: Orthonormal, of what is left to the linear part, shape (N, 3).
+        force_n: The law's force along the motion without that, shape (N,).
+    """
+
+    law: Placed
+    values: Array
+    linear: Array
+    force_n: Array
+
+
 def changes(
-    problem: Problem, result: Fit, motions: Sequence[tuple[int, Track]]
+    problem: Problem, result: Fit, motions: Sequence[tuple[int, Track]], most_laws: int
 ) -> tuple[Change, ...]:
     """Fitted models with one law more, or a like one for one of theirs, at its best start.
 
@@ -93,20 +108,27 @@ def changes(
         problem: Model and recordings.
         result: The model.
         motions: The motion of recordings, by their index.
+        most_laws: Laws that a model may hold.
 
     Returns:
         The changes, best first.
     """
     constants = strut_constants(problem, result.parts.linear)
-    tracks, laws = tuple(track for _, track in motions), law_values(problem, result)
-    base = _Base(problem, result, tracks, laws, constants, *_without_fitted(result))
-    jobs = [*_additions(base), *_likenesses(base)]
-    for job in jobs:
-        law(job.law[1])  # Compiled here: numba's compiler is no place for two threads.
+    tracks = tuple(track for _, track in motions)
+    base = _Base(problem, result, tracks, constants, *_without_fitted(result))
+    laws = result.candidate.new
+    added = _additions(base) if len(laws) < most_laws else []
+    like = list(_likenesses(base))
+    for _, name in [*laws, *(at for at, _ in (*added, *like))]:
+        law(name)  # Compiled here: numba's compiler is no place for two threads.
     with ThreadPoolExecutor(cpu_count()) as pool:
-        found = [one for one in pool.map(lambda job: _tried(base, job), jobs) if one is not None]
+        olds = dict(zip(laws, pool.map(lambda at: _old(base, at), laws), strict=True))
+        tried = [
+            *pool.map(lambda job: _with_addition(base, *job), added),
+            *pool.map(lambda job: _with_likeness(base, job[0], olds[job[1]]), like),
+        ]
     best: dict[Candidate, Change] = {}
-    for change in sorted(found, key=lambda change: change.left):
+    for change in sorted((one for one in tried if one is not None), key=lambda one: one.left):
         best.setdefault(change.candidate, change)
     return tuple(best.values())
 
@@ -120,85 +142,109 @@ def _without_fitted(result: Fit) -> tuple[Array, Array]:
     return basis, result.residual - basis @ (basis.T @ result.residual)
 
 
-def _additions(base: _Base) -> list[_Job]:
+def _additions(base: _Base) -> list[tuple[Placed, Array]]:
     laws = [at for at in proposed(base.problem) if goes_with(at, base.fit.candidate.new)]
-    return [_Job(at, start) for at in laws for start in starts(base.problem, at, {})]
+    return [(at, start) for at in laws for start in starts(base.problem, at, {})]
 
 
-def _likenesses(base: _Base) -> list[_Job]:
-    """For each law of the model those of its family, and those that degenerate to it."""
-    found: list[_Job] = []
-    for old in base.laws:
+def _likenesses(base: _Base) -> Iterator[tuple[Placed, Placed]]:
+    """Laws of the family of one of the model's, or that degenerate to it; with that one."""
+    for old in base.fit.candidate.new:
         others = base.fit.candidate.without(old).new
         for at in proposed(base.problem):
             item = effect(at[1])
             is_alike = item.family == effect(old[1]).family or old[1] in item.simpler
             if at[0] == old[0] and at != old and is_alike and goes_with(at, others):
-                found += [_Job(at, values, old) for values in _matched(base, at, old)]
-    return found
+                yield at, old
 
 
-def _matched(base: _Base, at: Placed, old: Placed) -> list[Array]:
+def _with_addition(base: _Base, at: Placed, start: Array) -> Change | None:
+    item, share, few = effect(at[1]), 1.0, start.copy()
+    if item.scaled:
+        mean_square = float(np.mean(_forces(base, at, start) ** 2))
+        if not 0.0 < mean_square < np.inf:
+            return None
+        share = _SMALL * base.problem.motions[at[0]].force_n / np.sqrt(mean_square)
+        few[list(item.scaled)] *= share
+    candidate = base.fit.candidate.added(at)
+    column = _answer(base, candidate, at, few)
+    if column is None:
+        return None
+    column = column / share
+    size = _best_size(base, column)
+    if not item.scaled:
+        size = float(np.clip(size, 0.0, 1.0))
+        return _change(base, candidate, at, start, size * column)
+    values = sized(at[1], start, size)
+    return None if values is None else _change(base, candidate, at, values, size * column)
+
+
+def _old(base: _Base, at: Placed) -> _Old:
+    values = law_values(base.problem, base.fit)[at]
+    linear, force_n = linear_forces(base.tracks, at[0]), _forces(base, at, values)
+    return _Old(at, values, linear, force_n - linear @ (linear.T @ force_n))
+
+
+def _with_likeness(base: _Base, at: Placed, old: _Old) -> Change | None:
+    values = _matched(base, at, old)
+    if values is None:
+        return None
+    candidate = base.fit.candidate.without(old.law).added(at)
+    column = _answer(base, candidate, at, values)
+    if column is None:
+        return None
+    # On the way from the old law to this one.
+    size = float(np.clip(_best_size(base, column), 0.0, 1.0))
+    return _change(base, candidate, at, values, size * column)
+
+
+def _matched(base: _Base, at: Placed, old: _Old) -> Array | None:
     """Parameters with which a law's force is nearest to another one's, but for a linear force."""
-    strut, item = at[0], effect(at[1])
-    linear = [
-        np.concatenate([rows(track)[strut] for track in base.tracks])
-        for rows in (attrgetter("heights_m"), attrgetter("velocities_m_per_s"))
-    ]
-    basis = np.linalg.qr(np.column_stack([np.ones_like(linear[0]), *linear]))[0]
-    whole = _forces(base, old, base.laws[old])
-    goal = whole - basis @ (basis.T @ whole)
-    unit = max(float(np.linalg.norm(goal)), _TINY)
+    scaled, unit = list(effect(at[1]).scaled), float(np.linalg.norm(old.force_n))
+    if unit <= 0.0:
+        return None
+
+    def shape(values: Array) -> Array:
+        force_n = _forces(base, at, values)
+        return (force_n - old.linear @ (old.linear.T @ force_n)) / unit
 
     def missed(values: Array) -> Array:
-        force = _forces(base, at, values)
-        return (goal - force + basis @ (basis.T @ force)) / unit
+        return old.force_n / unit - shape(values)
 
-    known = dict(zip((p.name for p in effect(old[1]).parameters), base.laws[old], strict=True))
     begins: list[tuple[float, Array]] = []
+    known = effect(old.law[1]).named(old.values.tolist())
     for start in starts(base.problem, at, known):
-        force = goal / unit - missed(start)
-        size = float(force @ goal) / unit / max(float(force @ force), _TINY)
-        values = start.copy()
-        values[list(item.scaled)] *= size
+        force, values = shape(start), start.copy()
+        values[scaled] *= float(force @ old.force_n) / unit / max(float(force @ force), _TINY)
         left = missed(values)
         begins.append((float(left @ left), values))
     if not begins:
-        return []
-    first = min(begins, key=lambda begin: begin[0])[1]
-    found = solve(missed, first, law_space(at[1], base.problem.motions[strut], first), _STEPS)
-    return [] if found is None else [found.values]
-
-
-def _tried(base: _Base, job: _Job) -> Change | None:
-    item, forces = effect(job.law[1]), _forces(base, job.law, job.start)
-    power = float(forces @ forces)
-    if not np.isfinite(power) or power <= 0.0:
         return None
-    values, scaled = job.start.copy(), list(item.scaled)
-    candidate, share = base.fit.candidate, 1.0
-    if job.stands_for is not None:
-        candidate = candidate.without(job.stands_for)
-    elif scaled:
-        force_n = base.problem.motions[job.law[0]].force_n
-        share = _SMALL * force_n / np.sqrt(power / len(forces))
-        values[scaled] *= share
-    candidate = candidate.added(job.law)
-    parts = parts_for(base.problem, base.fit, candidate, {job.law: values})
+    first = min(begins, key=lambda begin: begin[0])[1]
+    space = law_space(at[1], base.problem.motions[at[0]], first)
+    found = solve(missed, first, space, _STEPS)
+    return None if found is None else found.values
+
+
+def _answer(base: _Base, candidate: Candidate, at: Placed, values: Array) -> Array | None:
+    """What a changed model takes off the residual beyond what was fitted; None if it runs away."""
+    parts = parts_for(base.problem, base.fit, candidate, {at: values})
     there = residual(base.problem, candidate, parts)
     if there is None:
         return None
-    column = (base.fit.residual - there) / share
-    column = column - base.basis @ (base.basis.T @ column)
-    size = float(column @ base.left) / max(float(column @ column), _TINY)
-    if scaled and job.stands_for is None:
-        values[scaled] = size * job.start[scaled]
-    else:
-        size = float(np.clip(size, 0.0, 1.0))  # On the way to it, or it.
-    if any(not item.parameters[i].low <= values[i] <= item.parameters[i].high for i in scaled):
-        return None
-    rest = base.left - size * column
-    parts = parts_for(base.problem, base.fit, candidate, {job.law: values})
+    column = base.fit.residual - there
+    return column - base.basis @ (base.basis.T @ column)
+
+
+def _best_size(base: _Base, column: Array) -> float:
+    return float(column @ base.left) / max(float(column @ column), _TINY)
+
+
+def _change(
+    base: _Base, candidate: Candidate, at: Placed, values: Array, taken_off: Array
+) -> Change:
+    rest = base.left - taken_off
+    parts = parts_for(base.problem, base.fit, candidate, {at: values})
     return Change(candidate, parts, float(rest @ rest))
 
 

@@ -397,7 +397,7 @@ def _nested(
     for trial in trials:
         strut, name = trial.laws[-1]
         values, _ = law_and_shift(name, trial.values[-1])
-        known = {p.name: float(v) for p, v in zip(effect(name).parameters, values, strict=True)}
+        known = effect(name).named(values.tolist())
         found += [(at, known) for at in laws if at[0] == strut and name in effect(at[1]).simpler]
     return found
 
@@ -413,23 +413,27 @@ def goes_with(at: Placed, laws: Sequence[Placed]) -> bool:
 
 def _first(stage: Stage, at: Placed, start: Array, residual: Array, basis: Array) -> _Start | None:
     """Cost and parameters of a law at a start, its size by least squares where it has one."""
-    strut, name = at
-    item = effect(name)
-    column = response(stage, strut, name, start)
+    column = response(stage, *at, start)
     column = column - basis @ (basis.T @ column)
     power = float(column @ column)
     if not np.isfinite(power) or power <= 0.0:
         return None
-    values = start.copy()
-    if item.scaled:
+    if effect(at[1]).scaled:
         size = float(column @ residual) / power
-        for i in item.scaled:
-            values[i] = size * start[i]
-            if not item.parameters[i].low <= values[i] <= item.parameters[i].high:
-                return None
-        return float(residual @ residual) - size * size * power, values
+        values = sized(at[1], start, size)
+        return None if values is None else (float(residual @ residual) - size**2 * power, values)
     left = residual - column
-    return float(left @ left), values
+    return float(left @ left), start
+
+
+def sized(name: str, values: Array, size: float) -> Array | None:
+    """A law with so many times its force; None where its parameters may not be so large."""
+    item, scaled = effect(name), values.copy()
+    for i in item.scaled:
+        scaled[i] *= size
+        if not item.parameters[i].low <= scaled[i] <= item.parameters[i].high:
+            return None
+    return scaled
 
 
 def _residual(stage: Stage, laws: Sequence[Placed], values: Sequence[Array]) -> Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import effect
 from rig.diagnosis.problem.contract import Problem, Track, placed, slots_of, strut_constants
-from rig.diagnosis.problem.track import forces_along, law_force
+from rig.diagnosis.problem.track import forces_along, law_force, linear_forces
 from rig.diagnosis.search.criteria import SelectionCriteria
 from rig.diagnosis.search.fit import UNBOUND, Fit, effect_variables, spread, start_variables
 
@@ -118,15 +118,8 @@ def _disguised(
     """A law that is a linear spring and damper along this motion."""
     for row, name in _new(result):
         strut, force = forces[row]
-        columns = np.column_stack(
-            [
-                np.ones(len(force)),
-                np.concatenate([track.heights_m[strut] for track in along]),
-                np.concatenate([track.velocities_m_per_s[strut] for track in along]),
-            ]
-        )
-        columns = columns / np.linalg.norm(columns, axis=0)
-        left = force - columns @ np.linalg.lstsq(columns, force, rcond=None)[0]
+        basis = linear_forces(along, strut)
+        left = force - basis @ (basis.T @ force)
         power = float(np.linalg.norm(force))
         if power <= 0.0 or float(np.linalg.norm(left)) < criteria.leftover * power:
             return f"along this motion it is a linear spring and damper ({name})"

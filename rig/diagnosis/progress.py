@@ -1,0 +1,15 @@
+"""How far long work is."""
+
+from collections.abc import Callable
+
+Progress = Callable[[str, float], None]
+"""Told what is being done and the share that is done."""
+
+
+def within(progress: Progress, first: float, last: float, of: str = "") -> Progress:
+    """Progress of a part, in shares of the whole; its steps named after what they are of."""
+
+    def part(what: str, share: float) -> None:
+        progress(f"{of}: {what}" if of else what, first + (last - first) * share)
+
+    return part
