@@ -13,21 +13,26 @@ from rig.diagnosis.problem.build import (
     build,
     build_held_out,
     is_prescribed,
+    part_of,
     with_noise,
     with_tones,
 )
-from rig.diagnosis.problem.contract import Parts, existing_values, free_beside, nominal
+from rig.diagnosis.problem.contract import Parts, Problem, existing_values, free_beside, nominal
 from rig.diagnosis.problem.free_run import FreeRun
 from rig.diagnosis.problem.prescribed import Prescribed
 from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.recording import Recording, RecordingError
 from rig.diagnosis.search.conclude import Found, conclude
 from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
-from rig.diagnosis.search.explore import explore
+from rig.diagnosis.search.explore import FirstRound, explore
 from rig.diagnosis.search.fit import Fit, fit
 from rig.diagnosis.search.pool import Pool, Scored
 from rig.diagnosis.search.surface import surface
 from rig.diagnosis.write_up import judgement, needless, written_up
+
+_SEARCHED_NODES = 32_000
+"""Nodes of all recordings that are searched, half a minute at 1 kHz; with more than twice as many,
+in pieces spread over them."""
 
 
 def _quiet(_what: str, _share: float) -> None:
@@ -70,7 +75,7 @@ def diagnose(
 
     def figures(chosen: Fit) -> tuple[Evaluated, ...]:
         models = models_of(problem, found.linear.fit, chosen)
-        variance = np.nan if isinstance(problem, FreeRun) else np.nanmean(problem.noise_n**2)
+        variance = np.nanmean(problem.noise_n**2) if isinstance(problem, Prescribed) else np.nan
         left_n = float(np.sqrt(chosen.mean_square * variance))
         return evaluated(judged, models, recordings, left_n, kept=not held_out)
 
@@ -88,7 +93,7 @@ def diagnose(
 
 
 def _tabulated(
-    problem: FreeRun | Prescribed,
+    problem: Problem,
     found: Found,
     results: tuple[Evaluated, ...],
     figures: Callable[[Fit], tuple[Evaluated, ...]],
@@ -113,25 +118,58 @@ def _error(results: Sequence[Evaluated]) -> float:
 
 
 def _searched(
-    problem: FreeRun | Prescribed, criteria: SelectionCriteria, progress: Progress
-) -> tuple[Found, FreeRun | Prescribed]:
+    problem: Problem, criteria: SelectionCriteria, progress: Progress
+) -> tuple[Found, Problem]:
+    """Search, long recordings in pieces, and conclude on all of them."""
+    progress("fitting the linear part", 0.03)
+    given, linear = first_fits(problem)
+    problem = _sharpened(problem, linear)
+    part = part_of(problem, _SEARCHED_NODES)
+    share = within(progress, 0.05, 0.95 if part is problem else 0.7)
+    fits = (given, linear) if part is problem else first_fits(part)
+    first, last, seen = _explored(part, *fits, criteria, share)
+    if part is not problem:
+        last = _on_all(problem, given, linear, last, within(progress, 0.7, 0.95))
+    found = conclude(last, first, seen, progress)
+    if isinstance(last.problem, FreeRun):
+        found = found._replace(chosen=_polished(last.problem, found.chosen))
+    return found, last.problem
+
+
+def _explored(
+    problem: Problem,
+    given: Fit,
+    linear: Fit,
+    criteria: SelectionCriteria,
+    progress: Progress,
+) -> tuple[Pool, Pool, FirstRound | None]:
     """Search, and once more about what was found: its free run is nearer to the measurement.
 
     The noise, too, is only known once a model follows: what a poor one leaves is smooth and noise.
     """
-    progress("fitting the linear part", 0.03)
-    given, linear = first_fits(problem)
-    problem = _sharpened(problem, linear)
     first = Pool(problem, given, [linear], criteria)
-    seen = explore(first, within(progress, 0.05, 0.55))
+    seen = explore(first, within(progress, 0.0, 0.55))
     problem = _sharpened(problem, first.chosen(criteria.most_laws).fit)
     seeds = [scored.fit for scored in (first.linear, *first.best_and_less())]
-    second, rest = Pool(problem, given, seeds, criteria), within(progress, 0.55, 0.95)
-    explore(second, rest)
-    found = conclude(second, first, seen, rest)
-    if isinstance(problem, FreeRun):
-        found = found._replace(chosen=_polished(problem, found.chosen))
-    return found, problem
+    second = Pool(problem, given, seeds, criteria)
+    explore(second, within(progress, 0.55, 1.0))
+    return first, second, seen
+
+
+def _on_all(problem: Problem, given: Fit, linear: Fit, searched: Pool, progress: Progress) -> Pool:
+    """What was found in pieces, fitted to all; searched on where more than a formula is missing."""
+    criteria = searched.criteria
+    pool = Pool(problem, given, [linear], criteria)
+    pool.adopt(searched.chosen(criteria.most_laws).fit)
+    problem = _sharpened(problem, pool.chosen(criteria.most_laws).fit)
+    pool = Pool(problem, given, [linear], criteria)
+    for i, scored in enumerate(sets := searched.best_and_less()):
+        progress("fitting all of the recordings", 0.5 * i / len(sets))
+        pool.adopt(scored.fit)
+    pool.settle_best()
+    if not pool.is_formula(pool.least()):
+        explore(pool, within(progress, 0.5, 1.0))
+    return pool
 
 
 def _polished(problem: FreeRun, chosen: Scored) -> Scored:
@@ -141,7 +179,7 @@ def _polished(problem: FreeRun, chosen: Scored) -> Scored:
     return chosen if result is None else chosen._replace(fit=result)
 
 
-def first_fits(problem: FreeRun | Prescribed) -> tuple[Fit, Fit]:
+def first_fits(problem: Problem) -> tuple[Fit, Fit]:
     """The nominal model with its initial states fitted, and the best linear model.
 
     Raises:
@@ -162,7 +200,7 @@ def first_fits(problem: FreeRun | Prescribed) -> tuple[Fit, Fit]:
     return given, fit(problem, base, near.parts, free, 12) or near
 
 
-def _sharpened(problem: FreeRun | Prescribed, result: Fit) -> FreeRun | Prescribed:
+def _sharpened(problem: Problem, result: Fit) -> Problem:
     """The problem with the noise and the tones that a fit leaves."""
     forces = [
         there

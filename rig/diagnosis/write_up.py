@@ -77,7 +77,7 @@ class _Known(NamedTuple):
 
 
 def written_up(
-    problem: FreeRun | Prescribed,
+    problem: Problem,
     found: Found,
     verdict: Verdict,
     results: Sequence[Evaluated],
@@ -413,7 +413,7 @@ def _fitted_series(
     ]
 
 
-def _notes(problem: FreeRun | Prescribed, found: Found, *, blocks: bool) -> tuple[str, ...]:
+def _notes(problem: Problem, found: Found, *, blocks: bool) -> tuple[str, ...]:
     notes: list[str] = []
     if problem.bench == "force_given":
         notes.append(

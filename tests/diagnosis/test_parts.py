@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
 from dart_model.effects import Motion
-from rig.diagnosis.problem.build import build, with_tones
+from rig.diagnosis.problem.build import build, part_of, with_tones
 from rig.diagnosis.problem.contract import Parts, nominal
 from rig.diagnosis.problem.track import most_thinned, pieces
+from rig.diagnosis.search.fit import fit
 from tests.diagnosis import little_bench, little_dyno
 
 
@@ -81,3 +82,57 @@ def test_a_slow_line_is_taken_out_and_is_no_tone():
     (motion,) = with_tones(problem, [forces._replace(force_n=force_n)])
     assert all(hz >= 5.0 / t_s[-1] for hz, _ in motion.tones)
     assert motion.tones[0] == pytest.approx((fast_hz, 0.5 * np.pi), rel=0.02)
+
+
+def cut_and_whole(bench):
+    """A problem, its pieces, and the residual of the model without effects over all of it."""
+    problem = build(bench.model(), [bench.run(bench.Nothing(), duration_s=24.0)], 32, None)
+    nodes = problem.fitted(0).size
+    base, part = nominal(problem), part_of(problem, nodes // 4)
+    parts = Parts(np.zeros(len(problem.linear)), np.zeros(0), (problem.start(0, base),))
+    whole = np.full(nodes, np.nan)
+    whole[problem.fitted(0)] = problem.residual(0, base, parts)
+    cuts = pieces(nodes, nodes, nodes // 4, 1)
+    there = [w[np.isfinite(w)] for w in (whole[cut] for cut in cuts)]
+    return part, base, parts, there
+
+
+def test_along_a_given_motion_a_piece_misses_what_the_whole_misses_there():
+    part, base, parts, whole = cut_and_whole(little_dyno)
+    assert part.recordings == len(whole) == 8
+    for k, there in enumerate(whole):
+        own = part.residual(k, base, parts._replace(starts=(np.zeros(0),) * 8))
+        assert own == pytest.approx(there, rel=1e-9)
+        assert len(part.blocks(k)) == len(there)
+
+
+def test_the_first_piece_of_a_free_run_begins_as_the_recording_does():
+    part, base, parts, whole = cut_and_whole(little_bench)
+    assert part.recordings == len(whole) == 8
+    assert part.residual(0, base, parts) == pytest.approx(whole[0], rel=1e-9)
+
+
+def test_pieces_of_a_free_run_are_where_they_were_in_the_recording():
+    part, base, parts, _ = cut_and_whole(little_bench)
+    found = fit(
+        part,
+        base,
+        Parts(parts.linear, np.zeros(0), tuple(part.start(k, base) for k in range(8))),
+        parts.linear > 0.0,
+        effects=False,
+    )
+    assert found.mean_square == pytest.approx(1.0, abs=0.2)
+
+
+def test_no_piece_is_searched_that_is_kept_back():
+    problem = build(little_bench.model(), [little_bench.run(little_bench.Nothing())], 32, 5)
+    part = part_of(problem, problem.fitted(0).size // 8)
+    shares = [part.fitted(k).mean() for k in range(part.recordings)]
+    assert min(shares) > 0.5
+    assert len(shares) < 8
+
+
+def test_short_recordings_are_searched_whole():
+    problem = build(little_bench.model(), [little_bench.run(little_bench.Nothing())], 32, None)
+    assert part_of(problem, problem.fitted(0).size) is problem
+    assert part_of(problem, problem.fitted(0).size // 2 + 1) is problem

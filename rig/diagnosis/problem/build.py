@@ -50,6 +50,8 @@ _NEGLIGIBLE = 1e-9
 """Share of the strut's force below which an existing effect does not act on the recordings."""
 _TONES = 4
 _LEAST_BLOCK_S = 0.1
+_MOSTLY = 0.5
+"""Share of a piece that takes part in fits, for it to be looked at."""
 
 
 _Shared = tuple[
@@ -153,6 +155,27 @@ def _problem(
     for run in runs:
         _check_swing(run.grid)
     return with_noise(problem, nominal(problem), None)
+
+
+def part_of(problem: Problem, most: int) -> Problem:
+    """The problem of pieces spread over long recordings; itself up to twice as many nodes.
+
+    Args:
+        problem: The problem.
+        most: Nodes of all recordings that are taken.
+    """
+    flags = [problem.fitted(k) for k in range(problem.recordings)]
+    nodes = sum(map(len, flags))
+    pieces = [
+        (k, piece)
+        for k, fitted in enumerate(flags)
+        for piece in track.pieces(len(fitted), nodes, most, 1)
+        if float(np.mean(fitted[piece])) > _MOSTLY
+    ]
+    if len(pieces) == problem.recordings:
+        return problem
+    share = sum(piece.stop - piece.start for _, piece in pieces) / nodes
+    return replace(problem.cut(pieces), block_s=max(share * problem.block_s, _LEAST_BLOCK_S))
 
 
 def with_noise(problem: FreeRun, candidate: Candidate, parts: Parts | None) -> FreeRun:

@@ -12,7 +12,7 @@ References:
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from rig.diagnosis.problem.mechanism import Readers
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 Placed = tuple[int, str]
 """Index of a strut, and the name of an effect in it."""
 
@@ -131,6 +132,10 @@ class Track(NamedTuple):
         rows = t_s, heights_m.T, velocities_m_per_s.T, applied_n, temperature_c
         return cls(*(np.ascontiguousarray(row) for row in rows))
 
+    def cut(self, nodes: slice) -> "Track":
+        """The motion at some of the nodes."""
+        return Track(*(np.ascontiguousarray(part[..., nodes]) for part in self))
+
 
 class Segment(NamedTuple):
     """A recording or a part of one in the regression along the motion.
@@ -217,7 +222,7 @@ class Problem(ABC):
         """First guess of a recording's initial vector."""
 
     @abstractmethod
-    def start_scales(self, candidate: Candidate) -> tuple[Array, NDArray[np.bool_]]:
+    def start_scales(self, candidate: Candidate) -> tuple[Array, Flags]:
         """Usual sizes of an initial vector's entries, and which of them are fitted."""
 
     @abstractmethod
@@ -227,6 +232,17 @@ class Problem(ABC):
     @abstractmethod
     def states(self, k: int, candidate: Candidate, parts: Parts) -> Array:
         """Internal states at the beginning of a recording."""
+
+    @abstractmethod
+    def fitted(self, k: int) -> Flags:
+        """Nodes of a recording that take part in fits, shape (N,)."""
+
+    @abstractmethod
+    def cut(self, pieces: Sequence[tuple[int, slice]]) -> Self:
+        """The same of pieces of recordings, each given by its recording's index and its nodes.
+
+        Internal states begin anew with each piece: those that add up over a recording are wrong.
+        """
 
     @abstractmethod
     def segments(
@@ -289,7 +305,7 @@ def strut_constants(problem: Problem, linear: Array) -> Array:
     return constants
 
 
-def free_beside(problem: Problem, candidate: Candidate) -> NDArray[np.bool_]:
+def free_beside(problem: Problem, candidate: Candidate) -> Flags:
     """Linear parameters that are free beside a candidate's laws, shape (L,).
 
     The gain of the applied force is degenerate with all else, and has a turn of its own. The free
@@ -307,7 +323,7 @@ def middle_m(motion: Motion) -> float:
     return 0.5 * (motion.low_m + motion.high_m)
 
 
-def state_scales(candidate_effects: Sequence[Placed]) -> tuple[Array, NDArray[np.bool_]]:
+def state_scales(candidate_effects: Sequence[Placed]) -> tuple[Array, Flags]:
     """Usual sizes of effects' internal states, and which are fitted at the beginning."""
     scales = [scale for _, name in candidate_effects for scale in effect(name).state_scales]
     fitted = [

@@ -23,6 +23,7 @@ from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise
 from rig.diagnosis.problem import linear_part, track
 from rig.diagnosis.problem.contract import (
     Candidate,
+    Flags,
     Integers,
     LinearParameter,
     Parts,
@@ -106,6 +107,16 @@ def run_of(
     )
 
 
+def _cut(run: Run, nodes: slice) -> Run:
+    fine = slice(2 * run.substeps * nodes.start, 2 * run.substeps * (nodes.stop - 1) + 1)
+    return run._replace(
+        grid=run.grid.cut(nodes),
+        applied_n=run.applied_n[nodes],
+        fine_n=run.fine_n[fine],
+        mechanism=run.mechanism.cut(nodes),
+    )
+
+
 def _finer(run: Run) -> Run:
     steps = 2 * run.substeps
     spline = CubicSpline(fine_times(run.grid.t_s, steps), run.fine_n)
@@ -158,6 +169,14 @@ class FreeRun(Problem):
         """The same problem with steps half as long: the integrator then errs a sixteenth."""
         return replace(self, runs=tuple(_finer(run) for run in self.runs))
 
+    def fitted(self, k: int) -> Flags:
+        """Nodes of a recording that take part in fits, shape (N,)."""
+        return self.runs[k].grid.fitted
+
+    def cut(self, pieces: Sequence[tuple[int, slice]]) -> "FreeRun":
+        """The same of pieces of recordings."""
+        return replace(self, runs=tuple(_cut(self.runs[k], nodes) for k, nodes in pieces))
+
     @cached_property
     def _stroke_m(self) -> float:
         return max(motion.stroke_m for motion in self.motions)
@@ -179,7 +198,7 @@ class FreeRun(Problem):
         v = np.linalg.solve(rows, velocities)
         return np.concatenate([q, v, np.zeros(slots_of(self, candidate).states)])
 
-    def start_scales(self, candidate: Candidate) -> tuple[Array, NDArray[np.bool_]]:
+    def start_scales(self, candidate: Candidate) -> tuple[Array, Flags]:
         """A thousandth of the stroke, a hundredth of the speed, and the laws' own scales."""
         row = float(np.max(np.abs(self.runs[0].mechanism.rows)))
         q = 1e-3 * self._stroke_m / row

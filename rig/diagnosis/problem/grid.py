@@ -63,6 +63,16 @@ class Grid(NamedTuple):
         """Time from first to last node."""
         return float(self.t_s[-1] - self.t_s[0])
 
+    def cut(self, nodes: slice) -> "Grid":
+        """The recording at some of the nodes."""
+        return self._replace(
+            t_s=self.t_s[nodes],
+            heights_m=self.heights_m[nodes],
+            fitted=self.fitted[nodes],
+            kept=self.kept[nodes],
+            temperature_c=self.temperature_c[nodes],
+        )
+
     def blocks(self, length_s: float) -> NDArray[np.int64]:
         """Block of each fitted node."""
         return block_numbers(self.t_s, length_s)[self.fitted]

@@ -5,7 +5,7 @@ takes one pass. What is left of initial states are the laws' internal ones.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, NamedTuple
 
@@ -18,6 +18,7 @@ from rig.diagnosis.numerics.smoother import estimate_noise
 from rig.diagnosis.problem import linear_part, track
 from rig.diagnosis.problem.contract import (
     Candidate,
+    Flags,
     Integers,
     Parts,
     Problem,
@@ -32,7 +33,6 @@ from rig.diagnosis.problem.grid import Grid, SmoothMotion
 from rig.diagnosis.recording import Recording
 
 Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 _UNCERTAIN = 1.5
 """Times its median from which on the deviation of the smoothed velocity is that of a recording's
@@ -64,6 +64,15 @@ class Drive(NamedTuple):
     def fitted(self) -> Flags:
         """Nodes that take part in fits."""
         return self.grid.fitted & self.certain
+
+
+def _cut(drive: Drive, nodes: slice) -> Drive:
+    return drive._replace(
+        grid=drive.grid.cut(nodes),
+        along=drive.along.cut(nodes),
+        cells_n=drive.cells_n[:, nodes],
+        certain=drive.certain[nodes],
+    )
 
 
 def drive_of(grid: Grid, at: Integers, recording: Recording, smooth: SmoothMotion) -> Drive:
@@ -126,6 +135,14 @@ class Prescribed(Problem):
     def recordings(self) -> int:
         """Number of recordings."""
         return len(self.drives)
+
+    def fitted(self, k: int) -> Flags:
+        """Nodes of a recording that take part in fits, shape (N,)."""
+        return self.drives[k].fitted
+
+    def cut(self, pieces: Sequence[tuple[int, slice]]) -> "Prescribed":
+        """The same of pieces of recordings."""
+        return replace(self, drives=tuple(_cut(self.drives[k], nodes) for k, nodes in pieces))
 
     @cached_property
     def _celled(self) -> Integers:
@@ -192,7 +209,7 @@ class Prescribed(Problem):
     def _segment(self, k: int, missed: Array, cut: slice) -> Segment:
         drive = self.drives[k]
         whole = drive.along
-        along = Track(*(np.ascontiguousarray(part[..., cut]) for part in whole))
+        along = whole.cut(cut)
         rows = np.flatnonzero(drive.fitted[cut])
         numbers = block_numbers(whole.t_s, self.block_s)[cut][rows]
 

@@ -81,7 +81,7 @@ def conclude(pool: Pool, first: Pool, seen: FirstRound | None, progress: Progres
     rivals = _rivals(pool, chosen)
     superfluous = _superfluous(pool, chosen)
     lawless = _with_few_linear(pool, pool.linear)[0] if final.size else final
-    rejected = () if seen is None else _rejected(first, seen, final, rivals)
+    rejected = () if seen is None else _rejected(first, seen, pool.linear, final, rivals)
     return Found(pool.given, pool.linear, lawless, final, rivals, superfluous, rejected, alike)
 
 
@@ -315,9 +315,11 @@ def _as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] | None:
 
 
 def _rejected(
-    first: Pool, seen: FirstRound, chosen: Scored, rivals: Sequence[Scored]
+    first: Pool, seen: FirstRound, linear: Scored, chosen: Scored, rivals: Sequence[Scored]
 ) -> tuple[RejectedEffect, ...]:
     """Laws that were not chosen, with one line each, best first."""
+    # Of what the linear model leaves: the first search may know the noise less well, or see a part.
+    share = chosen.score / max(linear.score, 1e-300)
     found: dict[Placed, RejectedEffect] = {}
     taken = set(chosen.fit.candidate.new)
     tied = {placed for rival in rivals for placed in rival.fit.candidate.new} - taken
@@ -329,22 +331,22 @@ def _rejected(
         why = (
             "cannot be told from what was chosen by these data"
             if placed in tied
-            else _why(first, chosen, placed, left)
+            else _why(first, chosen.size, share, placed, left)
         )
         strut, name = first.problem.spec.struts[placed[0]].name, placed[1]
         found[placed] = RejectedEffect(effect(name).family, name, strut, why, min(left, 1.0))
     return tuple(sorted(found.values(), key=lambda r: 1.0 if r.left is None else r.left))
 
 
-def _why(first: Pool, chosen: Scored, placed: Placed, left: float) -> str:
+def _why(first: Pool, laws: int, share: float, placed: Placed, left: float) -> str:
     candidate = nominal(first.problem).added(placed)
     if candidate in first.unsound:
         return first.unsound[candidate]
-    if candidate in first.fits and chosen.size > 0:
-        alone = first.fits[candidate]
-        ratio = float(np.sqrt(alone.score / max(chosen.score, 1e-300)))
-        if chosen.size == 1:
+    if candidate in first.fits and laws > 0:
+        alone = first.fits[candidate].score / max(first.linear.score, 1e-300)
+        ratio = float(np.sqrt(alone / max(share, 1e-300)))
+        if laws == 1:
             return f"its out-of-sample residual is {ratio:.3g} times that of the chosen model"
         return f"alone it leaves {ratio:.3g} times the out-of-sample residual of the chosen set"
-    share = 100.0 * (1.0 - min(left, 1.0))
-    return f"along the motion it takes {share:.3g} % off the residual of the linear model"
+    taken = 100.0 * (1.0 - min(left, 1.0))
+    return f"along the motion it takes {taken:.3g} % off the residual of the linear model"

@@ -45,9 +45,7 @@ def explore(pool: Pool, progress: Progress) -> FirstRound | None:
         _about_the_best(pool, progress)
     else:
         seen = _from_nothing(pool, progress)
-    best = pool.best()
-    for scored in best:
-        pool.settle(scored, best[0])
+    pool.settle_best()
     return seen
 
 

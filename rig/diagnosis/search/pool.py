@@ -194,6 +194,11 @@ class Pool:
         result = fit(self.problem, candidate, own, none, *_BEGUN, effects=False)
         return own if result is None else result.parts
 
+    def adopt(self, result: Fit) -> None:
+        """Fit the laws of a model of other recordings, beginning with what they are there."""
+        parts = self._begun(result.candidate, result.parts.linear, result.parts.effects)
+        self.attempt(result.candidate, parts)
+
     def reject(self, candidate: Candidate, why: str) -> None:
         """Leave out a set that its last fit shows to be none that an engineer would use."""
         self.unsound[candidate] = why
@@ -204,6 +209,12 @@ class Pool:
         candidate = scored.fit.candidate
         if scored.size and self.is_near(scored, best) and candidate not in self.settled:
             self.attempt(candidate, scored.fit.parts, FULL)
+
+    def settle_best(self) -> None:
+        """Fit the sets that may be chosen to their end."""
+        best = self.best()
+        for scored in best:
+            self.settle(scored, best[0])
 
     # --- what may be chosen -------------------------------------------------------------------
 
