@@ -1,4 +1,4 @@
-"""Before and after: on data that took no part in any choice or fit, and the floor beside them.
+"""Before and after: on data that took no part in the search, and the floor beside them.
 
 A free run's heights are DART's, with the applied force as the only input; only the initial state,
 which nobody measured, is fitted. An observer with a high gain would hide any model error.
@@ -174,7 +174,7 @@ def _free_run(
         run.grid.name,
         heights,
         BeforeAfter(rms(residual[0]), rms(residual[1])),
-        _strut_force(problem, k, models, (before, after), recording),
+        _strut_force(problem, k, models, (before, after), recording, rows),
     )
     return Evaluated(
         figures, rms(measured - linear.heights_m), linear_n, heights,
@@ -188,12 +188,14 @@ def _strut_force(
     models: Models,
     motions: tuple[Trajectory, Trajectory],
     recording: Recording,
+    rows: NDArray[np.bool_],
 ) -> BeforeAfter | None:
-    """Error against the load cell, the models in free run."""
-    cells = recording.strut_forces_n
-    if cells is None:
+    """Error against the load cell where it is judged, the models in free run."""
+    if recording.strut_forces_n is None:
         return None
     run = problem.runs[k]
+    judged = np.interp(recording.t_s, run.grid.t_s, rows) > 0.5
+    cells = np.where(judged[:, np.newaxis], recording.strut_forces_n, np.nan)
     found: list[float] = []
     for (candidate, parts), motion in zip((models.given, models.chosen), motions, strict=True):
         along = track_of(run, motion)

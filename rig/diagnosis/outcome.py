@@ -37,8 +37,9 @@ class LinearCorrection:
 
     Attributes:
         strut: Strut that it belongs to.
-        parameter: ``mass_kg`` (all that the strut's upper body weighs), ``stiffness_n_per_m``,
-            ``damping_n_s_per_m``, ``preload_n``, ``free_length_m`` or ``input_gain``.
+        parameter: ``mass_kg`` (of the strut's upper body and what it carries),
+            ``stiffness_n_per_m``, ``damping_n_s_per_m``, ``preload_n``, ``free_length_m`` or
+            ``input_gain``.
         nominal: As the model file has it, the preload about mid-stroke.
         total: As the data have it.
         about_height_m: Mid-stroke, about which stiffness and preload are taken; else None.
@@ -185,7 +186,7 @@ class Diagnosis:
         rejected: Candidates that were not chosen, best first.
         ambiguous_with: Families that these recordings cannot tell from what was found.
         suggested_excitation: What recording would tell them apart.
-        held_out: Figures on data that took no part in any choice or fit.
+        held_out: Figures on data that took no part in the search.
         noise_floor: What a right model leaves there.
         residual_white: Whether the residual is white.
         notes: Whole sentences: what the data cannot separate, what was left out.
@@ -242,10 +243,10 @@ class HeldOutSeries:
         strut: Name of the strut.
         unit: ``m`` or ``N``, of the next three.
         t_s: Times in s, increasing, shape (N,).
-        measured: Height or load-cell force; NaN where a sample is missing.
+        measured: Height or load-cell force; NaN where it is missing or not judged on.
         before: The nominal model, open loop (or driven along the motion).
         after: The corrected model.
-        height_m: Measured height.
+        height_m: Measured height, smoothed where the motion is prescribed.
         velocity_m_per_s: Smoothed velocity.
     """
 

@@ -4,6 +4,8 @@ import pytest
 
 from dart_model.spec import MODELS, load_model
 from rig.diagnosis.diagnose import diagnose
+from rig.diagnosis.problem.linear_part import moving_mass_kg
+from rig.diagnosis.problem.mechanism import constant, readers
 from rig.diagnosis.recording import read_csv
 from tests.diagnosis.answers import is_at_the_floor, missing
 from tests.diagnosis.mechanisms import (
@@ -39,6 +41,14 @@ def test_a_complete_trailing_arm_lacks_nothing(tmp_path):
     found = diagnose(arm.model(tmp_path), [train], [test]).diagnosis
     assert found.verdict == "nothing_missing"
     assert found.effects == ()
+
+
+def test_a_mass_is_that_of_a_struts_upper_body_with_what_it_carries():
+    spec = load_model(MODELS / "quarter_car.yaml")
+    wheel, body = (part.mass_kg for part in spec.skeleton.bodies)
+    mechanism = constant(readers(spec))
+    assert moving_mass_kg(mechanism, 0) == pytest.approx(wheel + body)
+    assert moving_mass_kg(mechanism, 1) == pytest.approx(body)
 
 
 def quarter_car(car, folder):

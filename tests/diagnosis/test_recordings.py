@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from dart_model.spec import MODELS, load_model
 from rig.config import CONFIGS
 from rig.diagnosis.diagnose import diagnose
+from rig.diagnosis.problem.build import build
 from rig.diagnosis.recording import Recording, RecordingError, read_csv
+from rig.diagnosis.search.criteria import CRITERIA
 from rig.imports import import_table, load_mapping
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis import little_dyno as dyno
@@ -309,6 +311,15 @@ def test_two_recordings_are_learnt_from_together_and_blocks_of_them_are_kept_bac
     assert result.diagnosis.held_out.source == "blocks"
     assert result.diagnosis.runs == ("dyno1", "dyno2")
     assert {item.run for item in result.fitted} == {"dyno1", "dyno2"}
+
+
+def test_a_load_cell_is_judged_where_blocks_were_kept_back() -> None:
+    run = bench.run(bench.Nothing())
+    (kept,) = (r.grid.kept for r in build(bench.model(), [run], 32, CRITERIA.kept_every).runs)
+    cell_n = np.where(kept, 30.0, 1e6)[:, np.newaxis] + 0.1 * run.heights_m
+    found = diagnose(bench.model(), [replace(run, strut_forces_n=cell_n)]).diagnosis
+    assert found.held_out.source == "blocks"
+    assert found.held_out.strut_force_rmse_n.after < 1e4
 
 
 @pytest.mark.long

@@ -58,7 +58,8 @@ class Existing(NamedTuple):
         strut: Index of the strut.
         name: Name of the effect.
         values: Its parameters.
-        free: Whether it is refitted along: an effect that does not act on these recordings is not.
+        free: Whether it is refitted along: linear ones, a table, and what does not act on these
+            recordings are not.
     """
 
     strut: int

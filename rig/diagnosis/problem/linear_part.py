@@ -1,8 +1,8 @@
 """The linear part of a model: mass, stiffness, damping, preload, gain, free length, never exact.
 
 Each has a prior, from the model file's `tolerance` or a default, which decides only where the data
-do not: a change of all of mass, stiffness and damping in one proportion against a change of the
-gain, for one.
+do not. A change of mass, stiffness and damping in one proportion looks like one of the gain, which
+is never free beside them.
 """
 
 from collections.abc import Sequence
@@ -21,10 +21,10 @@ TOLERANCES = {
     "mass": 0.05, "stiffness": 0.2, "damping": 0.4, "preload": 0.1, "gain": 0.02, "free_length": 0.1
 }  # fmt: skip
 """Standard uncertainties where the model file states none, as shares of the nominal value; of the
-preload, of the spring's force over the stroke, and of the free length, of the stroke. A body can be
-weighed to a few percent with what moves along with it; springs are sold to 10 % and installed to
-20; dampers vary by 30 % from warm to cold and from piece to piece (Dixon, The Shock Absorber
-Handbook, 2007, 9); a load cell in calibration is good to 2 %."""
+preload, of what spring and damper give on the motion, and of the free length, of the stroke. A body
+can be weighed to a few percent with what moves along with it; springs are sold to 10 % and
+installed to 20; dampers vary by 30 % from warm to cold and from piece to piece (Dixon, The Shock
+Absorber Handbook, 2007, 9); a load cell in calibration is good to 2 %."""
 _LEAST_MASS = 0.1
 """Lowest mass that a correction may leave, as a share of the nominal value. Springs and dampers
 may vanish altogether: a law with a stiffness or damping of its own may take their place."""
@@ -99,9 +99,10 @@ def moving_mass_kg(mechanism: Mechanism, strut: int) -> float:
     """Mass that a strut's force moves directly: of its upper body with all that it carries."""
     per_kg = mechanism.mass_by_kg[:, strut].mean(axis=0)
     mass = mechanism.mass.mean(axis=0)
-    # Along the coordinates that a kg on this body loads.
-    at = int(np.argmax(np.diag(per_kg)))
-    return float(mass[at, at] / per_kg[at, at])
+    # Of the coordinates that a kg on this body loads, that which moves least else: further ones
+    # carry it along with what is below.
+    loaded = np.diag(per_kg) > 0.0
+    return float(np.min(np.diag(mass)[loaded] / np.diag(per_kg)[loaded]))
 
 
 def _along_last_strut(mechanism: Mechanism) -> bool:

@@ -1,4 +1,6 @@
-"""Every number that decides what is found, with its meaning and its source.
+"""The numbers that decide what is found, with their meaning and their source.
+
+Priors, bounds of laws and limits of noise stand where they are used.
 
 `python -m tests.criteria_study` shows how the hit rate moves when each is halved and doubled.
 """
@@ -32,8 +34,8 @@ class SelectionCriteria:
             Regression Trees, 1984, 3.4.3). More would lose what shows in few blocks: of an effect
             that acts in k of them alone the gain is sqrt(k) standard errors.
         least_likelihood_gain: Least gain of twice the out-of-sample log likelihood by a further
-            law. The best of some hundred useless starts gains 2 ln 100 = 9 by chance; a
-            coloured residual that much more often.
+            law, a better formula or a linear correction. The best of some hundred useless starts
+            gains 2 ln 100 = 9 by chance; a coloured residual that much more often.
         least_share: Least share of the mean square above the noise floor that a further law takes
             away; 0.19 is a tenth of the RMS.
         least_above_noise: Mean square above the noise floor, as a share of the floor, below which
@@ -46,7 +48,7 @@ class SelectionCriteria:
             agree to a few percent, at worst to 0.09, as seen on the foreign formulas of
             `tests.truth`.
         imitation: Factor by which each further law then has to lower the RMS that is left, to be
-            more than a part of a better formula; at the noise floor any factor will do.
+            more than a part of a better formula; at the noise floor that of `hopeless` will do.
             Seen on benches that developed the method: pairs that one law imitated left up to 0.15,
             a second law beside a foreign formula 0.29 and more, two of them 0.16.
         significant: Times its standard deviation that a linear correction is away from nothing.

@@ -1,4 +1,4 @@
-"""Laws beside a fitted model, each simulated at a small size.
+"""Laws beside a fitted model, or for one of its own, each simulated once.
 
 Where a strut sticks, a law along the smoothed motion errs by more than what is missing; the model's
 own answer to a little of a law does not. How much of the residual this answer could explain, with

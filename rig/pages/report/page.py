@@ -45,7 +45,8 @@ _ASSUMPTIONS = (
     "The sensors' noise is estimated from the data and taken as white; the noise floor is what it, "
     "and the applied force's, would leave.",
     "95 % intervals hold if the law that is named is the right one.",
-    "Held-out data took part in no fit; what does not hold on them is taken back.",
+    "Held-out data took no part in the search, only their initial states are fitted. Laws without "
+    "which they are at the noise floor are taken back.",
 )
 _OF_A_FREE_RUN = ("The free-run simulation has the applied force as its only input.",)
 
