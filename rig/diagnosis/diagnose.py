@@ -86,30 +86,24 @@ def diagnose(
     verdict = judgement(problem, results, found, criteria)
     if verdict == "not_explained":
         progress("tabulating what has no name", 0.97)
-        found, results = _tabulated(problem, found, results, figures)
+        found, results = _erring_least(problem, found, results, figures)
     result = written_up(problem, found, verdict, results, runs, criteria, blocks=not held_out)
     progress("done", 1.0)
     return result
 
 
-def _tabulated(
+def _erring_least(
     problem: Problem,
     found: Found,
     results: tuple[Evaluated, ...],
     figures: Callable[[Fit], tuple[Evaluated, ...]],
 ) -> tuple[Found, tuple[Evaluated, ...]]:
-    """A table as the correction where no law explains, if it does better on held-out data.
-
-    Laws that leave more there than the best linear model are no correction either.
-    """
-    linear = float(np.sqrt(np.mean([result.linear**2 for result in results])))
-    offered = surface(problem, found.linear.fit)
-    if offered is not None:
-        there = figures(offered)
-        if _error(there) < min(linear, _error(results)):
-            return found._replace(chosen=found.chosen._replace(fit=offered), rivals=()), there
-    if found.chosen.size and linear < _error(results):
-        return found._replace(chosen=found.plain, rivals=()), figures(found.plain.fit)
+    """What errs least on held-out data where no law explains: the laws, a table, or neither."""
+    for offered in (surface(problem, found.linear.fit), found.plain.fit, found.given):
+        there = None if offered is None else figures(offered)
+        if offered is not None and there is not None and _error(there) < _error(results):
+            results = there
+            found = found._replace(chosen=found.chosen._replace(fit=offered), rivals=())
     return found, results
 
 

@@ -281,7 +281,7 @@ def test_a_force_outside_the_catalogue_is_not_explained():
     runs = [bench.run(Cogging()), bench.run(Cogging(), seed=2)]
     found = diagnose(bench.model(), runs[:1], runs[1:]).diagnosis
     assert found.verdict in {"not_explained", "partly_explained"}
-    assert found.held_out.height_rmse_m.after <= 1.05 * found.held_out.height_rmse_m.before
+    assert found.held_out.height_rmse_m.after <= found.held_out.height_rmse_m.before
 
 
 def test_missing_samples_and_uneven_times_change_nothing():
