@@ -283,16 +283,13 @@ def _estimates(problem: Problem, known: _Known, row: int, name: str) -> dict[str
 def _linear_effects(
     problem: Problem, known: _Known, after: Sequence[ResidualForces | None]
 ) -> tuple[FoundEffect, ...]:
-    """Linear corrections as effects, where they are all that was found and not nothing."""
+    """Linear corrections as effects, where they are all that was found."""
     result = known.fit
     found: list[FoundEffect] = []
     places = np.flatnonzero(result.free)
     implied = _implied_preloads(problem, known)
     for variable, (place, p) in enumerate(zip(places, _free(problem, result), strict=True)):
         if variable in implied or p.kind not in EFFECTS:
-            continue
-        estimate = known.estimate(variable)
-        if not _outside(estimate, 0.0):
             continue
         linear = result.parts.linear.copy()
         linear[place] = 0.0
@@ -305,7 +302,7 @@ def _linear_effects(
                 forces.append(without.force_n[p.strut] - there.force_n[p.strut])
                 left.append(there.force_n[p.strut])
         name = EFFECTS[p.kind]
-        estimates = {effect(name).parameters[0].name: estimate}
+        estimates = {effect(name).parameters[0].name: known.estimate(variable)}
         all_left, force = (np.concatenate(rows) if rows else np.zeros(1) for rows in (left, forces))
         found.append(_found(problem, p.strut, name, all_left, force, estimates))
     return tuple(sorted(found, key=lambda item: -item.force_rms_n))

@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 
 from dart_model.effects import CATALOGUE
-from rig.diagnosis import write_up
-from rig.diagnosis.diagnose import diagnose, first_fits
-from rig.diagnosis.problem.build import build
+from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.recording import Recording
-from rig.diagnosis.search.fit import spread
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis.answers import LINEAR_FAMILIES, correction, holds, is_at_the_floor, named
 from tests.diagnosis.little_bench import DAMPING, FREE, MASS, STIFFNESS, Nothing
@@ -294,14 +291,3 @@ def test_missing_samples_and_uneven_times_change_nothing():
     found = diagnose(bench.model(), [thinned], [record]).diagnosis
     assert [e.family for e in found.effects] == ["stiffness"]
     assert found.effects[0].parameters["stiffness_n_per_m"].value == pytest.approx(200.0, rel=0.01)
-
-
-def test_a_correction_that_may_be_nothing_is_no_effect():
-    """Beside a free mass, stiffness, damping and preload the planted one alone is an effect."""
-    for effect, names in ((Nothing, set()), (Damping, {"linear_damping"})):
-        problem = build(bench.model(), [bench.run(effect())], 32, None)
-        _, linear = first_fits(problem)
-        after = [problem.residual_forces(0, linear.candidate, linear.parts)]
-        known = write_up._Known(linear, spread(linear))
-        found = write_up._linear_effects(problem, known, after)
-        assert {item.name for item in found} == names

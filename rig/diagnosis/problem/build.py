@@ -172,7 +172,7 @@ def part_of(problem: Problem, most: int) -> Problem:
         for piece in track.pieces(len(fitted), nodes, most, 1)
         if float(np.mean(fitted[piece])) > _MOSTLY
     ]
-    if len(pieces) == problem.recordings:
+    if nodes < 2 * most or not pieces:
         return problem
     share = sum(piece.stop - piece.start for _, piece in pieces) / nodes
     return replace(problem.cut(pieces), block_s=max(share * problem.block_s, _LEAST_BLOCK_S))

@@ -24,7 +24,7 @@ _LONGEST_STATE_STEP_S = 0.6e-3
 """Longest step of an internal state along a motion: a bristle that settles at 2000 1/s needs it."""
 _MOST_STATE_STEPS = 8
 _PIECES = 8
-"""Parts of a recording that is too long for all of it to be looked at."""
+"""Parts of recordings that are too long for all of them to be looked at; one of each at least."""
 _TURN = 0.5
 """Most that the fastest motion turns between samples: a cubic through heights and velocities then
 errs by less than a thousandth."""
@@ -58,8 +58,9 @@ def pieces(nodes: int, samples: int, most: int, most_thinned: int) -> list[slice
     share = most * step * nodes / samples
     if nodes < 2.0 * share:
         return [slice(0, nodes, step)]
-    length = max(int(share / _PIECES), 2 * step)
-    firsts = [int(k * (nodes - length) / (_PIECES - 1)) for k in range(_PIECES)]
+    count = max(1, round(_PIECES * nodes / samples))
+    length = max(int(share / count), 2 * step)
+    firsts = [int(k * (nodes - length) / max(count - 1, 1)) for k in range(count)]
     return [slice(first, first + length, step) for first in firsts]
 
 
