@@ -1,5 +1,6 @@
 """Runs in, diagnosis out: what `rig diagnose` does but for its page."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -29,11 +30,20 @@ def diagnose_runs(
         progress: Told what is being done, and the share that is done.
 
     Raises:
-        InputError: A run cannot be read, or `out` cannot be written or holds a run.
+        InputError: A run cannot be read or is given twice, or `out` cannot be written or holds a
+            run.
         RecordingError: A run holds nothing that can be diagnosed.
     """
     if (out / RUN_FILE).exists():
         raise InputError(f"{out}: holds a run, expected another folder for what was found")
+    # Before a search that takes minutes, not after it.
+    standing = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
+    if not standing.is_dir() or not os.access(standing, os.W_OK):
+        raise InputError(f"{out}: cannot be written: {standing}: expected a folder to write into")
+    given = [path.resolve() for path in (*runs, *held_out)]
+    for path in (*runs, *held_out):
+        if given.count(path.resolve()) > 1:
+            raise InputError(f"{path}: given twice, expected each run once: held-out ones are new")
     names = [strut.name for strut in model.struts]
     result = diagnose(
         model,

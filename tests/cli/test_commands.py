@@ -212,6 +212,30 @@ def test_a_diagnosis_that_cannot_begin_is_one_line_and_exit_code_2(
     assert expected in one_line(capsys)
 
 
+def test_a_diagnosis_into_a_file_is_refused_before_it_begins(
+    seed_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "file").touch()
+    arguments = (seed_folder / "run", "--model", "seed", "--out", tmp_path / "file" / "found")
+    assert rig(monkeypatch, "diagnose", *arguments) == 2
+    assert "expected a folder to write into" in one_line(capsys)
+
+
+def test_a_run_that_is_held_out_too_is_refused(
+    seed_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run, again = seed_folder / "run", seed_folder / "run" / ".." / "run"
+    arguments = (run, "--model", "seed", "--held-out", again, "--out", tmp_path / "found")
+    assert rig(monkeypatch, "diagnose", *arguments) == 2
+    assert "given twice" in one_line(capsys)
+
+
 def test_every_command_has_help_with_an_example(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
