@@ -40,9 +40,9 @@ def diagnose_runs(
     standing = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     if not standing.is_dir() or not os.access(standing, os.W_OK):
         raise InputError(f"{out}: cannot be written: {standing}: expected a folder to write into")
-    given = [path.resolve() for path in (*runs, *held_out)]
-    for path in (*runs, *held_out):
-        if given.count(path.resolve()) > 1:
+    given = (*runs, *held_out)
+    for i, path in enumerate(given):
+        if path.resolve() in {other.resolve() for other in given[:i]}:
             raise InputError(f"{path}: given twice, expected each run once: held-out ones are new")
     names = [strut.name for strut in model.struts]
     result = diagnose(

@@ -99,9 +99,10 @@ def _erring_least(
     figures: Callable[[Fit], tuple[Evaluated, ...]],
 ) -> tuple[Found, tuple[Evaluated, ...]]:
     """What errs least on held-out data where no law explains: the laws, a table, or neither."""
-    for offered in (surface(problem, found.linear.fit), found.plain.fit, found.given):
-        there = None if offered is None else figures(offered)
-        if offered is not None and there is not None and _error(there) < _error(results):
+    table = surface(problem, found.linear.fit)
+    for offered in (*([] if table is None else [table]), found.plain.fit, found.given):
+        there = figures(offered)
+        if _error(there) < _error(results):
             results = there
             found = found._replace(chosen=found.chosen._replace(fit=offered), rivals=())
     return found, results
@@ -119,11 +120,11 @@ def _searched(
     given, linear = first_fits(problem)
     problem = _sharpened(problem, linear)
     part = part_of(problem, _SEARCHED_NODES)
-    share = within(progress, 0.05, 0.95 if part is problem else 0.7)
+    share = within(progress, 0.05, 0.85 if part is problem else 0.6)
     fits = (given, linear) if part is problem else first_fits(part)
     first, last, seen = _explored(part, *fits, criteria, share)
     if part is not problem:
-        last = _on_all(problem, given, linear, last, within(progress, 0.7, 0.95))
+        last = _on_all(problem, given, linear, last, within(progress, 0.6, 0.85))
     found = conclude(last, first, seen, progress)
     if isinstance(last.problem, FreeRun):
         found = found._replace(chosen=_polished(last.problem, found.chosen))

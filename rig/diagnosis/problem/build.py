@@ -166,13 +166,15 @@ def part_of(problem: Problem, most: int) -> Problem:
     """
     flags = [problem.fitted(k) for k in range(problem.recordings)]
     nodes = sum(map(len, flags))
+    if nodes < 2 * most:
+        return problem
     pieces = [
         (k, piece)
         for k, fitted in enumerate(flags)
         for piece in track.pieces(len(fitted), nodes, most, 1)
         if float(np.mean(fitted[piece])) > _MOSTLY
     ]
-    if nodes < 2 * most or not pieces:
+    if not pieces:
         return problem
     share = sum(piece.stop - piece.start for _, piece in pieces) / nodes
     return replace(problem.cut(pieces), block_s=max(share * problem.block_s, _LEAST_BLOCK_S))

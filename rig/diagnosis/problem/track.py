@@ -45,7 +45,7 @@ def most_thinned(motions: Sequence[Motion]) -> int:
 
 
 def pieces(nodes: int, samples: int, most: int, most_thinned: int) -> list[slice]:
-    """Parts of a recording that the regression looks at.
+    """Parts of a recording that are looked at.
 
     Args:
         nodes: Nodes of the recording.

@@ -121,8 +121,8 @@ def changes(
     like = list(_likenesses(base))
     for _, name in [*laws, *(at for at, _ in (*added, *like))]:
         law(name)  # Compiled here: numba's compiler is no place for two threads.
+    olds = {at: _old(base, at) for at in laws}
     with ThreadPoolExecutor(cpu_count()) as pool:
-        olds = dict(zip(laws, pool.map(lambda at: _old(base, at), laws), strict=True))
         tried = [
             *pool.map(lambda job: _with_addition(base, *job), added),
             *pool.map(lambda job: _with_likeness(base, job[0], olds[job[1]]), like),
@@ -174,7 +174,6 @@ def _with_addition(base: _Base, at: Placed, start: Array) -> Change | None:
     size = _best_size(base, column)
     if not item.scaled:
         size = float(np.clip(size, 0.0, 1.0))
-        return _change(base, candidate, at, start, size * column)
     values = sized(at[1], start, size)
     return None if values is None else _change(base, candidate, at, values, size * column)
 
