@@ -232,6 +232,11 @@ TOTALS: dict[str, Total] = {
     ),
     "preload_n": Total("preload", _planted("constant"), _ANY_SPRING),
     "input_gain": Total("input_gain", _planted("load_scale"), _ANY_FORCE - {"input_gain"}),
+    "free_length_m": Total(
+        "preload",
+        lambda case: case.bench.free_length_m - case.nominal.free_length_m,
+        _ANY_SPRING | {"preload", "stop"},
+    ),
 }
 """Parameter of a linear correction -> how to hold it against the truth."""
 
