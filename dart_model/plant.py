@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import Effect, effect
 from dart_model.spec import WORLD, BodySpec, FileSkeleton, InlineSkeleton, ModelSpec, StrutSpec
-from dart_model.yaml_file import InputError
+from rig.inputs.errors import InputError
 
 # dartpy ships no types: it is untyped here, and nowhere else.
 _dart = cast("Any", dartpy)

@@ -20,10 +20,11 @@ from can_dbc.codec import decode_log
 from can_dbc.database import load_database
 from can_dbc.units import Dimension
 from rig.bench.config import load_bench_config
-from rig.config import CONFIGS, load_setup
 from rig.io.frame_columns import received_frames
 from rig.io.run_log import DBC_FILE, FRAMES_FILE, RUN_FILE, STEPS_FILE, parts
-from rig.runs import with_bench
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.setup import load_setup
 
 PART_S = 600
 S = 1_000_000_000

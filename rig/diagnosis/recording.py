@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from can_dbc.codec import decode_log
 from can_dbc.database import Message
 from can_dbc.protection import check_crc_log
-from dart_model.yaml_file import InputError
-from rig.config import Setup, SignalName
 from rig.core.messages import Quantity
+from rig.inputs.errors import InputError
 from rig.io.run_log import RunFolder
-from rig.replay import setup_of_run
+from rig.operation.config import SignalName
+from rig.operation.replay import setup_of_run
+from rig.operation.setup import Setup
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -47,7 +48,7 @@ _FULL_SPEED = 0.3
 to rest slows down before."""
 
 
-class RecordingError(ValueError):
+class RecordingError(InputError):
     """A recording that cannot be diagnosed; one line: file, column, what was found and expected."""
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.yaml_file import InputError
+from rig.inputs.errors import InputError
 from rig.io.run_log import LATEST_S, parse_frame
 
 _BLOCK_BYTES = 2 * 1024 * 1024

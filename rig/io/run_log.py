@@ -17,7 +17,8 @@ from typing import Any, cast
 import pyarrow as pa
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError, parse_mapping, read_text
+from rig.inputs.errors import InputError
+from rig.inputs.yaml_file import parse_mapping, read_text
 from rig.io.steps import step_schema
 
 _TAIL_BYTES = 4096

@@ -19,7 +19,7 @@ import pyarrow as pa
 import yaml
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError
+from rig.inputs.errors import InputError
 from rig.io.captures import Capture, Captures, Entry, Window
 from rig.io.realtime import follow
 from rig.io.run_log import (

@@ -20,14 +20,16 @@ import pytest
 from can_dbc.frame import Frame
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model
-from rig.config import CONFIGS, build_bridge, load_setup
 from rig.core.bridge import Bridge, BridgeState
 from rig.core.observer import update
 from rig.core.step import RigCore
 from rig.core.supervisor import Supervision
 from rig.core.types import ObserverState, RigState, StepInput
 from rig.io.bus import Bus, BusConfig
-from rig.replay import replay
+from rig.operation.assembly import build_bridge
+from rig.operation.config import CONFIGS
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup
 from tests.core.cores import GAINS, core, measured
 from tests.loop.listed import MS, ListPort, bench_frames, live
 

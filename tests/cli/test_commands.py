@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from rig.cli import main
-from rig.config import CONFIGS
+from rig.cli.main import main
+from rig.operation.config import CONFIGS
 
 EXAMPLE = CONFIGS / "seed.yaml"
 

@@ -6,10 +6,10 @@ import pytest
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, EffectSpec, load_model, parse_model
-from dart_model.yaml_file import InputError
 from rig.core.dyno import DynoCore, DynoState, Tracked, followed, predicted
 from rig.core.supervisor import Supervision
 from rig.core.types import Measurement, Mode, RigState, StepInput
+from rig.inputs.errors import InputError
 
 MODEL = """
 name: dyno

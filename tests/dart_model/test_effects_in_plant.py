@@ -7,7 +7,7 @@ import pytest
 from dart_model.effects import CATALOGUE, Effect
 from dart_model.plant import DEFAULT_STEP_S, DartPlant, PlantState
 from dart_model.spec import MODELS, EffectSpec, ModelSpec, load_model, parse_model
-from dart_model.yaml_file import InputError
+from rig.inputs.errors import InputError
 
 AMBIENT_C = 20.0
 SEED = load_model(MODELS / "seed.yaml")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from dart_model.plant import DartPlant, PlantState
 from dart_model.spec import MODELS, ModelSpec, load_model, parse_model
-from dart_model.yaml_file import InputError
+from rig.inputs.errors import InputError
 
 GRAVITY = 9.81
 AMBIENT_C = 20.0

@@ -7,7 +7,7 @@ import pytest
 
 from dart_model.plant import DartPlant
 from dart_model.spec import ModelSpec, load_model
-from dart_model.yaml_file import InputError
+from rig.inputs.errors import InputError
 
 INERTIA = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
 

@@ -24,7 +24,8 @@ from dart_model.spec import (
     load_model,
     parse_model,
 )
-from dart_model.yaml_file import InputError, parse_mapping, read_text
+from rig.inputs.errors import InputError
+from rig.inputs.yaml_file import parse_mapping, read_text
 
 TEXT = """
 name: seed

@@ -10,13 +10,14 @@ import pytest
 from msgspec.structs import astuple
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError
 from rig.bench.config import load_bench_config
-from rig.config import CONFIGS, load_setup
-from rig.export import FORMATS, export_run, import_run
+from rig.exchange.exported import FORMATS, export_run, import_run
+from rig.inputs.errors import InputError
 from rig.io.run_log import parse_frame, read_run
-from rig.replay import replay
-from rig.runs import with_bench
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,6 @@ from msgspec.structs import replace
 
 from can_dbc.frame import Frame
 from rig.bench.config import load_bench_config
-from rig.config import CONFIGS, load_setup
 from rig.core.messages import Conditions
 from rig.core.types import Mode
 from rig.io.bus import BusError
@@ -22,8 +21,10 @@ from rig.io.link import Link
 from rig.io.run_log import read_run
 from rig.io.steps import LOG_FAULT
 from rig.io.whole_file import WholeFile
-from rig.replay import replay
-from rig.runs import with_bench
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup
 from tests.faults.trial import BEGIN_NS, MS, Trial, first_ms, force_error_n
 from tests.io.at_once import AtOnce
 

@@ -6,11 +6,12 @@ from msgspec.structs import replace
 from can_dbc.codec import compile_decoder
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
-from dart_model.yaml_file import InputError, load_validated
-from rig.config import CONFIGS, LimitConfig, RunConfig
 from rig.core.messages import Conditions
 from rig.core.supervisor import TRANSITIONS, Action, Event, Limit, Watched, judged
 from rig.core.types import Measurement, Mode
+from rig.inputs.errors import InputError
+from rig.inputs.yaml_file import load_validated
+from rig.operation.config import CONFIGS, LimitConfig, RunConfig
 from tests.faults.trial import BEGIN_NS, MS, Trial, after, measurements_only
 
 STATUS = 0x300

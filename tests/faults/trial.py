@@ -8,10 +8,12 @@ import numpy as np
 from can_dbc.frame import Frame
 from rig.bench.config import load_bench_config
 from rig.bench.simulated import Bench
-from rig.config import CONFIGS, build_bridge, load_setup
 from rig.core.bridge import Bridge, BridgeState, TickResult
 from rig.core.messages import Conditions, Counts
 from rig.core.types import Mode
+from rig.operation.assembly import build_bridge
+from rig.operation.config import CONFIGS
+from rig.operation.setup import load_setup
 
 MS = 1_000_000
 BEGIN_NS = 300 * MS

@@ -9,13 +9,15 @@ import pytest
 from dart_model.spec import load_model
 from rig.bench.config import load_bench_config
 from rig.bench.trajectory import simulate
-from rig.check import check
-from rig.config import CONFIGS, InputError, load_setup
-from rig.demo import run_case
+from rig.demo.cases import run_case
 from rig.diagnosis.command import diagnose_runs
 from rig.diagnosis.recording import read_recording
-from rig.replay import replay
-from rig.runs import with_bench
+from rig.inputs.errors import InputError
+from rig.operation.check import check
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup
 
 DURATION_S = 3.0
 

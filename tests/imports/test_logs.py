@@ -10,14 +10,17 @@ import pytest
 from msgspec.structs import replace
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError
 from rig.bench.config import load_bench_config
 from rig.bench.simulated import Bench
-from rig.config import CONFIGS, Setup, load_setup
-from rig.imports import import_log, import_table, load_mapping
+from rig.exchange.bus_log import import_log
+from rig.exchange.foreign_table import import_table
+from rig.exchange.mapping import load_mapping
+from rig.inputs.errors import InputError
 from rig.io.log_files import read_log
 from rig.io.run_log import read_run
-from rig.replay import replay
+from rig.operation.config import CONFIGS
+from rig.operation.replay import replay
+from rig.operation.setup import Setup, load_setup
 
 EPOCH_S = 1_700_000_000.0
 

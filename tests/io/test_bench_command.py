@@ -5,8 +5,8 @@ import json
 import yaml
 from typer.testing import CliRunner
 
-from rig.cli import app
-from rig.config import CONFIGS
+from rig.cli.main import app
+from rig.operation.config import CONFIGS
 
 
 def test_it_takes_bus_and_key_from_the_bridge_and_writes_a_summary(tmp_path):

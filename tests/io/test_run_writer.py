@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError
+from rig.inputs.errors import InputError
 from rig.io.captures import Window
 from rig.io.frame_columns import received_frames
 from rig.io.run_log import RUN_FILE, read_run

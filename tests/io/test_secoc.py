@@ -9,15 +9,17 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError
 from rig.bench.config import load_bench_config
-from rig.check import Severity, check
-from rig.config import CONFIGS, load_setup
+from rig.inputs.errors import InputError
 from rig.io.link import Link
 from rig.io.run_log import STEPS_FILE
 from rig.io.secoc import Authentication, Authenticator, cmac, read_key
-from rig.replay import replay
-from rig.runs import BusPort, with_bench
+from rig.operation.check import Severity, check
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.ports import BusPort
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup
 from tests.io.at_once import AtOnce
 
 MS = 1_000_000

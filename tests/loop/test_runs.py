@@ -12,14 +12,15 @@ import pytest
 import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
-from dart_model.yaml_file import InputError
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig
 from rig.bench.trajectory import simulate
-from rig.config import CONFIGS, Setup, load_setup
+from rig.inputs.errors import InputError
 from rig.io.run_log import FRAMES_FILE, STEPS_FILE, read_run
-from rig.replay import replay
-from rig.runs import with_bench
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.replay import replay
+from rig.operation.setup import Setup, load_setup
 
 MS = 1_000_000
 _CHANNELS = count()

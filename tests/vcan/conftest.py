@@ -16,10 +16,12 @@ import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
 from rig.bench.config import load_bench_config
-from rig.config import CONFIGS, Setup, load_setup
 from rig.io.bus import BusConfig
-from rig.loop import Progress
-from rig.runs import Ended, live, run_bench
+from rig.operation.config import CONFIGS
+from rig.operation.live import live, run_bench
+from rig.operation.logged_run import Ended
+from rig.operation.loop import Progress
+from rig.operation.setup import Setup, load_setup
 
 TOOLS = ("ip", "candump", "canplayer", "cangen", "cangw", "cansend")
 

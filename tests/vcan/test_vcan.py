@@ -16,11 +16,12 @@ from can_dbc.frame import Frame
 from can_dbc.protection import check_crc
 from rig.bench.config import load_bench_config
 from rig.bench.simulated import Bench
-from rig.config import build_bridge, load_setup
 from rig.core.types import Mode
 from rig.io.bus import Bus, BusConfig
 from rig.io.run_log import RunFolder, parse_frame, read_run
-from rig.replay import replay
+from rig.operation.assembly import build_bridge
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup
 from tests.vcan.conftest import BENCH_IDS, RATE_HZ, Files, in_process, run_for, running
 
 pytestmark = pytest.mark.vcan

@@ -2,12 +2,9 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-import numpy as np
 from msgspec.structs import astuple
-from numpy.typing import NDArray
 
 from can_dbc.frame import Frame
 from rig.core.bridge import Bridge, BridgeState, TickResult
@@ -15,6 +12,7 @@ from rig.core.messages import Conditions
 from rig.core.types import Mode
 from rig.io.clock import Clock
 from rig.io.steps import Step
+from rig.operation.timing import BINS, Timing
 
 
 class Tick(NamedTuple):
@@ -47,59 +45,6 @@ Sink = Callable[[Sequence[Frame], Sequence[Frame], TickResult, Step], None]
 Progress = Callable[[int, Mode], None]
 """Told the time and mode of a tick."""
 
-_BINS = 20_000
-"""Histograms have bins of 1 µs; the last one takes all that is longer than 20 ms."""
-
-
-@dataclass(frozen=True)
-class Timing:
-    """How well the rate was kept; histograms have bins of 1 µs.
-
-    Attributes:
-        lateness: Ticks by lateness of the wake-up.
-        work: Ticks by time from wake-up to the end of the tick's work.
-        extremes_ns: Largest lateness, work and gap between two ticks, in ns.
-    """
-
-    lateness: NDArray[np.int64]
-    work: NDArray[np.int64]
-    extremes_ns: NDArray[np.int64]
-
-    @staticmethod
-    def empty() -> "Timing":
-        """Before the first tick; written in place from then on."""
-        bins = np.zeros((2, _BINS), dtype=np.int64)
-        return Timing(bins[0], bins[1], np.zeros(3, dtype=np.int64))
-
-    def lateness_us(self) -> dict[str, float]:
-        """Percentiles and maximum of the lateness, in µs."""
-        return _percentiles(self.lateness, int(self.extremes_ns[0]))
-
-    def work_us(self) -> dict[str, float]:
-        """Percentiles and maximum of the work, in µs."""
-        return _percentiles(self.work, int(self.extremes_ns[1]))
-
-    def summary(self) -> dict[str, object]:
-        """All figures, for `run.yaml`."""
-        return {
-            "lateness_us": self.lateness_us(),
-            "work_us": self.work_us(),
-            "longest_gap_us": int(self.extremes_ns[2]) / 1000,
-        }
-
-
-def _percentiles(histogram: NDArray[np.int64], largest_ns: int) -> dict[str, float]:
-    # A live run asks for this between two ticks.
-    cumulated = np.cumsum(histogram[: largest_ns // 1000 + 1])
-    total = int(cumulated[-1])
-    if total == 0:
-        return {}
-    levels = {"p50": 0.5, "p99": 0.99, "p99_9": 0.999}
-    result = {
-        name: float(np.searchsorted(cumulated, level * total) + 1) for name, level in levels.items()
-    }
-    return {**result, "max": largest_ns / 1000}
-
 
 def regular_ticks(
     clock: Clock, period_ns: int, count: int | None, stop: Callable[[], bool], timing: Timing
@@ -118,7 +63,7 @@ def regular_ticks(
     # A number is written through a view of the memory in half the time it takes in the array.
     lateness, work = timing.lateness.data, timing.work.data
     extremes = timing.extremes_ns.data
-    last = _BINS - 1
+    last = BINS - 1
     woke_ns = clock.now_ns()
     index, overruns = -(-woke_ns // period_ns), 0
     end = None if count is None else index + count

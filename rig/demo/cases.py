@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig
 from rig.bench.trajectory import simulate
-from rig.config import CONFIGS, ObserverConfig, Setup, load_setup
 from rig.core.types import Mode
 from rig.io.run_log import read_run
-from rig.replay import replay
-from rig.runs import Ended, with_bench
+from rig.operation.config import CONFIGS, ObserverConfig
+from rig.operation.live import with_bench
+from rig.operation.logged_run import Ended
+from rig.operation.replay import replay
+from rig.operation.setup import Setup, load_setup
 
 SETTLED_NS = 500_000_000
 """Figures are taken after this time."""

@@ -7,14 +7,14 @@ from enum import Enum
 from can_dbc.bus_load import frame_time_s
 from can_dbc.database import Message
 from dart_model.plant import DartPlant
-from rig.config import Setup, build_bridge, load_authentication
 from rig.core.stability import Pole, closed_loop_poles
+from rig.operation.assembly import build_bridge
+from rig.operation.setup import Setup, load_authentication
 
 LITTLE_DAMPING = 0.02
 """Damping ratio below which a pole is warned of: it rings for some 8 periods to a third."""
 
 _OTHERS_MAY_READ = stat.S_IRGRP | stat.S_IROTH
-
 FULL_LOAD, HIGH_LOAD = 1.0, 0.7
 
 

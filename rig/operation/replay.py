@@ -21,11 +21,11 @@ from can_dbc.frame import Frame
 from can_dbc.protection import SequenceState
 from can_dbc.protection_log import in_sequence
 from dart_model.spec import load_model
-from dart_model.yaml_file import InputError, validated
-from rig.config import RunConfig, Setup, build_bridge, put_together
 from rig.core.bridge import Bridge, BridgeState
 from rig.core.messages import Conditions, Incoming, Quantity
 from rig.core.types import Measurement, Mode, RigState, StepInput, StepOutput
+from rig.inputs.errors import InputError
+from rig.inputs.yaml_file import validated
 from rig.io.frame_columns import FrameColumns, received_frames
 from rig.io.run_log import (
     DBC_FILE,
@@ -36,7 +36,10 @@ from rig.io.run_log import (
     read_run,
 )
 from rig.io.steps import step_schema
-from rig.loop import Progress
+from rig.operation.assembly import build_bridge
+from rig.operation.config import RunConfig
+from rig.operation.loop import Progress
+from rig.operation.setup import Setup, put_together
 
 _CHUNK = 2048
 """Ticks whose objects are in memory at once."""
@@ -48,7 +51,6 @@ _NOTHING = (nan,) * 7
 """Of a strut before the first measurements."""
 
 _HOLD = Mode.HOLD
-
 _pa = cast("Any", pa)
 
 

@@ -1,5 +1,6 @@
 """YAML from outside, read as data: bounded, without aliases or repeated keys, then validated."""
 
+import re
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
@@ -8,12 +9,10 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
+from rig.inputs.errors import InputError
+
 _MAX_BYTES = 4 * 1024 * 1024
 _Model = TypeVar("_Model", bound=BaseModel)
-
-
-class InputError(ValueError):
-    """An input from outside is wrong; the message is one line that names it."""
 
 
 def _no_truth_value(value: object) -> object:
@@ -52,6 +51,17 @@ class _PlainLoader(yaml.SafeLoader):
             if isinstance(key, Hashable):
                 seen.add(key)
         return super().construct_mapping(node, deep)
+
+
+# YAML 1.1 reads 1e5, without a point, as text.
+cast("Any", _PlainLoader).add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?[0-9]+([.][0-9]*)?[eE][-+]?[0-9]+$"),
+    "-+0123456789",
+)
+
+_NO_YAML = (yaml.YAMLError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError)
+"""What PyYAML raises for a text that is none, or for a tag whose value does not fit it."""
 
 
 def read_text(path: Path, max_bytes: int = _MAX_BYTES) -> str:
@@ -93,8 +103,8 @@ def parse_mapping(text: str, source: str) -> dict[str, object]:
         mark = error.problem_mark
         where = f" line {mark.line + 1}" if mark else ""
         raise InputError(f"{source}:{where} is no valid YAML: {error.problem}") from error
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        reason = " ".join(str(error).split())
+    except (*_NO_YAML, RecursionError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{source}: is no valid YAML: {reason}") from error
     if not isinstance(data, dict):
         found = "nothing" if data is None else type(data).__name__
@@ -106,25 +116,31 @@ def parse_mapping(text: str, source: str) -> dict[str, object]:
     return cast("dict[str, object]", mapping)
 
 
-def validated(model: type[_Model], data: object, source: str) -> _Model:
+def validated(model: type[_Model], data: object, source: str, context: object = None) -> _Model:
     """`data` as a frozen `model`.
+
+    Args:
+        model: What the data are to be.
+        data: Keys and values.
+        source: What to call them in an error, usually the path of their file.
+        context: What the model's own checks are given.
 
     Raises:
         InputError: With the first error's key, value and expectation, and how many more there are.
     """
     try:
-        return model.model_validate(data)
+        return model.model_validate(data, context=context)
     except ValidationError as error:
         raise InputError(_one_line(error, model, source)) from error
 
 
-def load_validated(model: type[_Model], path: Path) -> _Model:
-    """The file at `path` as a frozen `model`.
+def load_validated(model: type[_Model], path: Path, context: object = None) -> _Model:
+    """The file at `path` as a frozen `model`; `context` as of `validated`.
 
     Raises:
         InputError: One line that names file, key, value and what was expected.
     """
-    return validated(model, parse_mapping(read_text(path), str(path)), str(path))
+    return validated(model, parse_mapping(read_text(path), str(path)), str(path), context)
 
 
 def _one_line(error: ValidationError, model: type[BaseModel], source: str) -> str:
@@ -139,7 +155,8 @@ def _one_line(error: ValidationError, model: type[BaseModel], source: str) -> st
     more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
     cause = cast("dict[str, object]", first.get("ctx", {})).get("error")
     if cause is not None:
-        return f"{source}: {key}: {cause}{more}"
+        where = f"{source}: {key}" if parts else source
+        return f"{where}: {cause}{more}"
     kind = first["type"]
     if kind == "missing":
         return f"{source}: {key}: is missing, expected a value{more}"
@@ -164,11 +181,21 @@ def _keys(schema: _Schema, path: Sequence[int | str]) -> list[str]:
             below += node.get("prefixItems", [])
             values = node.get("additionalProperties")
             below.append(None if isinstance(values, bool) else values)
-        nodes = [node for node in below if node]
+        # A part that is no key is the tag of one of several choices.
+        nodes = [node for node in below if node] or _tagged(schema, nodes, part)
     found: list[str] = []
     for node in _alternatives(schema, nodes):
         found += node.get("properties", {})
     return list(dict.fromkeys(found))
+
+
+def _tagged(schema: _Schema, nodes: Iterable[_Schema], tag: int | str) -> list[_Schema]:
+    """Choices among nodes that have a key whose only value is `tag`."""
+    return [
+        node
+        for node in _alternatives(schema, nodes)
+        if any(value.get("const") == tag for value in node.get("properties", {}).values())
+    ]
 
 
 def _alternatives(schema: _Schema, nodes: Iterable[_Schema]) -> Iterator[_Schema]:

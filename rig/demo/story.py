@@ -11,14 +11,16 @@ import numpy as np
 from dart_model.spec import load_model
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig, Effect
-from rig.config import CONFIGS, Setup, load_setup
 from rig.core.types import Mode
-from rig.demo import SETTLED_NS
+from rig.demo.cases import SETTLED_NS
 from rig.diagnosis.command import diagnose_runs
 from rig.diagnosis.outcome import CORRECTED_FILE, Diagnosis, to_json
 from rig.io.run_log import read_run
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.logged_run import Ended
+from rig.operation.setup import Setup, load_setup
 from rig.pages.report import write_report
-from rig.runs import Ended, with_bench
 
 _STRUT = "strut"
 _RANGES: Mapping[str, tuple[str, Mapping[str, tuple[float, float]]]] = {
