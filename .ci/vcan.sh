@@ -60,7 +60,7 @@ from can_dbc.database import DEFAULT_DATABASE, load_database
 from rig.bench.config import load_bench_config
 from rig.bench.simulated import Bench
 from rig.operation.config import CONFIGS
-Bench(load_bench_config(CONFIGS / "seed_bench.yaml"), load_database(DEFAULT_DATABASE)).update(10**8)
+Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), load_database(DEFAULT_DATABASE)).update(10**8)
 ')
 }
 

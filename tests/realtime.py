@@ -70,8 +70,8 @@ def busy_cores(share: float) -> Iterator[None]:
 def at_rate(
     rate_hz: float, seconds: float, *, fifo: bool, folder: Path
 ) -> tuple[Setup, BenchConfig]:
-    """The seed case with one frame in and one out a tick."""
-    ready = load_setup(CONFIGS / "seed.yaml", duration_s=seconds)
+    """The reference case with one frame in and one out a tick."""
+    ready = load_setup(CONFIGS / "reference.yaml", duration_s=seconds)
     folder.mkdir(parents=True)
     dbc = folder / "every_tick.dbc"
     # Without a cycle time a message is sent at every tick.
@@ -85,7 +85,7 @@ def at_rate(
             "realtime": realtime,
         }
     )
-    bench = load_bench_config(CONFIGS / "seed_bench.yaml")
+    bench = load_bench_config(CONFIGS / "reference_bench.yaml")
     measurement, auxiliary = bench.transmissions
     period_ns = config.period_ns
     every = (

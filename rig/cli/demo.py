@@ -13,14 +13,17 @@ from rig.inputs.errors import InputError
 STORY = "story"
 
 EXAMPLES = (
-    "Examples: `rig demo` · `rig demo --seed 7` · `rig demo --case seed --lockstep --out /tmp/seed`"
+    "Examples: `rig demo` · `rig demo --seed 7` · "
+    "`rig demo --case reference --lockstep --out /tmp/reference`"
 )
 
 
 def demo(
     case: Annotated[
         str,
-        typer.Option(help=f"{STORY}: the whole story; or a plain case: seed, quarter_car, dyno."),
+        typer.Option(
+            help=f"{STORY}: the whole story; or a plain case: reference, quarter_car, dyno."
+        ),
     ] = STORY,
     seed: Annotated[
         int, typer.Option(min=0, help="Draws the effect that the story's bench carries.")

@@ -91,7 +91,7 @@ def _share(force_n: float, peak_n: float) -> str:
 
 def print_ended(ended: "Ended", *, with_timing: bool) -> None:
     """Print how a run ended."""
-    table = Table("Run", f"{ended.ticks} ticks, ended {ended.state.rig.mode.name}")
+    table = Table("Run", f"{ended.ticks} ticks, ended {ended.state.core.mode.name}")
     for name, value in ended.state.counts._asdict().items():
         if value or name in ("lost", "refused", "overruns"):
             what = "ticks" if name in ("stale", "overruns") else "frames"

@@ -41,7 +41,7 @@ def run(
     listen_only: Annotated[bool, typer.Option("--listen-only", help="Send nothing.")] = False,
 ) -> None:
     """Run the bridge on a bus; Ctrl-C ends it in order."""
-    from rig.core.types import Mode
+    from rig.core.contract import Mode
     from rig.operation.live import live
     from rig.operation.setup import load_setup
 
@@ -52,6 +52,6 @@ def run(
     print_ended(ended, with_timing=True)
     (folder / "summary.json").write_text(json.dumps(ended.summary(), indent=2) + "\n", "utf-8")
     console.print(f"Run: {folder}")
-    if ended.state.rig.mode is Mode.SAFE:
+    if ended.state.core.mode is Mode.SAFE:
         console.print("The run ended in its safe state.", style="red")
         raise typer.Exit(FAILED)

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
-    from rig.core.types import Mode
+    from rig.core.contract import Mode
 
 
 _REFRESH_NS = 200_000_000

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig
 from rig.bench.trajectory import simulate
-from rig.core.types import Mode
+from rig.core.contract import Mode
+from rig.core.observers.pi import PiObserver
 from rig.io.run_log import read_run
-from rig.operation.config import CONFIGS, ObserverConfig
+from rig.operation.config import CONFIGS
 from rig.operation.live import with_bench
 from rig.operation.logged_run import Ended
 from rig.operation.replay import replay
@@ -25,7 +26,7 @@ from rig.operation.setup import Setup, load_setup
 SETTLED_NS = 500_000_000
 """Figures are taken after this time."""
 
-CASES = ("seed", "quarter_car", "dyno")
+CASES = ("reference", "quarter_car", "dyno")
 """Names of the cases; each has a bridge and a bench among the package's configurations."""
 
 
@@ -170,15 +171,13 @@ def _compared(ended: Ended, ready: Setup, bench: BenchConfig) -> Case:
 def _alone(ended: Ended, ready: Setup, observed: Any) -> dict[str, NDArray[np.float64]]:
     """Height and force of every strut of the model without virtual force."""
     names = list(ready.config.observers)
-    if ready.config.imposed_motion is not None:
+    if ready.config.prescribed_motion is not None:
         # The motion is what it is; the model's own force is what the virtual force comes on top of.
         virtual_n = {n: observed.column(f"{n}.virtual_force_n").to_numpy() for n in names}
         return {
             n: _height_and_force(observed, n) - np.outer(virtual_n[n], [0.0, 1.0]) for n in names
         }
-    without = {
-        name: ObserverConfig(proportional_n_per_m=0.0, integral_n_per_m_s=0.0) for name in names
-    }
+    without = {name: PiObserver(proportional_n_per_m=0.0, integral_n_per_m_s=0.0) for name in names}
     config = ready.config.model_copy(update={"observers": without})
     steps = replay(ended.folder, ready=ready.model_copy(update={"config": config})).steps
     return {name: _height_and_force(steps, name) for name in names}

@@ -11,7 +11,7 @@ import numpy as np
 from dart_model.spec import load_model
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig, Effect
-from rig.core.types import Mode
+from rig.core.contract import Mode
 from rig.demo.cases import SETTLED_NS
 from rig.diagnosis.command import diagnose_runs
 from rig.diagnosis.outcome import CORRECTED_FILE, Diagnosis, to_json

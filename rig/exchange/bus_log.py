@@ -89,7 +89,7 @@ def import_log(
     bridge = build_bridge(ready)
     # Half a tick after a tick, so that the jitter of a bench as fast as the bridge gives each tick
     # one frame, and not two to one and none to the next.
-    port = _LogPort(source, bridge.heard, ready.config.period_ns // 2)
+    port = _LogPort(source, bridge.subscribed, ready.config.period_ns // 2)
     wanted = tuple(item.message.name for item in bridge.incoming)
     if port.ended:
         raise InputError(

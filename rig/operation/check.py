@@ -6,9 +6,8 @@ from enum import Enum
 
 from can_dbc.bus_load import frame_time_s
 from can_dbc.database import Message
-from dart_model.plant import DartPlant
 from rig.core.stability import Pole, closed_loop_poles
-from rig.operation.assembly import build_bridge
+from rig.operation.assembly import build_bridge, build_plant
 from rig.operation.setup import Setup, load_authentication
 
 LITTLE_DAMPING = 0.02
@@ -73,8 +72,8 @@ def check(ready: Setup) -> list[Finding]:
         _load(ready),
         *_authenticated(ready),
     ]
-    if config.imposed_motion is not None:
-        text = "the motion is imposed: no loop is closed that could become unstable"
+    if config.prescribed_motion is not None:
+        text = "the motion is prescribed: no loop is closed that could become unstable"
         return [*findings, Finding(Severity.OK, "poles", text)]
     return findings + _stability(ready, heights)
 
@@ -160,14 +159,14 @@ def _load(ready: Setup) -> Finding:
 
 def _stability(ready: Setup, heights: list[Message]) -> list[Finding]:
     config = ready.config
-    plant = DartPlant(ready.model)
-    gains = tuple(observer.gains() for observer in config.observers.values())
+    plant = build_plant(ready)
+    observers = tuple(config.observers.values())
     rest = tuple(strut.free_length_m for strut in ready.model.struts)
     slowest_ns = max(message.cycle_time_ns or 0 for message in heights)
     every = max(1, round(slowest_ns / config.period_ns))
-    poles = closed_loop_poles(plant, gains, rest, config.period_ns, every)
+    poles = closed_loop_poles(plant, observers, rest, config.period_ns, every)
     findings = [_worst(poles)]
-    late = closed_loop_poles(plant, gains, rest, config.period_ns, every, delay=1)
+    late = closed_loop_poles(plant, observers, rest, config.period_ns, every, delay=1)
     worst = max(pole.magnitude for pole in late)
     text = f"largest |z| {worst:.5f} with measurements one cycle late"
     if worst >= 1.0 and findings[0].severity is not Severity.ERROR:

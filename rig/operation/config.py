@@ -2,17 +2,23 @@
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, model_validator
+from pydantic_core import CoreSchema
+from pydantic_core.core_schema import tagged_union_schema
 
-from rig.core.observer import ObserverGains
+from rig.core.contract import Observer
+from rig.core.observers import DEFAULT_KIND, OBSERVERS
+from rig.core.quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, OTHERS, Quantity
 from rig.core.supervisor import Action, Limit, Supervision, Watched
-from rig.inputs.yaml_file import Finite, NotNegative, Positive
+from rig.inputs.yaml_file import Finite, Positive
 from rig.io.bus import BusConfig
 from rig.io.captures import Window
 from rig.io.run_writer import Rotation
 from rig.io.secoc import Authentication
+
+_KEYS = (HEIGHT.key, *(quantity.key for quantity in OTHERS))
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 """Folder of the configurations that come with the package."""
@@ -37,40 +43,64 @@ class SignalName(_Frozen):
 
 
 class Signals(_Frozen):
-    """What is read from the bus.
+    """What is read from the bus: heights, and any other quantity of `OTHERS` under its key.
 
     Attributes:
         height: Measured height of each strut, by strut name.
-        applied_force: Applied force, if the bench sends it.
-        load_cell_force: Force of a load cell, logged with the run.
-        temperature: Damper temperature.
     """
 
+    model_config = ConfigDict(frozen=True, extra="allow")
+    __pydantic_extra__: dict[str, SignalName | None] = Field(  # pyright: ignore[reportIncompatibleVariableOverride] - pydantic's own way
+        init=False
+    )
+
     height: Annotated[dict[str, SignalName], Field(min_length=1)]
-    applied_force: SignalName | None = None
-    load_cell_force: SignalName | None = None
-    temperature: SignalName | None = None
+
+    @model_validator(mode="after")
+    def _known(self) -> "Signals":
+        known = [quantity.key for quantity in OTHERS]
+        for key in self.__pydantic_extra__:
+            if key not in known:
+                raise ValueError(f"{key}: unknown key, expected one of {', '.join(_KEYS)}")
+        return self
+
+    @property
+    def others(self) -> dict[Quantity, SignalName]:
+        """Signals of the quantities beside heights, in the order of `OTHERS`."""
+        given = self.__pydantic_extra__
+        found = ((quantity, given.get(quantity.key)) for quantity in OTHERS)
+        return {quantity: signal for quantity, signal in found if signal is not None}
+
+    @property
+    def measured(self) -> tuple[Quantity, ...]:
+        """Quantities beside heights that the bench sends."""
+        return tuple(self.others)
 
     def named(self) -> list[SignalName]:
-        """All of them, heights first."""
-        others = (self.applied_force, self.load_cell_force, self.temperature)
-        return [*self.height.values(), *(entry for entry in others if entry is not None)]
+        """All signals, heights first."""
+        return [*self.height.values(), *self.others.values()]
 
 
-class ObserverConfig(_Frozen):
-    """Gains of one strut's observer; the defaults are the seed's."""
-
-    proportional_n_per_m: NotNegative = 1.0e5
-    integral_n_per_m_s: NotNegative = 1.0e4
-    force_limit_n: Positive = 1.0e4
-
-    def gains(self) -> ObserverGains:
-        """As the observer takes them."""
-        return ObserverGains(self.proportional_n_per_m, self.integral_n_per_m_s, self.force_limit_n)
+def _observer_kind(data: object) -> object:
+    """Which of `OBSERVERS` an entry is."""
+    if isinstance(data, dict):
+        return cast("dict[str, object]", data).get("kind", DEFAULT_KIND)
+    return getattr(data, "kind", None)
 
 
-class ImposedMotionConfig(_Frozen):
-    """A dyno: the motion is imposed, the model is driven along it, and the load cell measures.
+class _OneOfObservers:
+    """How pydantic reads one of `OBSERVERS`, by its `kind`."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(
+        cls, _source: object, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        choices = {kind: handler.generate_schema(made) for kind, made in OBSERVERS.items()}
+        return tagged_union_schema(choices, _observer_kind)
+
+
+class PrescribedMotion(_Frozen):
+    """A dyno: the motion is prescribed, the model follows it, and the load cell measures.
 
     Attributes:
         settling_s: Time constant with which older heights fade in the velocity that the model is
@@ -252,12 +282,14 @@ class RunConfig(_Frozen):
         rate_hz: Ticks a second.
         duration_s: Length of the run; until Ctrl-C if absent.
         model: Model file, beside the configuration, or the name of one that comes with the package.
+        engine: What simulates the model.
         dbc: DBC file beside the configuration; the package's own if absent.
         bus: How to open the bus.
         authentication: Authentication of all frames; none if absent.
         signals: What is read from it.
-        imposed_motion: Declares a dyno; there is then a load cell and no applied force.
-        observers: One for each strut of the model, by strut name; a dyno has no use for them.
+        prescribed_motion: Declares a dyno; there is then a load cell and no applied force.
+        observers: One for each strut of the model, by strut name; none for a dyno. `kind`
+            says which, `pi` if absent; its other keys are its own.
         publish: Messages for each strut, by strut name; by default RIG_ESTIMATE and RIG_KINEMATICS
             for the first strut, and the same with _2, _3, ... for the next ones.
         status: Message that carries the state; null sends none.
@@ -269,13 +301,14 @@ class RunConfig(_Frozen):
 
     rate_hz: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] = 1000.0
     duration_s: Positive | None = None
-    model: Text = "seed"
+    model: Text = "reference"
+    engine: Text = "dart"
     dbc: Text | None = None
     bus: BusSettings = BusSettings()
     authentication: AuthenticationConfig | None = None
     signals: Signals
-    imposed_motion: ImposedMotionConfig | None = None
-    observers: dict[str, ObserverConfig] = Field(default_factory=dict[str, ObserverConfig])
+    prescribed_motion: PrescribedMotion | None = None
+    observers: dict[str, Annotated[Observer, _OneOfObservers]] = Field(default_factory=dict)
     publish: dict[str, Published] = Field(default_factory=dict[str, Published])
     status: Text | None = "RIG_STATUS"
     timing: Text | None = None
@@ -294,15 +327,15 @@ class RunConfig(_Frozen):
                 return data
 
     @model_validator(mode="after")
-    def _imposed_or_driven(self) -> "RunConfig":
-        if self.imposed_motion is None:
+    def _prescribed_or_driven(self) -> "RunConfig":
+        if self.prescribed_motion is None:
             return self
-        if self.signals.load_cell_force is None:
-            raise ValueError("imposed_motion: expected signals.load_cell_force beside it")
-        if self.signals.applied_force is not None:
+        if LOAD_CELL_FORCE not in self.signals.others:
+            raise ValueError("prescribed_motion: expected signals.load_cell_force beside it")
+        if APPLIED_FORCE in self.signals.others:
             raise ValueError(
-                "imposed_motion: expected no signals.applied_force beside it, because a motion "
-                "that is imposed asks for no force"
+                "prescribed_motion: expected no signals.applied_force beside it, because a motion "
+                "that is prescribed asks for no force"
             )
         return self
 

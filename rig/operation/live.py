@@ -10,7 +10,7 @@ from can_dbc.database import DEFAULT_DATABASE, load_database
 from rig.bench.schema import BenchConfig
 from rig.bench.simulated import Bench
 from rig.core.bridge import Bridge
-from rig.core.types import Mode
+from rig.core.contract import Mode
 from rig.io.bus import Bus, BusConfig
 from rig.io.clock import Clock, OccupiedClock, RealClock, VirtualClock
 from rig.io.link import Link
@@ -88,7 +88,7 @@ def _link(ready: Setup, bridge: Bridge, clock: Clock, *, listen_only: bool = Fal
     def open_bus() -> Bus:
         return Bus(
             config.bus.config(),
-            bridge.heard,
+            bridge.subscribed,
             listen_only=listen_only,
             epoch_ns=clock.epoch_ns,
         )

@@ -14,12 +14,13 @@ from pathlib import Path
 from can_dbc.frame import Frame
 from dart_model.spec import copy_skeleton, dump_model
 from rig.core.bridge import Bridge, BridgeState, TickResult
-from rig.core.types import Mode
+from rig.core.contract import Mode
+from rig.core.record import columns
 from rig.inputs.errors import InputError
 from rig.io.clock import Clock, OccupiedClock
 from rig.io.link import LinkFigures
 from rig.io.realtime import Granted
-from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE
+from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE, RUN_SCHEMA
 from rig.io.run_writer import RunLog
 from rig.io.steps import Step
 from rig.operation.loop import Port, Progress, regular_ticks, run
@@ -55,7 +56,7 @@ class Ended:
     def summary(self) -> dict[str, object]:
         """Every figure, for `summary.json`."""
         return {
-            "mode": self.state.rig.mode.name,
+            "mode": self.state.core.mode.name,
             "ticks": self.ticks,
             "counts": self.state.counts._asdict(),
             "timing": self.timing.summary(),
@@ -72,7 +73,7 @@ def _header(
         for name in (MODEL_FILE, DBC_FILE)
     }
     return {
-        "schema": 1,
+        "schema": RUN_SCHEMA,
         "epoch_ns": epoch_ns,
         "config": ready.config.model_dump(mode="json"),
         "config_source": str(ready.source),
@@ -138,7 +139,7 @@ def logged(
     log = RunLog(
         folder,
         header,
-        list(config.observers),
+        columns(list(config.observers), config.signals.measured),
         clock.epoch_ns,
         config.bus.channel,
         paced=granted is not None,
@@ -165,8 +166,8 @@ def logged(
         waiting = OccupiedClock(clock, told.look)
         due = regular_ticks(waiting, config.period_ns, count, stop, timing)
         with on_signal(signal.SIGUSR2, lambda: log.trigger("user")):
-            state = run(bridge, state, due, told, sink)
-        status = "safe" if state.rig.mode is Mode.SAFE else "done"
+            state = run(bridge, state, due, told, sink, config.signals.measured)
+        status = "safe" if state.core.mode is Mode.SAFE else "done"
     finally:
         log.close(
             lambda: {

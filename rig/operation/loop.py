@@ -1,21 +1,22 @@
 """The one loop: live, simulated and replayed runs differ only in ticks, source and sink."""
 
-import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
-from msgspec.structs import astuple
+from msgspec import Struct
 
 from can_dbc.frame import Frame
 from rig.core.bridge import Bridge, BridgeState, TickResult
+from rig.core.contract import Mode
 from rig.core.messages import Conditions
-from rig.core.types import Mode
+from rig.core.quantities import Quantity
+from rig.core.record import Record
 from rig.io.clock import Clock
-from rig.io.steps import Step
+from rig.io.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step
 from rig.operation.timing import BINS, Timing
 
 
-class Tick(NamedTuple):
+class Tick(Struct, frozen=True, gc=False):
     """A tick that is due.
 
     Attributes:
@@ -89,7 +90,12 @@ def regular_ticks(
 
 
 def run(
-    bridge: Bridge, state: BridgeState, ticks: Iterator[Tick], port: Port, sink: Sink
+    bridge: Bridge,
+    state: BridgeState,
+    ticks: Iterator[Tick],
+    port: Port,
+    sink: Sink,
+    measured: Sequence[Quantity],
 ) -> BridgeState:
     """Run the bridge over ticks.
 
@@ -99,37 +105,28 @@ def run(
         ticks: When.
         port: Where frames come from and go to.
         sink: Where the record of every tick goes.
+        measured: Quantities beside heights that the bench sends, for the record.
 
     Returns:
         The state at the end.
     """
+    record = Record(measured)
     for tick in ticks:
         frames, conditions = port.receive(tick.t_ns)
         if tick.overruns:
             conditions = conditions._replace(overruns=tick.overruns)
         state, result = bridge.tick(state, tick.t_ns, frames, conditions)
         sent = port.send(result.frames)
-        sink(frames, sent, result, _step(tick, len(frames), conditions, result))
+        numbers = record.numbers(result.step_input, result.output)
+        flags, mode = _flags(conditions), result.output.mode
+        step = Step(tick.t_ns, tick.overruns, len(frames), mode, flags, numbers)
+        sink(frames, sent, result, step)
     return state
 
 
-_NAN = math.nan
-
-
-def _step(tick: Tick, received: int, conditions: Conditions, result: TickResult) -> Step:
-    given, output = result.step_input, result.output
-    numbers: list[float] = []
-    for index, measured in enumerate(given.heights):
-        numbers += (_NAN, _NAN) if measured is None else (measured.height_m, measured.t_ns)
-        numbers += astuple(output.struts[index]) if output.struts else (_NAN,) * 7
-    flags = conditions.acknowledged + 2 * conditions.bus_fault + 4 * conditions.log_fault
-    return Step(
-        tick.t_ns,
-        tick.overruns,
-        received,
-        output.mode,
-        flags,
-        _NAN if given.applied_force_n is None else given.applied_force_n,
-        _NAN if given.temperature_c is None else given.temperature_c,
-        tuple(numbers),
+def _flags(conditions: Conditions) -> int:
+    return (
+        ACKNOWLEDGED * conditions.acknowledged
+        + BUS_FAULT * conditions.bus_fault
+        + LOG_FAULT * conditions.log_fault
     )

@@ -1,56 +1,41 @@
-"""A run computed again from its log, and compared with it bit for bit.
+"""A run computed again from its log, through the loop that ran live, and compared bit for bit.
 
-The core is the one that ran live, step by step. What is done for the whole log at once is only what
-stands around it: reading lines, checking and decoding frames. Sending is left out.
+The ticks, the frames of each and what the loop knew come from the log; nothing is sent.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
-from math import nan
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
-from msgspec.structs import astuple, replace
 from numpy.typing import NDArray
 
-from can_dbc.codec import compile_decoder, decode_log
 from can_dbc.database import load_database
 from can_dbc.frame import Frame
-from can_dbc.protection import SequenceState
-from can_dbc.protection_log import in_sequence
 from dart_model.spec import load_model
-from rig.core.bridge import Bridge, BridgeState
-from rig.core.messages import Conditions, Incoming, Quantity
-from rig.core.types import Measurement, Mode, RigState, StepInput, StepOutput
+from rig.core.bridge import TickResult
+from rig.core.messages import Conditions
+from rig.core.record import columns
 from rig.inputs.errors import InputError
 from rig.inputs.yaml_file import validated
 from rig.io.frame_columns import FrameColumns, received_frames
-from rig.io.run_log import (
-    DBC_FILE,
-    MODEL_FILE,
-    RUN_FILE,
-    RunFolder,
-    last_frame_ns,
-    read_run,
-)
-from rig.io.steps import step_schema
+from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE, RunFolder, last_frame_ns, read_run
+from rig.io.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step, StepRows
 from rig.operation.assembly import build_bridge
 from rig.operation.config import RunConfig
-from rig.operation.loop import Progress
+from rig.operation.loop import Progress, Tick, run
 from rig.operation.setup import Setup, put_together
 
-_CHUNK = 2048
-"""Ticks whose objects are in memory at once."""
+_TICKS_AT_ONCE = 4096
+"""Ticks whose frames and steps are objects in memory at once."""
 
 _MOST_LOST_A_FRAME = 1000
 """Ticks without a step for each frame after the last step, beyond which times cannot be right."""
 
-_NOTHING = (nan,) * 7
-"""Of a strut before the first measurements."""
+_NO_CONDITIONS = Conditions()
 
-_HOLD = Mode.HOLD
 _pa = cast("Any", pa)
 
 
@@ -74,8 +59,8 @@ class Replayed:
 
 
 @dataclass(frozen=True)
-class Ticks:
-    """Ticks of a run, with what the loop told the bridge, each of shape (ticks,).
+class LoggedTicks:
+    """Ticks of a run, with what the loop knew at each; all of shape (ticks,).
 
     Attributes:
         t_ns: Time.
@@ -85,9 +70,9 @@ class Ticks:
     """
 
     t_ns: NDArray[np.int64]
-    overruns: NDArray[np.int32]
-    received: NDArray[np.int32]
-    flags: NDArray[np.int8]
+    overruns: NDArray[np.int64]
+    received: NDArray[np.int64]
+    flags: NDArray[np.int64]
 
 
 def setup_of_run(folder: Path) -> tuple[RunFolder, Setup]:
@@ -114,28 +99,33 @@ def replay(
     Args:
         folder: Folder of the run.
         ready: Another configuration to replay with, e.g. with a corrected model or other gains.
-        progress: Told of ticks now and then.
+        progress: Called with the time and mode of every tick.
 
     Raises:
         InputError: The run is damaged.
     """
     found, own = setup_of_run(folder)
     ready = ready or own
-    bridge = build_bridge(ready)
+    bridge = build_bridge(ready, sending=False)
     frames = received_frames(found.frame_files, found.epoch_ns)
     ticks = _ticks(found, frames, ready.config.period_ns)
-    log = _Log(bridge, frames, ticks)
-    if ready.config.supervision.limits:
-        log.plain[:] = False  # limits are the bridge's own business
-    schema = step_schema(list(ready.config.observers))
-    tables: list[Any] = []
-    state = bridge.init(0)
-    for start in range(0, len(ticks.t_ns), _CHUNK):
-        part = slice(start, min(start + _CHUNK, len(ticks.t_ns)))
-        state, inputs, outputs = _computed(bridge, state, log, part)
-        tables.append(_table(ticks, part, inputs, outputs, schema))
-        progress(state.rig.t_ns, state.rig.mode)
-    steps = _pa.concat_tables(tables) if tables else schema.empty_table()
+    config = ready.config
+    rows = StepRows(columns(list(config.observers), config.signals.measured))
+    batches: list[Any] = []
+
+    def keep(
+        _received: Sequence[Frame], _sent: Sequence[Frame], result: TickResult, step: Step
+    ) -> None:
+        rows.append(step)
+        if rows.count == _TICKS_AT_ONCE:
+            batches.append(rows.batch())
+            rows.clear()
+        progress(step.t_ns, result.output.mode)
+
+    port = _LogPort(frames, ticks)
+    state = run(bridge, bridge.init(0), port.ticks(), port, keep, config.signals.measured)
+    batches.append(rows.batch())
+    steps = _pa.Table.from_batches(batches, schema=rows.schema)
     different = _different(found.steps, steps)
     return Replayed(
         steps,
@@ -146,51 +136,62 @@ def replay(
     )
 
 
-def _computed(
-    bridge: Bridge, state: BridgeState, log: "_Log", part: slice
-) -> tuple[BridgeState, list[StepInput], list[StepOutput]]:
-    """Inputs and outputs of some ticks, and the bridge after them.
+class _LogPort:
+    """The frames of a log, tick by tick, with what the loop knew."""
 
-    Where frames simply follow each other the core is stepped with what they hold; any other tick
-    is the bridge's.
-    """
-    inputs, outputs = log.inputs(part), list[StepOutput]()
-    step = bridge.core.step
-    tick = part.start
-    while tick < part.stop:
-        if not log.plain[tick] or not log.continues(state, tick):
-            state, result = bridge.tick(state, *log.received(tick))
-            inputs[tick - part.start] = result.step_input
-            outputs.append(result.output)
-            tick += 1
-            continue
-        odd = np.flatnonzero(~log.plain[tick : part.stop])
-        end = tick + int(odd[0]) if len(odd) else part.stop
-        rig, holds = state.rig, 0
-        for given in inputs[tick - part.start : end - part.start]:
-            rig, output = step(rig, given)
-            outputs.append(output)
-            holds += output.mode is _HOLD
-        state = log.after(state, end, rig, holds)
-        tick = end
-    return state, inputs, outputs
+    def __init__(self, frames: FrameColumns, ticks: LoggedTicks) -> None:
+        self._frames = frames
+        self._ticks = ticks
+        self._waiting: Iterator[tuple[Sequence[Frame], Conditions]] = iter(())
+
+    def ticks(self) -> Iterator[Tick]:
+        """The ticks; frames and conditions of some are made ready at a time."""
+        ticks, begin = self._ticks, 0
+        for first in range(0, len(ticks.t_ns), _TICKS_AT_ONCE):
+            part = slice(first, first + _TICKS_AT_ONCE)
+            received = ticks.received[part].tolist()
+            frames = list(self._frames.between(begin, begin + sum(received)))
+            begin += sum(received)
+            self._waiting = _by_tick(frames, received, ticks.flags[part].tolist())
+            yield from map(Tick, ticks.t_ns[part].tolist(), ticks.overruns[part].tolist())
+
+    def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
+        """Frames that the tick received, and what the loop knew."""
+        _ = t_ns  # the ticks come in their order
+        return next(self._waiting)
+
+    def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
+        """Nothing is sent."""
+        return frames
 
 
-def _ticks(found: RunFolder, frames: FrameColumns, period_ns: int) -> Ticks:
+def _by_tick(
+    frames: list[Frame], received: list[int], flags: list[int]
+) -> Iterator[tuple[Sequence[Frame], Conditions]]:
+    begin = 0
+    for count, known in zip(received, flags, strict=True):
+        conditions = _NO_CONDITIONS
+        if known:
+            conditions = Conditions(
+                acknowledged=bool(known & ACKNOWLEDGED),
+                bus_fault=bool(known & BUS_FAULT),
+                log_fault=bool(known & LOG_FAULT),
+            )
+        yield frames[begin : begin + count], conditions
+        begin += count
+
+
+def _ticks(found: RunFolder, frames: FrameColumns, period_ns: int) -> LoggedTicks:
     """Logged ticks whose frames are there, then those of the rate up to the last frame."""
-    count = len(frames.t_ns)
-    if found.steps.num_rows == 0:
-        t_ns, overruns, received, flags = (np.zeros(0, dtype=np.int64) for _ in range(4))
-    else:
-        t_ns, overruns, received, flags = (
-            cast("NDArray[np.int64]", found.steps.column(name).to_numpy())
-            for name in ("t_ns", "overruns", "received", "flags")
-        )
+    t_ns, overruns, received, flags = (
+        np.asarray(found.steps.column(name).to_numpy(), dtype=np.int64)
+        for name in ("t_ns", "overruns", "received", "flags")
+    )
     if (received < 0).any() or (np.diff(t_ns) <= 0).any():
         raise InputError(
             f"{found.folder}: steps.arrow: expected times that rise and numbers of frames received"
         )
-    there = int(np.searchsorted(np.cumsum(received), count, side="right"))
+    there = int(np.searchsorted(np.cumsum(received), len(frames.t_ns), side="right"))
     t_ns, overruns, received, flags = (
         column[:there] for column in (t_ns, overruns, received, flags)
     )
@@ -199,7 +200,7 @@ def _ticks(found: RunFolder, frames: FrameColumns, period_ns: int) -> Ticks:
     end_ns = last_frame_ns(found.folder, found.epoch_ns) + 1
     if there < found.steps.num_rows:
         end_ns = begin_ns  # the next tick's frames are not all there
-    if (end_ns - begin_ns) // period_ns > _MOST_LOST_A_FRAME * (count - used + 10):
+    if (end_ns - begin_ns) // period_ns > _MOST_LOST_A_FRAME * (len(frames.t_ns) - used + 10):
         raise InputError(
             f"{found.folder}: the last frame is {(end_ns - begin_ns) * 1e-9:.0f} s after the last "
             "step, expected a log whose times belong together"
@@ -208,199 +209,13 @@ def _ticks(found: RunFolder, frames: FrameColumns, period_ns: int) -> Ticks:
     # A frame comes with the first tick after it, and after the frames before it.
     came_ns = np.maximum.accumulate(frames.t_ns[used:])
     came = np.searchsorted(came_ns, lost_ns, side="right")
-    zeros = np.zeros(len(lost_ns), dtype=np.int64)
-    return Ticks(
+    nothing = np.zeros(len(lost_ns), dtype=np.int64)
+    return LoggedTicks(
         np.concatenate([t_ns, lost_ns]),
-        np.concatenate([overruns, zeros]).astype(np.int32),
-        np.concatenate([received, np.diff(came, prepend=0)]).astype(np.int32),
-        np.concatenate([flags, zeros]).astype(np.int8),
+        np.concatenate([overruns, nothing]),
+        np.concatenate([received, np.diff(came, prepend=0)]),
+        np.concatenate([flags, nothing]),
     )
-
-
-@dataclass(frozen=True)
-class _Received:
-    """Frames of one message.
-
-    Attributes:
-        tick: The tick that received each, shape (n,).
-        t_ns: Time of arrival, shape (n,).
-        counter: Counter, or zero for an unprotected message, shape (n,).
-        values: Values in SI, in the order of the message's targets, shape (n, targets).
-        latest: The last frame in each tick, -1 where there is none, shape (ticks,).
-    """
-
-    tick: NDArray[np.intp]
-    t_ns: NDArray[np.int64]
-    counter: NDArray[np.int64]
-    values: NDArray[np.float64]
-    latest: NDArray[np.intp]
-
-
-class _Log:
-    """What a bridge is given, tick by tick, checked and decoded at once."""
-
-    def __init__(self, bridge: Bridge, frames: FrameColumns, ticks: Ticks) -> None:
-        self._struts = bridge.struts
-        self._incoming = bridge.incoming
-        self._frames = frames
-        self._ticks = ticks
-        self._ends = np.cumsum(ticks.received)
-        self.plain: NDArray[np.bool_] = (ticks.flags == 0) & (ticks.overruns == 0)
-        """Ticks whose frames all follow the ones before, at most one of each message."""
-        tick_of = np.repeat(np.arange(len(ticks.t_ns)), ticks.received)
-        unknown = np.ones(len(tick_of), dtype=np.bool_)
-        self._messages = [self._read(item, tick_of, unknown) for item in bridge.incoming]
-        self.plain[tick_of[unknown]] = False
-
-    def _read(
-        self, item: Incoming, tick_of: NDArray[np.intp], unknown: NDArray[np.bool_]
-    ) -> _Received:
-        message, frames, count = item.message, self._frames, len(self._ticks.t_ns)
-        of_message = (frames.arbitration_id == message.arbitration_id) & ~frames.is_error
-        of_message &= frames.is_extended == message.is_extended
-        number = np.flatnonzero(of_message[: len(tick_of)])
-        unknown[number] = False
-        tick, payload = tick_of[number], frames.payload[number]
-        length, t_ns = frames.length[number], frames.t_ns[number]
-        counter = np.zeros(len(number), dtype=np.int64)
-        if item.message.protection is None:
-            good = length == message.length_bytes
-        else:
-            good = in_sequence(payload, length, t_ns, item.message.protection)
-            if payload.shape[1] > 1:
-                counter = (payload[:, 1] & 0x0F).astype(np.int64)
-        values, has_values = _decoded(item, payload)
-        self.plain[tick[~(good & has_values)]] = False
-        self.plain[np.bincount(tick, minlength=count) > 1] = False
-        latest = np.full(count, -1, dtype=np.intp)
-        latest[tick] = np.arange(len(tick))
-        return _Received(tick, t_ns, counter, values, latest)
-
-    def continues(self, state: BridgeState, tick: int) -> bool:
-        """Whether the bridge accepted the last frame of every message before a tick."""
-        for index, found in enumerate(self._messages):
-            last = int(np.searchsorted(found.tick, tick)) - 1
-            sequence = state.sequences[index]
-            if last >= 0 and self._incoming[index].message.protection is not None:
-                expected = int(found.counter[last]), int(found.t_ns[last])
-                if (sequence.counter, sequence.t_ns) != expected:
-                    return False
-        return True
-
-    def after(self, state: BridgeState, tick: int, rig: RigState, holds: int) -> BridgeState:
-        """The bridge before a tick, after plain ones that ended with `rig`."""
-        sequences = list(state.sequences)
-        for index, found in enumerate(self._messages):
-            last = int(np.searchsorted(found.tick, tick)) - 1
-            if last >= 0 and self._incoming[index].message.protection is not None:
-                sequences[index] = SequenceState(int(found.counter[last]), int(found.t_ns[last]))
-        ledger, counts = state.ledger, state.counts
-        if holds:
-            ledger = replace(ledger, counts=counts._replace(stale=counts.stale + holds))
-        return replace(state, rig=rig, sequences=tuple(sequences), ledger=ledger)
-
-    def received(self, tick: int) -> tuple[int, list[Frame], Conditions]:
-        """Time, frames and conditions of a tick."""
-        frames, ticks = self._frames, self._ticks
-        end = int(self._ends[tick])
-        received = [
-            Frame(
-                int(frames.t_ns[number]),
-                int(frames.arbitration_id[number]),
-                frames.payload[number, : frames.length[number]].tobytes(),
-                is_extended=bool(frames.is_extended[number]),
-                is_error=bool(frames.is_error[number]),
-            )
-            for number in range(end - int(ticks.received[tick]), end)
-        ]
-        flags = int(ticks.flags[tick])
-        conditions = Conditions(
-            int(ticks.overruns[tick]), bool(flags & 1), bool(flags & 2), bool(flags & 4)
-        )
-        return int(ticks.t_ns[tick]), received, conditions
-
-    def inputs(self, part: slice) -> list[StepInput]:
-        """What the core is given in plain ticks; of no meaning in others."""
-        t_ns = self._ticks.t_ns[part]
-        nothing: list[Any] = [None] * len(t_ns)
-        heights: list[list[Any]] = [nothing] * self._struts
-        others: dict[Quantity, list[Any]] = {}
-        for item, found in zip(self._incoming, self._messages, strict=True):
-            if len(found.tick) == 0:
-                continue
-            latest = found.latest[part]
-            came = (latest >= 0).tolist()
-            arrived = np.minimum(found.t_ns[latest], t_ns).tolist()
-            for column, target in enumerate(item.targets):
-                values = found.values[latest, column].tolist()
-                if target.quantity is Quantity.HEIGHT:
-                    heights[target.strut] = [
-                        Measurement(value, t) if new else None
-                        for value, t, new in zip(values, arrived, came, strict=True)
-                    ]
-                else:
-                    others[target.quantity] = [
-                        value if new else None for value, new in zip(values, came, strict=True)
-                    ]
-        columns = (
-            t_ns.tolist(),
-            zip(*heights, strict=True),
-            others.get(Quantity.APPLIED_FORCE, nothing),
-            others.get(Quantity.TEMPERATURE, nothing),
-            [False] * len(t_ns),
-            others.get(Quantity.LOAD_CELL_FORCE, nothing),
-        )
-        return [StepInput(*given) for given in zip(*columns, strict=True)]
-
-
-def _decoded(
-    item: Incoming, payloads: NDArray[np.uint8]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Values in the order of the targets, and which frames have them."""
-    message = item.message
-    names = [target.signal for target in item.targets]
-    length, count = message.length_bytes, len(payloads)
-    if payloads.shape[1] < length:
-        return np.full((count, len(names)), nan), np.zeros(count, dtype=np.bool_)
-    dimensions = [target.quantity.dimension for target in item.targets]
-    if any(message.signal(name).multiplexer is not None for name in names):
-        decode = compile_decoder(message, names, dimensions)
-        each = [decode(payload[:length].tobytes()) for payload in payloads]
-        nothing = (nan,) * len(names)
-        values = np.array([values or nothing for values in each], dtype=np.float64)
-        has_values = np.array([values is not None for values in each], dtype=np.bool_)
-        return values.reshape(-1, len(names)), has_values
-    columns = decode_log(message, names, dimensions, np.ascontiguousarray(payloads[:, :length]))
-    values = np.column_stack([columns[name] for name in names])
-    return values, np.ones(count, dtype=np.bool_)
-
-
-def _table(
-    ticks: Ticks,
-    part: slice,
-    inputs: list[StepInput],
-    outputs: list[StepOutput],
-    schema: Any,
-) -> Any:
-    """Steps as the loop logs them."""
-    columns: list[Any] = [
-        ticks.t_ns[part],
-        ticks.overruns[part],
-        ticks.received[part],
-        np.array([int(output.mode) for output in outputs], dtype=np.int8),
-        ticks.flags[part],
-        np.array([nan if x.applied_force_n is None else x.applied_force_n for x in inputs]),
-        np.array([nan if x.temperature_c is None else x.temperature_c for x in inputs]),
-    ]
-    for strut in range(len(inputs[0].heights)):
-        measured = [item.heights[strut] for item in inputs]
-        columns.append(np.array([nan if x is None else x.height_m for x in measured]))
-        columns.append(np.array([nan if x is None else float(x.t_ns) for x in measured]))
-        published = [astuple(item.struts[strut]) if item.struts else _NOTHING for item in outputs]
-        numbers = np.fromiter(chain.from_iterable(published), np.float64, 7 * len(published))
-        columns += list(numbers.reshape(-1, 7).T)
-    arrays = [_pa.array(column) for column in columns]
-    return _pa.Table.from_arrays(arrays, schema=schema)
 
 
 def _different(logged: Any, again: Any) -> NDArray[np.intp]:
@@ -410,7 +225,7 @@ def _different(logged: Any, again: Any) -> NDArray[np.intp]:
     if count == 0:
         return np.flatnonzero(unequal)
     if logged.schema != again.schema:
-        raise InputError("steps.arrow: its columns are not those of the run's struts")
+        raise InputError("steps.arrow: its columns are not those of the run's struts and signals")
     for name in logged.schema.names:
         a, b = (table.column(name).to_numpy()[:count] for table in (logged, again))
         unequal |= a.view(f"V{a.itemsize}") != b.view(f"V{b.itemsize}")

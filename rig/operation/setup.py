@@ -6,10 +6,11 @@ from pydantic import BaseModel, ConfigDict
 
 from can_dbc.database import DEFAULT_DATABASE, Database, Message, load_database
 from dart_model.spec import ModelSpec, load_model, model_file
+from rig.core.observers.pi import PiObserver
 from rig.inputs.errors import InputError
 from rig.inputs.yaml_file import load_validated
 from rig.io.secoc import FD_LENGTHS, Authentication, read_key
-from rig.operation.config import AuthenticationConfig, ObserverConfig, Published, RunConfig
+from rig.operation.config import AuthenticationConfig, Published, RunConfig
 
 
 class Setup(BaseModel):
@@ -117,7 +118,7 @@ def _with_strut_names(config: RunConfig, model: ModelSpec, source: Path) -> RunC
     for name in struts:
         if name not in heights:
             raise InputError(f"{source}: signals.height.{name}: is missing, expected its signal")
-    observers = {name: config.observers.get(name, ObserverConfig()) for name in struts}
+    observers = {name: config.observers.get(name, PiObserver()) for name in struts}
     publish = {
         name: config.publish.get(name, _default_messages(index))
         for index, name in enumerate(struts)

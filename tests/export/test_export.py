@@ -24,13 +24,13 @@ from rig.operation.setup import load_setup
 def run(tmp_path_factory):
     """A rotated run of half a second, with an extended, an FD and an error frame at its end."""
     folder = tmp_path_factory.mktemp("export") / "run"
-    ready = load_setup(CONFIGS / "seed.yaml", duration_s=1.5)
+    ready = load_setup(CONFIGS / "reference.yaml", duration_s=1.5)
     log = ready.config.log.model_copy(update={"rotate_s": 1.0})
     bus = ready.config.bus.model_copy(update={"channel": "export"})
     config = ready.config.model_copy(update={"log": log, "bus": bus})
     with_bench(
         ready.model_copy(update={"config": config}),
-        load_bench_config(CONFIGS / "seed_bench.yaml"),
+        load_bench_config(CONFIGS / "reference_bench.yaml"),
         folder,
         lockstep=True,
         stop=lambda: False,

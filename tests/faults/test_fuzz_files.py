@@ -143,7 +143,7 @@ def other(kind):
     """Content, name and reader of a file that belongs to no run."""
     match kind:
         case "config":
-            return (CONFIGS / "seed.yaml").read_bytes(), "seed.yaml", load_setup
+            return (CONFIGS / "reference.yaml").read_bytes(), "reference.yaml", load_setup
         case "bench":
             return (CONFIGS / "story_bench.yaml").read_bytes(), "bench.yaml", load_bench_config
         case "mapping":

@@ -145,13 +145,13 @@ def test_a_dyno_asks_for_a_load_cell_and_no_applied_force(tmp_path: Path) -> Non
     given = (CONFIGS / "dyno.yaml").read_text()
     path = tmp_path / "dyno.yaml"
     path.write_text(given.replace("load_cell_force:", "applied_force:"))
-    with pytest.raises(InputError, match=r"imposed_motion: expected signals\.load_cell_force"):
+    with pytest.raises(InputError, match=r"prescribed_motion: expected signals\.load_cell_force"):
         load_setup(path)
 
 
 def test_a_dyno_has_no_loop_that_could_ring() -> None:
     findings = {item.what: item.text for item in check(load_setup(CONFIGS / "dyno.yaml"))}
-    assert "the motion is imposed" in findings["poles"]
+    assert "the motion is prescribed" in findings["poles"]
 
 
 def test_the_case_that_comes_with_the_package_tells_how_far_the_model_is(tmp_path: Path) -> None:

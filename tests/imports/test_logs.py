@@ -27,12 +27,12 @@ EPOCH_S = 1_700_000_000.0
 
 @pytest.fixture(scope="module")
 def ready() -> Setup:
-    return load_setup(CONFIGS / "seed.yaml")
+    return load_setup(CONFIGS / "reference.yaml")
 
 
 @pytest.fixture(scope="module")
 def frames(ready: Setup) -> list[Frame]:
-    bench = Bench(load_bench_config(CONFIGS / "seed_bench.yaml"), ready.database)
+    bench = Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), ready.database)
     return bench.update(500_000_000)[0]
 
 

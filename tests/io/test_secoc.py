@@ -178,10 +178,10 @@ def test_a_refused_frame_is_told_as_a_fault_of_the_bus_for_one_tick():
 
 @pytest.fixture
 def configured(tmp_path):
-    """The seed's configuration with other keys, and a key file beside it."""
+    """The reference case's configuration with other keys, and a key file beside it."""
 
     def write(**keys):
-        config = yaml.safe_load((CONFIGS / "seed.yaml").read_text())
+        config = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
         config["bus"] = {
             "interface": "virtual",
             "channel": tmp_path.name,
@@ -202,7 +202,7 @@ def configured(tmp_path):
 def in_lockstep(path, folder):
     with_bench(
         load_setup(path, duration_s=0.3),
-        load_bench_config(CONFIGS / "seed_bench.yaml"),
+        load_bench_config(CONFIGS / "reference_bench.yaml"),
         folder,
         lockstep=True,
         stop=lambda: False,

@@ -17,7 +17,7 @@ FAULTS = ("lost", "repeated", "flipped", "short", "late", "foreign", "error", "a
 
 
 def ready_for(ticks: int) -> Setup:
-    return load_setup(CONFIGS / "seed.yaml", duration_s=ticks / 1000)
+    return load_setup(CONFIGS / "reference.yaml", duration_s=ticks / 1000)
 
 
 @settings(max_examples=20, deadline=None)

@@ -4,12 +4,13 @@ import math
 
 import pytest
 
-from dart_model.plant import DartPlant
+from dart_model.plant import PrescribedStrut
 from dart_model.spec import MODELS, EffectSpec, load_model, parse_model
-from rig.core.dyno import DynoCore, DynoState, Tracked, followed, predicted
+from rig.core.contract import Measurement, Mode, StepInput
+from rig.core.prescribed import PrescribedCore, Tracked, followed, predicted
 from rig.core.supervisor import Supervision
-from rig.core.types import Measurement, Mode, RigState, StepInput
 from rig.inputs.errors import InputError
+from tests.core.cores import others
 
 MODEL = """
 name: dyno
@@ -28,8 +29,8 @@ TICK_NS = 1_000_000
 SUPERVISION = Supervision(5 * TICK_NS, 50 * TICK_NS, False)
 
 
-def plant(*effects: EffectSpec) -> DartPlant:
-    return DartPlant(parse_model(MODEL, "dyno").with_effects("strut", effects))
+def plant(*effects: EffectSpec) -> PrescribedStrut:
+    return PrescribedStrut(parse_model(MODEL, "dyno").with_effects("strut", effects))
 
 
 def motion(t_s: float) -> tuple[float, float]:
@@ -40,7 +41,7 @@ def motion(t_s: float) -> tuple[float, float]:
 def step_input(number: int, cell_n: float | None, *, measured: bool = True) -> StepInput:
     t_ns = number * TICK_NS
     height = Measurement(motion(t_ns * 1e-9)[0], t_ns) if measured else None
-    return StepInput(t_ns, (height,), load_cell_force_n=cell_n)
+    return StepInput(t_ns, (height,), others(load_cell_force=cell_n))
 
 
 def test_the_filter_follows_a_constant_acceleration_without_lag() -> None:
@@ -62,7 +63,7 @@ def test_a_measurement_that_is_not_newer_changes_nothing() -> None:
 
 
 def test_the_virtual_force_is_what_the_cell_shows_beyond_the_model() -> None:
-    core = DynoCore(plant(), 0.002, SUPERVISION)
+    core = PrescribedCore(plant(), 0.002, SUPERVISION)
     state = core.init(0)
     for number in range(400):
         height_m, velocity = motion(number * 1e-3)
@@ -80,7 +81,7 @@ def test_what_effects_remember_is_led_along_the_motion() -> None:
     branch = EffectSpec(
         name="maxwell", parameters={"stiffness_n_per_m": 8000.0, "relaxation_time_s": 0.03}
     )
-    core = DynoCore(plant(branch), 0.002, SUPERVISION)
+    core = PrescribedCore(plant(branch), 0.002, SUPERVISION)
     state = core.init(0)
     deflection_m, virtual = 0.0, []
     for number in range(600):
@@ -96,7 +97,7 @@ def test_what_effects_remember_is_led_along_the_motion() -> None:
 
 
 def test_nothing_is_said_before_both_channels_came() -> None:
-    core = DynoCore(plant(), 0.002, SUPERVISION)
+    core = PrescribedCore(plant(), 0.002, SUPERVISION)
     state, output = core.step(core.init(0), step_input(0, None))
     assert output.mode is Mode.WAITING
     assert output.struts == ()
@@ -107,7 +108,7 @@ def test_nothing_is_said_before_both_channels_came() -> None:
 
 @pytest.mark.parametrize("silent", ["height", "cell"])
 def test_a_channel_that_falls_silent_ends_in_the_safe_state(silent: str) -> None:
-    core = DynoCore(plant(), 0.002, SUPERVISION)
+    core = PrescribedCore(plant(), 0.002, SUPERVISION)
     state = core.init(0)
     modes: list[Mode] = []
     for number in range(120):
@@ -127,22 +128,13 @@ def test_a_channel_that_falls_silent_ends_in_the_safe_state(silent: str) -> None
     assert output.mode is Mode.RUNNING
 
 
-def test_the_drive_carries_weight_and_inertia_less_the_strut() -> None:
-    driven = plant().driven(0.32, 0.5, 4.0, (), 0.0, 20.0)
-    strut_n = -5000.0 * 0.02 - 2000.0 * 0.5
-    assert driven.force_n == pytest.approx(strut_n, abs=1e-9)
-    assert driven.drive_n == pytest.approx(2.0 * (4.0 + 9.81) - strut_n, abs=1e-9)
+def test_the_force_is_the_law_of_spring_and_damper() -> None:
+    strut = plant()
+    force_n = strut.force_n(strut.init(0.0), 0.32, 0.5, 20.0)
+    assert force_n == pytest.approx(-5000.0 * 0.02 - 2000.0 * 0.5, abs=1e-9)
 
 
 def test_two_struts_are_refused() -> None:
-    with pytest.raises(InputError, match="expected one of each") as caught:
-        DynoCore(DartPlant(load_model(MODELS / "quarter_car.yaml")), 0.002, SUPERVISION)
+    with pytest.raises(InputError, match="2 struts, expected one") as caught:
+        PrescribedStrut(load_model(MODELS / "quarter_car.yaml"))
     assert "\n" not in str(caught.value)
-
-
-def test_a_state_of_another_core_is_refused() -> None:
-    core = DynoCore(plant(), 0.002, SUPERVISION)
-    assert isinstance(core.init(0), DynoState)
-    other = RigState(0, Mode.WAITING, (), (None,), None, 20.0, ())
-    with pytest.raises(TypeError, match="expected a state of this core"):
-        core.step(other, step_input(0, 1.0))

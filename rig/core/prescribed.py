@@ -1,26 +1,57 @@
-"""One tick at a dyno: the motion is imposed, and the load cell measures what it takes.
+"""One tick at a dyno: the motion is prescribed, and the load cell measures the force it takes.
 
-The model does not run by itself: DART is driven along the measured motion, and the virtual force
-is what the load cell shows beyond the model's own law. The motion between and at measurements is
-followed by a filter with fading memory, which has no lag for a constant acceleration.
+The model does not run by itself: its strut is moved along the measured motion, and the virtual
+force is what the load cell shows beyond the model's own law. The motion between and at measurements
+is followed by a filter with fading memory, which has no lag for a constant acceleration.
 
 Reference: Morrison, "Introduction to Sequential Smoothing and Prediction" (1969), chapter 13: the
 fading-memory polynomial filter of second degree.
 """
 
 import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Protocol
 
 from msgspec import Struct
 from msgspec.structs import replace
 
-from dart_model.plant import DartPlant
+from rig.core.contract import (
+    AMBIENT_C,
+    CoreState,
+    Divergence,
+    Measurement,
+    Mode,
+    StepInput,
+    StepOutput,
+    StrutOutput,
+    is_sensible,
+)
 from rig.core.supervisor import Event, Supervision, age_event, next_mode
-from rig.core.types import Measurement, Mode, RigState, StepInput, StepOutput, StrutOutput
 
-_AMBIENT_C = 20.0
-_LONGEST_MEMORY_STEP_S = 0.5e-3
-_MOST_MEMORY_STEPS = 1000
-_SENSELESS = 1e12
+
+class PrescribedModel(Protocol):
+    """A strut of a model that is moved from outside. Its states are frozen."""
+
+    def init(self, t_s: float) -> Any:
+        """State at the beginning."""
+        ...
+
+    def step(
+        self,
+        state: Any,
+        t_s: float,
+        motion: Callable[[float], tuple[float, float]],
+        temperature_c: float,
+    ) -> Any:
+        """State at `t_s`, after a motion: time in s -> height (m) and velocity (m/s)."""
+        ...
+
+    def force_n(
+        self, state: Any, height_m: float, velocity_m_per_s: float, temperature_c: float
+    ) -> float:
+        """What a load cell would show."""
+        ...
 
 
 class Tracked(Struct, frozen=True, gc=False):
@@ -41,18 +72,18 @@ class Tracked(Struct, frozen=True, gc=False):
     measured_ns: int
 
 
-class DynoState(RigState, frozen=True, gc=False):
+class PrescribedCoreState(CoreState, frozen=True, gc=False, kw_only=True):
     """State between two ticks at a dyno.
 
     Attributes:
         tracked: The motion; None before the first measurement.
-        memory: Memory of the model's effects.
+        model: State of the model; None before the first measurement.
         cell_n: Last force of the load cell; None before the first one.
         cell_ns: When it came.
     """
 
     tracked: Tracked | None = None
-    memory: tuple[float, ...] = ()
+    model: Any = None
     cell_n: float | None = None
     cell_ns: int = 0
 
@@ -93,23 +124,23 @@ def predicted(tracked: Tracked, t_ns: int) -> tuple[float, float, float]:
     )
 
 
-class DynoCore:
-    """The arithmetic of a dyno, without bus, clock or file.
+def _motion(tracked: Tracked, t_s: float) -> tuple[float, float]:
+    """Height and velocity at a time of the run."""
+    height_m, velocity_m_per_s, _ = predicted(tracked, round(t_s * 1e9))
+    return height_m, velocity_m_per_s
+
+
+class PrescribedCore:
+    """The bridge's arithmetic where the motion is given and the force is measured.
 
     Args:
-        plant: The model, with one strut and one coordinate.
+        model: The strut.
         settling_s: Time constant with which older measurements of the motion fade.
         supervision: Ages and safe output.
-
-    Raises:
-        InputError: The model has more than one strut or coordinate.
     """
 
-    def __init__(self, plant: DartPlant, settling_s: float, supervision: Supervision) -> None:
-        strut = plant.spec.struts[0]
-        at_rest = (0.0,) * plant.memory_size
-        plant.driven(strut.free_length_m, 0.0, 0.0, at_rest, 0.0, _AMBIENT_C)
-        self._plant = plant
+    def __init__(self, model: PrescribedModel, settling_s: float, supervision: Supervision) -> None:
+        self._model = model
         self._settling_s = settling_s
         self._supervision = supervision
 
@@ -118,11 +149,13 @@ class DynoCore:
         """Number of struts."""
         return 1
 
-    def init(self, t_ns: int) -> RigState:
+    def init(self, t_ns: int) -> PrescribedCoreState:
         """State before the first tick."""
-        return DynoState(t_ns, Mode.WAITING, (), (None,), None, _AMBIENT_C, ())
+        return PrescribedCoreState(t_ns, Mode.WAITING, AMBIENT_C)
 
-    def step(self, state: RigState, step_input: StepInput) -> tuple[RigState, StepOutput]:
+    def step(
+        self, state: PrescribedCoreState, step_input: StepInput
+    ) -> tuple[PrescribedCoreState, StepOutput]:
         """Advance by one tick.
 
         Args:
@@ -132,8 +165,6 @@ class DynoCore:
         Returns:
             State after this tick, and what it publishes.
         """
-        if not isinstance(state, DynoState):
-            raise TypeError(f"{type(state).__name__}, expected a state of this core")
         if state.mode is Mode.SAFE and step_input.acknowledged:
             mode = next_mode(state.mode, Event.ACKNOWLEDGED)
             state = replace(state, mode=mode, tracked=None, cell_n=None)
@@ -146,15 +177,17 @@ class DynoCore:
             age_ns = t_ns - min(tracked.measured_ns, received.cell_ns)
             mode = next_mode(received.mode, age_event(self._supervision, age_ns))
             if mode is not Mode.WAITING:
-                return self._driven(received, tracked, cell_n, mode, t_ns)
+                return self._moved(received, tracked, cell_n, mode, t_ns)
         return replace(received, t_ns=t_ns), StepOutput(received.mode, ())
 
-    def _received(self, state: DynoState, step_input: StepInput) -> DynoState:
-        """State with what came; the model begins with its effects' memory at zero."""
-        tracked, (measured,) = state.tracked, step_input.heights
-        if measured is not None:
-            begun = Tracked(measured.height_m, 0.0, 0.0, 0.0, measured.t_ns)
-            tracked = followed(tracked, measured, self._settling_s) if tracked else begun
+    def _received(self, state: PrescribedCoreState, step_input: StepInput) -> PrescribedCoreState:
+        """State with what came; the model begins at the first measurement."""
+        tracked, model, (measured,) = state.tracked, state.model, step_input.heights
+        if measured is not None and tracked is None:
+            tracked = Tracked(measured.height_m, 0.0, 0.0, 0.0, measured.t_ns)
+            model = self._model.init(state.t_ns * 1e-9)
+        elif measured is not None and tracked is not None:
+            tracked = followed(tracked, measured, self._settling_s)
         cell_n, cell_ns = state.cell_n, state.cell_ns
         if step_input.load_cell_force_n is not None:
             cell_n, cell_ns = step_input.load_cell_force_n, step_input.t_ns
@@ -162,66 +195,35 @@ class DynoCore:
         return replace(
             state,
             tracked=tracked,
-            memory=state.memory if state.tracked else (0.0,) * self._plant.memory_size,
+            model=model,
             cell_n=cell_n,
             cell_ns=cell_ns,
             temperature_c=state.temperature_c if warm is None else warm,
         )
 
-    def _driven(
-        self, state: DynoState, tracked: Tracked, cell_n: float, mode: Mode, t_ns: int
-    ) -> tuple[RigState, StepOutput]:
-        """Drive the model to the tick, and compare it with the load cell."""
-        memory = self._remembered(state, tracked, state.t_ns, t_ns)
+    def _moved(
+        self, state: PrescribedCoreState, tracked: Tracked, cell_n: float, mode: Mode, t_ns: int
+    ) -> tuple[PrescribedCoreState, StepOutput]:
+        """Move the model to the tick, and compare it with the load cell."""
+        temperature_c = state.temperature_c
+        model = self._model.step(state.model, t_ns * 1e-9, partial(_motion, tracked), temperature_c)
         height_m, velocity, acceleration = predicted(tracked, t_ns)
-        model = self._plant.driven(
-            height_m, velocity, acceleration, memory, t_ns * 1e-9, state.temperature_c
-        )
+        model_n = self._model.force_n(model, height_m, velocity, temperature_c)
         valid = mode is Mode.RUNNING
         strut = StrutOutput(
-            cell_n,
-            cell_n - model.force_n,
-            valid,
-            height_m,
-            velocity,
-            acceleration,
-            tracked.innovation_m,
+            cell_n, cell_n - model_n, valid, height_m, velocity, acceleration, tracked.innovation_m
         )
-        total = cell_n + model.force_n + height_m + velocity
-        if mode is Mode.SAFE or not abs(total) < _SENSELESS:
+        diverged = not is_sensible(cell_n + model_n + height_m + velocity)
+        if diverged:
+            state = replace(state, diverged=Divergence(0, t_ns))
+        if diverged or mode is Mode.SAFE:
             state = replace(state, t_ns=t_ns, mode=Mode.SAFE)
             return state, self._safe_output(state)
         last_valid = (strut,) if valid else state.last_valid
-        state = replace(state, t_ns=t_ns, mode=mode, memory=memory, last_valid=last_valid)
+        state = replace(state, t_ns=t_ns, mode=mode, model=model, last_valid=last_valid)
         return state, StepOutput(mode, (strut,))
 
-    def _remembered(
-        self, state: DynoState, tracked: Tracked, from_ns: int, t_ns: int
-    ) -> tuple[float, ...]:
-        """Memory of the effects, led along the motion from the last tick to this one."""
-        memory, span_ns = state.memory, t_ns - from_ns
-        if not memory or span_ns <= 0:
-            return memory
-        steps = min(_MOST_MEMORY_STEPS, math.ceil(span_ns * 1e-9 / _LONGEST_MEMORY_STEP_S))
-        h = span_ns * 1e-9 / steps
-        for step in range(steps):
-            at_ns = from_ns + (2 * step * span_ns) // (2 * steps)
-            mid_ns = from_ns + ((2 * step + 1) * span_ns) // (2 * steps)
-            rates = self._rates(state, tracked, memory, at_ns)
-            half = tuple([m + 0.5 * h * r for m, r in zip(memory, rates, strict=True)])
-            rates = self._rates(state, tracked, half, mid_ns)
-            memory = tuple([m + h * r for m, r in zip(memory, rates, strict=True)])
-        return memory
-
-    def _rates(
-        self, state: DynoState, tracked: Tracked, memory: tuple[float, ...], t_ns: int
-    ) -> list[float]:
-        height_m, velocity, acceleration = predicted(tracked, t_ns)
-        return self._plant.driven(
-            height_m, velocity, acceleration, memory, t_ns * 1e-9, state.temperature_c
-        ).memory_rates
-
-    def _safe_output(self, state: DynoState) -> StepOutput:
+    def _safe_output(self, state: PrescribedCoreState) -> StepOutput:
         """The defined output of the safe state."""
         if state.tracked is None:
             return StepOutput(state.mode, ())
