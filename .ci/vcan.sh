@@ -59,8 +59,8 @@ fill_caches() {
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from rig.bench.config import load_bench_config
 from rig.bench.simulated import Bench
-from rig.config import CONFIGS
-Bench(load_bench_config(CONFIGS / "seed_bench.yaml"), load_database(DEFAULT_DATABASE)).update(10**8)
+from rig.operation.config import CONFIGS
+Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), load_database(DEFAULT_DATABASE)).update(10**8)
 ')
 }
 

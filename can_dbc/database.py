@@ -110,6 +110,11 @@ class Message:
     signals: Mapping[str, Signal]
     protection: Protection | None
 
+    @property
+    def key(self) -> tuple[int, bool]:
+        """What tells its frames from others: arbitration id, and whether that is extended."""
+        return self.arbitration_id, self.is_extended
+
     def signal(self, name: str) -> Signal:
         """Return the signal of a name.
 

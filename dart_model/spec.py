@@ -22,15 +22,8 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from dart_model.effects import CATALOGUE, effect
-from dart_model.yaml_file import (
-    Finite,
-    InputError,
-    NotNegative,
-    Positive,
-    parse_mapping,
-    read_text,
-    validated,
-)
+from rig.inputs.errors import InputError
+from rig.inputs.yaml_file import Finite, NotNegative, Positive, parse_mapping, read_text, validated
 
 MODELS = Path(__file__).parent / "models"
 """Folder of the models that come with the package."""

@@ -23,10 +23,13 @@ import numpy as np
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig
-from rig.config import CONFIGS, Published, Setup, load_setup, put_together
-from rig.loop import Timing, regular_ticks
-from rig.runs import Ended, on_time, with_bench
-from rig.timing_picture import draw_run
+from rig.operation.config import CONFIGS, Published
+from rig.operation.live import on_time, with_bench
+from rig.operation.logged_run import Ended
+from rig.operation.loop import regular_ticks
+from rig.operation.setup import Setup, load_setup, put_together
+from rig.operation.timing import Timing
+from rig.pages.timing_picture import draw_run
 from tests.soak import force_error_n, load_cell
 
 CLASSIC_CAN_HZ = 3703
@@ -67,8 +70,8 @@ def busy_cores(share: float) -> Iterator[None]:
 def at_rate(
     rate_hz: float, seconds: float, *, fifo: bool, folder: Path
 ) -> tuple[Setup, BenchConfig]:
-    """The seed case with one frame in and one out a tick."""
-    ready = load_setup(CONFIGS / "seed.yaml", duration_s=seconds)
+    """The reference case with one frame in and one out a tick."""
+    ready = load_setup(CONFIGS / "reference.yaml", duration_s=seconds)
     folder.mkdir(parents=True)
     dbc = folder / "every_tick.dbc"
     # Without a cycle time a message is sent at every tick.
@@ -82,7 +85,7 @@ def at_rate(
             "realtime": realtime,
         }
     )
-    bench = load_bench_config(CONFIGS / "seed_bench.yaml")
+    bench = load_bench_config(CONFIGS / "reference_bench.yaml")
     measurement, auxiliary = bench.transmissions
     period_ns = config.period_ns
     every = (

@@ -20,10 +20,11 @@ from can_dbc.codec import decode_log
 from can_dbc.database import load_database
 from can_dbc.units import Dimension
 from rig.bench.config import load_bench_config
-from rig.config import CONFIGS, load_setup
 from rig.io.frame_columns import received_frames
 from rig.io.run_log import DBC_FILE, FRAMES_FILE, RUN_FILE, STEPS_FILE, parts
-from rig.runs import with_bench
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.setup import load_setup
 
 PART_S = 600
 S = 1_000_000_000
@@ -59,7 +60,7 @@ def main() -> int:
     parser.add_argument("--hours", type=float, default=4.0)
     parser.add_argument("--out", type=Path, required=True)
     asked = parser.parse_args()
-    ready = load_setup(CONFIGS / "seed.yaml", duration_s=asked.hours * 3600.0)
+    ready = load_setup(CONFIGS / "reference.yaml", duration_s=asked.hours * 3600.0)
     log = ready.config.log.model_copy(update={"rotate_s": float(PART_S)})
     memory_mib: list[float] = []
 
@@ -70,7 +71,7 @@ def main() -> int:
 
     ended = with_bench(
         ready.model_copy(update={"config": ready.config.model_copy(update={"log": log})}),
-        load_bench_config(CONFIGS / "seed_bench.yaml"),
+        load_bench_config(CONFIGS / "reference_bench.yaml"),
         asked.out,
         lockstep=True,
         stop=lambda: False,
@@ -81,7 +82,7 @@ def main() -> int:
     first_n, last_n = force_error_n(asked.out, 0), force_error_n(asked.out, len(files) - 2)
     growth_mib = memory_mib[-1] - memory_mib[0]
     expected = round(asked.hours * 3600.0 * ready.config.rate_hz)
-    drift_ns = ended.state.rig.t_ns - (expected - 1) * ready.config.period_ns
+    drift_ns = ended.state.core.t_ns - (expected - 1) * ready.config.period_ns
     print(f"memory: {growth_mib:.1f} MiB more than after ten minutes")
     print(f"ticks: {ended.ticks} of {expected}, last one {drift_ns} ns off; {len(files)} parts")
     print(f"force error: {first_n:.3f} N in the first ten minutes, {last_n:.3f} N in the last")

@@ -35,6 +35,7 @@ from dart_model.effects.contract import (
     Start,
     Writable,
 )
+from rig.inputs.errors import InputError
 
 __all__ = [
     "CATALOGUE",
@@ -139,7 +140,7 @@ FAMILY_WORDS: Mapping[str, str] = MappingProxyType(
 """Every family of effects as a phrase with its article."""
 
 
-class UnknownEffectError(ValueError):
+class UnknownEffectError(InputError):
     """There is no effect of that name."""
 
     def __init__(self, name: str) -> None:

@@ -20,12 +20,13 @@ from pydantic import (
 
 from rig.bench.effects import EFFECT_KINDS, parameter_error
 from rig.bench.samples import Samples, read_samples
+from rig.inputs.errors import InputError
 
 WORLD = "world"
 """Name of the ground."""
 
 
-class BenchConfigError(ValueError):
+class BenchConfigError(InputError):
     """A bench configuration that cannot be used; one line: file, key, value, expectation."""
 
 

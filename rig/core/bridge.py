@@ -11,7 +11,16 @@ from msgspec.structs import replace
 
 from can_dbc.frame import Frame
 from can_dbc.protection import INITIAL, SequenceState, Verdict
-from rig.core.messages import Conditions, Counts, Incoming, Outgoing, Quantity, Reader, Report
+from rig.core.contract import (
+    NO_OTHERS,
+    Core,
+    CoreState,
+    Measurement,
+    Mode,
+    StepInput,
+    StepOutput,
+)
+from rig.core.messages import Conditions, Counts, Incoming, Outgoing, Report
 from rig.core.supervisor import (
     EVENTS_BEYOND,
     Action,
@@ -21,27 +30,15 @@ from rig.core.supervisor import (
     judged,
     next_mode,
 )
-from rig.core.types import Core, Measurement, Mode, RigState, StepInput, StepOutput
 
 _NO_CONDITIONS = Conditions()
-
-# Looking up a member of an enum costs as much as the CRC of a frame.
-_OK, _HOLD = Verdict.OK, Mode.HOLD
-
-_OTHERS = (Quantity.APPLIED_FORCE, Quantity.TEMPERATURE, Quantity.LOAD_CELL_FORCE)
-"""What comes beside heights, as the core is given it."""
-
-_Heights = list[Measurement | None]
-_Others = list[float | None]
-"""What came of each strut, and of each of `_OTHERS`."""
-
-_NO_OTHERS: _Others = [None] * len(_OTHERS)
 
 RIVAL_FRAMES = 12
 """Frames out of sequence, one hardly after the other, that only a second sender explains: a sender
 that starts anew is believed after three, and frames that overtake others come singly."""
 
 _RIVAL_CYCLES = 3
+"""Cycle times within which one follows the other."""
 
 
 class Strays(NamedTuple):
@@ -56,18 +53,30 @@ class Strays(NamedTuple):
     t_ns: int = 0
 
 
+class Sending(Struct, frozen=True, gc=False):
+    """Where an outgoing message stands.
+
+    Attributes:
+        number: Frames sent so far.
+        due_ns: When the next one is due.
+    """
+
+    number: int
+    due_ns: int
+
+
 class Ledger(Struct, frozen=True, gc=False):
     """What is remembered of the unusual; most ticks leave it as it is.
 
     Attributes:
         counts: What has been counted.
-        told: What the last status knew of it.
+        reported: What the last status knew of it.
         seen: What plausibility remembers of each strut's measurements.
         strays: Of each incoming message, the frames that contradicted its counter.
     """
 
     counts: Counts
-    told: Counts
+    reported: Counts
     seen: tuple[Seen | None, ...]
     strays: tuple[Strays, ...]
 
@@ -76,16 +85,15 @@ class BridgeState(Struct, frozen=True, gc=False):
     """State of the bridge between two ticks.
 
     Attributes:
-        rig: State of the core.
+        core: State of the core.
         sequences: Counter state of each incoming message.
-        sendings: Of each outgoing message, how many frames were sent, and when the next is due, in
-            ns.
+        sendings: Where each outgoing message stands.
         ledger: What is remembered beside.
     """
 
-    rig: RigState
+    core: CoreState
     sequences: tuple[SequenceState, ...]
-    sendings: tuple[tuple[int, int], ...]
+    sendings: tuple[Sending, ...]
     ledger: Ledger
 
     @property
@@ -100,7 +108,7 @@ class TickResult(Struct, frozen=True, gc=False):
     Attributes:
         frames: Frames to send, stamped with the tick's time.
         step_input: What the core was given.
-        output: What the core said.
+        output: What the core published.
     """
 
     frames: list[Frame]
@@ -108,10 +116,24 @@ class TickResult(Struct, frozen=True, gc=False):
     output: StepOutput
 
 
-_Source = tuple[int, Reader, list[tuple[int, int]], list[tuple[int, int]]]
-"""An incoming message as a tick wants it: its place among the incoming ones; what reads it; place
-of a height among its values and the strut that it is of; place of another value and which one of
-`_OTHERS` it is. A plain tuple is taken apart three times as fast as a named one."""
+class _Received(Struct, frozen=True, gc=False):
+    """What the frames of a tick are to the core.
+
+    Attributes:
+        core: The core after all measurements that newer ones followed.
+        heights: What is left of heights.
+        others: What is left of other quantities.
+        sequences: Counter state of each incoming message.
+        ledger: What is remembered beside.
+        action: The severest action that the limits on measurements ask for, 0 if none.
+    """
+
+    core: CoreState
+    heights: list[Measurement | None]
+    others: list[float | None]
+    sequences: list[SequenceState]
+    ledger: Ledger
+    action: int
 
 
 class Bridge:
@@ -131,52 +153,26 @@ class Bridge:
         outgoing: Sequence[Outgoing],
         limits: Sequence[Limit] = (),
     ) -> None:
-        self._core = core
-        self._struts = core.struts
+        self.core = core
+        self.incoming = tuple(incoming)
         self._measured_limits = tuple(item for item in limits if item.watched.is_measured)
         self._limits = tuple(item for item in limits if not item.watched.is_measured)
-        self._incoming = tuple(incoming)
-        # Numbered once: to count along costs as much as to make two small objects.
-        self._outgoing = tuple(enumerate(outgoing))
-        self._no_heights: _Heights = [None] * core.struts
-        # By whether the id is extended, then by the id: half the time that a pair takes as a key.
-        self._sources: tuple[dict[int, _Source], dict[int, _Source]] = ({}, {})
-        for index, item in enumerate(incoming):
-            message = item.message
-            self._sources[message.is_extended][message.arbitration_id] = _source(index, item)
-        self._own = frozenset(
-            (item.message.arbitration_id, item.message.is_extended) for item in outgoing
-        )
+        self._outgoing = tuple(outgoing)
+        self._no_heights: list[Measurement | None] = [None] * core.struts
+        self._places = {item.message.key: place for place, item in enumerate(incoming)}
+        self._own = frozenset(item.message.key for item in outgoing)
 
     @property
-    def heard(self) -> frozenset[tuple[int, bool]]:
-        """The (arbitration id, is extended) that the bridge listens to, its own among them."""
-        messages = [item.message for item in self._incoming]
-        return self._own.union((item.arbitration_id, item.is_extended) for item in messages)
-
-    @property
-    def core(self) -> Core:
-        """The arithmetic."""
-        return self._core
-
-    @property
-    def incoming(self) -> tuple[Incoming, ...]:
-        """Messages of the bench."""
-        return self._incoming
-
-    @property
-    def struts(self) -> int:
-        """Number of struts."""
-        return self._struts
+    def subscribed(self) -> frozenset[tuple[int, bool]]:
+        """The (arbitration id, is extended) that the bridge subscribes to, its own among them."""
+        return self._own.union(self._places)
 
     def init(self, t_ns: int) -> BridgeState:
         """State before the first tick."""
-        sequences = (INITIAL,) * len(self._incoming)
-        nothing = Ledger(
-            Counts(), Counts(), (None,) * self._struts, (Strays(),) * len(self._incoming)
-        )
-        sendings = ((0, t_ns),) * len(self._outgoing)
-        return BridgeState(self._core.init(t_ns), sequences, sendings, nothing)
+        messages = len(self.incoming)
+        nothing = Ledger(Counts(), Counts(), (None,) * self.core.struts, (Strays(),) * messages)
+        sendings = (Sending(0, t_ns),) * len(self._outgoing)
+        return BridgeState(self.core.init(t_ns), (INITIAL,) * messages, sendings, nothing)
 
     def tick(
         self,
@@ -196,82 +192,59 @@ class Bridge:
         Returns:
             State after the tick, and what it did.
         """
-        rig, heights, others, sequences, ledger, action = self._received(state, t_ns, frames)
-        applied_n, temperature_c, load_cell_n = others
-        acknowledged = conditions.acknowledged
+        received = self._received(state, t_ns, frames)
         step_input = StepInput(
-            t_ns, tuple(heights), applied_n, temperature_c, acknowledged, load_cell_n
+            t_ns, tuple(received.heights), tuple(received.others), conditions.acknowledged
         )
-        rig, output = self._core.step(rig, step_input)
+        core, output = self.core.step(received.core, step_input)
+        action = received.action
         if self._limits or action:
-            rig, output, action = self._limited(state.rig, rig, output, action)
-        if action or output.mode is _HOLD or conditions.overruns or conditions.bus_fault:
-            ledger = _noted(ledger, output, action, conditions)
-        sendings = list(state.sendings)
-        sent: list[Frame] = []
-        if output.struts:  # nothing is sent before the first valid measurement
-            for index, item in self._outgoing:
-                number, due_ns = sendings[index]
-                if t_ns < due_ns:
-                    continue
-                report = Report(output, ledger.counts, ledger.told, conditions, number)
-                frame, saturated = item.frame(report, t_ns)
-                sent.append(frame)
-                sendings[index] = (number + 1, _next_due_ns(due_ns, t_ns, item.period_ns))
-                if item.is_status or saturated:
-                    ledger = _told(ledger, item, conditions, saturated=saturated)
-        state = BridgeState(rig, tuple(sequences), tuple(sendings), ledger)
-        return state, TickResult(sent, step_input, output)
+            core, output, action = self._limited(state.core, core, output, action)
+        ledger = _noted(received.ledger, output, action, conditions)
+        sendings, sent, ledger = self._sent(state.sendings, t_ns, output, ledger, conditions)
+        after = BridgeState(core, tuple(received.sequences), sendings, ledger)
+        return after, TickResult(sent, step_input, output)
 
-    def _received(
-        self, state: BridgeState, t_ns: int, frames: Sequence[Frame]
-    ) -> tuple[RigState, _Heights, _Others, list[SequenceState], Ledger, int]:
-        """What the frames of a tick are to the core.
+    def _received(self, state: BridgeState, t_ns: int, frames: Sequence[Frame]) -> _Received:
+        """Refuse or read every frame.
 
         A late tick finds several measurements of one strut. Each is used at its own time, or the
         model would run away under a force that was held for the whole gap.
-
-        Returns:
-            The core after all measurements that newer ones followed; what is left of heights and
-            others; the counters' states, the ledger, and the gravest action that the limits on
-            measurements ask for.
         """
-        rig, ledger, sequences, action = state.rig, state.ledger, list(state.sequences), 0
-        heights, others = self._no_heights.copy(), _NO_OTHERS.copy()
+        core, ledger, sequences, action = state.core, state.ledger, list(state.sequences), 0
+        heights, others = self._no_heights.copy(), list(NO_OTHERS)
         for frame in frames:
-            source = self._sources[frame.is_extended].get(frame.arbitration_id)
-            if source is None or frame.is_error:
+            place = self._places.get((frame.arbitration_id, frame.is_extended))
+            if place is None or frame.is_error:
                 ledger = self._foreign(ledger, frame)
                 continue
-            place, read, of_struts, of_others = source
-            sequences[place], verdict, values = read(sequences[place], frame)
-            if verdict is not _OK:
+            incoming = self.incoming[place]
+            sequences[place], verdict, values = incoming.read(sequences[place], frame)
+            if verdict is not Verdict.OK:
                 ledger = self._judged(ledger, place, frame.t_ns, verdict, sequences[place])
             if values is None:
                 continue
             if self._measured_limits:
-                ledger, asked = self._plausible(ledger, of_struts, frame.t_ns, values)
+                ledger, asked = self._plausible(ledger, incoming, frame.t_ns, values)
                 action = max(action, asked)
                 if asked >= Action.REFUSE:
                     continue
-            if of_struts and heights[of_struts[0][1]] is not None:
-                rig = self._caught_up(rig, heights, others)
-                heights, others = self._no_heights.copy(), _NO_OTHERS.copy()
-            for number, strut in of_struts:
-                arrived_ns = frame.t_ns if frame.t_ns < t_ns else t_ns
-                heights[strut] = Measurement(values[number], arrived_ns)
-            for number, other in of_others:
-                others[other] = values[number]
-        return rig, heights, others, sequences, ledger, action
+            if incoming.heights and heights[incoming.heights[0].strut] is not None:
+                core = self._caught_up(core, heights, others)
+                heights, others = self._no_heights.copy(), list(NO_OTHERS)
+            arrived_ns = min(frame.t_ns, t_ns)
+            for target in incoming.heights:
+                heights[target.strut] = Measurement(values[target.value], arrived_ns)
+            for target in incoming.others:
+                others[target.place] = values[target.value]
+        return _Received(core, heights, others, sequences, ledger, action)
 
-    def _caught_up(self, rig: RigState, heights: _Heights, others: _Others) -> RigState:
+    def _caught_up(
+        self, core: CoreState, heights: list[Measurement | None], others: list[float | None]
+    ) -> CoreState:
         """The core at the time of measurements that newer ones follow."""
-        t_ns = max([rig.t_ns, *[item.t_ns for item in heights if item]])
-        applied_n, temperature_c, load_cell_n = others
-        step_input = StepInput(
-            t_ns, tuple(heights), applied_n, temperature_c, load_cell_force_n=load_cell_n
-        )
-        return self._core.step(rig, step_input)[0]
+        t_ns = max([core.t_ns, *[item.t_ns for item in heights if item]])
+        return self.core.step(core, StepInput(t_ns, tuple(heights), tuple(others)))[0]
 
     def _foreign(self, ledger: Ledger, frame: Frame) -> Ledger:
         """After a frame of no incoming message: error frames, or somebody under our ids."""
@@ -281,42 +254,38 @@ class Bridge:
         return replace(ledger, counts=counts._replace(second_sender=counts.second_sender + 1))
 
     def _judged(
-        self, ledger: Ledger, index: int, t_ns: int, verdict: Verdict, sequence: SequenceState
+        self, ledger: Ledger, place: int, t_ns: int, verdict: Verdict, sequence: SequenceState
     ) -> Ledger:
         """After a frame that did not simply follow the one before."""
         counts = _counted(ledger.counts, verdict, sequence)
         if verdict is not Verdict.OUT_OF_SEQUENCE:
             return replace(ledger, counts=counts)
-        strays, rival = self._stray(ledger.strays, index, t_ns)
+        strays, rival = self._stray(ledger.strays, place, t_ns)
         counts = counts._replace(second_sender=counts.second_sender + rival)
         return replace(ledger, counts=counts, strays=strays)
 
     def _stray(
-        self, strays: tuple[Strays, ...], index: int, t_ns: int
+        self, strays: tuple[Strays, ...], place: int, t_ns: int
     ) -> tuple[tuple[Strays, ...], bool]:
         """Strays after another one, and whether only a second sender explains them."""
-        cycle_ns = self._incoming[index].message.cycle_time_ns or 0
-        before = strays[index]
+        cycle_ns = self.incoming[place].message.cycle_time_ns or 0
+        before = strays[place]
         follows = t_ns - before.t_ns <= _RIVAL_CYCLES * cycle_ns
         stray = Strays(before.frames + 1 if follows else 1, t_ns)
-        return (*strays[:index], stray, *strays[index + 1 :]), stray.frames >= RIVAL_FRAMES
+        return (*strays[:place], stray, *strays[place + 1 :]), stray.frames >= RIVAL_FRAMES
 
     def _plausible(
-        self,
-        ledger: Ledger,
-        of_struts: list[tuple[int, int]],
-        arrived_ns: int,
-        values: tuple[float, ...],
+        self, ledger: Ledger, incoming: Incoming, arrived_ns: int, values: tuple[float, ...]
     ) -> tuple[Ledger, int]:
-        """The gravest action that an accepted frame's measurements ask for.
+        """The severest action that an accepted frame's measurements ask for.
 
         A frame is used whole or not at all: from `Action.REFUSE` on it is to be dropped.
         """
         seen, action = list(ledger.seen), 0
-        for number, strut in of_struts:
-            measured = Measurement(values[number], arrived_ns)
-            seen[strut], asked = judged(self._measured_limits, seen[strut], measured)
-            action = max(action, asked)
+        for target in incoming.heights:
+            measured = Measurement(values[target.value], arrived_ns)
+            remembered, asked = judged(self._measured_limits, seen[target.strut], measured)
+            seen[target.strut], action = remembered, max(action, asked)
         if action < Action.REFUSE:
             return replace(ledger, seen=tuple(seen)), action
         counts = ledger.counts
@@ -325,66 +294,80 @@ class Bridge:
         return replace(ledger, counts=counts), action
 
     def _limited(
-        self, before: RigState, rig: RigState, output: StepOutput, action: int
-    ) -> tuple[RigState, StepOutput, int]:
+        self, before: CoreState, core: CoreState, output: StepOutput, action: int
+    ) -> tuple[CoreState, StepOutput, int]:
         """State, output and action of a tick, with the limits on its estimates seen to."""
         if output.mode in (Mode.RUNNING, Mode.HOLD):
             action = max([action, *[beyond(self._limits, strut) for strut in output.struts]])
         event = EVENTS_BEYOND.get(Action(action)) if action else None
         if event is None:
-            return rig, output, action
-        mode = next_mode(rig.mode, event)
-        if mode is Mode.SAFE and rig.mode is not Mode.SAFE:
-            rig = replace(rig, mode=mode, last_valid=before.last_valid)
-            rig, output = self._core.step(rig, StepInput(rig.t_ns, (None,) * self._struts))
+            return core, output, action
+        mode = next_mode(core.mode, event)
+        if mode is Mode.SAFE and core.mode is not Mode.SAFE:
+            core = replace(core, mode=mode, last_valid=before.last_valid)
+            core, output = self.core.step(core, StepInput(core.t_ns, tuple(self._no_heights)))
         elif mode is Mode.HOLD:
-            rig = replace(rig, mode=mode, last_valid=before.last_valid)
+            core = replace(core, mode=mode, last_valid=before.last_valid)
             struts = tuple([replace(strut, valid=False) for strut in output.struts])
             output = StepOutput(mode, struts)
-        return rig, output, action
+        return core, output, action
 
-
-def _source(place: int, item: Incoming) -> _Source:
-    of_struts = [
-        (number, target.strut)
-        for number, target in enumerate(item.targets)
-        if target.quantity is Quantity.HEIGHT
-    ]
-    of_others = [
-        (number, _OTHERS.index(target.quantity))
-        for number, target in enumerate(item.targets)
-        if target.quantity is not Quantity.HEIGHT
-    ]
-    return place, item.read, of_struts, of_others
+    def _sent(
+        self,
+        sendings: tuple[Sending, ...],
+        t_ns: int,
+        output: StepOutput,
+        ledger: Ledger,
+        conditions: Conditions,
+    ) -> tuple[tuple[Sending, ...], list[Frame], Ledger]:
+        """Where the outgoing messages stand, frames to send, and what is remembered."""
+        frames: list[Frame] = []
+        if not output.struts:  # nothing is sent before the first valid measurement
+            return sendings, frames, ledger
+        after = list(sendings)
+        for place, item in enumerate(self._outgoing):
+            sending = sendings[place]
+            if t_ns < sending.due_ns:
+                continue
+            report = Report(output, ledger.counts, ledger.reported, conditions, sending.number)
+            frame, saturated = item.frame(report, t_ns)
+            frames.append(frame)
+            due_ns = _next_due_ns(sending.due_ns, t_ns, item.period_ns)
+            after[place] = Sending(sending.number + 1, due_ns)
+            if item.is_status or saturated:
+                ledger = _reported(ledger, item, conditions, saturated=saturated)
+        return tuple(after), frames, ledger
 
 
 def _noted(ledger: Ledger, output: StepOutput, action: int, conditions: Conditions) -> Ledger:
-    """After a tick that was not as it should be."""
+    """After a tick; most are as they should be."""
+    holds = output.mode is Mode.HOLD
+    if not (action or holds or conditions.overruns or conditions.bus_fault):
+        return ledger
     counts = ledger.counts
     counts = counts._replace(
         overruns=counts.overruns + conditions.overruns,
-        stale=counts.stale + (output.mode is _HOLD),
+        stale=counts.stale + holds,
         limited=counts.limited + (action > 0),
         bus_faulty=counts.bus_faulty + conditions.bus_fault,
     )
     return replace(ledger, counts=counts)
 
 
-def _told(ledger: Ledger, item: Outgoing, conditions: Conditions, *, saturated: bool) -> Ledger:
+def _reported(ledger: Ledger, item: Outgoing, conditions: Conditions, *, saturated: bool) -> Ledger:
     """After a status, or after a frame with a value at the end of its range."""
     counts = ledger.counts
     if not item.is_status:
         return replace(ledger, counts=counts._replace(saturated=counts.saturated + saturated))
-    # A status that cannot be sent tells nobody.
-    return ledger if conditions.bus_fault else replace(ledger, told=counts)
+    # A status that cannot be sent reports to nobody.
+    return ledger if conditions.bus_fault else replace(ledger, reported=counts)
 
 
 def _next_due_ns(due_ns: int, t_ns: int, period_ns: int) -> int:
     """On the message's own grid; what was missed is not made up for."""
-    if due_ns == t_ns:
-        return t_ns + period_ns
-    late = (t_ns - due_ns) // period_ns if period_ns else 0
-    return due_ns + (late + 1) * period_ns if period_ns else t_ns
+    if not period_ns:
+        return t_ns
+    return due_ns + ((t_ns - due_ns) // period_ns + 1) * period_ns
 
 
 _CAUSES = {

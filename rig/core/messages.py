@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import Enum
 from typing import NamedTuple
 
 from msgspec import Struct
@@ -12,26 +11,11 @@ from can_dbc.database import Message
 from can_dbc.frame import Frame
 from can_dbc.protection import SequenceState, Verdict, compile_checker, compile_protector
 from can_dbc.units import Dimension
-from rig.core.types import Mode, StepOutput
+from rig.core.contract import Mode, StepOutput
+from rig.core.quantities import HEIGHT, PLACES, Quantity
 
 
-class Quantity(Enum):
-    """What a signal of the bench means to the bridge; the value is what it measures."""
-
-    HEIGHT = "height"
-    APPLIED_FORCE = "applied_force"
-    LOAD_CELL_FORCE = "load_cell_force"
-    TEMPERATURE = "temperature"
-
-    @property
-    def dimension(self) -> Dimension:
-        """Dimension its signal must have."""
-        if self is Quantity.HEIGHT:
-            return Dimension.LENGTH
-        return Dimension.TEMPERATURE if self is Quantity.TEMPERATURE else Dimension.FORCE
-
-
-class Target(NamedTuple):
+class Wanted(NamedTuple):
     """What one signal of an incoming message is for.
 
     Attributes:
@@ -42,7 +26,31 @@ class Target(NamedTuple):
 
     signal: str
     quantity: Quantity
+    strut: int = 0
+
+
+class HeightTarget(Struct, frozen=True, gc=False):
+    """Where a value of a frame goes: the height of a strut.
+
+    Attributes:
+        value: Its place among the frame's values.
+        strut: Index of the strut.
+    """
+
+    value: int
     strut: int
+
+
+class OtherTarget(Struct, frozen=True, gc=False):
+    """Where a value of a frame goes: another quantity.
+
+    Attributes:
+        value: Its place among the frame's values.
+        place: Place of the quantity among `OTHERS`.
+    """
+
+    value: int
+    place: int
 
 
 Reader = Callable[[SequenceState, Frame], tuple[SequenceState, Verdict, tuple[float, ...] | None]]
@@ -50,19 +58,21 @@ Reader = Callable[[SequenceState, Frame], tuple[SequenceState, Verdict, tuple[fl
 the frame is, and its values in SI; None where there are none to be used."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Incoming:
     """A message of the bench.
 
     Attributes:
         message: Its definition.
-        read: What reads its frames; values are in the order of `targets`.
-        targets: Where the values go.
+        read: What reads its frames.
+        heights: Where heights among its values go.
+        others: Where other values go.
     """
 
     message: Message
     read: Reader
-    targets: tuple[Target, ...]
+    heights: tuple[HeightTarget, ...]
+    others: tuple[OtherTarget, ...]
 
 
 class Counts(NamedTuple):
@@ -126,7 +136,7 @@ NO_TIMING = TimingFigures()
 
 
 class Conditions(NamedTuple):
-    """What the loop knows and a tick is told.
+    """What the loop knows and a tick is reported.
 
     Attributes:
         overruns: Ticks missed since the last one.
@@ -149,14 +159,14 @@ class Report(Struct, frozen=True, gc=False):
     Attributes:
         output: What the core said.
         counts: What has been counted.
-        told: What the last status that was sent knew of them.
+        reported: What the last status that was sent knew of them.
         conditions: What the loop knows.
         number: How many frames of the message came before.
     """
 
     output: StepOutput
     counts: Counts
-    told: Counts
+    reported: Counts
     conditions: Conditions
     number: int
 
@@ -179,19 +189,29 @@ class Outgoing:
     is_status: bool = False
 
 
-def incoming(message: Message, targets: Sequence[Target]) -> Incoming:
+def incoming(message: Message, wanted: Sequence[Wanted]) -> Incoming:
     """An incoming message, compiled.
 
     Args:
         message: Message of the bench.
-        targets: What its signals are for.
+        wanted: What its signals are for.
 
     Raises:
         DatabaseError: A signal is missing, or its unit does not fit what it is for.
     """
-    names = [target.signal for target in targets]
-    decode = compile_decoder(message, names, [target.quantity.dimension for target in targets])
-    return Incoming(message, _reader(message, decode), tuple(targets))
+    names = [item.signal for item in wanted]
+    decode = compile_decoder(message, names, [item.quantity.dimension for item in wanted])
+    heights = [
+        HeightTarget(value, item.strut)
+        for value, item in enumerate(wanted)
+        if item.quantity is HEIGHT
+    ]
+    others = [
+        OtherTarget(value, PLACES[item.quantity])
+        for value, item in enumerate(wanted)
+        if item.quantity is not HEIGHT
+    ]
+    return Incoming(message, _reader(message, decode), tuple(heights), tuple(others))
 
 
 def _reader(message: Message, decode: Decoder) -> Reader:
@@ -295,18 +315,18 @@ def status(message: Message) -> Outgoing:
     limits = [float("inf") if value is None else value for value in most.values()]
 
     def values(report: Report) -> Sequence[float]:
-        counts, told = report.counts, report.told
-        second_sender = counts.second_sender > told.second_sender
+        counts, reported = report.counts, report.reported
+        second_sender = counts.second_sender > reported.second_sender
         raw = (
             float(report.output.mode),
-            float(counts.saturated > told.saturated),
+            float(counts.saturated > reported.saturated),
             float(counts.overruns),
             float(counts.lost),
             float(counts.refused),
             float(counts.stale),
             float(report.output.mode is not Mode.RUNNING),
-            float(counts.limited > told.limited),
-            float(counts.bus_faulty > told.bus_faulty or second_sender),
+            float(counts.limited > reported.limited),
+            float(counts.bus_faulty > reported.bus_faulty or second_sender),
             float(report.conditions.log_fault),
         )
         return [min(value, limit) for value, limit in zip(raw, limits, strict=True)]

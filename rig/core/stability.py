@@ -7,16 +7,18 @@ Reference: Åström and Wittenmark, "Computer-Controlled Systems" (1997), chapte
 """
 
 import cmath
-import math
+import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dart_model.plant import DartPlant
-from rig.core.observer import ObserverGains, update
-from rig.core.types import ObserverState
+from rig.core.contract import AMBIENT_C, Measurement, Observer, Plant
+
+_STEP = 1e-8
+"""Step of the central differences, in units of the state: so small that no observer comes near its
+limit."""
 
 
 class Pole(NamedTuple):
@@ -34,9 +36,9 @@ class Pole(NamedTuple):
 
 
 def closed_loop_poles(
-    plant: DartPlant,
-    gains: tuple[ObserverGains, ...],
-    heights_m: tuple[float, ...],
+    plant: Plant,
+    observers: Sequence[Observer],
+    heights_m: Sequence[float],
     period_ns: int,
     measured_every: int,
     delay: int = 0,
@@ -45,7 +47,7 @@ def closed_loop_poles(
 
     Args:
         plant: The model.
-        gains: One observer a strut.
+        observers: One for each of its struts.
         heights_m: Strut heights at which the bench is assumed to rest.
         period_ns: Time between two ticks.
         measured_every: Ticks between two measurements; the virtual force is held in between.
@@ -54,52 +56,42 @@ def closed_loop_poles(
     Returns:
         Poles, the slowest to decay first.
     """
-    count = len(gains)
-    unlimited = [replace(gain, force_limit_n=math.inf) for gain in gains]
-    start = plant.initial(heights_m)
-    size = plant.coordinates
     interval_ns = period_ns * measured_every
+    start = list(plant.numbers(plant.init(heights_m)))
+    at_rest = [
+        list(observer.numbers(observer.init(Measurement(height_m, 0))))
+        for observer, height_m in zip(observers, heights_m, strict=True)
+    ]
+    # Where the numbers of each observer stand behind those of the plant.
+    ends = list(itertools.accumulate((len(part) for part in at_rest), initial=len(start)))
 
     def after(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        values = x.tolist()
-        state = plant.state(
-            tuple(values[:size]),
-            tuple(values[size : 2 * size]),
-            tuple(values[2 * size : 2 * size + plant.memory_size]),
-            0.0,
-        )
-        rest = values[2 * size + plant.memory_size :]
-        integrals, forces = rest[:count], rest[count : 2 * count]
-        # Model heights of earlier measurements, the newest first: what a delayed loop sees.
-        past = rest[2 * count :]
-        for _ in range(measured_every):
-            state = plant.step(plant.load(state, forces, 0.0, 20.0), period_ns * 1e-9, 0.0)
-        now = [height_m for height_m, _ in state.struts]
-        seen = past[-count:] if delay else now
-        updated = [
-            update(gain, ObserverState(integral, 0.0, 0.0, 0), height - model, interval_ns)
-            for gain, integral, height, model in zip(
-                unlimited, integrals, heights_m, seen, strict=True
-            )
+        numbers = x.tolist()
+        model = plant.state_of(numbers[: len(start)])
+        states = [
+            observer.state_of(numbers[first:end])
+            for observer, (first, end) in zip(observers, itertools.pairwise(ends), strict=True)
         ]
-        return np.array(
-            [
-                *state.positions,
-                *state.velocities,
-                *state.memory,
-                *[observer.integral_m_s for observer in updated],
-                *[observer.virtual_force_n for observer in updated],
-                *(now + past[: -count or None] if delay else []),
-            ]
-        )
+        # Model heights of earlier measurements, the newest first: what a delayed loop sees.
+        past = numbers[ends[-1] :]
+        virtual_n = [state.virtual_force_n for state in states]
+        for _ in range(measured_every):
+            loaded = plant.load(model, virtual_n, 0.0, AMBIENT_C)
+            model = plant.step(loaded, period_ns * 1e-9, 0.0)
+        now = [height_m for height_m, _ in model.struts]
+        seen = past[-len(now) :] if delay else now
+        updated: list[float] = []
+        for index, (observer, state) in enumerate(zip(observers, states, strict=True)):
+            velocity = model.struts[index][1]
+            measured = Measurement(heights_m[index], interval_ns)
+            corrected = observer.step(state, interval_ns, seen[index], velocity, measured)
+            updated += observer.numbers(corrected)
+        return np.array([*plant.numbers(model), *updated, *((now + past)[: len(now) * delay])])
 
-    x = np.array(
-        [*start.positions, *start.velocities, *start.memory, *(0.0,) * 2 * count]
-        + list(heights_m) * delay
-    )
+    x = np.array([*start, *itertools.chain(*at_rest), *(list(heights_m) * delay)])
     jacobian = np.empty((len(x), len(x)))
     for index, value in enumerate(x.tolist()):
-        step = 1e-6 * max(1.0, abs(value))
+        step = _STEP * max(1.0, abs(value))
         up, down = x.copy(), x.copy()
         up[index] += step
         down[index] -= step

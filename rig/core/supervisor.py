@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum, auto
 from typing import NamedTuple
 
-from rig.core.types import Measurement, Mode, StrutOutput
+from rig.core.contract import Measurement, Mode, StrutOutput
 
 
-class Event(Enum):
+class Event(IntEnum):
     """What a tick finds, the gravest one first."""
 
     STOP = auto()

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dart_model.spec import ModelSpec
-from dart_model.yaml_file import InputError
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.outcome import Result, write_results
 from rig.diagnosis.progress import Progress
 from rig.diagnosis.recording import read_recording
+from rig.inputs.errors import InputError
 from rig.io.run_log import RUN_FILE
 
 

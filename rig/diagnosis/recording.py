@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from can_dbc.codec import decode_log
 from can_dbc.database import Message
 from can_dbc.protection import check_crc_log
-from dart_model.yaml_file import InputError
-from rig.config import Setup, SignalName
-from rig.core.messages import Quantity
+from rig.core.quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, TEMPERATURE, Quantity
+from rig.inputs.errors import InputError
 from rig.io.run_log import RunFolder
-from rig.replay import setup_of_run
+from rig.operation.config import SignalName
+from rig.operation.replay import setup_of_run
+from rig.operation.setup import Setup
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -47,7 +48,7 @@ _FULL_SPEED = 0.3
 to rest slows down before."""
 
 
-class RecordingError(ValueError):
+class RecordingError(InputError):
     """A recording that cannot be diagnosed; one line: file, column, what was found and expected."""
 
 
@@ -268,31 +269,30 @@ def read_run(folder: Path) -> Recording:
     found, ready = setup_of_run(folder)
     payloads = _payloads(found, ready)
     signals = ready.config.signals
-    heights = [
-        _channel(ready, payloads, entry, Quantity.HEIGHT) for entry in signals.height.values()
-    ]
+    heights = [_channel(ready, payloads, entry, HEIGHT) for entry in signals.height.values()]
     for (name, entry), (t_s, _) in zip(signals.height.items(), heights, strict=True):
         if len(t_s) < 2:
             raise InputError(f"{folder}: no {entry.message} with the height of strut {name}")
     t_s = heights[0][0]
     half_s = 0.5 * float(np.median(np.diff(t_s)))
 
-    def other(entry: SignalName | None, quantity: Quantity) -> Array | None:
+    def other(quantity: Quantity) -> Array | None:
+        entry = signals.others.get(quantity)
         if entry is None:
             return None
         own_t_s, values = _channel(ready, payloads, entry, quantity)
         return np.interp(t_s, own_t_s, values) if len(own_t_s) else None
 
-    cell = other(signals.load_cell_force, Quantity.LOAD_CELL_FORCE)
+    cell = other(LOAD_CELL_FORCE)
     # The bus carries one load cell; with several struts nothing says whose it is.
     return checked(
         Recording(
             folder.name,
             t_s,
             np.column_stack([_nearest(t_s, *height, half_s) for height in heights]),
-            other(signals.applied_force, Quantity.APPLIED_FORCE),
+            other(APPLIED_FORCE),
             None if cell is None or len(heights) > 1 else cell[:, np.newaxis],
-            other(signals.temperature, Quantity.TEMPERATURE),
+            other(TEMPERATURE),
         )
     )
 

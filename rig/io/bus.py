@@ -10,6 +10,7 @@ from typing import Any, cast
 import can
 
 from can_dbc.frame import Frame
+from rig.inputs.errors import InputError
 
 FRAMES_A_MS = 64
 """Bound on the frames read per ms since the last tick, so that a flood holds no tick up. No bus
@@ -27,7 +28,7 @@ _LISTEN_ONLY_OPTIONS: dict[str, dict[str, Any]] = {
 """What keeps a controller from acknowledging frames too. SocketCAN leaves this to `ip link`."""
 
 
-class BusError(OSError):
+class BusError(InputError):
     """The bus cannot be opened, or a frame cannot be sent or received."""
 
 

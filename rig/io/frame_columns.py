@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.yaml_file import InputError
+from can_dbc.frame import Frame
+from rig.inputs.errors import InputError
 from rig.io.run_log import LATEST_S, parse_frame
 
 _BLOCK_BYTES = 2 * 1024 * 1024
@@ -41,6 +42,7 @@ class FrameColumns:
         is_extended: Whether ids have 29 bits, shape (n,).
         is_error: Whether it is an error frame, shape (n,).
         length: Length of the payload in bytes, shape (n,).
+        is_fd: Whether it is a CAN FD frame, shape (n,).
         payload: Payloads, padded with zeros, shape (n, largest length).
     """
 
@@ -49,7 +51,33 @@ class FrameColumns:
     is_extended: NDArray[np.bool_]
     is_error: NDArray[np.bool_]
     length: NDArray[np.int64]
+    is_fd: NDArray[np.bool_]
     payload: NDArray[np.uint8]
+
+    def between(self, first: int, end: int) -> Iterator[Frame]:
+        """Frames `first` to `end - 1`, one by one."""
+        part = slice(first, end)
+        payload = self.payload[part]
+        data, width = payload.tobytes(), payload.shape[1]
+        columns = zip(
+            self.t_ns[part].tolist(),
+            self.arbitration_id[part].tolist(),
+            range(0, len(data) + 1, width or 1),
+            self.length[part].tolist(),
+            self.is_extended[part].tolist(),
+            self.is_fd[part].tolist(),
+            self.is_error[part].tolist(),
+            strict=False,
+        )
+        for t_ns, arbitration_id, begin, length, is_extended, is_fd, is_error in columns:
+            yield Frame(
+                t_ns,
+                arbitration_id,
+                data[begin : begin + length],
+                is_extended,
+                is_fd,
+                is_error=is_error,
+            )
 
 
 def received_frames(paths: Sequence[Path], epoch_ns: int) -> FrameColumns:
@@ -74,6 +102,7 @@ def received_frames(paths: Sequence[Path], epoch_ns: int) -> FrameColumns:
         np.concatenate([part.is_extended for part in parts]),
         np.concatenate([part.is_error for part in parts]),
         np.concatenate([part.length for part in parts]),
+        np.concatenate([part.is_fd for part in parts]),
         np.concatenate(
             [np.pad(part.payload, ((0, 0), (0, width - part.payload.shape[1]))) for part in parts]
         ),
@@ -103,6 +132,7 @@ def _columns(count: int, width: int) -> FrameColumns:
         np.zeros(count, dtype=np.bool_),
         np.zeros(count, dtype=np.bool_),
         np.zeros(count, dtype=np.int64),
+        np.zeros(count, dtype=np.bool_),
         np.zeros((count, width), dtype=np.uint8),
     )
 
@@ -138,6 +168,7 @@ def _block(text: bytes, first_line: int, epoch_ns: int, path: Path) -> FrameColu
         found.is_extended[received],
         found.is_error[received],
         found.length[received],
+        found.is_fd[received],
         found.payload[received, :largest],
     )
 
@@ -173,6 +204,7 @@ def _read_alike(
     found.is_error[at] = is_long & ((number & 0x20000000) != 0)
     found.is_extended[at] = is_long & ((number & 0x20000000) == 0)
     found.length[at] = data.shape[1] // 2
+    found.is_fd[at] = shape["mark"].startswith(b"##")
     found.payload[at, : data.shape[1] // 2] = data[:, ::2] << 4 | data[:, 1::2]
     return alike
 
@@ -197,5 +229,6 @@ def _read_line(line: str, row: int, epoch_ns: int, place: str, found: FrameColum
     found.arbitration_id[row] = frame.arbitration_id
     found.is_extended[row] = frame.is_extended
     found.is_error[row] = frame.is_error
+    found.is_fd[row] = frame.is_fd
     found.length[row] = len(frame.data) if direction == "R" else -1
     found.payload[row, : len(frame.data)] = np.frombuffer(frame.data, dtype=np.uint8)

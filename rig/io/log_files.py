@@ -12,7 +12,7 @@ import can
 from can.io.blf import BLFParseError
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError
+from rig.inputs.errors import InputError
 
 _TEXT = MappingProxyType(
     {".asc": can.ASCReader, ".log": can.CanutilsLogReader, ".trc": can.TRCReader}

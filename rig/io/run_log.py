@@ -17,7 +17,8 @@ from typing import Any, cast
 import pyarrow as pa
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError, parse_mapping, read_text
+from rig.inputs.errors import InputError
+from rig.inputs.yaml_file import parse_mapping, read_text
 from rig.io.steps import step_schema
 
 _TAIL_BYTES = 4096
@@ -25,6 +26,9 @@ _TAIL_BYTES = 4096
 
 RUN_FILE, FRAMES_FILE, STEPS_FILE = "run.yaml", "frames.log", "steps.arrow"
 MODEL_FILE, DBC_FILE = "model.yaml", "bus.dbc"
+
+RUN_SCHEMA = 2
+"""Version of the folder's layout, in `run.yaml`."""
 
 LATEST_S = 9_000_000_000
 """Unix time beyond which a stamp is wrong: in ns it would hardly go into 64 bits."""
@@ -145,6 +149,11 @@ def read_run(folder: Path) -> RunFolder:
             raise InputError(f"{folder}: {name} is missing, expected a run")
     path = folder / RUN_FILE
     header = parse_mapping(read_text(path, 64 * 1024 * 1024), str(path))
+    schema = header.get("schema")
+    if schema != RUN_SCHEMA:
+        raise InputError(
+            f"{path}: schema: {str(schema)[:40]}: expected {RUN_SCHEMA}, a run of this version"
+        )
     epoch_ns = header.get("epoch_ns")
     if not isinstance(epoch_ns, int) or not 0 <= epoch_ns < LATEST_S * 1_000_000_000:
         raise InputError(f"{path}: epoch_ns: {str(epoch_ns)[:40]}: expected a Unix time in ns")
@@ -184,7 +193,7 @@ def _read_part(path: Path) -> Any:
     try:
         with _pa.memory_map(str(path)) as source:
             if source.size() < _schema_bytes(bytes(source.read(8))):
-                return step_schema(()).empty_table()
+                return step_schema().empty_table()
             source.seek(0)
             stream = _pa.ipc.open_stream(source)
             # Behind the last whole batch stands what a kill cut off.
@@ -202,7 +211,7 @@ def _read_part(path: Path) -> Any:
 
 
 def _check_columns(table: Any, path: Path) -> None:
-    common = step_schema(())
+    common = step_schema()
     for number, column in enumerate(table.schema):
         expected = common[number] if number < len(common) else _pa.field(column.name, _pa.float64())
         if (column.name, column.type) != (expected.name, expected.type):

@@ -19,7 +19,7 @@ import pyarrow as pa
 import yaml
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError
+from rig.inputs.errors import InputError
 from rig.io.captures import Capture, Captures, Entry, Window
 from rig.io.realtime import follow
 from rig.io.run_log import (
@@ -119,7 +119,7 @@ class RunLog:
     Args:
         folder: Folder to create; it must be empty or absent.
         header: What is known before the first tick, for `run.yaml`.
-        struts: Names of the struts.
+        columns: Names of the numbers of each step.
         epoch_ns: Unix time of the run's start.
         channel: Name of the bus in `frames.log`.
         paced: The run waits for a clock, so a thread of its own writes; otherwise the run waits for
@@ -137,7 +137,7 @@ class RunLog:
         self,
         folder: Path,
         header: dict[str, object],
-        struts: Sequence[str],
+        columns: Sequence[str],
         epoch_ns: int,
         channel: str,
         *,
@@ -157,8 +157,8 @@ class RunLog:
         self._header = header
         self._epoch_ns = epoch_ns
         self._channel = channel
-        self._struts = tuple(struts)
-        self._rows = StepRows(struts)
+        self._columns = tuple(columns)
+        self._rows = StepRows(columns)
         self._rotation = rotation
         self._captures = None if window is None else Captures(window, graver, self._write_capture)
         try:
@@ -221,7 +221,7 @@ class RunLog:
             self._failed("the disk is too slow")
         else:
             self._finish()
-        self.dropped += len(self._waiting) + len(self._rows)
+        self.dropped += len(self._waiting) + self._rows.count
         with contextlib.suppress(OSError):
             (self.folder / _RESERVE_FILE).unlink()
         try:
@@ -259,7 +259,7 @@ class RunLog:
             self._write_lines()
             self._flush_if_due()
             while self._waiting:
-                room = _MOST_STEPS - len(self._rows)
+                room = _MOST_STEPS - self._rows.count
                 self._take(min(_MOST_AT_ONCE, room, len(self._waiting)))
                 self._write_lines()
                 self._give_way()
@@ -296,15 +296,15 @@ class RunLog:
         self._lines = b""
 
     def _flush_if_due(self) -> None:
-        if self._rows.span_ns >= FLUSH_NS or len(self._rows) >= _MOST_STEPS:
+        if self._rows.span_ns >= FLUSH_NS or self._rows.count >= _MOST_STEPS:
             last_ns = self._rows.last_ns
             self._flush()
             self._rotate(last_ns)
             self._give_way()
 
     def _flush(self) -> None:
-        if self._rows:
-            self._part.steps.append(self._rows.serialized())
+        if self._rows.count:
+            self._part.steps.append(_serialized(self._rows))
             self._rows.clear()
 
     def _rotate(self, now_ns: int) -> None:
@@ -319,7 +319,7 @@ class RunLog:
     def _write_capture(self, capture: Capture) -> None:
         folder = self.folder / "captures" / f"{capture.number:03d}_{capture.why}"
         header = {**self._header, "capture": {"why": capture.why, "t_s": capture.t_ns * 1e-9}}
-        rows = StepRows(self._struts)
+        rows = StepRows(self._columns)
         try:
             folder.mkdir(parents=True)
             part = _Part(folder, 0, rows.schema, 0)
@@ -329,7 +329,7 @@ class RunLog:
                     rows.append(entry.step)
                     lines += self._lines_of(entry)
                 part.frames.append("".join(lines).encode("ascii"))
-                part.steps.append(rows.serialized())
+                part.steps.append(_serialized(rows))
                 rows.clear()
                 self._give_way()
             part.close()
@@ -339,6 +339,10 @@ class RunLog:
             _write_yaml(folder / RUN_FILE, header)
         except OSError as error:
             self._failed(f"capture {folder.name}: {error.strerror}")
+
+
+def _serialized(rows: StepRows) -> bytes:
+    return bytes(rows.batch().serialize())
 
 
 def _write_yaml(path: Path, content: dict[str, object]) -> None:

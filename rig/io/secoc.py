@@ -19,7 +19,8 @@ from typing import Any, NamedTuple, cast
 from msgspec.structs import replace
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError, read_text
+from rig.inputs.errors import InputError
+from rig.inputs.yaml_file import read_text
 
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 """Lengths that a CAN FD frame can have, in bytes."""

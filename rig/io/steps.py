@@ -2,10 +2,11 @@
 
 import struct
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct
 
 ACKNOWLEDGED, BUS_FAULT, LOG_FAULT = 1, 2, 4
 """Bits of `Step.flags`."""
@@ -13,7 +14,7 @@ ACKNOWLEDGED, BUS_FAULT, LOG_FAULT = 1, 2, 4
 _pa = cast("Any", pa)
 
 
-class Step(NamedTuple):
+class Step(Struct, frozen=True, gc=False):
     """What is logged of one tick.
 
     Attributes:
@@ -22,9 +23,7 @@ class Step(NamedTuple):
         received: Frames received, so that a replay gives each tick the same ones.
         mode: State of the bridge.
         flags: Bit 0 acknowledged, bit 1 bus fault, bit 2 log fault.
-        applied_force_n: New applied force, NaN where none came.
-        temperature_c: New temperature, NaN where none came.
-        struts: Nine numbers a strut, in the order of `STRUT_COLUMNS`.
+        numbers: What was measured and published, as the log's further columns are named.
     """
 
     t_ns: int
@@ -32,38 +31,23 @@ class Step(NamedTuple):
     received: int
     mode: int
     flags: int
-    applied_force_n: float
-    temperature_c: float
-    struts: tuple[float, ...]
+    numbers: tuple[float, ...]
 
 
-STRUT_COLUMNS = (
-    "measured_height_m",
-    "measured_t_ns",
-    "force_n",
-    "virtual_force_n",
-    "valid",
-    "height_m",
-    "velocity_m_per_s",
-    "acceleration_m_per_s2",
-    "innovation_m",
-)
-"""Columns of each strut, prefixed with its name and a dot; NaN where there is nothing."""
+def step_schema(columns: Sequence[str] = ()) -> Any:
+    """Arrow schema of `steps.arrow`.
 
-
-def step_schema(struts: Sequence[str]) -> Any:
-    """Arrow schema of `steps.arrow`."""
+    Args:
+        columns: Names of `Step.numbers`.
+    """
     fields = [
         ("t_ns", _pa.int64()),
         ("overruns", _pa.int32()),
         ("received", _pa.int32()),
         ("mode", _pa.int8()),
         ("flags", _pa.int8()),
-        ("applied_force_n", _pa.float64()),
-        ("temperature_c", _pa.float64()),
     ]
-    fields += [(f"{strut}.{name}", _pa.float64()) for strut in struts for name in STRUT_COLUMNS]
-    return _pa.schema(fields)
+    return _pa.schema([*fields, *((name, _pa.float64()) for name in columns)])
 
 
 class StepRows:
@@ -73,12 +57,12 @@ class StepRows:
     columns in one go would keep the interpreter from a fast loop for longer than a tick lasts.
 
     Args:
-        struts: Names of the struts.
+        columns: Names of the numbers of a step.
     """
 
-    def __init__(self, struts: Sequence[str]) -> None:
-        self.schema = step_schema(struts)
-        self._packer = struct.Struct(f"<qiibbdd{len(struts) * len(STRUT_COLUMNS)}d")
+    def __init__(self, columns: Sequence[str]) -> None:
+        self.schema = step_schema(columns)
+        self._packer = struct.Struct(f"<qiibb{len(columns)}d")
         self._columns = np.dtype(
             [(field.name, field.type.to_pandas_dtype()) for field in self.schema]
         )
@@ -86,9 +70,8 @@ class StepRows:
         self._first_ns = 0
         self.last_ns = 0
         """Time of the last one."""
-
-    def __len__(self) -> int:
-        return len(self._rows) // self._packer.size
+        self.count = 0
+        """How many they are."""
 
     @property
     def span_ns(self) -> int:
@@ -100,15 +83,18 @@ class StepRows:
         if not self._rows:
             self._first_ns = step.t_ns
         self.last_ns = step.t_ns
-        self._rows += self._packer.pack(*step[:-1], *step.struts)
+        self.count += 1
+        self._rows += self._packer.pack(
+            step.t_ns, step.overruns, step.received, step.mode, step.flags, *step.numbers
+        )
 
-    def serialized(self) -> bytes:
-        """All steps as a record batch."""
+    def batch(self) -> Any:
+        """All steps as an Arrow record batch."""
         table = np.frombuffer(self._rows, self._columns)
         arrays = [_pa.array(np.ascontiguousarray(table[name])) for name in self.schema.names]
-        batch = _pa.RecordBatch.from_arrays(arrays, schema=self.schema)
-        return bytes(batch.serialize())
+        return _pa.RecordBatch.from_arrays(arrays, schema=self.schema)
 
     def clear(self) -> None:
         """Begin anew."""
         self._rows = bytearray()
+        self.count = 0

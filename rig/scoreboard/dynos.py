@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rig.config import CONFIGS
 from rig.diagnosis.command import diagnose_runs
 from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.recording import RecordingError, read_recording
-from rig.imports import load_mapping
+from rig.exchange.mapping import load_mapping
+from rig.operation.config import CONFIGS
 from rig.pages.report import write_report
 from rig.scoreboard.parts import Part, imported
 from rig.scoreboard.starts import dyno_start

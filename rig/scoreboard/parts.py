@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import NamedTuple
 
-from rig.imports import Mapping, import_table
+from rig.exchange.foreign_table import import_table
+from rig.exchange.mapping import Mapping
 
 
 class Part(NamedTuple):

@@ -6,8 +6,8 @@ Sets that are not there are passed over, and nothing is downloaded.
 from collections.abc import Collection
 from pathlib import Path
 
-from dart_model.yaml_file import InputError
 from rig.diagnosis.progress import Progress
+from rig.inputs.errors import InputError
 from rig.scoreboard.dynos import brfd_rows, mr_damper_rows
 from rig.scoreboard.emps import emps_rows
 from rig.scoreboard.silverbox import silverbox_rows

@@ -18,8 +18,6 @@ from typing import Any, cast
 import numpy as np
 
 from dart_model.spec import ModelSpec, load_model
-from dart_model.yaml_file import InputError
-from rig.config import CONFIGS
 from rig.diagnosis.command import diagnose_runs
 from rig.diagnosis.on_dart import dart_heights
 from rig.diagnosis.outcome import CORRECTED_FILE
@@ -29,7 +27,9 @@ from rig.diagnosis.problem.free_run import FreeRun
 from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.recording import Recording, RecordingError, read_recording
 from rig.diagnosis.search.fit import fit
-from rig.imports import load_mapping
+from rig.exchange.mapping import load_mapping
+from rig.inputs.errors import InputError
+from rig.operation.config import CONFIGS
 from rig.pages.report import write_report
 from rig.scoreboard.parts import Part, imported
 from rig.scoreboard.starts import driven_start

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from dart_model.spec import WORLD, BodySpec, InlineSkeleton, JointSpec, ModelSpec, StrutSpec
-from dart_model.yaml_file import InputError
 from rig.diagnosis.recording import Recording
+from rig.inputs.errors import InputError
 
 Array = NDArray[np.float64]
 

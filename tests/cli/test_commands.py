@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from rig.cli import main
-from rig.config import CONFIGS
+from rig.cli.main import main
+from rig.operation.config import CONFIGS
 
-EXAMPLE = CONFIGS / "seed.yaml"
+EXAMPLE = CONFIGS / "reference.yaml"
 
 
 def rig(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
@@ -23,39 +23,39 @@ def rig(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
 
 
 @pytest.fixture(scope="module")
-def seed_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def case_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished demo of three seconds."""
     folder = tmp_path_factory.mktemp("demo") / "out"
     with pytest.MonkeyPatch.context() as monkeypatch:
-        arguments = ("--case", "seed", "--lockstep", "--duration-s", 3, "--out", folder)
+        arguments = ("--case", "reference", "--lockstep", "--duration-s", 3, "--out", folder)
         assert rig(monkeypatch, "demo", *arguments) == 0
     return folder
 
 
-def test_demo_writes_every_figure_of_its_table(seed_folder: Path) -> None:
-    summary = json.loads((seed_folder / "summary.json").read_text("utf-8"))
+def test_demo_writes_every_figure_of_its_table(case_folder: Path) -> None:
+    summary = json.loads((case_folder / "summary.json").read_text("utf-8"))
     names = {"height_error_max_m", "force_error_rms_n", "force_error_max_n", "force_peak_n"}
     assert set(summary["defective"]) == set(summary["observed"]) == names
     assert summary["observed"]["height_error_max_m"] < summary["defective"]["height_error_max_m"]
     assert summary["observed"]["force_peak_n"] == summary["defective"]["force_peak_n"]
     assert summary["ticks"] == 3000
-    assert (seed_folder / "strut.png").stat().st_size > 10_000
+    assert (case_folder / "strut.png").stat().st_size > 10_000
 
 
 def test_demo_leaves_a_run_that_replays(
-    seed_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    case_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert rig(monkeypatch, "replay", seed_folder / "run", "--out", tmp_path) == 0
+    assert rig(monkeypatch, "replay", case_folder / "run", "--out", tmp_path) == 0
     summary = json.loads((tmp_path / "summary.json").read_text("utf-8"))
     assert (summary["logged_ticks"], summary["different_ticks"]) == (3000, 0)
 
 
 def test_a_changed_log_fails_the_replay(
-    seed_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    case_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     changed = tmp_path / "run"
     changed.mkdir()
-    for path in (seed_folder / "run").iterdir():
+    for path in (case_folder / "run").iterdir():
         (changed / path.name).write_bytes(path.read_bytes())
     model = (changed / "model.yaml").read_text("utf-8")
     (changed / "model.yaml").write_text(model.replace("500.0", "501.0"), "utf-8")
@@ -63,9 +63,9 @@ def test_a_changed_log_fails_the_replay(
 
 
 def test_demo_does_not_write_over_anything(
-    seed_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    case_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert rig(monkeypatch, "demo", "--lockstep", "--out", seed_folder) == 2
+    assert rig(monkeypatch, "demo", "--lockstep", "--out", case_folder) == 2
     assert "not empty" in one_line(capsys)
 
 
@@ -119,7 +119,7 @@ WRONG_CONFIGS = {
     "no such model": (
         '{"model": "sed", "signals": {"height": {"message": "BENCH_MEASUREMENT",'
         ' "signal": "HEIGHT"}}}',
-        "seed",
+        "reference",
     ),
     "no such DBC": (
         '{"dbc": "none.dbc", "signals": {"height": {"message": "BENCH_MEASUREMENT",'
@@ -175,14 +175,14 @@ def test_an_interface_that_is_not_there_is_one_line_and_exit_code_2(
 @pytest.mark.parametrize("name", ["run.yaml", "frames.log", "steps.arrow", "model.yaml", "bus.dbc"])
 def test_a_run_without_a_file_is_one_line_and_exit_code_2(
     name: str,
-    seed_folder: Path,
+    case_folder: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     damaged = tmp_path / "run"
     damaged.mkdir()
-    for path in (seed_folder / "run").iterdir():
+    for path in (case_folder / "run").iterdir():
         if path.name != name:
             (damaged / path.name).write_bytes(path.read_bytes())
     assert rig(monkeypatch, "replay", damaged) == 2
@@ -192,8 +192,12 @@ def test_a_run_without_a_file_is_one_line_and_exit_code_2(
 @pytest.mark.parametrize(
     ("model", "out", "expected"),
     [
-        ("seed", "run", "holds a run, expected another folder"),
-        ("sead", "found", "model 'sead': expected a file in ., or one of bench, quarter_car, seed"),
+        ("reference", "run", "holds a run, expected another folder"),
+        (
+            "sead",
+            "found",
+            "model 'sead': expected a file in ., or one of bench, quarter_car, reference",
+        ),
         ("none.yaml", "found", "model 'none.yaml': expected a file"),
     ],
 )
@@ -201,37 +205,37 @@ def test_a_diagnosis_that_cannot_begin_is_one_line_and_exit_code_2(
     model: str,
     out: str,
     expected: str,
-    seed_folder: Path,
+    case_folder: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    folder = seed_folder / out if out == "run" else tmp_path / out
-    arguments = (seed_folder / "run", "--model", model, "--out", folder)
+    folder = case_folder / out if out == "run" else tmp_path / out
+    arguments = (case_folder / "run", "--model", model, "--out", folder)
     assert rig(monkeypatch, "diagnose", *arguments) == 2
     assert expected in one_line(capsys)
 
 
 def test_a_diagnosis_into_a_file_is_refused_before_it_begins(
-    seed_folder: Path,
+    case_folder: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "file").touch()
-    arguments = (seed_folder / "run", "--model", "seed", "--out", tmp_path / "file" / "found")
+    arguments = (case_folder / "run", "--model", "reference", "--out", tmp_path / "file" / "found")
     assert rig(monkeypatch, "diagnose", *arguments) == 2
     assert "expected a folder to write into" in one_line(capsys)
 
 
 def test_a_run_that_is_held_out_too_is_refused(
-    seed_folder: Path,
+    case_folder: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    run, again = seed_folder / "run", seed_folder / "run" / ".." / "run"
-    arguments = (run, "--model", "seed", "--held-out", again, "--out", tmp_path / "found")
+    run, again = case_folder / "run", case_folder / "run" / ".." / "run"
+    arguments = (run, "--model", "reference", "--held-out", again, "--out", tmp_path / "found")
     assert rig(monkeypatch, "diagnose", *arguments) == 2
     assert "given twice" in one_line(capsys)
 
@@ -245,7 +249,7 @@ def test_every_command_has_help_with_an_example(
 
 
 def write_config(folder: Path, changes: dict[str, object]) -> Path:
-    """The seed's configuration with other values, as JSON, which is YAML."""
+    """The reference case's configuration with other values, as JSON, which is YAML."""
     height = {"message": "BENCH_MEASUREMENT", "signal": "HEIGHT"}
     path = folder / "config.yaml"
     path.write_text(json.dumps({"signals": {"height": height}, **changes}), "utf-8")

@@ -6,16 +6,16 @@ import sys
 import pytest
 from typer.testing import CliRunner
 
-from rig.cli import app
-from rig.demo import CASES
-from rig.export import FORMATS
+from rig.cli.main import app
+from rig.demo.cases import CASES
+from rig.exchange.exported import FORMATS
 
 SLOW = ("asammdf", "can", "dartpy", "matplotlib", "numba", "numpy", "plotly", "pyarrow", "scipy")
 """What takes long to import; together seconds."""
 
 HELP = """
 import sys
-from rig.cli import main
+from rig.cli.main import main
 try:
     main()
 except SystemExit as ended:

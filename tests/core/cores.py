@@ -2,22 +2,38 @@
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model
-from rig.core.observer import ObserverGains
-from rig.core.step import RigCore
+from rig.core.contract import Measurement, StepInput, StepOutput
+from rig.core.observers.pi import PiObserver
+from rig.core.quantities import OTHERS
+from rig.core.step import RigCore, RigState
 from rig.core.supervisor import Supervision
-from rig.core.types import Measurement, RigState, StepInput, StepOutput
 
 MS = 1_000_000
-GAINS = ObserverGains(1e5, 1e4, 5000.0)
+
+
+def gains(proportional: float, integral: float, limit_n: float = 5000.0) -> PiObserver:
+    """A PI observer."""
+    return PiObserver(
+        proportional_n_per_m=proportional, integral_n_per_m_s=integral, force_limit_n=limit_n
+    )
+
+
+def others(**given: float | None) -> tuple[float | None, ...]:
+    """Quantities beside heights, by their keys."""
+    assert set(given) <= {quantity.key for quantity in OTHERS}
+    return tuple(given.get(quantity.key) for quantity in OTHERS)
+
+
+GAINS = gains(1e5, 1e4)
 SUPERVISION = Supervision(10 * MS, 500 * MS, safe_holds_last=False)
 
 
 def core(
-    model: str = "seed", gains: ObserverGains = GAINS, supervision: Supervision = SUPERVISION
+    model: str = "reference", observer: PiObserver = GAINS, supervision: Supervision = SUPERVISION
 ) -> RigCore:
     """The core of a shipped model with the same gains for every strut."""
     spec = load_model(MODELS / f"{model}.yaml")
-    return RigCore(DartPlant(spec), (gains,) * len(spec.struts), supervision)
+    return RigCore(DartPlant(spec), (observer,) * len(spec.struts), supervision)
 
 
 def measured(
@@ -28,7 +44,7 @@ def measured(
     heights = tuple(
         None if height is None else Measurement(height, t_ns - late_ns) for height in heights_m
     )
-    return StepInput(t_ns, heights, applied_n)
+    return StepInput(t_ns, heights, others(applied_force=applied_n))
 
 
 def run(

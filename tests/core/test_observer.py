@@ -6,12 +6,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.core.observer import ObserverGains, update
-from rig.core.types import ObserverState
+from rig.core.contract import Measurement
+from rig.core.observers.pi import PiObserver, PiState
+from tests.core.cores import GAINS, gains
 
-START = ObserverState(0.0, 0.0, 0.0, 0)
-GAINS = ObserverGains(1e5, 1e4, 5000.0)
+START = PiState(0.0, 0.0, 0.0, 0)
 MS = 1_000_000
+
+
+def update(observer: PiObserver, state: PiState, innovation_m: float, t_ns: int) -> PiState:
+    """State after a fresh measurement that is so far above the model's height of zero."""
+    return observer.step(state, t_ns, 0.0, 0.7, Measurement(innovation_m, t_ns))
+
 
 SMALL = st.floats(-1e-3, 1e-3)
 ANY = st.floats(-1.0, 1.0)
@@ -62,7 +68,7 @@ def test_at_the_limit_the_integral_does_not_wind_up(sign):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_at_the_limit_the_integral_may_still_unwind(sign):
-    wound = ObserverState(sign * 0.6, 0.0, 0.0, 0)
+    wound = PiState(sign * 0.6, 0.0, 0.0, 0)
     state = update(GAINS, wound, sign * -1e-3, MS)
     assert state.virtual_force_n == sign * GAINS.force_limit_n
     assert abs(state.integral_m_s) < 0.6
@@ -70,7 +76,26 @@ def test_at_the_limit_the_integral_may_still_unwind(sign):
 
 @given(innovation=SIZEABLE, integral=SIZEABLE, scale=st.sampled_from([0.5, 2.0, 4.0]))
 def test_it_is_linear_within_the_limit(innovation, integral, scale):
-    unlimited = ObserverGains(1e5, 1e4, math.inf)
-    once = update(unlimited, ObserverState(integral, 0.0, 0.0, 0), innovation, MS)
-    scaled = update(unlimited, ObserverState(scale * integral, 0.0, 0.0, 0), scale * innovation, MS)
+    unlimited = gains(1e5, 1e4, 1e300)
+    once = update(unlimited, PiState(integral, 0.0, 0.0, 0), innovation, MS)
+    scaled = update(unlimited, PiState(scale * integral, 0.0, 0.0, 0), scale * innovation, MS)
     assert scaled.virtual_force_n == scale * once.virtual_force_n
+
+
+def test_without_a_measurement_nothing_changes():
+    state = update(GAINS, START, 1e-3, MS)
+    assert GAINS.step(state, 2 * MS, 0.3, 0.1, None) is state
+
+
+@given(height=SMALL, velocity=ANY, late_ms=st.integers(0, 20))
+def test_a_late_measurement_meets_the_model_of_its_own_time(height, velocity, late_ms):
+    measured = Measurement(height, 30 * MS - late_ms * MS)
+    state = GAINS.step(START, 30 * MS, 0.5, velocity, measured)
+    assert state.innovation_m == pytest.approx(height - 0.5 + velocity * late_ms * 1e-3, abs=1e-12)
+
+
+@given(integral=ANY, force=ANY)
+def test_its_numbers_are_all_that_the_next_state_depends_on(integral, force):
+    state = PiState(integral, 0.3, force, 0)
+    again = GAINS.state_of(GAINS.numbers(state))
+    assert update(GAINS, again, 1e-3, MS) == update(GAINS, state, 1e-3, MS)

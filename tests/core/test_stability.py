@@ -7,27 +7,27 @@ import pytest
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model, parse_model
-from rig.core.observer import ObserverGains
+from rig.core.observers.pi import PiObserver
 from rig.core.stability import Pole, closed_loop_poles
 from rig.core.step import RigCore
 from rig.core.supervisor import Supervision
-from tests.core.cores import GAINS, MS, measured, run
+from tests.core.cores import GAINS, MS, gains, measured, run
 
 REST_M = 0.5 - 10.0 * 9.81 / 500.0
 ALWAYS_FRESH = Supervision(10**15, 10**16, safe_holds_last=False)
 
 
-def seed() -> DartPlant:
-    return DartPlant(load_model(MODELS / "seed.yaml"))
+def reference() -> DartPlant:
+    return DartPlant(load_model(MODELS / "reference.yaml"))
 
 
-def poles(gains: ObserverGains, every: int = 1, delay: int = 0) -> list[Pole]:
-    return closed_loop_poles(seed(), (gains,), (REST_M,), MS, every, delay)
+def poles(observer: PiObserver, every: int = 1, delay: int = 0) -> list[Pole]:
+    return closed_loop_poles(reference(), (observer,), (REST_M,), MS, every, delay)
 
 
-def ringing(gains: ObserverGains, every: int) -> tuple[float, float]:
+def ringing(observer: PiObserver, every: int) -> tuple[float, float]:
     """Decay per measurement and frequency (Hz) of the simulated loop's innovation."""
-    rig = RigCore(seed(), (gains,), ALWAYS_FRESH)
+    rig = RigCore(reference(), (observer,), ALWAYS_FRESH)
     count = 600 * every
     inputs = [measured(0, REST_M + 1e-3)] + [
         measured(tick, REST_M if tick % every == 0 else None) for tick in range(1, count)
@@ -47,9 +47,9 @@ def ringing(gains: ObserverGains, every: int) -> tuple[float, float]:
     ("gains", "every"),
     [
         (GAINS, 1),
-        (ObserverGains(2e4, 1e4, 5000.0), 1),
-        (ObserverGains(1e4, 1e4, 5000.0), 5),
-        (ObserverGains(5e3, 5e4, 5000.0), 3),
+        (gains(2e4, 1e4, 5000.0), 1),
+        (gains(1e4, 1e4, 5000.0), 5),
+        (gains(5e3, 5e4, 5000.0), 3),
     ],
 )
 def test_the_loop_rings_as_its_poles_say(gains, every):
@@ -61,7 +61,7 @@ def test_the_loop_rings_as_its_poles_say(gains, every):
 
 
 def test_without_an_observer_the_poles_are_those_of_the_mass_on_its_spring():
-    found = poles(ObserverGains(0.0, 0.0, 1.0))
+    found = poles(gains(0.0, 0.0, 1.0))
     natural, ratio = math.sqrt(500.0 / 10.0), 100.0 / (2.0 * math.sqrt(500.0 * 10.0))
     oscillating = [pole for pole in found if 0.0 < pole.damping_ratio < 0.999]
     assert len(oscillating) == 2
@@ -80,7 +80,7 @@ def test_the_gains_of_the_seed_are_stable_and_hardly_damped():
 
 @pytest.mark.parametrize(
     ("gains", "every", "delay"),
-    [(GAINS, 1, 1), (GAINS, 10, 0), (ObserverGains(1e5, 1e6, 5000.0), 1, 0)],
+    [(GAINS, 1, 1), (GAINS, 10, 0), (gains(1e5, 1e6, 5000.0), 1, 0)],
 )
 def test_a_loop_that_runs_away_has_a_pole_outside(gains, every, delay):
     assert max(pole.magnitude for pole in poles(gains, every, delay)) > 1.0
@@ -88,7 +88,7 @@ def test_a_loop_that_runs_away_has_a_pole_outside(gains, every, delay):
 
 def test_a_slow_measurement_that_runs_away_does_so_at_the_speed_of_its_pole():
     fastest = max(pole.magnitude for pole in poles(GAINS, 10))
-    rig = RigCore(seed(), (ObserverGains(1e5, 1e4, 1e12),), ALWAYS_FRESH)
+    rig = RigCore(reference(), (gains(1e5, 1e4, 1e12),), ALWAYS_FRESH)
     inputs = [measured(0, REST_M + 1e-6)] + [
         measured(tick, REST_M if tick % 10 == 0 else None) for tick in range(1, 600)
     ]
@@ -107,10 +107,10 @@ def test_each_strut_of_the_quarter_car_brings_its_poles():
 
 
 def test_the_memory_of_effects_has_poles_too():
-    text = (MODELS / "seed.yaml").read_text("utf-8")
+    text = (MODELS / "reference.yaml").read_text("utf-8")
     law = "{name: maxwell, parameters: {stiffness_n_per_m: 1000.0, relaxation_time_s: 0.02}}"
     spec = parse_model(text.replace("effects: []", f"effects: [{law}]"), "maxwell.yaml")
-    found = closed_loop_poles(DartPlant(spec), (ObserverGains(0.0, 0.0, 1.0),), (0.3,), MS, 1)
+    found = closed_loop_poles(DartPlant(spec), (gains(0.0, 0.0, 1.0),), (0.3,), MS, 1)
     # The branch relaxes in 20 ms, a little faster for the mass that it drives: a real, fast pole.
     fast = min(pole.magnitude for pole in found)
     assert 0.9 < fast < 0.97

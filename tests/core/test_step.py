@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model
-from rig.core.observer import ObserverGains
+from rig.core.contract import Mode, StepInput, StepOutput, StrutOutput
 from rig.core.step import RigCore
-from rig.core.types import Mode, StepInput, StepOutput, StrutOutput
-from tests.core.cores import GAINS, MS, SUPERVISION, core, measured, run
+from tests.core.cores import GAINS, MS, SUPERVISION, core, gains, measured, others, run
 
 REST_M = 0.5 - 10.0 * 9.81 / 500.0
 
@@ -39,7 +38,7 @@ def test_a_first_measurement_that_has_grown_old_does_not_start_the_model():
 
 def test_a_constant_unknown_force_leaves_no_steady_innovation():
     """A bench that rests 3 cm beside the model's own rest position: the integral takes it all."""
-    rig = core(gains=ObserverGains(1e4, 1e6, 5000.0), supervision=SUPERVISION)
+    rig = core(observer=gains(1e4, 1e6, 5000.0), supervision=SUPERVISION)
     rig = damped(rig)
     height_m = REST_M + 0.03
     _, outputs = run(rig, [measured(tick, height_m) for tick in range(6000)])
@@ -55,12 +54,12 @@ def damped(rig: RigCore) -> RigCore:
     spec = rig._plant.spec
     strut = spec.struts[0].model_copy(update={"damping_n_s_per_m": 2000.0})
     return RigCore(
-        DartPlant(spec.model_copy(update={"struts": (strut,)})), rig._gains, rig._supervision
+        DartPlant(spec.model_copy(update={"struts": (strut,)})), rig._observers, rig._supervision
     )
 
 
 def test_the_seed_gains_leave_what_proportional_control_leaves():
-    rig = core(gains=ObserverGains(1e5, 0.0, 5000.0))
+    rig = core(observer=gains(1e5, 0.0, 5000.0))
     height_m = REST_M + 0.03
     _, outputs = run(rig, [measured(tick, height_m) for tick in range(4000)])
     (strut,) = outputs[-1].struts
@@ -165,10 +164,10 @@ def test_an_acknowledgement_means_nothing_elsewhere():
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e308])
-@pytest.mark.parametrize("model", ["seed", "quarter_car"])
+@pytest.mark.parametrize("model", ["reference", "quarter_car"])
 def test_a_model_that_diverges_goes_to_the_safe_state(model, bad, capfd):
     rig = core(model)
-    heights = (0.4,) if model == "seed" else (0.29, 0.4)
+    heights = (0.4,) if model == "reference" else (0.29, 0.4)
     states, outputs = run(rig, [measured(tick, *heights) for tick in range(5)])
     good = outputs[-1].struts
     inputs = [measured(5, *heights, applied_n=bad)]
@@ -180,7 +179,9 @@ def test_a_model_that_diverges_goes_to_the_safe_state(model, bad, capfd):
         assert strut.force_n == 0.0
         assert not strut.valid
         assert strut.height_m == pytest.approx(last.height_m, abs=1e-3)
-    acknowledged = StepInput(9 * MS, measured(9, *heights).heights, 0.0, acknowledged=True)
+    acknowledged = StepInput(
+        9 * MS, measured(9, *heights).heights, others(applied_force=0.0), acknowledged=True
+    )
     _, outputs = run(rig, [acknowledged], states[-1])
     assert outputs[-1].mode is Mode.RUNNING
 
@@ -213,7 +214,7 @@ def test_a_run_continues_identically_from_any_of_its_states(drawn, cut, stride):
         StepInput(
             tick * stride * MS,
             measured(tick * stride, tyre, suspension).heights,
-            applied_n,
+            others(applied_force=applied_n),
             acknowledged=acknowledged,
         )
         for tick, (tyre, suspension, applied_n, acknowledged) in enumerate(drawn)

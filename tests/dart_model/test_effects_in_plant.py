@@ -5,12 +5,12 @@ import math
 import pytest
 
 from dart_model.effects import CATALOGUE, Effect
-from dart_model.plant import DEFAULT_STEP_S, DartPlant, PlantState
+from dart_model.plant import LONGEST_STEP_S, DartPlant, PlantState
 from dart_model.spec import MODELS, EffectSpec, ModelSpec, load_model, parse_model
-from dart_model.yaml_file import InputError
+from rig.inputs.errors import InputError
 
 AMBIENT_C = 20.0
-SEED = load_model(MODELS / "seed.yaml")
+SEED = load_model(MODELS / "reference.yaml")
 STRUT = (0.5, 500.0, 100.0, 9.81)
 
 
@@ -35,7 +35,7 @@ def test_a_law_s_force_is_in_the_strut(name):
     law = CATALOGUE[name]
     parameters = usual(law)
     plant = with_effect(name)
-    state = plant.initial([0.43], [0.2])
+    state = plant.init([0.43], [0.2])
     memory = tuple(0.01 * (k + 1) for k in range(law.state_size))
     state = plant.state(state.positions, state.velocities, memory, 1.5)
     ((height_m, velocity),) = state.struts
@@ -49,18 +49,18 @@ def test_a_law_s_force_is_in_the_strut(name):
 @pytest.mark.parametrize("name", sorted(CATALOGUE))
 def test_a_step_with_a_law_is_finite_and_repeatable(name):
     plant = with_effect(name)
-    state = plant.initial([0.45], [0.1])
+    state = plant.init([0.45], [0.1])
     loaded = plant.load(state, (2.0,), 10.0, AMBIENT_C)
     after = plant.step(loaded, 1e-3, 12.0)
     assert all(math.isfinite(value) for value in (*after.positions, *after.velocities))
-    assert len(after.memory) == CATALOGUE[name].state_size
-    plant.step(plant.load(plant.initial([0.2]), (-50.0,), -90.0, 60.0), 1e-3, 0.0)
+    assert len(after.internal) == CATALOGUE[name].state_size
+    plant.step(plant.load(plant.init([0.2]), (-50.0,), -90.0, 60.0), 1e-3, 0.0)
     assert plant.step(plant.load(state, (2.0,), 10.0, AMBIENT_C), 1e-3, 12.0) == after
 
 
 def test_no_effect_changes_nothing():
     plain, none = DartPlant(SEED), with_effect("none")
-    state = plain.initial([0.4])
+    state = plain.init([0.4])
     a = plain.step(plain.load(state, (3.0,), 10.0, AMBIENT_C), 1e-3, 12.0)
     b = none.step(none.load(state, (3.0,), 10.0, AMBIENT_C), 1e-3, 12.0)
     assert a.positions == pytest.approx(b.positions, abs=1e-15)
@@ -68,7 +68,7 @@ def test_no_effect_changes_nothing():
 
 def accelerations(plant: DartPlant, heights: tuple[float, ...], applied_n: float) -> list[float]:
     without = (0.0,) * len(heights)
-    loaded = plant.load(plant.initial(heights), without, applied_n, AMBIENT_C)
+    loaded = plant.load(plant.init(heights), without, applied_n, AMBIENT_C)
     return loaded.accelerations_m_per_s2
 
 
@@ -95,7 +95,7 @@ def test_a_law_in_one_strut_of_two_is_felt_by_both_bodies():
 
 def test_memory_relaxes_as_the_maxwell_branch_does():
     """A branch that is stretched and then held lets go with its relaxation time."""
-    text = (MODELS / "seed.yaml").read_text("utf-8")
+    text = (MODELS / "reference.yaml").read_text("utf-8")
     # So heavy that it does not move: what is left is the branch.
     text = text.replace("mass_kg: 10.0", "mass_kg: 1.0e+12").replace("9.81", "0.0")
     heavy = parse_model(text, "heavy.yaml")
@@ -107,22 +107,22 @@ def test_memory_relaxes_as_the_maxwell_branch_does():
         (force_n,) = plant.load(state, (0.0,), 0.0, AMBIENT_C).forces_n
         return force_n + 500.0 * (height_m - 0.5) + 100.0 * velocity_m_per_s
 
-    state = plant.initial([0.5], [0.3])
+    state = plant.init([0.5], [0.3])
     for _ in range(100):
         state = plant.step(plant.load(state, (0.0,), 0.0, AMBIENT_C), 1e-3, 0.0)
     start_n = branch_n(state)
     assert start_n == pytest.approx(-1000.0 * 0.05 * 0.3 * (1.0 - math.exp(-0.1 / 0.05)), rel=1e-3)
-    still = plant.state(state.positions, (0.0,), state.memory, state.t_s)
+    still = plant.state(state.positions, (0.0,), state.internal, state.t_s)
     for _ in range(50):
         still = plant.step(plant.load(still, (0.0,), 0.0, AMBIENT_C), 1e-3, 0.0)
     assert branch_n(still) == pytest.approx(start_n * math.exp(-1.0), rel=1e-4)
 
 
 def test_a_stiff_law_shortens_the_step():
-    assert DartPlant(SEED).step_s == DEFAULT_STEP_S
+    assert DartPlant(SEED).step_s == LONGEST_STEP_S
     stiff = with_effect("linear_stiffness", stiffness_n_per_m=1e8)
     assert stiff.step_s < 0.4e-3
-    state = stiff.initial([0.5])
+    state = stiff.init([0.5])
     for _ in range(200):
         state = stiff.step(stiff.load(state, (0.0,), 0.0, AMBIENT_C), 1e-3, 0.0)
     # It swings about its rest position a micrometre below, and does not run away.

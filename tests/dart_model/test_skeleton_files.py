@@ -7,7 +7,7 @@ import pytest
 
 from dart_model.plant import DartPlant
 from dart_model.spec import ModelSpec, load_model
-from dart_model.yaml_file import InputError
+from rig.inputs.errors import InputError
 
 INERTIA = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
 
@@ -99,7 +99,7 @@ def test_a_file_gives_the_same_motion_as_the_inline_bodies(name, tmp_path):
     plants = [DartPlant(model(tmp_path, text)) for text in (f"{{file: {name}}}", INLINE)]
     after: list[list[tuple[float, float]]] = []
     for plant in plants:
-        state = plant.initial([0.42])
+        state = plant.init([0.42])
         for _ in range(50):
             state = plant.step(plant.load(state, (20.0,), 30.0, 20.0), 1e-3, 30.0)
         after.append(state.struts)
@@ -123,8 +123,8 @@ def test_a_spring_or_damper_of_the_joint_itself_acts(name, text, own_force_n, tm
     found: list[float] = []
     for skeleton in (f"{{file: {name}}}", INLINE):
         plant = DartPlant(model(tmp_path, skeleton))
-        moving = plant.initial([0.42], [0.7])
-        plant.load(plant.initial([0.1]), (0.0,), 0.0, 20.0)
+        moving = plant.init([0.42], [0.7])
+        plant.load(plant.init([0.1]), (0.0,), 0.0, 20.0)
         found.append(plant.load(moving, (0.0,), 0.0, 20.0).accelerations_m_per_s2[0])
     assert found[0] == pytest.approx(found[1] + own_force_n / 10.0, rel=1e-6)
 

@@ -24,10 +24,11 @@ from dart_model.spec import (
     load_model,
     parse_model,
 )
-from dart_model.yaml_file import InputError, parse_mapping, read_text
+from rig.inputs.errors import InputError
+from rig.inputs.yaml_file import parse_mapping, read_text
 
 TEXT = """
-name: seed
+name: reference
 gravity_m_per_s2: 9.81
 skeleton:
   bodies:
@@ -112,7 +113,7 @@ def test_shipped_models_are_valid_and_named_after_their_files(path):
 
 
 def test_the_seed_is_the_published_defective_model():
-    (strut,) = load_model(MODELS / "seed.yaml").struts
+    (strut,) = load_model(MODELS / "reference.yaml").struts
     assert (strut.free_length_m, strut.stiffness_n_per_m, strut.damping_n_s_per_m) == (
         0.5,
         500,
@@ -121,7 +122,7 @@ def test_the_seed_is_the_published_defective_model():
 
 
 def test_effects_of_a_strut_are_replaced():
-    spec = parse_model(TEXT, "seed.yaml")
+    spec = parse_model(TEXT, "reference.yaml")
     effect = EffectSpec(name="preload", parameters={"force_n": 3.0})
     changed = spec.with_effects("strut", [effect])
     assert changed.strut("strut").effects == (effect,)
@@ -135,7 +136,7 @@ def test_tolerances_are_shares_and_written_as_percentages():
         "tolerance: {mass_kg: 0.1 %, stiffness_n_per_m: 20%, damping_n_s_per_m: 40 %, "
         "preload_n: 5.0, input_gain: 7 %}"
     )
-    spec = parse_model(TEXT + known, "seed.yaml")
+    spec = parse_model(TEXT + known, "reference.yaml")
     assert spec.tolerance == Tolerance.model_construct(
         mass_kg=0.001, stiffness_n_per_m=0.2, damping_n_s_per_m=0.4, preload_n=5.0, input_gain=0.07
     )
@@ -149,19 +150,19 @@ def test_tolerances_are_shares_and_written_as_percentages():
 
 
 def test_a_model_without_tolerances_has_none():
-    spec = parse_model(TEXT, "seed.yaml")
+    spec = parse_model(TEXT, "reference.yaml")
     assert spec.tolerance is None
     assert "tolerance" not in dump_model(spec)
-    some = parse_model(TEXT + "tolerance: {mass_kg: 1 %}", "seed.yaml").tolerance
+    some = parse_model(TEXT + "tolerance: {mass_kg: 1 %}", "reference.yaml").tolerance
     assert some == Tolerance.model_construct(mass_kg=0.01)
 
 
 def refused(text: str) -> str:
     """The message, after checking that it is one line that names the file."""
     with pytest.raises(InputError) as caught:
-        parse_model(text, "folder/seed.yaml")
+        parse_model(text, "folder/reference.yaml")
     message = str(caught.value)
-    assert message.startswith("folder/seed.yaml:")
+    assert message.startswith("folder/reference.yaml:")
     assert "\n" not in message
     assert len(message) < 1500
     return message
@@ -170,9 +171,9 @@ def refused(text: str) -> str:
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("name: seed", "", "name: is missing"),
-        ("name: seed", "name: [1]", "name: [1]: input should be a valid string"),
-        ("name: seed", "name: '1 & 2'", "name: '1 & 2': string should match pattern"),
+        ("name: reference", "", "name: is missing"),
+        ("name: reference", "name: [1]", "name: [1]: input should be a valid string"),
+        ("name: reference", "name: '1 & 2'", "name: '1 & 2': string should match pattern"),
         ("9.81", "heavy", "gravity_m_per_s2: 'heavy': input should be a valid number"),
         ("9.81", ".nan", "gravity_m_per_s2: nan: input should be a finite number"),
         ("mass_kg: 10.0", "mass_kg: -1", "skeleton.bodies.0.mass_kg: -1: input should be greater"),
@@ -275,7 +276,7 @@ def test_parents_stand_before_children():
     assert "parents stand before children" in refused(yaml.safe_dump(data))
 
 
-@pytest.mark.parametrize("text", ["", "[]", "3", "seed", "- a\n- b"])
+@pytest.mark.parametrize("text", ["", "[]", "3", "reference", "- a\n- b"])
 def test_what_is_no_mapping_is_refused(text):
     assert "expected keys and values at the top level" in refused(text)
 

@@ -31,7 +31,7 @@ def with_effect(model, name, strut="strut", **parameters):
 def dart_heights(model, t_s, load_n, start_m, step_s=1e-3):
     """DART alone from rest, with the load between samples as it is."""
     plant = DartPlant(model)
-    state = plant.initial(start_m)
+    state = plant.init(start_m)
     rows = [[height for height, _ in state.struts]]
     for before, after in pairwise(t_s):
         count = max(1, round((after - before) / step_s))
@@ -128,7 +128,7 @@ def test_the_little_dyno():
     plant = DartPlant(model)
     for t, (force_n,) in zip(record.t_s.tolist(), record.strut_forces_n.tolist(), strict=True):
         z, v = dyno.broad(t)
-        state = plant.initial([z], [v])
+        state = plant.init([z], [v])
         (dart_n,) = plant.load(state, (0.0,), 0.0, 20.0).forces_n
         assert dart_n == pytest.approx(force_n, abs=0.051)
 

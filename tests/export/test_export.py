@@ -10,26 +10,27 @@ import pytest
 from msgspec.structs import astuple
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError
 from rig.bench.config import load_bench_config
-from rig.config import CONFIGS, load_setup
-from rig.export import FORMATS, export_run, import_run
+from rig.exchange.exported import FORMATS, export_run, import_run
+from rig.inputs.errors import InputError
 from rig.io.run_log import parse_frame, read_run
-from rig.replay import replay
-from rig.runs import with_bench
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A rotated run of half a second, with an extended, an FD and an error frame at its end."""
     folder = tmp_path_factory.mktemp("export") / "run"
-    ready = load_setup(CONFIGS / "seed.yaml", duration_s=1.5)
+    ready = load_setup(CONFIGS / "reference.yaml", duration_s=1.5)
     log = ready.config.log.model_copy(update={"rotate_s": 1.0})
     bus = ready.config.bus.model_copy(update={"channel": "export"})
     config = ready.config.model_copy(update={"log": log, "bus": bus})
     with_bench(
         ready.model_copy(update={"config": config}),
-        load_bench_config(CONFIGS / "seed_bench.yaml"),
+        load_bench_config(CONFIGS / "reference_bench.yaml"),
         folder,
         lockstep=True,
         stop=lambda: False,

@@ -9,7 +9,7 @@ from can_dbc.codec import compile_decoder
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from rig.core.bridge import RIVAL_FRAMES
-from rig.core.types import Mode
+from rig.core.contract import Mode
 from tests.faults.trial import (
     BEGIN_NS,
     MEASUREMENT,
@@ -122,7 +122,7 @@ def test_delay(row):
     )
     row(
         4,
-        "delay: everything 3 ms late, at the seed's gains unstable",
+        "delay: everything 3 ms late, at the reference case's gains unstable",
         "the limit on the innovation (5 mm) enters the safe state",
         first_ms(ticks, lambda tick: tick.mode is Mode.SAFE),
         NOTHING_RECEIVED,

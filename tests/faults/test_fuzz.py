@@ -13,7 +13,6 @@ from msgspec.structs import replace
 from can_dbc.codec import compile_decoder
 from can_dbc.protection import Verdict, check_crc
 from can_dbc.units import Dimension
-from rig.core.messages import Quantity
 from tests.faults.trial import Trial
 
 LENGTHS = (0, 1, 7, 8, 9, 12, 64)
@@ -44,10 +43,10 @@ def fuzz(ticks, seed):
     heights_of = {
         item.message.arbitration_id: (
             item.message.protection,
-            compile_decoder(item.message, [item.targets[0].signal], [Dimension.LENGTH]),
+            compile_decoder(item.message, ["HEIGHT"], [Dimension.LENGTH]),
         )
         for item in bridge.incoming
-        if item.targets[0].quantity is Quantity.HEIGHT
+        if item.heights
     }
     frames = 0
     for index in range(ticks):

@@ -11,16 +11,17 @@ import pytest
 import yaml
 
 import rig.io.run_log
-import rig.replay
+import rig.operation.replay
 from can_dbc.errors import DatabaseError
-from dart_model.yaml_file import InputError
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfigError
-from rig.config import CONFIGS, load_setup
 from rig.diagnosis.recording import RecordingError, read_csv
-from rig.imports import load_mapping
+from rig.exchange.mapping import load_mapping
+from rig.inputs.errors import InputError
 from rig.io.run_log import DBC_FILE, FRAMES_FILE, MODEL_FILE, RUN_FILE, STEPS_FILE
-from rig.replay import replay
+from rig.operation.config import CONFIGS
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup
 from tests.faults.test_machine import lockstep
 
 REFUSED = (InputError, DatabaseError, BenchConfigError, RecordingError)
@@ -107,8 +108,8 @@ def run(tmp_path_factory):
 def known(monkeypatch):
     """Reads what stays the same once."""
     for module, name in (
-        (rig.replay, "load_database"),
-        (rig.replay, "load_model"),
+        (rig.operation.replay, "load_database"),
+        (rig.operation.replay, "load_model"),
     ):
         monkeypatch.setattr(module, name, once_for_each_content(getattr(module, name)))
     parse, texts = rig.io.run_log.parse_mapping, {}
@@ -142,7 +143,7 @@ def other(kind):
     """Content, name and reader of a file that belongs to no run."""
     match kind:
         case "config":
-            return (CONFIGS / "seed.yaml").read_bytes(), "seed.yaml", load_setup
+            return (CONFIGS / "reference.yaml").read_bytes(), "reference.yaml", load_setup
         case "bench":
             return (CONFIGS / "story_bench.yaml").read_bytes(), "bench.yaml", load_bench_config
         case "mapping":

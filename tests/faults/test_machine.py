@@ -14,16 +14,17 @@ from msgspec.structs import replace
 
 from can_dbc.frame import Frame
 from rig.bench.config import load_bench_config
-from rig.config import CONFIGS, load_setup
+from rig.core.contract import Mode
 from rig.core.messages import Conditions
-from rig.core.types import Mode
 from rig.io.bus import BusError
 from rig.io.link import Link
 from rig.io.run_log import read_run
 from rig.io.steps import LOG_FAULT
 from rig.io.whole_file import WholeFile
-from rig.replay import replay
-from rig.runs import with_bench
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup
 from tests.faults.trial import BEGIN_NS, MS, Trial, first_ms, force_error_n
 from tests.io.at_once import AtOnce
 
@@ -155,11 +156,11 @@ def test_clock_jump(row, step_s):
 
 
 def lockstep(folder, name, duration_s, progress=lambda _t_ns, _mode: None):
-    ready = load_setup(CONFIGS / "seed.yaml", duration_s=duration_s)
+    ready = load_setup(CONFIGS / "reference.yaml", duration_s=duration_s)
     bus = ready.config.bus.model_copy(update={"channel": name})
     return with_bench(
         ready.model_copy(update={"config": ready.config.model_copy(update={"bus": bus})}),
-        load_bench_config(CONFIGS / "seed_bench.yaml"),
+        load_bench_config(CONFIGS / "reference_bench.yaml"),
         folder,
         lockstep=True,
         stop=lambda: False,
@@ -236,7 +237,7 @@ def test_slow_disk(row, tmp_path, monkeypatch):
             reached.set()
 
     monkeypatch.setattr(WholeFile, "append", slow)
-    ready = load_setup(CONFIGS / "seed.yaml", duration_s=1.0)
+    ready = load_setup(CONFIGS / "reference.yaml", duration_s=1.0)
     quiet = {"fifo_priority": 0, "lock_memory": False, "freeze_garbage": False}
     config = ready.config.model_copy(
         update={
@@ -248,7 +249,7 @@ def test_slow_disk(row, tmp_path, monkeypatch):
     timer.start()
     ended = with_bench(
         ready.model_copy(update={"config": config}),
-        load_bench_config(CONFIGS / "seed_bench.yaml"),
+        load_bench_config(CONFIGS / "reference_bench.yaml"),
         tmp_path / "run",
         lockstep=False,
         stop=lambda: False,
@@ -274,7 +275,7 @@ PROGRAM = Path(sys.executable).parent / "rig"
 
 def demo_until_logged(folder, number):
     """A demo in real time; ends it with a signal when its log has grown, gives its exit code."""
-    command = [PROGRAM, "demo", "--case", "seed", "--out", folder, "--duration-s", "60"]
+    command = [PROGRAM, "demo", "--case", "reference", "--out", folder, "--duration-s", "60"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     frames, steps = folder / "run" / "frames.log", folder / "run" / "steps.arrow"
 

@@ -6,11 +6,12 @@ from msgspec.structs import replace
 from can_dbc.codec import compile_decoder
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
-from dart_model.yaml_file import InputError, load_validated
-from rig.config import CONFIGS, LimitConfig, RunConfig
+from rig.core.contract import Measurement, Mode
 from rig.core.messages import Conditions
 from rig.core.supervisor import TRANSITIONS, Action, Event, Limit, Watched, judged
-from rig.core.types import Measurement, Mode
+from rig.inputs.errors import InputError
+from rig.inputs.yaml_file import load_validated
+from rig.operation.config import CONFIGS, LimitConfig, RunConfig
 from tests.faults.trial import BEGIN_NS, MS, Trial, after, measurements_only
 
 STATUS = 0x300
@@ -163,7 +164,7 @@ def test_every_way_out_of_the_safe_state_is_somebodys_decision():
     ],
 )
 def test_a_wrong_row_is_one_line_that_names_it(tmp_path, row, expected):
-    text = (CONFIGS / "seed.yaml").read_text()
+    text = (CONFIGS / "reference.yaml").read_text()
     cells = ", ".join(f"{key}: {value}" for key, value in row.items())
     path = tmp_path / "rig.yaml"
     path.write_text(f"{text}\nsupervision: {{limits: [{{{cells}}}]}}\n")

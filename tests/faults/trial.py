@@ -1,4 +1,4 @@
-"""The seed case with a fault between bench and bridge, tick by tick and without a clock."""
+"""The reference case with a fault between bench and bridge, tick by tick and without a clock."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,10 +8,12 @@ import numpy as np
 from can_dbc.frame import Frame
 from rig.bench.config import load_bench_config
 from rig.bench.simulated import Bench
-from rig.config import CONFIGS, build_bridge, load_setup
 from rig.core.bridge import Bridge, BridgeState, TickResult
+from rig.core.contract import Mode
 from rig.core.messages import Conditions, Counts
-from rig.core.types import Mode
+from rig.operation.assembly import build_bridge
+from rig.operation.config import CONFIGS
+from rig.operation.setup import load_setup
 
 MS = 1_000_000
 BEGIN_NS = 300 * MS
@@ -55,14 +57,14 @@ class Trial:
     """A bridge and a bench, joined tick by tick."""
 
     def __init__(self, **supervision: object) -> None:
-        ready = load_setup(CONFIGS / "seed.yaml")
+        ready = load_setup(CONFIGS / "reference.yaml")
         changed = ready.config.supervision.model_validate(
             ready.config.supervision.model_dump() | supervision
         )
         config = ready.config.model_copy(update={"supervision": changed})
         self.ready = ready.model_copy(update={"config": config})
         self.bridge: Bridge = build_bridge(self.ready)
-        self.bench = Bench(load_bench_config(CONFIGS / "seed_bench.yaml"), ready.database)
+        self.bench = Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), ready.database)
         self.state: BridgeState = self.bridge.init(0)
         self.ticks: list[Tick] = []
 

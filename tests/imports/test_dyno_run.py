@@ -9,13 +9,15 @@ import pytest
 from dart_model.spec import load_model
 from rig.bench.config import load_bench_config
 from rig.bench.trajectory import simulate
-from rig.check import check
-from rig.config import CONFIGS, InputError, load_setup
-from rig.demo import run_case
+from rig.demo.cases import run_case
 from rig.diagnosis.command import diagnose_runs
 from rig.diagnosis.recording import read_recording
-from rig.replay import replay
-from rig.runs import with_bench
+from rig.inputs.errors import InputError
+from rig.operation.check import check
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup
 
 DURATION_S = 3.0
 
@@ -143,13 +145,13 @@ def test_a_dyno_asks_for_a_load_cell_and_no_applied_force(tmp_path: Path) -> Non
     given = (CONFIGS / "dyno.yaml").read_text()
     path = tmp_path / "dyno.yaml"
     path.write_text(given.replace("load_cell_force:", "applied_force:"))
-    with pytest.raises(InputError, match=r"imposed_motion: expected signals\.load_cell_force"):
+    with pytest.raises(InputError, match=r"prescribed_motion: expected signals\.load_cell_force"):
         load_setup(path)
 
 
 def test_a_dyno_has_no_loop_that_could_ring() -> None:
     findings = {item.what: item.text for item in check(load_setup(CONFIGS / "dyno.yaml"))}
-    assert "the motion is imposed" in findings["poles"]
+    assert "the motion is prescribed" in findings["poles"]
 
 
 def test_the_case_that_comes_with_the_package_tells_how_far_the_model_is(tmp_path: Path) -> None:

@@ -10,26 +10,29 @@ import pytest
 from msgspec.structs import replace
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError
 from rig.bench.config import load_bench_config
 from rig.bench.simulated import Bench
-from rig.config import CONFIGS, Setup, load_setup
-from rig.imports import import_log, import_table, load_mapping
+from rig.exchange.bus_log import import_log
+from rig.exchange.foreign_table import import_table
+from rig.exchange.mapping import load_mapping
+from rig.inputs.errors import InputError
 from rig.io.log_files import read_log
 from rig.io.run_log import read_run
-from rig.replay import replay
+from rig.operation.config import CONFIGS
+from rig.operation.replay import replay
+from rig.operation.setup import Setup, load_setup
 
 EPOCH_S = 1_700_000_000.0
 
 
 @pytest.fixture(scope="module")
 def ready() -> Setup:
-    return load_setup(CONFIGS / "seed.yaml")
+    return load_setup(CONFIGS / "reference.yaml")
 
 
 @pytest.fixture(scope="module")
 def frames(ready: Setup) -> list[Frame]:
-    bench = Bench(load_bench_config(CONFIGS / "seed_bench.yaml"), ready.database)
+    bench = Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), ready.database)
     return bench.update(500_000_000)[0]
 
 

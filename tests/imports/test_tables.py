@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dart_model.yaml_file import InputError
-from rig.imports import import_table, load_mapping
+from rig.exchange.foreign_table import import_table
+from rig.exchange.mapping import load_mapping
+from rig.inputs.errors import InputError
 
 Written = Callable[[str, str], Path]
 

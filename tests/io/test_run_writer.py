@@ -8,10 +8,10 @@ import pytest
 import yaml
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError
+from rig.inputs.errors import InputError
 from rig.io.captures import Window
 from rig.io.frame_columns import received_frames
-from rig.io.run_log import RUN_FILE, read_run
+from rig.io.run_log import RUN_FILE, RUN_SCHEMA, read_run
 from rig.io.run_writer import MANY_WAITING, Rotation, RunLog
 from rig.io.steps import BUS_FAULT, Step
 from rig.io.whole_file import WholeFile
@@ -19,11 +19,11 @@ from rig.io.whole_file import WholeFile
 MS = 1_000_000
 EPOCH_NS = 1_700_000_000_000_000_000
 RUNNING, HOLD = 2, 3
+COLUMNS = [f"strut.number_{k}" for k in range(11)]
 
 
 def step(index, mode=RUNNING, flags=0):
-    numbers = (0.5 + index, float(index), 1.0, 2.0, 1.0, 0.5, 0.1, 0.2, 0.3)
-    return Step(index * MS, 0, 1, mode, flags, math.nan, math.nan, numbers)
+    return Step(index * MS, 0, 1, mode, flags, (0.5 + index, float(index), *(math.nan,) * 9))
 
 
 def tick(index, **options):
@@ -34,8 +34,8 @@ def tick(index, **options):
 
 
 def open_log(folder, *, paced=False, **options):
-    header = {"schema": 1, "epoch_ns": EPOCH_NS}
-    return RunLog(folder, header, ["strut"], EPOCH_NS, "can0", paced=paced, **options)
+    header = {"schema": RUN_SCHEMA, "epoch_ns": EPOCH_NS}
+    return RunLog(folder, header, COLUMNS, EPOCH_NS, "can0", paced=paced, **options)
 
 
 def ending():

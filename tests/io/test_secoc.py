@@ -9,15 +9,17 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError
 from rig.bench.config import load_bench_config
-from rig.check import Severity, check
-from rig.config import CONFIGS, load_setup
+from rig.inputs.errors import InputError
 from rig.io.link import Link
 from rig.io.run_log import STEPS_FILE
 from rig.io.secoc import Authentication, Authenticator, cmac, read_key
-from rig.replay import replay
-from rig.runs import BusPort, with_bench
+from rig.operation.check import Severity, check
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.ports import BusPort
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup
 from tests.io.at_once import AtOnce
 
 MS = 1_000_000
@@ -176,10 +178,10 @@ def test_a_refused_frame_is_told_as_a_fault_of_the_bus_for_one_tick():
 
 @pytest.fixture
 def configured(tmp_path):
-    """The seed's configuration with other keys, and a key file beside it."""
+    """The reference case's configuration with other keys, and a key file beside it."""
 
     def write(**keys):
-        config = yaml.safe_load((CONFIGS / "seed.yaml").read_text())
+        config = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
         config["bus"] = {
             "interface": "virtual",
             "channel": tmp_path.name,
@@ -200,7 +202,7 @@ def configured(tmp_path):
 def in_lockstep(path, folder):
     with_bench(
         load_setup(path, duration_s=0.3),
-        load_bench_config(CONFIGS / "seed_bench.yaml"),
+        load_bench_config(CONFIGS / "reference_bench.yaml"),
         folder,
         lockstep=True,
         stop=lambda: False,

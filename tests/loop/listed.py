@@ -10,11 +10,12 @@ from can_dbc.codec import compile_encoder
 from can_dbc.frame import Frame
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
-from rig.config import Setup, build_bridge
 from rig.core.messages import Conditions
 from rig.io.clock import VirtualClock
 from rig.io.link import LinkFigures
-from rig.runs import logged
+from rig.operation.assembly import build_bridge
+from rig.operation.logged_run import logged
+from rig.operation.setup import Setup
 
 MS = 1_000_000
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from can_dbc.frame import Frame
-from dart_model.yaml_file import InputError
+from rig.inputs.errors import InputError
 from rig.io.frame_columns import FrameColumns, received_frames
 from rig.io.run_log import format_frame, parse_frame
 

@@ -7,16 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.config import CONFIGS, Setup, load_setup
 from rig.core.supervisor import Supervision
-from rig.replay import replay
+from rig.operation.config import CONFIGS
+from rig.operation.replay import replay
+from rig.operation.setup import Setup, load_setup
 from tests.loop.listed import MS, ListPort, bench_frames, live
 
 FAULTS = ("lost", "repeated", "flipped", "short", "late", "foreign", "error", "again", "silent")
 
 
 def ready_for(ticks: int) -> Setup:
-    return load_setup(CONFIGS / "seed.yaml", duration_s=ticks / 1000)
+    return load_setup(CONFIGS / "reference.yaml", duration_s=ticks / 1000)
 
 
 @settings(max_examples=20, deadline=None)

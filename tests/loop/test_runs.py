@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -12,14 +13,15 @@ import pytest
 import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
-from dart_model.yaml_file import InputError
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig
 from rig.bench.trajectory import simulate
-from rig.config import CONFIGS, Setup, load_setup
+from rig.inputs.errors import InputError
 from rig.io.run_log import FRAMES_FILE, STEPS_FILE, read_run
-from rig.replay import replay
-from rig.runs import with_bench
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.replay import replay
+from rig.operation.setup import Setup, load_setup
 
 MS = 1_000_000
 _CHANNELS = count()
@@ -65,8 +67,8 @@ def errors(folder: Path, name: str) -> dict[str, dict[str, float]]:
 
 
 @pytest.fixture(scope="module")
-def seed_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return lockstep(tmp_path_factory.mktemp("seed") / "run", "seed", 4.0)
+def reference_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return lockstep(tmp_path_factory.mktemp("reference") / "run", "reference", 4.0)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +79,7 @@ def quarter_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def poor_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bench whose frames are lost, late and uneven."""
-    text = (CONFIGS / "seed_bench.yaml").read_text("utf-8")
+    text = (CONFIGS / "reference_bench.yaml").read_text("utf-8")
     data = yaml.safe_load(text)
     data["transmissions"][0] |= {
         "loss_probability": 0.05,
@@ -87,11 +89,11 @@ def poor_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("poor")
     path = folder / "bench.yaml"
     path.write_text(yaml.safe_dump(data), "utf-8")
-    return lockstep(folder / "run", "seed", 2.0, load_bench_config(path))
+    return lockstep(folder / "run", "reference", 2.0, load_bench_config(path))
 
 
-def test_the_published_case_is_met(seed_run):
-    found = errors(seed_run, "seed")["strut"]
+def test_the_published_case_is_met(reference_run):
+    found = errors(reference_run, "reference")["strut"]
     assert found["height_max_m"] <= 2.5e-3
     assert found["force_rms"] <= 0.0114
 
@@ -103,10 +105,10 @@ def test_both_struts_of_the_quarter_car_are_estimated(quarter_run):
         assert strut["force_rms"] <= 0.02
 
 
-def test_how_well_the_rate_is_kept_is_told_on_the_bus(seed_run):
+def test_how_well_the_rate_is_kept_is_told_on_the_bus(reference_run):
     message = cantools.database.load_file(DEFAULT_DATABASE).get_message_by_name("RIG_TIMING")
     pages: dict[int, dict[str, float]] = {}
-    for frame, direction in read_run(seed_run).frames():
+    for frame, direction in read_run(reference_run).frames():
         if direction == "T" and frame.arbitration_id == message.frame_id:
             page = message.decode(frame.data, decode_choices=False)
             pages[page["PAGE"]] = page
@@ -118,8 +120,8 @@ def test_how_well_the_rate_is_kept_is_told_on_the_bus(seed_run):
     assert pages[2]["OVERRUNS"] == 0
 
 
-def test_two_runs_are_identical_byte_by_byte(seed_run, tmp_path):
-    again = lockstep(tmp_path / "run", "seed", 4.0)
+def test_two_runs_are_identical_byte_by_byte(reference_run, tmp_path):
+    again = lockstep(tmp_path / "run", "reference", 4.0)
 
     def content(folder: Path) -> tuple[bytes, bytes]:
         # The channel's name is the only thing that differs.
@@ -127,10 +129,10 @@ def test_two_runs_are_identical_byte_by_byte(seed_run, tmp_path):
         frames = b"\n".join(b" ".join(line.split()[:1] + line.split()[2:]) for line in lines)
         return frames, (folder / STEPS_FILE).read_bytes()
 
-    assert content(seed_run) == content(again)
+    assert content(reference_run) == content(again)
 
 
-@pytest.mark.parametrize("run", ["seed_run", "quarter_run", "poor_run"])
+@pytest.mark.parametrize("run", ["reference_run", "quarter_run", "poor_run"])
 def test_a_replay_is_identical_bit_by_bit(run, request):
     folder = request.getfixturevalue(run)
     found = replay(folder)
@@ -148,14 +150,14 @@ def test_a_poor_bus_costs_frames_and_no_ticks(poor_run):
     assert (received >= 2).any()
 
 
-def test_a_replay_with_other_gains_is_another_run(seed_run):
-    ready = setup("seed", 4.0)
+def test_a_replay_with_other_gains_is_another_run(reference_run):
+    ready = setup("reference", 4.0)
     weak = {
-        name: observer.model_copy(update={"proportional_n_per_m": 1e4})
+        name: replace(observer, proportional_n_per_m=1e4)
         for name, observer in ready.config.observers.items()
     }
     config = ready.config.model_copy(update={"observers": weak})
-    found = replay(seed_run, ready=ready.model_copy(update={"config": config}))
+    found = replay(reference_run, ready=ready.model_copy(update={"config": config}))
     assert found.different > 3000
     assert found.first_different_ns is not None
 
@@ -197,34 +199,34 @@ def bits(table: Any, count: int) -> list[bytes]:
 
 
 def test_steps_that_are_ahead_of_the_frames_are_replayed_as_far_as_the_frames_go(
-    seed_run, tmp_path
+    reference_run, tmp_path
 ):
-    frames_size = (seed_run / FRAMES_FILE).stat().st_size
-    steps_size = (seed_run / STEPS_FILE).stat().st_size
-    folder = cut(seed_run, tmp_path / "run", frames_size // 2, steps_size)
+    frames_size = (reference_run / FRAMES_FILE).stat().st_size
+    steps_size = (reference_run / STEPS_FILE).stat().st_size
+    folder = cut(reference_run, tmp_path / "run", frames_size // 2, steps_size)
     found = replay(folder)
     assert found.logged == 4000
     assert found.different == 0
     assert len(found.steps) == pytest.approx(2000, abs=50)
 
 
-def test_nothing_but_the_header_is_an_empty_replay(seed_run, tmp_path):
-    found = replay(cut(seed_run, tmp_path / "run", 0, 0))
+def test_nothing_but_the_header_is_an_empty_replay(reference_run, tmp_path):
+    found = replay(cut(reference_run, tmp_path / "run", 0, 0))
     assert len(found.steps) == found.logged == 0
 
 
 @pytest.mark.parametrize("steps_bytes", [1, 3, 7, 8, 100, 700])
 def test_steps_that_were_cut_before_the_first_are_all_computed_again(
-    seed_run, tmp_path, steps_bytes
+    reference_run, tmp_path, steps_bytes
 ):
-    size = (seed_run / FRAMES_FILE).stat().st_size
-    found = replay(cut(seed_run, tmp_path / "run", size, steps_bytes))
+    size = (reference_run / FRAMES_FILE).stat().st_size
+    found = replay(cut(reference_run, tmp_path / "run", size, steps_bytes))
     assert found.logged == 0
-    assert bits(found.steps, 4000) == bits(read_run(seed_run).steps, 4000)
+    assert bits(found.steps, 4000) == bits(read_run(reference_run).steps, 4000)
 
 
-def test_a_file_that_holds_no_steps_is_refused(seed_run, tmp_path):
-    folder = cut(seed_run, tmp_path / "run", 0, 0)
+def test_a_file_that_holds_no_steps_is_refused(reference_run, tmp_path):
+    folder = cut(reference_run, tmp_path / "run", 0, 0)
     (folder / STEPS_FILE).write_text("these are no steps", "utf-8")
     with pytest.raises(InputError, match=r"steps\.arrow: is no Arrow stream of steps"):
         replay(folder)

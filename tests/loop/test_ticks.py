@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.loop import Tick, Timing, regular_ticks
+from rig.operation.loop import Tick, regular_ticks
+from rig.operation.timing import Timing
 
 PERIOD_NS = 1_000_000
 

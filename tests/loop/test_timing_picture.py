@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.timing_picture import Distribution, _coarser, draw_timing
+from rig.pages.timing_picture import Distribution, _coarser, draw_timing
 
 BINS = 20_000
 PNG = b"\x89PNG\r\n\x1a\n"

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from dart_model.effects import CATALOGUE, FAMILY_WORDS
 from dart_model.spec import ModelSpec
-from dart_model.yaml_file import InputError
 from rig.diagnosis.outcome import (
     BeforeAfter,
     Diagnosis,
@@ -30,6 +29,7 @@ from rig.diagnosis.outcome import (
     Verdict,
     White,
 )
+from rig.inputs.errors import InputError
 from rig.pages.report import page, sentence, write_report
 from rig.pages.report.quantities import label, quantity, value_and_interval
 from rig.pages.report.series import cloud, envelope, spectrum, surface

@@ -9,11 +9,12 @@ import pytest
 from can_dbc.codec import compile_decoder
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.units import Dimension
-from rig.bench.config import BenchConfigError, load_bench_config
+from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig
 from rig.bench.simulated import Bench
 from rig.bench.trajectory import simulate
-from rig.config import CONFIGS
+from rig.inputs.errors import InputError
+from rig.operation.config import CONFIGS
 from tests.rig_bench.linear_bench import linear_strut
 
 STIFFNESS_N_PER_M, DAMPING_N_S_PER_M, LENGTH_M = 5000.0, 200.0, 0.5
@@ -208,7 +209,7 @@ def test_a_height_at_the_start_and_an_imposed_motion_contradict(tmp_path: Path) 
     path.write_text(
         text.replace("free_length_m: 0.3", "free_length_m: 0.3\n    initial_height_m: 0.31")
     )
-    with pytest.raises(BenchConfigError, match="expected none: its motion is imposed"):
+    with pytest.raises(InputError, match="expected none: its motion is imposed"):
         load_bench_config(path)
 
 

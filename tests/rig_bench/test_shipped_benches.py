@@ -1,4 +1,4 @@
-"""The shipped benches under the seed method's observer on a linear, defective model.
+"""The shipped benches under the published method's observer on a linear, defective model.
 
 The model is advanced exactly (matrix exponential, forces held between samples), so that what is
 left is the method's own error.
@@ -81,20 +81,20 @@ def _settled(values: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def seed_truth():
-    return simulate(load_bench_config(CONFIGS / "seed_bench.yaml"), 20_000_000_000)
+def reference_truth():
+    return simulate(load_bench_config(CONFIGS / "reference_bench.yaml"), 20_000_000_000)
 
 
-def test_seed_bench_moves_as_in_the_published_case(seed_truth):
-    assert 0.595 <= _settled(seed_truth.height_m).max() <= 0.6005
-    assert 430.0 <= np.abs(_settled(seed_truth.strut_force_n)).max() <= 440.0
+def test_reference_bench_moves_as_in_the_published_case(reference_truth):
+    assert 0.595 <= _settled(reference_truth.height_m).max() <= 0.6005
+    assert 430.0 <= np.abs(_settled(reference_truth.strut_force_n)).max() <= 440.0
 
 
-def test_seed_observer_reaches_the_published_errors(seed_truth):
-    heights_m, forces_n = _observe(SEED, seed_truth)
-    height_error_m = _settled(heights_m - seed_truth.height_m)
-    force_error_n = _settled(forces_n - seed_truth.strut_force_n)
-    peak_n = np.abs(_settled(seed_truth.strut_force_n)).max()
+def test_reference_observer_reaches_the_published_errors(reference_truth):
+    heights_m, forces_n = _observe(SEED, reference_truth)
+    height_error_m = _settled(heights_m - reference_truth.height_m)
+    force_error_n = _settled(forces_n - reference_truth.strut_force_n)
+    peak_n = np.abs(_settled(reference_truth.strut_force_n)).max()
     assert np.abs(height_error_m).max() <= 2.5e-3
     assert np.sqrt(np.mean(force_error_n**2)) <= 0.0114 * peak_n
 
@@ -109,7 +109,7 @@ def test_quarter_car_observers_follow_both_struts():
     assert np.all(truth.height_m[:, 0] < 0.3)
 
 
-@pytest.mark.parametrize("name", ["seed_bench", "quarter_car_bench"])
+@pytest.mark.parametrize("name", ["reference_bench", "quarter_car_bench"])
 def test_shipped_bench_fits_the_default_bus(name):
     bench = Bench(load_bench_config(CONFIGS / f"{name}.yaml"), load_database(DEFAULT_DATABASE))
     frames, _ = bench.update(100_000_000)

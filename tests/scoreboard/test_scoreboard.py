@@ -7,10 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dart_model.yaml_file import InputError
-from rig.config import CONFIGS
 from rig.diagnosis.recording import Recording
-from rig.imports import import_table, load_mapping
+from rig.exchange.foreign_table import import_table
+from rig.exchange.mapping import load_mapping
+from rig.inputs.errors import InputError
+from rig.operation.config import CONFIGS
 from rig.scoreboard import silverbox
 from rig.scoreboard.run import run_scoreboard
 from rig.scoreboard.silverbox import PUBLISHED, TESTS, TRAINING, open_loop_rmse_m

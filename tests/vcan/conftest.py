@@ -16,10 +16,12 @@ import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
 from rig.bench.config import load_bench_config
-from rig.config import CONFIGS, Setup, load_setup
 from rig.io.bus import BusConfig
-from rig.loop import Progress
-from rig.runs import Ended, live, run_bench
+from rig.operation.config import CONFIGS
+from rig.operation.live import live, run_bench
+from rig.operation.logged_run import Ended
+from rig.operation.loop import Progress
+from rig.operation.setup import Setup, load_setup
 
 TOOLS = ("ip", "candump", "canplayer", "cangen", "cangw", "cansend")
 
@@ -89,8 +91,8 @@ class Files(NamedTuple):
 
     Attributes:
         dbc: The package's DBC with cycle times of 10 ms.
-        bench: The seed's bench.
-        bridge: The seed's bridge, with gains for this rate, by interface.
+        bench: The reference case's bench.
+        bridge: The reference case's bridge, with gains for this rate, by interface.
     """
 
     dbc: Path
@@ -100,14 +102,14 @@ class Files(NamedTuple):
 
 @pytest.fixture(scope="session")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
-    """The seed case at 100 Hz."""
+    """The reference case at 100 Hz."""
     folder = tmp_path_factory.mktemp("files")
     dbc = folder / "slow.dbc"
     slower = re.sub(r'("GenMsgCycleTime" BO_ \d+) 1;', r"\1 10;", DEFAULT_DATABASE.read_text())
     dbc.write_text(slower)
 
     def bridge(channel: str) -> Path:
-        config = yaml.safe_load((CONFIGS / "seed.yaml").read_text())
+        config = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
         # Soft enough for two processes whose ticks are up to two cycles apart: at that delay the
         # slowest pole is at 0.986 and the least damping ratio 0.09.
         gains = {"proportional_n_per_m": 2000.0, "integral_n_per_m_s": 5000.0}
@@ -129,7 +131,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
         path.write_text(yaml.safe_dump(config))
         return path
 
-    return Files(dbc, CONFIGS / "seed_bench.yaml", bridge)
+    return Files(dbc, CONFIGS / "reference_bench.yaml", bridge)
 
 
 @contextmanager

@@ -16,11 +16,12 @@ from can_dbc.frame import Frame
 from can_dbc.protection import check_crc
 from rig.bench.config import load_bench_config
 from rig.bench.simulated import Bench
-from rig.config import build_bridge, load_setup
-from rig.core.types import Mode
+from rig.core.contract import Mode
 from rig.io.bus import Bus, BusConfig
 from rig.io.run_log import RunFolder, parse_frame, read_run
-from rig.replay import replay
+from rig.operation.assembly import build_bridge
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup
 from tests.vcan.conftest import BENCH_IDS, RATE_HZ, Files, in_process, run_for, running
 
 pytestmark = pytest.mark.vcan
@@ -264,7 +265,7 @@ def test_ten_times_down_and_up_are_survived_and_each_gap_is_shown(bench, bridge)
         assert inside.sum() > 0.1 * RATE_HZ
         assert (flags[inside] & 2).all()
         assert (steps["received"].to_numpy()[inside] == 0).all()
-    assert ended.state.rig.mode is Mode.RUNNING
+    assert ended.state.core.mode is Mode.RUNNING
 
 
 def test_a_flood_of_foreign_and_of_broken_frames_changes_nothing(bench, bridge):
@@ -282,7 +283,7 @@ def test_a_flood_of_foreign_and_of_broken_frames_changes_nothing(bench, bridge):
     assert heights.min() > 0.1
     assert heights.max() < 0.7
     assert replay(ended.folder).different == 0
-    assert ended.state.rig.mode is Mode.RUNNING
+    assert ended.state.core.mode is Mode.RUNNING
     # One broken frame of 256 carries the right CRC by chance. It may cost the few frames that
     # follow it, but never so many that an estimate turns stale.
     right_crc = _with_right_crc(found, "BENCH_MEASUREMENT")
@@ -324,7 +325,7 @@ def test_frames_that_a_gateway_corrupts_are_all_refused(bench, second_vcan, brid
     assert np.isnan(found.steps["strut.measured_height_m"].to_numpy()[late]).all()
     assert not (found.steps["strut.valid"].to_numpy()[late] == 1.0).any()
     assert counts.wrong_crc + counts.masquerade > 1.5 * RATE_HZ
-    assert ended.state.rig.mode is Mode.SAFE
+    assert ended.state.core.mode is Mode.SAFE
 
 
 def test_listening_only_sends_nothing(bench, bridge, tmp_path):
@@ -337,4 +338,4 @@ def test_listening_only_sends_nothing(bench, bridge, tmp_path):
         ended = bridge(bench, 3.0, listen_only=True)
     assert record.read_text() == ""
     assert {direction for _, direction in read_run(ended.folder).frames()} == {"R"}
-    assert ended.state.rig.model is not None  # it had something to say
+    assert ended.state.core.model is not None  # it had something to say

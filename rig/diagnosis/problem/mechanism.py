@@ -117,16 +117,16 @@ def tabulated(read: Readers, heights_m: Array, velocities_m_per_s: Array) -> Mec
         InputError: The joints cannot reach the heights.
     """
     plant = read.plain
-    q = np.array(plant.initial(heights_m[0].tolist()).positions)
+    q = np.array(plant.init(heights_m[0].tolist()).positions)
     entries: list[Mechanism] = []
     for height, velocity in zip(heights_m, velocities_m_per_s, strict=True):
         for _ in range(20):
-            there = plant.strut_rows(q)
+            there = plant.jacobians(q)
             error = height - there.offsets_m - there.struts @ q
             q = q + np.linalg.lstsq(there.struts, error, rcond=None)[0]
             if float(np.max(np.abs(error))) < _REACHED_M:
                 break
-        v = np.linalg.lstsq(plant.strut_rows(q).struts, velocity, rcond=None)[0]
+        v = np.linalg.lstsq(plant.jacobians(q).struts, velocity, rcond=None)[0]
         entries.append(_at(read, q, v))
     return _stacked(entries)
 
@@ -145,7 +145,7 @@ def _at(read: Readers, q: Array, v: Array) -> Mechanism:
         q,
         v,
         there.heights_m,
-        there.rows,
+        there.struts,
         there.applied,
         there.mass,
         there.bias,

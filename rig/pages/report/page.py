@@ -9,8 +9,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from plotly import offline
 
 from dart_model.effects import FAMILY_WORDS, effect
-from dart_model.yaml_file import InputError
 from rig.diagnosis.outcome import Diagnosis, Result, write_text
+from rig.inputs.errors import InputError
 from rig.pages.report import tables
 from rig.pages.report.figures import (
     Plot,

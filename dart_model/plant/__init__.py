@@ -1,0 +1,230 @@
+"""DART as a black box: state in, forces in, state out.
+
+    skeleton      bodies and joints in DART
+    geometry      heights and Jacobians of the struts
+    strut         spring, damper and effects as one force
+    backend       the acceleration, which DART is asked for
+    integrator    Kutta's method, and how long its steps may be
+    mechanism     struts on joints: the equations of motion
+    prescribed    a strut whose motion is given, as on a dyno
+
+Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008).
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dart_model.plant.backend import ManyCoordinates, OneCoordinate
+from dart_model.plant.geometry import Array, Geometry, Jacobians, sample_positions
+from dart_model.plant.integrator import (
+    LONGEST_STEP_S,
+    SHORTEST_STEP_S,
+    Linearised,
+    exact_step_s,
+    stable_step_s,
+)
+from dart_model.plant.mechanism import Mechanism
+from dart_model.plant.prescribed import PrescribedState, PrescribedStrut
+from dart_model.plant.skeleton import build
+from dart_model.plant.state import Loaded, Mechanics, PlantState
+from dart_model.plant.strut import struts_of
+from dart_model.spec import ModelSpec
+from rig.inputs.errors import InputError
+
+__all__ = [
+    "LONGEST_STEP_S",
+    "DartPlant",
+    "Jacobians",
+    "Loaded",
+    "Mechanics",
+    "PlantState",
+    "PrescribedState",
+    "PrescribedStrut",
+]
+
+_DIFFERENCE = 1e-6
+"""Step of coordinates and rates in the central differences of the bias force."""
+
+
+class DartPlant:
+    """A model in DART.
+
+    The skeleton inside is scratch paper: every call first writes all of the state that its answer
+    depends on, so that results depend on the arguments alone. One plant must not be used from two
+    threads at once.
+
+    Args:
+        spec: The model.
+
+    Raises:
+        InputError: A skeleton file is wrong, a body that a strut names is not in it, or the bench
+            is too stiff to be simulated.
+    """
+
+    def __init__(self, spec: ModelSpec) -> None:
+        self.spec = spec
+        self._skeleton = build(spec)
+        self._geometry = Geometry(spec, self._skeleton)
+        self._struts = struts_of(spec)
+        self._mechanism: Mechanism[float] | Mechanism[Array]
+        if self.coordinates == 1 and self._geometry.constant is not None:
+            one = OneCoordinate(self._skeleton)
+            self._mechanism = Mechanism[float](one, self._struts, self._geometry)
+        else:
+            many = ManyCoordinates(self._skeleton)
+            self._mechanism = Mechanism[Array](many, self._struts, self._geometry)
+        self.step_s = self._longest_step_s()
+        """Longest step of the integrator."""
+
+    @property
+    def struts(self) -> int:
+        """Number of struts."""
+        return len(self._struts)
+
+    @property
+    def coordinates(self) -> int:
+        """Number of joint coordinates."""
+        return self._skeleton.coordinates
+
+    @property
+    def internal_states(self) -> int:
+        """Number of internal states of all effects."""
+        return sum(strut.states for strut in self._struts)
+
+    def init(
+        self,
+        heights_m: Sequence[float],
+        velocities_m_per_s: Sequence[float] | None = None,
+        t_s: float = 0.0,
+    ) -> PlantState:
+        """State with given strut heights and velocities; internal states are zero.
+
+        Args:
+            heights_m: One height a strut.
+            velocities_m_per_s: One velocity a strut; at rest if absent.
+            t_s: Time.
+
+        Raises:
+            InputError: The joints cannot reach the heights.
+        """
+        q = self._geometry.reaching(np.asarray(heights_m, np.float64), np.zeros(self.coordinates))
+        v = np.zeros(self.coordinates)
+        if velocities_m_per_s is not None:
+            struts = self._geometry.at(q).struts
+            v = np.linalg.lstsq(struts, np.asarray(velocities_m_per_s), rcond=None)[0]
+        return self.state(q.tolist(), v.tolist(), (0.0,) * self.internal_states, t_s)
+
+    def state(
+        self,
+        positions: Sequence[float],
+        velocities: Sequence[float],
+        internal: tuple[float, ...],
+        t_s: float,
+    ) -> PlantState:
+        """State with given coordinates; arguments as of `PlantState`."""
+        return self._mechanism.state(positions, velocities, internal, t_s)
+
+    def numbers(self, state: PlantState) -> tuple[float, ...]:
+        """A state as numbers, for whoever differentiates a step; its time is not among them."""
+        return (*state.positions, *state.velocities, *state.internal)
+
+    def state_of(self, numbers: Sequence[float], t_s: float = 0.0) -> PlantState:
+        """The state of what `numbers` gave."""
+        n = self.coordinates
+        return self.state(numbers[:n], numbers[n : 2 * n], tuple(numbers[2 * n :]), t_s)
+
+    def load(
+        self,
+        state: PlantState,
+        virtual_forces_n: Sequence[float],
+        applied_force_n: float,
+        temperature_c: float,
+    ) -> Loaded:
+        """Let forces act on a state.
+
+        Args:
+            state: The state.
+            virtual_forces_n: Virtual force in each strut.
+            applied_force_n: Applied force.
+            temperature_c: Damper temperature.
+        """
+        return self._mechanism.load(state, virtual_forces_n, applied_force_n, temperature_c)
+
+    def step(self, loaded: Loaded, dt_s: float, applied_force_end_n: float) -> PlantState:
+        """Advance the model.
+
+        Args:
+            loaded: State at the beginning and the forces on it; virtual forces are held.
+            dt_s: Duration; divided into steps of at most `step_s`.
+            applied_force_end_n: Applied force at the end; it is linear in between.
+
+        Returns:
+            State at the end.
+        """
+        return self._mechanism.step(loaded, dt_s, applied_force_end_n, self.step_s)
+
+    def jacobians(self, q: Array) -> Jacobians:
+        """Heights and Jacobians of the struts at coordinates `q`, shape (n,)."""
+        return self._geometry.at(q)
+
+    def mechanics(self, q: Array, v: Array) -> Mechanics:
+        """Equations of motion at coordinates `q` with rates `v`, each of shape (n,)."""
+        here, dart = self._geometry.at(q), self._skeleton.dart
+        dart.setPositions(q)
+        dart.setVelocities(v)
+        dart.setForces(np.zeros(self.coordinates))
+        dart.computeForwardDynamics()
+        mass = np.array(dart.getMassMatrix(), dtype=np.float64)
+        bias = mass @ np.array(dart.getAccelerations(), dtype=np.float64)
+        return Mechanics(here.heights_m(q), here.struts, here.applied, mass, bias)
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether mass matrix and Jacobians are the same in every configuration."""
+        if self._geometry.constant is None:
+            return False
+        first, *others = [
+            self.mechanics(q, np.zeros_like(q)).mass for q in sample_positions(self.coordinates)
+        ]
+        return all(np.allclose(first, other, rtol=1e-9, atol=0.0) for other in others)
+
+    def _longest_step_s(self) -> float:
+        linear = [(s.stiffness_n_per_m, s.damping_n_s_per_m) for s in self.spec.struts]
+        exact_s = min(exact_step_s(item) for item in self._linearised(linear))
+        if exact_s < SHORTEST_STEP_S:
+            fastest_hz = 1.0 / (2.0 * np.pi * exact_s)
+            raise InputError(
+                f"model {self.spec.name}: its masses, stiffnesses and dampings ask for steps of "
+                f"{exact_s:.1g} s ({fastest_hz:.1g} Hz), expected a bench that {SHORTEST_STEP_S} s "
+                "are short enough for"
+            )
+        steepest = [strut.steepest() for strut in self._struts]
+        stable_s = min(stable_step_s(item) for item in self._linearised(steepest))
+        return min(LONGEST_STEP_S, exact_s, max(stable_s, SHORTEST_STEP_S))
+
+    def _linearised(self, struts: Sequence[tuple[float, float]]) -> list[Linearised]:
+        """The bench with given stiffness and damping of each strut, at sampled configurations."""
+        stiffness, damping = (np.diag(column) for column in zip(*struts, strict=True))
+        found: list[Linearised] = []
+        for q in sample_positions(self.coordinates):
+            here = self.mechanics(q, np.zeros_like(q))
+            by_q, by_v = self._bias_slopes(q)
+            jacobian = here.struts
+            found.append(
+                Linearised(
+                    here.mass,
+                    jacobian.T @ damping @ jacobian - by_v,
+                    jacobian.T @ stiffness @ jacobian - by_q,
+                )
+            )
+        return found
+
+    def _bias_slopes(self, q: Array) -> tuple[Array, Array]:
+        """Derivatives of the bias force by coordinates and rates, at rest, each shape (n, n)."""
+        rest = np.zeros_like(q)
+        steps = _DIFFERENCE * np.eye(len(q))
+        by_q = [self.mechanics(q + h, rest).bias - self.mechanics(q - h, rest).bias for h in steps]
+        by_v = [self.mechanics(q, h).bias - self.mechanics(q, -h).bias for h in steps]
+        scale = 2.0 * _DIFFERENCE
+        return np.column_stack(by_q) / scale, np.column_stack(by_v) / scale

@@ -1,0 +1,134 @@
+"""What DART is asked while a model runs: the acceleration in a state under given forces.
+
+A model with one coordinate, the usual bench, is computed with floats and any other with arrays. The
+two classes are all that tells them apart: the formulas around them hold for both.
+"""
+
+import math
+import operator
+from collections.abc import Callable, Sequence
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dart_model.plant.geometry import coordinates_add_up, moved
+from dart_model.plant.skeleton import Skeleton
+
+Array = NDArray[np.float64]
+
+Value = TypeVar("Value", float, Array)
+"""One number a coordinate: a float where there is one coordinate, else an array of shape (n,)."""
+
+
+class Backend(Protocol[Value]):
+    """Joint coordinates and their dynamics."""
+
+    def value(self, numbers: Sequence[float]) -> Value:
+        """One number a coordinate, from a sequence."""
+        ...
+
+    def numbers(self, value: Value) -> tuple[float, ...]:
+        """The same as a tuple."""
+        ...
+
+    def dot(self, row: Value, value: Value) -> float:
+        """Product of a row of a Jacobian and a value."""
+        ...
+
+    def moved(self, q: Value, v: Value, h: float) -> Value:
+        """Where rates lead to in `h` seconds."""
+        ...
+
+    def acceleration(self, q: Value, v: Value, force: Value) -> Value:
+        """Second derivative of the coordinates under generalised forces, in m/s² or rad/s²."""
+        ...
+
+
+_SAMPLE_FORCES_N = (0.0, 1e-3, -0.7, 37.3, -4100.0)
+"""A difference in the last bit may hide beside a large force."""
+
+
+class OneCoordinate:
+    """The only coordinate of a skeleton, as a float."""
+
+    dot = staticmethod(operator.mul)
+
+    def __init__(self, skeleton: Skeleton) -> None:
+        coordinate = skeleton.dart.getDof(0)
+        self._put_position: Callable[[float], None] = coordinate.setPosition
+        self._put_velocity: Callable[[float], None] = coordinate.setVelocity
+        self._put_force: Callable[[float], None] = coordinate.setForce
+        self._solve: Callable[[], None] = skeleton.dart.computeForwardDynamics
+        self._acceleration: Callable[[], float] = coordinate.getAcceleration
+        self._only_force_matters = False
+        self._only_force_matters = self._answers_by_force_alone()
+
+    def value(self, numbers: Sequence[float]) -> float:
+        return numbers[0]
+
+    def numbers(self, value: float) -> tuple[float, ...]:
+        return (value,)
+
+    def moved(self, q: float, v: float, h: float) -> float:
+        return q + h * v
+
+    def acceleration(self, q: float, v: float, force: float) -> float:
+        if not self._only_force_matters:
+            self._put_position(q)
+            self._put_velocity(v)
+        self._put_force(force)
+        self._solve()
+        return self._acceleration()
+
+    def _answers_by_force_alone(self) -> bool:
+        """Whether position and velocity make no difference to DART's answer, not even in a bit.
+
+        So it is for a body on a straight guide without springs or damping of DART's own; to say
+        where it is takes DART as long as the answer itself.
+        """
+        return all(
+            len(
+                {
+                    self.acceleration(0.3 * math.sin(1.7 * k), math.cos(2.3 * k), force_n)
+                    for k in range(16)
+                }
+            )
+            == 1
+            for force_n in _SAMPLE_FORCES_N
+        )
+
+
+class ManyCoordinates:
+    """The coordinates of a skeleton, as an array."""
+
+    def __init__(self, skeleton: Skeleton) -> None:
+        self._skeleton = skeleton
+        # DART's functions for arrays cost as much as six or more of those for one number.
+        coordinates = [skeleton.dart.getDof(k) for k in range(skeleton.coordinates)]
+        self._put: list[tuple[Callable[[float], None], ...]] = [
+            (item.setPosition, item.setVelocity, item.setForce) for item in coordinates
+        ]
+        self._get: list[Callable[[], float]] = [item.getAcceleration for item in coordinates]
+        self._solve: Callable[[], None] = skeleton.dart.computeForwardDynamics
+        self._adds_up = coordinates_add_up(skeleton)
+
+    def value(self, numbers: Sequence[float]) -> Array:
+        return np.array(numbers, dtype=np.float64)
+
+    def numbers(self, value: Array) -> tuple[float, ...]:
+        return tuple(value.tolist())
+
+    def dot(self, row: Array, value: Array) -> float:
+        return float(row @ value)
+
+    def moved(self, q: Array, v: Array, h: float) -> Array:
+        return q + h * v if self._adds_up else moved(self._skeleton, q, v, h)
+
+    def acceleration(self, q: Array, v: Array, force: Array) -> Array:
+        numbers = zip(q.tolist(), v.tolist(), force.tolist(), strict=True)
+        for puts, values in zip(self._put, numbers, strict=True):
+            for put, number in zip(puts, values, strict=True):
+                put(number)
+        self._solve()
+        return np.array([get() for get in self._get])

@@ -1,0 +1,177 @@
+"""Struts on joints: the equations of motion that the integrator advances."""
+
+import math
+from collections.abc import Sequence
+from typing import Generic, NamedTuple
+
+import numpy as np
+
+from dart_model.plant.backend import Backend, Value
+from dart_model.plant.geometry import Geometry, Jacobians
+from dart_model.plant.integrator import Internal, advance
+from dart_model.plant.state import Loaded, PlantState
+from dart_model.plant.strut import Strut
+
+_MOST_STEPS = 10_000
+"""Steps of one call; one that is so late that it would need more takes longer ones."""
+
+
+class _Placed(NamedTuple, Generic[Value]):
+    """A strut in one configuration: ``height = offset + row @ q``.
+
+    Attributes:
+        strut: The strut.
+        offset_m: Its offset.
+        row: Its row of the Jacobian.
+    """
+
+    strut: Strut
+    offset_m: float
+    row: Value
+
+
+class _Configuration(NamedTuple, Generic[Value]):
+    """The struts and the applied force in one configuration.
+
+    Attributes:
+        struts: The struts.
+        applied: Generalised force per newton of applied force.
+    """
+
+    struts: tuple[_Placed[Value], ...]
+    applied: Value
+
+
+class Mechanism(Generic[Value]):
+    """A model that moves.
+
+    Args:
+        backend: Its coordinates and their dynamics.
+        struts: Its struts.
+        geometry: Where they are.
+    """
+
+    def __init__(
+        self, backend: Backend[Value], struts: Sequence[Strut], geometry: Geometry
+    ) -> None:
+        self._backend = backend
+        self._struts = tuple(struts)
+        self._no_rates = [0.0] * sum(strut.states for strut in struts)
+        self._geometry = geometry
+        constant = geometry.constant
+        self._constant = None if constant is None else self._configuration(constant)
+
+    def state(
+        self,
+        positions: Sequence[float],
+        velocities: Sequence[float],
+        internal: Internal,
+        t_s: float,
+    ) -> PlantState:
+        """State with given coordinates; arguments as of `PlantState`."""
+        value = self._backend.value
+        return self._state(value(positions), value(velocities), internal, t_s)
+
+    def load(
+        self,
+        state: PlantState,
+        virtual_forces_n: Sequence[float],
+        applied_force_n: float,
+        temperature_c: float,
+    ) -> Loaded:
+        """Let forces act on a state; arguments as of `DartPlant.load`."""
+        backend, internal, t_s = self._backend, state.internal, state.t_s
+        q, v = backend.value(state.positions), backend.value(state.velocities)
+        struts, applied = self._constant or self._at(q)
+        rates = self._no_rates.copy()
+        total = applied_force_n * applied
+        forces: list[float] = []
+        for index, (strut, _, row) in enumerate(struts):
+            height_m, velocity_m_per_s = state.struts[index]
+            force = strut.force_n(
+                height_m, velocity_m_per_s, internal, t_s, applied_force_n, temperature_c, rates
+            )
+            forces.append(force)
+            total = total + (force + virtual_forces_n[index]) * row
+        acceleration = backend.acceleration(q, v, total)
+        accelerations: list[float] = []
+        for _, _, row in struts:
+            accelerations.append(backend.dot(row, acceleration))
+        if self._constant is None:
+            rate = np.array(state.velocities)
+            turned = self._geometry.turning(np.array(state.positions), rate) @ rate
+            accelerations = [a + float(b) for a, b in zip(accelerations, turned, strict=True)]
+        return Loaded(
+            state,
+            tuple(virtual_forces_n),
+            applied_force_n,
+            temperature_c,
+            forces,
+            accelerations,
+            q,
+            v,
+            acceleration,
+            rates,
+        )
+
+    def step(
+        self, loaded: Loaded, dt_s: float, applied_force_end_n: float, longest_s: float
+    ) -> PlantState:
+        """Advance in steps of at most `longest_s`; other arguments as of `DartPlant.step`."""
+        backend, state, constant = self._backend, loaded.state, self._constant
+        virtual_forces_n, temperature_c = loaded.virtual_forces_n, loaded.temperature_c
+        dot = backend.dot
+
+        def slope(
+            q: Value, v: Value, internal: Internal, t_s: float, applied_force_n: float
+        ) -> tuple[Value, Sequence[float]]:
+            struts, applied = constant or self._at(q)
+            rates = self._no_rates.copy()
+            total = applied_force_n * applied
+            for index, (strut, offset_m, row) in enumerate(struts):
+                height_m, velocity_m_per_s = offset_m + dot(row, q), dot(row, v)
+                force = strut.force_n(
+                    height_m, velocity_m_per_s, internal, t_s, applied_force_n, temperature_c, rates
+                )
+                total = total + (force + virtual_forces_n[index]) * row
+            return backend.acceleration(q, v, total), rates
+
+        q, v, internal = advance(
+            slope,
+            backend.moved,
+            (loaded.position, loaded.velocity, state.internal),
+            (loaded.acceleration, loaded.internal_rates),
+            state.t_s,
+            dt_s,
+            steps_of(dt_s, longest_s),
+            (loaded.applied_force_n, applied_force_end_n),
+        )
+        return self._state(q, v, internal, state.t_s + dt_s)
+
+    def _state(self, q: Value, v: Value, internal: Internal, t_s: float) -> PlantState:
+        backend, dot = self._backend, self._backend.dot
+        struts, _ = self._constant or self._at(q)
+        motions: list[tuple[float, float]] = []
+        for _, offset_m, row in struts:
+            motions.append((offset_m + dot(row, q), dot(row, v)))
+        return PlantState(backend.numbers(q), backend.numbers(v), internal, t_s, motions)
+
+    def _at(self, q: Value) -> _Configuration[Value]:
+        return self._configuration(self._geometry.at(np.array(self._backend.numbers(q))))
+
+    def _configuration(self, jacobians: Jacobians) -> _Configuration[Value]:
+        value = self._backend.value
+        placed = tuple(
+            _Placed(strut, offset_m, value(row))
+            for strut, offset_m, row in zip(
+                self._struts, jacobians.offsets_m.tolist(), jacobians.struts.tolist(), strict=True
+            )
+        )
+        return _Configuration(placed, value(jacobians.applied.tolist()))
+
+
+def steps_of(dt_s: float, longest_s: float) -> int:
+    """Number of equal steps of at most `longest_s`."""
+    if dt_s <= longest_s * (1.0 + 1e-9):  # a tick of one step must not become two by rounding
+        return 1
+    return min(math.ceil(dt_s / longest_s), _MOST_STEPS)

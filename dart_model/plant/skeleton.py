@@ -1,0 +1,189 @@
+"""The bodies and joints of a model in DART, from its YAML or from a file by DART's own parsers."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import dartpy
+import numpy as np
+
+from dart_model.effects import effect
+from dart_model.spec import WORLD, BodySpec, FileSkeleton, InlineSkeleton, ModelSpec
+from rig.inputs.errors import InputError
+
+# dartpy ships no types: it is untyped in this package, and nowhere else.
+_dart = cast("Any", dartpy)
+
+_INSTANT_S = 1e-9
+"""DART takes springs and dampers of a joint's own at the end of its time step, not of ours."""
+
+
+class Skeleton(NamedTuple):
+    """Bodies and joints in DART.
+
+    Attributes:
+        dart: DART's skeleton.
+        bodies: Its bodies by name.
+        pushed: Body on which the applied force acts.
+    """
+
+    dart: Any
+    bodies: dict[str, Any]
+    pushed: Any
+
+    @property
+    def coordinates(self) -> int:
+        """Number of joint coordinates."""
+        return int(self.dart.getNumDofs())
+
+
+def build(spec: ModelSpec) -> Skeleton:
+    """The skeleton of a model, with its gravity and with the masses that effects add.
+
+    Raises:
+        InputError: A skeleton file is wrong, a body that the model names is not in it, no joint
+            moves, or an effect leaves a body no mass.
+    """
+    if isinstance(spec.skeleton, FileSkeleton):
+        dart = _read_skeleton(spec.skeleton, spec.folder)
+    else:
+        dart = _inline_skeleton(spec.name, spec.skeleton)
+    bodies = {str(body.getName()): body for body in dart.getBodyNodes()}
+    for strut in spec.struts:
+        for end in strut.between:
+            if end != WORLD and end not in bodies:
+                raise InputError(
+                    f"model {spec.name}: strut {strut.name}: between {end!r}: expected one of "
+                    f"{', '.join([WORLD, *bodies])}"
+                )
+    if int(dart.getNumDofs()) == 0:
+        raise InputError(f"model {spec.name}: skeleton has no joint that moves, expected one")
+    dart.setGravity([0.0, 0.0, -spec.gravity_m_per_s2])
+    dart.setTimeStep(_INSTANT_S)
+    _add_masses(spec, bodies)
+    return Skeleton(dart, bodies, bodies[_pushed_body(spec, bodies)])
+
+
+def _add_masses(spec: ModelSpec, bodies: dict[str, Any]) -> None:
+    """Give DART the masses that effects add, so that it carries their weight and inertia."""
+    for strut in spec.struts:
+        for item in strut.effects:
+            if not effect(item.name).adds_mass:
+                continue
+            end = strut.between[1] if strut.between[1] != WORLD else strut.between[0]
+            mass = float(bodies[end].getMass()) + item.values()[0]
+            if mass <= 0.0:
+                raise InputError(
+                    f"model {spec.name}: strut {strut.name}: effect {item.name} leaves {end} "
+                    f"a mass of {mass} kg, expected more than zero"
+                )
+            bodies[end].setMass(mass)
+
+
+def _pushed_body(spec: ModelSpec, bodies: dict[str, Any]) -> str:
+    name = spec.applied_force_body or spec.struts[-1].between[1]
+    if name == WORLD:
+        name = spec.struts[-1].between[0]
+    if name not in bodies:
+        raise InputError(
+            f"model {spec.name}: applied_force_body {name!r}: expected one of {', '.join(bodies)}"
+        )
+    return name
+
+
+def _inline_skeleton(name: str, spec: InlineSkeleton) -> Any:
+    skeleton = _dart.dynamics.Skeleton(name)
+    bodies: dict[str, Any] = {}
+    for body in spec.bodies:
+        create, properties = _joint(body, skeleton)
+        _, node = create(bodies.get(body.joint.parent), properties)
+        node.setName(body.name)
+        moments = body.inertia_kg_m2 or (body.mass_kg,) * 3
+        inertia = _dart.dynamics.Inertia(body.mass_kg, np.zeros(3), np.diag(moments))
+        node.setInertia(inertia)
+        bodies[body.name] = node
+    return skeleton
+
+
+def _joint(body: BodySpec, skeleton: Any) -> tuple[Callable[..., Any], Any]:
+    kinds = {
+        "prismatic": (_dart.dynamics.PrismaticJointProperties, "Prismatic"),
+        "revolute": (_dart.dynamics.RevoluteJointProperties, "Revolute"),
+        "free": (_dart.dynamics.FreeJointProperties, "Free"),
+        "ball": (_dart.dynamics.BallJointProperties, "Ball"),
+    }
+    make, kind = kinds[body.joint.type]
+    properties = make()
+    properties.mName = f"{body.name}_joint"
+    if body.joint.type in ("prismatic", "revolute"):
+        axis = np.array(body.joint.axis)
+        properties.mAxis = axis / np.linalg.norm(axis)
+    offset = _dart.math.Isometry3()
+    offset.set_translation(np.array(body.joint.offset_m))
+    properties.mT_ParentBodyToJoint = offset
+    return getattr(skeleton, f"create{kind}JointAndBodyNodePair"), properties
+
+
+def _read_skeleton(spec: FileSkeleton, folder: Path) -> Any:
+    path = (folder / spec.file).resolve()
+    if not path.is_file():
+        raise InputError(f"{path}: skeleton.file: no such file, expected URDF, SDF, SKEL or MJCF")
+    suffix = path.suffix.lower()
+    if suffix not in _PARSERS:
+        raise InputError(f"{path}: suffix {suffix!r}: expected {', '.join(_PARSERS)}")
+    try:
+        skeleton = _PARSERS[suffix](str(path))
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: DART cannot read it: {reason}") from error
+    if skeleton is None:
+        raise InputError(f"{path}: DART finds no skeleton in it, expected a valid {suffix} file")
+    if suffix in _MJCF:
+        _refuse_bodies_without_shape(skeleton, path)
+    return skeleton
+
+
+def _read_urdf(uri: str) -> Any:
+    loader = _dart.utils.DartLoader()
+    options = loader.getOptions()
+    # A bench stands on the ground; DART would let the root link fly.
+    options.mDefaultRootJointType = _dart.utils.DartLoaderRootJointType.FIXED
+    loader.setOptions(options)
+    return loader.parseSkeleton(uri)
+
+
+def _read_sdf(uri: str) -> Any:
+    return _dart.utils.SdfParser.readSkeleton(uri)
+
+
+def _read_skel(uri: str) -> Any:
+    return _first_skeleton(_dart.utils.SkelParser.readWorld(uri))
+
+
+def _read_mjcf(uri: str) -> Any:
+    return _first_skeleton(_dart.utils.MjcfParser.readWorld(uri))
+
+
+def _first_skeleton(world: Any) -> Any:
+    return world.getSkeleton(0) if world is not None and world.getNumSkeletons() > 0 else None
+
+
+_MJCF = (".xml", ".mjcf")
+
+
+_PARSERS: dict[str, Callable[[str], Any]] = {
+    ".urdf": _read_urdf,
+    ".sdf": _read_sdf,
+    ".skel": _read_skel,
+    **dict.fromkeys(_MJCF, _read_mjcf),
+}
+"""DART's parser for each suffix."""
+
+
+def _refuse_bodies_without_shape(skeleton: Any, path: Path) -> None:
+    """DART's MJCF parser gives a body without a geom 1 kg, whatever its inertial says."""
+    for body in skeleton.getBodyNodes():
+        if int(body.getNumShapeNodes()) == 0:
+            raise InputError(
+                f"{path}: body {body.getName()}: no geom, expected one: DART reads no mass without"
+            )

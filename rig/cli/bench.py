@@ -1,0 +1,67 @@
+"""`rig bench`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.output import ConfigFile, console, write_summary
+from rig.cli.watching import progress_line, stoppable
+
+EXAMPLES = (
+    "Examples: `rig bench reference_bench.yaml --interface socketcan --channel vcan0` · "
+    "`rig bench reference_bench.yaml --bridge rig.yaml --out runs/bench`"
+)
+
+
+def bench(
+    config: ConfigFile,
+    interface: Annotated[
+        str, typer.Option(help="python-can's name of the interface.")
+    ] = "socketcan",
+    channel: Annotated[str, typer.Option(help="Channel of the interface.")] = "vcan0",
+    bitrate: Annotated[int, typer.Option(min=1, help="Bit rate in bit/s.")] = 1_000_000,
+    dbc: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="DBC; the package's own by default.")
+    ] = None,
+    duration_s: Annotated[
+        float | None,
+        typer.Option("--duration-s", min=0.001, help="Length in s; until Ctrl-C by default."),
+    ] = None,
+    bridge: Annotated[
+        Path | None,
+        typer.Option(
+            "--bridge",
+            metavar="FILE",
+            help="Take bus, DBC and authentication from a bridge's configuration instead.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Write summary.json there.")
+    ] = None,
+) -> None:
+    """Run a simulated bench on a bus, in real time."""
+    from rig.bench.config import load_bench_config
+    from rig.io.bus import BusConfig
+    from rig.operation.live import run_bench
+    from rig.operation.setup import load_authentication, load_setup
+
+    bench_config = load_bench_config(config)
+    bus, authentication = BusConfig(interface, channel, bitrate), None
+    if bridge is not None:
+        ready = load_setup(bridge)
+        bus, dbc = ready.config.bus.config(), ready.database.path
+        authentication = load_authentication(ready)
+    with stoppable() as stop, progress_line(duration_s) as progress:
+        sent = run_bench(
+            bench_config,
+            bus,
+            dbc,
+            authentication=authentication,
+            duration_s=duration_s,
+            stop=stop,
+            progress=progress,
+        )
+    console.print(f"Sent {sent} frames.")
+    if out is not None:
+        write_summary(out, {"bench": bench_config.name, "frames": sent})

@@ -1,0 +1,88 @@
+"""`rig demo`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.output import console, free_folder, refuse_full
+from rig.cli.results import print_case, print_diagnosis, print_ended
+from rig.cli.watching import progress_bar, progress_line, stoppable
+from rig.inputs.errors import InputError
+
+STORY = "story"
+
+EXAMPLES = (
+    "Examples: `rig demo` · `rig demo --seed 7` · "
+    "`rig demo --case reference --lockstep --out /tmp/reference`"
+)
+
+
+def demo(
+    case: Annotated[
+        str,
+        typer.Option(
+            help=f"{STORY}: the whole story; or a plain case: reference, quarter_car, dyno."
+        ),
+    ] = STORY,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Draws the effect that the story's bench carries.")
+    ] = 1,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder to write into; rig-demo by default."),
+    ] = None,
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="Simulated time, as fast as the machine allows.")
+    ] = False,
+    duration_s: Annotated[
+        float | None, typer.Option("--duration-s", min=1.0, help="Length of a run in s.")
+    ] = None,
+) -> None:
+    """Run a simulated bench and the bridge on this machine, over virtual CAN.
+
+    The story: a bench with an effect that nobody declared, logged by the bridge, diagnosed,
+    corrected, and run again.
+    """
+    from rig.demo.cases import CASES, run_case
+
+    if case not in (STORY, *CASES):
+        raise InputError(f"--case {case!r}: expected one of {', '.join((STORY, *CASES))}")
+    out = out or free_folder("rig-demo")
+    refuse_full(out)
+    if case == STORY:
+        _tell(seed, out, lockstep=lockstep, duration_s=duration_s)
+        return
+    with stoppable() as stop, progress_line(duration_s) as progress:
+        done = run_case(
+            case, out, lockstep=lockstep, duration_s=duration_s, stop=stop, progress=progress
+        )
+    print_case(done)
+    print_ended(done.run, with_timing=not lockstep)
+    console.print(f"Written: {out}/summary.json, a picture of each strut, and the run {out}/run")
+
+
+def _tell(seed: int, out: Path, *, lockstep: bool, duration_s: float | None) -> None:
+    from rig.demo.story import tell
+
+    with stoppable() as stop, progress_line(duration_s) as progress, progress_bar() as bar:
+        story = tell(
+            seed,
+            out,
+            duration_s=duration_s,
+            lockstep=lockstep,
+            stop=stop,
+            chapter=lambda text: console.print(f"- {text}"),
+            progress=progress,
+            diagnosis_progress=bar,
+        )
+    print_ended(story.first_run, with_timing=not lockstep)
+    print_diagnosis(story.diagnosis, struts=1)
+    before, after = story.virtual_force_rms_n
+    parameters = ", ".join(f"{key} {value:.4g}" for key, value in story.effect.parameters.items())
+    console.print(
+        f"On a fresh run the virtual force falls from {before:.2f} N to {after:.2f} N RMS.\n"
+        f"What the bench carried, and nobody had told the diagnosis: {story.effect.name} "
+        f"(family {story.family}): {parameters}.\n"
+        f"Report: {out}/diagnosis/report.html"
+    )

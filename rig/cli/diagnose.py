@@ -1,0 +1,39 @@
+"""`rig diagnose`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.output import console
+from rig.cli.results import print_diagnosis
+from rig.cli.watching import progress_bar
+
+EXAMPLES = "Example: `rig diagnose runs/7 --model bench.yaml --held-out runs/8 --out found`"
+
+
+def diagnose(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Folders of runs, or CSV files.")
+    ],
+    model: Annotated[
+        str,
+        typer.Option("--model", metavar="MODEL", help="Model file, or the name of a shipped one."),
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
+    held_out: Annotated[
+        list[Path] | None,
+        typer.Option("--held-out", metavar="RUN", help="Run to judge on; once for each."),
+    ] = None,
+) -> None:
+    """Trace what the model lacks to named effects, correct it, and judge it on other data."""
+    from dart_model.spec import load_model, model_file
+    from rig.diagnosis.command import diagnose_runs
+    from rig.pages.report import write_report
+
+    spec = load_model(model_file(model, Path()))
+    with progress_bar() as bar:
+        result = diagnose_runs(runs, spec, held_out or [], out, bar)
+        write_report(result, out / "report.html")
+    print_diagnosis(result.diagnosis, struts=len(spec.struts))
+    console.print(f"Written: {out}/diagnosis.json, {out}/corrected.yaml, {out}/report.html")

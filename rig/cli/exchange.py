@@ -1,0 +1,80 @@
+"""`rig import` and `rig export`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.output import console
+from rig.cli.watching import progress_line
+from rig.inputs.errors import InputError
+
+IMPORT_EXAMPLES = (
+    "Examples: `rig import bench.txt --mapping bench.yaml --out bench.csv` · "
+    "`rig import bus.blf --config rig.yaml --out runs/9` · `rig import run.mf4 --out runs/10`"
+)
+
+
+def import_command(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Table, bus log or export.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="PATH", help="CSV file, or folder of the run.")
+    ],
+    mapping: Annotated[
+        Path | None,
+        typer.Option("--mapping", metavar="FILE", help="Columns and units of a foreign table."),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="FILE", help="Signals of a bus log, with its DBC."),
+    ] = None,
+) -> None:
+    """Make a CSV of a foreign table, or a run of a bus log or of an export.
+
+    A table wants --mapping, a bus log (BLF, ASC, candump, TRC, MF4) --config; what `rig export`
+    wrote wants neither.
+    """
+    from rig.exchange.bus_log import import_log
+    from rig.exchange.exported import import_run
+    from rig.exchange.foreign_table import import_table
+    from rig.exchange.mapping import load_mapping
+    from rig.operation.setup import load_setup
+
+    if mapping is not None and config is not None:
+        raise InputError("--mapping and --config: expected one of them")
+    if mapping is not None:
+        report = import_table(source, load_mapping(mapping), out)
+    elif config is not None:
+        with progress_line(None) as progress:
+            report = import_log(source, load_setup(config), out, progress)
+    else:
+        import_run(source, out)
+        console.print(f"Run: {out}")
+        return
+    console.print(
+        f"{report.samples} samples, {report.duration_s:.3f} s at {report.rate_hz:g} a second: "
+        f"{', '.join(report.columns)}"
+    )
+    for line in report.assumptions:
+        console.print(f"- {line}", markup=False)
+    console.print(f"Written: {report.out}")
+
+
+EXPORT_EXAMPLES = (
+    "Examples: `rig export runs/7 --format mf4 --out run.mf4` · "
+    "`rig export runs/7 --format candump --out run.log`"
+)
+
+
+def export_command(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="PATH", help="New file; for Parquet a folder.")
+    ],
+    kind: Annotated[str, typer.Option("--format", help="One of mf4, parquet, csv, candump.")],
+) -> None:
+    """Write a run for other programs: MF4, Parquet, CSV or candump."""
+    from rig.exchange.exported import export_run
+
+    for path in export_run(folder, kind, out):
+        console.print(f"Written: {path}")

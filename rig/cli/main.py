@@ -1,0 +1,63 @@
+"""The command line whole: every command, and what a wrong input or an interruption ends with."""
+
+import sys
+
+import click
+import typer
+from rich.console import Console
+
+from rig.cli import bench, check, demo, diagnose, exchange, replay, run, scoreboard
+from rig.cli.output import OK, WRONG_INPUT
+from rig.inputs.errors import InputError
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="rig",
+    help="Bridge between a shock-absorber bench on CAN and a DART multibody model.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+)
+app.command("demo", epilog=demo.EXAMPLES)(demo.demo)
+app.command("check", epilog=check.EXAMPLES)(check.check_command)
+app.command("run", epilog=run.EXAMPLES)(run.run)
+app.command("bench", epilog=bench.EXAMPLES)(bench.bench)
+app.command("replay", epilog=replay.EXAMPLES)(replay.replay_command)
+app.command("diagnose", epilog=diagnose.EXAMPLES)(diagnose.diagnose)
+app.command("import", epilog=exchange.IMPORT_EXAMPLES)(exchange.import_command)
+app.command("export", epilog=exchange.EXPORT_EXAMPLES)(exchange.export_command)
+app.command("scoreboard", epilog=scoreboard.EXAMPLES)(scoreboard.scoreboard)
+
+_INTERRUPTED = 130
+"""What a shell expects of a program that Ctrl-C ended: 128 and the number of SIGINT."""
+
+
+def main() -> None:
+    """Run the command; a wrong input is one line on standard error and exit code 2."""
+    try:
+        ended = app(standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message())
+        sys.exit(WRONG_INPUT)
+    except click.ClickException as error:
+        _refuse(error.format_message())
+    except InputError as error:
+        _refuse(str(error))
+    except (KeyboardInterrupt, click.Abort):
+        _say("interrupted")
+        sys.exit(_INTERRUPTED)
+    else:
+        sys.exit(ended if isinstance(ended, int) else OK)
+
+
+def _refuse(why: str) -> None:
+    _say(why)
+    sys.exit(WRONG_INPUT)
+
+
+def _say(text: str) -> None:
+    # A name from outside may hold line breaks and control characters.
+    line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.splitlines()))
+    Console(stderr=True).print(f"rig: {line}", style="red", markup=False, soft_wrap=True)

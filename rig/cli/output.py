@@ -1,0 +1,44 @@
+"""Where commands print and write, and the exit codes they end with."""
+
+import itertools
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from rig.inputs.errors import InputError
+
+OK, FAILED, WRONG_INPUT = 0, 1, 2
+ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file.")]
+console = Console()
+
+
+def free_folder(name: str) -> Path:
+    """`name`, or with the first number that makes it new."""
+    numbered = (Path(f"{name}-{number}") for number in itertools.count(2))
+    return next(path for path in itertools.chain([Path(name)], numbered) if not path.exists())
+
+
+def refuse_full(folder: Path) -> None:
+    """Refuse a folder that holds anything.
+
+    Raises:
+        InputError: It does, or is no folder.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"--out {folder}: is not empty, expected a new or an empty folder")
+
+
+def write_summary(folder: Path, summary: dict[str, object]) -> None:
+    """Write `summary.json`.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
+    except OSError as error:
+        raise InputError(f"--out {folder}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,57 @@
+"""`rig run`."""
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.output import FAILED, ConfigFile, console
+from rig.cli.results import print_ended
+from rig.cli.watching import progress_line, stoppable
+
+EXAMPLES = "Examples: `rig run rig.yaml` · `rig run rig.yaml --out runs/7 --listen-only`"
+
+
+def run(
+    config: ConfigFile,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="DIR", help="Folder of the run; by default runs/ and the time."
+        ),
+    ] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            "--model",
+            metavar="MODEL",
+            help="Another model than the configuration's, e.g. a corrected one.",
+        ),
+    ] = None,
+    duration_s: Annotated[
+        float | None,
+        typer.Option(
+            "--duration-s",
+            min=0.001,
+            help="Length of the run in s; else the configuration's, or until Ctrl-C.",
+        ),
+    ] = None,
+    listen_only: Annotated[bool, typer.Option("--listen-only", help="Send nothing.")] = False,
+) -> None:
+    """Run the bridge on a bus; Ctrl-C ends it in order."""
+    from rig.core.contract import Mode
+    from rig.operation.live import live
+    from rig.operation.setup import load_setup
+
+    ready = load_setup(config, model=model, duration_s=duration_s)
+    folder = out or Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
+    with stoppable() as stop, progress_line(ready.config.duration_s) as progress:
+        ended = live(ready, folder, listen_only=listen_only, stop=stop, progress=progress)
+    print_ended(ended, with_timing=True)
+    (folder / "summary.json").write_text(json.dumps(ended.summary(), indent=2) + "\n", "utf-8")
+    console.print(f"Run: {folder}")
+    if ended.state.core.mode is Mode.SAFE:
+        console.print("The run ended in its safe state.", style="red")
+        raise typer.Exit(FAILED)

@@ -1,0 +1,40 @@
+"""`rig scoreboard`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from rig.cli.output import console
+from rig.cli.watching import progress_bar
+
+EXAMPLES = "Example: `rig scoreboard --data measured --set emps --out scores`"
+
+
+def scoreboard(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            "--data",
+            metavar="DIR",
+            help="Folder with folders silverbox, emps, brfd, mr_damper, any of them.",
+        ),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME", help="Only this set; may be given several times."),
+    ] = None,
+) -> None:
+    """Diagnose published measured sets and print our figures beside the published ones."""
+    from rig.scoreboard.run import run_scoreboard
+
+    with progress_bar() as bar:
+        rows = run_scoreboard(data, out, bar, only or ())
+    table = Table("set", "test", "model", "figure", "source", title="Measured sets")
+    for row in rows:
+        figure = "-" if row.value is None else f"{row.value:.4g} {row.unit}"
+        table.add_row(row.dataset, row.test, row.model, figure, row.source)
+    console.print(table)
+    console.print(f"Written: {out}/scoreboard.csv, {out}/scoreboard.md")

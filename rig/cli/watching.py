@@ -1,0 +1,70 @@
+"""A command that takes time: how far it is, and how it is asked to end."""
+
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Callable, Generator
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+if TYPE_CHECKING:
+    from rig.core.contract import Mode
+
+
+_REFRESH_NS = 200_000_000
+
+
+@contextlib.contextmanager
+def stoppable() -> Generator[Callable[[], bool]]:
+    """Ctrl-C and SIGTERM ask the loop to end in order instead of breaking it off."""
+    asked = False
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def progress_bar() -> Generator[Callable[[str, float], None]]:
+    """A bar for the diagnosis, which has no tick to miss."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    shown = Console(stderr=True)
+    # Where it cannot be rewritten it would leave an empty line behind.
+    with Progress(*columns, console=shown, transient=True, disable=not shown.is_terminal) as bars:
+        task = bars.add_task("diagnosis", total=1.0, visible=False)
+
+        def show(what: str, share: float) -> None:
+            bars.update(task, description=what, completed=share, visible=share < 1.0)
+
+        yield show
+
+
+@contextlib.contextmanager
+def progress_line(duration_s: float | None) -> Generator[Callable[[int, "Mode"], None]]:
+    """One line that is rewritten; a single write, because the loop itself calls it."""
+    shown = sys.stderr.isatty()
+    due_ns = 0
+    total = "" if duration_s is None else f" of {duration_s:g} s"
+
+    def show(t_ns: int, mode: "Mode") -> None:
+        nonlocal due_ns
+        if shown and t_ns >= due_ns:
+            due_ns = t_ns + _REFRESH_NS
+            os.write(2, f"\r{t_ns * 1e-9:9.1f} s{total}  {mode.name:<8}".encode())
+
+    try:
+        yield show
+    finally:
+        if shown:
+            os.write(2, b"\r\x1b[K")

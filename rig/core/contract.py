@@ -1,0 +1,294 @@
+"""What a step is given and gives, and what its parts must be able to do."""
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Any, Protocol
+
+from msgspec import Struct
+
+from rig.core.quantities import APPLIED_FORCE, LOAD_CELL_FORCE, OTHERS, PLACES, TEMPERATURE
+
+
+class Mode(IntEnum):
+    """State of the bridge, with the numbers it has on the bus."""
+
+    INIT = 0
+    WAITING = 1
+    RUNNING = 2
+    HOLD = 3
+    SAFE = 4
+    STOPPED = 5
+
+
+class Measurement(Struct, frozen=True, gc=False):
+    """A height that arrived.
+
+    Attributes:
+        height_m: Measured strut height.
+        t_ns: Time at which it was true.
+    """
+
+    height_m: float
+    t_ns: int
+
+
+NO_OTHERS: tuple[float | None, ...] = (None,) * len(OTHERS)
+_APPLIED, _LOAD_CELL, _TEMPERATURE = (
+    PLACES[quantity] for quantity in (APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE)
+)
+
+
+class StepInput(Struct, frozen=True, gc=False):
+    """All that one tick is given.
+
+    Attributes:
+        t_ns: Time of the tick.
+        heights: New measurement of each observed strut, None where no frame came.
+        others: New value of each of `OTHERS`, in SI, None where no frame came.
+        acknowledged: Somebody acknowledged the safe state.
+    """
+
+    t_ns: int
+    heights: tuple[Measurement | None, ...]
+    others: tuple[float | None, ...] = NO_OTHERS
+    acknowledged: bool = False
+
+    @property
+    def applied_force_n(self) -> float | None:
+        """New applied force."""
+        return self.others[_APPLIED]
+
+    @property
+    def load_cell_force_n(self) -> float | None:
+        """New force of the load cell."""
+        return self.others[_LOAD_CELL]
+
+    @property
+    def temperature_c(self) -> float | None:
+        """New damper temperature."""
+        return self.others[_TEMPERATURE]
+
+
+class MovingModel(Protocol):
+    """State of a model, made by its plant and frozen."""
+
+    @property
+    def struts(self) -> Sequence[tuple[float, float]]:
+        """Height (m) and velocity (m/s) of each strut."""
+        ...
+
+
+class LoadedModel(Protocol):
+    """A state of a model under the forces that act from it on; frozen."""
+
+    @property
+    def state(self) -> Any:
+        """The state, a `MovingModel`."""
+        ...
+
+    @property
+    def forces_n(self) -> Sequence[float]:
+        """Spring-damper force of each strut, without the virtual force."""
+        ...
+
+    @property
+    def accelerations_m_per_s2(self) -> Sequence[float]:
+        """Second derivative of each strut's height."""
+        ...
+
+    @property
+    def applied_force_n(self) -> float:
+        """Applied force."""
+        ...
+
+    @property
+    def temperature_c(self) -> float:
+        """Damper temperature."""
+        ...
+
+
+class Plant(Protocol):
+    """A model that runs beside a bench. Its answers depend on its arguments alone."""
+
+    @property
+    def struts(self) -> int:
+        """Number of struts."""
+        ...
+
+    def init(
+        self,
+        heights_m: Sequence[float],
+        velocities_m_per_s: Sequence[float] | None = None,
+        t_s: float = 0.0,
+    ) -> Any:
+        """State with given strut heights, at rest unless velocities are given."""
+        ...
+
+    def load(
+        self,
+        state: Any,
+        virtual_forces_n: Sequence[float],
+        applied_force_n: float,
+        temperature_c: float,
+    ) -> Any:
+        """The state with forces on it, a `LoadedModel`; virtual forces are held from it on."""
+        ...
+
+    def step(self, loaded: Any, dt_s: float, applied_force_end_n: float) -> Any:
+        """State after `dt_s`, with an applied force that is linear in between."""
+        ...
+
+    def numbers(self, state: Any) -> Sequence[float]:
+        """A state as numbers, for whoever differentiates a step."""
+        ...
+
+    def state_of(self, numbers: Sequence[float]) -> Any:
+        """The state of what `numbers` gave."""
+        ...
+
+
+class ObserverState(Protocol):
+    """State of an observer; frozen."""
+
+    @property
+    def innovation_m(self) -> float:
+        """Last innovation: measured less model height, at the time of the measurement."""
+        ...
+
+    @property
+    def virtual_force_n(self) -> float:
+        """Virtual force, held until the next step."""
+        ...
+
+    @property
+    def measured_ns(self) -> int:
+        """Time of the last measurement."""
+        ...
+
+
+class Observer(Protocol):
+    """What makes the model of one strut follow its bench. It knows no other strut."""
+
+    def init(self, measured: Measurement) -> Any:
+        """State at the first measurement, an `ObserverState` without virtual force."""
+        ...
+
+    def step(
+        self,
+        state: Any,
+        t_ns: int,
+        height_m: float,
+        velocity_m_per_s: float,
+        measured: Measurement | None,
+    ) -> Any:
+        """State after a tick.
+
+        Args:
+            state: State after the last tick.
+            t_ns: Time of the tick.
+            height_m: Height of the model at the tick.
+            velocity_m_per_s: Its velocity.
+            measured: New measurement; None where no frame came.
+        """
+        ...
+
+    def numbers(self, state: Any) -> Sequence[float]:
+        """What of a state the next one depends on."""
+        ...
+
+    def state_of(self, numbers: Sequence[float]) -> Any:
+        """The state of what `numbers` gave, last measured at time zero."""
+        ...
+
+
+class StrutOutput(Struct, frozen=True, gc=False):
+    """What a tick says of one strut; each attribute is a column of the log.
+
+    Attributes:
+        force_n: Estimated spring-damper force, virtual force included.
+        virtual_force_n: Virtual force.
+        valid: Whether the estimate rests on a fresh measurement.
+        height_m: Model height.
+        velocity_m_per_s: Model velocity.
+        acceleration_m_per_s2: Model acceleration.
+        innovation_m: Innovation.
+    """
+
+    force_n: float
+    virtual_force_n: float
+    valid: bool
+    height_m: float
+    velocity_m_per_s: float
+    acceleration_m_per_s2: float
+    innovation_m: float
+
+
+class StepOutput(Struct, frozen=True, gc=False):
+    """What a tick publishes.
+
+    Attributes:
+        mode: State of the bridge.
+        struts: One a strut, in the model's order; empty before the first measurements.
+    """
+
+    mode: Mode
+    struts: tuple[StrutOutput, ...]
+
+
+class Divergence(Struct, frozen=True, gc=False):
+    """A model whose numbers no bench has.
+
+    Attributes:
+        strut: Index of the first strut that shows it.
+        t_ns: Time of the tick that found it.
+    """
+
+    strut: int
+    t_ns: int
+
+
+class CoreState(Struct, frozen=True, gc=False):
+    """State of a core between two ticks; a run can be restarted from any.
+
+    Attributes:
+        t_ns: Time of the last tick.
+        mode: State of the bridge.
+        temperature_c: Last damper temperature.
+        last_valid: What was last published as valid; empty before.
+        diverged: The last divergence of the model, if there ever was one.
+    """
+
+    t_ns: int
+    mode: Mode
+    temperature_c: float
+    last_valid: tuple[StrutOutput, ...] = ()
+    diverged: Divergence | None = None
+
+
+class Core(Protocol):
+    """The arithmetic of a bridge: values in, values out."""
+
+    @property
+    def struts(self) -> int:
+        """Number of struts."""
+        ...
+
+    def init(self, t_ns: int) -> CoreState:
+        """State before the first tick."""
+        ...
+
+    def step(self, state: Any, step_input: StepInput) -> tuple[CoreState, StepOutput]:
+        """State after a tick, and what it publishes; `state` is what `init` or `step` gave."""
+        ...
+
+
+AMBIENT_C = 20.0
+"""Damper temperature where none was measured."""
+
+_SENSELESS = 1e12
+"""No bench has heights, velocities or forces of this size: the model has diverged."""
+
+
+def is_sensible(number: float) -> bool:
+    """Whether a number, or a sum of some, in SI is of a size that a bench may have; NaN is not."""
+    return -_SENSELESS < number < _SENSELESS

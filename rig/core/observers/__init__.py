@@ -1,0 +1,13 @@
+"""Observers, one file each. A further one is a file here and a line in the table below."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from rig.core.observers.pi import PiObserver
+
+OBSERVERS: Mapping[str, type[Any]] = MappingProxyType({"pi": PiObserver})
+"""`kind` in a configuration -> a frozen pydantic dataclass that is an `Observer`."""
+
+DEFAULT_KIND = "pi"
+"""What an observer without `kind` is."""

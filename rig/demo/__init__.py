@@ -1,0 +1,1 @@
+"""What comes with the package to be tried: cases with known truth, and the whole story."""

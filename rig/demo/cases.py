@@ -1,0 +1,215 @@
+"""Cases that come with the package: a bench, a bridge, and how far the model is from the bench."""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from rig.bench.config import load_bench_config
+from rig.bench.schema import BenchConfig
+from rig.bench.trajectory import simulate
+from rig.core.contract import Mode
+from rig.core.observers.pi import PiObserver
+from rig.io.run_log import read_run
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.logged_run import Ended
+from rig.operation.replay import replay
+from rig.operation.setup import Setup, load_setup
+
+SETTLED_NS = 500_000_000
+"""Figures are taken after this time."""
+
+CASES = ("reference", "quarter_car", "dyno")
+"""Names of the cases; each has a bridge and a bench among the package's configurations."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How far a model is from the bench.
+
+    Attributes:
+        height_error_max_m: Largest error of the height.
+        force_error_rms_n: Root mean square error of the spring-damper force.
+        force_error_max_n: Its largest error.
+        force_peak_n: Largest force of the bench.
+    """
+
+    height_error_max_m: float
+    force_error_rms_n: float
+    force_error_max_n: float
+    force_peak_n: float
+
+
+@dataclass(frozen=True)
+class StrutCase:
+    """One strut in a case.
+
+    Attributes:
+        name: Name of the strut.
+        t_s: Times, shape (ticks,).
+        truth: Height in m, velocity in m/s and force in N of the bench, shape (ticks, 3).
+        defective: Height in m and force in N of the model running alone, shape (ticks, 2).
+        observed: The same of the model with the virtual force, shape (ticks, 2).
+    """
+
+    name: str
+    t_s: NDArray[np.float64]
+    truth: NDArray[np.float64]
+    defective: NDArray[np.float64]
+    observed: NDArray[np.float64]
+
+    def figures(self, model: NDArray[np.float64]) -> Figures:
+        """Figures of `defective` or `observed`."""
+        settled = self.t_s >= SETTLED_NS * 1e-9
+        height = (model[:, 0] - self.truth[:, 0])[settled]
+        force = (model[:, 1] - self.truth[:, 2])[settled]
+        return Figures(
+            height_error_max_m=float(np.max(np.abs(height))),
+            force_error_rms_n=float(np.sqrt(np.mean(force**2))),
+            force_error_max_n=float(np.max(np.abs(force))),
+            force_peak_n=float(np.max(np.abs(self.truth[settled, 2]))),
+        )
+
+
+@dataclass(frozen=True)
+class Case:
+    """A case that was run.
+
+    Attributes:
+        run: The run.
+        struts: What each strut did.
+    """
+
+    run: Ended
+    struts: tuple[StrutCase, ...]
+
+    def summary(self) -> dict[str, object]:
+        """Every figure, for `summary.json`; at the top level those of the first strut."""
+        by_strut = {
+            strut.name: {
+                "defective": asdict(strut.figures(strut.defective)),
+                "observed": asdict(strut.figures(strut.observed)),
+            }
+            for strut in self.struts
+        }
+        ended = self.run
+        return {
+            **next(iter(by_strut.values())),
+            "struts": by_strut,
+            "ticks": ended.ticks,
+            "counts": ended.state.counts._asdict(),
+            "timing": ended.timing.summary(),
+        }
+
+
+def run_case(
+    name: str,
+    folder: Path,
+    *,
+    lockstep: bool,
+    duration_s: float | None,
+    stop: Callable[[], bool],
+    progress: Callable[[int, Mode], None],
+) -> Case:
+    """Run a case into ``folder/run`` and write its summary and picture into `folder`.
+
+    Args:
+        name: One of `CASES`.
+        folder: Where to write; absent or empty.
+        lockstep: Simulated time, as fast as the machine allows; otherwise real time.
+        duration_s: Length; the configuration's own if None.
+        stop: Asked before each tick whether to end.
+        progress: Told of every tick.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    ready = load_setup(CONFIGS / f"{name}.yaml", duration_s=duration_s)
+    bench = load_bench_config(CONFIGS / f"{name}_bench.yaml")
+    ended = with_bench(
+        ready, bench, folder / "run", lockstep=lockstep, stop=stop, progress=progress
+    )
+    case = _compared(ended, ready, bench)
+    (folder / "summary.json").write_text(json.dumps(case.summary(), indent=2) + "\n", "utf-8")
+    for strut in case.struts:
+        draw(strut, folder / f"{strut.name}.png")
+    return case
+
+
+def _compared(ended: Ended, ready: Setup, bench: BenchConfig) -> Case:
+    observed = read_run(ended.folder).steps
+    t_ns = np.asarray(observed.column("t_ns").to_numpy(), dtype=np.int64)
+    period_ns = ready.config.period_ns
+    truth = simulate(bench, int(t_ns[-1]) + period_ns, period_ns)
+    model_alone = _alone(ended, ready, observed)
+    at = t_ns // period_ns
+    struts = tuple(
+        StrutCase(
+            name,
+            np.asarray(t_ns * 1e-9, dtype=np.float64),
+            np.column_stack(
+                [
+                    column[at, index]
+                    for column in (truth.height_m, truth.velocity_m_per_s, truth.strut_force_n)
+                ]
+            ),
+            model_alone[name],
+            _height_and_force(observed, name),
+        )
+        for index, name in enumerate(ready.config.observers)
+    )
+    return Case(ended, struts)
+
+
+def _alone(ended: Ended, ready: Setup, observed: Any) -> dict[str, NDArray[np.float64]]:
+    """Height and force of every strut of the model without virtual force."""
+    names = list(ready.config.observers)
+    if ready.config.prescribed_motion is not None:
+        # The motion is what it is; the model's own force is what the virtual force comes on top of.
+        virtual_n = {n: observed.column(f"{n}.virtual_force_n").to_numpy() for n in names}
+        return {
+            n: _height_and_force(observed, n) - np.outer(virtual_n[n], [0.0, 1.0]) for n in names
+        }
+    without = {name: PiObserver(proportional_n_per_m=0.0, integral_n_per_m_s=0.0) for name in names}
+    config = ready.config.model_copy(update={"observers": without})
+    steps = replay(ended.folder, ready=ready.model_copy(update={"config": config})).steps
+    return {name: _height_and_force(steps, name) for name in names}
+
+
+def _height_and_force(steps: Any, strut: str) -> NDArray[np.float64]:
+    columns = [steps.column(f"{strut}.{name}").to_numpy() for name in ("height_m", "force_n")]
+    return np.column_stack(columns)
+
+
+def draw(case: StrutCase, path: Path) -> None:
+    """Draw height and force of bench and model, and their errors, over the last two seconds."""
+    last = case.t_s >= case.t_s[-1] - 2.0
+    t_s = case.t_s[last]
+    style = {"axes.grid": True, "grid.alpha": 0.3, "legend.frameon": False}
+    with cast("Any", mpl).rc_context(style):
+        figure = cast("Any", Figure)(figsize=(10, 7), layout="constrained")
+        panels = figure.subplots(2, 2, sharex=True)
+        for column, (title, of_truth, of_model, scale, unit) in enumerate(
+            (("Height", 0, 0, 1e3, "mm"), ("Spring-damper force", 2, 1, 1.0, "N"))
+        ):
+            truth = case.truth[last, of_truth] * scale
+            defective = case.defective[last, of_model] * scale
+            observed = case.observed[last, of_model] * scale
+            upper, lower = panels[0, column], panels[1, column]
+            upper.plot(t_s, truth, color="black", label="bench")
+            upper.plot(t_s, defective, color="tab:red", label="model alone")
+            upper.plot(t_s, observed, "--", color="tab:blue", label="model with virtual force")
+            upper.set(title=title, ylabel=f"{title.lower()} / {unit}")
+            lower.plot(t_s, observed - truth, color="tab:blue")
+            lower.set(title="Error with virtual force", xlabel="time / s", ylabel=f"error / {unit}")
+        lines, labels = panels[0, 0].get_legend_handles_labels()
+        figure.legend(lines, labels, loc="outside lower center", ncols=3)
+        figure.suptitle(f"Strut “{case.name}”: bench and model over CAN")
+        figure.savefig(path, dpi=110)

@@ -1,0 +1,174 @@
+"""The whole story on one machine: an undeclared effect, found, named, corrected and tried again."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dart_model.spec import load_model
+from rig.bench.config import load_bench_config
+from rig.bench.schema import BenchConfig, Effect
+from rig.core.contract import Mode
+from rig.demo.cases import SETTLED_NS
+from rig.diagnosis.command import diagnose_runs
+from rig.diagnosis.outcome import CORRECTED_FILE, Diagnosis, to_json
+from rig.io.run_log import read_run
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.logged_run import Ended
+from rig.operation.setup import Setup, load_setup
+from rig.pages.report import write_report
+
+_STRUT = "strut"
+_RANGES: Mapping[str, tuple[str, Mapping[str, tuple[float, float]]]] = {
+    "friction": ("friction", {"coulomb_force_n": (5.0, 15.0)}),
+    "cubic_stiffness": ("nonlinear_stiffness", {"stiffness_n_per_m3": (1.0e5, 4.0e5)}),
+    "bump_stop": (
+        "stop",
+        {
+            "contact_height_m": (0.405, 0.415),
+            "contact_stiffness_n_per_m1_5": (5.0e4, 2.0e5),
+            "dissipation_s_per_m": (0.0, 0.3),
+        },
+    ),
+    "quadratic_damping": ("nonlinear_damping", {"damping_n_s2_per_m2": (60.0, 200.0)}),
+    "preload": ("preload", {"force_n": (5.0, 20.0)}),
+    "added_mass": ("inertia", {"mass_kg": (0.5, 2.0)}),
+    "linear_damping": ("damping", {"damping_n_s_per_m": (20.0, 60.0)}),
+    "linear_stiffness": ("stiffness", {"stiffness_n_per_m": (100.0, 300.0)}),
+}
+"""Undeclared effects that may be drawn: their family, and the range of each parameter."""
+
+
+@dataclass(frozen=True)
+class Story:
+    """What happened.
+
+    Attributes:
+        family: Family of the effect that the bench carried.
+        effect: The effect, as the bench names it.
+        diagnosis: What the diagnosis found, without knowing it.
+        virtual_force_rms_n: RMS of the virtual force on a fresh run, before and after.
+        first_run: The run that was diagnosed.
+    """
+
+    family: str
+    effect: Effect
+    diagnosis: Diagnosis
+    virtual_force_rms_n: tuple[float, float]
+    first_run: Ended
+
+    def summary(self) -> dict[str, object]:
+        """Every figure, for `summary.json`."""
+        before, after = self.virtual_force_rms_n
+        return {
+            "bench": {"family": self.family, **self.effect.model_dump(mode="json")},
+            "diagnosis": json.loads(to_json(self.diagnosis)),
+            "virtual_force_rms_n": {"before": before, "after": after},
+            "run": self.first_run.summary(),
+        }
+
+
+def draw_effect(seed: int) -> tuple[str, Effect]:
+    """Family and effect that a seed gives the bench.
+
+    Args:
+        seed: Not negative.
+    """
+    random = np.random.default_rng(seed)
+    name = list(_RANGES)[seed % len(_RANGES)]  # so that neighbouring seeds tell other stories
+    family, ranges = _RANGES[name]
+    parameters = {key: float(random.uniform(low, high)) for key, (low, high) in ranges.items()}
+    return family, Effect.model_validate({"name": name, "strut": _STRUT, "parameters": parameters})
+
+
+def tell(
+    seed: int,
+    folder: Path,
+    *,
+    duration_s: float | None,
+    lockstep: bool,
+    stop: Callable[[], bool],
+    chapter: Callable[[str], None],
+    progress: Callable[[int, Mode], None],
+    diagnosis_progress: Callable[[str, float], None],
+) -> Story:
+    """Run the story into `folder`.
+
+    The first run goes over virtual CAN in real time (or in lockstep) and is diagnosed; a second one
+    with another excitation is held out; a third one is run with the model before and after.
+
+    Args:
+        seed: Draws the effect.
+        folder: Where to write; absent or empty.
+        duration_s: Length of the runs; the configuration's own if None.
+        lockstep: Simulated time also for the first run.
+        stop: Asked before each tick whether to end.
+        chapter: Told what comes next.
+        progress: Told of every tick.
+        diagnosis_progress: Told of the diagnosis's steps and how far they are.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    family, effect = draw_effect(seed)
+    ready = load_setup(CONFIGS / "story.yaml", duration_s=duration_s)
+    benches = [_bench(effect, excitation) for excitation in (1, 2, 3)]
+
+    def run(number: int, name: str, with_ready: Setup, in_lockstep: bool) -> Ended:
+        return with_bench(
+            with_ready,
+            benches[number],
+            folder / name,
+            lockstep=in_lockstep,
+            stop=stop,
+            progress=progress,
+        )
+
+    chapter("The bridge runs with a bench that carries an undeclared effect")
+    first = run(0, "run", ready, lockstep)
+    chapter("A second run, with another excitation, is held out")
+    held_out = run(1, "held_out", ready, in_lockstep=True)
+    chapter("The first run is diagnosed")
+    out = folder / "diagnosis"
+    result = diagnose_runs([first.folder], ready.model, [held_out.folder], out, diagnosis_progress)
+    write_report(result, out / "report.html")
+    chapter("A fresh run, with the model as it was and with the corrected one")
+    before = run(2, "fresh_before", ready, in_lockstep=True)
+    corrected = load_model(out / CORRECTED_FILE)
+    after = run(2, "fresh_after", ready.model_copy(update={"model": corrected}), in_lockstep=True)
+    story = Story(
+        family,
+        effect,
+        result.diagnosis,
+        (_virtual_force_rms_n(before), _virtual_force_rms_n(after)),
+        first,
+    )
+    (folder / "summary.json").write_text(json.dumps(story.summary(), indent=2) + "\n", "utf-8")
+    return story
+
+
+def _bench(effect: Effect, excitation: int) -> BenchConfig:
+    bench = load_bench_config(CONFIGS / "story_bench.yaml")
+    components = tuple(
+        component.model_copy(update={"seed": excitation})
+        for component in bench.applied_force.components
+    )
+    return bench.model_copy(
+        update={
+            "undeclared_effects": (effect,),
+            "seed": excitation,
+            "applied_force": bench.applied_force.model_copy(update={"components": components}),
+        }
+    )
+
+
+def _virtual_force_rms_n(ended: Ended) -> float:
+    steps: Any = read_run(ended.folder).steps
+    t_ns = np.asarray(steps.column("t_ns").to_numpy(), dtype=np.int64)
+    force = np.asarray(steps.column(f"{_STRUT}.virtual_force_n").to_numpy(), dtype=np.float64)
+    force = force[t_ns >= SETTLED_NS]
+    return float(np.sqrt(np.mean(force**2)))

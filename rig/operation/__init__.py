@@ -1,0 +1,1 @@
+"""A run put together: configuration, bus, clock, bridge and log."""

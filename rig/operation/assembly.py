@@ -1,0 +1,86 @@
+"""The bridge that a configuration describes, put together from its parts."""
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+from dart_model.plant import DartPlant, PrescribedStrut
+from dart_model.spec import ModelSpec
+from rig.core.bridge import Bridge
+from rig.core.contract import Core, Plant
+from rig.core.messages import (
+    Incoming,
+    Outgoing,
+    Wanted,
+    estimate,
+    incoming,
+    kinematics,
+    status,
+    timing,
+)
+from rig.core.prescribed import PrescribedCore
+from rig.core.quantities import HEIGHT
+from rig.core.step import RigCore
+from rig.operation.setup import Setup
+
+ENGINES: Mapping[str, Callable[[ModelSpec], Plant]] = MappingProxyType({"dart": DartPlant})
+"""`engine` in a configuration -> what makes a plant of a model. A further one is a line here."""
+
+
+def build_bridge(ready: Setup, model: ModelSpec | None = None, *, sending: bool = True) -> Bridge:
+    """The bridge that a configuration describes.
+
+    Args:
+        ready: Configuration, model and DBC.
+        model: Another model with the same struts, e.g. a corrected one.
+        sending: Whether it makes frames to send; what it computes is the same without.
+
+    Raises:
+        InputError: The model cannot be built.
+        DatabaseError: A signal does not fit what it is for.
+    """
+    outgoing = _outgoing(ready) if sending else ()
+    limits = ready.config.supervision.supervision().limits
+    return Bridge(_core(ready, model or ready.model), _incoming(ready), outgoing, limits)
+
+
+def build_plant(ready: Setup, model: ModelSpec | None = None) -> Plant:
+    """The model that runs beside the bench, in the configuration's engine.
+
+    Raises:
+        InputError: The model cannot be built.
+    """
+    return ENGINES[ready.config.engine](model or ready.model)
+
+
+def _core(ready: Setup, model: ModelSpec) -> Core:
+    config = ready.config
+    supervision = config.supervision.supervision()
+    if config.prescribed_motion is not None:
+        settling_s = config.prescribed_motion.settling_s
+        return PrescribedCore(PrescribedStrut(model), settling_s, supervision)
+    observers = tuple(config.observers.values())
+    return RigCore(build_plant(ready, model), observers, supervision)
+
+
+def _incoming(ready: Setup) -> list[Incoming]:
+    signals = ready.config.signals
+    wanted: dict[str, list[Wanted]] = {}
+    for index, entry in enumerate(signals.height.values()):
+        wanted.setdefault(entry.message, []).append(Wanted(entry.signal, HEIGHT, index))
+    for quantity, entry in signals.others.items():
+        wanted.setdefault(entry.message, []).append(Wanted(entry.signal, quantity))
+    return [incoming(ready.database.message(name), found) for name, found in wanted.items()]
+
+
+def _outgoing(ready: Setup) -> list[Outgoing]:
+    config, message = ready.config, ready.database.message
+    outgoing: list[Outgoing] = []
+    for index, entry in enumerate(config.publish.values()):
+        outgoing.append(estimate(message(entry.estimate), index))
+        if entry.kinematics is not None:
+            outgoing.append(kinematics(message(entry.kinematics), index))
+    if config.status is not None:
+        outgoing.append(status(message(config.status)))
+    if config.timing is not None:
+        outgoing.append(timing(message(config.timing)))
+    return outgoing

@@ -1,0 +1,194 @@
+"""What can be wrong before a bench moves."""
+
+import stat
+from dataclasses import dataclass, replace
+from enum import Enum
+
+from can_dbc.bus_load import frame_time_s
+from can_dbc.database import Message
+from rig.core.stability import Pole, closed_loop_poles
+from rig.operation.assembly import build_bridge, build_plant
+from rig.operation.setup import Setup, load_authentication
+
+LITTLE_DAMPING = 0.02
+"""Damping ratio below which a pole is warned of: it rings for some 8 periods to a third."""
+
+_OTHERS_MAY_READ = stat.S_IRGRP | stat.S_IROTH
+FULL_LOAD, HIGH_LOAD = 1.0, 0.7
+
+
+class Severity(Enum):
+    """How grave a finding is; an error keeps the run from starting."""
+
+    OK = "ok"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the check.
+
+    Attributes:
+        severity: How grave it is.
+        what: What was looked at.
+        text: What was found, with figures.
+    """
+
+    severity: Severity
+    what: str
+    text: str
+
+    def as_dict(self) -> dict[str, str]:
+        """For `summary.json`."""
+        return {"severity": self.severity.value, "what": self.what, "text": self.text}
+
+
+def check(ready: Setup) -> list[Finding]:
+    """Check a configuration: signals and units, rate, bus load, stability.
+
+    Args:
+        ready: Configuration, model and DBC.
+
+    Returns:
+        All findings, good ones too.
+
+    Raises:
+        InputError: The model cannot be built.
+        DatabaseError: A signal or its unit is wrong.
+    """
+    build_bridge(ready)
+    config = ready.config
+    heights = [ready.database.message(entry.message) for entry in config.signals.height.values()]
+    findings = [
+        Finding(
+            Severity.OK,
+            "signals",
+            f"all in {ready.database.path.name}, units converted to SI",
+        ),
+        *[_protected(message) for message in heights],
+        *[_rate(message, config.period_ns) for message in heights],
+        _staleness(ready, heights),
+        _load(ready),
+        *_authenticated(ready),
+    ]
+    if config.prescribed_motion is not None:
+        text = "the motion is prescribed: no loop is closed that could become unstable"
+        return [*findings, Finding(Severity.OK, "poles", text)]
+    return findings + _stability(ready, heights)
+
+
+def _protected(message: Message) -> Finding:
+    if message.protection is None:
+        return Finding(
+            Severity.WARNING,
+            f"protection of {message.name}",
+            "none in the DBC: a corrupted, repeated or foreign frame passes as data",
+        )
+    profile = message.protection.identity.profile.value
+    return Finding(Severity.OK, f"protection of {message.name}", f"E2E profile {profile}")
+
+
+def _rate(message: Message, period_ns: int) -> Finding:
+    what = f"rate against {message.name}"
+    cycle_ns = message.cycle_time_ns
+    if cycle_ns is None:
+        return Finding(
+            Severity.WARNING, what, "the DBC gives no cycle time: poles assume a frame a tick"
+        )
+    text = f"a frame every {cycle_ns * 1e-6:g} ms, a tick every {period_ns * 1e-6:g} ms"
+    if cycle_ns < period_ns:
+        return Finding(Severity.WARNING, what, f"{text}: only the last frame before a tick is used")
+    if cycle_ns % period_ns:
+        return Finding(Severity.WARNING, what, f"{text}: no whole number of ticks a frame")
+    return Finding(Severity.OK, what, text)
+
+
+def _staleness(ready: Setup, heights: list[Message]) -> Finding:
+    stale_ns = round(ready.config.supervision.stale_after_s * 1e9)
+    slowest_ns = max(message.cycle_time_ns or 0 for message in heights)
+    text = f"stale after {stale_ns * 1e-6:g} ms, slowest measurement every {slowest_ns * 1e-6:g} ms"
+    if stale_ns < slowest_ns + ready.config.period_ns:
+        return Finding(
+            Severity.ERROR,
+            "supervision.stale_after_s",
+            f"{text}: expected more than one cycle and one tick, or the bridge holds all the time",
+        )
+    return Finding(Severity.OK, "supervision.stale_after_s", text)
+
+
+def _authenticated(ready: Setup) -> list[Finding]:
+    asked = ready.config.authentication
+    if asked is None:
+        return []
+    load_authentication(ready)
+    text = (
+        f"AES-128 CMAC, {asked.mac_bits} bits, freshness {asked.freshness_bits} bits, "
+        f"clocks within {asked.clock_tolerance_s:g} s"
+    )
+    path = ready.source.parent / asked.key_file
+    if path.stat().st_mode & _OTHERS_MAY_READ:
+        return [
+            Finding(Severity.WARNING, "authentication", f"{text}; {path} is readable by others")
+        ]
+    return [Finding(Severity.OK, "authentication", text)]
+
+
+def _load(ready: Setup) -> Finding:
+    config, database = ready.config, ready.database
+    sent = config.published_messages()
+    names = {entry.message for entry in config.signals.named()}.union(sent)
+    period_ns = config.period_ns
+    load = 0.0
+    for name in sorted(names):
+        message = database.message(name)
+        cycle_ns = message.cycle_time_ns or period_ns
+        if name in sent:
+            cycle_ns = max(cycle_ns, period_ns)
+        if config.authentication is not None:
+            length = message.length_bytes + config.authentication.trailer_bytes
+            message = replace(message, length_bytes=length, is_fd=True)
+        time_s = frame_time_s(message, config.bus.bitrate, config.bus.data_bitrate)
+        load += time_s / (cycle_ns * 1e-9)
+    rate = f"{config.bus.bitrate / 1e6:g} Mbit/s"
+    text = f"{load:.0%} of {rate} with the most stuff bits (configured messages alone)"
+    if load > FULL_LOAD:
+        return Finding(Severity.ERROR, "bus load", f"{text}: the bus cannot carry it")
+    return Finding(Severity.WARNING if load > HIGH_LOAD else Severity.OK, "bus load", text)
+
+
+def _stability(ready: Setup, heights: list[Message]) -> list[Finding]:
+    config = ready.config
+    plant = build_plant(ready)
+    observers = tuple(config.observers.values())
+    rest = tuple(strut.free_length_m for strut in ready.model.struts)
+    slowest_ns = max(message.cycle_time_ns or 0 for message in heights)
+    every = max(1, round(slowest_ns / config.period_ns))
+    poles = closed_loop_poles(plant, observers, rest, config.period_ns, every)
+    findings = [_worst(poles)]
+    late = closed_loop_poles(plant, observers, rest, config.period_ns, every, delay=1)
+    worst = max(pole.magnitude for pole in late)
+    text = f"largest |z| {worst:.5f} with measurements one cycle late"
+    if worst >= 1.0 and findings[0].severity is not Severity.ERROR:
+        text += ": unstable; keep bench and bridge in step, or lower K_P or raise the rate"
+        findings.append(Finding(Severity.WARNING, "poles, one cycle late", text))
+    else:
+        findings.append(Finding(Severity.OK, "poles, one cycle late", text))
+    return findings
+
+
+def _worst(poles: list[Pole]) -> Finding:
+    slowest = max(poles, key=lambda pole: pole.magnitude)
+    ringing = min(poles, key=lambda pole: pole.damping_ratio)
+    text = (
+        f"largest |z| {slowest.magnitude:.5f}; least damped at {ringing.frequency_hz:.1f} Hz "
+        f"with damping ratio {ringing.damping_ratio:.3f}"
+    )
+    # An integrator that is switched off leaves a pole at exactly 1, which harms nothing.
+    if ringing.damping_ratio < 0.0 or slowest.magnitude > 1.0 + 1e-6:
+        return Finding(
+            Severity.ERROR, "poles", f"{text}: unstable, lower the gains or raise the rate"
+        )
+    if ringing.damping_ratio < LITTLE_DAMPING:
+        return Finding(Severity.WARNING, "poles", f"{text}: little damping")
+    return Finding(Severity.OK, "poles", text)

@@ -1,0 +1,352 @@
+"""Configuration of the bridge: YAML -> frozen values, validated once."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal, cast
+
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, model_validator
+from pydantic_core import CoreSchema
+from pydantic_core.core_schema import tagged_union_schema
+
+from rig.core.contract import Observer
+from rig.core.observers import DEFAULT_KIND, OBSERVERS
+from rig.core.quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, OTHERS, Quantity
+from rig.core.supervisor import Action, Limit, Supervision, Watched
+from rig.inputs.yaml_file import Finite, Positive
+from rig.io.bus import BusConfig
+from rig.io.captures import Window
+from rig.io.run_writer import Rotation
+from rig.io.secoc import Authentication
+
+_KEYS = (HEIGHT.key, *(quantity.key for quantity in OTHERS))
+
+CONFIGS = Path(__file__).parent.parent / "configs"
+"""Folder of the configurations that come with the package."""
+
+Text = Annotated[str, Field(min_length=1, max_length=255)]
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class SignalName(_Frozen):
+    """Where a value stands on the bus.
+
+    Attributes:
+        message: Message of the DBC.
+        signal: Signal of the message; its unit is converted.
+    """
+
+    message: Text
+    signal: Text
+
+
+class Signals(_Frozen):
+    """What is read from the bus: heights, and any other quantity of `OTHERS` under its key.
+
+    Attributes:
+        height: Measured height of each strut, by strut name.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+    __pydantic_extra__: dict[str, SignalName | None] = Field(  # pyright: ignore[reportIncompatibleVariableOverride] - pydantic's own way
+        init=False
+    )
+
+    height: Annotated[dict[str, SignalName], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _known(self) -> "Signals":
+        known = [quantity.key for quantity in OTHERS]
+        for key in self.__pydantic_extra__:
+            if key not in known:
+                raise ValueError(f"{key}: unknown key, expected one of {', '.join(_KEYS)}")
+        return self
+
+    @property
+    def others(self) -> dict[Quantity, SignalName]:
+        """Signals of the quantities beside heights, in the order of `OTHERS`."""
+        given = self.__pydantic_extra__
+        found = ((quantity, given.get(quantity.key)) for quantity in OTHERS)
+        return {quantity: signal for quantity, signal in found if signal is not None}
+
+    @property
+    def measured(self) -> tuple[Quantity, ...]:
+        """Quantities beside heights that the bench sends."""
+        return tuple(self.others)
+
+    def named(self) -> list[SignalName]:
+        """All signals, heights first."""
+        return [*self.height.values(), *self.others.values()]
+
+
+def _observer_kind(data: object) -> object:
+    """Which of `OBSERVERS` an entry is."""
+    if isinstance(data, dict):
+        return cast("dict[str, object]", data).get("kind", DEFAULT_KIND)
+    return getattr(data, "kind", None)
+
+
+class _OneOfObservers:
+    """How pydantic reads one of `OBSERVERS`, by its `kind`."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(
+        cls, _source: object, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        choices = {kind: handler.generate_schema(made) for kind, made in OBSERVERS.items()}
+        return tagged_union_schema(choices, _observer_kind)
+
+
+class PrescribedMotion(_Frozen):
+    """A dyno: the motion is prescribed, the model follows it, and the load cell measures.
+
+    Attributes:
+        settling_s: Time constant with which older heights fade in the velocity that the model is
+            given; the velocity errs by three times the square of its product with the motion's
+            angular frequency.
+    """
+
+    settling_s: Annotated[float, Field(gt=0, le=1.0, allow_inf_nan=False)] = 0.002
+
+
+class Published(_Frozen):
+    """Messages that carry one strut's results."""
+
+    estimate: Text = "RIG_ESTIMATE"
+    kinematics: Text | None = "RIG_KINEMATICS"
+
+
+class LimitConfig(_Frozen):
+    """One row of the table of limits, for every strut.
+
+    Attributes:
+        value: What is limited, with its unit. Of the measurement: `measured_height_m`,
+            `measured_rate_m_per_s`, `unchanged_s` (how long it may stay exactly the same). Of the
+            estimate: `height_m`, `force_n`, `virtual_force_n`, `innovation_m`.
+        low: Smallest value within.
+        high: Largest value within.
+        action: `warn` tells of it in the status; `refuse` drops the measurement; `hold` marks the
+            estimate invalid as long as it lasts; `safe` enters the safe state.
+    """
+
+    value: Watched
+    low: Finite | None = None
+    high: Finite | None = None
+    action: Literal["warn", "refuse", "hold", "safe"]
+
+    @model_validator(mode="after")
+    def _sensible(self) -> "LimitConfig":
+        if self.low is None and self.high is None:
+            raise ValueError(f"{self.value.value}: expected low, high or both")
+        if self.low is not None and self.high is not None and self.low >= self.high:
+            raise ValueError(f"low {self.low}: expected less than high ({self.high})")
+        if self.action == "refuse" and not self.value.is_measured:
+            raise ValueError(
+                f"action refuse of {self.value.value}: expected warn, hold or safe, "
+                "because only a measurement can be refused"
+            )
+        return self
+
+    def limit(self) -> Limit:
+        """As the core takes it."""
+        low = -math.inf if self.low is None else self.low
+        high = math.inf if self.high is None else self.high
+        return Limit(self.value, low, high, Action[self.action.upper()])
+
+
+class SupervisionConfig(_Frozen):
+    """Ages of the measurement, the output of the safe state, and the table of limits."""
+
+    stale_after_s: Positive = 0.01
+    safe_after_s: Positive = 0.5
+    safe_output: Literal["zero", "last"] = "zero"
+    limits: Annotated[tuple[LimitConfig, ...], Field(max_length=100)] = ()
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "SupervisionConfig":
+        if self.safe_after_s < self.stale_after_s:
+            raise ValueError(
+                f"safe_after_s {self.safe_after_s}: expected at least stale_after_s "
+                f"({self.stale_after_s})"
+            )
+        return self
+
+    def supervision(self) -> Supervision:
+        """As the core takes it."""
+        return Supervision(
+            round(self.stale_after_s * 1e9),
+            round(self.safe_after_s * 1e9),
+            self.safe_output == "last",
+            tuple(row.limit() for row in self.limits),
+        )
+
+
+class BusSettings(_Frozen):
+    """How to open the bus; `options` go to python-can's interface as they are."""
+
+    interface: Text = "virtual"
+    channel: Text = "rig"
+    bitrate: Annotated[int, Field(gt=0)] = 1_000_000
+    data_bitrate: Annotated[int, Field(gt=0)] | None = None
+    options: dict[str, Any] = Field(default_factory=dict[str, Any])
+
+    def config(self) -> BusConfig:
+        """As the bus takes it."""
+        return BusConfig(
+            self.interface, self.channel, self.bitrate, self.data_bitrate, self.options
+        )
+
+
+class Realtime(_Frozen):
+    """What is asked of the machine; every key works without being granted.
+
+    Attributes:
+        fifo_priority: Priority under SCHED_FIFO; 0 asks for none.
+        lock_memory: Keep all pages in memory.
+        cpu: Core on which the loop runs.
+        spin_s: How long to spin before a deadline where SCHED_FIFO was granted.
+        freeze_garbage: Collect garbage before the run and not during it.
+    """
+
+    fifo_priority: Annotated[int, Field(ge=0, le=99)] = 50
+    lock_memory: bool = True
+    cpu: Annotated[int, Field(ge=0)] | None = None
+    spin_s: Annotated[float, Field(ge=0, le=0.01)] = 0.0002
+    freeze_garbage: bool = True
+
+
+class AuthenticationConfig(_Frozen):
+    """Authentication of all frames after AUTOSAR SecOC, on CAN FD.
+
+    Attributes:
+        key_file: File with 32 hexadecimal digits, beside the configuration.
+        freshness_bits: Bits of the freshness value in a frame.
+        mac_bits: Bits of the CMAC in a frame.
+        clock_tolerance_s: How far bench's and bridge's clocks may be apart. A frame that was
+            recorded longer ago is refused also by a bridge that has just been started.
+    """
+
+    key_file: Text
+    freshness_bits: Literal[8, 16, 24, 32] = 8
+    mac_bits: Literal[24, 32, 40, 48, 56, 64, 96, 128] = 24
+    clock_tolerance_s: Annotated[float, Field(ge=0.001, le=10.0, allow_inf_nan=False)] = 0.1
+
+    def with_key(self, key: bytes) -> Authentication:
+        """As the bus takes it."""
+        tolerance_ns = round(self.clock_tolerance_s * 1e9)
+        return Authentication(key, self.freshness_bits // 8, self.mac_bits // 8, tolerance_ns)
+
+    @property
+    def trailer_bytes(self) -> int:
+        """How much longer a frame becomes."""
+        return (self.freshness_bits + self.mac_bits) // 8
+
+
+class LogConfig(_Frozen):
+    """How the log of a run is kept.
+
+    Attributes:
+        rotate_bytes: Size at which the log is continued in further files; never if absent.
+        rotate_s: Time after which it is.
+        capture_before_s: Time before a fault that is kept apart.
+        capture_after_s: Time after it.
+        most_captures: Windows kept apart in one run; 0 for none. A window is opened by HOLD, SAFE,
+            a fault of bus or log, and SIGUSR2.
+    """
+
+    rotate_bytes: Annotated[int, Field(ge=100_000)] | None = None
+    rotate_s: Annotated[float, Field(ge=1.0, allow_inf_nan=False)] | None = None
+    capture_before_s: Annotated[float, Field(ge=0.0, le=60.0)] = 2.0
+    capture_after_s: Annotated[float, Field(ge=0.0, le=60.0)] = 2.0
+    most_captures: Annotated[int, Field(ge=0, le=1000)] = 0
+
+    def rotation(self) -> Rotation:
+        """As the log takes it."""
+        time_ns = None if self.rotate_s is None else round(self.rotate_s * 1e9)
+        return Rotation(self.rotate_bytes, time_ns)
+
+    def window(self) -> Window | None:
+        """As the log takes it; None captures nothing."""
+        if self.most_captures == 0:
+            return None
+        before_ns, after_ns = round(self.capture_before_s * 1e9), round(self.capture_after_s * 1e9)
+        return Window(before_ns, after_ns, self.most_captures)
+
+
+class RunConfig(_Frozen):
+    """All of a run's configuration.
+
+    Attributes:
+        rate_hz: Ticks a second.
+        duration_s: Length of the run; until Ctrl-C if absent.
+        model: Model file, beside the configuration, or the name of one that comes with the package.
+        engine: What simulates the model.
+        dbc: DBC file beside the configuration; the package's own if absent.
+        bus: How to open the bus.
+        authentication: Authentication of all frames; none if absent.
+        signals: What is read from it.
+        prescribed_motion: Declares a dyno; there is then a load cell and no applied force.
+        observers: One for each strut of the model, by strut name; none for a dyno. `kind`
+            says which, `pi` if absent; its other keys are its own.
+        publish: Messages for each strut, by strut name; by default RIG_ESTIMATE and RIG_KINEMATICS
+            for the first strut, and the same with _2, _3, ... for the next ones.
+        status: Message that carries the state; null sends none.
+        timing: Message that carries how well the rate is kept; null sends none.
+        supervision: Ages and safe state.
+        realtime: What is asked of the machine.
+        log: Rotation, and windows that are kept apart.
+    """
+
+    rate_hz: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] = 1000.0
+    duration_s: Positive | None = None
+    model: Text = "reference"
+    engine: Text = "dart"
+    dbc: Text | None = None
+    bus: BusSettings = BusSettings()
+    authentication: AuthenticationConfig | None = None
+    signals: Signals
+    prescribed_motion: PrescribedMotion | None = None
+    observers: dict[str, Annotated[Observer, _OneOfObservers]] = Field(default_factory=dict)
+    publish: dict[str, Published] = Field(default_factory=dict[str, Published])
+    status: Text | None = "RIG_STATUS"
+    timing: Text | None = None
+    supervision: SupervisionConfig = SupervisionConfig()
+    realtime: Realtime = Realtime()
+    log: LogConfig = LogConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_height(cls, data: Any) -> Any:
+        """Let a model of one strut say `height: {message, signal}` without the strut's name."""
+        match data:
+            case {"signals": {"height": {"message": _, "signal": _} as height, **others}, **rest}:
+                return {**rest, "signals": {**others, "height": {"": height}}}
+            case _:
+                return data
+
+    @model_validator(mode="after")
+    def _prescribed_or_driven(self) -> "RunConfig":
+        if self.prescribed_motion is None:
+            return self
+        if LOAD_CELL_FORCE not in self.signals.others:
+            raise ValueError("prescribed_motion: expected signals.load_cell_force beside it")
+        if APPLIED_FORCE in self.signals.others:
+            raise ValueError(
+                "prescribed_motion: expected no signals.applied_force beside it, because a motion "
+                "that is prescribed asks for no force"
+            )
+        return self
+
+    def published_messages(self) -> list[str]:
+        """Names of all messages that the bridge sends."""
+        names = [self.status, self.timing]
+        for entry in self.publish.values():
+            names += [entry.estimate, entry.kinematics]
+        return [name for name in names if name is not None]
+
+    @property
+    def period_ns(self) -> int:
+        """Time between two ticks."""
+        return round(1e9 / self.rate_hz)

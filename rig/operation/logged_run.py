@@ -1,0 +1,210 @@
+"""A run of the bridge on any port, logged to its folder."""
+
+import contextlib
+import hashlib
+import platform
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+from can_dbc.frame import Frame
+from dart_model.spec import copy_skeleton, dump_model
+from rig.core.bridge import Bridge, BridgeState, TickResult
+from rig.core.contract import Mode
+from rig.core.record import columns
+from rig.inputs.errors import InputError
+from rig.io.clock import Clock, OccupiedClock
+from rig.io.link import LinkFigures
+from rig.io.realtime import Granted
+from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE, RUN_SCHEMA
+from rig.io.run_writer import RunLog
+from rig.io.steps import Step
+from rig.operation.loop import Port, Progress, regular_ticks, run
+from rig.operation.ports import InformedPort
+from rig.operation.setup import Setup
+from rig.operation.timing import Timing
+
+_PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "autosar-e2e")
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a run ended.
+
+    Attributes:
+        folder: Its folder.
+        state: Last state of the bridge.
+        timing: How well the rate was kept.
+        granted: What the machine granted.
+        log_fault: What went wrong with the log, if anything.
+        ticks: Number of ticks.
+        period_ns: Time between two of them.
+    """
+
+    folder: Path
+    state: BridgeState
+    timing: Timing
+    granted: Granted | None
+    log_fault: str | None
+    ticks: int
+    period_ns: int
+
+    def summary(self) -> dict[str, object]:
+        """Every figure, for `summary.json`."""
+        return {
+            "mode": self.state.core.mode.name,
+            "ticks": self.ticks,
+            "counts": self.state.counts._asdict(),
+            "timing": self.timing.summary(),
+            "granted": None if self.granted is None else self.granted.as_dict(),
+            "log_fault": self.log_fault,
+        }
+
+
+def _header(
+    ready: Setup, epoch_ns: int, granted: Granted | None, folder: Path
+) -> dict[str, object]:
+    files = {
+        name: hashlib.sha256((folder / name).read_bytes()).hexdigest()
+        for name in (MODEL_FILE, DBC_FILE)
+    }
+    return {
+        "schema": RUN_SCHEMA,
+        "epoch_ns": epoch_ns,
+        "config": ready.config.model_dump(mode="json"),
+        "config_source": str(ready.source),
+        "files_sha256": files,
+        "versions": {
+            **{name: version(name) for name in _PACKAGES},
+            "python": platform.python_version(),
+            "system": platform.platform(),
+        },
+        "granted": None if granted is None else granted.as_dict(),
+    }
+
+
+def _copy_inputs(ready: Setup, folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / MODEL_FILE).write_text(dump_model(ready.model), "utf-8")
+        shutil.copyfile(ready.database.path, folder / DBC_FILE)
+        copy_skeleton(ready.model, folder)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
+
+
+def nothing_to_do() -> None:
+    """Begin without ado."""
+
+
+def logged(
+    ready: Setup,
+    bridge: Bridge,
+    port: Port,
+    clock: Clock,
+    folder: Path,
+    *,
+    figures: LinkFigures,
+    granted: Granted | None = None,
+    begin: Callable[[], None] = nothing_to_do,
+    stop: Callable[[], bool],
+    progress: Progress,
+) -> Ended:
+    """Run on a port and log it.
+
+    Args:
+        ready: Configuration, model and DBC.
+        bridge: The bridge built from them.
+        port: Where frames come from and go to.
+        clock: When ticks come.
+        folder: Folder of the run; absent or empty.
+        figures: What becomes of the bus behind the port, for `run.yaml`.
+        granted: What the machine granted; None for simulated time, which then waits for the disk.
+        begin: Called when all is set up, before the first tick.
+        stop: Asked before each tick whether to end.
+        progress: Told of every tick.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    config = ready.config
+    if (folder / RUN_FILE).exists():
+        raise InputError(f"{folder}: holds a run already, expected an empty folder")
+    _copy_inputs(ready, folder)
+    header = _header(ready, clock.epoch_ns, granted, folder)
+    log = RunLog(
+        folder,
+        header,
+        columns(list(config.observers), config.signals.measured),
+        clock.epoch_ns,
+        config.bus.channel,
+        paced=granted is not None,
+        priority=config.realtime.fifo_priority if granted is not None and granted.fifo else 0,
+        rotation=config.log.rotation(),
+        window=config.log.window(),
+        graver=_graver,
+    )
+    count = None if config.duration_s is None else _ticks(config.duration_s, config.rate_hz)
+    timing, ticks, status = Timing.empty(), 0, "failed"
+    state = bridge.init(0)
+
+    def sink(
+        received: Sequence[Frame], sent: Sequence[Frame], result: TickResult, step: Step
+    ) -> None:
+        nonlocal ticks
+        log.add(received, sent, step)
+        ticks += 1
+        progress(step.t_ns, result.output.mode)
+
+    try:
+        begin()
+        told = InformedPort(port, log, timing)
+        waiting = OccupiedClock(clock, told.look)
+        due = regular_ticks(waiting, config.period_ns, count, stop, timing)
+        with on_signal(signal.SIGUSR2, lambda: log.trigger("user")):
+            state = run(bridge, state, due, told, sink, config.signals.measured)
+        status = "safe" if state.core.mode is Mode.SAFE else "done"
+    finally:
+        log.close(
+            lambda: {
+                "ending": {
+                    "status": status,
+                    "ticks": ticks,
+                    "counts": state.counts._asdict(),
+                    "timing": timing.summary(),
+                    "bus": figures.as_dict(),
+                    "log_fault": log.trouble,
+                    "dropped_steps": log.dropped,
+                }
+            }
+        )
+    return Ended(folder, state, timing, granted, log.trouble, ticks, config.period_ns)
+
+
+def _ticks(duration_s: float, rate_hz: float) -> int:
+    return max(1, round(duration_s * rate_hz))
+
+
+def _graver(before: int, now: int) -> str | None:
+    """Name of a mode that the log captures a window around, when the bridge comes into it."""
+    return Mode(now).name.lower() if now != before and now in (Mode.HOLD, Mode.SAFE) else None
+
+
+@contextlib.contextmanager
+def on_signal(number: signal.Signals, action: Callable[[], None]) -> Generator[None]:
+    """Do something when a signal comes, where this thread can be told of signals.
+
+    SIGUSR1 acknowledges the safe state, SIGUSR2 captures a window of the log.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(number, lambda _number, _frame: action())
+    try:
+        yield
+    finally:
+        signal.signal(number, before)

@@ -1,0 +1,186 @@
+"""A configuration with the files it names, read and checked against each other."""
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict
+
+from can_dbc.database import DEFAULT_DATABASE, Database, Message, load_database
+from dart_model.spec import ModelSpec, load_model, model_file
+from rig.core.observers.pi import PiObserver
+from rig.inputs.errors import InputError
+from rig.inputs.yaml_file import load_validated
+from rig.io.secoc import FD_LENGTHS, Authentication, read_key
+from rig.operation.config import AuthenticationConfig, Published, RunConfig
+
+
+class Setup(BaseModel):
+    """A configuration with the files it names, read and checked against each other.
+
+    Attributes:
+        config: The configuration, with every strut named.
+        source: File it came from.
+        model: The model.
+        database: The DBC.
+    """
+
+    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
+
+    config: RunConfig
+    source: Path
+    model: ModelSpec
+    database: Database
+
+
+def load_setup(path: Path, *, model: str | None = None, duration_s: float | None = None) -> Setup:
+    """A configuration and all files it names.
+
+    Args:
+        path: YAML file.
+        model: File or name of a model to use instead of the configuration's.
+        duration_s: A length to use instead of the configuration's.
+
+    Raises:
+        InputError: One line that names file, key, value and what was expected.
+        DatabaseError: The same, of the DBC.
+    """
+    config = load_validated(RunConfig, path)
+    if duration_s is not None:
+        config = config.model_copy(update={"duration_s": duration_s})
+    return setup(config, path, None if model is None else model_file(model, Path()))
+
+
+def setup(config: RunConfig, source: Path, model_path: Path | None = None) -> Setup:
+    """A configuration with the files it names.
+
+    Args:
+        config: The configuration.
+        source: File it came from; what it names lies beside it.
+        model_path: A model to use instead of the configuration's.
+
+    Raises:
+        InputError: One line that names file, key, value and what was expected.
+        DatabaseError: The same, of the DBC.
+    """
+    model = load_model(model_path or _model_path(config.model, source))
+    database = load_database(DEFAULT_DATABASE if config.dbc is None else source.parent / config.dbc)
+    return put_together(config, source, model, database)
+
+
+def put_together(config: RunConfig, source: Path, model: ModelSpec, database: Database) -> Setup:
+    """A configuration with what it names, checked against each other.
+
+    Raises:
+        InputError: One line that names file, key, value and what was expected.
+        DatabaseError: The same, of the DBC.
+    """
+    named = _with_strut_names(config, model, source)
+    _check_messages(named, database, source)
+    return Setup(config=named, source=source, model=model, database=database)
+
+
+def load_authentication(ready: Setup) -> Authentication | None:
+    """How frames are authenticated, with its key; None without authentication.
+
+    Raises:
+        InputError: The key cannot be read.
+    """
+    asked = ready.config.authentication
+    return None if asked is None else asked.with_key(read_key(ready.source.parent / asked.key_file))
+
+
+def _model_path(name: str, source: Path) -> Path:
+    try:
+        return model_file(name, source.parent)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None
+
+
+def _with_strut_names(config: RunConfig, model: ModelSpec, source: Path) -> RunConfig:
+    struts = [strut.name for strut in model.struts]
+    heights = config.signals.height
+    if list(heights) == [""]:
+        if len(struts) > 1:
+            raise InputError(
+                f"{source}: signals.height: the model has {len(struts)} struts, "
+                f"expected one entry for each of {', '.join(struts)}"
+            )
+        heights = {struts[0]: heights[""]}
+    for key, names in (
+        ("signals.height", heights),
+        ("observers", config.observers),
+        ("publish", config.publish),
+    ):
+        for name in names:
+            if name not in struts:
+                raise InputError(
+                    f"{source}: {key}.{name}: no such strut, expected {', '.join(struts)}"
+                )
+    for name in struts:
+        if name not in heights:
+            raise InputError(f"{source}: signals.height.{name}: is missing, expected its signal")
+    observers = {name: config.observers.get(name, PiObserver()) for name in struts}
+    publish = {
+        name: config.publish.get(name, _default_messages(index))
+        for index, name in enumerate(struts)
+    }
+    return config.model_copy(
+        update={
+            "signals": config.signals.model_copy(
+                update={"height": {name: heights[name] for name in struts}}
+            ),
+            "observers": observers,
+            "publish": publish,
+        }
+    )
+
+
+def _default_messages(index: int) -> Published:
+    ending = "" if index == 0 else f"_{index + 1}"
+    return Published(estimate=f"RIG_ESTIMATE{ending}", kinematics=f"RIG_KINEMATICS{ending}")
+
+
+def _check_messages(config: RunConfig, database: Database, source: Path) -> None:
+    outputs = config.published_messages()
+    for entry in config.signals.named():
+        database.message(entry.message).signal(entry.signal)
+        if entry.message in outputs:
+            raise InputError(
+                f"{source}: signals: {entry.message} is also published, "
+                "expected a message of the bench"
+            )
+    repeated = {name for name in outputs if outputs.count(name) > 1}
+    if repeated:
+        raise InputError(
+            f"{source}: publish: {min(repeated)} stands twice, expected one message each"
+        )
+    for name in outputs:
+        database.message(name)
+    if config.authentication is not None:
+        names = {entry.message for entry in config.signals.named()}.union(outputs)
+        _check_authentication(
+            config,
+            config.authentication,
+            [database.message(name) for name in sorted(names)],
+            source,
+        )
+
+
+def _check_authentication(
+    config: RunConfig, asked: AuthenticationConfig, messages: list[Message], source: Path
+) -> None:
+    if config.bus.data_bitrate is None:
+        raise InputError(
+            f"{source}: authentication: classic CAN has no room for it, expected bus.data_bitrate"
+        )
+    for message in messages:
+        if message.is_extended:
+            raise InputError(
+                f"{source}: authentication: {message.name} has a 29-bit id, expected 11 bits, "
+                "because SecOC's data ids have 16"
+            )
+        length = message.length_bytes + asked.trailer_bytes
+        if length not in FD_LENGTHS:
+            raise InputError(
+                f"{source}: authentication: {message.name} would be {length} bytes long, "
+                f"expected one of CAN FD's lengths {', '.join(map(str, FD_LENGTHS))}"
+            )
