@@ -29,6 +29,7 @@ from rig.operation.logged_run import Ended
 from rig.operation.loop import regular_ticks
 from rig.operation.setup import Setup, load_setup, put_together
 from rig.operation.timing import Timing
+from rig.operation.trace import Trace
 from rig.pages.timing_picture import draw_run
 from tests.soak import force_error_n, load_cell
 
@@ -96,13 +97,20 @@ def at_rate(
     return ready, bench.model_copy(update={"transmissions": every})
 
 
-def bare(ready: Setup) -> None:
+def bare(ready: Setup, folder: Path, *, traced: bool) -> None:
     """Let ticks come with nothing to do, and print how well the rate was kept."""
     config, timing = ready.config, Timing.empty()
     count = round((config.duration_s or 0.0) * config.rate_hz)
-    with on_time(config) as (granted, clock):
-        ticks = regular_ticks(clock, config.period_ns, count, lambda: False, timing)
-        overruns = [tick.overruns for tick in ticks]
+    trace = Trace(config.period_ns)
+    overruns: list[int] = []
+    with on_time(config) as (granted, real):
+        clock = trace.clock(real) if traced else real
+        for tick in regular_ticks(clock, config.period_ns, count, lambda: False, timing):
+            overruns.append(tick.overruns)
+            if traced:
+                trace.nothing_done()
+    if traced:
+        trace.write(folder)
     print(f"bare loop: {len(overruns)} ticks, {sum(overruns)} overruns, FIFO {granted.fifo}")
     for name, figures in timing.summary().items():
         print(f"{name}: {figures}")
@@ -140,13 +148,14 @@ def main() -> int:
         default=1.0,
         help="share of its core that each busy process takes (0: no such processes)",
     )
+    parser.add_argument("--trace", action="store_true", help="keep what became of late ticks")
     parser.add_argument("--bare", action="store_true", help="ticks with nothing to do")
     asked = parser.parse_args()
     ready, bench = at_rate(asked.rate_hz, asked.seconds, fifo=not asked.no_fifo, folder=asked.out)
     load = busy_cores(asked.busy) if asked.busy > 0.0 else contextlib.nullcontext()
     if asked.bare:
         with load:
-            bare(ready)
+            bare(ready, asked.out, traced=asked.trace)
         return 0
     with load:
         ended = with_bench(
@@ -154,6 +163,7 @@ def main() -> int:
             bench,
             asked.out / "run",
             lockstep=False,
+            trace=Trace(ready.config.period_ns) if asked.trace else None,
             stop=lambda: False,
             progress=lambda _t_ns, _mode: None,
         )

@@ -6,7 +6,7 @@ import click
 import typer
 from rich.console import Console
 
-from rig.cli import bench, check, demo, diagnose, exchange, replay, run, scoreboard
+from rig.cli import bench, check, demo, diagnose, exchange, replay, run, scoreboard, timing
 from rig.cli.output import OK, WRONG_INPUT
 from rig.inputs.errors import InputError
 
@@ -24,6 +24,7 @@ app.command("demo", epilog=demo.EXAMPLES)(demo.demo)
 app.command("check", epilog=check.EXAMPLES)(check.check_command)
 app.command("run", epilog=run.EXAMPLES)(run.run)
 app.command("bench", epilog=bench.EXAMPLES)(bench.bench)
+app.command("timing", epilog=timing.EXAMPLES)(timing.timing)
 app.command("replay", epilog=replay.EXAMPLES)(replay.replay_command)
 app.command("diagnose", epilog=diagnose.EXAMPLES)(diagnose.diagnose)
 app.command("import", epilog=exchange.IMPORT_EXAMPLES)(exchange.import_command)

@@ -102,6 +102,9 @@ def print_ended(ended: "Ended", *, with_timing: bool) -> None:
             text = " · ".join(f"{level} {value:.0f}" for level, value in figures.items())
             table.add_row(f"{label} of a tick, µs", text)
         table.add_row("longest gap, µs", f"{timing.extremes_ns[2] / 1000:.0f}")
+    if ended.diverged is not None:
+        where = f"strut {ended.diverged['strut']} at {ended.diverged['t_s']:.3f} s"
+        table.add_row("model diverged", f"[red]{where}[/]")
     if ended.log_fault is not None:
         table.add_row("log", f"[red]{ended.log_fault}[/]")
     console.print(table)

@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import FAILED, ConfigFile, console
+from rig.cli.output import FAILED, ConfigFile, console, refuse_full
 from rig.cli.results import print_ended
 from rig.cli.watching import progress_line, stoppable
+from rig.inputs.errors import InputError
 
 EXAMPLES = "Examples: `rig run rig.yaml` · `rig run rig.yaml --out runs/7 --listen-only`"
 
@@ -39,16 +40,38 @@ def run(
         ),
     ] = None,
     listen_only: Annotated[bool, typer.Option("--listen-only", help="Send nothing.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Run although `rig check` finds an error.")
+    ] = False,
+    trace: Annotated[
+        bool, typer.Option("--trace", help="Keep what became of late ticks, for `rig timing`.")
+    ] = False,
 ) -> None:
     """Run the bridge on a bus; Ctrl-C ends it in order."""
     from rig.core.contract import Mode
+    from rig.operation.check import errors
     from rig.operation.live import live
     from rig.operation.setup import load_setup
+    from rig.operation.trace import Trace
 
     ready = load_setup(config, model=model, duration_s=duration_s)
+    wrong = errors(ready)
+    if wrong and not force:
+        raise InputError(
+            f"{config}: {wrong[0].what}: {wrong[0].text} (`rig check` shows all; --force runs it)"
+        )
     folder = out or Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
+    refuse_full(folder)
     with stoppable() as stop, progress_line(ready.config.duration_s) as progress:
-        ended = live(ready, folder, listen_only=listen_only, stop=stop, progress=progress)
+        ended = live(
+            ready,
+            folder,
+            listen_only=listen_only,
+            trace=Trace(ready.config.period_ns) if trace else None,
+            forced=[finding.as_dict() for finding in wrong],
+            stop=stop,
+            progress=progress,
+        )
     print_ended(ended, with_timing=True)
     (folder / "summary.json").write_text(json.dumps(ended.summary(), indent=2) + "\n", "utf-8")
     console.print(f"Run: {folder}")

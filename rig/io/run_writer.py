@@ -154,6 +154,8 @@ class RunLog:
         """What was wrong with it first, if ever anything was."""
         self.dropped = 0
         """Ticks that the disk did not take."""
+        self.is_busy = False
+        """Whether ticks are being written now."""
         self._header = header
         self._epoch_ns = epoch_ns
         self._channel = channel
@@ -255,6 +257,7 @@ class RunLog:
 
     def _write_waiting(self) -> None:
         """Write what waits; what the disk does not take is kept, and tried again the next time."""
+        self.is_busy = True
         try:
             self._write_lines()
             self._flush_if_due()
@@ -268,6 +271,8 @@ class RunLog:
             self._failed(str(error.strerror))
         else:
             self.fault = None
+        finally:
+            self.is_busy = False
 
     def _give_way(self) -> None:
         """Let the loop have the interpreter, if it waits for it."""

@@ -78,6 +78,11 @@ def check(ready: Setup) -> list[Finding]:
     return findings + _stability(ready, heights)
 
 
+def errors(ready: Setup) -> list[Finding]:
+    """What keeps a run from starting; arguments and errors as of `check`."""
+    return [finding for finding in check(ready) if finding.severity is Severity.ERROR]
+
+
 def _protected(message: Message) -> Finding:
     if message.protection is None:
         return Finding(
@@ -129,7 +134,11 @@ def _authenticated(ready: Setup) -> list[Finding]:
     path = ready.source.parent / asked.key_file
     if path.stat().st_mode & _OTHERS_MAY_READ:
         return [
-            Finding(Severity.WARNING, "authentication", f"{text}; {path} is readable by others")
+            Finding(
+                Severity.ERROR,
+                "authentication",
+                f"{text}; {path} can be read by others, expected mode 0600",
+            )
         ]
     return [Finding(Severity.OK, "authentication", text)]
 

@@ -2,7 +2,7 @@
 
 import contextlib
 import signal
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -12,16 +12,17 @@ from rig.bench.simulated import Bench
 from rig.core.bridge import Bridge
 from rig.core.contract import Mode
 from rig.io.bus import Bus, BusConfig
-from rig.io.clock import Clock, OccupiedClock, RealClock, VirtualClock
+from rig.io.clock import Clock, RealClock, VirtualClock
 from rig.io.link import Link
 from rig.io.realtime import Granted, Request, realtime
 from rig.io.secoc import Authentication, Authenticator
 from rig.operation.assembly import build_bridge
 from rig.operation.config import RunConfig
-from rig.operation.logged_run import Ended, logged, nothing_to_do, on_signal
+from rig.operation.logged_run import Ended, logged, on_signal
 from rig.operation.loop import Progress
 from rig.operation.ports import BenchOnBus, BusPort
 from rig.operation.setup import Setup, load_authentication
+from rig.operation.trace import Trace
 
 _BENCH_PORTION_NS = 20_000_000
 _SPINNING_SHARE = 5
@@ -52,10 +53,21 @@ def live(
     folder: Path,
     *,
     listen_only: bool = False,
+    trace: Trace | None = None,
+    forced: Sequence[Mapping[str, str]] = (),
     stop: Callable[[], bool],
     progress: Progress,
 ) -> Ended:
     """Run on the configured bus in real time.
+
+    Args:
+        ready: Configuration, model and DBC.
+        folder: Folder of the run; absent or empty.
+        listen_only: Send nothing.
+        trace: Where the parts of ticks that are late are kept; None keeps nothing.
+        forced: Errors of the check that somebody passed over, for `run.yaml`.
+        stop: Asked before each tick whether to end.
+        progress: Called with time and mode of every tick.
 
     Raises:
         InputError: Something of the configuration is wrong, or the folder cannot be written.
@@ -75,6 +87,8 @@ def live(
                     folder,
                     figures=link.figures,
                     granted=granted,
+                    trace=trace,
+                    forced=forced,
                     stop=stop,
                     progress=progress,
                 )
@@ -108,6 +122,7 @@ def with_bench(
     folder: Path,
     *,
     lockstep: bool,
+    trace: Trace | None = None,
     stop: Callable[[], bool],
     progress: Progress,
 ) -> Ended:
@@ -118,6 +133,7 @@ def with_bench(
         bench_config: The bench.
         folder: Folder of the run.
         lockstep: Simulated time, as fast as the machine allows; otherwise real time.
+        trace: Where the parts of ticks that are late are kept; None keeps nothing.
         stop: Asked before each tick whether to end.
         progress: Told of every tick.
 
@@ -144,11 +160,13 @@ def with_bench(
             ready,
             bridge,
             on_bus,
-            OccupiedClock(clock, on_bus.send_up_to),
+            clock,
             folder,
             figures=link.figures,
             granted=granted,
-            begin=nothing_to_do if lockstep else partial(on_bus.begin, clock),
+            trace=trace,
+            begin=None if lockstep else partial(on_bus.begin, clock),
+            while_waiting=(on_bus.send_up_to,),
             stop=stop,
             progress=progress,
         )

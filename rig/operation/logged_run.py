@@ -6,7 +6,7 @@ import platform
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -23,10 +23,11 @@ from rig.io.realtime import Granted
 from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE, RUN_SCHEMA
 from rig.io.run_writer import RunLog
 from rig.io.steps import Step
-from rig.operation.loop import Port, Progress, regular_ticks, run
+from rig.operation.loop import Port, Progress, Sink, regular_ticks, run
 from rig.operation.ports import InformedPort
 from rig.operation.setup import Setup
 from rig.operation.timing import Timing
+from rig.operation.trace import Trace
 
 _PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "autosar-e2e")
 
@@ -43,6 +44,7 @@ class Ended:
         log_fault: What went wrong with the log, if anything.
         ticks: Number of ticks.
         period_ns: Time between two of them.
+        diverged: Strut and time of the model's last divergence, if there was one.
     """
 
     folder: Path
@@ -52,6 +54,7 @@ class Ended:
     log_fault: str | None
     ticks: int
     period_ns: int
+    diverged: Mapping[str, object] | None
 
     def summary(self) -> dict[str, object]:
         """Every figure, for `summary.json`."""
@@ -59,6 +62,7 @@ class Ended:
             "mode": self.state.core.mode.name,
             "ticks": self.ticks,
             "counts": self.state.counts._asdict(),
+            "diverged": self.diverged,
             "timing": self.timing.summary(),
             "granted": None if self.granted is None else self.granted.as_dict(),
             "log_fault": self.log_fault,
@@ -97,10 +101,6 @@ def _copy_inputs(ready: Setup, folder: Path) -> None:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
 
 
-def nothing_to_do() -> None:
-    """Begin without ado."""
-
-
 def logged(
     ready: Setup,
     bridge: Bridge,
@@ -110,7 +110,10 @@ def logged(
     *,
     figures: LinkFigures,
     granted: Granted | None = None,
-    begin: Callable[[], None] = nothing_to_do,
+    trace: Trace | None = None,
+    forced: Sequence[Mapping[str, str]] = (),
+    begin: Callable[[], None] | None = None,
+    while_waiting: Sequence[Callable[[int], None]] = (),
     stop: Callable[[], bool],
     progress: Progress,
 ) -> Ended:
@@ -124,7 +127,10 @@ def logged(
         folder: Folder of the run; absent or empty.
         figures: What becomes of the bus behind the port, for `run.yaml`.
         granted: What the machine granted; None for simulated time, which then waits for the disk.
+        trace: Where the parts of ticks that are late are kept; None keeps nothing.
+        forced: Errors of the check that somebody passed over, for `run.yaml`.
         begin: Called when all is set up, before the first tick.
+        while_waiting: Called before each wait with the time that is awaited.
         stop: Asked before each tick whether to end.
         progress: Told of every tick.
 
@@ -136,6 +142,8 @@ def logged(
         raise InputError(f"{folder}: holds a run already, expected an empty folder")
     _copy_inputs(ready, folder)
     header = _header(ready, clock.epoch_ns, granted, folder)
+    if forced:
+        header["forced"] = [dict(finding) for finding in forced]
     log = RunLog(
         folder,
         header,
@@ -161,12 +169,19 @@ def logged(
         progress(step.t_ns, result.output.mode)
 
     try:
-        begin()
-        told = InformedPort(port, log, timing)
-        waiting = OccupiedClock(clock, told.look)
+        if begin is not None:
+            begin()
+        informed = InformedPort(port, log, timing)
+        source: Port = informed
+        keep: Sink = sink
+        if trace is not None:
+            clock, source, keep = trace.clock(clock), trace.port(informed, log), trace.sink(sink)
+        waiting: Clock = clock
+        for occupation in (*while_waiting, informed.look):
+            waiting = OccupiedClock(waiting, occupation)
         due = regular_ticks(waiting, config.period_ns, count, stop, timing)
         with on_signal(signal.SIGUSR2, lambda: log.trigger("user")):
-            state = run(bridge, state, due, told, sink, config.signals.measured)
+            state = run(bridge, state, due, source, keep, config.signals.measured)
         status = "safe" if state.core.mode is Mode.SAFE else "done"
     finally:
         log.close(
@@ -175,6 +190,7 @@ def logged(
                     "status": status,
                     "ticks": ticks,
                     "counts": state.counts._asdict(),
+                    "diverged": _divergence(ready, state),
                     "timing": timing.summary(),
                     "bus": figures.as_dict(),
                     "log_fault": log.trouble,
@@ -182,7 +198,17 @@ def logged(
                 }
             }
         )
-    return Ended(folder, state, timing, granted, log.trouble, ticks, config.period_ns)
+    if trace is not None:
+        trace.write(folder)
+    diverged = _divergence(ready, state)
+    return Ended(folder, state, timing, granted, log.trouble, ticks, config.period_ns, diverged)
+
+
+def _divergence(ready: Setup, state: BridgeState) -> dict[str, object] | None:
+    found = state.core.diverged
+    if found is None:
+        return None
+    return {"strut": ready.model.struts[found.strut].name, "t_s": found.t_ns * 1e-9}
 
 
 def _ticks(duration_s: float, rate_hz: float) -> int:

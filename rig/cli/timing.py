@@ -1,0 +1,51 @@
+"""`rig timing`."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from rig.cli.output import console, write_summary
+
+EXAMPLES = "Example: `rig run rig.yaml --trace --out runs/7`, then `rig timing runs/7`"
+
+_MOST_ROWS = 40
+"""Gaps that are shown one by one."""
+
+
+def timing(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run with --trace.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Write summary.json there.")
+    ] = None,
+) -> None:
+    """Say of each missed tick of a traced run in which part the time went, and who took it."""
+    from rig.operation.late_ticks import late_ticks
+    from rig.operation.replay import setup_of_run
+    from rig.operation.trace import read_trace
+
+    _, ready = setup_of_run(folder)
+    late = late_ticks(read_trace(folder), ready.config.period_ns)
+    if not late:
+        console.print("No tick was missed.")
+    else:
+        one_by_one = Table("time / s", "missed", "part", "longer by / ms", "cause", title="Gaps")
+        for item in late[:_MOST_ROWS]:
+            when, longer = f"{item.t_ns * 1e-9:.3f}", f"{item.excess_ns * 1e-6:.2f}"
+            one_by_one.add_row(when, str(item.missed), item.part, longer, item.cause.value)
+        console.print(one_by_one)
+        if len(late) > _MOST_ROWS:
+            console.print(f"and {len(late) - _MOST_ROWS} more")
+        gaps, missed = Counter[str](), Counter[str]()
+        for item in late:
+            gaps[item.cause.value] += 1
+            missed[item.cause.value] += item.missed
+        causes = Table("cause", "gaps", "missed ticks", title="Causes")
+        for cause, count in gaps.most_common():
+            causes.add_row(cause, str(count), str(missed[cause]))
+        console.print(causes)
+    if out is not None:
+        rows = [{**item._asdict(), "cause": item.cause.name.lower()} for item in late]
+        write_summary(out, {"late": rows})
