@@ -121,6 +121,20 @@ def compile_encoder(
     return _join_encoder(slots, base, message.length_bytes)
 
 
+def si_range(message: Message, signal_name: str, dimension: Dimension) -> tuple[float, float]:
+    """Smallest and largest SI value that a signal carries, by the DBC's range and its bits.
+
+    Raises:
+        DatabaseError: As for `compile_decoder`.
+    """
+    (field,) = _fields(message, [signal_name], [dimension])
+    if field.float_format:
+        low = -math.inf if field.minimum is None else field.minimum
+        return low, math.inf if field.maximum is None else field.maximum
+    ends = [raw * field.scale + field.offset for raw in _raw_limits(message, field)]
+    return min(ends), max(ends)
+
+
 def decode_log(
     message: Message,
     signal_names: Sequence[str],

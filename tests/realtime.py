@@ -23,7 +23,7 @@ import numpy as np
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig
-from rig.operation.config import CONFIGS, Published
+from rig.operation.config import CONFIGS, SignalName
 from rig.operation.live import on_time, with_bench
 from rig.operation.logged_run import Ended
 from rig.operation.loop import regular_ticks
@@ -32,6 +32,8 @@ from rig.operation.timing import Timing
 from rig.operation.trace import Trace
 from rig.pages.timing_picture import draw_run
 from tests.soak import force_error_n, load_cell
+
+ESTIMATE = SignalName(message="RIG_ESTIMATE", signal="SPRING_DAMPER_FORCE")
 
 CLASSIC_CAN_HZ = 3703
 """What 1 Mbit/s carries of one frame in and one out, with the most stuff bits."""
@@ -82,7 +84,7 @@ def at_rate(
     config = ready.config.model_copy(
         update={
             "rate_hz": rate_hz,
-            "publish": {"strut": Published(kinematics=None)},
+            "publish": {"strut": {"force": ESTIMATE}},
             "realtime": realtime,
         }
     )

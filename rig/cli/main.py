@@ -6,7 +6,7 @@ import click
 import typer
 from rich.console import Console
 
-from rig.cli import bench, check, demo, diagnose, exchange, replay, run, scoreboard, timing
+from rig.cli import bench, check, demo, diagnose, exchange, init, replay, run, scoreboard, timing
 from rig.cli.output import OK, WRONG_INPUT
 from rig.inputs.errors import InputError
 
@@ -21,6 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("demo", epilog=demo.EXAMPLES)(demo.demo)
+app.command("init", epilog=init.EXAMPLES)(init.init)
 app.command("check", epilog=check.EXAMPLES)(check.check_command)
 app.command("run", epilog=run.EXAMPLES)(run.run)
 app.command("bench", epilog=bench.EXAMPLES)(bench.bench)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from msgspec import Struct
 
-from can_dbc.codec import Decoder, Encoder, compile_decoder, compile_encoder
+from can_dbc.codec import Decoder, compile_decoder, compile_encoder, si_range
 from can_dbc.database import Message
 from can_dbc.frame import Frame
 from can_dbc.protection import SequenceState, Verdict, compile_checker, compile_protector
@@ -172,6 +172,101 @@ class Report(Struct, frozen=True, gc=False):
 
 
 @dataclass(frozen=True)
+class Publication:
+    """Something that the bridge can put on the bus.
+
+    Attributes:
+        key: Its key under `publish`, `status` or `timing` of a configuration.
+        dimension: What a signal of it measures; it is converted to the signal's unit.
+        value: What the tick reports, and the index of a strut -> the value in SI.
+        signal: Name of its signal where a message is given and no signal.
+        stops_at_range: A value beyond the signal's range is sent as the end of it, and no fault.
+    """
+
+    key: str
+    dimension: Dimension
+    value: Callable[[Report, int], float]
+    signal: str
+    stops_at_range: bool = False
+
+
+def _of_strut(attribute: str) -> Callable[[Report, int], float]:
+    return lambda report, strut: getattr(report.output.struts[strut], attribute)
+
+
+ESTIMATE = (
+    Publication("force", Dimension.FORCE, _of_strut("force_n"), "SPRING_DAMPER_FORCE"),
+    Publication("virtual_force", Dimension.FORCE, _of_strut("virtual_force_n"), "VIRTUAL_FORCE"),
+    Publication("valid", Dimension.NUMBER, _of_strut("valid"), "VALID"),
+)
+KINEMATICS = (
+    Publication("height", Dimension.LENGTH, _of_strut("height_m"), "MODEL_HEIGHT"),
+    Publication("velocity", Dimension.VELOCITY, _of_strut("velocity_m_per_s"), "MODEL_VELOCITY"),
+    Publication(
+        "acceleration",
+        Dimension.ACCELERATION,
+        _of_strut("acceleration_m_per_s2"),
+        "MODEL_ACCELERATION",
+    ),
+    Publication("innovation", Dimension.LENGTH, _of_strut("innovation_m"), "INNOVATION"),
+)
+STRUT = (*ESTIMATE, *KINEMATICS)
+"""What is published of a strut."""
+
+
+def _status(key: str, value: Callable[[Report], float]) -> Publication:
+    return Publication(
+        key, Dimension.NUMBER, lambda report, _: value(report), key.upper(), stops_at_range=True
+    )
+
+
+def _is_bus_faulty(report: Report) -> bool:
+    """Since the last status: a fault of the bus, or somebody else under the same ids."""
+    counts, reported = report.counts, report.reported
+    return counts.bus_faulty > reported.bus_faulty or counts.second_sender > reported.second_sender
+
+
+STATUS = (
+    _status("state", lambda report: report.output.mode),
+    _status("encoding_saturated", lambda r: r.counts.saturated > r.reported.saturated),
+    _status("overruns", lambda report: report.counts.overruns),
+    _status("lost_frames", lambda report: report.counts.lost),
+    _status("refused_frames", lambda report: report.counts.refused),
+    _status("stale_frames", lambda report: report.counts.stale),
+    _status("measurement_fault", lambda report: report.output.mode is not Mode.RUNNING),
+    _status("limit_fault", lambda report: report.counts.limited > report.reported.limited),
+    _status("bus_fault", _is_bus_faulty),
+    _status("log_fault", lambda report: report.conditions.log_fault),
+)
+"""What is published of the bridge; faults are those since the last status."""
+
+
+def _timing(key: str, value: Callable[[TimingFigures], float]) -> Publication:
+    return Publication(
+        key,
+        Dimension.TIME,
+        lambda report, _: value(report.conditions.timing),
+        key.upper(),
+        stops_at_range=True,
+    )
+
+
+TIMING = (
+    _timing("lateness_p50", lambda kept: kept.lateness_s[0]),
+    _timing("lateness_p99", lambda kept: kept.lateness_s[1]),
+    _timing("lateness_p99_9", lambda kept: kept.lateness_s[2]),
+    _timing("lateness_max", lambda kept: kept.lateness_s[3]),
+    _timing("work_p50", lambda kept: kept.work_s[0]),
+    _timing("work_p99", lambda kept: kept.work_s[1]),
+    _timing("work_p99_9", lambda kept: kept.work_s[2]),
+    _timing("work_max", lambda kept: kept.work_s[3]),
+    _timing("longest_gap", lambda kept: kept.longest_gap_s),
+    _status("overruns", lambda report: report.counts.overruns),
+)
+"""How well the rate is kept."""
+
+
+@dataclass(frozen=True)
 class Outgoing:
     """A message of the bridge.
 
@@ -187,6 +282,20 @@ class Outgoing:
     frame: Callable[[Report, int], tuple[Frame, bool]]
     period_ns: int
     is_status: bool = False
+
+
+class Published(NamedTuple):
+    """What one signal of an outgoing message carries.
+
+    Attributes:
+        signal: Name of the signal.
+        publication: What it carries.
+        strut: Index of the strut it is of, else 0.
+    """
+
+    signal: str
+    publication: "Publication"
+    strut: int = 0
 
 
 def incoming(message: Message, wanted: Sequence[Wanted]) -> Incoming:
@@ -239,148 +348,63 @@ def _reader(message: Message, decode: Decoder) -> Reader:
     return read
 
 
-_ESTIMATE = {
-    "SPRING_DAMPER_FORCE": Dimension.FORCE,
-    "VIRTUAL_FORCE": Dimension.FORCE,
-    "VALID": Dimension.NUMBER,
-}
-_KINEMATICS = {
-    "MODEL_HEIGHT": Dimension.LENGTH,
-    "MODEL_VELOCITY": Dimension.VELOCITY,
-    "MODEL_ACCELERATION": Dimension.ACCELERATION,
-    "INNOVATION": Dimension.LENGTH,
-}
-_STATUS = {
-    "STATE": Dimension.NUMBER,
-    "ENCODING_SATURATED": Dimension.NUMBER,
-    "OVERRUNS": Dimension.NUMBER,
-    "LOST_FRAMES": Dimension.NUMBER,
-    "REFUSED_FRAMES": Dimension.NUMBER,
-    "STALE_FRAMES": Dimension.NUMBER,
-    "MEASUREMENT_FAULT": Dimension.NUMBER,
-    "LIMIT_FAULT": Dimension.NUMBER,
-    "BUS_FAULT": Dimension.NUMBER,
-    "LOG_FAULT": Dimension.NUMBER,
-}
+def outgoing(message: Message, published: Sequence[Published]) -> Outgoing:
+    """An outgoing message, compiled. Signals that nothing is published under are zero.
 
-_LEVELS = ("P50", "P99", "P99_9", "MAX")
-_TIMING_PAGES = (
-    {f"LATENESS_{level}": Dimension.TIME for level in _LEVELS},
-    {f"WORK_{level}": Dimension.TIME for level in _LEVELS},
-    {"LONGEST_GAP": Dimension.TIME, "OVERRUNS": Dimension.NUMBER},
-)
-"""Signals of the pages of a multiplexed message, in the order in which they are sent."""
+    Multiplexed signals are sent page by page, one page a frame.
 
-
-def estimate(message: Message, strut: int) -> Outgoing:
-    """The message with a strut's estimated force.
+    Args:
+        message: Message of the bridge.
+        published: What its signals carry.
 
     Raises:
-        DatabaseError: One of its signals is missing or has the wrong unit.
+        DatabaseError: A signal is missing, or its unit does not fit what is published under it.
     """
-
-    def values(report: Report) -> Sequence[float]:
-        output = report.output.struts[strut]
-        return output.force_n, output.virtual_force_n, output.valid
-
-    return _coded(message, _ESTIMATE, values)
-
-
-def kinematics(message: Message, strut: int) -> Outgoing:
-    """The message with the motion of the corrected model at a strut.
-
-    Raises:
-        DatabaseError: One of its signals is missing or has the wrong unit.
-    """
-
-    def values(report: Report) -> Sequence[float]:
-        output = report.output.struts[strut]
-        return (
-            output.height_m,
-            output.velocity_m_per_s,
-            output.acceleration_m_per_s2,
-            output.innovation_m,
-        )
-
-    return _coded(message, _KINEMATICS, values)
-
-
-def status(message: Message) -> Outgoing:
-    """The message with the bridge's state. Its counts stop at the ends of their ranges.
-
-    Raises:
-        DatabaseError: One of its signals is missing.
-    """
-    most = {name: message.signal(name).maximum for name in _STATUS}
-    limits = [float("inf") if value is None else value for value in most.values()]
-
-    def values(report: Report) -> Sequence[float]:
-        counts, reported = report.counts, report.reported
-        second_sender = counts.second_sender > reported.second_sender
-        raw = (
-            float(report.output.mode),
-            float(counts.saturated > reported.saturated),
-            float(counts.overruns),
-            float(counts.lost),
-            float(counts.refused),
-            float(counts.stale),
-            float(report.output.mode is not Mode.RUNNING),
-            float(counts.limited > reported.limited),
-            float(counts.bus_faulty > reported.bus_faulty or second_sender),
-            float(report.conditions.log_fault),
-        )
-        return [min(value, limit) for value, limit in zip(raw, limits, strict=True)]
-
-    return _coded(message, _STATUS, values, is_status=True)
-
-
-def timing(message: Message) -> Outgoing:
-    """The message with how well the rate was kept, page by page.
-
-    A figure beyond its range is sent as the end of it.
-
-    Raises:
-        DatabaseError: One of its signals is missing or has the wrong unit.
-    """
-    encoders = [compile_encoder(message, list(page), list(page.values())) for page in _TIMING_PAGES]
-
-    def values(report: Report) -> Sequence[float]:
-        page, kept = report.number % len(encoders), report.conditions.timing
-        pages = (kept.lateness_s, kept.work_s, (kept.longest_gap_s, float(report.counts.overruns)))
-        return (page, *pages[page])
-
-    def encode(paged: Sequence[float]) -> tuple[bytes, bool]:
-        # The end of a range says "that much or more" and is no saturation to be told of.
-        return encoders[int(paged[0])](paged[1:])[0], False
-
-    return _outgoing(message, encode, values)
-
-
-def _coded(
-    message: Message,
-    signals: dict[str, Dimension],
-    values: Callable[[Report], Sequence[float]],
-    *,
-    is_status: bool = False,
-) -> Outgoing:
-    encode = compile_encoder(message, list(signals), list(signals.values()))
-    return _outgoing(message, encode, values, is_status=is_status)
-
-
-def _outgoing(
-    message: Message,
-    encode: Encoder,
-    values: Callable[[Report], Sequence[float]],
-    *,
-    is_status: bool = False,
-) -> Outgoing:
+    pages = [_page(message, page) for page in _pages(message, published)]
     protect = None if message.protection is None else compile_protector(message.protection)
-    arbitration_id, is_extended, is_fd = message.arbitration_id, message.is_extended, message.is_fd
+    (arbitration_id, is_extended), is_fd = message.key, message.is_fd
 
     def frame(report: Report, t_ns: int) -> tuple[Frame, bool]:
-        payload, saturated = encode(values(report))
+        payload, saturated = pages[report.number % len(pages)](report)
         if protect is not None:
             payload = protect(payload, report.number)
         return Frame(t_ns, arbitration_id, payload, is_extended, is_fd), saturated
 
+    is_status = any(item.publication in STATUS for item in published)
     return Outgoing(message, frame, message.cycle_time_ns or 0, is_status)
+
+
+def _pages(message: Message, published: Sequence[Published]) -> list[list[Published]]:
+    """What stands in one frame together, in the order of the multiplexer's values."""
+    always: list[Published] = []
+    by_values: dict[tuple[int, ...], list[Published]] = {}
+    for item in published:
+        signal = message.signal(item.signal)
+        if signal.multiplexer is None:
+            always.append(item)
+        else:
+            by_values.setdefault(tuple(sorted(signal.multiplexer_ids)), []).append(item)
+    return [always + by_values[key] for key in sorted(by_values)] or [always]
+
+
+def _page(
+    message: Message, published: Sequence[Published]
+) -> Callable[[Report], tuple[bytes, bool]]:
+    names = [item.signal for item in published]
+    dimensions = [item.publication.dimension for item in published]
+    encode = compile_encoder(message, names, dimensions)
+    values = tuple(_value(message, item) for item in published)
+
+    def payload(report: Report) -> tuple[bytes, bool]:
+        return encode([value(report) for value in values])
+
+    return payload
+
+
+def _value(message: Message, item: Published) -> Callable[[Report], float]:
+    """A published value; a count stops at the end of its range, which is no saturation."""
+    value, strut = item.publication.value, item.strut
+    if not item.publication.stops_at_range:
+        return lambda report: value(report, strut)
+    _, high = si_range(message, item.signal, item.publication.dimension)
+    return lambda report: min(value(report, strut), high)

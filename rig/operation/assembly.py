@@ -8,14 +8,15 @@ from dart_model.spec import ModelSpec
 from rig.core.bridge import Bridge
 from rig.core.contract import Core, Plant
 from rig.core.messages import (
+    STATUS,
+    STRUT,
+    TIMING,
     Incoming,
     Outgoing,
+    Published,
     Wanted,
-    estimate,
     incoming,
-    kinematics,
-    status,
-    timing,
+    outgoing,
 )
 from rig.core.prescribed import PrescribedCore
 from rig.core.quantities import HEIGHT
@@ -73,14 +74,16 @@ def _incoming(ready: Setup) -> list[Incoming]:
 
 
 def _outgoing(ready: Setup) -> list[Outgoing]:
-    config, message = ready.config, ready.database.message
-    outgoing: list[Outgoing] = []
-    for index, entry in enumerate(config.publish.values()):
-        outgoing.append(estimate(message(entry.estimate), index))
-        if entry.kinematics is not None:
-            outgoing.append(kinematics(message(entry.kinematics), index))
-    if config.status is not None:
-        outgoing.append(status(message(config.status)))
-    if config.timing is not None:
-        outgoing.append(timing(message(config.timing)))
-    return outgoing
+    config = ready.config
+    publications = {item.key: item for item in STRUT}
+    published: dict[str, list[Published]] = {}
+    for strut, name in enumerate(config.observers):
+        for key, entry in (config.publish or {}).get(name, {}).items():
+            carried = Published(entry.signal, publications[key], strut)
+            published.setdefault(entry.message, []).append(carried)
+    for group, choices in ((config.status, STATUS), (config.timing, TIMING)):
+        publications = {item.key: item for item in choices}
+        for key, entry in (group or {}).items():
+            carried = Published(entry.signal, publications[key])
+            published.setdefault(entry.message, []).append(carried)
+    return [outgoing(ready.database.message(name), found) for name, found in published.items()]

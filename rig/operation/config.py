@@ -1,14 +1,23 @@
 """Configuration of the bridge: YAML -> frozen values, validated once."""
 
 import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    model_validator,
+)
 from pydantic_core import CoreSchema
 from pydantic_core.core_schema import tagged_union_schema
 
 from rig.core.contract import Observer
+from rig.core.messages import STATUS, STRUT, TIMING, Publication
 from rig.core.observers import DEFAULT_KIND, OBSERVERS
 from rig.core.quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, OTHERS, Quantity
 from rig.core.supervisor import Action, Limit, Supervision, Watched
@@ -111,11 +120,37 @@ class PrescribedMotion(_Frozen):
     settling_s: Annotated[float, Field(gt=0, le=1.0, allow_inf_nan=False)] = 0.002
 
 
-class Published(_Frozen):
-    """Messages that carry one strut's results."""
+Mapped = dict[str, SignalName]
+"""What is published, by its key, and where it stands on the bus."""
 
-    estimate: Text = "RIG_ESTIMATE"
-    kinematics: Text | None = "RIG_KINEMATICS"
+
+def _is_of_one_strut(published: object) -> bool:
+    """Whether keys are those of publications, and not names of struts."""
+    keys = cast("dict[object, object]", published) if isinstance(published, dict) else {}
+    return any(item.key in keys for item in STRUT)
+
+
+def _mapping(choices: Sequence[Publication]) -> Callable[[object], object]:
+    """Reads a group of publications: signals by key, or a message that has all of them.
+
+    Args:
+        choices: What may be published.
+    """
+
+    def read(data: object) -> object:
+        match data:
+            case str(message):
+                return {item.key: {"message": message, "signal": item.signal} for item in choices}
+            case dict():
+                known = [item.key for item in choices]
+                for key in cast("dict[object, object]", data):
+                    if key not in known:
+                        raise ValueError(f"{key}: unknown key, expected one of {', '.join(known)}")
+                return cast("object", data)
+            case _:
+                return data
+
+    return read
 
 
 class LimitConfig(_Frozen):
@@ -290,10 +325,13 @@ class RunConfig(_Frozen):
         prescribed_motion: Declares a dyno; there is then a load cell and no applied force.
         observers: One for each strut of the model, by strut name; none for a dyno. `kind`
             says which, `pi` if absent; its other keys are its own.
-        publish: Messages for each strut, by strut name; by default RIG_ESTIMATE and RIG_KINEMATICS
-            for the first strut, and the same with _2, _3, ... for the next ones.
-        status: Message that carries the state; null sends none.
-        timing: Message that carries how well the rate is kept; null sends none.
+        publish: What is published of each strut, by strut name: signals by the keys of
+            `rig.core.messages.STRUT`. By default, where the DBC has them, RIG_ESTIMATE and
+            RIG_KINEMATICS for the first strut, and the same with _2, _3, ... for the next ones.
+        status: What is published of the bridge, by the keys of `rig.core.messages.STATUS`; or a
+            message that has a signal of each name. By default RIG_STATUS, where the DBC has it.
+        timing: How well the rate is kept, by the keys of `rig.core.messages.TIMING`, or a message;
+            nothing by default.
         supervision: Ages and safe state.
         realtime: What is asked of the machine.
         log: Rotation, and windows that are kept apart.
@@ -309,20 +347,25 @@ class RunConfig(_Frozen):
     signals: Signals
     prescribed_motion: PrescribedMotion | None = None
     observers: dict[str, Annotated[Observer, _OneOfObservers]] = Field(default_factory=dict)
-    publish: dict[str, Published] = Field(default_factory=dict[str, Published])
-    status: Text | None = "RIG_STATUS"
-    timing: Text | None = None
+    publish: dict[str, Annotated[Mapped, BeforeValidator(_mapping(STRUT))]] | None = None
+    status: Annotated[Mapped, BeforeValidator(_mapping(STATUS))] | None = None
+    timing: Annotated[Mapped, BeforeValidator(_mapping(TIMING))] | None = None
     supervision: SupervisionConfig = SupervisionConfig()
     realtime: Realtime = Realtime()
     log: LogConfig = LogConfig()
 
     @model_validator(mode="before")
     @classmethod
-    def _one_height(cls, data: Any) -> Any:
-        """Let a model of one strut say `height: {message, signal}` without the strut's name."""
+    def _one_strut(cls, data: Any) -> Any:
+        """Let a model of one strut say what is measured and published without the strut's name."""
         match data:
             case {"signals": {"height": {"message": _, "signal": _} as height, **others}, **rest}:
-                return {**rest, "signals": {**others, "height": {"": height}}}
+                data = {**rest, "signals": {**others, "height": {"": height}}}
+            case _:
+                pass
+        match data:
+            case {"publish": published, **rest} if _is_of_one_strut(published):
+                return {**rest, "publish": {"": published}}
             case _:
                 return data
 
@@ -339,12 +382,14 @@ class RunConfig(_Frozen):
             )
         return self
 
+    def published(self) -> list[SignalName]:
+        """Every signal that the bridge sends."""
+        groups = [*(self.publish or {}).values(), self.status or {}, self.timing or {}]
+        return [entry for group in groups for entry in group.values()]
+
     def published_messages(self) -> list[str]:
         """Names of all messages that the bridge sends."""
-        names = [self.status, self.timing]
-        for entry in self.publish.values():
-            names += [entry.estimate, entry.kinematics]
-        return [name for name in names if name is not None]
+        return list(dict.fromkeys(entry.message for entry in self.published()))
 
     @property
     def period_ns(self) -> int:

@@ -18,11 +18,22 @@ caches make four of it."""
 _MOSTLY = 0.5
 """Share of the excess from which an account explains it."""
 
+_QUOTA_PERIOD_NS = 100_000_000
+"""Period of the kernel's CPU bandwidth control, by default: a host's quota for a guest or container
+that is used up stops it until the period ends."""
+
+_QUOTA_PHASE_NS = 1_500_000
+"""Within which the ends of such stops lie, in the period: its clock and ours drift apart."""
+
+_LEAST_IN_PHASE = 4
+"""Gaps in phase that are no coincidence: of twenty at random, as many are in one in a thousand."""
+
 
 class Cause(Enum):
     """Who took the time, as far as the kernel accounts for it."""
 
-    HOST = "the host ran something else (steal)"
+    QUOTA = "the host's CPU quota: gaps end in phase with periods of 100 ms"
+    HOST = "the host ran something else: as much time was stolen in the run"
     OTHER_THREAD = "the loop could run, and another thread had the core"
     INTERPRETER = "the log's thread held the interpreter"
     DISK = "a page was read from a disk"
@@ -42,6 +53,7 @@ class LateTick(NamedTuple):
             it waits) or wait.
         cause: Who took it.
         excess_ns: How much longer the part took than usual.
+        end_ns: When the loop went on.
     """
 
     t_ns: int
@@ -49,6 +61,7 @@ class LateTick(NamedTuple):
     part: str
     cause: Cause
     excess_ns: int
+    end_ns: int
 
 
 def late_ticks(rows: Sequence[Row], period_ns: int) -> list[LateTick]:
@@ -68,11 +81,12 @@ def late_ticks(rows: Sequence[Row], period_ns: int) -> list[LateTick]:
     if not on_time:
         return []
     usual = {part: median(parts[part] for parts in on_time) for part in on_time[0]}
-    return [
+    late = [
         _explained(before, row, period_ns, usual)
         for before, row in pairs
         if row.woke_ns - row.deadline_ns >= period_ns
     ]
+    return _by_host(late, rows[-1].steal_ns - rows[0].steal_ns)
 
 
 def _parts(before: Row, row: Row) -> dict[str, int]:
@@ -95,14 +109,13 @@ def _explained(before: Row, row: Row, period_ns: int, usual: dict[str, float]) -
     is_wait = part == "wait"
     own = not is_wait and parts[part] < _OWN_SHARE * usual[part]
     cause = _cause(before, row, excess_ns, is_wait=is_wait, own=own)
-    return LateTick(row.deadline_ns, missed, part, cause, excess_ns)
+    return LateTick(row.deadline_ns, missed, part, cause, excess_ns, row.woke_ns)
 
 
 def _cause(before: Row, row: Row, excess_ns: int, *, is_wait: bool, own: bool) -> Cause:
-    """The first account that explains the excess; the surest come first."""
+    """The first account of the guest's kernel that explains the excess; the surest come first."""
     switched = row.voluntary - before.voluntary
     accounts = (
-        (row.steal_ns > before.steal_ns, Cause.HOST),
         (row.run_delay_ns - before.run_delay_ns > _MOSTLY * excess_ns, Cause.OTHER_THREAD),
         (row.major_faults > before.major_faults, Cause.DISK),
         # Once to wait for the deadline; a second time for the interpreter.
@@ -112,3 +125,32 @@ def _cause(before: Row, row: Row, excess_ns: int, *, is_wait: bool, own: bool) -
         (own, Cause.OWN),
     )
     return next((cause for holds, cause in accounts if holds), Cause.UNACCOUNTED)
+
+
+def _by_host(late: list[LateTick], stolen_ns: int) -> list[LateTick]:
+    """What nobody in the guest accounts for, put down to the host where that shows.
+
+    Stolen time is counted in steps of 10 ms, which no single gap is as long as.
+    """
+    unaccounted = [item for item in late if item.cause is Cause.UNACCOUNTED]
+    in_phase = _in_phase(unaccounted)
+    left_ns = sum(item.excess_ns for item in unaccounted if item not in in_phase)
+    stolen_ns -= sum(item.excess_ns for item in in_phase)
+    rest = Cause.HOST if left_ns and stolen_ns >= _MOSTLY * left_ns else Cause.UNACCOUNTED
+    causes = {item: Cause.QUOTA if item in in_phase else rest for item in unaccounted}
+    return [item._replace(cause=causes.get(item, item.cause)) for item in late]
+
+
+def _in_phase(late: Sequence[LateTick]) -> list[LateTick]:
+    """The largest group of gaps that end at one phase of the quota's period, if it is no chance."""
+    groups = [
+        [
+            other
+            for other in late
+            if (other.end_ns - item.end_ns + _QUOTA_PHASE_NS) % _QUOTA_PERIOD_NS
+            <= 2 * _QUOTA_PHASE_NS
+        ]
+        for item in late
+    ]
+    largest = max(groups, key=len) if groups else []
+    return largest if len(largest) >= _LEAST_IN_PHASE else []

@@ -1,16 +1,19 @@
 """A configuration with the files it names, read and checked against each other."""
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
 from can_dbc.database import DEFAULT_DATABASE, Database, Message, load_database
 from dart_model.spec import ModelSpec, load_model, model_file
+from rig.core.messages import ESTIMATE, KINEMATICS, STATUS, Publication
 from rig.core.observers.pi import PiObserver
 from rig.inputs.errors import InputError
 from rig.inputs.yaml_file import load_validated
 from rig.io.secoc import FD_LENGTHS, Authentication, read_key
-from rig.operation.config import AuthenticationConfig, Published, RunConfig
+from rig.operation.config import AuthenticationConfig, Mapped, RunConfig, SignalName
 
 
 class Setup(BaseModel):
@@ -73,7 +76,7 @@ def put_together(config: RunConfig, source: Path, model: ModelSpec, database: Da
         InputError: One line that names file, key, value and what was expected.
         DatabaseError: The same, of the DBC.
     """
-    named = _with_strut_names(config, model, source)
+    named = _with_names(config, model, database, source)
     _check_messages(named, database, source)
     return Setup(config=named, source=source, model=model, database=database)
 
@@ -95,20 +98,18 @@ def _model_path(name: str, source: Path) -> Path:
         raise InputError(f"{source}: {error}") from None
 
 
-def _with_strut_names(config: RunConfig, model: ModelSpec, source: Path) -> RunConfig:
+def _with_names(config: RunConfig, model: ModelSpec, database: Database, source: Path) -> RunConfig:
+    """The configuration with every strut and every published signal named."""
     struts = [strut.name for strut in model.struts]
-    heights = config.signals.height
-    if list(heights) == [""]:
-        if len(struts) > 1:
-            raise InputError(
-                f"{source}: signals.height: the model has {len(struts)} struts, "
-                f"expected one entry for each of {', '.join(struts)}"
-            )
-        heights = {struts[0]: heights[""]}
+    heights = _named(config.signals.height, struts, f"{source}: signals.height")
+    publish = config.publish
+    if publish is None:
+        publish = _default_messages(struts, database)
+    publish = _named(publish, struts, f"{source}: publish")
     for key, names in (
         ("signals.height", heights),
         ("observers", config.observers),
-        ("publish", config.publish),
+        ("publish", publish),
     ):
         for name in names:
             if name not in struts:
@@ -118,25 +119,51 @@ def _with_strut_names(config: RunConfig, model: ModelSpec, source: Path) -> RunC
     for name in struts:
         if name not in heights:
             raise InputError(f"{source}: signals.height.{name}: is missing, expected its signal")
+    status = config.status
+    if "status" not in config.model_fields_set:
+        status = _all_in("RIG_STATUS", STATUS, database) or None
     observers = {name: config.observers.get(name, PiObserver()) for name in struts}
-    publish = {
-        name: config.publish.get(name, _default_messages(index))
-        for index, name in enumerate(struts)
-    }
+    height = {name: heights[name] for name in struts}
     return config.model_copy(
         update={
-            "signals": config.signals.model_copy(
-                update={"height": {name: heights[name] for name in struts}}
-            ),
+            "signals": config.signals.model_copy(update={"height": height}),
             "observers": observers,
-            "publish": publish,
+            "publish": {name: publish[name] for name in struts if name in publish},
+            "status": status,
         }
     )
 
 
-def _default_messages(index: int) -> Published:
-    ending = "" if index == 0 else f"_{index + 1}"
-    return Published(estimate=f"RIG_ESTIMATE{ending}", kinematics=f"RIG_KINEMATICS{ending}")
+_Entry = TypeVar("_Entry")
+
+
+def _named(given: Mapping[str, _Entry], struts: list[str], place: str) -> Mapping[str, _Entry]:
+    """Entries by strut name, where a model of one strut may leave the name out."""
+    if list(given) != [""]:
+        return given
+    if len(struts) > 1:
+        raise InputError(
+            f"{place}: the model has {len(struts)} struts, expected one entry for each of "
+            f"{', '.join(struts)}"
+        )
+    return {struts[0]: given[""]}
+
+
+def _default_messages(struts: list[str], database: Database) -> dict[str, Mapped]:
+    found: dict[str, Mapped] = {}
+    for index, name in enumerate(struts):
+        ending = "" if index == 0 else f"_{index + 1}"
+        estimate = _all_in(f"RIG_ESTIMATE{ending}", ESTIMATE, database)
+        kinematics = _all_in(f"RIG_KINEMATICS{ending}", KINEMATICS, database)
+        found[name] = {**estimate, **kinematics}
+    return found
+
+
+def _all_in(message: str, publications: Iterable[Publication], database: Database) -> Mapped:
+    """Every publication by its own signal's name, if the DBC has the message."""
+    if message not in database.messages:
+        return {}
+    return {item.key: SignalName(message=message, signal=item.signal) for item in publications}
 
 
 def _check_messages(config: RunConfig, database: Database, source: Path) -> None:
@@ -148,13 +175,13 @@ def _check_messages(config: RunConfig, database: Database, source: Path) -> None
                 f"{source}: signals: {entry.message} is also published, "
                 "expected a message of the bench"
             )
-    repeated = {name for name in outputs if outputs.count(name) > 1}
-    if repeated:
-        raise InputError(
-            f"{source}: publish: {min(repeated)} stands twice, expected one message each"
-        )
-    for name in outputs:
-        database.message(name)
+    published = [(entry.message, entry.signal) for entry in config.published()]
+    for message, signal in published:
+        database.message(message).signal(signal)
+        if published.count((message, signal)) > 1:
+            raise InputError(
+                f"{source}: publish: signal {signal} of {message} stands twice, expected once"
+            )
     if config.authentication is not None:
         names = {entry.message for entry in config.signals.named()}.union(outputs)
         _check_authentication(

@@ -54,7 +54,8 @@ class Row(NamedTuple):
         minor_faults: Pages mapped without a disk.
         major_faults: Pages read from a disk.
         run_delay_ns: Time in which the loop could have run and another thread did.
-        steal_ns: Time in which the host did not run this machine, of all cores.
+        steal_ns: Time in which the host did not run this machine, of all cores; as last read, which
+            is at the beginning and at ticks that are late.
         log_busy: Whether the log's thread was at work when the loop went on.
     """
 
@@ -90,9 +91,9 @@ class Trace:
         self._counters: tuple[int, ...] = ()
         self._now: Any = None
         self._log: Any = None
-        self._steal_ns = 0
         self._schedstat = _opened("/proc/thread-self/schedstat")
         self._stat = _opened("/proc/stat")
+        self._steal_ns = self._read_steal_ns()
 
     def clock(self, clock: Clock) -> Clock:
         """The clock, with marks around its waits."""

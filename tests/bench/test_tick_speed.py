@@ -127,9 +127,9 @@ def bridge_and_frames() -> tuple[Bridge, BridgeState, list[list[Frame]]]:
     """One BENCH_MEASUREMENT in, one RIG_ESTIMATE out."""
     ready = load_setup(CONFIGS / "reference.yaml")
     signals = ready.config.signals.model_copy(update={"load_cell_force": None, "temperature": None})
+    keys = ("force", "virtual_force", "valid")
     publish = {
-        name: item.model_copy(update={"kinematics": None})
-        for name, item in ready.config.publish.items()
+        name: {key: mapped[key] for key in keys} for name, mapped in ready.config.publish.items()
     }
     config = ready.config.model_copy(
         update={"signals": signals, "publish": publish, "status": None, "timing": None}

@@ -1,0 +1,39 @@
+"""`rig init`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.output import console
+from rig.inputs.errors import InputError
+
+EXAMPLES = "Example: `rig init --dbc my.dbc --out my.yaml`, then `rig check my.yaml`"
+
+
+def init(
+    dbc: Annotated[Path, typer.Option("--dbc", metavar="FILE", help="DBC of the bench's bus.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="FILE", help="New file beside the DBC; shown if absent."
+        ),
+    ] = None,
+) -> None:
+    """Propose a configuration from a DBC: height, forces, temperature, and where to publish."""
+    from can_dbc.database import load_database
+    from rig.operation.proposal import propose
+
+    text = propose(load_database(dbc))
+    if out is None:
+        typer.echo(text, nl=False)
+        return
+    if out.exists():
+        raise InputError(f"--out {out}: exists, expected a new file")
+    if out.resolve().parent != dbc.resolve().parent:
+        raise InputError(f"--out {out}: expected a file beside {dbc}, which it names")
+    try:
+        out.write_text(text, "utf-8")
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
+    console.print(f"Written: {out}. Read it, set bus and model, then `rig check {out}`.")
