@@ -92,6 +92,7 @@ class Message:
         arbitration_id: 11-bit id, or 29-bit if `is_extended`.
         is_extended: Whether the id has 29 bits.
         is_fd: Whether the frame is CAN FD.
+        is_j1939: Whether it is known by its J1939 parameter group.
         length_bytes: Payload length.
         cycle_time_ns: Time between two frames, in ns, or None if the DBC gives none.
         sender: Node that sends it, or None if the DBC gives none.
@@ -104,6 +105,7 @@ class Message:
     arbitration_id: int
     is_extended: bool
     is_fd: bool
+    is_j1939: bool
     length_bytes: int
     cycle_time_ns: int | None
     sender: str | None
@@ -283,6 +285,7 @@ def _message(path: Path, message: CantoolsMessage) -> Message:
         arbitration_id=message.frame_id,
         is_extended=is_extended,
         is_fd=bool(message.is_fd) or message.length > 8,
+        is_j1939=is_extended and message.protocol == "j1939",
         length_bytes=message.length,
         cycle_time_ns=cycle_time_ns,
         sender=message.senders[0] if message.senders else None,

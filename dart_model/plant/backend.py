@@ -32,7 +32,7 @@ class Backend(Protocol[Value]):
         """The same as a tuple."""
         ...
 
-    def dot(self, row: Value, value: Value) -> float:
+    def dot(self, row: Value, value: Value, /) -> float:
         """Product of a row of a Jacobian and a value."""
         ...
 

@@ -15,9 +15,7 @@ def init(
     dbc: Annotated[Path, typer.Option("--dbc", metavar="FILE", help="DBC of the bench's bus.")],
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", metavar="FILE", help="New file beside the DBC; shown if absent."
-        ),
+        typer.Option("--out", metavar="FILE", help="New file beside the DBC; shown if absent."),
     ] = None,
 ) -> None:
     """Propose a configuration from a DBC: height, forces, temperature, and where to publish."""

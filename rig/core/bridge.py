@@ -9,6 +9,7 @@ from typing import NamedTuple
 from msgspec import Struct
 from msgspec.structs import replace
 
+from can_dbc.addressing import Directory
 from can_dbc.frame import Frame
 from can_dbc.protection import INITIAL, SequenceState, Verdict
 from rig.core.contract import (
@@ -159,13 +160,11 @@ class Bridge:
         self._limits = tuple(item for item in limits if not item.watched.is_measured)
         self._outgoing = tuple(outgoing)
         self._no_heights: list[Measurement | None] = [None] * core.struts
-        self._places = {item.message.key: place for place, item in enumerate(incoming)}
+        self.directory = Directory(item.message for item in incoming)
+        """Which incoming message a frame is of."""
         self._own = frozenset(item.message.key for item in outgoing)
-
-    @property
-    def subscribed(self) -> frozenset[tuple[int, bool]]:
-        """The (arbitration id, is extended) that the bridge subscribes to, its own among them."""
-        return self._own.union(self._places)
+        self.filters = Directory(item.message for item in (*incoming, *outgoing)).filters
+        """What lets in the frames that the bridge subscribes to, its own among them."""
 
     def init(self, t_ns: int) -> BridgeState:
         """State before the first tick."""
@@ -214,7 +213,7 @@ class Bridge:
         core, ledger, sequences, action = state.core, state.ledger, list(state.sequences), 0
         heights, others = self._no_heights.copy(), list(NO_OTHERS)
         for frame in frames:
-            place = self._places.get((frame.arbitration_id, frame.is_extended))
+            place = self.directory.place(frame.arbitration_id, frame.is_extended)
             if place is None or frame.is_error:
                 ledger = self._foreign(ledger, frame)
                 continue

@@ -13,6 +13,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from can_dbc.addressing import Directory
 from can_dbc.codec import decode_log
 from can_dbc.database import Message
 from can_dbc.protection import check_crc_log
@@ -297,30 +298,29 @@ def read_run(folder: Path) -> Recording:
     )
 
 
-_Payloads = dict[tuple[int, bool], tuple[NDArray[np.int64], NDArray[np.uint8]]]
+_Payloads = dict[str, tuple[NDArray[np.int64], NDArray[np.uint8]]]
 
 
 def _payloads(found: RunFolder, ready: Setup) -> _Payloads:
     """Times and payloads of every received message, wrong lengths left out."""
-    lengths = {
-        (message.arbitration_id, message.is_extended): message.length_bytes
-        for message in map(
-            ready.database.message, {entry.message for entry in ready.config.signals.named()}
-        )
-    }
-    times: dict[tuple[int, bool], list[int]] = {key: [] for key in lengths}
-    data: dict[tuple[int, bool], list[bytes]] = {key: [] for key in lengths}
+    names = sorted({entry.message for entry in ready.config.signals.named()})
+    messages = [ready.database.message(name) for name in names]
+    directory = Directory(messages)
+    times: list[list[int]] = [[] for _ in messages]
+    data: list[list[bytes]] = [[] for _ in messages]
     for frame, direction in found.frames():
-        key = (frame.arbitration_id, frame.is_extended)
-        if direction == "R" and not frame.is_error and lengths.get(key) == len(frame.data):
-            times[key].append(frame.t_ns)
-            data[key].append(frame.data)
+        place = directory.place(frame.arbitration_id, frame.is_extended)
+        if place is None or direction != "R" or frame.is_error:
+            continue
+        if len(frame.data) == messages[place].length_bytes:
+            times[place].append(frame.t_ns)
+            data[place].append(frame.data)
     return {
-        key: (
-            np.array(times[key], dtype=np.int64),
-            np.frombuffer(b"".join(data[key]), dtype=np.uint8).reshape(-1, length),
+        message.name: (
+            np.array(times[place], dtype=np.int64),
+            np.frombuffer(b"".join(data[place]), dtype=np.uint8).reshape(-1, message.length_bytes),
         )
-        for key, length in lengths.items()
+        for place, message in enumerate(messages)
     }
 
 
@@ -329,7 +329,7 @@ def _channel(
 ) -> tuple[Array, Array]:
     """Sample times in s and values of one signal."""
     message = ready.database.message(entry.message)
-    t_ns, data = payloads[message.arbitration_id, message.is_extended]
+    t_ns, data = payloads[message.name]
     good = np.ones(len(data), dtype=bool)
     if message.protection is not None:
         good = check_crc_log(data, message.protection)

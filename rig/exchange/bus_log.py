@@ -5,6 +5,7 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
+from can_dbc.addressing import Directory
 from can_dbc.frame import Frame
 from rig.core.messages import Conditions
 from rig.exchange.imported import ImportReport
@@ -23,10 +24,10 @@ _LONGEST_GAP_NS = 3_600_000_000_000
 class _LogPort:
     """Frames of a foreign log, tick by tick. What the bridge sends goes nowhere."""
 
-    def __init__(self, source: Path, heard: frozenset[tuple[int, bool]], first_due_ns: int) -> None:
+    def __init__(self, source: Path, directory: Directory, first_due_ns: int) -> None:
         self._source = source
         self._frames = read_log(source)
-        self._heard = heard
+        self._directory = directory
         self.taken = 0
         self.others = 0
         self.last_ns = 0
@@ -56,7 +57,7 @@ class _LogPort:
 
     def _next(self) -> Frame | None:
         for _, frame in self._frames:
-            if (frame.arbitration_id, frame.is_extended) in self._heard:
+            if self._directory.place(frame.arbitration_id, frame.is_extended) is not None:
                 if self.taken and frame.t_ns - self.last_ns > _LONGEST_GAP_NS:
                     gap_s = (frame.t_ns - self.last_ns) * 1e-9
                     raise InputError(
@@ -89,7 +90,7 @@ def import_log(
     bridge = build_bridge(ready)
     # Half a tick after a tick, so that the jitter of a bench as fast as the bridge gives each tick
     # one frame, and not two to one and none to the next.
-    port = _LogPort(source, bridge.subscribed, ready.config.period_ns // 2)
+    port = _LogPort(source, bridge.directory, ready.config.period_ns // 2)
     wanted = tuple(item.message.name for item in bridge.incoming)
     if port.ended:
         raise InputError(

@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import can
 
+from can_dbc.addressing import Filter
 from can_dbc.frame import Frame
 from rig.inputs.errors import InputError
 
@@ -18,6 +19,9 @@ reaches it (CAN FD at 1 and 8 Mbit/s carries a third); what is beyond waits."""
 
 _QUEUE_BYTES, _SO_RCVBUFFORCE = 4_000_000, 33
 """Some 5 000 frames wait for a tick that is late; more than usual is granted to root alone."""
+
+_MOST_KNOWN = 10_000
+"""Identifiers that are remembered as let in or not; a flood of others must fill no memory."""
 
 _LISTEN_ONLY_OPTIONS: dict[str, dict[str, Any]] = {
     "pcan": {"state": can.BusState.PASSIVE},
@@ -60,7 +64,7 @@ class Bus:
 
     Args:
         config: How to open it.
-        heard: The only (arbitration id, is extended) that are let in; None lets all in.
+        filters: The only frames that are let in, beside error frames; None lets all in.
         listen_only: Send nothing. Most interfaces swallow such a request silently, so it is kept
             here: the interface's way of sending is not even looked up.
         epoch_ns: Unix time of the run's start; time stamps are given relative to it.
@@ -72,15 +76,16 @@ class Bus:
     def __init__(
         self,
         config: BusConfig,
-        heard: Iterable[tuple[int, bool]] | None = None,
+        filters: Iterable[Filter] | None = None,
         *,
         listen_only: bool = False,
         epoch_ns: int = 0,
     ) -> None:
-        self._heard = None if heard is None else frozenset(heard)
+        self._filters = None if filters is None else frozenset(filters)
+        self._known: dict[tuple[int, bool], bool] = {}
         self.epoch_ns = epoch_ns
         """Unix time that stamps are relative to; to be set anew when the system's clock was."""
-        self._bus = _open(config, self._heard, listen_only=listen_only)
+        self._bus = _open(config, self._filters, listen_only=listen_only)
         self._receive = self._bus.recv
         self._send = None if listen_only else self._bus.send
 
@@ -94,18 +99,32 @@ class Bus:
             BusError: The interface is gone.
         """
         frames: list[Frame] = []
-        receive, heard = self._receive, self._heard
+        receive = self._receive
         try:
             for _ in range(FRAMES_A_MS * (elapsed_ns // 1_000_000 + 1)):
                 message = receive(0)
                 if message is None:
                     break
-                key = (message.arbitration_id, message.is_extended_id)
-                if heard is None or key in heard or message.is_error_frame:
+                if message.is_error_frame or self._lets_in(message):
                     frames.append(self._frame(message))
         except (can.CanError, OSError, ValueError) as error:
             raise BusError(f"receiving failed: {error}") from error
         return frames
+
+    def _lets_in(self, message: can.Message) -> bool:
+        if self._filters is None:
+            return True
+        key = (message.arbitration_id, message.is_extended_id)
+        known = self._known.get(key)
+        if known is None:
+            known = self._known[key] = any(
+                item.is_extended == message.is_extended_id
+                and message.arbitration_id & item.mask == item.arbitration_id & item.mask
+                for item in self._filters
+            )
+            if len(self._known) > _MOST_KNOWN:
+                self._known.clear()
+        return known
 
     def _frame(self, message: can.Message) -> Frame:
         return Frame(
@@ -168,9 +187,7 @@ def _sending_failed(error: Exception) -> BusError:
     return (BusFullError if full else BusError)(f"sending failed: {text}")
 
 
-def _open(
-    config: BusConfig, heard: frozenset[tuple[int, bool]] | None, *, listen_only: bool
-) -> can.BusABC:
+def _open(config: BusConfig, wanted: frozenset[Filter] | None, *, listen_only: bool) -> can.BusABC:
     options: dict[str, Any] = dict(config.options)
     if listen_only:
         options |= _LISTEN_ONLY_OPTIONS.get(config.interface, {})
@@ -181,12 +198,12 @@ def _open(
         options.setdefault("fd", True)
         options.setdefault("data_bitrate", config.data_bitrate)
     filters = None
-    if heard is not None and config.interface == "socketcan":
+    if wanted is not None and config.interface == "socketcan":
         # The kernel's filters let error frames pass. python-can's own, which stand in for them at
         # other interfaces, do not, and end a poll at the first foreign frame.
         filters = [
-            {"can_id": key, "can_mask": 0x1FFFFFFF if extended else 0x7FF, "extended": extended}
-            for key, extended in sorted(heard)
+            {"can_id": item.arbitration_id, "can_mask": item.mask, "extended": item.is_extended}
+            for item in sorted(wanted, key=lambda item: item.arbitration_id)
         ]
     try:
         bus: can.BusABC = cast("Any", can.Bus)(

@@ -102,7 +102,7 @@ def _link(ready: Setup, bridge: Bridge, clock: Clock, *, listen_only: bool = Fal
     def open_bus() -> Bus:
         return Bus(
             config.bus.config(),
-            bridge.subscribed,
+            bridge.filters,
             listen_only=listen_only,
             epoch_ns=clock.epoch_ns,
         )

@@ -229,7 +229,7 @@ def test_a_tick_over_a_virtual_bus(capsys):
     """Told and not asserted: it depends on what else this machine does."""
     bridge, state, frames = bridge_and_frames()
     config = BusConfig("virtual", "test-tick-speed", 1_000_000)
-    near, far = Bus(config, bridge.subscribed), Bus(config)
+    near, far = Bus(config, bridge.filters), Bus(config)
     work_us: list[float] = []
     try:
         for tick, received in enumerate(frames, start=1):

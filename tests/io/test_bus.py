@@ -3,8 +3,11 @@
 import can
 import pytest
 
+from can_dbc.addressing import Filter
 from can_dbc.frame import Frame
 from rig.io.bus import Bus, BusConfig, BusError
+
+ONLY_0X100 = Filter(0x100, 0x7FF, is_extended=False)
 
 
 @pytest.fixture
@@ -24,8 +27,8 @@ def opened(config):
     """Open a bus that is closed after the test."""
     buses = []
 
-    def open_bus(heard=None, **options):
-        buses.append(Bus(config, heard, **options))
+    def open_bus(filters=None, **options):
+        buses.append(Bus(config, filters, **options))
         return buses[-1]
 
     yield open_bus
@@ -34,7 +37,7 @@ def opened(config):
 
 
 def test_only_configured_ids_are_heard_and_foreign_ones_do_not_end_the_poll(opened, peer):
-    bus = opened({(0x100, False), (0x18FF0001, True)})
+    bus = opened([ONLY_0X100, Filter(0x18FF0001, 0x1FFFFFFF, is_extended=True)])
     wanted = [Frame(7, 0x100, b"\1"), Frame(8, 0x18FF0001, b"\2", is_extended=True)]
     foreign = [Frame(7, 0x101, b""), Frame(7, 0x100, b"", is_extended=True), Frame(7, 0x7FF, b"")]
     for frame in (*foreign, wanted[0], *foreign, wanted[1], *foreign):
@@ -43,7 +46,7 @@ def test_only_configured_ids_are_heard_and_foreign_ones_do_not_end_the_poll(open
 
 
 def test_a_flood_is_read_in_portions_and_none_of_it_is_lost(opened, peer):
-    bus = opened({(0x100, False)})
+    bus = opened([ONLY_0X100])
     for number in range(200):
         peer.send(Frame(number, 0x100, bytes([number])))
     portions = [bus.receive(999_999) for _ in range(5)]
@@ -52,7 +55,7 @@ def test_a_flood_is_read_in_portions_and_none_of_it_is_lost(opened, peer):
 
 
 def test_error_frames_come_whatever_is_heard(opened, config):
-    bus = opened({(0x100, False)})
+    bus = opened([ONLY_0X100])
     raw = can.Bus(interface="virtual", channel=config.channel)
     try:
         raw.send(can.Message(arbitration_id=0x40, is_error_frame=True, is_extended_id=False))
@@ -98,3 +101,21 @@ def test_all_that_a_frame_has_goes_through(opened, peer):
     for frame in frames:
         peer.send(frame)
     assert bus.receive() == frames
+
+
+def test_a_group_lets_in_every_source_address_of_it(opened, peer):
+    bus = opened([Filter(0x18FEF100, 0x03FFFF00, is_extended=True)])
+    wanted = [Frame(k, 0x0CFEF100 + k, b"", is_extended=True) for k in (0, 7, 255)]
+    for frame in (*wanted, Frame(0, 0x18FEF200, b"", is_extended=True), Frame(0, 0x100, b"")):
+        peer.send(frame)
+    assert bus.receive() == wanted
+
+
+def test_a_flood_of_foreign_identifiers_fills_no_memory(opened, peer):
+    bus = opened([ONLY_0X100])
+    for number in range(12_000):
+        peer.send(Frame(0, number + 0x10000, b"", is_extended=True))
+        if number % 60 == 0:
+            bus.receive()
+    bus.receive()
+    assert len(bus._known) <= 10_001

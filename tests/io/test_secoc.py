@@ -232,7 +232,7 @@ def test_the_check_tells_of_it(configured):
     assert found().severity is Severity.OK
     assert "24 bits" in found().text
     (path.parent / "bench.key").chmod(0o644)
-    assert found().severity is Severity.WARNING
+    assert found().severity is Severity.ERROR
     assert KEY.hex() not in found().text
 
 

@@ -81,7 +81,7 @@ def test_what_was_proposed_runs_over_a_bus_and_replays(dbc, tmp_path):
     bridge = build_bridge(ready)
     clock = VirtualClock()
     bus = ready.config.bus.config()
-    link = Link(lambda: Bus(bus, bridge.subscribed), clock.epoch_now_ns, executor=AtOnce())
+    link = Link(lambda: Bus(bus, bridge.filters), clock.epoch_now_ns, executor=AtOnce())
     peer = Bus(bus)
     other = cantools.database.load_file(dbc)
 

@@ -11,6 +11,7 @@ import yaml
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from can_dbc.addressing import Filter
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.frame import Frame
 from can_dbc.protection import check_crc
@@ -102,7 +103,9 @@ def contents(frames: list[Frame]) -> list[tuple[int, bytes]]:
 
 
 def test_only_configured_ids_are_heard(second_vcan):
-    bus = Bus(BusConfig("socketcan", second_vcan, 500_000), {(0x100, False)})
+    bus = Bus(
+        BusConfig("socketcan", second_vcan, 500_000), [Filter(0x100, 0x7FF, is_extended=False)]
+    )
     try:
         for text in ("101#01", "100#0203", "00000100#04", "100##10203"):
             subprocess.run(["cansend", second_vcan, text], check=False)

@@ -1,0 +1,86 @@
+"""Which message a frame is of, by its arbitration id.
+
+A message of J1939 is known by its parameter group: priority and source address of a frame may be
+others than in the DBC, and the destination too where the group has one.
+
+Reference: SAE J1939-21, "Data Link Layer", 5.1: the fields of an identifier.
+"""
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from can_dbc.database import Message
+
+_PDU_FORMAT = 16
+_DESTINATION_BELOW = 240
+"""PDU formats below this have a destination in the byte behind them."""
+
+_WITH_DESTINATION, _BROADCAST = 0x03FF0000, 0x03FFFF00
+"""Bits of an identifier that are its parameter group."""
+
+_ALL_STANDARD, _ALL_EXTENDED = 0x7FF, 0x1FFFFFFF
+
+
+def group_mask(arbitration_id: int) -> int:
+    """Bits of a J1939 identifier that are its parameter group."""
+    pdu_format = arbitration_id >> _PDU_FORMAT & 0xFF
+    return _WITH_DESTINATION if pdu_format < _DESTINATION_BELOW else _BROADCAST
+
+
+@dataclass(frozen=True)
+class Filter:
+    """Identifiers that are let in: those with ``id & mask == arbitration_id & mask``.
+
+    Attributes:
+        arbitration_id: An identifier.
+        mask: Bits that must agree.
+        is_extended: Whether it has 29 bits.
+    """
+
+    arbitration_id: int
+    mask: int
+    is_extended: bool
+
+
+class Directory:
+    """Messages by the identifiers of their frames.
+
+    A group that several of the messages belong to says nothing: these are known by their whole
+    identifiers.
+
+    Args:
+        messages: Messages; their places in this sequence are what is looked up.
+    """
+
+    def __init__(self, messages: Iterable[Message]) -> None:
+        listed = list(messages)
+        self.exact = {message.key: place for place, message in enumerate(listed)}
+        groups = {
+            place: (message.arbitration_id & group_mask(message.arbitration_id))
+            for place, message in enumerate(listed)
+            if message.is_j1939
+        }
+        often = Counter(groups.values())
+        self._groups = {group: place for place, group in groups.items() if often[group] == 1}
+        self._filters = tuple(
+            _filter(message, place in self._groups.values()) for place, message in enumerate(listed)
+        )
+
+    def place(self, arbitration_id: int, is_extended: bool) -> int | None:
+        """Place of the message that a frame is of; None if it is of no one."""
+        found = self.exact.get((arbitration_id, is_extended))
+        if found is None and is_extended and self._groups:
+            return self._groups.get(arbitration_id & group_mask(arbitration_id))
+        return found
+
+    @property
+    def filters(self) -> tuple[Filter, ...]:
+        """What lets the frames of all messages in."""
+        return self._filters
+
+
+def _filter(message: Message, is_group: bool) -> Filter:
+    whole = _ALL_EXTENDED if message.is_extended else _ALL_STANDARD
+    mask = group_mask(message.arbitration_id) if is_group else whole
+    return Filter(message.arbitration_id, mask, message.is_extended)
