@@ -338,7 +338,9 @@ def copy_skeleton(spec: ModelSpec, folder: Path) -> None:
     if isinstance(spec.skeleton, FileSkeleton):
         target = folder / spec.skeleton.file
         target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(spec.folder / spec.skeleton.file, target)
+        source = spec.folder / spec.skeleton.file
+        if not (target.exists() and target.samefile(source)):
+            shutil.copyfile(source, target)
 
 
 def _refuse_repeated(what: str, names: Iterable[str]) -> None:

@@ -5,10 +5,11 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import console, free_folder, refuse_full
+from rig.cli.output import console, free_folder
 from rig.cli.results import print_case, print_diagnosis, print_ended
 from rig.cli.watching import progress_bar, progress_line, stoppable
 from rig.inputs.errors import InputError
+from rig.inputs.folders import refuse_full
 
 STORY = "story"
 

@@ -1,8 +1,8 @@
 """The command line whole: every command, and what a wrong input or an interruption ends with."""
 
 import sys
+from typing import Any, cast
 
-import click
 import typer
 from rich.console import Console
 
@@ -36,20 +36,29 @@ _INTERRUPTED = 130
 """What a shell expects of a program that Ctrl-C ended: 128 and the number of SIGINT."""
 
 
+# Typer carries click inside itself and names none of its own errors but this one.
+_UsageError = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "UsageError")
+
+
 def main() -> None:
     """Run the command; a wrong input is one line on standard error and exit code 2."""
+    if len(sys.argv) == 1:
+        sys.argv.append("--help")
     try:
         ended = app(standalone_mode=False)
-    except click.exceptions.NoArgsIsHelpError as error:
-        click.echo(error.format_message())
-        sys.exit(WRONG_INPUT)
-    except click.ClickException as error:
-        _refuse(error.format_message())
     except InputError as error:
         _refuse(str(error))
-    except (KeyboardInterrupt, click.Abort):
+    except OSError as error:
+        if error.filename is None:
+            raise
+        _refuse(f"{error.filename}: {error.strerror}")
+    except (KeyboardInterrupt, typer.Abort):
         _say("interrupted")
         sys.exit(_INTERRUPTED)
+    except Exception as error:
+        if not isinstance(error, _UsageError):
+            raise
+        _refuse(cast("Any", error).format_message())
     else:
         sys.exit(ended if isinstance(ended, int) else OK)
 

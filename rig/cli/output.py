@@ -21,22 +21,14 @@ def free_folder(name: str) -> Path:
     return next(path for path in itertools.chain([Path(name)], numbered) if not path.exists())
 
 
-def refuse_full(folder: Path) -> None:
-    """Refuse a folder that holds anything.
-
-    Raises:
-        InputError: It does, or is no folder.
-    """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"--out {folder}: is not empty, expected a new or an empty folder")
-
-
 def write_summary(folder: Path, summary: dict[str, object]) -> None:
     """Write `summary.json`.
 
     Raises:
         InputError: The folder cannot be written.
     """
+    if (folder / "run.yaml").exists():
+        raise InputError(f"--out {folder}: holds a run, expected another folder")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", "utf-8")

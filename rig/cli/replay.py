@@ -19,6 +19,7 @@ def replay_command(
     ] = None,
 ) -> None:
     """Compute a run again from its frames and compare it with its log, bit for bit."""
+    from rig.io.run_log import changed_files
     from rig.operation.replay import replay
 
     with progress_line(None) as progress:
@@ -36,6 +37,11 @@ def replay_command(
     console.print(table)
     if out is not None:
         write_summary(out, summary)
+    if result.steps.num_rows == 0:
+        console.print("The run holds no tick: nothing was compared.", style="red")
+        raise typer.Exit(FAILED)
+    for name in changed_files(folder):
+        console.print(f"{name} is not the one that ran: its hash differs.", style="yellow")
     if result.different:
         console.print("The replay differs from the log.", style="red")
         raise typer.Exit(FAILED)

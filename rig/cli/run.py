@@ -7,10 +7,11 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import FAILED, ConfigFile, console, refuse_full
+from rig.cli.output import FAILED, ConfigFile, console
 from rig.cli.results import print_ended
 from rig.cli.watching import progress_line, stoppable
 from rig.inputs.errors import InputError
+from rig.inputs.folders import refuse_full
 
 EXAMPLES = "Examples: `rig run rig.yaml` · `rig run rig.yaml --out runs/7 --listen-only`"
 
@@ -72,8 +73,10 @@ def run(
             stop=stop,
             progress=progress,
         )
+        # Inside: a second Ctrl-C must not lose it.
+        text = json.dumps(ended.summary(), indent=2) + "\n"
+        (folder / "summary.json").write_text(text, "utf-8")
     print_ended(ended, with_timing=True)
-    (folder / "summary.json").write_text(json.dumps(ended.summary(), indent=2) + "\n", "utf-8")
     console.print(f"Run: {folder}")
     if ended.state.core.mode is Mode.SAFE:
         console.print("The run ended in its safe state.", style="red")

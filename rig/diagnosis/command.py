@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dart_model.spec import ModelSpec
 from rig.diagnosis.diagnose import diagnose
-from rig.diagnosis.outcome import Result, write_results
+from rig.diagnosis.outcome import CORRECTED_FILE, DIAGNOSIS_FILE, Result, write_results
 from rig.diagnosis.progress import Progress
 from rig.diagnosis.recording import read_recording
 from rig.inputs.errors import InputError
@@ -37,6 +37,9 @@ def diagnose_runs(
     if (out / RUN_FILE).exists():
         raise InputError(f"{out}: holds a run, expected another folder for what was found")
     # Before a search that takes minutes, not after it.
+    for name in (DIAGNOSIS_FILE, CORRECTED_FILE):
+        if (out / name).exists():
+            raise InputError(f"{out}: holds {name} already, expected a folder without one")
     standing = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     if not standing.is_dir() or not os.access(standing, os.W_OK):
         raise InputError(f"{out}: cannot be written: {standing}: expected a folder to write into")

@@ -10,7 +10,9 @@ Parquet and MF4 hold everything: `import_run` makes the same run of them again, 
 day of the files.
 """
 
-from collections.abc import Callable
+import contextlib
+import shutil
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,6 +23,7 @@ from rig.exchange.content import channel_of, inside
 from rig.exchange.mf4 import from_mf4, to_mf4
 from rig.exchange.parquet import from_parquet, to_parquet
 from rig.inputs.errors import InputError
+from rig.inputs.folders import refuse_full
 from rig.inputs.yaml_file import parse_mapping
 from rig.io.run_log import (
     FRAMES_FILE,
@@ -57,9 +60,23 @@ def export_run(folder: Path, kind: str, out: Path) -> list[Path]:
     found = read_run(folder)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        return FORMATS[kind](found, out)
+        with _all_or_nothing(out):
+            return FORMATS[kind](found, out)
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def _all_or_nothing(out: Path) -> Generator[None]:
+    """Leave nothing under a name whose content is not whole."""
+    try:
+        yield
+    except BaseException:
+        if out.is_dir():
+            shutil.rmtree(out, ignore_errors=True)
+        else:
+            out.unlink(missing_ok=True)
+        raise
 
 
 def import_run(source: Path, folder: Path) -> None:
@@ -72,8 +89,7 @@ def import_run(source: Path, folder: Path) -> None:
     Raises:
         InputError: The source is no such export, or the folder cannot be written.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: is not empty, expected a new or an empty folder")
+    refuse_full(folder)
     content = from_parquet(source) if source.is_dir() else from_mf4(source)
     header = parse_mapping(content.files[RUN_FILE].decode("utf-8"), f"{source}: {RUN_FILE}")
     epoch_ns, channel = header.get("epoch_ns"), channel_of(header)

@@ -80,12 +80,14 @@ def _write(out: Path, names: Sequence[str], columns: Sequence[Array]) -> None:
     beside = out.with_name(out.name + ".part")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        with beside.open("w", encoding="ascii", newline="\n") as file:
+        with beside.open("x", encoding="ascii", newline="\n") as file:
             file.write(",".join(names) + "\n")
             for first in range(0, len(columns[0]), ROWS_AT_ONCE):
                 part = np.column_stack([column[first : first + ROWS_AT_ONCE] for column in columns])
                 file.writelines(_line(row) for row in part.tolist())
         beside.replace(out)
+    except FileExistsError as error:
+        raise InputError(f"{beside}: exists, expected that name to be free") from error
     except OSError as error:
         beside.unlink(missing_ok=True)
         raise InputError(f"{out}: cannot be written: {error.strerror}") from error

@@ -45,8 +45,8 @@ class Table(_Section):
     skip_lines: Annotated[int, Field(ge=0, le=100_000)] = 0
     column_names: bool = True
     skip_after_names: Annotated[int, Field(ge=0, le=1000)] = 0
-    first_row: Annotated[int, Field(ge=0)] = 0
-    rows: Annotated[int, Field(ge=1)] | None = None
+    first_row: Annotated[int, Field(ge=0, le=10**12)] = 0
+    rows: Annotated[int, Field(ge=1, le=10**12)] | None = None
 
     @model_validator(mode="after")
     def _one_meaning_a_character(self) -> "Table":

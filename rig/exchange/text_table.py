@@ -2,6 +2,7 @@
 
 import csv
 import itertools
+import re
 from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -266,7 +267,7 @@ class _Dates:
                 stamp = datetime.fromisoformat(text)
             else:
                 stamp = datetime.strptime(text, self._form)
-        except ValueError:
+        except (ValueError, re.error):
             raise InputError(
                 f"{self._source}: line {line}: time = {text[:40]!r}, "
                 f"expected a date as {self._form!r}"

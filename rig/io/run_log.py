@@ -9,6 +9,7 @@ took of the steps is computed again from the frames.
 """
 
 import contextlib
+import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -158,6 +159,27 @@ def read_run(folder: Path) -> RunFolder:
     if not isinstance(epoch_ns, int) or not 0 <= epoch_ns < LATEST_S * 1_000_000_000:
         raise InputError(f"{path}: epoch_ns: {str(epoch_ns)[:40]}: expected a Unix time in ns")
     return RunFolder(folder, header, _read_steps(parts(folder, STEPS_FILE)), epoch_ns)
+
+
+def changed_files(folder: Path) -> list[str]:
+    """Names of a run's files that are not those it ran with, by their hashes in `run.yaml`.
+
+    Raises:
+        InputError: A file cannot be read.
+    """
+    recorded = read_run(folder).header.get("files_sha256")
+    if not isinstance(recorded, dict):
+        return []
+    changed: list[str] = []
+    for name, expected in cast("dict[object, object]", recorded).items():
+        path = folder / Path(str(name)).name
+        try:
+            found = hashlib.sha256(path.read_bytes()).hexdigest()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        if found != expected:
+            changed.append(path.name)
+    return changed
 
 
 def last_frame_ns(folder: Path, epoch_ns: int) -> int:

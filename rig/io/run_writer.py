@@ -6,6 +6,7 @@ While the disk takes nothing, ticks wait in memory, and what does not fit there 
 """
 
 import contextlib
+import re
 import shutil
 import threading
 import time
@@ -158,7 +159,8 @@ class RunLog:
         """Whether ticks are being written now."""
         self._header = header
         self._epoch_ns = epoch_ns
-        self._channel = channel
+        # A line of the log has no place for blanks or anything beyond ASCII.
+        self._channel = re.sub(r"[^!-~]", "_", channel)
         self._columns = tuple(columns)
         self._rows = StepRows(columns)
         self._rotation = rotation

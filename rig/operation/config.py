@@ -223,8 +223,8 @@ class BusSettings(_Frozen):
 
     interface: Text = "virtual"
     channel: Text = "rig"
-    bitrate: Annotated[int, Field(gt=0)] = 1_000_000
-    data_bitrate: Annotated[int, Field(gt=0)] | None = None
+    bitrate: Annotated[int, Field(gt=0, le=1_000_000_000)] = 1_000_000
+    data_bitrate: Annotated[int, Field(gt=0, le=1_000_000_000)] | None = None
     options: dict[str, Any] = Field(default_factory=dict[str, Any])
 
     def config(self) -> BusConfig:
@@ -247,7 +247,7 @@ class Realtime(_Frozen):
 
     fifo_priority: Annotated[int, Field(ge=0, le=99)] = 50
     lock_memory: bool = True
-    cpu: Annotated[int, Field(ge=0)] | None = None
+    cpu: Annotated[int, Field(ge=0, le=65_535)] | None = None
     spin_s: Annotated[float, Field(ge=0, le=0.01)] = 0.0002
     freeze_garbage: bool = True
 
@@ -337,7 +337,7 @@ class RunConfig(_Frozen):
         log: Rotation, and windows that are kept apart.
     """
 
-    rate_hz: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] = 1000.0
+    rate_hz: Annotated[Finite, Field(ge=0.001, le=100_000)] = 1000.0
     duration_s: Positive | None = None
     model: Text = "reference"
     engine: Text = "dart"

@@ -17,10 +17,11 @@ from rig.core.bridge import Bridge, BridgeState, TickResult
 from rig.core.contract import Mode
 from rig.core.record import columns
 from rig.inputs.errors import InputError
+from rig.inputs.folders import refuse_full
 from rig.io.clock import Clock, OccupiedClock
 from rig.io.link import LinkFigures
 from rig.io.realtime import Granted
-from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE, RUN_SCHEMA
+from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_SCHEMA
 from rig.io.run_writer import RunLog
 from rig.io.steps import Step
 from rig.operation.loop import Port, Progress, Sink, regular_ticks, run
@@ -138,8 +139,7 @@ def logged(
         InputError: The folder cannot be written.
     """
     config = ready.config
-    if (folder / RUN_FILE).exists():
-        raise InputError(f"{folder}: holds a run already, expected an empty folder")
+    refuse_full(folder)
     _copy_inputs(ready, folder)
     header = _header(ready, clock.epoch_ns, granted, folder)
     if forced:

@@ -48,6 +48,8 @@ def load_setup(path: Path, *, model: str | None = None, duration_s: float | None
     """
     config = load_validated(RunConfig, path)
     if duration_s is not None:
+        if not 0.0 < duration_s < float("inf"):
+            raise InputError(f"--duration-s {duration_s}: expected a finite number above zero")
         config = config.model_copy(update={"duration_s": duration_s})
     return setup(config, path, None if model is None else model_file(model, Path()))
 
