@@ -1,1 +1,96 @@
-"""Hardware-in-the-loop bridge over CAN between a shock-absorber bench and a DART model."""
+"""Hardware-in-the-loop bridge over CAN between a shock-absorber bench and a DART model.
+
+What a script or a notebook needs:
+
+    import rig
+
+    run = rig.open_run("runs/7")                       # arrays by column, with units in the names
+    found = rig.diagnose(["runs/7"], "bench.yaml", held_out=["test.csv"])
+    found.write("found")
+
+Each function imports what it needs when it is called: DART and numba take seconds.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from dart_model.spec import ModelSpec
+    from rig.diagnosis.recording import Recording
+    from rig.exchange.arrays import Run
+    from rig.pages.found import Found
+
+__all__ = ["diagnose", "load_model", "open_run", "read_csv"]
+
+
+def load_model(name: Path | str) -> "ModelSpec":
+    """A model from its YAML file, or a shipped one by its name.
+
+    Raises:
+        InputError: One line that names file, key, value and what was expected.
+    """
+    from dart_model import spec
+
+    return spec.load_model(spec.model_file(str(name), Path()))
+
+
+def open_run(folder: Path | str) -> "Run":
+    """A run of the bridge as arrays.
+
+    Raises:
+        InputError: It is no run, or damaged.
+    """
+    from rig.exchange import arrays
+
+    return arrays.open_run(folder)
+
+
+def read_csv(path: Path | str, struts: Sequence[str] | None = None) -> "Recording":
+    """A recording from a CSV file with units in its header.
+
+    Args:
+        path: The file.
+        struts: Names of the model's struts, where columns name them.
+
+    Raises:
+        InputError: The file is no such table, or holds nothing that can be diagnosed.
+    """
+    from rig.diagnosis import recording
+
+    return recording.read_csv(Path(path), struts)
+
+
+def diagnose(
+    runs: Sequence["Path | str | Recording"],
+    model: "Path | str | ModelSpec",
+    held_out: Sequence["Path | str | Recording"] = (),
+    progress: Callable[[str, float], None] = lambda _what, _share: None,
+) -> "Found":
+    """Trace what a model lacks to named effects, correct it, and judge it on held-out data.
+
+    Args:
+        runs: Recordings, or folders of runs and CSV files, to learn from.
+        model: The nominal model, its file, or the name of a shipped one.
+        held_out: Recordings to judge on; without them, blocks spread over `runs` are kept back.
+        progress: Called with what is being done and the share that is done.
+
+    Returns:
+        What was found; it shows itself in a notebook.
+
+    Raises:
+        InputError: A recording or the model cannot be used.
+    """
+    from dart_model.spec import ModelSpec
+    from rig.diagnosis import diagnose as diagnosis
+    from rig.diagnosis.recording import Recording, read_recording
+    from rig.pages.found import Found
+
+    spec = model if isinstance(model, ModelSpec) else load_model(model)
+    struts = [strut.name for strut in spec.struts]
+
+    def read(given: "Path | str | Recording") -> Recording:
+        return given if isinstance(given, Recording) else read_recording(Path(given), struts)
+
+    result = diagnosis.diagnose(spec, [*map(read, runs)], [*map(read, held_out)], progress)
+    return Found(result, spec)

@@ -6,7 +6,19 @@ from typing import Any, cast
 import typer
 from rich.console import Console
 
-from rig.cli import bench, check, demo, diagnose, exchange, init, replay, run, scoreboard, timing
+from rig.cli import (
+    bench,
+    check,
+    demo,
+    diagnose,
+    docs,
+    exchange,
+    init,
+    replay,
+    run,
+    scoreboard,
+    timing,
+)
 from rig.cli.output import OK, WRONG_INPUT
 from rig.inputs.errors import InputError
 
@@ -30,6 +42,7 @@ app.command("replay", epilog=replay.EXAMPLES)(replay.replay_command)
 app.command("diagnose", epilog=diagnose.EXAMPLES)(diagnose.diagnose)
 app.command("import", epilog=exchange.IMPORT_EXAMPLES)(exchange.import_command)
 app.command("export", epilog=exchange.EXPORT_EXAMPLES)(exchange.export_command)
+app.command("docs", epilog=docs.EXAMPLES)(docs.docs)
 app.command("scoreboard", epilog=scoreboard.EXAMPLES)(scoreboard.scoreboard)
 
 _INTERRUPTED = 130

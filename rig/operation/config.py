@@ -192,7 +192,14 @@ class LimitConfig(_Frozen):
 
 
 class SupervisionConfig(_Frozen):
-    """Ages of the measurement, the output of the safe state, and the table of limits."""
+    """Ages of the measurement, the output of the safe state, and the table of limits.
+
+    Attributes:
+        stale_after_s: Age of a height from which the estimate is held and invalid.
+        safe_after_s: Age from which the safe state is entered.
+        safe_output: Force that the safe state publishes: `zero`, or the `last` valid one.
+        limits: What is done beyond which values, row by row.
+    """
 
     stale_after_s: Positive = 0.01
     safe_after_s: Positive = 0.5
@@ -219,7 +226,15 @@ class SupervisionConfig(_Frozen):
 
 
 class BusSettings(_Frozen):
-    """How to open the bus; `options` go to python-can's interface as they are."""
+    """How to open the bus.
+
+    Attributes:
+        interface: python-can's name of the interface: `socketcan`, `pcan`, `slcan`, `virtual`, ...
+        channel: Channel of the interface.
+        bitrate: Bit rate in bit/s.
+        data_bitrate: Bit rate of CAN FD payloads in bit/s; classic CAN if absent.
+        options: Further arguments, which go to python-can's interface as they are.
+    """
 
     interface: Text = "virtual"
     channel: Text = "rig"

@@ -1,0 +1,38 @@
+"""`rig docs`."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rig.cli.output import console
+
+EXAMPLES = "Example: `rig docs reference`, then open reference/index.html"
+
+
+def docs(
+    context: typer.Context,
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write into.")],
+) -> None:
+    """Write the reference: every effect, every key of a configuration, every command."""
+    from rig.pages.reference import write_reference
+
+    parent: Any = context.parent
+    texts = {name: _help(parent, name) for name in parent.command.list_commands(parent)}
+    console.print(f"Written: {write_reference(folder, texts)}")
+
+
+def _help(parent: Any, name: str) -> str:
+    """Usage, arguments and options of a command, as plain text."""
+    command = parent.command.get_command(parent, name)
+    made = command.make_context(name, [], parent=parent, resilient_parsing=True)
+    lines = [command.get_usage(made), "", (command.help or "").strip(), ""]
+    for parameter in command.get_params(made):
+        record = parameter.get_help_record(made)
+        if record is not None:
+            lines.append(f"  {record[0]:34} {record[1]}")
+        else:
+            lines.append(
+                f"  {parameter.make_metavar(made):34} {getattr(parameter, 'help', '') or ''}"
+            )
+    return "\n".join(lines)

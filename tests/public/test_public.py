@@ -1,0 +1,101 @@
+"""What a script or a notebook uses, and the reference that is made from the code."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rig
+from dart_model.effects import CATALOGUE, FAMILY_WORDS
+from rig.inputs.errors import InputError
+from rig.operation.config import CONFIGS
+from rig.operation.setup import load_setup
+from rig.pages.reference import write_reference
+from tests.loop.listed import ListPort, bench_frames, live
+from tests.public.bench import heights
+
+
+def test_importing_it_loads_nothing_slow():
+    script = "import sys, rig; print(*sys.modules)"
+    shown = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert not {"numpy", "dartpy", "numba", "pyarrow"}.intersection(shown.stdout.split())
+
+
+def test_a_model_comes_by_name():
+    by_name = rig.load_model("reference")
+    assert by_name.struts[0].stiffness_n_per_m == 500.0
+    with pytest.raises(InputError, match="model 'nosuch'"):
+        rig.load_model("nosuch")
+
+
+def test_a_run_is_arrays_by_column(tmp_path):
+    ready = load_setup(CONFIGS / "reference.yaml", duration_s=0.3)
+    live(ready, tmp_path / "run", ListPort(bench_frames(ready, 300, {}), set()))
+    run = rig.open_run(tmp_path / "run")
+    assert run.t_s.tolist() == pytest.approx(np.arange(300) * 1e-3)
+    assert run["strut.height_m"].shape == run["applied_force_n"].shape == (300,)
+    assert np.isfinite(run["strut.force_n"][1:]).all()
+    assert run.header["schema"] == 2
+    with pytest.raises(KeyError, match=r"nosuch: expected one of .*strut\.height_m"):
+        run["nosuch"]
+
+
+def test_a_diagnosis_shows_itself_and_is_written(tmp_path):
+    """A bench of the plant's own model with friction that the nominal one lacks."""
+    t_s = np.arange(0.0, 12.0, 2e-3)
+    rng = np.random.default_rng(5)
+    paths = []
+    for name, phase in (("train", 0.0), ("test", 1.0)):
+        applied, height = heights(t_s, phase)
+        path = tmp_path / f"{name}.csv"
+        noisy = height + 2e-6 * rng.standard_normal(len(height))
+        rows = "\n".join(
+            f"{a:.4f},{b:.8f},{c:.5f}" for a, b, c in zip(t_s, noisy, applied, strict=True)
+        )
+        path.write_text("t_s,height_m,applied_force_n\n" + rows + "\n")
+        paths.append(path)
+    told = []
+    found = rig.diagnose(
+        [rig.read_csv(paths[0])], "reference", [paths[1]], lambda _what, share: told.append(share)
+    )
+    assert found.diagnosis.verdict == "explained"
+    assert [effect.family for effect in found.diagnosis.effects] == ["nonlinear_stiffness"]
+    assert str(found).startswith("explained: ")
+    html = found._repr_html_()
+    assert "<table>" in html
+    assert "cubic_stiffness" in html
+    found.write(tmp_path / "found")
+    assert {path.name for path in (tmp_path / "found").iterdir()} == {
+        "diagnosis.json", "corrected.yaml", "report.html"
+    }  # fmt: skip
+    assert told[-1] == 1.0
+
+
+def test_the_reference_holds_every_effect_key_and_command(tmp_path):
+    path = write_reference(tmp_path / "reference", {"run": "Usage: rig run CONFIG"})
+    text = path.read_text("utf-8")
+    for name, effect in CATALOGUE.items():
+        if effect.family not in FAMILY_WORDS:
+            continue  # the null partner of all effects
+        assert f'id="{name}"' in text
+    for key in ("rate_hz", "bus.bitrate", "supervision.limits.action", "log.rotate_s", "engine"):
+        assert f"<code>{key}</code>" in text
+    assert "Usage: rig run CONFIG" in text
+    assert text.count("<img ") > 30
+    assert "http" not in text.replace("https://", "").replace("http://www.w3.org", "")
+
+
+def test_the_reference_says_what_every_key_means(tmp_path):
+    text = write_reference(tmp_path, {}).read_text("utf-8")
+    configuration = text[text.index('id="configuration"') : text.index('id="bus"')]
+    assert "<td></td></tr>" not in configuration
+
+
+def test_the_reference_is_one_line_where_it_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_reference(Path(tmp_path / "file" / "reference"), {})
