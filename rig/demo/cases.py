@@ -136,14 +136,15 @@ def run_case(
     ended = with_bench(
         ready, bench, folder / "run", lockstep=lockstep, stop=stop, progress=progress
     )
-    case = _compared(ended, ready, bench)
+    case = compared(ended, ready, bench)
     (folder / "summary.json").write_text(json.dumps(case.summary(), indent=2) + "\n", "utf-8")
     for strut in case.struts:
         draw(strut, folder / f"{strut.name}.png")
     return case
 
 
-def _compared(ended: Ended, ready: Setup, bench: BenchConfig) -> Case:
+def compared(ended: Ended, ready: Setup, bench: BenchConfig) -> Case:
+    """A run with a simulated bench beside the bench's truth and the model alone."""
     observed = read_run(ended.folder).steps
     t_ns = np.asarray(observed.column("t_ns").to_numpy(), dtype=np.int64)
     period_ns = ready.config.period_ns

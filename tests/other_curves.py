@@ -1,0 +1,97 @@
+"""The reference case with other curves of the bench: `python -m tests.other_curves`.
+
+The paper gives no curves of its spring and damper; those of the shipped bench were chosen so that
+its figures are met. Here the slope of each curve is multiplied, along the curve, by a smooth factor
+drawn between half and two, and the same observer follows.
+"""
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from rig.bench.config import load_bench_config
+from rig.bench.schema import BenchConfig
+from rig.demo.cases import SETTLED_NS, compared
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.setup import load_setup
+
+
+def redrawn(
+    at: tuple[float, ...], forces: tuple[float, ...], rng: np.random.Generator
+) -> list[float]:
+    """A curve with other slopes, which is where it was in its middle."""
+    knots = rng.uniform(-np.log(2.0), np.log(2.0), 4)
+    along = np.linspace(0.0, 1.0, len(at) - 1)
+    factors = np.exp(PchipInterpolator(np.linspace(0.0, 1.0, 4), knots)(along))
+    rises = np.diff(forces) * factors
+    curve = np.concatenate([[0.0], np.cumsum(rises)])
+    middle = len(at) // 2
+    return (curve - curve[middle] + forces[middle]).tolist()
+
+
+def other(bench: BenchConfig, rng: np.random.Generator) -> BenchConfig:
+    """The bench with redrawn curves of spring and damper."""
+    (strut,) = bench.struts
+    spring, damper = strut.spring, strut.damper
+    changed = strut.model_copy(
+        update={
+            "spring": spring.model_copy(
+                update={"force_n": tuple(redrawn(spring.height_m, spring.force_n, rng))}
+            ),
+            "damper": damper.model_copy(
+                update={"force_n": tuple(redrawn(damper.velocity_m_per_s, damper.force_n, rng))}
+            ),
+        }
+    )
+    return bench.model_copy(update={"struts": (changed,)})
+
+
+def main() -> None:
+    """Print the errors with each bench, and their spread."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--benches", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=1)
+    asked = parser.parse_args()
+    rng = np.random.default_rng(asked.seed)
+    shipped = load_bench_config(CONFIGS / "reference_bench.yaml")
+    ready = load_setup(CONFIGS / "reference.yaml")
+    rows: list[tuple[float, float, float, float]] = []
+    for number in range(asked.benches):
+        bench = other(shipped, rng)
+        with tempfile.TemporaryDirectory() as folder:
+            ended = with_bench(
+                ready,
+                bench,
+                Path(folder) / "run",
+                lockstep=True,
+                stop=lambda: False,
+                progress=lambda _t, _mode: None,
+            )
+            (strut,) = compared(ended, ready, bench).struts
+        figures = strut.figures(strut.observed)
+        rows.append(
+            (
+                figures.height_error_max_m * 1e3,
+                figures.force_error_rms_n,
+                100.0 * figures.force_error_rms_n / figures.force_peak_n,
+                figures.force_peak_n,
+            )
+        )
+        print(
+            f"{number}: height {rows[-1][0]:.2f} mm, force {rows[-1][1]:.2f} N = "
+            f"{rows[-1][2]:.2f} % of the peak of {rows[-1][3]:.0f} N"
+        )
+    columns = np.array(rows).T
+    for name, column in zip(
+        ("height / mm", "force / N", "force / % of peak"), columns, strict=False
+    ):
+        low, middle, high = np.percentile(column, [0, 50, 100])
+        print(f"{name}: median {middle:.2f}, {low:.2f} to {high:.2f}, after {SETTLED_NS * 1e-9} s")
+
+
+if __name__ == "__main__":
+    main()
