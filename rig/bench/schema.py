@@ -290,7 +290,7 @@ class Temperature(_Section):
 
 
 class Effect(_Section):
-    """An effect that the bench has and no model was told of.
+    """An effect that the bench has and no model declares.
 
     Attributes:
         name: One of `rig.bench.effects.EFFECT_KINDS`.
@@ -387,7 +387,7 @@ class BenchConfig(_Section):
         applied_force: The force that drives the bench, if any.
         imposed_motion: The motion that drives a strut, if any.
         temperature: The damper's temperature.
-        undeclared_effects: What the bench has and no model was told of.
+        undeclared_effects: What the bench has and no model declares.
         transmissions: Messages that the bench sends.
         seed: Seed of noise, jitter and loss.
         step_ns: Longest step of the integrator.

@@ -83,7 +83,7 @@ def _tell(seed: int, out: Path, *, lockstep: bool, duration_s: float | None) -> 
     parameters = ", ".join(f"{key} {value:.4g}" for key, value in story.effect.parameters.items())
     console.print(
         f"On a fresh run the virtual force falls from {before:.2f} N to {after:.2f} N RMS.\n"
-        f"What the bench carried, and nobody had told the diagnosis: {story.effect.name} "
+        f"What the bench carried, and the diagnosis did not know: {story.effect.name} "
         f"(family {story.family}): {parameters}.\n"
         f"Report: {out}/diagnosis/report.html"
     )

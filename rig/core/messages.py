@@ -272,10 +272,10 @@ class Outgoing:
 
     Attributes:
         message: Its definition.
-        frame: What is to be told, and the time in ns -> the frame, and whether one of its values
+        frame: What a tick reports, and the time in ns -> the frame, and whether one of its values
             saturated.
         period_ns: Time between two frames.
-        is_status: Whether it tells of what has happened since the last one of its kind.
+        is_status: Whether it reports what has happened since the last one of its kind.
     """
 
     message: Message

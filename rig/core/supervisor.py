@@ -9,7 +9,7 @@ from rig.core.contract import Measurement, Mode, StrutOutput
 
 
 class Event(IntEnum):
-    """What a tick finds, the gravest one first."""
+    """What a tick finds, the severest first."""
 
     STOP = auto()
     BEYOND_SAFE = auto()
@@ -21,9 +21,9 @@ class Event(IntEnum):
 
 
 class Action(IntEnum):
-    """What is done beyond a limit, the gravest last.
+    """What is done beyond a limit, the severest last.
 
-    WARN tells of it in the status. REFUSE also drops the measurement, with all of its frame. HOLD
+    WARN reports it in the status. REFUSE also drops the measurement, with all of its frame. HOLD
     also marks the estimate invalid as long as it lasts. SAFE enters the safe state. HOLD and SAFE
     for a measurement drop it too.
     """
@@ -94,7 +94,7 @@ def judged(limits: Sequence[Limit], seen: Seen | None, measured: Measurement) ->
         measured: The new measurement.
 
     Returns:
-        What is to be remembered, and the gravest action asked for, 0 if none.
+        What is to be remembered, and the severest action asked for, 0 if none.
     """
     height_m, t_ns = measured.height_m, measured.t_ns
     last = seen or Seen(height_m, t_ns, t_ns)
@@ -120,7 +120,7 @@ def judged(limits: Sequence[Limit], seen: Seen | None, measured: Measurement) ->
 
 
 def beyond(limits: Sequence[Limit], strut: StrutOutput) -> int:
-    """The gravest action that the limits ask for at an estimate, 0 if it is within all of them.
+    """The severest action that the limits ask for at an estimate, 0 if it is within all of them.
 
     Args:
         limits: Limits on estimated quantities; others are passed over.

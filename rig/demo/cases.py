@@ -126,7 +126,7 @@ def run_case(
         lockstep: Simulated time, as fast as the machine allows; otherwise real time.
         duration_s: Length; the configuration's own if None.
         stop: Asked before each tick whether to end.
-        progress: Told of every tick.
+        progress: Called with time and mode of every tick.
 
     Raises:
         InputError: The folder cannot be written.

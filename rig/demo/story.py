@@ -108,8 +108,8 @@ def tell(
         lockstep: Simulated time also for the first run.
         stop: Asked before each tick whether to end.
         chapter: Told what comes next.
-        progress: Told of every tick.
-        diagnosis_progress: Told of the diagnosis's steps and how far they are.
+        progress: Called with time and mode of every tick.
+        diagnosis_progress: Called with the diagnosis's steps and how far they are.
 
     Raises:
         InputError: The folder cannot be written.

@@ -1,4 +1,4 @@
-"""A bus log of another program becomes a run, as if the bridge had heard it live."""
+"""A bus log of another program becomes a run, as if the bridge had received it live."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -72,13 +72,13 @@ class _LogPort:
 def import_log(
     source: Path, ready: Setup, out: Path, progress: Progress = lambda _t, _mode: None
 ) -> ImportReport:
-    """Turn a bus log of another program into a run, as if the bridge had heard it live.
+    """Turn a bus log of another program into a run, as if the bridge had received it live.
 
     Args:
         source: BLF, ASC, candump, TRC or MF4 log of a bus.
-        ready: Configuration that says which signals are heard, with model and DBC.
+        ready: Configuration that says which signals are read, with model and DBC.
         out: Folder of the run to write; absent or empty.
-        progress: Told of every tick.
+        progress: Called with time and mode of every tick.
 
     Returns:
         What was made and what was assumed.

@@ -56,18 +56,18 @@ class Captures:
 
     Args:
         window: What is captured.
-        graver: Whether a change from one mode to another is a trigger, and its name if so.
+        capture_name: Whether a change from one mode to another is a trigger, and its name if so.
         finished: Called with every finished window.
     """
 
     def __init__(
         self,
         window: Window,
-        graver: Callable[[int, int], str | None],
+        capture_name: Callable[[int, int], str | None],
         finished: Callable[[Capture], None],
     ) -> None:
         self._window = window
-        self._graver = graver
+        self._capture_name = capture_name
         self._finished = finished
         self._before: deque[Entry] = deque()
         self._open: Capture | None = None
@@ -116,4 +116,4 @@ class Captures:
             return "bus"
         if began & LOG_FAULT:
             return "log"
-        return self._graver(self._mode, step.mode)
+        return self._capture_name(self._mode, step.mode)

@@ -14,7 +14,7 @@ _CONTROLLER_PROBLEM, _BUS_OFF, _RESTARTED = 0x004, 0x040, 0x100
 
 
 class Controller(IntEnum):
-    """State of a controller, the gravest last."""
+    """State of a controller, the severest last."""
 
     ACTIVE = 0
     WARNING = 1
@@ -23,7 +23,7 @@ class Controller(IntEnum):
 
 
 _DETAILS = ((0x30, Controller.PASSIVE), (0x0C, Controller.WARNING), (0x40, Controller.ACTIVE))
-"""Bits of the second byte of a controller problem, the gravest first, and the state they tell."""
+"""Bits of the second byte of a controller problem, the severest first, and the state they mean."""
 
 
 def state_after(state: Controller, frame: Frame) -> Controller:
@@ -34,7 +34,7 @@ def state_after(state: Controller, frame: Frame) -> Controller:
         frame: An error frame, or one of the bus, which only a controller that is on it receives.
 
     Returns:
-        The new state; an error frame that tells nothing of it (a bit error, a lost arbitration)
+        The new state; an error frame that says nothing of it (a bit error, a lost arbitration)
         leaves it as it was.
     """
     if not frame.is_error:

@@ -167,7 +167,7 @@ class Link:
             return frames[:done]
         if self._unsent_since_ns is not None and frames:
             self._unsent_since_ns = None
-            self._tell_controller()
+            self._report_controller()
         return frames
 
     @property
@@ -216,11 +216,11 @@ class Link:
             figures.passive += self._controller is Controller.PASSIVE
             figures.bus_off += self._controller is Controller.BUS_OFF
         if self._controller is not before:
-            self._tell_controller()
+            self._report_controller()
 
-    def _tell_controller(self) -> None:
-        grave = self._controller >= Controller.PASSIVE
-        self.fault = f"the controller is {self._controller.name}" if grave else None
+    def _report_controller(self) -> None:
+        faulty = self._controller >= Controller.PASSIVE
+        self.fault = f"the controller is {self._controller.name}" if faulty else None
 
     def _unsent(self, frames: Sequence[Frame], error: BusError) -> None:
         self.figures.unsent += len(frames)

@@ -128,7 +128,7 @@ class RunLog:
         priority: Real-time priority of the loop, which the thread follows; 0 for none.
         rotation: When the files are continued in others.
         window: What is captured around faults; None captures nothing.
-        graver: Whether a change of mode is a trigger of a capture, and its name if so.
+        capture_name: Whether a change of mode is a trigger of a capture, and its name if so.
 
     Raises:
         InputError: The folder cannot be created, or holds another run.
@@ -146,7 +146,7 @@ class RunLog:
         priority: int = 0,
         rotation: Rotation = Rotation(),
         window: Window | None = None,
-        graver: Callable[[int, int], str | None] = lambda _before, _now: None,
+        capture_name: Callable[[int, int], str | None] = lambda _before, _now: None,
     ) -> None:
         self.folder = folder
         self.fault: str | None = None
@@ -164,7 +164,9 @@ class RunLog:
         self._columns = tuple(columns)
         self._rows = StepRows(columns)
         self._rotation = rotation
-        self._captures = None if window is None else Captures(window, graver, self._write_capture)
+        self._captures = (
+            None if window is None else Captures(window, capture_name, self._write_capture)
+        )
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if (folder / RUN_FILE).exists():

@@ -18,7 +18,7 @@ FULL_LOAD, HIGH_LOAD = 1.0, 0.7
 
 
 class Severity(Enum):
-    """How grave a finding is; an error keeps the run from starting."""
+    """Severity of a finding; an error keeps the run from starting."""
 
     OK = "ok"
     WARNING = "warning"
@@ -30,7 +30,7 @@ class Finding:
     """One line of the check.
 
     Attributes:
-        severity: How grave it is.
+        severity: Its severity.
         what: What was looked at.
         text: What was found, with figures.
     """

@@ -162,7 +162,7 @@ class LimitConfig(_Frozen):
             estimate: `height_m`, `force_n`, `virtual_force_n`, `innovation_m`.
         low: Smallest value within.
         high: Largest value within.
-        action: `warn` tells of it in the status; `refuse` drops the measurement; `hold` marks the
+        action: `warn` reports it in the status; `refuse` drops the measurement; `hold` marks the
             estimate invalid as long as it lasts; `safe` enters the safe state.
     """
 

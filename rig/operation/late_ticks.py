@@ -1,4 +1,4 @@
-"""Why ticks were missed, told from the rows of a trace."""
+"""Why ticks were missed, from the rows of a trace."""
 
 from collections.abc import Sequence
 from enum import Enum

@@ -135,7 +135,7 @@ def with_bench(
         lockstep: Simulated time, as fast as the machine allows; otherwise real time.
         trace: Where the parts of ticks that are late are kept; None keeps nothing.
         stop: Asked before each tick whether to end.
-        progress: Told of every tick.
+        progress: Called with time and mode of every tick.
 
     Raises:
         InputError: Something of the configuration is wrong, or the folder cannot be written.
@@ -191,7 +191,7 @@ def run_bench(
         authentication: How its frames are secured; not at all if None.
         duration_s: Length; until asked to stop if None.
         stop: Asked before each frame whether to end.
-        progress: Told of the time.
+        progress: Called with the time.
 
     Returns:
         Number of frames sent.
@@ -211,11 +211,11 @@ def run_bench(
     )
     try:
         while not stop() and (end_ns is None or due_ns < end_ns):
-            # Woken at least every 0.1 s, so that Ctrl-C is heard between slow frames.
+            # Woken at least every 0.1 s, so that Ctrl-C takes effect between slow frames.
             now_ns = clock.wait_until(min(due_ns, clock.now_ns() + 100_000_000))
             # A machine that is too slow gets a slow bench, not a silent one that sends in bursts.
             frames, due_ns = bench.update(min(now_ns, due_ns + _BENCH_PORTION_NS))
-            link.receive(now_ns)  # an interface that has gone tells so here
+            link.receive(now_ns)  # an interface that has gone is noticed here
             sent += len(link.send(frames))
             progress(now_ns, Mode.RUNNING)
     finally:

@@ -133,7 +133,7 @@ def logged(
         begin: Called when all is set up, before the first tick.
         while_waiting: Called before each wait with the time that is awaited.
         stop: Asked before each tick whether to end.
-        progress: Told of every tick.
+        progress: Called with time and mode of every tick.
 
     Raises:
         InputError: The folder cannot be written.
@@ -154,7 +154,7 @@ def logged(
         priority=config.realtime.fifo_priority if granted is not None and granted.fifo else 0,
         rotation=config.log.rotation(),
         window=config.log.window(),
-        graver=_graver,
+        capture_name=_capture_name,
     )
     count = None if config.duration_s is None else _ticks(config.duration_s, config.rate_hz)
     timing, ticks, status = Timing.empty(), 0, "failed"
@@ -215,14 +215,14 @@ def _ticks(duration_s: float, rate_hz: float) -> int:
     return max(1, round(duration_s * rate_hz))
 
 
-def _graver(before: int, now: int) -> str | None:
+def _capture_name(before: int, now: int) -> str | None:
     """Name of a mode that the log captures a window around, when the bridge comes into it."""
     return Mode(now).name.lower() if now != before and now in (Mode.HOLD, Mode.SAFE) else None
 
 
 @contextlib.contextmanager
 def on_signal(number: signal.Signals, action: Callable[[], None]) -> Generator[None]:
-    """Do something when a signal comes, where this thread can be told of signals.
+    """Do something when a signal comes, where this thread receives signals.
 
     SIGUSR1 acknowledges the safe state, SIGUSR2 captures a window of the log.
     """

@@ -44,7 +44,7 @@ Sink = Callable[[Sequence[Frame], Sequence[Frame], TickResult, Step], None]
 """What a tick received and sent, what it did, and the record of it."""
 
 Progress = Callable[[int, Mode], None]
-"""Told the time and mode of a tick."""
+"""Called with time and mode of a tick."""
 
 
 def regular_ticks(

@@ -18,12 +18,12 @@ _NO_CONDITIONS = Conditions()
 _CATCHING_UP = 4
 """How often a simulated bench catches up before the first tick, each time in less time."""
 
-_TIMING_TOLD_NS = 500_000_000
+_TIMING_EVERY_NS = 500_000_000
 """How often percentiles are taken of the timing, for the bus."""
 
 
 class BusPort:
-    """A port on a bus. A fault of the bus is told with every tick; it does not stop the loop."""
+    """A port on a bus. Every tick reports a fault of the bus; it does not stop the loop."""
 
     def __init__(self, link: Link) -> None:
         self.link = link
@@ -51,23 +51,23 @@ class BusPort:
 
 
 class InformedPort:
-    """A port whose conditions tell of the log too, and of how well the rate is kept."""
+    """A port whose conditions hold the state of the log too, and how well the rate is kept."""
 
     def __init__(self, port: Port, log: RunLog, timing: Timing) -> None:
         self._port = port
         self._log = log
         self._timing = timing
-        self._told = NO_TIMING
+        self._figures = NO_TIMING
         self._calm = _NO_CONDITIONS
-        self._again_ns = _TIMING_TOLD_NS
+        self._again_ns = _TIMING_EVERY_NS
         self.send = port.send
 
     def look(self, t_ns: int) -> None:
         """Take the percentiles anew, if it is time; done in a tick it would delay that tick."""
         if t_ns >= self._again_ns:
-            self._again_ns = t_ns + _TIMING_TOLD_NS
-            self._told = _figures(self._timing)
-            self._calm = Conditions(timing=self._told)
+            self._again_ns = t_ns + _TIMING_EVERY_NS
+            self._figures = _figures(self._timing)
+            self._calm = Conditions(timing=self._figures)
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
         """Frames of the port, with what is known of log and timing."""
@@ -75,7 +75,7 @@ class InformedPort:
         if conditions is _NO_CONDITIONS and self._log.fault is None:
             return frames, self._calm
         log_fault = self._log.fault is not None
-        return frames, conditions._replace(log_fault=log_fault, timing=self._told)
+        return frames, conditions._replace(log_fault=log_fault, timing=self._figures)
 
 
 def _figures(timing: Timing) -> TimingFigures:

@@ -209,7 +209,7 @@ def test_a_second_sender_of_the_benchs_id(row):
     row(
         8,
         "a second sender of the bench's id, with valid frames",
-        "believes one of the two, refuses the other's frames, tells of a second sender "
+        "believes one of the two, refuses the other's frames, reports a second sender "
         "(BUS_FAULT in RIG_STATUS)",
         found_ms,
         "the frames of one of the two",
@@ -229,7 +229,7 @@ def test_a_second_sender_of_our_id(row):
     row(
         9,
         "a second sender of RIG_ESTIMATE",
-        "counts every frame and tells of it (BUS_FAULT in RIG_STATUS)",
+        "counts every frame and reports it (BUS_FAULT in RIG_STATUS)",
         first_ms(ticks, lambda tick: tick.counts.second_sender > 0),
         NOTHING_RECEIVED,
     )
