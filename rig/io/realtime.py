@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 
 _MCL_CURRENT_AND_FUTURE = 3
 _PR_SET_TIMERSLACK = 29
+_PR_SET_THP_DISABLE = 41
 _SWITCH_INTERVAL_S = 1e-4
 """How long another thread (the log's) may hold the interpreter when the loop wants it."""
 
@@ -45,6 +46,7 @@ class Granted:
         locked_memory: Pages locked.
         cpu: Core, or None if not pinned.
         timer_slack: Timer slack of 1 ns.
+        small_pages: No huge pages, which the kernel looks for every ten seconds and for milliseconds.
         frozen_garbage: Garbage collection frozen.
     """
 
@@ -52,6 +54,7 @@ class Granted:
     locked_memory: bool
     cpu: int | None
     timer_slack: bool
+    small_pages: bool
     frozen_garbage: bool
 
     def as_dict(self) -> dict[str, object]:
@@ -78,6 +81,7 @@ def realtime(request: Request) -> Generator[Granted]:
         locked_memory=request.lock_memory and libc.mlockall(_MCL_CURRENT_AND_FUTURE) == 0,
         cpu=_pinned(request.cpu),
         timer_slack=libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0) == 0,
+        small_pages=libc.prctl(_PR_SET_THP_DISABLE, 1, 0, 0, 0) == 0,
         frozen_garbage=request.freeze_garbage,
     )
     if request.freeze_garbage:
@@ -97,6 +101,7 @@ def realtime(request: Request) -> Generator[Granted]:
         if granted.cpu is not None:
             os.sched_setaffinity(0, affinity)
         libc.prctl(_PR_SET_TIMERSLACK, 0, 0, 0, 0)
+        libc.prctl(_PR_SET_THP_DISABLE, 0, 0, 0, 0)
         sys.setswitchinterval(switch_interval_s)
 
 
