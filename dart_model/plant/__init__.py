@@ -6,6 +6,7 @@
     backend       the acceleration, which DART is asked for
     integrator    Kutta's method, and how long its steps may be
     mechanism     struts on joints: the equations of motion
+    state         what goes in and comes out
     prescribed    a strut whose motion is given, as on a dyno
 
 Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008).
@@ -58,8 +59,8 @@ class DartPlant:
         spec: The model.
 
     Raises:
-        InputError: A skeleton file is wrong, a body that a strut names is not in it, or the bench
-            is too stiff to be simulated.
+        InputError: A skeleton file is wrong, a body that a strut names is not in it, no joint moves
+            a strut, an effect has no value, or the bench is too stiff to be simulated.
     """
 
     def __init__(self, spec: ModelSpec) -> None:
@@ -156,7 +157,7 @@ class DartPlant:
 
         Args:
             loaded: State at the beginning and the forces on it; virtual forces are held.
-            dt_s: Duration; divided into steps of at most `step_s`.
+            dt_s: Duration; divided into steps of at most `step_s`, and into 10 000 at most.
             applied_force_end_n: Applied force at the end; it is linear in between.
 
         Returns:

@@ -25,10 +25,11 @@ def write_summary(folder: Path, summary: dict[str, object]) -> None:
     """Write `summary.json`.
 
     Raises:
-        InputError: The folder cannot be written.
+        InputError: The folder cannot be written, or holds a run or another summary.
     """
-    if (folder / "run.yaml").exists():
-        raise InputError(f"--out {folder}: holds a run, expected another folder")
+    for name in ("run.yaml", "summary.json"):
+        if (folder / name).exists():
+            raise InputError(f"--out {folder}: holds {name}, expected a folder without one")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", "utf-8")

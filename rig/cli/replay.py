@@ -40,6 +40,9 @@ def replay_command(
     if result.steps.num_rows == 0:
         console.print("The run holds no tick: nothing was compared.", style="red")
         raise typer.Exit(FAILED)
+    missing = result.logged - result.steps.num_rows
+    if missing > 0:
+        console.print(f"{missing} steps have no frames and were not compared.", style="yellow")
     for name in changed_files(folder):
         console.print(f"{name} is not the one that ran: its hash differs.", style="yellow")
     if result.different:

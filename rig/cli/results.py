@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from rig.operation.logged_run import Ended
 
 
+_OF_TICKS = ("stale", "overruns", "limited", "bus_faulty")
+"""Counts of ticks; the others are of frames."""
+
+
 def print_case(case: "Case") -> None:
     """Print how far the model was from the bench, strut by strut."""
     for strut in case.struts:
@@ -94,7 +98,7 @@ def print_ended(ended: "Ended", *, with_timing: bool) -> None:
     table = Table("Run", f"{ended.ticks} ticks, ended {ended.state.core.mode.name}")
     for name, value in ended.state.counts._asdict().items():
         if value or name in ("lost", "refused", "overruns"):
-            what = "ticks" if name in ("stale", "overruns") else "frames"
+            what = "ticks" if name in _OF_TICKS else "frames"
             table.add_row(f"{name.replace('_', ' ')} ({what})", str(value))
     if with_timing:
         timing = ended.timing

@@ -1,5 +1,6 @@
 """`rig run`."""
 
+import contextlib
 import json
 import time
 from pathlib import Path
@@ -75,7 +76,8 @@ def run(
         )
         # Inside: a second Ctrl-C must not lose it.
         text = json.dumps(ended.summary(), indent=2) + "\n"
-        (folder / "summary.json").write_text(text, "utf-8")
+        with contextlib.suppress(OSError):  # a full disk, which the table below reports
+            (folder / "summary.json").write_text(text, "utf-8")
     print_ended(ended, with_timing=True)
     console.print(f"Run: {folder}")
     if ended.state.core.mode is Mode.SAFE:

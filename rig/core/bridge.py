@@ -356,10 +356,12 @@ def _noted(ledger: Ledger, output: StepOutput, action: int, conditions: Conditio
 def _reported(ledger: Ledger, item: Outgoing, conditions: Conditions, *, saturated: bool) -> Ledger:
     """After a status, or after a frame with a value at the end of its range."""
     counts = ledger.counts
-    if not item.is_status:
-        return replace(ledger, counts=counts._replace(saturated=counts.saturated + saturated))
-    # A status that cannot be sent reports to nobody.
-    return ledger if conditions.bus_fault else replace(ledger, reported=counts)
+    if saturated:
+        ledger = replace(ledger, counts=counts._replace(saturated=counts.saturated + 1))
+    # A frame reports what was counted before it; one that cannot be sent reports nothing.
+    if item.is_status and not conditions.bus_fault:
+        ledger = replace(ledger, reported=counts)
+    return ledger
 
 
 def _next_due_ns(due_ns: int, t_ns: int, period_ns: int) -> int:

@@ -81,7 +81,7 @@ class Counts(NamedTuple):
     Attributes:
         lost: Frames missing in the counters' sequences.
         refused: Frames not accepted.
-        stale: Ticks without a fresh measurement.
+        stale: Ticks in HOLD.
         overruns: Ticks that were missed.
         saturated: Frames sent with a value at the limit of its range.
         wrong_crc: Frames refused for their CRC.
@@ -238,7 +238,8 @@ STATUS = (
     _status("bus_fault", _is_bus_faulty),
     _status("log_fault", lambda report: report.conditions.log_fault),
 )
-"""What is published of the bridge; faults are those since the last status."""
+"""What is published of the bridge. Faults of encoding, limits and bus are those since the last
+status, the others are of now."""
 
 
 def _timing(key: str, value: Callable[[TimingFigures], float]) -> Publication:

@@ -47,6 +47,9 @@ class RigCore:
         plant: The model.
         observers: One for each of the model's struts, in their order.
         supervision: Ages and safe output.
+
+    Raises:
+        ValueError: There are more or fewer observers than struts.
     """
 
     def __init__(

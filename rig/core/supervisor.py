@@ -151,7 +151,7 @@ class Supervision:
     """When a measurement is too old, what the safe state publishes, and the limits.
 
     Attributes:
-        stale_after_ns: Age at which the integral is frozen and the estimate marked invalid.
+        stale_after_ns: Age at which the estimate is marked invalid.
         safe_after_ns: Age at which the safe state is entered.
         safe_holds_last: The safe state publishes the last valid force; otherwise zero.
         limits: What is done beyond which values.

@@ -37,7 +37,7 @@ def diagnose_runs(
     if (out / RUN_FILE).exists():
         raise InputError(f"{out}: holds a run, expected another folder for what was found")
     # Before a search that takes minutes, not after it.
-    for name in (DIAGNOSIS_FILE, CORRECTED_FILE):
+    for name in (DIAGNOSIS_FILE, CORRECTED_FILE, "report.html"):
         if (out / name).exists():
             raise InputError(f"{out}: holds {name} already, expected a folder without one")
     standing = next(folder for folder in (out, *out.absolute().parents) if folder.exists())

@@ -46,7 +46,7 @@ class Granted:
         locked_memory: Pages locked.
         cpu: Core, or None if not pinned.
         timer_slack: Timer slack of 1 ns.
-        small_pages: No huge pages, which the kernel looks for every ten seconds and for milliseconds.
+        small_pages: No huge pages: the kernel searches memory for them every ten seconds.
         frozen_garbage: Garbage collection frozen.
     """
 

@@ -21,6 +21,7 @@ from rig.core.messages import (
 from rig.core.prescribed import PrescribedCore
 from rig.core.quantities import HEIGHT
 from rig.core.step import RigCore
+from rig.inputs.errors import InputError
 from rig.operation.setup import Setup
 
 ENGINES: Mapping[str, Callable[[ModelSpec], Plant]] = MappingProxyType({"dart": DartPlant})
@@ -48,9 +49,14 @@ def build_plant(ready: Setup, model: ModelSpec | None = None) -> Plant:
     """The model that runs beside the bench, in the configuration's engine.
 
     Raises:
-        InputError: The model cannot be built.
+        InputError: There is no such engine, or the model cannot be built.
     """
-    return ENGINES[ready.config.engine](model or ready.model)
+    make = ENGINES.get(ready.config.engine)
+    if make is None:
+        raise InputError(
+            f"{ready.source}: engine {ready.config.engine!r}: expected one of {', '.join(ENGINES)}"
+        )
+    return make(model or ready.model)
 
 
 def _core(ready: Setup, model: ModelSpec) -> Core:

@@ -6,6 +6,7 @@ from enum import Enum
 
 from can_dbc.bus_load import frame_time_s
 from can_dbc.database import Message
+from rig.core.quantities import LOAD_CELL_FORCE
 from rig.core.stability import Pole, closed_loop_poles
 from rig.operation.assembly import build_bridge, build_plant
 from rig.operation.setup import Setup, load_authentication
@@ -54,7 +55,7 @@ def check(ready: Setup) -> list[Finding]:
         All findings, good ones too.
 
     Raises:
-        InputError: The model cannot be built.
+        InputError: The model cannot be built, or a key cannot be read.
         DatabaseError: A signal or its unit is wrong.
     """
     build_bridge(ready)
@@ -103,7 +104,11 @@ def _rate(message: Message, period_ns: int) -> Finding:
         )
     text = f"a frame every {cycle_ns * 1e-6:g} ms, a tick every {period_ns * 1e-6:g} ms"
     if cycle_ns < period_ns:
-        return Finding(Severity.WARNING, what, f"{text}: only the last frame before a tick is used")
+        return Finding(
+            Severity.WARNING,
+            what,
+            f"{text}: each is used at its own time, at one core step a frame",
+        )
     if cycle_ns % period_ns:
         return Finding(Severity.WARNING, what, f"{text}: no whole number of ticks a frame")
     return Finding(Severity.OK, what, text)
@@ -111,7 +116,11 @@ def _rate(message: Message, period_ns: int) -> Finding:
 
 def _staleness(ready: Setup, heights: list[Message]) -> Finding:
     stale_ns = round(ready.config.supervision.stale_after_s * 1e9)
-    slowest_ns = max(message.cycle_time_ns or 0 for message in heights)
+    messages = list(heights)
+    if ready.config.prescribed_motion is not None:
+        cell = ready.config.signals.others[LOAD_CELL_FORCE]
+        messages.append(ready.database.message(cell.message))
+    slowest_ns = max(message.cycle_time_ns or 0 for message in messages)
     text = f"stale after {stale_ns * 1e-6:g} ms, slowest measurement every {slowest_ns * 1e-6:g} ms"
     if stale_ns < slowest_ns + ready.config.period_ns:
         return Finding(
@@ -178,11 +187,11 @@ def _stability(ready: Setup, heights: list[Message]) -> list[Finding]:
     late = closed_loop_poles(plant, observers, rest, config.period_ns, every, delay=1)
     worst = max(pole.magnitude for pole in late)
     text = f"largest |z| {worst:.5f} with measurements one cycle late"
-    if worst >= 1.0 and findings[0].severity is not Severity.ERROR:
+    if worst < 1.0:
+        findings.append(Finding(Severity.OK, "poles, one cycle late", text))
+    elif findings[0].severity is not Severity.ERROR:
         text += ": unstable; keep bench and bridge in step, or lower K_P or raise the rate"
         findings.append(Finding(Severity.WARNING, "poles, one cycle late", text))
-    else:
-        findings.append(Finding(Severity.OK, "poles, one cycle late", text))
     return findings
 
 

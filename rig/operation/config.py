@@ -195,7 +195,7 @@ class SupervisionConfig(_Frozen):
     """Ages of the measurement, the output of the safe state, and the table of limits.
 
     Attributes:
-        stale_after_s: Age of a height from which the estimate is held and invalid.
+        stale_after_s: Age of a height from which the estimate is marked invalid.
         safe_after_s: Age from which the safe state is entered.
         safe_output: Force that the safe state publishes: `zero`, or the `last` valid one.
         limits: What is done beyond which values, row by row.
@@ -338,8 +338,8 @@ class RunConfig(_Frozen):
         authentication: Authentication of all frames; none if absent.
         signals: What is read from it.
         prescribed_motion: Declares a dyno; there is then a load cell and no applied force.
-        observers: One for each strut of the model, by strut name; none for a dyno. `kind`
-            says which, `pi` if absent; its other keys are its own.
+        observers: One for each strut of the model, by strut name; PI where none is named.
+            `kind` says which, `pi` if absent; its other keys are its own. A dyno uses none.
         publish: What is published of each strut, by strut name: signals by the keys of
             `rig.core.messages.STRUT`. By default, where the DBC has them, RIG_ESTIMATE and
             RIG_KINEMATICS for the first strut, and the same with _2, _3, ... for the next ones.

@@ -78,15 +78,16 @@ def late_ticks(rows: Sequence[Row], period_ns: int) -> list[LateTick]:
         if row.deadline_ns - before.deadline_ns == period_ns
         and row.woke_ns - row.deadline_ns < period_ns
     ]
-    if not on_time:
-        return []
-    usual = {part: median(parts[part] for parts in on_time) for part in on_time[0]}
+    usual = {part: median([parts[part] for parts in on_time] or [0]) for part in _PARTS}
     late = [
         _explained(before, row, period_ns, usual)
         for before, row in pairs
         if row.woke_ns - row.deadline_ns >= period_ns
     ]
-    return _by_host(late, rows[-1].steal_ns - rows[0].steal_ns)
+    return _by_host(late, rows[-1].steal_ns - rows[0].steal_ns) if late else []
+
+
+_PARTS = ("receive", "compute", "send", "log", "between", "wait")
 
 
 def _parts(before: Row, row: Row) -> dict[str, int]:

@@ -190,7 +190,7 @@ def run_bench(
         dbc: What its messages mean; the package's own if None.
         authentication: How its frames are secured; not at all if None.
         duration_s: Length; until asked to stop if None.
-        stop: Asked before each frame whether to end.
+        stop: Asked at least every 0.1 s whether to end.
         progress: Called with the time.
 
     Returns:

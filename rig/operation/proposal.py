@@ -17,7 +17,7 @@ _WORDS: dict[Quantity, tuple[str, ...]] = {
 }
 """Parts of names by which a signal is preferred among those of the right unit."""
 
-_ESTIMATE_WORDS = ("estim", "schaetz", "calc", "model", "virtual", "cmd", "set", "out", "soll")
+_ESTIMATE_WORDS = ("estim", "schaetz", "calc", "spring", "damper", "cmd", "set", "out", "soll")
 _MOST_OTHERS = 4
 """Other candidates that are named in a comment."""
 
@@ -38,8 +38,8 @@ def propose(database: Database) -> str:
     """YAML of a configuration for a bus whose DBC is known.
 
     Units decide what a signal may be, names which of them it is, and the node that sends the height
-    which messages are the bench's; every other candidate stands in a comment. It is a proposal:
-    whoever knows the bench reads it before it runs.
+    which messages are the bench's; up to four other candidates stand in a comment. It is a
+    proposal: whoever knows the bench reads it before it runs.
 
     Args:
         database: The DBC.
@@ -56,7 +56,8 @@ def propose(database: Database) -> str:
     bench = heights[0].message.sender
     messages = database.messages.values()
     received = [item for item in messages if item.sender == bench]
-    others = [item for item in messages if item.sender != bench or item is not heights[0].message]
+    # A DBC that names no nodes says nothing of who sends what.
+    others = [item for item in messages if item.sender != bench] or list(messages)
     lines = [
         "model: reference          # the bench's own model file",
         f"dbc: {database.path.name}",

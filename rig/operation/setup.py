@@ -162,10 +162,15 @@ def _default_messages(struts: list[str], database: Database) -> dict[str, Mapped
 
 
 def _all_in(message: str, publications: Iterable[Publication], database: Database) -> Mapped:
-    """Every publication by its own signal's name, if the DBC has the message."""
+    """The publications that a message has a signal of that name for, if the DBC has it."""
     if message not in database.messages:
         return {}
-    return {item.key: SignalName(message=message, signal=item.signal) for item in publications}
+    signals = database.messages[message].signals
+    return {
+        item.key: SignalName(message=message, signal=item.signal)
+        for item in publications
+        if item.signal in signals
+    }
 
 
 def _check_messages(config: RunConfig, database: Database, source: Path) -> None:

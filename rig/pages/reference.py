@@ -62,9 +62,11 @@ def write_reference(folder: Path, commands: Mapping[str, str]) -> Path:
         commands: Help text of each command, by its name.
 
     Raises:
-        InputError: The folder cannot be written.
+        InputError: The folder cannot be written, or holds one already.
     """
     path = folder / "index.html"
+    if path.exists():
+        raise InputError(f"{path}: exists, expected a folder without it")
     text = _page(commands)
     try:
         folder.mkdir(parents=True, exist_ok=True)

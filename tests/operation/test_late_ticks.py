@@ -115,3 +115,10 @@ def test_a_run_without_a_trace_is_told_in_one_line(tmp_path):
     (tmp_path / "trace.arrow").write_bytes(b"no arrow")
     with pytest.raises(InputError, match="is no trace"):
         read_trace(tmp_path)
+
+
+def test_a_run_without_a_tick_on_time_has_its_gaps_all_the_same():
+    late = {k: {"overslept_ns": 3 * MS} for k in range(1, 60, 4)}
+    found = late_ticks(rows(late, ticks=60), MS)
+    assert len(found) == 14
+    assert {item.part for item in found} == {"wait"}

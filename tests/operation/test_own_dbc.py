@@ -7,12 +7,13 @@ import cantools
 import pytest
 import yaml
 
-from can_dbc.database import load_database
+from can_dbc.database import DEFAULT_DATABASE, load_database
 from rig.inputs.errors import InputError
 from rig.io.bus import Bus
 from rig.io.clock import VirtualClock
 from rig.io.link import Link, LinkFigures
 from rig.operation.assembly import build_bridge
+from rig.operation.config import CONFIGS
 from rig.operation.logged_run import logged
 from rig.operation.ports import BusPort
 from rig.operation.proposal import propose
@@ -126,3 +127,25 @@ def test_what_was_proposed_runs_over_a_bus_and_replays(dbc, tmp_path):
     assert len(bench.forces) == 300
     found = replay(tmp_path / "run")
     assert (found.logged, found.different) == (300, 0)
+
+
+def test_several_messages_of_the_bench_leave_the_estimate_to_another_node(dbc):
+    text = DBC.replace(
+        "BO_ 400",
+        'BO_ 300 SENSOR_2: 8 SENSOR\n SG_ SetForce : 7|16@0- (0.1,0) [-3000|3000] "N" CONTROL\n\nBO_ 400',
+    )
+    dbc.write_text(text)
+    published = yaml.safe_load(propose(load_database(dbc)))["publish"]
+    assert published == {"force": {"message": "CONTROL_1", "signal": "EstimatedForce"}}
+
+
+def test_the_packages_own_dbc_gives_its_own_estimate():
+    published = yaml.safe_load(propose(load_database(DEFAULT_DATABASE)))["publish"]
+    assert published["force"]["signal"] == "SPRING_DAMPER_FORCE"
+
+
+def test_an_engine_that_is_not_there_is_one_line(tmp_path):
+    text = (CONFIGS / "reference.yaml").read_text() + "\nengine: magic\n"
+    (tmp_path / "my.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"my\.yaml: engine 'magic': expected one of dart"):
+        build_bridge(load_setup(tmp_path / "my.yaml"))
