@@ -80,6 +80,10 @@ def run(
             (folder / "summary.json").write_text(text, "utf-8")
     print_ended(ended, with_timing=True)
     console.print(f"Run: {folder}")
+    if ended.state.core.mode is Mode.WAITING:
+        wanted = sorted({entry.message for entry in ready.config.signals.height.values()})
+        console.print(f"No valid height came: expected frames of {', '.join(wanted)}.", style="red")
+        raise typer.Exit(FAILED)
     if ended.state.core.mode is Mode.SAFE:
         console.print("The run ended in its safe state.", style="red")
         raise typer.Exit(FAILED)

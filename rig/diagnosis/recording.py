@@ -285,6 +285,11 @@ def read_run(folder: Path) -> Recording:
         return np.interp(t_s, own_t_s, values) if len(own_t_s) else None
 
     cell = other(LOAD_CELL_FORCE)
+    if cell is None and other(APPLIED_FORCE) is None:
+        raise RecordingError(
+            f"{folder}: has heights alone, expected signals.applied_force or "
+            "signals.load_cell_force in its configuration, and frames of it"
+        )
     # The bus carries one load cell; with several struts nothing says whose it is.
     return checked(
         Recording(

@@ -143,6 +143,10 @@ def load_validated(model: type[_Model], path: Path, context: object = None) -> _
     return validated(model, parse_mapping(read_text(path), str(path)), str(path), context)
 
 
+_NO_MAPPING = ("dict_type", "model_type", "model_attributes_type", "dataclass_type")
+"""pydantic's names for a value where keys and values are wanted."""
+
+
 def _one_line(error: ValidationError, model: type[BaseModel], source: str) -> str:
     errors = error.errors(include_url=False)
     # A list whose items are wrong is also called too short: that says nothing more.
@@ -150,7 +154,7 @@ def _one_line(error: ValidationError, model: type[BaseModel], source: str) -> st
     errors = [item for item in errors if item["type"] != "too_short" or len(item["loc"]) == deepest]
     first = max(errors, key=lambda item: (len(item["loc"]), item["type"] == "extra_forbidden"))
     # Parts in angle brackets are not keys: they tell apart what may stand under one.
-    parts = [part for part in first["loc"] if not str(part).startswith("<")]
+    parts = [part for part in first["loc"] if part != "" and not str(part).startswith("<")]
     key = ".".join(str(part) for part in parts) or "top level"
     more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
     cause = cast("dict[str, object]", first.get("ctx", {})).get("error")
@@ -160,9 +164,18 @@ def _one_line(error: ValidationError, model: type[BaseModel], source: str) -> st
     kind = first["type"]
     if kind == "missing":
         return f"{source}: {key}: is missing, expected a value{more}"
-    if kind == "extra_forbidden":
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         known = ", ".join(_keys(model.model_json_schema(), parts[:-1]))
-        return f"{source}: {key}: unknown key, expected one of {known}{more}"
+        expected = f", expected one of {known}" if known else ""
+        return f"{source}: {key}: unknown key{expected}{more}"
+    if kind == "union_tag_invalid":
+        context = cast("dict[str, str]", first.get("ctx", {}))
+        tag, choices = (context[name].strip("'<>") for name in ("tag", "expected_tags"))
+        expected = choices.replace("'", "").replace("<", "").replace(">", "")
+        return f"{source}: {key}: {tag!r}: expected one of {expected}{more}"
+    if kind in _NO_MAPPING:
+        shown = repr(cast("object", first["input"]))[:60]
+        return f"{source}: {key}: {shown}: expected keys and values{more}"
     value = repr(cast("object", first["input"]))
     shown = value if len(value) <= 60 else value[:57] + "..."
     return f"{source}: {key}: {shown}: {first['msg'][0].lower()}{first['msg'][1:]}{more}"

@@ -65,13 +65,14 @@ class Signals(_Frozen):
 
     height: Annotated[dict[str, SignalName], Field(min_length=1)]
 
-    @model_validator(mode="after")
-    def _known(self) -> "Signals":
-        known = [quantity.key for quantity in OTHERS]
-        for key in self.__pydantic_extra__:
-            if key not in known:
+    @model_validator(mode="before")
+    @classmethod
+    def _known(cls, data: object) -> object:
+        keys = list(cast("dict[object, object]", data)) if isinstance(data, dict) else []
+        for key in keys:
+            if key not in _KEYS:
                 raise ValueError(f"{key}: unknown key, expected one of {', '.join(_KEYS)}")
-        return self
+        return cast("object", data)
 
     @property
     def others(self) -> dict[Quantity, SignalName]:
@@ -91,10 +92,10 @@ class Signals(_Frozen):
 
 
 def _observer_kind(data: object) -> object:
-    """Which of `OBSERVERS` an entry is."""
+    """Which of `OBSERVERS` an entry is, in brackets: it is no key of the file."""
     if isinstance(data, dict):
-        return cast("dict[str, object]", data).get("kind", DEFAULT_KIND)
-    return getattr(data, "kind", None)
+        return f"<{cast('dict[str, object]', data).get('kind', DEFAULT_KIND)}>"
+    return f"<{getattr(data, 'kind', None)}>"
 
 
 class _OneOfObservers:
@@ -104,7 +105,7 @@ class _OneOfObservers:
     def __get_pydantic_core_schema__(
         cls, _source: object, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        choices = {kind: handler.generate_schema(made) for kind, made in OBSERVERS.items()}
+        choices = {f"<{kind}>": handler.generate_schema(made) for kind, made in OBSERVERS.items()}
         return tagged_union_schema(choices, _observer_kind)
 
 
@@ -125,9 +126,15 @@ Mapped = dict[str, SignalName]
 
 
 def _is_of_one_strut(published: object) -> bool:
-    """Whether keys are those of publications, and not names of struts."""
-    keys = cast("dict[object, object]", published) if isinstance(published, dict) else {}
-    return any(item.key in keys for item in STRUT)
+    """Whether its keys are publications, and not names of struts."""
+    given = cast("dict[object, object]", published) if isinstance(published, dict) else {}
+    keys = [item.key for item in STRUT]
+    return any(key in keys or not _is_group(value) for key, value in given.items())
+
+
+def _is_group(value: object) -> bool:
+    """Whether it is what one strut publishes, and not a signal."""
+    return isinstance(value, dict) and "message" not in value and "signal" not in value
 
 
 def _mapping(choices: Sequence[Publication]) -> Callable[[object], object]:

@@ -16,6 +16,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from dart_model.effects import CATALOGUE, FAMILY_WORDS, Effect, Motion
+from dart_model.spec import ModelSpec
 from rig.core.messages import STATUS, STRUT, TIMING
 from rig.core.observers import OBSERVERS
 from rig.core.quantities import HEIGHT, OTHERS
@@ -81,7 +82,8 @@ def _page(commands: Mapping[str, str]) -> str:
         "<h1>rig: reference</h1><p>Made from the code by <code>rig docs</code>. SI everywhere; "
         "every strut force is positive when it pushes its two bodies apart.</p>",
         '<nav><a href="#effects">Effects</a><a href="#configuration">Configuration</a>'
-        '<a href="#bus">What is measured and published</a><a href="#commands">Commands</a></nav>',
+        '<a href="#bus">What is measured and published</a><a href="#model">Model file</a>'
+        '<a href="#commands">Commands</a></nav>',
         '<h2 id="effects">Effects</h2><p>Each is drawn at the parameters with which a search '
         "begins, over a stroke of 100 mm at 2.4 Hz: force over height, and over velocity.</p>",
     ]
@@ -97,6 +99,8 @@ def _page(commands: Mapping[str, str]) -> str:
         parts.append(_keys(observer))
     parts.append('<h2 id="bus">What is measured and published</h2>')
     parts.append(_bus())
+    parts.append('<h2 id="model">Model file</h2>')
+    parts.append(_keys(ModelSpec))
     parts.append('<h2 id="commands">Commands</h2>')
     for name, text in commands.items():
         parts.append(f"<h3>rig {escape(name)}</h3><pre>{escape(text)}</pre>")
@@ -205,6 +209,8 @@ def _rows(model: type[Any], prefix: str) -> Iterator[tuple[str, str, str]]:
         model.model_fields if issubclass(model, BaseModel) else model.__pydantic_fields__
     )
     for name, field in fields.items():
+        if getattr(field, "exclude", False):
+            continue
         default = field.get_default(call_default_factory=True)
         section = _section(field.annotation)
         meaning = meanings.get(name, "")

@@ -124,6 +124,10 @@ def test_a_channel_of_any_name_gives_a_log_that_can_be_read(tmp_path, channel, w
         ("observers: {strut: {kind: magic}}", "magic"),
         ("publish: {force: {message: RIG_ESTIMATE}}", "signal"),
         ("publish: {strut: {torque: {message: A, signal: B}}}", "torque"),
+        ("publish: {frce: {message: A, signal: B}}", "frce: unknown key"),
+        ("publish: {force: RIG_ESTIMATE}", "expected keys and values"),
+        ("signals: {heigth: {message: A, signal: B}}", "heigth: unknown key"),
+        ("observers: {strut: {proportional: 1.0}}", "strut.proportional: unknown key"),
     ],
 )  # fmt: skip
 def test_a_wrong_configuration_is_one_line(tmp_path, monkeypatch, capsys, text, words):
@@ -154,3 +158,27 @@ def test_a_wrong_command_line_is_one_line(monkeypatch, capsys, arguments, words)
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert words in error
+
+
+def test_a_run_that_never_had_a_height_is_no_success(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "my.yaml"
+    text = (CONFIGS / "reference.yaml").read_text().replace("channel: rig", "channel: silent")
+    path.write_text(text + "realtime: {fifo_priority: 0, lock_memory: false}\n")
+    arguments = ("run", path, "--out", tmp_path / "run", "--duration-s", 0.05)
+    assert rig(monkeypatch, *arguments) == 1
+    assert "expected frames of BENCH_MEASUREMENT" in capsys.readouterr().out
+
+
+def test_a_run_with_heights_alone_is_not_diagnosed(tmp_path, monkeypatch, capsys):
+    ready = load_setup(CONFIGS / "reference.yaml", duration_s=1.0)
+    signals = ready.config.signals.model_copy(
+        update=dict.fromkeys(("applied_force", "load_cell_force", "temperature"))
+    )
+    config = ready.config.model_copy(update={"signals": signals})
+    ready = ready.model_copy(update={"config": config})
+    live(ready, tmp_path / "run", ListPort(bench_frames(ready, 1000, {}), set()))
+    arguments = ("diagnose", tmp_path / "run", "--model", "reference", "--out", tmp_path / "found")
+    assert rig(monkeypatch, *arguments) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "has heights alone" in error

@@ -132,7 +132,8 @@ def test_what_was_proposed_runs_over_a_bus_and_replays(dbc, tmp_path):
 def test_several_messages_of_the_bench_leave_the_estimate_to_another_node(dbc):
     text = DBC.replace(
         "BO_ 400",
-        'BO_ 300 SENSOR_2: 8 SENSOR\n SG_ SetForce : 7|16@0- (0.1,0) [-3000|3000] "N" CONTROL\n\nBO_ 400',
+        "BO_ 300 SENSOR_2: 8 SENSOR\n"
+        ' SG_ SetForce : 7|16@0- (0.1,0) [-3000|3000] "N" CONTROL\n\nBO_ 400',
     )
     dbc.write_text(text)
     published = yaml.safe_load(propose(load_database(dbc)))["publish"]

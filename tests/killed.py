@@ -1,0 +1,84 @@
+"""What a SIGKILL takes: `python -m tests.killed --out DIR`.
+
+The reference case runs in real time in a process of its own, which counts what was received in
+memory that outlives it; it is killed at random moments, and what stands on the disk is counted.
+"""
+
+import argparse
+import mmap
+import multiprocessing
+import os
+import signal
+import struct
+import time
+from pathlib import Path
+
+import numpy as np
+
+from rig.bench.config import load_bench_config
+from rig.io.run_log import read_run
+from rig.io.run_writer import RunLog
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup
+
+_COUNTS = struct.Struct("<qq")
+"""Frames received, and ticks."""
+
+
+def run(folder: Path, counts: mmap.mmap) -> None:
+    """Run the reference case until killed; what was received is counted before it is logged."""
+    add, total = RunLog.add, [0, 0]
+
+    def counted(self, received, sent, step):
+        total[0] += len(received)
+        total[1] += 1
+        counts[: _COUNTS.size] = _COUNTS.pack(*total)
+        add(self, received, sent, step)
+
+    RunLog.add = counted
+    with_bench(
+        load_setup(CONFIGS / "reference.yaml", duration_s=60.0),
+        load_bench_config(CONFIGS / "reference_bench.yaml"),
+        folder,
+        lockstep=False,
+        stop=lambda: False,
+        progress=lambda _t, _mode: None,
+    )
+
+
+def main() -> None:
+    """Kill ten runs, and print what each lost."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--kills", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=1)
+    asked = parser.parse_args()
+    rng = np.random.default_rng(asked.seed)
+    worst = 0
+    for number in range(asked.kills):
+        counts = mmap.mmap(-1, _COUNTS.size)
+        folder = asked.out / f"run{number}"
+        process = multiprocessing.get_context("fork").Process(target=run, args=(folder, counts))
+        process.start()
+        while _COUNTS.unpack(counts[: _COUNTS.size])[1] == 0:
+            time.sleep(0.01)
+        time.sleep(float(rng.uniform(0.3, 4.0)))
+        os.kill(process.pid or 0, signal.SIGKILL)
+        process.join()
+        received, ticks = _COUNTS.unpack(counts[: _COUNTS.size])
+        found = read_run(folder)
+        kept = sum(direction == "R" for _, direction in found.frames())
+        again = replay(folder)
+        worst = max(worst, received - kept)
+        print(
+            f"{number}: received {received} frames in {ticks} ticks; on the disk {kept} frames, "
+            f"{found.steps.num_rows} steps; replayed {again.steps.num_rows} ticks, "
+            f"{again.different} different"
+        )
+    print(f"lost at most {worst} frames")
+
+
+if __name__ == "__main__":
+    main()
