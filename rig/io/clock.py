@@ -80,17 +80,15 @@ class VirtualClock:
         return self._now_ns
 
 
-class OccupiedClock:
-    """A clock whose waits begin with something to do, which then takes time that is waited anyway.
+class WrappedClock:
+    """A clock that does something of its own around the waits of another.
 
     Args:
-        clock: The clock.
-        occupation: Called before each wait, with the time that is awaited.
+        clock: The other clock.
     """
 
-    def __init__(self, clock: Clock, occupation: Callable[[int], None]) -> None:
+    def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self._occupation = occupation
 
     @property
     def epoch_ns(self) -> int:
@@ -106,6 +104,23 @@ class OccupiedClock:
         return self._clock.now_ns()
 
     def wait_until(self, t_ns: int) -> int:
+        """Wait as the other clock does."""
+        return self._clock.wait_until(t_ns)
+
+
+class OccupiedClock(WrappedClock):
+    """A clock whose waits begin with something to do, which then takes time that is waited anyway.
+
+    Args:
+        clock: The clock.
+        occupation: Called before each wait, with the time that is awaited.
+    """
+
+    def __init__(self, clock: Clock, occupation: Callable[[int], None]) -> None:
+        super().__init__(clock)
+        self._occupation = occupation
+
+    def wait_until(self, t_ns: int) -> int:
         """Do what there is to do, then wait."""
         self._occupation(t_ns)
-        return self._clock.wait_until(t_ns)
+        return super().wait_until(t_ns)

@@ -16,7 +16,7 @@ from can_dbc.frame import Frame
 from rig.core.bridge import TickResult
 from rig.core.messages import Conditions
 from rig.inputs.errors import InputError
-from rig.io.clock import Clock
+from rig.io.clock import Clock, WrappedClock
 from rig.io.steps import Step
 from rig.operation.loop import Port, Sink
 
@@ -190,24 +190,14 @@ def _opened(path: str) -> int | None:
     return None
 
 
-class _TracedClock:
+class _TracedClock(WrappedClock):
     def __init__(self, clock: Clock, trace: Trace) -> None:
-        self._clock = clock
+        super().__init__(clock)
         self._trace = trace
 
-    @property
-    def epoch_ns(self) -> int:
-        return self._clock.epoch_ns
-
-    def epoch_now_ns(self) -> int:
-        return self._clock.epoch_now_ns()
-
-    def now_ns(self) -> int:
-        return self._clock.now_ns()
-
     def wait_until(self, t_ns: int) -> int:
-        asleep_ns = self._clock.now_ns()
-        woke_ns = self._clock.wait_until(t_ns)
+        asleep_ns = self.now_ns()
+        woke_ns = super().wait_until(t_ns)
         self._trace.begin(t_ns, asleep_ns, woke_ns)
         return woke_ns
 
