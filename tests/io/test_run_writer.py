@@ -209,7 +209,7 @@ def test_a_window_around_a_fault_is_a_run_of_its_own(tmp_path):
     log = open_log(
         tmp_path / "run",
         window=Window(100 * MS, 50 * MS, 10),
-        graver=lambda before, now: "hold" if now == HOLD != before else None,
+        capture_name=lambda before, now: "hold" if now == HOLD != before else None,
     )
     for index in range(1000):
         log.add(*tick(index, mode=HOLD if index in (500, 501, 502) else RUNNING))
