@@ -120,13 +120,13 @@ class Mechanism(Generic[Value]):
         """Advance in steps of at most `longest_s`; other arguments as of `DartPlant.step`."""
         backend, state, constant = self._backend, loaded.state, self._constant
         virtual_forces_n, temperature_c = loaded.virtual_forces_n, loaded.temperature_c
-        dot = backend.dot
+        dot, acceleration, no_rates = backend.dot, backend.acceleration, self._no_rates
 
         def slope(
             q: Value, v: Value, internal: Internal, t_s: float, applied_force_n: float
         ) -> tuple[Value, Sequence[float]]:
             struts, applied = constant or self._at(q)
-            rates = self._no_rates.copy()
+            rates = no_rates.copy()
             total = applied_force_n * applied
             for index, (strut, offset_m, row) in enumerate(struts):
                 height_m, velocity_m_per_s = offset_m + dot(row, q), dot(row, v)
@@ -134,7 +134,7 @@ class Mechanism(Generic[Value]):
                     height_m, velocity_m_per_s, internal, t_s, applied_force_n, temperature_c, rates
                 )
                 total = total + (force + virtual_forces_n[index]) * row
-            return backend.acceleration(q, v, total), rates
+            return acceleration(q, v, total), rates
 
         q, v, internal = advance(
             slope,

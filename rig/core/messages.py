@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import NamedTuple
 
 from msgspec import Struct
@@ -191,7 +192,8 @@ class Publication:
 
 
 def _of_strut(attribute: str) -> Callable[[Report, int], float]:
-    return lambda report, strut: getattr(report.output.struts[strut], attribute)
+    get = attrgetter(attribute)
+    return lambda report, strut: get(report.output.struts[strut])
 
 
 ESTIMATE = (
@@ -362,17 +364,26 @@ def outgoing(message: Message, published: Sequence[Published]) -> Outgoing:
         DatabaseError: A signal is missing, or its unit does not fit what is published under it.
     """
     pages = [_page(message, page) for page in _pages(message, published)]
+    payload = pages[0] if len(pages) == 1 else _in_turn(pages)
     protect = None if message.protection is None else compile_protector(message.protection)
     (arbitration_id, is_extended), is_fd = message.key, message.is_fd
 
     def frame(report: Report, t_ns: int) -> tuple[Frame, bool]:
-        payload, saturated = pages[report.number % len(pages)](report)
+        data, saturated = payload(report)
         if protect is not None:
-            payload = protect(payload, report.number)
-        return Frame(t_ns, arbitration_id, payload, is_extended, is_fd), saturated
+            data = protect(data, report.number)
+        return Frame(t_ns, arbitration_id, data, is_extended, is_fd), saturated
 
     is_status = any(item.publication in STATUS for item in published)
     return Outgoing(message, frame, message.cycle_time_ns or 0, is_status)
+
+
+_Payload = Callable[[Report], tuple[bytes, bool]]
+"""What a tick reports -> a payload, and whether one of its values saturated."""
+
+
+def _in_turn(pages: Sequence[_Payload]) -> _Payload:
+    return lambda report: pages[report.number % len(pages)](report)
 
 
 def _pages(message: Message, published: Sequence[Published]) -> list[list[Published]]:
@@ -388,24 +399,22 @@ def _pages(message: Message, published: Sequence[Published]) -> list[list[Publis
     return [always + by_values[key] for key in sorted(by_values)] or [always]
 
 
-def _page(
-    message: Message, published: Sequence[Published]
-) -> Callable[[Report], tuple[bytes, bool]]:
+def _page(message: Message, published: Sequence[Published]) -> _Payload:
     names = [item.signal for item in published]
     dimensions = [item.publication.dimension for item in published]
     encode = compile_encoder(message, names, dimensions)
-    values = tuple(_value(message, item) for item in published)
+    values = [(_value(message, item), item.strut) for item in published]
 
     def payload(report: Report) -> tuple[bytes, bool]:
-        return encode([value(report) for value in values])
+        return encode([value(report, strut) for value, strut in values])
 
     return payload
 
 
-def _value(message: Message, item: Published) -> Callable[[Report], float]:
+def _value(message: Message, item: Published) -> Callable[[Report, int], float]:
     """A published value; a count stops at the end of its range, which is no saturation."""
-    value, strut = item.publication.value, item.strut
+    value = item.publication.value
     if not item.publication.stops_at_range:
-        return lambda report: value(report, strut)
+        return value
     _, high = si_range(message, item.signal, item.publication.dimension)
-    return lambda report: min(value(report, strut), high)
+    return lambda report, strut: min(value(report, strut), high)

@@ -19,7 +19,7 @@ from rig.core.contract import (
     StrutOutput,
     is_sensible,
 )
-from rig.core.supervisor import Event, Supervision, age_event, next_mode
+from rig.core.supervisor import Event, Supervision, age_event, mode_at_age, next_mode
 
 
 class RigState(CoreState, frozen=True, gc=False, kw_only=True):
@@ -82,6 +82,8 @@ class RigCore:
         Returns:
             State after this tick, and what it publishes.
         """
+        if state.mode is Mode.RUNNING:
+            return self._observe(state, state.model, step_input)
         if state.mode is Mode.SAFE and step_input.acknowledged:
             mode = next_mode(state.mode, Event.ACKNOWLEDGED)
             state = replace(state, mode=mode, first=(None,) * self.struts)
@@ -135,7 +137,7 @@ class RigCore:
             virtual_n.append(observed.virtual_force_n)
             oldest_ns = min(oldest_ns, observed.measured_ns)
         loaded = self._plant.load(model, virtual_n, applied_n, temperature_c)
-        mode = next_mode(state.mode, age_event(self._supervision, t_ns - oldest_ns))
+        mode = mode_at_age(self._supervision, state.mode, t_ns - oldest_ns)
         return self._published(state, t_ns, mode, tuple(observers), loaded)
 
     def _published(

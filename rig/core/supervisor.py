@@ -186,6 +186,13 @@ def next_mode(mode: Mode, event: Event) -> Mode:
     return TRANSITIONS.get((mode, event), mode)
 
 
+def mode_at_age(supervision: Supervision, mode: Mode, age_ns: int) -> Mode:
+    """Mode after a tick at which the oldest measurement is of some age."""
+    if mode is Mode.RUNNING and age_ns <= supervision.stale_after_ns:
+        return mode
+    return next_mode(mode, age_event(supervision, age_ns))
+
+
 def age_event(supervision: Supervision, age_ns: int) -> Event:
     """What the age of the oldest measurement means."""
     if age_ns <= supervision.stale_after_ns:

@@ -73,12 +73,13 @@ class PiObserver:
         innovation_m = measured.height_m - model_m
         elapsed_s = (measured.t_ns - state.measured_ns) * 1e-9
         integral_m_s = state.integral_m_s + innovation_m * elapsed_s
-        force_n = self._force_n(innovation_m, integral_m_s)
+        proportional_n = self.proportional_n_per_m * innovation_m
+        force_n = proportional_n + self.integral_n_per_m_s * integral_m_s
         limit_n = self.force_limit_n
-        if abs(force_n) > limit_n:
+        if not -limit_n <= force_n <= limit_n:
             if force_n * innovation_m > 0.0:
                 integral_m_s = state.integral_m_s
-                force_n = self._force_n(innovation_m, integral_m_s)
+                force_n = proportional_n + self.integral_n_per_m_s * integral_m_s
             force_n = min(max(force_n, -limit_n), limit_n)
         return PiState(integral_m_s, innovation_m, force_n, measured.t_ns)
 
@@ -90,6 +91,3 @@ class PiObserver:
         """The state of what `numbers` gave, last measured at time zero."""
         integral_m_s, virtual_force_n = numbers
         return PiState(integral_m_s, 0.0, virtual_force_n, 0)
-
-    def _force_n(self, innovation_m: float, integral_m_s: float) -> float:
-        return self.proportional_n_per_m * innovation_m + self.integral_n_per_m_s * integral_m_s
