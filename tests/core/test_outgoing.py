@@ -1,0 +1,57 @@
+"""Outgoing messages: when they are sent and what they carry, by another program's codec."""
+
+from itertools import pairwise
+
+import cantools.database
+import pytest
+
+from can_dbc.database import DEFAULT_DATABASE
+from tests.faults.trial import MS, Trial
+
+DBC = cantools.database.load_file(DEFAULT_DATABASE)
+
+
+@pytest.fixture(scope="module")
+def ticks():
+    return Trial().run(2100)
+
+
+def sent(ticks, name):
+    message = DBC.get_message_by_name(name)
+    return [
+        (frame.t_ns, message.decode(frame.data, decode_choices=False))
+        for tick in ticks
+        for frame in tick.result.frames
+        if frame.arbitration_id == message.frame_id
+    ]
+
+
+@pytest.mark.parametrize("name", ["RIG_ESTIMATE", "RIG_KINEMATICS", "RIG_STATUS", "RIG_TIMING"])
+def test_each_message_is_sent_at_its_cycle_time(ticks, name):
+    cycle_ns = DBC.get_message_by_name(name).cycle_time * MS
+    times = [t_ns for t_ns, _ in sent(ticks, name)]
+    assert len(times) >= 2100 * MS // cycle_ns
+    assert {b - a for a, b in pairwise(times)} == {cycle_ns}
+
+
+def test_counters_go_up_by_one(ticks):
+    for name in ("RIG_ESTIMATE", "RIG_STATUS"):
+        counters = [values["COUNTER"] for _, values in sent(ticks, name)]
+        assert {(b - a) % 16 for a, b in pairwise(counters)} == {1}
+
+
+def test_what_is_sent_is_what_the_core_published(ticks):
+    by_time = {
+        tick.t_ns: tick.result.output.struts[0] for tick in ticks if tick.result.output.struts
+    }
+    for t_ns, values in sent(ticks, "RIG_ESTIMATE"):
+        strut = by_time[t_ns]
+        assert values["SPRING_DAMPER_FORCE"] == pytest.approx(strut.force_n, abs=0.0026)
+        assert values["VIRTUAL_FORCE"] == pytest.approx(strut.virtual_force_n, abs=0.0026)
+        assert values["VALID"] == strut.valid
+    for t_ns, values in sent(ticks, "RIG_KINEMATICS"):
+        strut = by_time[t_ns]
+        assert values["MODEL_HEIGHT"] == pytest.approx(strut.height_m, abs=1.7e-5)
+        assert values["MODEL_VELOCITY"] == pytest.approx(strut.velocity_m_per_s, abs=1.1e-3)
+        assert values["MODEL_ACCELERATION"] == pytest.approx(strut.acceleration_m_per_s2, abs=0.06)
+        assert values["INNOVATION"] == pytest.approx(strut.innovation_m, abs=2.6e-6)
