@@ -55,7 +55,7 @@ class Directory:
 
     def __init__(self, messages: Iterable[Message]) -> None:
         listed = list(messages)
-        self.exact = {message.key: place for place, message in enumerate(listed)}
+        self._exact = {message.key: place for place, message in enumerate(listed)}
         groups = {
             place: (message.arbitration_id & group_mask(message.arbitration_id))
             for place, message in enumerate(listed)
@@ -63,21 +63,17 @@ class Directory:
         }
         often = Counter(groups.values())
         self._groups = {group: place for place, group in groups.items() if often[group] == 1}
-        self._filters = tuple(
+        self.filters = tuple(
             _filter(message, place in self._groups.values()) for place, message in enumerate(listed)
         )
+        """What lets the frames of all messages in."""
 
     def place(self, arbitration_id: int, is_extended: bool) -> int | None:
         """Place of the message that a frame is of; None if it is of no one."""
-        found = self.exact.get((arbitration_id, is_extended))
+        found = self._exact.get((arbitration_id, is_extended))
         if found is None and is_extended and self._groups:
             return self._groups.get(arbitration_id & group_mask(arbitration_id))
         return found
-
-    @property
-    def filters(self) -> tuple[Filter, ...]:
-        """What lets the frames of all messages in."""
-        return self._filters
 
 
 def _filter(message: Message, is_group: bool) -> Filter:

@@ -114,7 +114,7 @@ class Message:
 
     @property
     def key(self) -> tuple[int, bool]:
-        """What tells its frames from others: arbitration id, and whether that is extended."""
+        """What identifies its frames: arbitration id, and whether that is extended."""
         return self.arbitration_id, self.is_extended
 
     def signal(self, name: str) -> Signal:

@@ -72,7 +72,7 @@ def diagnose(
     Args:
         runs: Recordings, or folders of runs and CSV files, to learn from.
         model: The nominal model, its file, or the name of a shipped one.
-        held_out: Recordings to judge on; without them, blocks spread over `runs` are kept back.
+        held_out: Recordings to judge on; without them, blocks spread over `runs` are held out.
         progress: Called with what is being done and the share that is done.
 
     Returns:

@@ -103,7 +103,7 @@ def _linear_temperature_starts(motion: Motion) -> list[Start]:
 
 
 def _standard(_: Motion) -> tuple[float, float]:
-    # Another reference temperature is another damping: the data cannot tell one from the other.
+    # Another reference temperature is another damping: no data distinguish the two.
     return _STANDARD_C, _STANDARD_C
 
 

@@ -45,7 +45,8 @@ __all__ = [
 ]
 
 _DIFFERENCE = 1e-6
-"""Step of coordinates and rates in the central differences of the bias force."""
+"""Step of the coordinates (m or rad, and per second) in central differences of the bias force: a
+third of the digits of a double, where rounding and truncation are about equal."""
 
 
 class DartPlant:
@@ -180,6 +181,19 @@ class DartPlant:
         bias = mass @ np.array(dart.getAccelerations(), dtype=np.float64)
         return Mechanics(here.heights_m(q), here.struts, here.applied, mass, bias)
 
+    def bias_slopes(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Derivatives of the bias force by coordinates and by their rates, each of shape (n, n).
+
+        Args:
+            q: Coordinates, shape (n,).
+            v: Their rates, shape (n,).
+        """
+        steps = _DIFFERENCE * np.eye(len(q))
+        by_q = [self.mechanics(q + h, v).bias - self.mechanics(q - h, v).bias for h in steps]
+        by_v = [self.mechanics(q, v + h).bias - self.mechanics(q, v - h).bias for h in steps]
+        scale = 2.0 * _DIFFERENCE
+        return np.column_stack(by_q) / scale, np.column_stack(by_v) / scale
+
     @property
     def is_constant(self) -> bool:
         """Whether mass matrix and Jacobians are the same in every configuration."""
@@ -192,7 +206,10 @@ class DartPlant:
 
     def _longest_step_s(self) -> float:
         linear = [(s.stiffness_n_per_m, s.damping_n_s_per_m) for s in self.spec.struts]
-        exact_s = min(exact_step_s(item) for item in self._linearised(linear))
+        rest = np.zeros(self.coordinates)
+        samples = sample_positions(self.coordinates)
+        benches = [(self.mechanics(q, rest), *self.bias_slopes(q, rest)) for q in samples]
+        exact_s = min(exact_step_s(_linearised(*bench, linear)) for bench in benches)
         if exact_s < SHORTEST_STEP_S:
             fastest_hz = 1.0 / (2.0 * np.pi * exact_s)
             raise InputError(
@@ -201,31 +218,18 @@ class DartPlant:
                 "are short enough for"
             )
         steepest = [strut.steepest() for strut in self._struts]
-        stable_s = min(stable_step_s(item) for item in self._linearised(steepest))
+        stable_s = min(stable_step_s(_linearised(*bench, steepest)) for bench in benches)
         return min(LONGEST_STEP_S, exact_s, max(stable_s, SHORTEST_STEP_S))
 
-    def _linearised(self, struts: Sequence[tuple[float, float]]) -> list[Linearised]:
-        """The bench with given stiffness and damping of each strut, at sampled configurations."""
-        stiffness, damping = (np.diag(column) for column in zip(*struts, strict=True))
-        found: list[Linearised] = []
-        for q in sample_positions(self.coordinates):
-            here = self.mechanics(q, np.zeros_like(q))
-            by_q, by_v = self._bias_slopes(q)
-            jacobian = here.struts
-            found.append(
-                Linearised(
-                    here.mass,
-                    jacobian.T @ damping @ jacobian - by_v,
-                    jacobian.T @ stiffness @ jacobian - by_q,
-                )
-            )
-        return found
 
-    def _bias_slopes(self, q: Array) -> tuple[Array, Array]:
-        """Derivatives of the bias force by coordinates and rates, at rest, each shape (n, n)."""
-        rest = np.zeros_like(q)
-        steps = _DIFFERENCE * np.eye(len(q))
-        by_q = [self.mechanics(q + h, rest).bias - self.mechanics(q - h, rest).bias for h in steps]
-        by_v = [self.mechanics(q, h).bias - self.mechanics(q, -h).bias for h in steps]
-        scale = 2.0 * _DIFFERENCE
-        return np.column_stack(by_q) / scale, np.column_stack(by_v) / scale
+def _linearised(
+    here: Mechanics, by_q: Array, by_v: Array, struts: Sequence[tuple[float, float]]
+) -> Linearised:
+    """The bench about one configuration, with a stiffness and a damping of each strut."""
+    stiffness, damping = (np.diag(column) for column in zip(*struts, strict=True))
+    jacobian = here.struts
+    return Linearised(
+        here.mass,
+        jacobian.T @ damping @ jacobian - by_v,
+        jacobian.T @ stiffness @ jacobian - by_q,
+    )

@@ -13,10 +13,12 @@ from rig.inputs.errors import InputError
 Array = NDArray[np.float64]
 
 _NEWTON_STEPS = 50
+"""Newton's method doubles its digits at each step, once it is near: more steps find nothing."""
+
 _REACHED_M, _OUT_OF_REACH_M = 1e-13, 1e-9
 """Error of a height at which Newton's method ends, and above which it has failed."""
 
-_TURNING_STEP_S = 1e-6
+_RATE_STEP_S = 1e-6
 """Step of the central difference of a Jacobian in time."""
 
 
@@ -74,13 +76,13 @@ class Geometry:
         applied = np.array(skeleton.dart.getLinearJacobian(skeleton.pushed), dtype=np.float64)[2]
         return Jacobians(heights - struts @ q, struts, applied)
 
-    def turning(self, q: Array, v: Array) -> Array:
+    def jacobian_rate(self, q: Array, v: Array) -> Array:
         """Time derivative of the struts' Jacobian at `q` with rates `v`, shape (struts, n)."""
         if self.constant is not None:
             return np.zeros_like(self.constant.struts)
-        ahead = self.at(moved(self._skeleton, q, v, _TURNING_STEP_S))
-        behind = self.at(moved(self._skeleton, q, v, -_TURNING_STEP_S))
-        return (ahead.struts - behind.struts) / (2.0 * _TURNING_STEP_S)
+        ahead = self.at(moved(self._skeleton, q, v, _RATE_STEP_S))
+        behind = self.at(moved(self._skeleton, q, v, -_RATE_STEP_S))
+        return (ahead.struts - behind.struts) / (2.0 * _RATE_STEP_S)
 
     def reaching(self, heights_m: Array, near: Array) -> Array:
         """Coordinates with given strut heights, found by Newton's method.

@@ -99,7 +99,7 @@ class Mechanism(Generic[Value]):
             accelerations.append(backend.dot(row, acceleration))
         if self._constant is None:
             rate = np.array(state.velocities)
-            turned = self._geometry.turning(np.array(state.positions), rate) @ rate
+            turned = self._geometry.jacobian_rate(np.array(state.positions), rate) @ rate
             accelerations = [a + float(b) for a, b in zip(accelerations, turned, strict=True)]
         return Loaded(
             state,

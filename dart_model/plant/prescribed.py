@@ -4,12 +4,16 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+from dart_model.plant.integrator import grown
 from dart_model.plant.strut import struts_of
 from dart_model.spec import ModelSpec
 from rig.inputs.errors import InputError
 
 _LONGEST_STEP_S = 0.5e-3
+"""Half the longest step of a bench, since the midpoint rule is of one order less."""
+
 _MOST_STEPS = 1000
+"""Steps of one call: over half a second without a measured height they get longer."""
 
 Motion = Callable[[float], tuple[float, float]]
 """Time in s -> height (m) and velocity (m/s)."""
@@ -68,9 +72,9 @@ class PrescribedStrut:
         for step in range(steps):
             begin_s = state.t_s + step * h
             rates = self._rates(begin_s, motion, internal, temperature_c)
-            half = _grown(internal, 0.5 * h, rates)
+            half = grown(internal, 0.5 * h, rates)
             rates = self._rates(begin_s + 0.5 * h, motion, half, temperature_c)
-            internal = _grown(internal, h, rates)
+            internal = grown(internal, h, rates)
         return PrescribedState(t_s, internal)
 
     def force_n(
@@ -93,7 +97,3 @@ class PrescribedStrut:
         rates = [0.0] * self._strut.states
         self._strut.force_n(height_m, velocity_m_per_s, internal, t_s, 0.0, temperature_c, rates)
         return rates
-
-
-def _grown(internal: tuple[float, ...], h: float, rates: list[float]) -> tuple[float, ...]:
-    return tuple([state + h * rate for state, rate in zip(internal, rates, strict=True)])

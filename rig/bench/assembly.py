@@ -17,9 +17,9 @@ from rig.bench.mechanics import (
     Drive,
     Effects,
     Floats,
-    Imposed,
     Law,
     Mechanics,
+    Prescribed,
     Thermal,
     derivatives,
     give,
@@ -35,8 +35,8 @@ from rig.bench.schema import (
     HeightMultisine,
     HeightSine,
     HeightSweep,
-    ImposedMotion,
     Multisine,
+    PrescribedMotion,
     Sine,
     Sweep,
 )
@@ -73,7 +73,8 @@ def assemble(config: BenchConfig) -> Assembly:
     """
     mechanics = _mechanics(config)
     drive = Drive(
-        _applied(config.applied_force, config.undeclared_effects), _imposed(config.imposed_motion)
+        _applied(config.applied_force, config.undeclared_effects),
+        _prescribed(config.prescribed_motion),
     )
     return Assembly(mechanics, drive, _start(config, mechanics, drive))
 
@@ -87,7 +88,7 @@ def _mechanics(config: BenchConfig) -> Mechanics:
         mass_kg=_masses(config, uppers),
         lower=np.array([-1 if name == WORLD else uppers.index(name) for name in lowers]),
         driven=uppers.index(config.applied_force.body or uppers[0]),
-        imposed=_imposed_strut(config),
+        prescribed=_prescribed_strut(config),
         free_length_m=np.array([strut.free_length_m for strut in config.struts]),
         springs=_curves([(s.spring.height_m, s.spring.force_n) for s in config.struts]),
         dampers=_curves([(s.damper.velocity_m_per_s, s.damper.force_n) for s in config.struts]),
@@ -100,10 +101,10 @@ def _mechanics(config: BenchConfig) -> Mechanics:
     )
 
 
-def _imposed_strut(config: BenchConfig) -> int:
-    if config.imposed_motion is None:
+def _prescribed_strut(config: BenchConfig) -> int:
+    if config.prescribed_motion is None:
         return -1
-    return [strut.name for strut in config.struts].index(config.imposed_motion.strut)
+    return [strut.name for strut in config.struts].index(config.prescribed_motion.strut)
 
 
 def _masses(config: BenchConfig, uppers: list[str]) -> Floats:
@@ -161,7 +162,7 @@ def _applied(force: AppliedForce, effects: tuple[Effect, ...]) -> Applied:
     )
 
 
-def _imposed(motion: ImposedMotion | None) -> Imposed:
+def _prescribed(motion: PrescribedMotion | None) -> Prescribed:
     sines: list[tuple[float, ...]] = []
     sweeps: list[tuple[float, ...]] = []
     files: list[Floats] = []
@@ -174,7 +175,7 @@ def _imposed(motion: ImposedMotion | None) -> Imposed:
             sweeps.append(_sweep(part, part.amplitude_m))
         else:
             files.append(_spline(part))
-    return Imposed(
+    return Prescribed(
         mean_height_m=0.0 if motion is None else motion.mean_height_m,
         sines=_rows(sines, SINE_COLUMNS),
         sweeps=_rows(sweeps, SWEEP_COLUMNS),
@@ -243,9 +244,9 @@ def _start(config: BenchConfig, mechanics: Mechanics, drive: Drive) -> Floats:
             y[state] = -mass_kg * mechanics.gravity_m_per_s2 / stiffness_n_per_m
     heights_m = [strut.initial_height_m for strut in config.struts]
     at_start = np.zeros(GIVEN)
-    if mechanics.imposed >= 0:
+    if mechanics.prescribed >= 0:
         give(mechanics, drive, 0.0, at_start)
-        heights_m[mechanics.imposed] = float(at_start[1])
+        heights_m[mechanics.prescribed] = float(at_start[1])
     at_start[[0, 2]] = 0.0  # the others rest before it starts
     y[:n] = _positions(mechanics, _heights(mechanics, y, heights_m, at_start))
     return y

@@ -35,7 +35,7 @@ _R = TypeVar("_R")
 
 @unique
 class Law(IntEnum):
-    """Codes by which the compiled equations of motion tell the laws apart."""
+    """codes of the laws in the compiled equations of motion."""
 
     PRELOAD = 0
     LINEAR_STIFFNESS = 1
@@ -70,7 +70,7 @@ SINE_COLUMNS = 3
 SWEEP_COLUMNS = 5
 """amplitude_n, start_hz, end_hz, duration_s, 1 if the spacing is logarithmic else 0."""
 GIVEN = 3
-"""What the drive gives at a time: force on the driven body, imposed height, its rate."""
+"""What the drive gives at a time: force on the driven body, prescribed height, its rate."""
 RECORD_COLUMNS = 3
 """Columns of a record for each strut: height, rate of height, strut force."""
 RECORD_EXTRA = 3
@@ -112,8 +112,8 @@ class Applied(NamedTuple):
     file_force_n: Floats
 
 
-class Imposed(NamedTuple):
-    """The motion imposed on a strut.
+class Prescribed(NamedTuple):
+    """The motion prescribed on a strut.
 
     Attributes:
         mean_height_m: Height about which it moves.
@@ -133,11 +133,11 @@ class Drive(NamedTuple):
 
     Attributes:
         force: The applied force.
-        imposed: The imposed motion; not looked at where no strut's motion is imposed.
+        prescribed: The prescribed motion; not looked at where no strut's motion is prescribed.
     """
 
     force: Applied
-    imposed: Imposed
+    prescribed: Prescribed
 
 
 class Effects(NamedTuple):
@@ -177,7 +177,7 @@ class Mechanics(NamedTuple):
         mass_kg: Mass of each body, shape (n,).
         lower: Body on which each strut stands, -1 for the world, shape (n,).
         driven: Body on which the applied force acts.
-        imposed: Strut whose motion is imposed, -1 if there is none.
+        prescribed: Strut whose motion is prescribed, -1 if there is none.
         free_length_m: Free length of each strut, shape (n,).
         springs: Spring curves over height.
         dampers: Damper curves over rate of height.
@@ -189,7 +189,7 @@ class Mechanics(NamedTuple):
     mass_kg: Floats
     lower: Integers
     driven: int
-    imposed: int
+    prescribed: int
     free_length_m: Floats
     springs: Curves
     dampers: Curves
@@ -315,25 +315,25 @@ def acting_force(drive: Applied, t_s: float) -> float:
 
 
 @_compiled
-def imposed_motion(imposed: Imposed, t_s: float) -> tuple[float, float]:
-    """Imposed height in m and its rate in m/s. Files and sweeps stay where they end."""
-    height_m = imposed.mean_height_m
+def prescribed_motion(prescribed: Prescribed, t_s: float) -> tuple[float, float]:
+    """Prescribed height in m and its rate in m/s. Files and sweeps stay where they end."""
+    height_m = prescribed.mean_height_m
     rate_m_per_s = 0.0
-    for i in range(imposed.sines.shape[0]):
-        rate_rad_per_s = imposed.sines[i, 1]
-        phase = rate_rad_per_s * t_s + imposed.sines[i, 2]
-        height_m += imposed.sines[i, 0] * math.sin(phase)
-        rate_m_per_s += imposed.sines[i, 0] * rate_rad_per_s * math.cos(phase)
-    for i in range(imposed.sweeps.shape[0]):
-        amplitude_m = imposed.sweeps[i, 0]
-        end_s = imposed.sweeps[i, 3]
-        turns, frequency_hz = _sweep_turns(imposed.sweeps[i], min(t_s, end_s))
+    for i in range(prescribed.sines.shape[0]):
+        rate_rad_per_s = prescribed.sines[i, 1]
+        phase = rate_rad_per_s * t_s + prescribed.sines[i, 2]
+        height_m += prescribed.sines[i, 0] * math.sin(phase)
+        rate_m_per_s += prescribed.sines[i, 0] * rate_rad_per_s * math.cos(phase)
+    for i in range(prescribed.sweeps.shape[0]):
+        amplitude_m = prescribed.sweeps[i, 0]
+        end_s = prescribed.sweeps[i, 3]
+        turns, frequency_hz = _sweep_turns(prescribed.sweeps[i], min(t_s, end_s))
         height_m += amplitude_m * math.sin(2.0 * math.pi * turns)
         if t_s < end_s:
             phase = 2.0 * math.pi * turns
             rate_m_per_s += amplitude_m * 2.0 * math.pi * frequency_hz * math.cos(phase)
-    for i in range(imposed.files.first.shape[0] - 1):
-        segment = imposed.files.segments[curve_segment(imposed.files, i, t_s)]
+    for i in range(prescribed.files.first.shape[0] - 1):
+        segment = prescribed.files.segments[curve_segment(prescribed.files, i, t_s)]
         start, length, a, b, c, d = segment
         offset = min(max(t_s - start, 0.0), length)
         height_m += ((a * offset + b) * offset + c) * offset + d
@@ -346,14 +346,14 @@ def imposed_motion(imposed: Imposed, t_s: float) -> tuple[float, float]:
 def give(mechanics: Mechanics, drive: Drive, t_s: float, given: Floats) -> None:
     """Write what the drive gives at a time, shape (GIVEN,)."""
     given[0] = acting_force(drive.force, t_s)
-    if mechanics.imposed >= 0:
-        given[1], given[2] = imposed_motion(drive.imposed, t_s)
+    if mechanics.prescribed >= 0:
+        given[1], given[2] = prescribed_motion(drive.prescribed, t_s)
 
 
 @_compiled
-def impose(mechanics: Mechanics, given: Floats, y: Floats) -> None:
-    """Put the body above an imposed strut where the drive has it."""
-    body = mechanics.imposed
+def prescribe(mechanics: Mechanics, given: Floats, y: Floats) -> None:
+    """Put the body above an prescribed strut where the drive has it."""
+    body = mechanics.prescribed
     if body < 0:
         return
     n = mechanics.mass_kg.shape[0]
@@ -519,12 +519,12 @@ def derivatives(mechanics: Mechanics, t_s: float, given: Floats, y: Floats, dy: 
         mechanics: The bench.
         t_s: Time in s.
         given: What the drive gives, shape (GIVEN,).
-        y: State, shape (states,); an imposed body is put where the drive has it.
+        y: State, shape (states,); an prescribed body is put where the drive has it.
         dy: Receives the rates, shape (states,).
     """
     n = mechanics.mass_kg.shape[0]
     thermal = mechanics.thermal
-    impose(mechanics, given, y)
+    prescribe(mechanics, given, y)
     dy[2 * n] = thermal.cooling_per_s * (thermal.ambient_c - y[2 * n])
     for i in range(n):
         dy[i] = y[n + i]
@@ -588,7 +588,7 @@ def runge_kutta_step(
     for j in range(y.shape[0]):
         slope = work[0, j] + 2.0 * (work[1, j] + work[2, j]) + work[3, j]
         y[j] += step_s / 6.0 * slope
-    impose(mechanics, given[2], y)
+    prescribe(mechanics, given[2], y)
 
 
 @_compiled
@@ -631,7 +631,7 @@ def advance(mechanics: Mechanics, drive: Drive, span: Span, y: Floats, records: 
     for row in range(records.shape[0]):
         start = (span.first + row) * span.substeps
         give(mechanics, drive, start * step_s, given[2])
-        impose(mechanics, given[2], y)
+        prescribe(mechanics, given[2], y)
         observe(mechanics, drive, start * step_s, y, records[row])
         for i in range(start, start + span.substeps):
             given[0] = given[2]

@@ -259,11 +259,11 @@ HeightComponent = Annotated[
 ]
 
 
-class ImposedMotion(_Section):
+class PrescribedMotion(_Section):
     """A motion that a strut is forced through, whatever force it takes: a damper dyno.
 
     Attributes:
-        strut: Strut whose height is imposed.
+        strut: Strut whose height is prescribed.
         mean_height_m: Height about which the components move, in m.
         components: Motions that add up.
     """
@@ -385,7 +385,7 @@ class BenchConfig(_Section):
         masses: Bodies.
         struts: Struts; each carries one body, the lower ends are the world or other bodies.
         applied_force: The force that drives the bench, if any.
-        imposed_motion: The motion that drives a strut, if any.
+        prescribed_motion: The motion that drives a strut, if any.
         temperature: The damper's temperature.
         undeclared_effects: What the bench has and no model declares.
         transmissions: Messages that the bench sends.
@@ -398,7 +398,7 @@ class BenchConfig(_Section):
     masses: Annotated[tuple[Mass, ...], Field(strict=False, min_length=1, max_length=20)]
     struts: Annotated[tuple[Strut, ...], Field(strict=False, min_length=1, max_length=20)]
     applied_force: AppliedForce = AppliedForce()
-    imposed_motion: ImposedMotion | None = None
+    prescribed_motion: PrescribedMotion | None = None
     temperature: Temperature = Temperature()
     undeclared_effects: Annotated[tuple[Effect, ...], Field(strict=False, max_length=50)] = ()
     transmissions: Annotated[tuple[Transmission, ...], Field(strict=False, max_length=50)] = ()
@@ -412,9 +412,9 @@ class BenchConfig(_Section):
         _check_tree(self.struts, masses)
         if self.applied_force.body is not None:
             _check_known("applied_force.body", self.applied_force.body, masses)
-        if self.imposed_motion is not None:
-            _check_known("imposed_motion.strut", self.imposed_motion.strut, struts)
-            _check_imposed(self.imposed_motion.strut, self.struts, self.undeclared_effects)
+        if self.prescribed_motion is not None:
+            _check_known("prescribed_motion.strut", self.prescribed_motion.strut, struts)
+            _check_prescribed(self.prescribed_motion.strut, self.struts, self.undeclared_effects)
         for index, effect in enumerate(self.undeclared_effects):
             _check_known(f"undeclared_effects.{index}.strut", effect.strut, struts)
         for index, sent in enumerate(self.transmissions):
@@ -444,20 +444,20 @@ def _check_known(key: str, name: str, known: list[str]) -> None:
         raise ValueError(f"{key} = {name!r}, expected one of {', '.join(known)}")
 
 
-_UNSEEN_IN_IMPOSED_MOTION = ("added_mass", "hidden_mass")
+_UNSEEN_IN_PRESCRIBED_MOTION = ("added_mass", "hidden_mass")
 
 
-def _check_imposed(name: str, struts: tuple[Strut, ...], effects: tuple[Effect, ...]) -> None:
+def _check_prescribed(name: str, struts: tuple[Strut, ...], effects: tuple[Effect, ...]) -> None:
     strut = next(strut for strut in struts if strut.name == name)
     if strut.initial_height_m is not None:
         raise ValueError(
-            f"struts: {name} has an initial_height_m, expected none: its motion is imposed"
+            f"struts: {name} has an initial_height_m, expected none: its motion is prescribed"
         )
     for index, effect in enumerate(effects):
-        if effect.strut == name and effect.name in _UNSEEN_IN_IMPOSED_MOTION:
+        if effect.strut == name and effect.name in _UNSEEN_IN_PRESCRIBED_MOTION:
             raise ValueError(
                 f"undeclared_effects.{index}: {effect.name} does not change the force of strut "
-                f"{name}, whose motion is imposed, expected another effect"
+                f"{name}, whose motion is prescribed, expected another effect"
             )
 
 

@@ -189,7 +189,7 @@ class Bench:
         return frames, self._next_due_ns()
 
     def truth(self, t_ns: int) -> BenchTruth:
-        """Tell what the bench really does at a time.
+        """What the bench really does at a time.
 
         At the sensors' sample times the values are those that were sampled. Between, heights follow
         a cubic and the rest a straight line.

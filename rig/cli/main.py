@@ -1,7 +1,7 @@
 """The command line whole: every command, and what a wrong input or an interruption ends with."""
 
 import sys
-from typing import Any, cast
+from typing import cast
 
 import typer
 from rich.console import Console
@@ -27,7 +27,6 @@ __all__ = ["app", "main"]
 app = typer.Typer(
     name="rig",
     help="Bridge between a shock-absorber bench on CAN and a DART multibody model.",
-    no_args_is_help=True,
     add_completion=False,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
@@ -50,7 +49,10 @@ _INTERRUPTED = 130
 
 
 # Typer carries click inside itself and names none of its own errors but this one.
-_UsageError = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "UsageError")
+_UsageError = cast(
+    "type[typer.BadParameter]",
+    next(base for base in typer.BadParameter.__mro__ if base.__name__ == "UsageError"),
+)
 
 
 def main() -> None:
@@ -68,10 +70,8 @@ def main() -> None:
     except (KeyboardInterrupt, typer.Abort):
         _say("interrupted")
         sys.exit(_INTERRUPTED)
-    except Exception as error:
-        if not isinstance(error, _UsageError):
-            raise
-        _refuse(cast("Any", error).format_message())
+    except _UsageError as error:
+        _refuse(error.format_message())
     else:
         sys.exit(ended if isinstance(ended, int) else OK)
 

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from rig.diagnosis.outcome import Diagnosis
     from rig.operation.logged_run import Ended
 
-
 _OF_TICKS = ("stale", "overruns", "limited", "bus_faulty")
 """Counts of ticks; the others are of frames."""
 

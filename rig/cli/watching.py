@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 
 _REFRESH_NS = 200_000_000
+"""Five times a second: as fast as a person reads."""
 
 
 @contextlib.contextmanager

@@ -17,7 +17,6 @@ class Mode(IntEnum):
     RUNNING = 2
     HOLD = 3
     SAFE = 4
-    STOPPED = 5
 
 
 class Measurement(Struct, frozen=True, gc=False):

@@ -11,7 +11,6 @@ from rig.core.contract import Measurement, Mode, StrutOutput
 class Event(IntEnum):
     """What a tick finds, the severest first."""
 
-    STOP = auto()
     BEYOND_SAFE = auto()
     TIMEOUT = auto()
     BEYOND_HOLD = auto()
@@ -173,10 +172,6 @@ TRANSITIONS: dict[tuple[Mode, Event], Mode] = {
     (Mode.HOLD, Event.FRESH): Mode.RUNNING,
     (Mode.HOLD, Event.TIMEOUT): Mode.SAFE,
     (Mode.SAFE, Event.ACKNOWLEDGED): Mode.WAITING,
-    (Mode.WAITING, Event.STOP): Mode.STOPPED,
-    (Mode.RUNNING, Event.STOP): Mode.STOPPED,
-    (Mode.HOLD, Event.STOP): Mode.STOPPED,
-    (Mode.SAFE, Event.STOP): Mode.STOPPED,
 }
 """Mode and event -> next mode; a pair that is not listed changes nothing."""
 

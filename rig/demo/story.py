@@ -79,7 +79,7 @@ def draw_effect(seed: int) -> tuple[str, Effect]:
         seed: Not negative.
     """
     random = np.random.default_rng(seed)
-    name = list(_RANGES)[seed % len(_RANGES)]  # so that neighbouring seeds tell other stories
+    name = list(_RANGES)[seed % len(_RANGES)]  # so that neighbouring seeds plant other effects
     family, ranges = _RANGES[name]
     parameters = {key: float(random.uniform(low, high)) for key, (low, high) in ranges.items()}
     return family, Effect.model_validate({"name": name, "strut": _STRUT, "parameters": parameters})
@@ -107,7 +107,7 @@ def tell(
         duration_s: Length of the runs; the configuration's own if None.
         lockstep: Simulated time also for the first run.
         stop: Asked before each tick whether to end.
-        chapter: Told what comes next.
+        chapter: Called with what comes next.
         progress: Called with time and mode of every tick.
         diagnosis_progress: Called with the diagnosis's steps and how far they are.
 

@@ -27,7 +27,7 @@ def diagnose_runs(
         model: The nominal model.
         held_out: Runs to judge on.
         out: Folder to write into.
-        progress: Told what is being done, and the share that is done.
+        progress: Called with what is being done, and the share that is done.
 
     Raises:
         InputError: A run cannot be read or is given twice, or `out` cannot be written or holds a

@@ -51,8 +51,8 @@ def diagnose(
     Args:
         spec: The nominal model.
         runs: Recordings to learn from.
-        held_out: Recordings to judge on; without them, blocks spread over `runs` are kept back.
-        progress: Told what is being done and the share that is done.
+        held_out: Recordings to judge on; without them, blocks spread over `runs` are held out.
+        progress: Called with what is being done and the share that is done.
         criteria: What decides.
 
     Raises:

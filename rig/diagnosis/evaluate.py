@@ -95,11 +95,11 @@ def evaluated(
     """Figures of every recording.
 
     Args:
-        problem: Held-out recordings, or those that blocks of were kept back from.
+        problem: Held-out recordings, or those that blocks of were held out from.
         models: What is compared.
         recordings: As measured.
         left_n: Load-cell force that the corrected model leaves where it was fitted; NaN without.
-        kept: The figures are those of the blocks kept back; initial states are then known.
+        kept: The figures are those of the blocks held out; initial states are then known.
 
     Raises:
         RecordingError: A model runs away on a recording.

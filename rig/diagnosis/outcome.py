@@ -184,8 +184,8 @@ class Diagnosis:
             corrections are all that was found.
         existing: Effects of the nominal model that the data change.
         rejected: Candidates that were not chosen, best first.
-        ambiguous_with: Families that these recordings cannot tell from what was found.
-        suggested_excitation: What recording would tell them apart.
+        ambiguous_with: Families that these recordings cannot distinguish from what was found.
+        suggested_excitation: What recording would distinguish them.
         held_out: Figures on data that took no part in the search.
         noise_floor: What a right model leaves there.
         residual_white: Whether the residual is white.

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 Progress = Callable[[str, float], None]
-"""Told what is being done and the share that is done."""
+"""Called with what is being done and the share that is done."""
 
 
 def within(progress: Progress, first: float, last: float, of: str = "") -> Progress:

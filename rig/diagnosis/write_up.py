@@ -95,7 +95,7 @@ def written_up(
         results: Held-out recordings, before and after.
         runs: Recordings that were learnt from.
         criteria: What decides.
-        blocks: Whether blocks were kept back, since no run was held out.
+        blocks: Whether blocks were held out, since no run was held out.
     """
     chosen = found.chosen.fit
     before = [_forces(problem, k, found.given) for k in range(problem.recordings)]

@@ -19,6 +19,7 @@ from rig.operation.loop import Progress
 from rig.operation.setup import Setup
 
 _LONGEST_GAP_NS = 3_600_000_000_000
+"""Time between two frames of one recording, an hour; more is another day's, or a wrong clock."""
 
 
 class _LogPort:

@@ -60,7 +60,7 @@ def _said_of_signs(mapping: Mapping) -> list[str]:
     if mapping.strut_force is not None:
         said.append("strut force is taken as positive when the strut pushes its bodies apart")
     if mapping.applied_force is None:
-        said.append("there is no applied force: the motion is taken as imposed")
+        said.append("there is no applied force: the motion is taken as prescribed")
     return said
 
 

@@ -17,8 +17,14 @@ from rig.inputs.errors import InputError
 
 Array = NDArray[np.float64]
 _MAX_BYTES = 4_000_000_000
+"""Largest file: some hours at the highest rates, and a row at a time is in memory."""
+
 _MAX_LINE = 100_000
+"""Longest line in characters: hundreds of columns."""
+
 _MAX_SAMPLES = 5_000_000
+"""Most rows: more than an hour at 1 kHz, and what a diagnosis can hold."""
+
 ROWS_AT_ONCE = 50_000
 _MISSING = ("", "nan", "na", "n/a", "null", "-")
 Columns = tuple[Array, list[Array], list[str]]

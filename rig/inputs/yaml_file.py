@@ -12,6 +12,8 @@ from pydantic_core import PydanticCustomError
 from rig.inputs.errors import InputError
 
 _MAX_BYTES = 4 * 1024 * 1024
+"""Largest file; a model with a thousand struts has a tenth of it."""
+
 _Model = TypeVar("_Model", bound=BaseModel)
 
 

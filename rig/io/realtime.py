@@ -16,6 +16,8 @@ from dataclasses import asdict, dataclass
 _MCL_CURRENT_AND_FUTURE = 3
 _PR_SET_TIMERSLACK = 29
 _PR_SET_THP_DISABLE = 41
+"""Number of the request in linux/prctl.h, which the C library's wrapper takes as it is."""
+
 _SWITCH_INTERVAL_S = 1e-4
 """How long another thread (the log's) may hold the interpreter when the loop wants it."""
 

@@ -25,6 +25,8 @@ from rig.operation.setup import Setup, load_authentication
 from rig.operation.trace import Trace
 
 _BENCH_PORTION_NS = 20_000_000
+"""Simulated time after which the bench looks at its bus, while it catches up."""
+
 _SPINNING_SHARE = 5
 """At most this part of a period is spun away before a deadline."""
 

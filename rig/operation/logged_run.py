@@ -184,13 +184,14 @@ def logged(
             state = run(bridge, state, due, source, keep, config.signals.measured)
         status = "safe" if state.core.mode is Mode.SAFE else "done"
     finally:
+        diverged = _divergence(ready, state)
         log.close(
             lambda: {
                 "ending": {
                     "status": status,
                     "ticks": ticks,
                     "counts": state.counts._asdict(),
-                    "diverged": _divergence(ready, state),
+                    "diverged": diverged,
                     "timing": timing.summary(),
                     "bus": figures.as_dict(),
                     "log_fault": log.trouble,
@@ -200,7 +201,6 @@ def logged(
         )
     if trace is not None:
         trace.write(folder)
-    diverged = _divergence(ready, state)
     return Ended(folder, state, timing, granted, log.trouble, ticks, config.period_ns, diverged)
 
 

@@ -57,7 +57,7 @@ class InformedPort:
         self._port = port
         self._log = log
         self._timing = timing
-        self._figures = NO_TIMING
+        self._latest = NO_TIMING
         self._calm = _NO_CONDITIONS
         self._again_ns = _TIMING_EVERY_NS
         self.send = port.send
@@ -66,8 +66,8 @@ class InformedPort:
         """Take the percentiles anew, if it is time; done in a tick it would delay that tick."""
         if t_ns >= self._again_ns:
             self._again_ns = t_ns + _TIMING_EVERY_NS
-            self._figures = _figures(self._timing)
-            self._calm = Conditions(timing=self._figures)
+            self._latest = _figures(self._timing)
+            self._calm = Conditions(timing=self._latest)
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
         """Frames of the port, with what is known of log and timing."""
@@ -75,7 +75,7 @@ class InformedPort:
         if conditions is _NO_CONDITIONS and self._log.fault is None:
             return frames, self._calm
         log_fault = self._log.fault is not None
-        return frames, conditions._replace(log_fault=log_fault, timing=self._figures)
+        return frames, conditions._replace(log_fault=log_fault, timing=self._latest)
 
 
 def _figures(timing: Timing) -> TimingFigures:

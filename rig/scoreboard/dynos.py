@@ -1,4 +1,4 @@
-"""Dampers on a dyno: the motion is imposed, the force is missed.
+"""Dampers on a dyno: the motion is prescribed, the force is missed.
 
 References:
     Downey, Cao, Laflamme, Taylor, Ricles, "High capacity variable friction damper based on band

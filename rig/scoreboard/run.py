@@ -33,7 +33,7 @@ def run_scoreboard(
             machine is found.
         out: Folder to write into: `scoreboard.csv`, `scoreboard.md`, and a folder for each
             diagnosis.
-        progress: Told what is being done.
+        progress: Called with what is being done.
         only: Names of `SETS`; all if empty.
 
     Returns:

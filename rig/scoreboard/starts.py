@@ -57,7 +57,7 @@ def dyno_start(records: Sequence[Recording], name: str) -> ModelSpec:
     """The spring and damper that come nearest to a dyno's load cell; a mass of 1 kg, unseen.
 
     Args:
-        records: Runs with one height, imposed, and a strut force.
+        records: Runs with one height, prescribed, and a strut force.
         name: Name of the model.
     """
     middle_m = float(np.mean([np.nanmean(record.heights_m) for record in records]))

@@ -77,8 +77,8 @@ def test_cycle_time_and_sender(rig: Database, message: str, cycle_ms: int, sende
 
 def test_state_names(rig: Database) -> None:
     choices = rig.message("RIG_STATUS").signal("STATE").choices
-    names = ["INIT", "WAITING", "RUNNING", "HOLD", "SAFE", "STOPPED"]
-    assert [choices[raw] for raw in range(6)] == names
+    names = ["INIT", "WAITING", "RUNNING", "HOLD", "SAFE"]
+    assert [choices[raw] for raw in range(5)] == names
 
 
 def test_urgent_messages_win_arbitration(rig: Database) -> None:

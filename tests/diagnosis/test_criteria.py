@@ -19,7 +19,7 @@ ABSURD = [
     ("screened", 0, "one_kind"),
     ("most_laws", 0, "hardening"),
     ("most_laws", 1, "two_kinds"),
-    ("finalists", 0, "exponential"),
+    ("fitted_a_size", 0, "exponential"),
     ("hopeless", 1e-9, "hardening"),
     ("standard_errors", 1e9, "hardening"),
     ("least_likelihood_gain", 1e12, "hardening"),

@@ -145,7 +145,7 @@ def test_nothing_is_sent_before_the_first_valid_measurement():
 
 def test_every_way_out_of_the_safe_state_is_somebodys_decision():
     ways = {event for (mode, event) in TRANSITIONS if mode is Mode.SAFE}
-    assert ways == {Event.ACKNOWLEDGED, Event.STOP}
+    assert ways == {Event.ACKNOWLEDGED}
 
 
 @pytest.mark.parametrize(

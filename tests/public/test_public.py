@@ -58,9 +58,9 @@ def test_a_diagnosis_shows_itself_and_is_written(tmp_path):
         )
         path.write_text("t_s,height_m,applied_force_n\n" + rows + "\n")
         paths.append(path)
-    told = []
+    shares = []
     found = rig.diagnose(
-        [rig.read_csv(paths[0])], "reference", [paths[1]], lambda _what, share: told.append(share)
+        [rig.read_csv(paths[0])], "reference", [paths[1]], lambda _what, share: shares.append(share)
     )
     assert found.diagnosis.verdict == "explained"
     assert [effect.family for effect in found.diagnosis.effects] == ["nonlinear_stiffness"]
@@ -72,7 +72,7 @@ def test_a_diagnosis_shows_itself_and_is_written(tmp_path):
     assert {path.name for path in (tmp_path / "found").iterdir()} == {
         "diagnosis.json", "corrected.yaml", "report.html"
     }  # fmt: skip
-    assert told[-1] == 1.0
+    assert shares[-1] == 1.0
 
 
 def test_the_reference_holds_every_effect_key_and_command(tmp_path):

@@ -5,7 +5,7 @@ Kinds: ``single`` (families in turn), any family's name, ``pair``, ``triple``, `
 that no catalogue holds.
 
 ``rough_KIND`` is such a case whose model file is rough in all that is linear, so that only what is
-not linear is planted; ``dyno_KIND`` is one whose motion is imposed, the model file rough or not.
+not linear is planted; ``dyno_KIND`` is one whose motion is prescribed, the model file rough or not.
 """
 
 import zlib
@@ -65,7 +65,7 @@ class _Recipe(NamedTuple):
 
     Attributes:
         base: The kind of what is planted.
-        is_dyno: Whether the motion is imposed.
+        is_dyno: Whether the motion is prescribed.
         is_rough: Whether the model file is rough.
     """
 

@@ -654,7 +654,7 @@ def _moment_on(system, path, half):
 
 @numba.njit(cache=True, error_model="numpy")
 def _path_rates(system, path, half, y, out):
-    """Rates of all memories at a half step of an imposed motion."""
+    """Rates of all memories at a half step of an prescribed motion."""
     moment, at = _moment_on(system, path, half), system.at
     for i in range(out.size):
         out[i] = 0.0
@@ -665,7 +665,7 @@ def _path_rates(system, path, half, y, out):
 
 @numba.njit(cache=True, error_model="numpy")
 def _advance_on(system, path, k, y, work):
-    """One step of all memories in place, the motion being imposed."""
+    """One step of all memories in place, the motion being prescribed."""
     h = system.step_s
     trial = work[4]
     for stage in range(4):
@@ -695,7 +695,7 @@ def _observe_on(system, path, half, y, forces):
 
 @numba.njit(cache=True, error_model="numpy")
 def run_along(system, path, steps, y):
-    """Follow all memories along an imposed motion; what acts through a mass gives no force.
+    """Follow all memories along an prescribed motion; what acts through a mass gives no force.
 
     Args:
         system: The bench; its drive is not read.

@@ -1,4 +1,4 @@
-"""Draws dynos: a spring and a damper whose height is imposed, and a load cell."""
+"""Draws dynos: a spring and a damper whose height is prescribed, and a load cell."""
 
 import numpy as np
 
@@ -20,7 +20,7 @@ FAMILIES = (
     "fade",
     "periodic_force",
 )
-"""What shows where the motion is imposed: no masses, and nothing that acts on a load."""
+"""What shows where the motion is prescribed: no masses, and nothing that acts on a load."""
 
 HEIGHT_LOW_M = 0.05
 FORCE_LIMIT_N = 2e4

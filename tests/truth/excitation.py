@@ -76,7 +76,7 @@ def _noise(excitation: Excitation, bench: Bench, t_s: Samples) -> Samples:
 
 
 def stroke_path(stroke: Stroke, t_s: Samples) -> Samples:
-    """(3, n) height, velocity and acceleration of an imposed motion at any times."""
+    """(3, n) height, velocity and acceleration of an prescribed motion at any times."""
     rng = np.random.default_rng([stroke.seed, 7])
     lines = int(rng.integers(7, 16))
     edges = np.geomspace(stroke.low_hz, stroke.high_hz, lines + 1)

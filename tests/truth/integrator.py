@@ -41,7 +41,7 @@ def _sum_of(effects: tuple[Planted, ...], law: str) -> float:
 
 
 class Drive(NamedTuple):
-    """What the run imposes.
+    """What the run prescribes.
 
     Attributes:
         force_n: (2 n + 1,) all forces that depend on time alone, at steps and half steps.
@@ -68,7 +68,7 @@ def _system_and_start(
     Args:
         bench: Body, spring, damper.
         effects: What is planted.
-        drive: What is imposed.
+        drive: What is prescribed.
         body: States before the memories.
         start: Initial height, ambient temperature in °C.
     """
@@ -115,7 +115,7 @@ def integrate(
     Args:
         bench: Body, spring, damper.
         effects: What is planted; what depends on time alone must be in the drive.
-        drive: What is imposed.
+        drive: What is prescribed.
         height_m: Initial height.
         ambient_c: Ambient temperature.
     """
@@ -127,7 +127,7 @@ def integrate(
 def follow(
     bench: Bench, effects: tuple[Planted, ...], drive: Drive, path: Samples, ambient_c: float
 ) -> Motion:
-    """Follow the effects along a motion that is imposed.
+    """Follow the effects along a motion that is prescribed.
 
     Args:
         bench: Spring and damper.

@@ -78,7 +78,7 @@ class Excitation:
 
 @dataclass(frozen=True)
 class Stroke:
-    """A height that a dyno imposes: a sum of sines, as a function of continuous time.
+    """A height that a dyno prescribes: a sum of sines, as a function of continuous time.
 
     Attributes:
         stroke_m: Highest less lowest height of the run.
@@ -197,7 +197,7 @@ class Case:
 
     @property
     def is_dyno(self) -> bool:
-        """Whether the height is imposed and a load cell measures, on no free body."""
+        """Whether the height is prescribed and a load cell measures, on no free body."""
         return isinstance(self.train.excitation, Stroke)
 
     @property

@@ -99,7 +99,7 @@ def true_path(
     """Follow one run of a dyno, with so many steps a sample.
 
     Returns:
-        (n,) sample times in s, and the imposed motion with every effect's force.
+        (n,) sample times in s, and the prescribed motion with every effect's force.
     """
     samples = round(plan.excitation.duration_s * sample_rate_hz) + 1
     half_steps = np.arange(2 * steps * (samples - 1) + 1) / (2.0 * steps * sample_rate_hz)

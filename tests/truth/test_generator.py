@@ -61,11 +61,11 @@ def driven(effects: tuple[Planted, ...], drive, rig: Rig) -> tuple[np.ndarray, M
     samples = round(rig.duration_s * RATE_HZ) + 1
     half_steps = np.arange(2 * steps * (samples - 1) + 1) / (2 * steps * RATE_HZ)
     balance = bench.free_length_m - bench.weight_n / bench.stiffness_n_per_m
-    imposed = Drive(
+    prescribed = Drive(
         drive(half_steps).astype(float), np.zeros_like(half_steps), 1 / (steps * RATE_HZ), steps
     )
     start = balance if rig.height_m is None else rig.height_m
-    return half_steps[:: 2 * steps], integrate(bench, effects, imposed, start, 20.0)
+    return half_steps[:: 2 * steps], integrate(bench, effects, prescribed, start, 20.0)
 
 
 def sine(force_n: float, frequency_hz: float):
@@ -458,7 +458,7 @@ def test_rough_kinds_draw_roughness_and_plant_nothing_linear():
         make_case(0, "rough_preload")
 
 
-def test_imposed_motion_keeps_to_its_stroke_and_its_derivatives():
+def test_prescribed_motion_keeps_to_its_stroke_and_its_derivatives():
     stroke = Stroke(0.08, 0.4, 0.3, 6.0, 0.8, 12.0, 5)
     t_s = np.arange(0.0, 12.0, 1e-4)
     height, velocity, acceleration = stroke_path(stroke, t_s)

@@ -86,7 +86,7 @@ def build(
         spec: The nominal model.
         recordings: Runs, of one kind.
         blocks: Blocks of cross-validation over all of them.
-        kept_every: One block of so many is kept back to be judged on; none if absent.
+        kept_every: One block of so many is held out to be judged on; none if absent.
 
     Raises:
         RecordingError: A recording or the model cannot be used; one line says why.
@@ -296,9 +296,9 @@ def _mechanism(read: Readers, motion: Track) -> Mechanism:
 def _fastest(spec: ModelSpec, m: Mechanism) -> float:
     """Largest eigenvalue of the model without effects, by size."""
     constants = np.array([(s.stiffness_n_per_m, s.damping_n_s_per_m) for s in spec.struts])
-    rows, mass = m.rows.mean(axis=0), m.mass.mean(axis=0)
-    stiffness = rows.T @ np.diag(constants[:, 0]) @ rows - m.bias_q.mean(axis=0)
-    damping = rows.T @ np.diag(constants[:, 1]) @ rows - m.bias_v.mean(axis=0)
+    jacobian, mass = m.jacobian.mean(axis=0), m.mass.mean(axis=0)
+    stiffness = jacobian.T @ np.diag(constants[:, 0]) @ jacobian - m.bias_q.mean(axis=0)
+    damping = jacobian.T @ np.diag(constants[:, 1]) @ jacobian - m.bias_v.mean(axis=0)
     poles = np.linalg.eigvals(system(mass, stiffness, damping))
     return max(float(np.max(np.abs(poles))), 1e-9)
 

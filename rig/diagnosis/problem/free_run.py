@@ -1,7 +1,7 @@
-"""A model that runs alone under the applied force: its residual is the height that it misses.
+"""A model that runs alone under the applied force: its residual is the height it does not explain.
 
 The regression along the motion rests on an identity. Let the reference be a simulation with the
-linear dynamics G (heights by force). What it misses of the measured heights is G applied to the
+linear dynamics G (heights by force). The residual of the measured heights is G applied to the
 force of what is missing, and to the changes of the linear part times the measured motion, plus
 sensor noise as it is: an equation error that passes through the model's own dynamics has the noise
 of an output error (Young 2011, 8.2). The measured motion itself comes from a smoother.
@@ -193,14 +193,14 @@ class FreeRun(Problem):
         """Coordinates and velocities from a parabola through the first samples; states at zero."""
         grid, mechanism = self.runs[k].grid, self.runs[k].mechanism
         heights, velocities = first_motion(grid)
-        rows = mechanism.rows[0]
-        q = mechanism.q[0] + np.linalg.solve(rows, heights - mechanism.heights_m[0])
-        v = np.linalg.solve(rows, velocities)
+        jacobian = mechanism.jacobian[0]
+        q = mechanism.q[0] + np.linalg.solve(jacobian, heights - mechanism.heights_m[0])
+        v = np.linalg.solve(jacobian, velocities)
         return np.concatenate([q, v, np.zeros(slots_of(self, candidate).states)])
 
     def start_scales(self, candidate: Candidate) -> tuple[Array, Flags]:
         """A thousandth of the stroke, a hundredth of the speed, and the laws' own scales."""
-        row = float(np.max(np.abs(self.runs[0].mechanism.rows)))
+        row = float(np.max(np.abs(self.runs[0].mechanism.jacobian)))
         q = 1e-3 * self._stroke_m / row
         v = 1e-2 * max(motion.speed_m_per_s for motion in self.motions) / row
         n = self.runs[0].mechanism.coordinates
@@ -261,7 +261,7 @@ class FreeRun(Problem):
             m.bias,
             m.bias_q,
             m.bias_v,
-            m.rows,
+            m.jacobian,
             m.heights_m,
             m.applied,
             m.q,
@@ -292,25 +292,30 @@ class FreeRun(Problem):
         m = linear_part.corrected(run.mechanism, self.linear, parts.linear)
         if there is None or m is None:
             return None
-        miss, _ = smoothed(run.grid, there.heights_m)
-        z, w, a = (b + np.column_stack([s.states[:, i] for s in miss]) for i, b in enumerate(there))
-        spread = [np.column_stack([s.deviations[:, i] for s in miss]) for i in range(3)]
+        residual, _ = smoothed(run.grid, there.heights_m)
+        z, w, a = (
+            b + np.column_stack([s.states[:, i] for s in residual]) for i, b in enumerate(there)
+        )
+        spread = [np.column_stack([s.deviations[:, i] for s in residual]) for i in range(3)]
         along = Track.of_columns(run.grid.t_s, z, w, run.applied_n, run.grid.temperature_c)
         states = self.states(k, candidate, parts)
         forces = track.strut_forces(self, candidate, parts, along, states)
         every = np.arange(len(z)) if len(m.q) > 1 else np.zeros(len(z), dtype=np.int64)
-        rows, mass = m.rows[every], m.mass[every]
-        q = m.q[every] + np.linalg.solve(rows, (z - m.heights_m[every])[..., np.newaxis])[..., 0]
-        v = np.linalg.solve(rows, w[..., np.newaxis])[..., 0]
-        acceleration = np.linalg.solve(rows, a[..., np.newaxis])[..., 0]
+        jacobian, mass = m.jacobian[every], m.mass[every]
+        q = (
+            m.q[every]
+            + np.linalg.solve(jacobian, (z - m.heights_m[every])[..., np.newaxis])[..., 0]
+        )
+        v = np.linalg.solve(jacobian, w[..., np.newaxis])[..., 0]
+        acceleration = np.linalg.solve(jacobian, a[..., np.newaxis])[..., 0]
         bias = m.bias[every] + m.applied[every] * run.applied_n[:, np.newaxis]
         bias = bias + np.einsum("kij,kj->ki", m.bias_q[every], q - m.q[every])
         bias = bias + np.einsum("kij,kj->ki", m.bias_v[every], v - m.v[every])
         needed = np.einsum("kij,kj->ki", mass, acceleration) - bias
-        transposed = np.swapaxes(rows, 1, 2)
+        transposed = np.swapaxes(jacobian, 1, 2)
         needed = np.linalg.solve(transposed, needed[..., np.newaxis])[..., 0]
         constants = strut_constants(self, parts.linear)
-        inertia = np.abs(np.linalg.solve(transposed[0], mass[0] @ np.linalg.inv(rows[0])))
+        inertia = np.abs(np.linalg.solve(transposed[0], mass[0] @ np.linalg.inv(jacobian[0])))
         deviation = (
             spread[2] @ inertia.T + constants[:, 2] * spread[1] + constants[:, 1] * spread[0]
         )
@@ -337,27 +342,27 @@ class FreeRun(Problem):
             there = self.simulated(run, candidate, parts, parts.starts[k])
             if there is None:
                 raise FloatingPointError(run.grid.name)
-            miss, _ = smoothed(run.grid, there.heights_m)
+            residual, _ = smoothed(run.grid, there.heights_m)
             pieces = track.pieces(len(run.grid.t_s), samples, most_samples, most_thinned)
-            lead = self._whole(run, there, miss) if len(pieces) > 1 else None
+            lead = self._whole(run, there, residual) if len(pieces) > 1 else None
             for cut in pieces:
                 if not np.any(run.grid.fitted[cut]):
-                    continue  # All of it is kept back.
+                    continue  # All of it is held out.
                 dynamics = _Dynamics(self, run, parts.linear, cut)
-                found.append(self._segment(run, there, miss, lead, cut, dynamics))
+                found.append(self._segment(run, there, residual, lead, cut, dynamics))
         return tuple(found)
 
     def _segment(
         self,
         run: Run,
         there: Trajectory,
-        miss: Sequence[Smoothed],
+        residual: Sequence[Smoothed],
         lead: tuple[Track, Track] | None,
         cut: slice,
         dynamics: "_Dynamics",
     ) -> Segment:
         grid = run.grid
-        states = [np.column_stack([s.states[cut, i] for s in miss]) for i in range(3)]
+        states = [np.column_stack([s.states[cut, i] for s in residual]) for i in range(3)]
         motion = [a[cut] + b for a, b in zip(there, states, strict=True)]
         # The grid of the filter: finer where the motion is fast, never coarser than the samples.
         t_s = fine_times(grid.t_s[cut], dynamics.finer)
@@ -378,7 +383,7 @@ class FreeRun(Problem):
         tables = _Tables(run.mechanism.cut(cut), grid.t_s[cut], t_s)
 
         def respond_to(strut: int, force: Array) -> Array:
-            return answer(tables.rows[:, strut] * force[:, np.newaxis])
+            return answer(tables.jacobian[:, strut] * force[:, np.newaxis])
 
         raw = grid.heights_m[cut] - there.heights_m[cut]
         held = dynamics.holding_forces(states[0], states[1], grid.t_s[cut], t_s)
@@ -405,13 +410,15 @@ class FreeRun(Problem):
             blocks,
         )
 
-    def _whole(self, run: Run, there: Trajectory, miss: Sequence[Smoothed]) -> tuple[Track, Track]:
+    def _whole(
+        self, run: Run, there: Trajectory, residual: Sequence[Smoothed]
+    ) -> tuple[Track, Track]:
         """Measured and reference motion of a whole recording, at its nodes."""
         reference = track_of(run, there)
         measured = reference._replace(
-            heights_m=reference.heights_m + np.array([s.states[:, 0] for s in miss]),
+            heights_m=reference.heights_m + np.array([s.states[:, 0] for s in residual]),
             velocities_m_per_s=reference.velocities_m_per_s
-            + np.array([s.states[:, 1] for s in miss]),
+            + np.array([s.states[:, 1] for s in residual]),
         )
         return measured, reference
 
@@ -449,7 +456,7 @@ class _Tables:
         if len(mechanism.q) > 1:
             at = np.clip(np.searchsorted(nodes_s, t_s - 1e-12), 0, len(nodes_s) - 1)
         self._mechanism, self._at = mechanism, at
-        self.rows = mechanism.rows[at]
+        self.jacobian = mechanism.jacobian[at]
 
     def generalised(
         self,
@@ -463,13 +470,13 @@ class _Tables:
         """Generalised force (N, n) of a unit change of a linear parameter along the motion."""
         strut = parameter.strut
         if parameter.kind == "mass":
-            q = np.linalg.solve(self.rows, acceleration[..., np.newaxis])[..., 0]
+            q = np.linalg.solve(self.jacobian, acceleration[..., np.newaxis])[..., 0]
             inertia = np.einsum("kij,kj->ki", self._mechanism.mass_by_kg[self._at, strut], q)
             return self._mechanism.bias_by_kg[self._at, strut] - inertia
         if parameter.kind == "gain":
             return self._mechanism.applied[self._at] * applied[:, np.newaxis]
         force = linear_part.strut_force(parameter.kind, z[:, strut], w[:, strut], motions[strut])
-        return self.rows[:, strut] * force[:, np.newaxis]
+        return self.jacobian[:, strut] * force[:, np.newaxis]
 
 
 class _Dynamics:
@@ -481,10 +488,10 @@ class _Dynamics:
             raise FloatingPointError(run.grid.name)
         n = m.coordinates
         constants = strut_constants(problem, linear)
-        rows = m.rows.mean(axis=0)
+        jacobian = m.jacobian.mean(axis=0)
         mass = m.mass.mean(axis=0)
-        stiffness = rows.T @ np.diag(constants[:, 1]) @ rows - m.bias_q.mean(axis=0)
-        damping = rows.T @ np.diag(constants[:, 2]) @ rows - m.bias_v.mean(axis=0)
+        stiffness = jacobian.T @ np.diag(constants[:, 1]) @ jacobian - m.bias_q.mean(axis=0)
+        damping = jacobian.T @ np.diag(constants[:, 2]) @ jacobian - m.bias_v.mean(axis=0)
         duration = (cut.stop - cut.start) * run.grid.step_s
         coarse_s = run.grid.step_s * cut.step
         self.more_stiffness, self.more_damping = _settling(
@@ -505,20 +512,20 @@ class _Dynamics:
             e[: 2 * n, : 2 * n],
             e[: 2 * n, 2 * n : 3 * n] - late,
             late,
-            np.hstack([rows, np.zeros_like(rows)]),
+            np.hstack([jacobian, np.zeros_like(jacobian)]),
         )
         self._parts = tuple(np.ascontiguousarray(part, dtype=np.float64) for part in parts)
-        self._rows = rows
+        self._jacobian = jacobian
 
     def heights(self, forces: Array) -> Array:
         """Heights (N, struts) from rest under generalised forces (N, n)."""
-        out = np.empty((len(forces), len(self._rows)))
+        out = np.empty((len(forces), len(self._jacobian)))
         respond(*self._parts, np.ascontiguousarray(forces), out)
         return out
 
     def holding_forces(self, z: Array, w: Array, nodes_s: Array, t_s: Array) -> Array:
         """Generalised force of what was added so that the dynamics settle, along a difference."""
-        inverse = np.linalg.pinv(self._rows)
+        inverse = np.linalg.pinv(self._jacobian)
         force = z @ inverse.T @ self.more_stiffness.T + w @ inverse.T @ self.more_damping.T
         return CubicSpline(nodes_s, force)(t_s)
 

@@ -38,7 +38,7 @@ class Grid(NamedTuple):
         t_s: Times of the nodes: measured times and, in gaps, times between, shape (N,).
         heights_m: Measured heights, NaN elsewhere and where outliers were, shape (N, struts).
         fitted: Nodes whose measurements take part in fits, shape (N,).
-        kept: Nodes that are kept back to be judged on, shape (N,).
+        kept: Nodes that are held out to be judged on, shape (N,).
         temperature_c: Temperature at the nodes, shape (N,).
         has_temperature: Whether it was measured.
         outliers: Number of heights that were left out as outliers.
@@ -106,7 +106,7 @@ def grid_of(recording: Recording) -> tuple[Grid, NDArray[np.int64]]:
 
 
 def with_blocks_kept(grid: Grid, length_s: float, every: int) -> Grid:
-    """One block of every few kept back, spread over the recording where there is motion."""
+    """One block of every few held out, spread over the recording where there is motion."""
     numbers = block_numbers(grid.t_s, length_s)
     speed = np.zeros(len(grid.t_s))
     for column in grid.heights_m.T:

@@ -107,7 +107,7 @@ def moving_mass_kg(mechanism: Mechanism, strut: int) -> float:
 
 def _along_last_strut(mechanism: Mechanism) -> bool:
     """Whether the applied force acts as a force in the last strut would."""
-    return bool(np.allclose(mechanism.applied, mechanism.rows[:, -1], rtol=1e-9, atol=1e-12))
+    return bool(np.allclose(mechanism.applied, mechanism.jacobian[:, -1], rtol=1e-9, atol=1e-12))
 
 
 def strut_force(kind: Kind, height_m: Array, velocity_m_per_s: Array, motion: Motion) -> Array:

@@ -16,9 +16,6 @@ from rig.diagnosis.recording import RecordingError
 
 Array = NDArray[np.float64]
 
-_DIFFERENCE = 1e-6
-"""Step of the coordinates (m or rad, and per second) in central differences of the bias force: a
-third of the digits of a double, where rounding and truncation are about equal."""
 _REACHED_M = 1e-12
 """Error of a height at which Newton's method has arrived: a millionth of any sensor's step."""
 _ONE_KG = EffectSpec(name="added_mass", parameters={"mass_kg": 1.0})
@@ -31,7 +28,7 @@ class Mechanism(NamedTuple):
         q: Reference coordinates, shape (K, n).
         v: Their rates, shape (K, n).
         heights_m: Strut heights there, shape (K, struts).
-        rows: Jacobian of the struts, shape (K, struts, n).
+        jacobian: Jacobian of the struts, shape (K, struts, n).
         applied: Generalised force per newton of applied force, shape (K, n).
         mass: Mass matrix, shape (K, n, n).
         bias: Generalised force of all but struts and applied force, shape (K, n).
@@ -45,7 +42,7 @@ class Mechanism(NamedTuple):
     q: Array
     v: Array
     heights_m: Array
-    rows: Array
+    jacobian: Array
     applied: Array
     mass: Array
     bias: Array
@@ -134,12 +131,7 @@ def tabulated(read: Readers, heights_m: Array, velocities_m_per_s: Array) -> Mec
 def _at(read: Readers, q: Array, v: Array) -> Mechanism:
     plain = read.plain
     there = plain.mechanics(q, v)
-    n = len(q)
-    bias_q, bias_v = np.empty((n, n)), np.empty((n, n))
-    for j in range(n):
-        step = _DIFFERENCE * np.eye(n)[j]
-        bias_q[:, j] = plain.mechanics(q + step, v).bias - plain.mechanics(q - step, v).bias
-        bias_v[:, j] = plain.mechanics(q, v + step).bias - plain.mechanics(q, v - step).bias
+    bias_q, bias_v = plain.bias_slopes(q, v)
     heavier = [plant.mechanics(q, v) for plant in read.heavier]
     return Mechanism(
         q,
@@ -149,8 +141,8 @@ def _at(read: Readers, q: Array, v: Array) -> Mechanism:
         there.applied,
         there.mass,
         there.bias,
-        bias_q / (2.0 * _DIFFERENCE),
-        bias_v / (2.0 * _DIFFERENCE),
+        bias_q,
+        bias_v,
         np.array([other.mass - there.mass for other in heavier]),
         np.array([other.bias - there.bias for other in heavier]),
     )

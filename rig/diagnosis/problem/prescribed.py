@@ -1,4 +1,4 @@
-"""A strut whose motion is given: its residual is the load-cell force that its law misses.
+"""A strut whose motion is given: its residual is the load-cell force that its law does not explain.
 
 Nothing is simulated: the motion is smoothed over the whole recording, and a law's force along it
 takes one pass. What is left of initial states are the laws' internal ones.

@@ -19,7 +19,7 @@ from rig.diagnosis.progress import Progress
 from rig.diagnosis.search.explore import FirstRound
 from rig.diagnosis.search.fit import Fit, fit, law_values, parts_for, spread
 from rig.diagnosis.search.pool import FINAL, FULL, Pool, Scored
-from rig.diagnosis.search.screen import Trial, plain, proposed, ranked, refined
+from rig.diagnosis.search.screen import Screening, plain, proposed, ranked, refined
 from rig.diagnosis.search.sound import unmeasured
 
 Array = NDArray[np.float64]
@@ -39,7 +39,7 @@ class Found(NamedTuple):
         linear: The best linear model.
         plain: The same with those corrections alone that the data call for.
         chosen: The model that was chosen.
-        rivals: Models with other families that the data cannot tell from it.
+        rivals: Models with other families that the data cannot distinguish from it.
         superfluous: Existing effects, by index, without which the data are as well described.
         rejected: Laws that were not chosen, best first.
         gain_alike: Whether a gain of the applied force stands for mass, stiffness and damping, or
@@ -63,7 +63,7 @@ def conclude(pool: Pool, first: Pool, seen: FirstRound | None, progress: Progres
         pool: Models to choose from.
         first: Those about the linear model, for what was not chosen.
         seen: Single laws there.
-        progress: Told what is being done and the share that is done.
+        progress: Called with what is being done and the share that is done.
     """
     progress("leaving out what is needless", 0.85)
     most_laws = pool.criteria.most_laws
@@ -117,8 +117,8 @@ def _simpler(pool: Pool, chosen: Scored, placed: Placed) -> Iterable[Scored]:
         near = 0.0 if whole is None else criteria.hopeless * whole.score
         return max(near, criteria.formula**2 * nothing)
 
-    def is_hopeful(trial: Trial | None) -> bool:
-        return trial is not None and trial.score <= most()
+    def is_hopeful(screening: Screening | None) -> bool:
+        return screening is not None and screening.score <= most()
 
     if chosen.size > 1:
         # Its own fit may have ended in a side valley, which the larger set has left.
@@ -133,15 +133,15 @@ def _simpler(pool: Pool, chosen: Scored, placed: Placed) -> Iterable[Scored]:
             continue
         candidate = less.added(other)
         if candidate not in pool.fits:
-            for trial in ranked(stage, _as_trial(less.new, known), 1, [other]):
-                if trial.values and is_hopeful(trial):
-                    pool.attempt_trial(stage, pool.linear, trial, FULL)
+            for screening in ranked(stage, _as_screening(less.new, known), 1, [other]):
+                if screening.values and is_hopeful(screening):
+                    pool.attempt_screened(stage, pool.linear, screening, FULL)
         yield from _settled(pool, candidate, chosen)
 
 
-def _as_trial(laws: Sequence[Placed], known: Mapping[Placed, Array]) -> Trial:
+def _as_screening(laws: Sequence[Placed], known: Mapping[Placed, Array]) -> Screening:
     """Fitted laws as a set that others are tried beside."""
-    return Trial(tuple(laws), tuple(known[law] for law in laws), 0.0, np.zeros(1))
+    return Screening(tuple(laws), tuple(known[law] for law in laws), 0.0, np.zeros(1))
 
 
 def _settled(pool: Pool, candidate: Candidate, chosen: Scored) -> Iterable[Scored]:
@@ -157,13 +157,13 @@ def _try_plainer(pool: Pool, unbound: Scored) -> None:
     known = law_values(pool.problem, unbound.fit)
     for placed in unbound.fit.candidate.new:
         less = unbound.fit.candidate.without(placed).new
-        base = _as_trial(less, known)
+        base = _as_screening(less, known)
         plainer = [at for at in proposed(pool.problem) if _is_plainer(at, placed)]
-        for trial in ranked(pool.linear_stage, base, len(plainer), plainer)[
-            : pool.criteria.finalists
+        for screening in ranked(pool.linear_stage, base, len(plainer), plainer)[
+            : pool.criteria.fitted_a_size
         ]:
-            if trial.values:
-                pool.attempt_trial(pool.linear_stage, pool.linear, trial, FULL)
+            if screening.values:
+                pool.attempt_screened(pool.linear_stage, pool.linear, screening, FULL)
 
 
 def _is_plainer(one: Placed, other: Placed) -> bool:
@@ -174,7 +174,7 @@ def _is_plainer(one: Placed, other: Placed) -> bool:
 
 
 def _rivals(pool: Pool, chosen: Scored) -> tuple[Scored, ...]:
-    """Sets of the same size and other families that the data cannot tell from the chosen."""
+    """Sets of the same size and other families that the data cannot distinguish from the chosen."""
     found: dict[tuple[str, ...], Scored] = {}
     for other in sorted(pool.sound(), key=lambda s: s.score):
         if other.size != chosen.size or other.families in (chosen.families, *found):
@@ -246,7 +246,7 @@ def _called_for(pool: Pool, chosen: Scored) -> Scored:
 
 
 def _needed(result: Fit, significant: float) -> Flags:
-    """Backward elimination by Wald's test with the covariance of a coloured residual."""
+    """Backward elimination by Wald's test with the covariance of an autocorrelated residual."""
     variables = np.flatnonzero(result.free)
     count = len(variables)
     known = spread(result).covariance[:count, :count].copy()
@@ -323,11 +323,11 @@ def _rejected(
     found: dict[Placed, RejectedEffect] = {}
     taken = set(chosen.fit.candidate.new)
     tied = {placed for rival in rivals for placed in rival.fit.candidate.new} - taken
-    for trial in seen.trials:
-        placed = trial.laws[-1]
+    for screening in seen.screenings:
+        placed = screening.laws[-1]
         if placed in taken or placed in found:
             continue
-        left = float(np.sqrt(max(trial.cost, 0.0) / max(seen.nothing.cost, 1e-300)))
+        left = float(np.sqrt(max(screening.cost, 0.0) / max(seen.nothing.cost, 1e-300)))
         why = (
             "cannot be told from what was chosen by these data"
             if placed in tied

@@ -15,17 +15,17 @@ class SelectionCriteria:
     Attributes:
         blocks: Blocks of cross-validation over all recordings: the standard error of a sum over
             them is then known to an eighth (1 / sqrt(2 * blocks)), and each holds some periods.
-        kept_every: Without held-out runs, one block of so many is kept back to be judged on; a
+        kept_every: Without held-out runs, one block of so many is held out to be judged on; a
             fifth is usual (Hastie, Tibshirani, Friedman, The Elements of Statistical Learning,
             2009, 7.10).
-        screened: Laws of each round whose parameters are refined before they are compared: their
+        screening: Laws of each round whose parameters are refined before they are compared: their
             order at starts that nothing has adapted is rough, and a round costs as much as it has.
         beam: Sets of laws that each round goes on from, so that an early choice can be revisited.
         most_laws: Laws that a finding may consist of. A force needs three at most before a table
             describes it as well (measured dampers: the fourth gains less than the scatter between
             recordings).
-        finalists: Sets of each size that are fitted in full, smaller ones of theirs apart; changes
-            of a fitted set likewise.
+        fitted_a_size: Sets of each size that are fitted in full, smaller ones of theirs apart;
+            changes of a fitted set likewise.
         hopeless: Times the sum of squares of the best set of a size, along the motion, from which
             on a set of that size is not fitted in full, and no longer near the best where sets were
             fitted: smoothing the motion costs laws that switch a factor of two at most.
@@ -35,7 +35,7 @@ class SelectionCriteria:
             that acts in k of them alone the gain is sqrt(k) standard errors.
         least_likelihood_gain: Least gain of twice the out-of-sample log likelihood by a further
             law, a better formula or a linear correction. The best of some hundred useless starts
-            gains 2 ln 100 = 9 by chance; a coloured residual that much more often.
+            gains 2 ln 100 = 9 by chance; an autocorrelated residual that much more often.
         least_share: Least share of the mean square above the noise floor that a further law takes
             away; 0.19 is a tenth of the RMS.
         least_above_noise: Mean square above the noise floor, as a share of the floor, below which
@@ -68,10 +68,10 @@ class SelectionCriteria:
 
     blocks: int = 32
     kept_every: int = 5
-    screened: int = 10
+    screening: int = 10
     beam: int = 3
     most_laws: int = 3
-    finalists: int = 4
+    fitted_a_size: int = 4
     hopeless: float = 4.0
     standard_errors: float = 1.0
     least_likelihood_gain: float = 30.0

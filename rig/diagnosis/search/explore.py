@@ -15,9 +15,17 @@ from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.search.fit import parts_for
 from rig.diagnosis.search.pool import Pool, Scored
 from rig.diagnosis.search.score import Change
-from rig.diagnosis.search.screen import Stage, Trial, best_of_each, plain, ranked, refined, stage_of
+from rig.diagnosis.search.screen import (
+    Screening,
+    Stage,
+    best_of_each,
+    plain,
+    ranked,
+    refined,
+    stage_of,
+)
 
-Tried = TypeVar("Tried", Trial, Change)
+Tried = TypeVar("Tried", Screening, Change)
 _EXPLORED = 0.85
 """Share of a search's time after which it compares rivals."""
 
@@ -27,11 +35,11 @@ class FirstRound(NamedTuple):
 
     Attributes:
         nothing: No law at all.
-        trials: The laws, best first.
+        screenings: The laws, best first.
     """
 
-    nothing: Trial
-    trials: tuple[Trial, ...]
+    nothing: Screening
+    screenings: tuple[Screening, ...]
 
 
 def explore(pool: Pool, progress: Progress) -> FirstRound | None:
@@ -55,13 +63,13 @@ def _from_nothing(pool: Pool, progress: Progress) -> FirstRound | None:
     if pool.at_floor(pool.linear):
         return None
     seen = _singles(pool, progress)
-    best = _refined([seen.trials])[:1]
-    if not any(_gains(pool, pool.linear_stage, seen.nothing, trial) for trial in best):
+    best = _refined([seen.screenings])[:1]
+    if not any(_gains(pool, pool.linear_stage, seen.nothing, screening) for screening in best):
         pool.look_closer()
         seen = _singles(pool, progress)
     stage, beam = pool.linear_stage, [seen.nothing]
-    rounds: Sequence[Sequence[Trial]] = [seen.trials]
-    levels: list[list[Trial]] = []
+    rounds: Sequence[Sequence[Screening]] = [seen.screenings]
+    levels: list[list[Screening]] = []
     for size in range(1, criteria.most_laws + 1):
         begin = _EXPLORED * (size - 1) / criteria.most_laws
         end = _EXPLORED * size / criteria.most_laws
@@ -71,9 +79,9 @@ def _from_nothing(pool: Pool, progress: Progress) -> FirstRound | None:
         level = _refined(rounds)
         if not level or not _gains(pool, stage, min(beam, key=_score), level[0]):
             break
-        finalists = _finalists(pool, level) + _backward(pool, levels, level[:2])
+        chosen = _to_be_fitted(pool, level) + _backward(pool, levels, level[:2])
         levels.append(level)
-        _fit_all(pool, stage, pool.linear, finalists, within(progress, 0.5 * (begin + end), end))
+        _fit_all(pool, stage, pool.linear, chosen, within(progress, 0.5 * (begin + end), end))
         # One law may imitate two. What a pair leaves is looked for about it, not the linear model.
         if pool.at_floor(pool.settled_least()) or (size > 1 and pool.is_formula(pool.least())):
             break
@@ -82,11 +90,11 @@ def _from_nothing(pool: Pool, progress: Progress) -> FirstRound | None:
 
 def _singles(pool: Pool, progress: Progress) -> FirstRound:
     nothing = plain(pool.linear_stage)
-    (trials,) = _rounds(pool, pool.linear_stage, [nothing], progress)
-    return FirstRound(nothing, tuple(trials))
+    (screenings,) = _rounds(pool, pool.linear_stage, [nothing], progress)
+    return FirstRound(nothing, tuple(screenings))
 
 
-def _gains(pool: Pool, stage: Stage, before: Trial, after: Trial) -> bool:
+def _gains(pool: Pool, stage: Stage, before: Screening, after: Screening) -> bool:
     """Whether a further law could be worth its while, as far as is seen along the motion."""
     gain, above = before.score - after.score, before.score - len(stage.target)
     return gain > max(pool.criteria.least_likelihood_gain, pool.criteria.least_share * above)
@@ -127,7 +135,7 @@ def _along_the_motion(pool: Pool, reference: Scored, progress: Progress) -> None
     stage = stage_of(pool.problem, reference.fit.candidate, reference.fit.parts)
     rounds = _rounds(pool, stage, [plain(stage)], within(progress, 0.0, 0.5))
     level = [t for t in _refined(rounds) if t.laws != reference.fit.candidate.new]
-    _fit_all(pool, stage, reference, _finalists(pool, level), within(progress, 0.5, 1.0))
+    _fit_all(pool, stage, reference, _to_be_fitted(pool, level), within(progress, 0.5, 1.0))
 
 
 def _in_simulation(
@@ -150,40 +158,44 @@ def _in_simulation(
         for change in pool.changes(model)
         if change.left < min(least, known.get(change.candidate, least))
     ]
-    for change in _diverse(found, pool.criteria.finalists):
+    for change in _diverse(found, pool.criteria.fitted_a_size):
         progress(f"fitting {', '.join(name for _, name in change.laws)}", 0.5)
         pool.attempt(change.candidate, change.parts)
 
 
 def _rounds(
-    pool: Pool, stage: Stage, beam: Sequence[Trial], progress: Progress
-) -> list[list[Trial]]:
+    pool: Pool, stage: Stage, beam: Sequence[Screening], progress: Progress
+) -> list[list[Screening]]:
     """For each set of a beam, that set with one law more, best first."""
-    found: list[list[Trial]] = []
+    found: list[list[Screening]] = []
     for i, base in enumerate(beam):
         progress("screening laws", i / len(beam))
-        found.append(ranked(stage, base, pool.criteria.screened))
+        found.append(ranked(stage, base, pool.criteria.screening))
     return found
 
 
-def _refined(rounds: Sequence[Sequence[Trial]]) -> list[Trial]:
+def _refined(rounds: Sequence[Sequence[Screening]]) -> list[Screening]:
     """Sets that were refined along the motion, each at its best, best first."""
-    return best_of_each(trial for trials in rounds for trial in trials if trial.values)
+    return best_of_each(
+        screening for screenings in rounds for screening in screenings if screening.values
+    )
 
 
-def _backward(pool: Pool, levels: Sequence[Sequence[Trial]], best: Sequence[Trial]) -> list[Trial]:
+def _backward(
+    pool: Pool, levels: Sequence[Sequence[Screening]], best: Sequence[Screening]
+) -> list[Screening]:
     """The best sets less one of their laws, where that set is hopeful and has not been tried."""
-    found: list[Trial] = []
-    for trial in best:
-        if len(trial.laws) < 2:
+    found: list[Screening] = []
+    for screening in best:
+        if len(screening.laws) < 2:
             continue
-        less = levels[len(trial.laws) - 2]
+        less = levels[len(screening.laws) - 2]
         known = {frozenset(t.laws) for t in less}
-        for i in range(len(trial.laws)):
-            laws = trial.laws[:i] + trial.laws[i + 1 :]
+        for i in range(len(screening.laws)):
+            laws = screening.laws[:i] + screening.laws[i + 1 :]
             if frozenset(laws) in known:
                 continue
-            values = trial.values[:i] + trial.values[i + 1 :]
+            values = screening.values[:i] + screening.values[i + 1 :]
             smaller = refined(pool.linear_stage, laws, values)
             if smaller is not None and smaller.score <= pool.criteria.hopeless * less[0].score:
                 found.append(smaller)
@@ -191,31 +203,35 @@ def _backward(pool: Pool, levels: Sequence[Sequence[Trial]], best: Sequence[Tria
 
 
 def _fit_all(
-    pool: Pool, stage: Stage, reference: Scored, trials: Sequence[Trial], progress: Progress
+    pool: Pool, stage: Stage, reference: Scored, screenings: Sequence[Screening], progress: Progress
 ) -> None:
-    for i, trial in enumerate(trials):
-        progress(f"fitting {', '.join(name for _, name in trial.laws)}", i / len(trials))
-        pool.attempt_trial(stage, reference, trial)
+    for i, screening in enumerate(screenings):
+        progress(f"fitting {', '.join(name for _, name in screening.laws)}", i / len(screenings))
+        pool.attempt_screened(stage, reference, screening)
 
 
-def _finalists(pool: Pool, level: Sequence[Trial]) -> list[Trial]:
-    least = pool.criteria.hopeless * min((trial.score for trial in level), default=0.0)
-    return [trial for trial in _diverse(level, pool.criteria.finalists) if trial.score <= least]
+def _to_be_fitted(pool: Pool, level: Sequence[Screening]) -> list[Screening]:
+    least = pool.criteria.hopeless * min((screening.score for screening in level), default=0.0)
+    return [
+        screening
+        for screening in _diverse(level, pool.criteria.fitted_a_size)
+        if screening.score <= least
+    ]
 
 
 def _diverse(level: Sequence[Tried], count: int) -> list[Tried]:
     """The best sets, at most two of which are of the same families."""
     chosen: list[Tried] = []
     seen: dict[tuple[str, ...], int] = {}
-    for trial in level:
+    for screening in level:
         if len(chosen) >= count:
             break
-        families = tuple(sorted(effect(name).family for _, name in trial.laws))
+        families = tuple(sorted(effect(name).family for _, name in screening.laws))
         if seen.get(families, 0) < 2:
-            chosen.append(trial)
+            chosen.append(screening)
             seen[families] = seen.get(families, 0) + 1
     return chosen
 
 
-def _score(trial: Trial) -> float:
-    return trial.score
+def _score(screening: Screening) -> float:
+    return screening.score

@@ -3,7 +3,7 @@
 References:
     Ljung, System Identification (1999), 9.4, covariance of output-error estimates.
     White, Maximum likelihood estimation of misspecified models, Econometrica 50 (1982), for
-    intervals where the residual is coloured.
+    intervals where the residual is autocorrelated.
     Rad, Maleki, A scalable estimate of the out-of-sample prediction error via approximate
     leave-one-out, J. R. Stat. Soc. B 82 (2020); here blocks are left out, and a step of Newton's
     method stands for the fit without each.
@@ -340,7 +340,7 @@ class Spread(NamedTuple):
 
 
 def spread(result: Fit) -> Spread:
-    """Covariance of a fit that takes the residual as coloured as it is (White's sandwich).
+    """Covariance of a fit that takes the residual as autocorrelated as it is (White's sandwich).
 
     The smaller covariance of white noise is a lower limit.
     """

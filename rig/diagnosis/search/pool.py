@@ -25,8 +25,8 @@ from rig.diagnosis.search.criteria import DISSIPATING, STORING, SelectionCriteri
 from rig.diagnosis.search.fit import Fit, block_scores, fit
 from rig.diagnosis.search.score import Change, changes
 from rig.diagnosis.search.screen import (
+    Screening,
     Stage,
-    Trial,
     law_and_shift,
     linear_beside,
     stage_of,
@@ -159,32 +159,34 @@ class Pool:
         if why is not None:
             self.unsound[candidate] = why
 
-    def attempt_trial(
-        self, stage: Stage, reference: Scored, trial: Trial, effort: Effort = ROUGH
+    def attempt_screened(
+        self, stage: Stage, reference: Scored, screening: Screening, effort: Effort = ROUGH
     ) -> None:
-        """Fit a trial's laws in simulation, from what it found along the motion.
+        """Fit a screening's laws in simulation, from what it found along the motion.
 
         Args:
             stage: Where it was found.
             reference: The model that stage is about.
-            trial: The laws.
+            screening: The laws.
             effort: How far to go.
         """
         base, known = nominal(self.problem), reference.fit
         existing = existing_values(self.problem, base)
         if known.candidate.kept == base.kept:
             existing = known.parts.effects[: len(existing)]
-        values, linear = [existing], known.parts.linear + linear_beside(stage, trial)
-        for at, own in sorted(zip(trial.laws, trial.values, strict=True), key=lambda law: law[0]):
+        values, linear = [existing], known.parts.linear + linear_beside(stage, screening)
+        for at, own in sorted(
+            zip(screening.laws, screening.values, strict=True), key=lambda law: law[0]
+        ):
             parameters, shift = law_and_shift(at[1], own)
             values.append(parameters)
             here = [(p.strut, p.kind) == (at[0], "free_length") for p in self.problem.linear]
             linear = linear + shift * np.array(here)
         least = np.array([p.least for p in self.problem.linear])
-        candidate = base.added(*trial.laws)
+        candidate = base.added(*screening.laws)
         parts = self._begun(candidate, np.maximum(linear, least), np.concatenate(values))
         # Priors weigh as they did there: a free run may begin far off with the right parameters.
-        self.attempt(candidate, parts, effort, max(1.0, trial.cost / len(stage.target)))
+        self.attempt(candidate, parts, effort, max(1.0, screening.cost / len(stage.target)))
 
     def _begun(self, candidate: Candidate, linear: Array, effects: Array) -> Parts:
         """With initial states of its own: those of a poorer model make up for what it lacks."""
@@ -241,7 +243,7 @@ class Pool:
         """The best sound sets that come near the best one."""
         order = sorted((s for s in self.sound() if s.size > 0), key=lambda s: s.score)
         near = (s for s in order if self.is_near(s, order[0]))
-        return tuple(near)[: self.criteria.finalists]
+        return tuple(near)[: self.criteria.fitted_a_size]
 
     def best_and_less(self) -> list[Scored]:
         """The best sets and what they hold: a smaller one may be all that can be defended."""
@@ -262,7 +264,7 @@ class Pool:
             current = self._plainest([s for s in larger if s.size == least])
 
     def _plainest(self, sets: Sequence[Scored]) -> Scored:
-        """Of the sets that the data cannot tell from the best, that with the fewest parameters."""
+        """Of the sets as good as the best for all the data say, that with the fewest parameters."""
         best = min(sets, key=lambda s: s.score)
         alike = [s for s in sets if self.is_alike(s, best)]
         return min(alike, key=lambda s: (len(s.fit.parts.effects), s.score))
@@ -330,7 +332,7 @@ class Pool:
         return scored.score <= self.criteria.hopeless * best.score
 
     def is_alike(self, other: Scored, best: Scored) -> bool:
-        """Whether the data cannot tell a set from the best one."""
+        """Whether the data cannot distinguish a set from the best one."""
         lost = other.score - best.score
         return lost <= self.criteria.standard_errors * _standard_error(other, best)
 

@@ -51,7 +51,7 @@ _SIDE_VALLEY = 2.0
 _REPEATABLE = ("stop", "nonlinear_damping")
 """Families of which a strut may have two: stops at both ends; a damper's valves."""
 _FINE = 5
-"""Laws of a round that are refined on all samples, one more than are fitted (see `finalists`)."""
+"""Laws of a round that are refined on all samples: one more than `fitted_a_size`."""
 _STEPS = 7
 _REMEMBERED = 3
 """Answers of a law that are kept for the next difference."""
@@ -62,7 +62,7 @@ _DIFFERENCE = 1e-4
 
 
 class Stage(NamedTuple):
-    """The regression along the motion, as all trials share it.
+    """The regression along the motion, as all sets of laws share it.
 
     Attributes:
         problem: Model and recordings.
@@ -94,7 +94,7 @@ _Start = tuple[float, Array]
 """Cost of a law at a start, and its parameters there."""
 
 
-class Trial(NamedTuple):
+class Screening(NamedTuple):
     """Laws along the motion, refined or (without values) at their best start.
 
     Attributes:
@@ -151,7 +151,7 @@ def _stage(
     tangents: list[list[Array]] = [[] for _ in segments]
     for row, (strut, name) in enumerate(placed(problem, candidate)):
         values = parts.effects[index[row, 1] : index[row, 2]]
-        # The reference's laws acted along its own motion; those of a trial along the measured.
+        # The reference's laws acted along its own motion; those of a screening, along the measured.
         forces = segment_forces(segments, strut, name, values, constants, reference=True)
         if row < len(candidate.kept):
             measured = segment_forces(segments, strut, name, values, constants, reference=False)
@@ -237,7 +237,7 @@ def answer(stage: Stage, strut: int, name: str, values: Array) -> Array:
 
 
 def law_and_shift(name: str, values: Array) -> tuple[Array, float]:
-    """Parameters of a law in a trial, and by how much the free length is another one."""
+    """Parameters of a law in a screening, and by how much the free length is another one."""
     count = len(effect(name).parameters)
     return values[:count], float(values[count]) if len(values) > count else 0.0
 
@@ -248,7 +248,7 @@ def _with_shift(name: str, values: Array) -> Array:
 
 
 def _space(stage: Stage, at: Placed, values: Array) -> tuple[Space, Array]:
-    """Where a law's parameters in a trial are searched, and the weights of their priors."""
+    """Where a law's parameters in a screening are searched, and the weights of their priors."""
     strut, name = at
     own, _ = law_and_shift(name, values)
     space = law_space(name, stage.problem.motions[strut], own)
@@ -268,10 +268,10 @@ def response(stage: Stage, strut: int, name: str, values: Array) -> Array:
     return whole - stage.basis @ (stage.basis.T @ whole)
 
 
-def linear_beside(stage: Stage, trial: Trial) -> Array:
-    """Changes of the linear parameters against the reference beside a trial's laws, shape (L,)."""
+def linear_beside(stage: Stage, screening: Screening) -> Array:
+    """Changes of the linear parameters against the reference beside these laws, shape (L,)."""
     left = stage.goal.copy()
-    for (strut, name), values in zip(trial.laws, trial.values, strict=True):
+    for (strut, name), values in zip(screening.laws, screening.values, strict=True):
         left -= answer(stage, strut, name, values)
     size = np.maximum(np.linalg.norm(stage.nuisance, axis=0), 1e-300)
     found = np.linalg.lstsq(stage.nuisance / size, left, rcond=_RANK)[0] / size
@@ -280,9 +280,9 @@ def linear_beside(stage: Stage, trial: Trial) -> Array:
     return changes
 
 
-def plain(stage: Stage) -> Trial:
+def plain(stage: Stage) -> Screening:
     """No law at all."""
-    return Trial((), (), float(stage.target @ stage.target), _scores(stage, stage.target, None))
+    return Screening((), (), float(stage.target @ stage.target), _scores(stage, stage.target, None))
 
 
 def _scores(stage: Stage, residual: Array, jacobian: Array | None) -> Array:
@@ -304,16 +304,16 @@ def proposed(problem: Problem) -> list[Placed]:
 
 def ranked(
     stage: Stage,
-    base: Trial,
-    screened: int,
+    base: Screening,
+    screening: int,
     only: Sequence[Placed] | None = None,
-) -> list[Trial]:
+) -> list[Screening]:
     """A set of laws with one more, for the best laws that there are; best first.
 
     Args:
         stage: The regression.
         base: The set.
-        screened: How many laws are refined.
+        screening: How many laws are refined.
         only: Laws that compete; all if absent.
     """
     coarse = stage.coarse or stage
@@ -334,7 +334,7 @@ def ranked(
 
     with ThreadPoolExecutor(cpu_count()) as pool:
         tried = list(pool.map(first, laws))
-        order = sorted((t[0][0], i) for i, t in enumerate(tried) if t)[:screened]
+        order = sorted((t[0][0], i) for i, t in enumerate(tried) if t)[:screening]
         jobs = [
             (laws[i], values)
             for least, i in order
@@ -342,36 +342,38 @@ def ranked(
             if cost < _SIDE_VALLEY * least
         ]
 
-        def roughly(job: tuple[Placed, Array]) -> Trial | None:
+        def roughly(job: tuple[Placed, Array]) -> Screening | None:
             return refined(coarse, (*base.laws, job[0]), (*base.values, job[1]))
 
-        def refine(trial: Trial) -> Trial | None:
-            return refined(stage, trial.laws, trial.values)
+        def refine(screening: Screening) -> Screening | None:
+            return refined(stage, screening.laws, screening.values)
 
-        rough = best_of_each(trial for trial in pool.map(roughly, jobs) if trial is not None)
+        rough = best_of_each(
+            screening for screening in pool.map(roughly, jobs) if screening is not None
+        )
         # A law begins no worse than a simpler one that is known.
         nested = list(pool.map(lambda job: (job[0], first(*job)[:1]), _nested(rough, laws)))
         jobs = [(at, values) for at, starts in nested for _, values in starts]
         rough = best_of_each([*rough, *(t for t in pool.map(roughly, jobs) if t is not None)])
-        best = [trial for trial in pool.map(refine, rough[:_FINE]) if trial is not None]
+        best = [screening for screening in pool.map(refine, rough[:_FINE]) if screening is not None]
     # Coarse costs in terms of fine ones, for laws that are not refined there.
     scale = len(stage.target) / len(coarse.target)
     best += [t._replace(cost=scale * t.cost, scores=scale * t.scores) for t in rough[_FINE:]]
     rest = [
-        Trial((*base.laws, laws[i]), (), scale * cost, np.array([scale * cost]))
-        for cost, i in sorted((t[0][0], i) for i, t in enumerate(tried) if t)[screened:]
+        Screening((*base.laws, laws[i]), (), scale * cost, np.array([scale * cost]))
+        for cost, i in sorted((t[0][0], i) for i, t in enumerate(tried) if t)[screening:]
     ]
-    return [*sorted(best, key=lambda trial: trial.score), *rest]
+    return [*sorted(best, key=lambda screening: screening.score), *rest]
 
 
-def best_of_each(trials: Iterable[Trial]) -> list[Trial]:
+def best_of_each(screenings: Iterable[Screening]) -> list[Screening]:
     """Each set of laws at its best, best first."""
-    found: dict[frozenset[Placed], Trial] = {}
-    for trial in trials:
-        key = frozenset(trial.laws)
-        if key not in found or trial.score < found[key].score:
-            found[key] = trial
-    return sorted(found.values(), key=lambda trial: trial.score)
+    found: dict[frozenset[Placed], Screening] = {}
+    for screening in screenings:
+        key = frozenset(screening.laws)
+        if key not in found or screening.score < found[key].score:
+            found[key] = screening
+    return sorted(found.values(), key=lambda screening: screening.score)
 
 
 def starts(problem: Problem, at: Placed, known: Mapping[str, float]) -> list[Array]:
@@ -390,13 +392,13 @@ def starts(problem: Problem, at: Placed, known: Mapping[str, float]) -> list[Arr
 
 
 def _nested(
-    trials: Sequence[Trial], laws: Sequence[Placed]
+    screenings: Sequence[Screening], laws: Sequence[Placed]
 ) -> list[tuple[Placed, dict[str, float]]]:
     """Laws that have a refined one as their simpler case, with what this one's parameters are."""
     found: list[tuple[Placed, dict[str, float]]] = []
-    for trial in trials:
-        strut, name = trial.laws[-1]
-        values, _ = law_and_shift(name, trial.values[-1])
+    for screening in screenings:
+        strut, name = screening.laws[-1]
+        values, _ = law_and_shift(name, screening.values[-1])
         known = effect(name).named(values.tolist())
         found += [(at, known) for at in laws if at[0] == strut and name in effect(at[1]).simpler]
     return found
@@ -443,7 +445,7 @@ def _residual(stage: Stage, laws: Sequence[Placed], values: Sequence[Array]) -> 
     return total
 
 
-def _columns(stage: Stage, base: Trial) -> Array:
+def _columns(stage: Stage, base: Screening) -> Array:
     """Answers to small changes of the parameters of a set's laws, shape (m, k)."""
     found: list[Array] = []
     for (strut, name), values in zip(base.laws, base.values, strict=True):
@@ -458,7 +460,7 @@ def _columns(stage: Stage, base: Trial) -> Array:
     return np.column_stack(used) if used else np.zeros((len(stage.target), 0))
 
 
-def refined(stage: Stage, laws: Sequence[Placed], values: Sequence[Array]) -> Trial | None:
+def refined(stage: Stage, laws: Sequence[Placed], values: Sequence[Array]) -> Screening | None:
     """All parameters of a set of laws, fitted together along the motion."""
     values = [_with_shift(name, own) for (_, name), own in zip(laws, values, strict=True)]
     lengths = np.cumsum([0, *(len(own) for own in values)])
@@ -488,4 +490,4 @@ def refined(stage: Stage, laws: Sequence[Placed], values: Sequence[Array]) -> Tr
     if found is None:
         return None
     scores = _scores(stage, found.residual, found.jacobian)
-    return Trial(tuple(laws), tuple(split(found.values)), found.cost, scores)
+    return Screening(tuple(laws), tuple(split(found.values)), found.cost, scores)

@@ -33,7 +33,7 @@ _AS_EFFECT = {
     "input_gain": "input_gain",
 }
 
-BLOCKS = "blocks of the recordings, spread over them, were kept back"
+BLOCKS = "blocks of the recordings, spread over them, were held out"
 
 
 def listed(items: Sequence[str], last: str) -> str:

@@ -1,4 +1,4 @@
-"""A bench that imposes a strut's motion: the motion is exact, and the force is the law's."""
+"""A bench that prescribes a strut's motion: the motion is exact, and the force is the law's."""
 
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ def dyno(components: list[dict[str, Any]], **more: Any) -> BenchConfig:
             "name": "dyno",
             "masses": [{"name": "body", "mass_kg": 3.0}],
             "struts": [strut],
-            "imposed_motion": {
+            "prescribed_motion": {
                 "strut": "strut",
                 "mean_height_m": LENGTH_M,
                 "components": components,
@@ -112,7 +112,7 @@ def test_a_file_is_a_spline_through_its_samples_and_still_outside(tmp_path: Path
     config = BenchConfig.model_validate(
         {
             **dyno([SINE]).model_dump(),
-            "imposed_motion": {
+            "prescribed_motion": {
                 "strut": "strut",
                 "components": [{"kind": "file", "path": "motion.csv"}],
             },
@@ -130,7 +130,7 @@ def test_a_file_is_a_spline_through_its_samples_and_still_outside(tmp_path: Path
     np.testing.assert_allclose(z[t < 0.2], 0.5, atol=1e-12)
 
 
-def test_bodies_above_an_imposed_strut_move_by_their_own_laws() -> None:
+def test_bodies_above_an_prescribed_strut_move_by_their_own_laws() -> None:
     """A mass on a linear strut on a shaken ground: closed form of base excitation."""
     mass_kg, stiffness, damping, omega = 2.0, 800.0, 12.0, 2.0 * np.pi * 1.5
     config = BenchConfig.model_validate(
@@ -153,7 +153,7 @@ def test_bodies_above_an_imposed_strut_move_by_their_own_laws() -> None:
                     "initial_height_m": 0.4,
                 },
             ],
-            "imposed_motion": {
+            "prescribed_motion": {
                 "strut": "strut",
                 "mean_height_m": 0.5,
                 "components": [{"kind": "sine", "amplitude_m": 0.01, "frequency_hz": 1.5}],
@@ -181,11 +181,11 @@ def test_bodies_above_an_imposed_strut_move_by_their_own_laws() -> None:
             "does not change the force",
         ),
         (
-            {"imposed_motion": {"strut": "other", "components": [SINE]}},
-            "imposed_motion.strut = 'other', expected one of strut",
+            {"prescribed_motion": {"strut": "other", "components": [SINE]}},
+            "prescribed_motion.strut = 'other', expected one of strut",
         ),
         (
-            {"imposed_motion": {"strut": "strut", "components": [{**SINE, "amplitude_n": 1.0}]}},
+            {"prescribed_motion": {"strut": "strut", "components": [{**SINE, "amplitude_n": 1.0}]}},
             "amplitude_n",
         ),
         (
@@ -203,13 +203,13 @@ def test_what_makes_no_sense_is_refused(more: dict[str, Any], words: str) -> Non
         dyno([SINE], **more)
 
 
-def test_a_height_at_the_start_and_an_imposed_motion_contradict(tmp_path: Path) -> None:
+def test_a_height_at_the_start_and_an_prescribed_motion_contradict(tmp_path: Path) -> None:
     text = (CONFIGS / "dyno_bench.yaml").read_text()
     path = tmp_path / "dyno.yaml"
     path.write_text(
         text.replace("free_length_m: 0.3", "free_length_m: 0.3\n    initial_height_m: 0.31")
     )
-    with pytest.raises(InputError, match="expected none: its motion is imposed"):
+    with pytest.raises(InputError, match="expected none: its motion is prescribed"):
         load_bench_config(path)
 
 
