@@ -18,7 +18,7 @@ class SelectionCriteria:
         kept_every: Without held-out runs, one block of so many is held out to be judged on; a
             fifth is usual (Hastie, Tibshirani, Friedman, The Elements of Statistical Learning,
             2009, 7.10).
-        screening: Laws of each round whose parameters are refined before they are compared: their
+        screened: Laws of each round whose parameters are refined before they are compared: their
             order at starts that nothing has adapted is rough, and a round costs as much as it has.
         beam: Sets of laws that each round goes on from, so that an early choice can be revisited.
         most_laws: Laws that a finding may consist of. A force needs three at most before a table
@@ -68,7 +68,7 @@ class SelectionCriteria:
 
     blocks: int = 32
     kept_every: int = 5
-    screening: int = 10
+    screened: int = 10
     beam: int = 3
     most_laws: int = 3
     fitted_a_size: int = 4

@@ -170,7 +170,7 @@ def _rounds(
     found: list[list[Screening]] = []
     for i, base in enumerate(beam):
         progress("screening laws", i / len(beam))
-        found.append(ranked(stage, base, pool.criteria.screening))
+        found.append(ranked(stage, base, pool.criteria.screened))
     return found
 
 

@@ -305,7 +305,7 @@ def proposed(problem: Problem) -> list[Placed]:
 def ranked(
     stage: Stage,
     base: Screening,
-    screening: int,
+    screened: int,
     only: Sequence[Placed] | None = None,
 ) -> list[Screening]:
     """A set of laws with one more, for the best laws that there are; best first.
@@ -313,7 +313,7 @@ def ranked(
     Args:
         stage: The regression.
         base: The set.
-        screening: How many laws are refined.
+        screened: How many laws are refined.
         only: Laws that compete; all if absent.
     """
     coarse = stage.coarse or stage
@@ -334,7 +334,7 @@ def ranked(
 
     with ThreadPoolExecutor(cpu_count()) as pool:
         tried = list(pool.map(first, laws))
-        order = sorted((t[0][0], i) for i, t in enumerate(tried) if t)[:screening]
+        order = sorted((t[0][0], i) for i, t in enumerate(tried) if t)[:screened]
         jobs = [
             (laws[i], values)
             for least, i in order
@@ -361,7 +361,7 @@ def ranked(
     best += [t._replace(cost=scale * t.cost, scores=scale * t.scores) for t in rough[_FINE:]]
     rest = [
         Screening((*base.laws, laws[i]), (), scale * cost, np.array([scale * cost]))
-        for cost, i in sorted((t[0][0], i) for i, t in enumerate(tried) if t)[screening:]
+        for cost, i in sorted((t[0][0], i) for i, t in enumerate(tried) if t)[screened:]
     ]
     return [*sorted(best, key=lambda screening: screening.score), *rest]
 
