@@ -308,7 +308,7 @@ _Payloads = dict[str, tuple[NDArray[np.int64], NDArray[np.uint8]]]
 
 def _payloads(found: RunFolder, ready: Setup) -> _Payloads:
     """Times and payloads of every received message, wrong lengths left out."""
-    names = sorted({entry.message for entry in ready.config.signals.named()})
+    names = sorted({entry.message for entry in ready.config.signals.named().values()})
     messages = [ready.database.message(name) for name in names]
     directory = Directory(messages)
     times: list[list[int]] = [[] for _ in messages]

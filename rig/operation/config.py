@@ -86,9 +86,11 @@ class Signals(_Frozen):
         """Quantities beside heights that the bench sends."""
         return tuple(self.others)
 
-    def named(self) -> list[SignalName]:
-        """All signals, heights first."""
-        return [*self.height.values(), *self.others.values()]
+    def named(self) -> dict[str, SignalName]:
+        """All signals by their keys, heights first."""
+        heights = {f"signals.height.{name}": entry for name, entry in self.height.items()}
+        others = {f"signals.{quantity.key}": entry for quantity, entry in self.others.items()}
+        return {**heights, **others}
 
 
 def _observer_kind(data: object) -> object:
@@ -404,14 +406,17 @@ class RunConfig(_Frozen):
             )
         return self
 
-    def published(self) -> list[SignalName]:
-        """Every signal that the bridge sends."""
-        groups = [*(self.publish or {}).values(), self.status or {}, self.timing or {}]
-        return [entry for group in groups for entry in group.values()]
+    def published(self) -> dict[str, SignalName]:
+        """Every signal that the bridge sends, by its key."""
+        groups = {f"publish.{strut}": group for strut, group in (self.publish or {}).items()}
+        groups |= {"status": self.status or {}, "timing": self.timing or {}}
+        return {
+            f"{name}.{key}": entry for name, group in groups.items() for key, entry in group.items()
+        }
 
     def published_messages(self) -> list[str]:
         """Names of all messages that the bridge sends."""
-        return list(dict.fromkeys(entry.message for entry in self.published()))
+        return list(dict.fromkeys(entry.message for entry in self.published().values()))
 
     @property
     def period_ns(self) -> int:

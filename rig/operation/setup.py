@@ -7,6 +7,7 @@ from typing import TypeVar
 from pydantic import BaseModel, ConfigDict
 
 from can_dbc.database import DEFAULT_DATABASE, Database, Message, load_database
+from can_dbc.errors import DatabaseError
 from dart_model.spec import ModelSpec, load_model, model_file
 from rig.core.messages import ESTIMATE, KINEMATICS, STATUS, Publication
 from rig.core.observers.pi import PiObserver
@@ -175,28 +176,37 @@ def _all_in(message: str, publications: Iterable[Publication], database: Databas
 
 def _check_messages(config: RunConfig, database: Database, source: Path) -> None:
     outputs = config.published_messages()
-    for entry in config.signals.named():
-        database.message(entry.message).signal(entry.signal)
+    for key, entry in config.signals.named().items():
+        _check_signal(database, entry, f"{source}: {key}")
         if entry.message in outputs:
             raise InputError(
-                f"{source}: signals: {entry.message} is also published, "
+                f"{source}: {key}: {entry.message} is also published, "
                 "expected a message of the bench"
             )
-    published = [(entry.message, entry.signal) for entry in config.published()]
-    for message, signal in published:
-        database.message(message).signal(signal)
-        if published.count((message, signal)) > 1:
+    published = config.published()
+    entries = list(published.values())
+    for key, entry in published.items():
+        _check_signal(database, entry, f"{source}: {key}")
+        if entries.count(entry) > 1:
             raise InputError(
-                f"{source}: publish: signal {signal} of {message} stands twice, expected once"
+                f"{source}: {key}: signal {entry.signal} of {entry.message} stands twice, "
+                "expected once"
             )
     if config.authentication is not None:
-        names = {entry.message for entry in config.signals.named()}.union(outputs)
+        names = {entry.message for entry in config.signals.named().values()}.union(outputs)
         _check_authentication(
             config,
             config.authentication,
             [database.message(name) for name in sorted(names)],
             source,
         )
+
+
+def _check_signal(database: Database, entry: SignalName, key: str) -> None:
+    try:
+        database.message(entry.message).signal(entry.signal)
+    except DatabaseError as error:
+        raise InputError(f"{key}: {error}") from error
 
 
 def _check_authentication(

@@ -17,6 +17,8 @@ from pydantic_core import PydanticUndefined
 
 from dart_model.effects import CATALOGUE, FAMILY_WORDS, Effect, Motion
 from dart_model.spec import ModelSpec
+from rig.bench.effects import EFFECT_KINDS
+from rig.bench.schema import BenchConfig
 from rig.core.messages import STATUS, STRUT, TIMING
 from rig.core.observers import OBSERVERS
 from rig.core.quantities import HEIGHT, OTHERS
@@ -83,7 +85,7 @@ def _page(commands: Mapping[str, str]) -> str:
         "every strut force is positive when it pushes its two bodies apart.</p>",
         '<nav><a href="#effects">Effects</a><a href="#configuration">Configuration</a>'
         '<a href="#bus">What is measured and published</a><a href="#model">Model file</a>'
-        '<a href="#commands">Commands</a></nav>',
+        '<a href="#bench">Simulated bench</a><a href="#commands">Commands</a></nav>',
         '<h2 id="effects">Effects</h2><p>Each is drawn at the parameters with which a search '
         "begins, over a stroke of 100 mm at 2.4 Hz: force over height, and over velocity.</p>",
     ]
@@ -101,6 +103,10 @@ def _page(commands: Mapping[str, str]) -> str:
     parts.append(_bus())
     parts.append('<h2 id="model">Model file</h2>')
     parts.append(_keys(ModelSpec))
+    parts.append('<h2 id="bench">Configuration of a simulated bench</h2>')
+    parts.append(_keys(BenchConfig))
+    parts.append("<p>Undeclared effects, which share no code with those of a model:</p>")
+    parts.append(_table(("name", "parameters"), _bench_effects()))
     parts.append('<h2 id="commands">Commands</h2>')
     for name, text in commands.items():
         parts.append(f"<h3>rig {escape(name)}</h3><pre>{escape(text)}</pre>")
@@ -195,6 +201,13 @@ def _bus() -> str:
         + "<p>Units of the DBC are converted. What is published:</p>"
         + _table(("under", "key", "unit", "signal if only a message is given"), published)
     )
+
+
+def _bench_effects() -> list[tuple[str, ...]]:
+    return [
+        (name, ", ".join(parameter.name for parameter in kind.parameters))
+        for name, kind in EFFECT_KINDS.items()
+    ]
 
 
 def _keys(model: type[Any], prefix: str = "") -> str:

@@ -106,7 +106,7 @@ WRONG_CONFIGS = {
     "no signal": ('{"signals": {"height": {"message": "BENCH_MEASUREMENT"}}}', "height"),
     "no message": (
         '{"signals": {"height": {"message": "BENCH_MEASURMENT", "signal": "HEIGHT"}}}',
-        "BENCH_MEASUREMENT",
+        "signals.height.strut: ",
     ),
     "not a signal": (
         '{"signals": {"height": {"message": "BENCH_MEASUREMENT", "signal": "HIGHT"}}}',
