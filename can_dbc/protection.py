@@ -226,7 +226,8 @@ def check_crc_log(data: NDArray[np.uint8], protection: Protection) -> NDArray[np
         head = np.broadcast_to(ids[::-1], (len(data), 2))
         crc = _crc_over_columns(np.zeros(len(data), dtype=np.uint8), head, _TABLE_1D)
         crc = _crc_over_columns(crc, data[:, 1:], _TABLE_1D)
-    return crc == data[:, 0]
+    # Profile 1 has no counter of 15, and refuses one whatever its CRC.
+    return (crc == data[:, 0]) & (data[:, 1] & 0x0F < protection.counter_modulus)
 
 
 class _Crc(NamedTuple):
@@ -258,8 +259,6 @@ def _judge_sequence(
     state: SequenceState, counter: int, t_ns: int, protection: Protection
 ) -> tuple[SequenceState, Verdict]:
     modulus = protection.counter_modulus
-    if counter >= modulus:
-        return state, Verdict.OUT_OF_SEQUENCE
     if state.counter < 0:
         return SequenceState(counter, t_ns), Verdict.FIRST
     delta = (counter - state.counter) % modulus

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from e2e.p01 import e2e_p01_protect
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -271,3 +272,17 @@ def test_first_profile_counts_to_fourteen(first_profile: Protection) -> None:
     damaged = bytearray(frame(3, first_profile))
     damaged[4] ^= 1
     assert compile_checker(first_profile)(INITIAL, damaged, 0)[1] is Verdict.WRONG_CRC
+
+
+def test_a_counter_that_the_first_profile_does_not_have_is_refused(
+    first_profile: Protection,
+) -> None:
+    forged = bytearray(frame(14, first_profile))
+    forged[1] |= 0x0F
+    e2e_p01_protect(forged, 0x1234, increment_counter=False)
+    assert read_counter(forged) == 15
+    state, verdict = compile_checker(first_profile)(INITIAL, forged, 0)
+    assert verdict is Verdict.WRONG_CRC
+    assert state == INITIAL
+    assert not check_crc(bytes(forged), first_profile)
+    assert not check_crc_log(np.frombuffer(forged, np.uint8)[None, :], first_profile)[0]

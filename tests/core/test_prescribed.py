@@ -96,6 +96,25 @@ def test_what_effects_remember_is_led_along_the_motion() -> None:
     assert max(abs(force) for force in virtual[200:]) < 3.0
 
 
+def test_a_measured_temperature_holds_until_the_next() -> None:
+    fade = EffectSpec(
+        name="linear_temperature_fade", parameters={"fraction_per_k": 0.01, "reference_c": 20.0}
+    )
+    core = PrescribedCore(plant(fade), 0.002, SUPERVISION)
+    state = core.init(0)
+    for number in range(400):
+        height_m, velocity = motion(number * 1e-3)
+        warm = 45.0 if number >= 100 else 20.0
+        law_n = -5000.0 * (height_m - 0.3) - 2000.0 * (1.0 - 0.01 * (warm - 20.0)) * velocity
+        measured = {20.0: None, 45.0: 45.0 if number == 100 else None}[warm]
+        height = Measurement(height_m, number * TICK_NS)
+        given = others(load_cell_force=law_n, temperature=measured)
+        state, output = core.step(state, StepInput(number * TICK_NS, (height,), given))
+        if number > 110:
+            assert state.temperature_c == 45.0
+            assert output.struts[0].virtual_force_n == pytest.approx(0.0, abs=2.5)
+
+
 def test_nothing_is_said_before_both_channels_came() -> None:
     core = PrescribedCore(plant(), 0.002, SUPERVISION)
     state, output = core.step(core.init(0), step_input(0, None))

@@ -28,6 +28,13 @@ def test_nothing_is_said_before_every_strut_was_measured():
     assert states[2].model is not None
 
 
+def test_the_model_keeps_the_time_of_the_run():
+    rig = core()
+    states, _ = run(rig, [measured(tick, REST_M) for tick in (2500, 2501)])
+    assert states[0].model.state.t_s == pytest.approx(2.5, abs=1e-12)
+    assert states[1].model.state.t_s == pytest.approx(2.501, abs=1e-12)
+
+
 def test_a_first_measurement_that_has_grown_old_does_not_start_the_model():
     rig = core("quarter_car")
     _, outputs = run(rig, [measured(0, 0.29, None), measured(50, None, 0.4)])

@@ -1,0 +1,69 @@
+"""What the bridge counts, held against what was done to it, and what the status says of it."""
+
+import cantools.database
+import msgspec
+
+from can_dbc.database import DEFAULT_DATABASE
+from rig.core import bridge, contract, messages, prescribed, record, step, supervisor
+from rig.core.contract import Mode
+from rig.core.messages import Conditions
+from tests.faults.trial import BEGIN_NS, MS, Trial, after
+
+STATUS = cantools.database.load_file(DEFAULT_DATABASE).get_message_by_name("RIG_STATUS")
+
+
+def last_status(ticks):
+    frames = [f for t in ticks for f in t.result.frames if f.arbitration_id == STATUS.frame_id]
+    return STATUS.decode(frames[-1].data, decode_choices=False)
+
+
+def test_ticks_in_hold_are_stale():
+    def gap(t_ns, frames):
+        return [] if t_ns < BEGIN_NS + 40 * MS else frames
+
+    ticks = Trial().run(700, after(BEGIN_NS, gap))
+    held = [tick for tick in ticks if tick.mode is Mode.HOLD]
+    assert len(held) > 20
+    assert ticks[-1].counts.stale == len(held)
+    assert last_status(ticks)["STALE_FRAMES"] == len(held)
+
+
+def test_missed_ticks_and_ticks_with_a_fault_of_the_bus_add_up():
+    def conditions(t_ns):
+        bus_fault = 300 * MS <= t_ns < 310 * MS
+        return Conditions(overruns=3 * (t_ns in (100 * MS, 200 * MS)), bus_fault=bus_fault)
+
+    ticks = Trial().run(700, conditions=conditions)
+    assert ticks[-1].counts.overruns == 6
+    assert ticks[-1].counts.bus_faulty == 10
+    assert last_status(ticks)["OVERRUNS"] == 6
+
+
+def test_ticks_beyond_a_limit_are_counted():
+    limits = [{"value": "force_n", "high": 20.0, "action": "warn"}]
+    ticks = Trial(limits=limits).run(1000)
+    beyond = [tick for tick in ticks if tick.is_valid and tick.force_n > 20.0]
+    assert beyond
+    assert ticks[-1].counts.limited == len(beyond)
+
+
+def test_a_count_beyond_its_signal_stays_at_the_largest_value():
+    def conditions(t_ns):
+        return Conditions(overruns=10**7 * (t_ns == 100 * MS))
+
+    ticks = Trial().run(400, conditions=conditions)
+    status = last_status(ticks)
+    assert status["OVERRUNS"] == STATUS.get_signal_by_name("OVERRUNS").maximum
+    assert status["ENCODING_SATURATED"] == 0
+
+
+def test_a_state_of_the_core_cannot_be_changed():
+    modules = [contract, record, step, supervisor, messages, bridge, prescribed]
+    structs = {
+        value
+        for module in modules
+        for value in vars(module).values()
+        if isinstance(value, type) and issubclass(value, msgspec.Struct)
+    } - {msgspec.Struct}
+    assert len(structs) > 10
+    assert all(made.__struct_config__.frozen for made in structs)
