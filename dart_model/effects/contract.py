@@ -46,7 +46,7 @@ Rate = Callable[
 """Same arguments as `Force`, then the derivative of the internal state, written in place."""
 
 Bench = Literal["force_given", "motion_given"]
-"""Force given, height missed (a free run); or motion given, force missed (a dyno)."""
+"""Force given, residual in the height (free run); or motion given, residual in the force (dyno)."""
 
 
 class Motion(NamedTuple):

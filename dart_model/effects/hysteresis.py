@@ -1,4 +1,4 @@
-"""Forces with memory of where the strut has been."""
+"""Forces with an internal state: they depend on where the strut has been."""
 
 import math
 

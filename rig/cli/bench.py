@@ -9,8 +9,8 @@ from rig.cli.output import ConfigFile, console, write_summary
 from rig.cli.watching import progress_line, stoppable
 
 EXAMPLES = (
-    "Examples: `rig bench reference_bench.yaml --interface socketcan --channel vcan0` · "
-    "`rig bench reference_bench.yaml --bridge rig.yaml --out runs/bench`"
+    "Examples: `rig bench my_bench.yaml --interface socketcan --channel vcan0` · "
+    "`rig bench my_bench.yaml --bridge rig.yaml --out runs/bench`"
 )
 
 

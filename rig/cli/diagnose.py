@@ -23,7 +23,7 @@ def diagnose(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
     held_out: Annotated[
         list[Path] | None,
-        typer.Option("--held-out", metavar="RUN", help="Run to judge on; once for each."),
+        typer.Option("--held-out", metavar="RUN", help="Held-out run; once for each."),
     ] = None,
 ) -> None:
     """Trace what the model lacks to named effects, correct it, and judge it on other data."""

@@ -208,7 +208,7 @@ class Bridge:
         """Refuse or read every frame.
 
         A late tick finds several measurements of one strut. Each is used at its own time, or the
-        model would run away under a force that was held for the whole gap.
+        model would run away under a force that was constant over the whole gap.
         """
         core, ledger, sequences, action = state.core, state.ledger, list(state.sequences), 0
         heights, others = self._no_heights.copy(), list(NO_OTHERS)

@@ -130,7 +130,7 @@ class Plant(Protocol):
         applied_force_n: float,
         temperature_c: float,
     ) -> Any:
-        """The state with forces on it, a `LoadedModel`; virtual forces are held from it on."""
+        """The state with forces on it, a `LoadedModel`; virtual forces are constant from it on."""
         ...
 
     def step(self, loaded: Any, dt_s: float, applied_force_end_n: float) -> Any:
@@ -156,7 +156,7 @@ class ObserverState(Protocol):
 
     @property
     def virtual_force_n(self) -> float:
-        """Virtual force, held until the next step."""
+        """Virtual force, constant until the next step."""
         ...
 
     @property
@@ -201,7 +201,7 @@ class Observer(Protocol):
 
 
 class StrutOutput(Struct, frozen=True, gc=False):
-    """What a tick says of one strut; each attribute is a column of the log.
+    """What a tick publishes of one strut; each attribute is a column of the log.
 
     Attributes:
         force_n: Estimated spring-damper force, virtual force included.

@@ -155,10 +155,10 @@ class Conditions(NamedTuple):
 
 
 class Report(Struct, frozen=True, gc=False):
-    """All that an outgoing message can speak of.
+    """All that an outgoing message can publish.
 
     Attributes:
-        output: What the core said.
+        output: What the core published.
         counts: What has been counted.
         reported: What the last status that was sent knew of them.
         conditions: What the loop knows.
@@ -277,7 +277,7 @@ class Outgoing:
         message: Its definition.
         frame: What a tick reports, and the time in ns -> the frame, and whether one of its values
             saturated.
-        period_ns: Time between two frames.
+        period_ns: Time between two frames; 0: one at every tick.
         is_status: Whether it reports what has happened since the last one of its kind.
     """
 

@@ -15,7 +15,8 @@ class Quantity:
 
     Attributes:
         key: Its key under `signals`.
-        column: Its column in the log and in a CSV of measured data, with the unit.
+        column: Its column in the log and in a CSV of measured data, with the unit; a
+            height's in the log is `measured_height_m`, after its strut's name.
         dimension: What a signal of it measures; its unit is converted to SI.
         words: The quantity as it is called in a sentence.
     """

@@ -50,7 +50,7 @@ def closed_loop_poles(
         observers: One for each of its struts.
         heights_m: Strut heights at which the bench is assumed to rest.
         period_ns: Time between two ticks.
-        measured_every: Ticks between two measurements; the virtual force is held in between.
+        measured_every: Ticks between two measurements; the virtual force is constant in between.
         delay: Age of a measurement when it is used, in measurement periods.
 
     Returns:

@@ -123,7 +123,7 @@ def beyond(limits: Sequence[Limit], strut: StrutOutput) -> int:
 
     Args:
         limits: Limits on estimated quantities; others are passed over.
-        strut: What a tick says of one strut.
+        strut: What a tick publishes of one strut.
     """
     values = {
         Watched.HEIGHT_M: strut.height_m,

@@ -55,7 +55,7 @@ class StrutCase:
         name: Name of the strut.
         t_s: Times, shape (ticks,).
         truth: Height in m, velocity in m/s and force in N of the bench, shape (ticks, 3).
-        defective: Height in m and force in N of the model running alone, shape (ticks, 2).
+        defective: Height in m and force in N of the nominal model in free run, shape (ticks, 2).
         observed: The same of the model with the virtual force, shape (ticks, 2).
     """
 

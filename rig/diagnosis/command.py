@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from dart_model.spec import ModelSpec
+from dart_model.spec import FileSkeleton, ModelSpec
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.outcome import CORRECTED_FILE, DIAGNOSIS_FILE, Result, write_results
 from rig.diagnosis.progress import Progress
@@ -40,6 +40,10 @@ def diagnose_runs(
     for name in (DIAGNOSIS_FILE, CORRECTED_FILE, "report.html"):
         if (out / name).exists():
             raise InputError(f"{out}: holds {name} already, expected a folder without one")
+    if isinstance(model.skeleton, FileSkeleton):
+        copied = out / model.skeleton.file
+        if copied.exists() and not copied.samefile(model.folder / model.skeleton.file):
+            raise InputError(f"{copied}: exists already, expected a folder without it")
     standing = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     if not standing.is_dir() or not os.access(standing, os.W_OK):
         raise InputError(f"{out}: cannot be written: {standing}: expected a folder to write into")

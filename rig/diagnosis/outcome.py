@@ -81,7 +81,8 @@ class ExistingEffect:
     Attributes:
         name: Effect in the catalogue.
         strut: Strut that it acts in.
-        change: ``refitted``: other parameters; ``superfluous``: the data are as well without it.
+        change: ``refitted``: other parameters; ``superfluous``: the data are as well described
+            without it.
         nominal: Its parameters in the model file.
         parameters: Its parameters as the data have them; empty where it is superfluous.
     """

@@ -48,7 +48,7 @@ _CLOCK = 5e-5
 """Half-width that an interval has at least, as a share of the value: clocks of sensors and loggers
 run right to 50 ppm (a usual crystal), which shifts a mass as a frequency; integration errs less."""
 _HELD = 0.3
-"""Share of half a sampling interval within which a delay is what a held input looks like."""
+"""Share of half a sampling interval within which a delay is what a zero-order hold looks like."""
 
 
 class _Known(NamedTuple):
@@ -434,7 +434,7 @@ def _notes(problem: Problem, found: Found, *, blocks: bool) -> tuple[str, ...]:
     if _looks_held(problem, found.chosen.fit):
         notes.append(
             "The delay found is half a sampling interval: that is what an applied force looks like "
-            "that is held between samples. If the bench holds it, nothing is wrong with it."
+            "under a zero-order hold. If the bench has one, nothing is wrong with it."
         )
     if blocks:
         notes.append(
@@ -445,7 +445,7 @@ def _notes(problem: Problem, found: Found, *, blocks: bool) -> tuple[str, ...]:
 
 
 def _looks_held(problem: Problem, result: Fit) -> bool:
-    """Whether a delay was found that a force held between samples would feign."""
+    """Whether a delay was found that a zero-order hold of the force would feign."""
     half_s = 0.5 * problem.motions[0].step_s
     index = slots_of(problem, result.candidate).index[len(result.candidate.kept) :]
     return any(

@@ -1,4 +1,4 @@
-"""Dampers on a dyno: the motion is prescribed, the force is missed.
+"""Dampers on a dyno: the motion is prescribed, the residual is in the force.
 
 References:
     Downey, Cao, Laflamme, Taylor, Ricles, "High capacity variable friction damper based on band

@@ -39,7 +39,7 @@ GROUPS = {
     "triple": Group(15, ("triple",), "three effects"),
     "complete": Group(40, ("complete",), "nothing planted"),
     "outside": Group(20, ("outside",), "a force that no catalogue holds"),
-    "foreign": Group(25, tuple(FOREIGN_KINDS), "a formula kept back from catalogues"),
+    "foreign": Group(25, tuple(FOREIGN_KINDS), "a formula that no catalogue holds"),
     "rough": Group(
         75, tuple(f"rough_{f}" for f in NONLINEAR_FAMILIES), "one effect, rough nominal model"
     ),

@@ -96,7 +96,7 @@ def test_reordering(row, undisturbed_n):
     error_n = force_error_n(ticks)
     row(
         3,
-        "reordering: every measurement after its successor",
+        "reordering: every second measurement after its successor",
         f"refuses the late ones and counts them; force error {error_n:.1f} N "
         f"instead of {undisturbed_n:.1f} N RMS",
         first_ms(ticks, lambda tick: tick.counts.out_of_sequence > 0),

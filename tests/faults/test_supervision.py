@@ -115,7 +115,7 @@ def test_a_height_may_stay_the_same_for_as_long_as_the_limit_says():
     assert seen_after(stuck, *same) == [0, 0, 0, Action.HOLD, Action.HOLD, 0, 0]
 
 
-def test_the_gravest_action_counts():
+def test_the_severest_action_counts():
     rows = [
         Limit(Watched.MEASURED_HEIGHT_M, 0.2, 0.8, Action.WARN),
         Limit(Watched.MEASURED_HEIGHT_M, 0.1, 0.9, Action.SAFE),

@@ -469,7 +469,7 @@ FOREIGN: dict[str, tuple[Draw, ...]] = {
     "fade": (_stretched,),
     "periodic_force": (_overtone,),
 }
-"""Family -> laws kept back from any catalogue, which must not be given them.
+"""Family -> laws that no catalogue may hold.
 
 They show whether a family is recognised when the strut follows no formula that was written down.
 """

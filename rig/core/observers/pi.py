@@ -24,7 +24,7 @@ class PiState(Struct, frozen=True, gc=False):
     Attributes:
         integral_m_s: Integral of the innovation.
         innovation_m: Last innovation.
-        virtual_force_n: Virtual force, held until the next measurement.
+        virtual_force_n: Virtual force, constant until the next measurement.
         measured_ns: Time of the last measurement.
     """
 
@@ -64,7 +64,8 @@ class PiObserver:
     ) -> PiState:
         """State after a tick; arguments as of `Observer.step`.
 
-        Between measurements the virtual force is held. At the limit the integral grows no further.
+        Between measurements the virtual force is constant. At the limit the integral grows no
+        further.
         """
         if measured is None:
             return state
@@ -84,7 +85,7 @@ class PiObserver:
         return PiState(integral_m_s, innovation_m, force_n, measured.t_ns)
 
     def numbers(self, state: PiState) -> tuple[float, float]:
-        """Integral and held force: what the next state depends on."""
+        """Integral and virtual force: what the next state depends on."""
         return state.integral_m_s, state.virtual_force_n
 
     def state_of(self, numbers: Sequence[float]) -> PiState:

@@ -489,7 +489,7 @@ along = compile_loop(
 )  # fmt: skip
 """Force of one law along a known motion: its force and rate, each a list of one, parameters, strut
 constants (4,), then times, heights, velocities, applied force and temperature (N,), sub-steps for
-the memory, its start; force, written.
+the internal state, its start; force, written.
 """
 
 

@@ -1,4 +1,4 @@
-"""A model that runs alone under the applied force: its residual is the height it does not explain.
+"""Free-run simulation under the applied force: the residual is measured less simulated height.
 
 The regression along the motion rests on an identity. Let the reference be a simulation with the
 linear dynamics G (heights by force). The residual of the measured heights is G applied to the

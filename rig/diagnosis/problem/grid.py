@@ -1,4 +1,4 @@
-"""A recording on the nodes of a computation: gaps filled with nodes, outliers and kept rows apart.
+"""A recording on the nodes of a computation: gaps are filled, outliers and held-out nodes apart.
 
 Reference: Hampel, The influence curve and its role in robust estimation, JASA 69 (1974), for the
 median absolute deviation as a scale that outliers do not move.
@@ -27,7 +27,7 @@ _PATTERN = (-2.0 / 3.0, 0.25)
 _GAUSS = 1.4826
 """Standard deviation over median absolute deviation of a Gaussian."""
 _QUIET = 0.3
-"""Share of the mean square velocity below which a block shows too little motion to judge on."""
+"""Share of the RMS velocity below which a block shows too little motion to judge on."""
 
 
 class Grid(NamedTuple):

@@ -2,7 +2,7 @@
 
 Each has a prior, from the model file's `tolerance` or a default, which decides only where the data
 do not. A change of mass, stiffness and damping in one proportion looks like one of the gain, which
-is never free beside them.
+is never free beside all three.
 """
 
 from collections.abc import Sequence

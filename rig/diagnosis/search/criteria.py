@@ -41,7 +41,7 @@ class SelectionCriteria:
         least_above_noise: Mean square above the noise floor, as a share of the floor, below which
             no first law is looked for: integration and interpolation err by as much.
         least_above_noise_later: The same for a further law: what a formula that is nearly right
-            leaves over is no effect. Its root is half of what `explained` allows.
+            leaves over is no effect. An RMS 1.1 times the floor: half of what `explained` allows.
         formula: Share of the RMS residual of the best linear model below which what a law leaves is
             put down to its formula, and a further law has to do far more than a better formula
             would (`imitation`), unless one stores and one dissipates: two formulas for one effect

@@ -27,7 +27,7 @@ from rig.diagnosis.search.screen import (
 
 Tried = TypeVar("Tried", Screening, Change)
 _EXPLORED = 0.85
-"""Share of a search's time after which it compares rivals."""
+"""Share of a search's progress that its rounds take; the rest fits the best sets to their end."""
 
 
 class FirstRound(NamedTuple):

@@ -84,7 +84,7 @@ class Fit(NamedTuple):
 
     @property
     def mean_square(self) -> float:
-        """Mean square of the whitened residual; 1 at the noise floor."""
+        """Mean square of the whitened residual, 1 at the sensors' noise (`Problem.floor_level`)."""
         return float(np.mean(self.residual**2))
 
 
