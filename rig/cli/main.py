@@ -18,6 +18,7 @@ from rig.cli import (
     run,
     scoreboard,
     timing,
+    view,
 )
 from rig.cli.output import OK, WRONG_INPUT
 from rig.inputs.errors import InputError
@@ -36,6 +37,7 @@ app.command("init", epilog=init.EXAMPLES)(init.init)
 app.command("check", epilog=check.EXAMPLES)(check.check_command)
 app.command("run", epilog=run.EXAMPLES)(run.run)
 app.command("bench", epilog=bench.EXAMPLES)(bench.bench)
+app.command("view", epilog=view.EXAMPLES)(view.view)
 app.command("timing", epilog=timing.EXAMPLES)(timing.timing)
 app.command("replay", epilog=replay.EXAMPLES)(replay.replay_command)
 app.command("diagnose", epilog=diagnose.EXAMPLES)(diagnose.diagnose)

@@ -28,6 +28,9 @@ _TAIL_BYTES = 4096
 RUN_FILE, FRAMES_FILE, STEPS_FILE = "run.yaml", "frames.log", "steps.arrow"
 MODEL_FILE, DBC_FILE = "model.yaml", "bus.dbc"
 
+END_OF_STREAM = b"\xff\xff\xff\xff\0\0\0\0"
+"""What an Arrow stream that was closed ends with."""
+
 RUN_SCHEMA = 2
 """Version of the folder's layout, in `run.yaml`."""
 
@@ -148,6 +151,17 @@ def read_run(folder: Path) -> RunFolder:
     for name in (RUN_FILE, FRAMES_FILE, STEPS_FILE):
         if not (folder / name).is_file():
             raise InputError(f"{folder}: {name} is missing, expected a run")
+    header = read_header(folder)
+    epoch_ns = cast("int", header["epoch_ns"])
+    return RunFolder(folder, header, _read_steps(parts(folder, STEPS_FILE)), epoch_ns)
+
+
+def read_header(folder: Path) -> dict[str, object]:
+    """Content of a run's `run.yaml`.
+
+    Raises:
+        InputError: It is no run's, or one of another version.
+    """
     path = folder / RUN_FILE
     header = parse_mapping(read_text(path, 64 * 1024 * 1024), str(path))
     schema = header.get("schema")
@@ -158,7 +172,7 @@ def read_run(folder: Path) -> RunFolder:
     epoch_ns = header.get("epoch_ns")
     if not isinstance(epoch_ns, int) or not 0 <= epoch_ns < LATEST_S * 1_000_000_000:
         raise InputError(f"{path}: epoch_ns: {str(epoch_ns)[:40]}: expected a Unix time in ns")
-    return RunFolder(folder, header, _read_steps(parts(folder, STEPS_FILE)), epoch_ns)
+    return header
 
 
 def changed_files(folder: Path) -> list[str]:

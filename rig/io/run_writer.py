@@ -25,6 +25,7 @@ from rig.io.captures import Capture, Captures, Entry, Window
 from rig.io.realtime import follow
 from rig.io.run_log import (
     DBC_FILE,
+    END_OF_STREAM,
     FRAMES_FILE,
     MODEL_FILE,
     RUN_FILE,
@@ -60,13 +61,14 @@ MOST_WAITING = 120_000
 MANY_WAITING = 2_000
 """Ticks waiting that are a fault."""
 
+_ASIDE_EVERY_S = 1.0
+"""Time between two writings of the file beside the log."""
+
 _CLOSING_S = 30.0
 """How long the end of a run waits for a slow disk."""
 
 _RESERVE_FILE, _RESERVE_BYTES = "reserve.tmp", 65_536
 """Space kept back, so that a full disk still takes how the run ended."""
-
-_END_OF_STREAM = b"\xff\xff\xff\xff\0\0\0\0"
 
 _pa = cast("Any", pa)
 
@@ -108,7 +110,7 @@ class _Part:
 
     def close(self) -> None:
         try:
-            self.steps.append(_END_OF_STREAM)
+            self.steps.append(END_OF_STREAM)
         finally:
             self.steps.close()
             self.frames.close()
@@ -129,6 +131,7 @@ class RunLog:
         rotation: When the files are continued in others.
         window: What is captured around faults; None captures nothing.
         capture_name: Whether a change of mode is a trigger of a capture, and its name if so.
+        aside: Name and content of a file that is written anew once a second, if any.
 
     Raises:
         InputError: The folder cannot be created, or holds another run.
@@ -147,6 +150,7 @@ class RunLog:
         rotation: Rotation = Rotation(),
         window: Window | None = None,
         capture_name: Callable[[int, int], str | None] = lambda _before, _now: None,
+        aside: tuple[str, Callable[[], bytes]] | None = None,
     ) -> None:
         self.folder = folder
         self.fault: str | None = None
@@ -162,6 +166,7 @@ class RunLog:
         # A line of the log has no place for blanks or anything beyond ASCII.
         self._channel = re.sub(r"[^!-~]", "_", channel)
         self._columns = tuple(columns)
+        self._aside = aside
         self._rows = StepRows(columns)
         self._rotation = rotation
         self._captures = (
@@ -237,6 +242,7 @@ class RunLog:
 
     def _finish(self) -> None:
         self._write_waiting()
+        self._write_aside()
         if self._captures is not None:
             self._captures.finish()
         try:
@@ -254,10 +260,21 @@ class RunLog:
 
     def _write_until_closed(self) -> None:
         follow(self._priority)
+        due_s = time.monotonic() + _ASIDE_EVERY_S
         while not self._closing.is_set():
             self._wake.wait(_LONGEST_PAUSE_S)
             self._wake.clear()
             self._write_waiting()
+            if time.monotonic() >= due_s:
+                due_s += _ASIDE_EVERY_S
+                self._write_aside()
+
+    def _write_aside(self) -> None:
+        """Write the file beside the log; where it fails, the next one takes its place."""
+        if self._aside is not None:
+            name, content = self._aside
+            with contextlib.suppress(OSError):
+                _write_whole(self.folder / name, content())
 
     def _write_waiting(self) -> None:
         """Write what waits; what the disk does not take is kept, and tried again the next time."""
@@ -355,7 +372,12 @@ def _serialized(rows: StepRows) -> bytes:
 
 
 def _write_yaml(path: Path, content: dict[str, object]) -> None:
+    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    _write_whole(path, text.encode())
+
+
+def _write_whole(path: Path, content: bytes) -> None:
     # Written beside and moved, so that a kill leaves the old or the new file, never half of one.
     beside = path.with_suffix(".tmp")
-    beside.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), "utf-8")
+    beside.write_bytes(content)
     beside.replace(path)

@@ -27,7 +27,7 @@ from rig.io.steps import Step
 from rig.operation.loop import Port, Progress, Sink, regular_ticks, run
 from rig.operation.ports import InformedPort
 from rig.operation.setup import Setup
-from rig.operation.timing import Timing
+from rig.operation.timing import HISTOGRAMS_FILE, Timing
 from rig.operation.trace import Trace
 
 _PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "autosar-e2e")
@@ -144,6 +144,7 @@ def logged(
     header = _header(ready, clock.epoch_ns, granted, folder)
     if forced:
         header["forced"] = [dict(finding) for finding in forced]
+    timing = Timing.empty()
     log = RunLog(
         folder,
         header,
@@ -155,9 +156,10 @@ def logged(
         rotation=config.log.rotation(),
         window=config.log.window(),
         capture_name=_capture_name,
+        aside=None if granted is None else (HISTOGRAMS_FILE, timing.histograms),
     )
     count = None if config.duration_s is None else _ticks(config.duration_s, config.rate_hz)
-    timing, ticks, status = Timing.empty(), 0, "failed"
+    ticks, status = 0, "failed"
     state = bridge.init(0)
 
     def sink(

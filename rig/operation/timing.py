@@ -1,12 +1,22 @@
 """How well the rate of a run was kept."""
 
+import contextlib
+import json
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 BINS = 20_000
 """Histograms have bins of 1 µs; the last one takes all that is longer than 20 ms."""
+
+HISTOGRAMS_FILE = "timing.json"
+"""Histograms of a run's ticks, in its folder, once a second."""
+
+_EDGES = np.unique(np.geomspace(1, BINS, 96).astype(np.intp) - 1)
+"""First bins of those in the file: as wide as they are read, and few enough for a live run."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +47,16 @@ class Timing:
         """Percentiles and maximum of the work, in µs."""
         return _percentiles(self.work, int(self.extremes_ns[1]))
 
+    def histograms(self) -> bytes:
+        """Content of `HISTOGRAMS_FILE`: lower edges in µs, and ticks of each bin."""
+        content = {
+            "edges_us": _EDGES.tolist(),
+            "lateness": np.add.reduceat(self.lateness, _EDGES).tolist(),
+            "work": np.add.reduceat(self.work, _EDGES).tolist(),
+            "longest_gap_us": int(self.extremes_ns[2]) / 1000,
+        }
+        return json.dumps(content).encode()
+
     def summary(self) -> dict[str, object]:
         """All figures, for `run.yaml`."""
         return {
@@ -57,3 +77,11 @@ def _percentiles(histogram: NDArray[np.int64], largest_ns: int) -> dict[str, flo
         name: float(np.searchsorted(cumulated, level * total) + 1) for name, level in levels.items()
     }
     return {**result, "max": largest_ns / 1000}
+
+
+def read_histograms(folder: Path) -> dict[str, Any] | None:
+    """Content of a run's `HISTOGRAMS_FILE`; None if it has none."""
+    with contextlib.suppress(OSError, ValueError):
+        found: Any = json.loads((folder / HISTOGRAMS_FILE).read_text("utf-8"))
+        return found if isinstance(found, dict) else None  # pyright: ignore[reportUnknownVariableType]
+    return None

@@ -1,0 +1,47 @@
+"""`rig view`."""
+
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.output import console
+from rig.cli.watching import stoppable
+
+EXAMPLES = (
+    "Examples: `rig view runs/7` while it runs · `rig view before after --model corrected.yaml`"
+)
+
+
+def view(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs.")],
+    model: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--model", metavar="MODEL", help="Draw this model's law too; once for each model."
+        ),
+    ] = None,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port on this machine; 0 takes a free one.")
+    ] = 8321,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Open no browser, only say where the page is.")
+    ] = False,
+) -> None:
+    """Show runs in the browser, while they are written or afterwards; Ctrl-C ends it."""
+    import time
+
+    from dart_model.spec import load_model, model_file
+    from rig.pages.view.server import ViewServer
+
+    models = {name: load_model(model_file(name, Path())) for name in model or ()}
+    server = ViewServer(runs, models, port)
+    server.serving()
+    console.print(f"{server.address} (on this machine only; Ctrl-C ends it)")
+    if not no_browser:
+        webbrowser.open(server.address)
+    with stoppable() as stop:
+        while not stop():
+            time.sleep(0.1)
+    server.shutdown()

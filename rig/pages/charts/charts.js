@@ -1,0 +1,225 @@
+"use strict";
+// Charts on uPlot that the pages share: lines over time, points in a plane, steps of a histogram.
+// Colours are names of CSS properties, so that a change of theme only asks for another drawing.
+
+const Charts = (() => {
+  const colour = (name) =>
+    name.startsWith("--")
+      ? getComputedStyle(document.documentElement).getPropertyValue(name).trim()
+      : name;
+
+  // Five digits, in the notation that is shorter; NaN and null are nothing.
+  const number = (value) => {
+    if (value === null || value === undefined || Number.isNaN(value)) return "–";
+    const size = Math.abs(value);
+    if (size !== 0 && (size < 1e-4 || size >= 1e6)) return value.toExponential(3);
+    return value.toPrecision(5);
+  };
+
+  const axis = (label, size, more) => ({
+    label,
+    size,
+    labelSize: 18,
+    labelGap: 0,
+    gap: 3,
+    font: "12px system-ui, sans-serif",
+    labelFont: "12px system-ui, sans-serif",
+    stroke: () => colour("--axis"),
+    grid: { stroke: () => colour("--grid"), width: 1 },
+    ticks: { stroke: () => colour("--grid"), width: 1, size: 4 },
+    ...more,
+  });
+
+  const short = (u, values) =>
+    values.map((v) => {
+      if (v === null || v === undefined) return "";
+      const size = Math.abs(v);
+      return size !== 0 && (size < 1e-3 || size >= 1e5) ? v.toExponential(0) : String(+v.toPrecision(6));
+    });
+
+  const line = (item) => ({
+    label: item.label,
+    stroke: () => colour(item.colour),
+    width: item.width ?? 1,
+    dash: item.dash,
+    spanGaps: item.spanGaps ?? false,
+    points: { show: item.points ?? false, size: 4 },
+    paths: item.paths,
+    value: (_u, v) => `${number(v)}${item.unit ? ` ${item.unit}` : ""}`,
+  });
+
+  const width = (place) => Math.max(200, Math.floor(place.clientWidth));
+  const height = (place) => parseInt(getComputedStyle(place).getPropertyValue("--height"), 10);
+
+  // A chart follows the width of its place, at the height that the place's style names; its legend
+  // stands below.
+  const fitted = (place, chart) => {
+    const observer = new ResizeObserver(() => {
+      if (chart.width !== width(place)) chart.setSize({ width: width(place), height: height(place) });
+    });
+    observer.observe(place);
+    return () => {
+      observer.disconnect();
+      chart.destroy();
+    };
+  };
+
+  // Lines over a common axis. `onSelect` is given the ends of a stretch that was drawn.
+  function lines(place, spec) {
+    const chart = new uPlot(
+      {
+        width: width(place),
+        height: height(place),
+        padding: [8, 12, 0, 0],
+        cursor: {
+          sync: spec.sync ? { key: spec.sync } : undefined,
+          drag: { x: true, y: false, setScale: spec.onSelect === undefined },
+          focus: { prox: 16 },
+        },
+        focus: { alpha: 0.5 },
+        legend: { live: true },
+        scales: {
+          x: { time: false, distr: spec.logX ? 3 : 1, range: spec.rangeX },
+          y: { distr: spec.logY ? 3 : 1, range: spec.rangeY },
+        },
+        axes: [
+          axis(spec.xLabel, 24, { values: spec.logX ? undefined : short }),
+          axis(spec.yLabel, 62, { values: spec.yValues ?? (spec.logY ? undefined : short), ...spec.yAxis }),
+        ],
+        series: [
+          { label: spec.xName ?? "t", value: (_u, v) => (v === null ? "–" : `${number(v)} ${spec.xUnit ?? ""}`) },
+          ...spec.series.map(line),
+        ],
+        bands: spec.bands?.map((band) => ({ series: band.series, fill: () => colour(band.colour) })),
+        hooks: {
+          setSelect: [
+            (u) => {
+              if (spec.onSelect === undefined || u.select.width < 4) return;
+              const begin = u.posToVal(u.select.left, "x");
+              const end = u.posToVal(u.select.left + u.select.width, "x");
+              u.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
+              spec.onSelect(begin, end);
+            },
+          ],
+        },
+      },
+      [[], ...spec.series.map(() => [])],
+      place,
+    );
+    spec.named?.forEach((isNamed, i) => {
+      place.querySelectorAll(".u-series")[i + 1].hidden = !isNamed;
+    });
+    if (spec.onReset) chart.over.addEventListener("dblclick", spec.onReset);
+    return {
+      chart,
+      destroy: fitted(place, chart),
+      set(data, begin, end) {
+        chart.batch(() => {
+          chart.setData(data, begin === undefined);
+          if (begin !== undefined) chart.setScale("x", { min: begin, max: end });
+        });
+      },
+      redraw: () => chart.redraw(false, true),
+    };
+  }
+
+  // What uPlot asks of a series that is no line over a common axis: it draws itself.
+  const drawn = (draw) => (u, index) => {
+    uPlot.orient(u, index, (series, _x, _y, scaleX, scaleY, posX, posY, left, top, wide, high) => {
+      const [xs, ys] = u.data[index];
+      const at = (i) => [posX(xs[i], scaleX, wide, left), posY(ys[i], scaleY, high, top)];
+      const ctx = u.ctx;
+      ctx.save();
+      ctx.beginPath();
+      ctx.rect(left, top, wide, high);
+      ctx.clip();
+      draw(ctx, series, xs.length, at);
+      ctx.restore();
+    });
+    return null;
+  };
+
+  const dots = drawn((ctx, series, count, at) => {
+    const size = 2.2 * devicePixelRatio;
+    ctx.fillStyle = series.stroke();
+    ctx.globalAlpha = 0.45; // so that a curve shows over them
+    for (let i = 0; i < count; i++) {
+      const [x, y] = at(i);
+      ctx.fillRect(x - size / 2, y - size / 2, size, size);
+    }
+  });
+
+  const curve = drawn((ctx, series, count, at) => {
+    ctx.strokeStyle = series.stroke();
+    ctx.lineWidth = series.width * devicePixelRatio;
+    ctx.setLineDash((series.dash ?? []).map((d) => d * devicePixelRatio));
+    ctx.beginPath();
+    for (let i = 0; i < count; i++) ctx.lineTo(...at(i));
+    ctx.stroke();
+  });
+
+  const padded = (values) => {
+    let low = Infinity;
+    let high = -Infinity;
+    for (const list of values) {
+      for (const v of list) {
+        if (v < low) low = v;
+        if (v > high) high = v;
+      }
+    }
+    if (!(low <= high)) return [0, 1];
+    const margin = 0.05 * (high - low || Math.abs(high) || 1);
+    return [low - margin, high + margin];
+  };
+
+  // Points and curves in a plane; every series has abscissae of its own.
+  function plane(place, spec) {
+    let data = spec.series.map(() => [[], []]);
+    const chart = new uPlot(
+      {
+        mode: 2,
+        width: width(place),
+        height: height(place),
+        padding: [8, 12, 0, 0],
+        cursor: { drag: { x: false, y: false }, points: { show: false } },
+        legend: { live: false },
+        scales: {
+          x: { time: false, range: () => padded(data.map((pair) => pair[0])) },
+          y: { range: () => padded(data.map((pair) => pair[1])) },
+        },
+        axes: [axis(spec.xLabel, 24, { values: short }), axis(spec.yLabel, 62, { values: short })],
+        series: [
+          {},
+          ...spec.series.map((item) => ({
+            label: item.label,
+            stroke: () => colour(item.colour),
+            width: item.width ?? 2,
+            dash: item.dash,
+            paths: item.dots ? dots : curve,
+            points: { show: false },
+          })),
+        ],
+      },
+      [null, ...data],
+      place,
+    );
+    return {
+      chart,
+      destroy: fitted(place, chart),
+      set(pairs) {
+        data = pairs;
+        // In this mode uPlot counts the points of the data before: without any it draws nothing.
+        chart.setData([null, ...pairs], false);
+        chart.setData([null, ...pairs]);
+        // What is not there needs no place in the legend.
+        place.querySelectorAll(".u-series").forEach((entry, i) => {
+          entry.hidden = pairs[i][0].length === 0;
+        });
+      },
+      redraw: () => chart.redraw(false, true),
+    };
+  }
+
+  const steps = uPlot.paths.stepped({ align: 1 });
+  return { lines, plane, steps, number };
+})();

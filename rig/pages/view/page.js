@@ -1,0 +1,355 @@
+"use strict";
+// The page asks for the stretch in sight, draws it, and asks again: a slow page only draws less
+// often. All that it shows comes from the server; it keeps no data but what is on the screen.
+
+const FRAME_MS = 48;
+const CLOSELY_MS = 1000;
+const RUNS_MS = 1000;
+const HIDDEN_MS = 1000;
+const COLOURS = ["--model", "--second", "--third", "--fourth"];
+const LEVELS = ["missed ticks", "log fault", "bus fault", "WAITING", "RUNNING", "HOLD", "SAFE"];
+const FIRST_MODE = 2; // WAITING is mode 1 and the fourth level
+const TONES = { live: "good", done: "good", safe: "bad", failed: "bad", killed: "warn", reading: "quiet", absent: "quiet", empty: "warn", unreadable: "bad" };
+
+const at = (id) => document.getElementById(id);
+const charts = {};
+let runs = [];
+let shape = ""; // what the charts were made for
+let strut = "";
+// `follow`: the end is the newest step. `span` is a length in s, or null for the whole run.
+const view = { begin: 0, end: 10, span: 10, follow: true };
+let changed = true;
+let drawnAt = 0;
+let askedCloselyFor = "";
+
+async function ask(path, given = {}) {
+  const answer = await fetch(`${path}?${new URLSearchParams(given)}`);
+  if (!answer.ok) throw new Error(await answer.text());
+  return answer;
+}
+
+const columnsOf = (name) => [
+  `${name}.height_m`, `${name}.measured_height_m`, `${name}.force_n`, "strut_force_n",
+  `${name}.virtual_force_n`, `${name}.innovation_m`, "mode", "overruns", "bus_fault", "log_fault",
+];
+
+// A stretch as plain lists: uPlot takes null for nothing.
+async function stretch(index, points) {
+  const columns = columnsOf(strut);
+  const given = { run: index, begin: view.begin, end: view.end, points, columns: columns.join(",") };
+  if (view.follow && runs.length === 1 && view.span !== null) given.follow = 1;
+  const content = await (await ask("stretch", given)).arrayBuffer();
+  const length = new DataView(content).getUint32(0, true);
+  const head = JSON.parse(new TextDecoder().decode(new Uint8Array(content, 4, length)));
+  const begin = 4 + length;
+  const t = Array.from(new Float64Array(content, begin, head.count));
+  const values = new Float32Array(content, begin + 8 * head.count);
+  const lists = columns.map((_name, i) => {
+    const list = new Array(head.count);
+    for (let k = 0; k < head.count; k++) {
+      const value = values[i * head.count + k];
+      list[k] = Number.isNaN(value) ? null : value;
+    }
+    return list;
+  });
+  return { head, t, lists };
+}
+
+// What each chart over time shows of a run: which columns, and how.
+function seriesOf(several) {
+  const named = (index, text) => (several ? `${runs[index].name}: ${text}` : text);
+  const measured = (index) => (several ? COLOURS[index % 4] : "--measured");
+  const thin = several ? { dash: [4, 4], width: 1 } : { width: 2 };
+  const found = { height: [], force: [], virtual: [], innovation: [], state: [] };
+  runs.forEach((run, index) => {
+    const own = { colour: COLOURS[index % 4], spanGaps: several };
+    found.height.push({ column: 1, label: named(index, "measured"), unit: "m", ...own, ...thin, colour: measured(index), spanGaps: true });
+    found.height.push({ column: 0, label: named(index, "model"), unit: "m", ...own });
+    if (run.columns.includes("strut_force_n")) {
+      found.force.push({ column: 3, label: named(index, "load cell"), unit: "N", ...own, ...thin, colour: measured(index), spanGaps: true });
+    }
+    found.force.push({ column: 2, label: named(index, "estimated"), unit: "N", ...own });
+    found.virtual.push({ column: 4, label: named(index, "virtual force"), unit: "N", ...own });
+    found.innovation.push({ column: 5, label: named(index, "innovation"), unit: "m", ...own });
+    found.state.push({ column: 6, label: named(index, "state"), width: 3, paths: Charts.steps, ...own, level: (v) => v + FIRST_MODE });
+    const mark = (column, level) => ({ column, label: "", width: 0, points: true, colour: several ? own.colour : "--bad", level: (v) => (v > 0 ? level : null) });
+    found.state.push(mark(8, 2), mark(9, 1), mark(7, 0));
+  });
+  return found;
+}
+
+let shown = {};
+
+function build() {
+  for (const chart of Object.values(charts)) chart.destroy();
+  const several = runs.length > 1;
+  shown = seriesOf(several);
+  const common = { sync: "t", xLabel: "time / s", xUnit: "s", onSelect: look, onReset: newest };
+  const over = (id, yLabel, more = {}) => {
+    charts[id] = Charts.lines(at(id), { ...common, yLabel, series: shown[id], ...more });
+  };
+  over("height", "height / m");
+  over("force", "force / N");
+  over("virtual", "force / N");
+  over("innovation", "innovation / m");
+  over("state", "", {
+    rangeY: [-0.5, 6.5],
+    yValues: (_u, ticks) => ticks.map((v) => LEVELS[v] ?? ""),
+    yAxis: { splits: () => [0, 1, 2, 3, 4, 5, 6], size: 90, labelSize: 0 },
+    named: shown.state.map((item) => item.label !== ""),
+  });
+  const laws = several ? runs.map((run, i) => ({ label: `${run.name}: law`, colour: COLOURS[i % 4], dash: [8, 4] })) : [{ label: "model’s law", colour: "--model" }];
+  const points = runs.flatMap((run, i) => [
+    { label: several ? run.name : "estimated", colour: several ? COLOURS[i % 4] : "--second", dots: true },
+    { label: several ? `${run.name}: load cell` : "load cell", colour: "--measured", dots: true },
+  ]);
+  for (const [id, label] of [["velocity", "velocity / (m/s)"], ["height", "height / m"]]) {
+    charts[`plane-${id}`] = Charts.plane(at(`plane-${id}`), {
+      xLabel: label, yLabel: "force / N", series: [...points, ...laws, { label: "other models", colour: "--third", dash: [3, 3] }],
+    });
+  }
+  charts.spectrum = Charts.lines(at("spectrum"), {
+    xLabel: "frequency / Hz", xName: "frequency", xUnit: "Hz", yLabel: "N / √Hz", logX: true, logY: true,
+    series: runs.map((run, i) => ({ label: several ? run.name : "virtual force", unit: "N/√Hz", colour: COLOURS[i % 4], spanGaps: true })),
+  });
+  charts.timing = Charts.lines(at("timing"), {
+    xLabel: "time / µs", xName: "from", xUnit: "µs", yLabel: "ticks", logX: true, logY: true,
+    series: [
+      { label: "lateness", colour: "--second", paths: Charts.steps },
+      { label: "work", colour: "--model", paths: Charts.steps },
+    ],
+  });
+}
+
+function draw(found) {
+  const [first] = found;
+  if (view.follow && runs.length === 1 && view.span !== null) {
+    view.begin = first.head.begin_s;
+    view.end = first.head.end_s;
+  }
+  found.forEach((item, i) => {
+    runs[i].span_s = item.head.span_s;
+    runs[i].state = item.head.state;
+  });
+  const width = columnsOf(strut).length;
+  const t = found.length === 1 ? [first.t, ...first.lists] : uPlot.join(found.map((item) => [item.t, ...item.lists]));
+  for (const id of Object.keys(shown)) {
+    const perRun = shown[id].length / found.length;
+    const lists = shown[id].map((item, i) => {
+      const list = t[1 + Math.floor(i / perRun) * width + item.column];
+      return item.level ? list.map((v) => (v === null || v === undefined ? null : item.level(v))) : list;
+    });
+    charts[id].set([t[0], ...lists], view.begin, view.end);
+  }
+  const steps = found.reduce((sum, item) => sum + item.head.steps, 0);
+  at("shown").textContent = `${view.begin.toFixed(2)} to ${view.end.toFixed(2)} s, ${steps.toLocaleString("en")} ticks`;
+  document.body.dataset.end = first.head.span_s[1];
+  document.body.dataset.frames = Number(document.body.dataset.frames ?? 0) + 1;
+}
+
+async function lookClosely() {
+  const key = [view.begin, view.end, strut].join();
+  if (document.hidden || shape === "" || key === askedCloselyFor) return;
+  askedCloselyFor = key;
+  const given = { begin: view.begin, end: view.end, strut };
+  const found = await Promise.all(runs.map(async (_run, run) => (await ask("closely", { run, ...given })).json()));
+  for (const id of ["velocity_m_per_s", "height_m"]) {
+    const points = found.flatMap((item) => [item.planes[`${id}:estimated`], item.planes[`${id}:measured`]]);
+    const own = found.map((item) => item.laws.model?.[id] ?? [[], []]);
+    const others = Object.entries(found[0].laws).filter(([name]) => name !== "model").map(([, law]) => law[id]);
+    // One line for all others, with a gap between two.
+    const joined = others.reduce(([xs, ys], [x, y]) => [[...xs, ...x], [...ys, ...y]], [[], []]);
+    charts[id === "height_m" ? "plane-height" : "plane-velocity"].set([...points, ...own, joined]);
+  }
+  const spectra = found.map((item) => [item.spectrum.frequency_hz, item.spectrum.density]);
+  charts.spectrum.set(spectra.length === 1 ? spectra[0] : uPlot.join(spectra));
+  const timing = found[0].timing;
+  at("timing").closest("section").hidden = !timing;
+  if (timing) {
+    const some = (list) => list.map((v) => (v > 0 ? v : null));
+    charts.timing.set([timing.edges_us.map((v) => Math.max(v, 0.5)), some(timing.lateness), some(timing.work)]);
+  }
+  at("longest").textContent = found[0].longest_s;
+  figures(found);
+}
+
+function figures(found) {
+  const rows = [];
+  found.forEach((item, i) => {
+    const name = runs.length > 1 ? `${runs[i].name}: ` : "";
+    if (item.bus.load !== undefined) {
+      rows.push([`${name}bus load`, `${(100 * item.bus.load).toFixed(1)} %`]);
+      rows.push([`${name}frames`, `${item.bus.frames_per_s.toFixed(0)} /s`]);
+    }
+    if (item.timing) rows.push([`${name}longest gap`, `${(item.timing.longest_gap_us / 1000).toFixed(2)} ms`]);
+    const counts = Object.entries(runs[i].counts ?? {}).filter(([key, value]) => value > 0 && key !== "started");
+    for (const [key, value] of counts) rows.push([`${name}${key.replaceAll("_", " ")}`, value.toLocaleString("en")]);
+    if (runs[i].counts && counts.length === 0) rows.push([`${name}faults counted`, "none"]);
+    if (runs[i].diverged) rows.push([`${name}diverged`, `${runs[i].diverged.strut}, ${runs[i].diverged.t_s.toFixed(3)} s`]);
+  });
+  const list = at("figures");
+  list.replaceChildren(
+    ...rows.map(([name, value]) => {
+      const pair = document.createElement("div");
+      pair.append(Object.assign(document.createElement("dt"), { textContent: name }), Object.assign(document.createElement("dd"), { textContent: value }));
+      return pair;
+    }),
+  );
+}
+
+// --- Which stretch is in sight ---------------------------------------------------------------
+
+const last = () => Math.max(0, ...runs.map((run) => run.span_s[1]));
+
+function look(begin, end) {
+  const least = 1e-3;
+  if (end - begin < least) end = begin + least;
+  Object.assign(view, { begin, end, span: end - begin, follow: false });
+  update();
+}
+
+function follow(span) {
+  Object.assign(view, { span, follow: true, end: last(), begin: span === null ? 0 : last() - span });
+  update();
+}
+
+const newest = () => follow(at("span").value === "whole" ? null : Number(at("span").value));
+
+function move(share) {
+  const by = share * (view.end - view.begin);
+  look(view.begin + by, view.end + by);
+}
+
+function zoom(factor) {
+  const middle = view.follow ? view.end : 0.5 * (view.begin + view.end);
+  const half = 0.5 * factor * (view.end - view.begin);
+  if (view.follow) follow(2 * half);
+  else look(middle - half, middle + half);
+}
+
+function pause() {
+  if (view.follow) look(view.begin, view.end);
+  else newest();
+}
+
+function update() {
+  changed = true;
+  at("pause").setAttribute("aria-pressed", String(!view.follow));
+  at("pause").textContent = view.follow ? "Pause" : "Resume";
+}
+
+// --- The runs --------------------------------------------------------------------------------
+
+async function readRuns() {
+  runs = await (await ask("runs")).json();
+  const list = runs.map((run, i) => {
+    const place = document.createElement("div");
+    place.className = "run";
+    const name = Object.assign(document.createElement("b"), { textContent: run.name, title: run.folder });
+    const pill = Object.assign(document.createElement("span"), { textContent: run.state, title: run.words, className: `pill ${TONES[run.state] ?? "quiet"}` });
+    const about = Object.assign(document.createElement("span"), { className: "quiet", textContent: [run.model, run.rate_hz ? `${run.rate_hz} Hz` : ""].filter(Boolean).join(", ") });
+    if (runs.length > 1) place.append(Object.assign(document.createElement("span"), { className: `swatch run${i % 4}` }));
+    place.append(name, pill, about);
+    return place;
+  });
+  at("runs").replaceChildren(...list);
+  document.title = `${runs.map((run) => run.name).join(", ")} – rig view`;
+  const said = runs.filter((run) => !["live", "done"].includes(run.state)).map((run) => run.words);
+  at("message").hidden = said.length === 0;
+  at("message").textContent = said.join(" ");
+  const struts = [...new Set(runs.flatMap((run) => run.struts))];
+  const ready = runs.some((run) => run.steps > 0) && struts.length > 0;
+  at("charts").hidden = !ready;
+  const now = JSON.stringify([runs.map((run) => [run.name, run.columns]), struts]);
+  if (ready && now !== shape) {
+    const select = at("strut");
+    select.replaceChildren(...struts.map((name) => new Option(name, name)));
+    strut = struts.includes(strut) ? strut : struts.at(-1);
+    select.value = strut;
+    at("strut-label").hidden = struts.length < 2;
+    build();
+    if (shape === "" && !runs.some((run) => run.state === "live")) {
+      at("span").value = "whole";
+    }
+    shape = now;
+    newest();
+  }
+}
+
+async function frame() {
+  if (shape === "") return;
+  const moves = runs.some((run) => ["live", "reading"].includes(run.state)) && view.follow;
+  if (!changed && !moves) return;
+  changed = false;
+  if (view.follow && (runs.length > 1 || view.span === null)) {
+    view.end = last();
+    view.begin = view.span === null ? 0 : view.end - view.span;
+  }
+  if (view.end <= view.begin) view.end = view.begin + 1e-3;
+  // Two points a bucket: one for each pixel.
+  const points = Math.min(2000, Math.max(150, Math.round(at("height").clientWidth / 2)));
+  draw(await Promise.all(runs.map((_run, index) => stretch(index, points))));
+}
+
+// One question after the other; what fails is asked again.
+function every(period, action) {
+  const once = async () => {
+    const begin = performance.now();
+    try {
+      await action();
+      at("runs").dataset.lost = "";
+    } catch (error) {
+      changed = true;
+      if (error instanceof TypeError && /fetch/i.test(error.message)) lost();
+      else console.error(error);
+    }
+    const pause = document.hidden ? HIDDEN_MS : Math.max(4, period - (performance.now() - begin));
+    setTimeout(once, pause);
+  };
+  once();
+}
+
+function lost() {
+  at("message").hidden = false;
+  at("message").textContent = "No answer from rig view: it has ended, or is busy. The page goes on when it answers.";
+}
+
+function keyboard(event) {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+  const actions = {
+    " ": pause, ArrowLeft: () => move(-0.25), ArrowRight: () => move(0.25), "+": () => zoom(0.5),
+    "-": () => zoom(2), Home: () => follow(null), End: newest,
+  };
+  const action = actions[event.key];
+  if (action === undefined || (event.key === " " && event.target.tagName === "BUTTON")) return;
+  event.preventDefault();
+  action();
+}
+
+function theme(name) {
+  document.documentElement.dataset.theme = name;
+  for (const chart of Object.values(charts)) chart.redraw();
+}
+
+at("span").addEventListener("change", newest);
+at("strut").addEventListener("change", () => {
+  strut = at("strut").value;
+  askedCloselyFor = "";
+  update();
+});
+for (const [id, action] of Object.entries({
+  pause, back: () => move(-0.5), forth: () => move(0.5), closer: () => zoom(0.5), wider: () => zoom(2),
+  whole: () => follow(null), newest,
+})) {
+  at(id).addEventListener("click", action);
+}
+at("theme").addEventListener("click", () => {
+  const name = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
+  localStorage.setItem("theme", name);
+  theme(name);
+});
+document.addEventListener("keydown", keyboard);
+theme(localStorage.getItem("theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
+every(RUNS_MS, readRuns);
+every(FRAME_MS, frame);
+every(CLOSELY_MS, lookClosely);

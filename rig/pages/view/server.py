@@ -1,0 +1,252 @@
+"""Answers the page: on loopback only, each question by itself, in a thread of its own.
+
+A page asks for a stretch when it has drawn the last one, so that a stalled one slows nobody, and
+one that lost its connection only asks again. The server keeps no state of a page.
+"""
+
+import json
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, cast
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+
+from dart_model.spec import ModelSpec
+from rig.inputs.errors import InputError
+from rig.operation.timing import read_histograms
+from rig.pages.charts import ASSETS
+from rig.pages.view import closely
+from rig.pages.view.watched import WatchedRun
+
+HOST = "127.0.0.1"
+
+_MOST_POINTS = 4000
+_HERE = Path(__file__).parent
+
+_FILES: Mapping[str, tuple[Path, str]] = {
+    "/": (_HERE / "page.html", "text/html; charset=utf-8"),
+    "/page.css": (_HERE / "page.css", "text/css; charset=utf-8"),
+    "/page.js": (_HERE / "page.js", "text/javascript; charset=utf-8"),
+    **{f"/{path.name}": (path, kind) for path, kind in ASSETS},
+}
+
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "connect-src 'self'; img-src 'self' data:; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+
+class _WrongQuestionError(Exception):
+    """A question that has no answer; its text is for whoever asked."""
+
+
+class ViewServer(ThreadingHTTPServer):
+    """The server of a page.
+
+    Args:
+        folders: Folders of runs.
+        models: Models whose laws are drawn beside those of the runs, by name.
+        port: Port on loopback; 0 for a free one.
+
+    Raises:
+        InputError: The port is taken.
+    """
+
+    daemon_threads = True
+
+    def __init__(self, folders: Sequence[Path], models: Mapping[str, ModelSpec], port: int) -> None:
+        self.runs = tuple(WatchedRun(folder) for folder in folders)
+        self.models = models
+        try:
+            super().__init__((HOST, port), _Handler)
+        except OSError as error:
+            raise InputError(
+                f"--port {port}: {error.strerror}, expected a port that is free"
+            ) from error
+
+    @property
+    def address(self) -> str:
+        """Where a browser finds the page."""
+        return f"http://{HOST}:{self.server_address[1]}/"
+
+    def serving(self) -> threading.Thread:
+        """Serve in a thread, until `shutdown`."""
+        thread = threading.Thread(target=self.serve_forever, args=(0.1,), name="view", daemon=True)
+        thread.start()
+        return thread
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "rig", ""
+    disable_nagle_algorithm = True
+
+    @property
+    def _view(self) -> ViewServer:
+        return cast("ViewServer", self.server)
+
+    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - the base's name
+        """Nothing: twenty questions a second are no news."""
+
+    def do_GET(self) -> None:
+        """Answer a question."""
+        asked = urlsplit(self.path)
+        # A page of another site must not read through a name that it points at this machine.
+        port = self._view.server_address[1]
+        if self.headers.get("Host") not in (f"{HOST}:{port}", f"localhost:{port}"):
+            self._send(HTTPStatus.FORBIDDEN, b"another host", "text/plain")
+            return
+        if asked.path in _FILES:
+            path, kind = _FILES[asked.path]
+            self._send(HTTPStatus.OK, path.read_bytes(), kind)
+            return
+        answer = _ANSWERS.get(asked.path)
+        if answer is None:
+            self._send(HTTPStatus.NOT_FOUND, b"no such page", "text/plain")
+            return
+        try:
+            content, kind = answer(self._view, _Question(asked.query))
+        except _WrongQuestionError as error:
+            self._send(HTTPStatus.BAD_REQUEST, str(error).encode(), "text/plain; charset=utf-8")
+        else:
+            self._send(HTTPStatus.OK, content, kind)
+
+    def _send(self, status: HTTPStatus, content: bytes, kind: str) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(content)
+
+
+class _Question:
+    """What a page asks for, by name."""
+
+    def __init__(self, query: str) -> None:
+        self._given = parse_qs(query)
+
+    def text(self, name: str) -> str:
+        return self._given.get(name, [""])[0]
+
+    def number(self, name: str) -> float:
+        try:
+            value = float(self.text(name))
+        except ValueError:
+            value = float("nan")
+        if not np.isfinite(value):
+            raise _WrongQuestionError(f"{name}: {self.text(name)!r}: expected a number")
+        return value
+
+    def run(self, view: ViewServer) -> WatchedRun:
+        number = self.number("run")
+        if number not in range(len(view.runs)):
+            raise _WrongQuestionError(f"run: {number:g}: expected 0 to {len(view.runs) - 1}")
+        return view.runs[int(number)]
+
+    def stretch(self) -> tuple[float, float]:
+        begin_s, end_s = self.number("begin"), self.number("end")
+        if not begin_s < end_s:
+            raise _WrongQuestionError(f"begin: {begin_s:g}: expected less than end")
+        return begin_s, end_s
+
+
+Answer = tuple[bytes, str]
+
+
+def _json(content: Any) -> Answer:
+    # No number that JSON does not have gets here: what is not finite is None or was left out.
+    return json.dumps(content, allow_nan=False).encode(), "application/json"
+
+
+def _runs(view: ViewServer, _question: _Question) -> Answer:
+    return _json([_described(run) for run in view.runs])
+
+
+def _described(run: WatchedRun) -> dict[str, Any]:
+    with run.lock:
+        run.update()
+        state, words = run.state()
+        config = cast("Mapping[str, Any]", run.header.get("config", {}))
+        ending = cast("Mapping[str, Any]", run.header.get("ending") or {})
+        return {
+            "name": run.folder.name or str(run.folder),
+            "folder": str(run.folder),
+            "state": state,
+            "words": words,
+            "model": run.model.name if run.model is not None else None,
+            "struts": [strut.name for strut in run.model.struts] if run.model is not None else [],
+            "rate_hz": config.get("rate_hz"),
+            "epoch_ns": str(run.header.get("epoch_ns", "")),
+            "columns": list(run.follower.columns),
+            "span_s": run.follower.span_s,
+            "steps": run.follower.steps,
+            "counts": ending.get("counts"),
+            "diverged": ending.get("diverged"),
+        }
+
+
+def _stretch(view: ViewServer, question: _Question) -> Answer:
+    """Columns of a stretch: a head in JSON, then times in doubles and columns in floats.
+
+    With `follow` the stretch ends with the newest step.
+    """
+    run = question.run(view)
+    begin_s, end_s = question.stretch()
+    points = int(min(max(question.number("points"), 1), _MOST_POINTS))
+    names = [name for name in question.text("columns").split(",") if name]
+    with run.lock:
+        run.update()
+        if question.text("follow"):
+            begin_s, end_s = run.follower.span_s[1] - (end_s - begin_s), run.follower.span_s[1]
+        found = run.follower.window(names, begin_s, end_s, points)
+        head = {
+            "span_s": run.follower.span_s,
+            "state": run.state()[0],
+            "begin_s": begin_s,
+            "end_s": end_s,
+            "count": len(found.t_s),
+            "steps": found.steps,
+        }
+    text = json.dumps(head).encode()
+    text += b" " * (-(len(text) + 4) % 8)
+    columns = found.values.astype(np.float32).tobytes()
+    content = len(text).to_bytes(4, "little") + text + found.t_s.tobytes() + columns
+    return content, "application/octet-stream"
+
+
+def _closely(view: ViewServer, question: _Question) -> Answer:
+    run = question.run(view)
+    begin_s, end_s = question.stretch()
+    strut = question.text("strut")
+    with run.lock:
+        rows = closely.rows_between(run.follower, begin_s, end_s)
+        models = {"model": run.model} if run.model is not None else {}
+        return _json(
+            {
+                "longest_s": closely.LONGEST_S,
+                "planes": closely.planes(run.follower, rows, strut),
+                "laws": closely.laws({**models, **view.models}, run.follower, rows, strut),
+                "spectrum": closely.spectrum(run.follower, rows, strut),
+                "bus": closely.bus_load(
+                    run.folder, run.header.get("epoch_ns", 0), run.frame_times_s, end_s
+                ),
+                "timing": read_histograms(run.folder),
+            }
+        )
+
+
+_ANSWERS: Mapping[str, Callable[[ViewServer, _Question], Answer]] = {
+    "/runs": _runs,
+    "/stretch": _stretch,
+    "/closely": _closely,
+}

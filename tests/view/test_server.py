@@ -1,0 +1,183 @@
+"""What the page's server answers, and to whom."""
+
+import json
+import shutil
+import socket
+
+import numpy as np
+import pytest
+import yaml
+
+from dart_model.spec import MODELS, load_model
+from rig.exchange.arrays import open_run
+from rig.inputs.errors import InputError
+from rig.pages.view.server import HOST, ViewServer
+from tests.view.serving import COUNT, described, get, grown_old, make_run, serving, stretch
+
+STRUT = "strut"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("view") / "reference")
+
+
+@pytest.fixture(scope="module")
+def server(run):
+    with serving(run, models={"corrected": load_model(MODELS / "reference.yaml")}) as made:
+        yield made
+
+
+def test_the_page_is_whole_and_needs_no_other_host(server):
+    status, headers, page = get(server, "/")
+    assert status == 200
+    assert "default-src 'none'" in headers["Content-Security-Policy"]
+    assert "unsafe" not in headers["Content-Security-Policy"]
+    assert b"http://" not in page
+    assert b"https://" not in page
+    for name in ("uPlot.iife.js", "uPlot.min.css", "charts.js", "page.js", "page.css"):
+        assert name.encode() in page
+        assert get(server, f"/{name}")[0] == 200 or name == "charts.css"
+
+
+def test_it_listens_on_loopback_only(server):
+    assert server.server_address[0] == HOST == "127.0.0.1"
+
+
+@pytest.mark.parametrize("host", ["rebound.example:80", "127.0.0.1", "localhost:1"])
+def test_a_page_of_another_host_learns_nothing(server, host):
+    status, _, body = get(server, "/runs", headers={"Host": host})
+    assert status == 403
+    assert b"reference" not in body
+
+
+@pytest.mark.parametrize("path", ["/../run.yaml", "/page.py", "/closely.py", "/%2e%2e/x"])
+def test_nothing_but_the_page_is_served(server, path):
+    assert get(server, path)[0] == 404
+
+
+@pytest.mark.parametrize(
+    ("question", "expected"),
+    [
+        ({"run": 1}, "run: 1: expected 0 to 0"),
+        ({"run": "x"}, "run: 'x': expected a number"),
+        ({"run": 0.5}, "expected 0 to 0"),
+        ({"begin": 5, "end": 5}, "expected less than end"),
+        ({"begin": "nan"}, "expected a number"),
+        ({"end": "1e999"}, "expected a number"),
+        ({"points": ""}, "points: '': expected a number"),
+    ],
+)
+def test_a_wrong_question_is_answered_with_one_line(server, question, expected):
+    given = {"run": 0, "begin": 0, "end": 1, "points": 100, "columns": "mode", **question}
+    status, _, body = get(server, "/stretch", **given)
+    assert status == 400
+    assert expected in body.decode()
+    assert b"\n" not in body
+
+
+def test_a_stretch_is_what_the_log_says(server, run):
+    names = [f"{STRUT}.height_m", f"{STRUT}.force_n", "mode", "no_such_column"]
+    head, t_s, values = stretch(
+        server, run=0, begin=0.2, end=0.6, points=4000, columns=",".join(names)
+    )
+    logged = open_run(run)
+    sight = (logged.t_s >= 0.2 - 1e-9) & (logged.t_s <= 0.6 + 1e-9)
+    assert head["steps"] == head["count"] == sight.sum()
+    np.testing.assert_array_equal(t_s, logged.t_s[sight])
+    for name, found in zip(names[:3], values, strict=False):
+        np.testing.assert_array_equal(found, logged[name][sight].astype(np.float32))
+    assert np.isnan(values[3]).all()
+
+
+def test_following_ends_with_the_newest_step(server):
+    head, t_s, _ = stretch(server, run=0, begin=0, end=0.1, points=500, columns="mode", follow="1")
+    assert t_s[-1] == head["end_s"] == pytest.approx((COUNT - 1) * 1e-3)
+    assert head["begin_s"] == pytest.approx(head["end_s"] - 0.1)
+
+
+def test_what_is_in_sight_is_looked_at_closely(server, run):
+    status, _, body = get(server, "/closely", run=0, begin=0, end=1, strut=STRUT)
+    assert status == 200
+    found = json.loads(body)
+    logged = open_run(run)
+    velocities, forces = found["planes"]["velocity_m_per_s:estimated"]
+    drawn = set(zip(velocities, forces, strict=True))
+    both = zip(logged[f"{STRUT}.velocity_m_per_s"], logged[f"{STRUT}.force_n"], strict=True)
+    assert drawn <= {(float(f"{v:.6g}"), float(f"{f:.6g}")) for v, f in both}
+    # The reference model is 500 N/m and 100 N s/m about 0.5 m.
+    for law in (found["laws"]["model"], found["laws"]["corrected"]):
+        heights, over_height = map(np.array, law["height_m"])
+        np.testing.assert_allclose(over_height, -500.0 * (heights - 0.5), atol=2e-3)
+        _, over_velocity = law["velocity_m_per_s"]
+        slope = np.diff(over_velocity) / np.diff(law["velocity_m_per_s"][0])
+        np.testing.assert_allclose(slope, -100.0, rtol=2e-3)
+    # One measurement in and an estimate and kinematics out a tick, and what comes less often.
+    assert 2900 < found["bus"]["frames_per_s"] < 3400
+    assert 0.3 < found["bus"]["load"] < 0.5
+
+
+@pytest.fixture
+def states(tmp_path, run):
+    """Folders in every state that a run's can be in."""
+    folders = {name: tmp_path / name for name in ("live", "killed", "empty", "schema", "no_run")}
+    for name in ("live", "killed", "empty", "schema"):
+        shutil.copytree(run, folders[name])
+    for name in ("live", "killed"):
+        header = yaml.safe_load((run / "run.yaml").read_text())
+        del header["ending"]
+        (folders[name] / "run.yaml").write_text(yaml.safe_dump(header))
+        steps = (run / "steps.arrow").read_bytes()
+        (folders[name] / "steps.arrow").write_bytes(steps[: len(steps) * 2 // 3])
+    grown_old(folders["killed"])
+    (folders["live"] / "frames.log").touch()
+    (folders["empty"] / "steps.arrow").write_bytes(b"")
+    text = (run / "run.yaml").read_text().replace("schema: 2", "schema: 1")
+    (folders["schema"] / "run.yaml").write_text(text)
+    folders["no_run"].mkdir()
+    folders["file"] = tmp_path / "file"
+    folders["file"].write_text("x")
+    folders["absent"] = tmp_path / "absent"
+    return folders
+
+
+def test_the_page_says_what_a_folder_is(states):
+    with serving(*states.values()) as server:
+        found = dict(zip(states, described(server), strict=True))
+    assert {name: item["state"] for name, item in found.items()} == {
+        "live": "live",
+        "killed": "killed",
+        "empty": "empty",
+        "schema": "unreadable",
+        "no_run": "absent",
+        "file": "unreadable",
+        "absent": "absent",
+    }
+    assert "schema: 1: expected 2" in found["schema"]["words"]
+    assert "rig replay" in found["killed"]["words"]
+    assert 0 < found["killed"]["steps"] < COUNT
+    assert found["live"]["steps"] > 0
+
+
+def test_a_run_that_comes_later_is_shown(tmp_path, run):
+    with serving(tmp_path / "later") as server:
+        assert described(server)[0]["state"] == "absent"
+        shutil.copytree(run, tmp_path / "later")
+        assert described(server)[0]["state"] == "done"
+        assert described(server)[0]["steps"] == COUNT
+
+
+def test_a_port_that_is_taken_is_one_line(run):
+    wrong = pytest.raises(InputError, match=r"--port \d+: .*expected a port that is free")
+    with socket.create_server((HOST, 0)) as taken, wrong:
+        ViewServer([run], {}, taken.getsockname()[1])
+
+
+def test_a_stalled_browser_delays_no_other(server):
+    stalled = socket.create_connection(server.server_address)
+    stalled.sendall(b"GET /stretch?run=0&begin=0")  # and not a byte more
+    try:
+        for _ in range(5):
+            assert stretch(server, run=0, begin=0, end=1, points=50, columns="mode")[0]["count"]
+    finally:
+        stalled.close()
