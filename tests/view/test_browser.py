@@ -1,0 +1,212 @@
+"""The page in a browser, by mouse and by keyboard alone."""
+
+import contextlib
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+
+from tests.view.browser import browser, drawn, frames, in_sight, needs_chromium, page, until
+from tests.view.serving import COUNT, make_run, serving
+
+pytestmark = needs_chromium
+
+axe = pytest.importorskip(
+    "axe_playwright_python.sync_playwright", reason="no axe-playwright-python"
+)
+
+END_S = (COUNT - 1) * 1e-3
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("browser") / "reference")
+
+
+@pytest.fixture(scope="module")
+def made():
+    with browser() as chromium:
+        yield chromium
+
+
+@pytest.fixture(scope="module")
+def server(run):
+    with serving(run, run) as two:
+        yield two
+
+
+@pytest.fixture
+def opened(made, run):
+    with serving(run) as one, page(made, one) as found:
+        drawn(found)
+        yield found
+
+
+def test_a_finished_run_is_shown_whole(opened):
+    assert in_sight(opened) == pytest.approx((0.0, END_S), abs=2e-3)
+    assert opened.title().startswith("reference")
+    assert opened.locator(".pill").inner_text() == "done"
+    for heading in ("Height", "Strut force", "Virtual force", "Innovation", "State and faults"):
+        assert opened.get_by_role("heading", name=heading, exact=True).is_visible()
+    until(opened, "document.querySelectorAll('#figures dt').length > 1")
+    points = opened.evaluate("charts['plane-height'].chart.data[1][0].length")
+    assert points > 50
+
+
+def test_a_stretch_that_is_drawn_is_zoomed_in_all_charts(opened):
+    box = opened.locator("#force .u-over").bounding_box()
+    opened.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 50)
+    opened.mouse.down()
+    opened.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 50, steps=5)
+    opened.mouse.up()
+    until(opened, "view.end - view.begin < 0.3")
+    begin, end = in_sight(opened)
+    assert (begin, end) == pytest.approx((0.25 * END_S, 0.5 * END_S), abs=0.01)
+    until(opened, f"Math.abs(charts.height.chart.scales.x.max - {end}) < 1e-6")
+    opened.locator("#innovation .u-over").dblclick()
+    until(opened, "view.begin === 0")
+
+
+def test_the_keyboard_reaches_everything(opened):
+    opened.keyboard.press("+")
+    until(opened, f"view.end - view.begin < {0.6 * END_S}")
+    end = in_sight(opened)[1]
+    opened.keyboard.press("ArrowLeft")
+    assert in_sight(opened)[1] < end
+    opened.keyboard.press("-")
+    opened.keyboard.press("Home")
+    until(opened, "view.begin === 0 && view.follow")
+    opened.keyboard.press(" ")
+    assert opened.locator("#pause").get_attribute("aria-pressed") == "true"
+    opened.keyboard.press("End")
+    assert opened.locator("#pause").get_attribute("aria-pressed") == "false"
+    reached = set()
+    for _ in range(12):
+        opened.keyboard.press("Tab")
+        reached.add(opened.evaluate("document.activeElement.id"))
+    assert {
+        "span",
+        "pause",
+        "back",
+        "forth",
+        "closer",
+        "wider",
+        "whole",
+        "newest",
+        "theme",
+    } <= reached
+
+
+def test_values_stand_under_the_cursor_with_their_units(opened):
+    box = opened.locator("#height .u-over").bounding_box()
+    opened.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 40)
+    values = opened.locator("#height .u-value")
+    until(opened, "document.querySelectorAll('#height .u-value')[1].textContent.includes(' m')")
+    assert re.fullmatch(r"0\.\d+ s", values.nth(0).inner_text())
+    # The cursors of the charts over time stand at one time.
+    assert re.fullmatch(r"-?[\d.]+ N", opened.locator("#force .u-value").nth(2).inner_text())
+
+
+def test_runs_are_laid_over_one_another(made, server):
+    with page(made, server) as opened:
+        drawn(opened)
+        assert opened.locator(".run").count() == 2
+        assert opened.evaluate("charts.virtual.chart.series.length") == 3
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1400, 390])
+def test_nothing_keeps_anybody_out(made, run, scheme, width):
+    with serving(run) as one, page(made, one, width=width, scheme=scheme) as opened:
+        drawn(opened)
+        assert opened.evaluate("document.documentElement.dataset.theme") == scheme
+        found = axe.Axe().run(opened).response["violations"]
+        serious = [item for item in found if item["impact"] in ("serious", "critical")]
+        assert serious == [], [(item["id"], item["nodes"][0]["html"]) for item in serious]
+        assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_a_name_is_never_executed(made, run, tmp_path):
+    bad = "<img src=x onerror=document.body.dataset.hit=1>"
+    folder = tmp_path / bad.replace("/", "")
+    shutil.copytree(run, folder)
+    for name in ("model.yaml", "run.yaml"):
+        text = (folder / name).read_text()
+        (folder / name).write_text(text.replace("reference_case", bad))
+    content = yaml.safe_load((folder / "model.yaml").read_text())
+    content["name"] = "x"
+    header = yaml.safe_load((folder / "run.yaml").read_text())
+    header["ending"]["status"] = bad
+    header["ending"]["diverged"] = {"strut": bad, "t_s": 0.1}
+    header["ending"]["counts"] = {bad: 3}
+    (folder / "run.yaml").write_text(yaml.safe_dump(header))
+    with serving(folder) as one, page(made, one) as opened:
+        drawn(opened)
+        until(opened, "document.querySelectorAll('#figures dt').length > 1")
+        assert opened.locator("#runs b").inner_text() == folder.name
+        assert bad in opened.locator("#figures").inner_text()
+        assert opened.evaluate("document.body.dataset.hit") is None
+        assert opened.locator("img").count() == 0
+
+
+@contextlib.contextmanager
+def command(run, port):
+    """`rig view` as a process of its own."""
+    call = ["from rig.cli.main import main; main()", "view", run, "--port", port, "--no-browser"]
+    whole = [sys.executable, "-c", *map(str, call)]
+    with subprocess.Popen(whole, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process.stdout.readline()
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(20) == 0
+
+
+def test_a_page_goes_on_when_the_server_is_back(made, run):
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with contextlib.closing(made.new_page()) as opened:
+        with command(run, port) as said:
+            assert said.startswith(f"http://127.0.0.1:{port}/ (on this machine only")
+            opened.goto(f"http://127.0.0.1:{port}/")
+            drawn(opened)
+        until(opened, "document.getElementById('message').textContent.includes('No answer')")
+        with command(run, port):
+            until(opened, "document.getElementById('message').hidden")
+
+
+@pytest.mark.long
+def test_a_live_run_is_followed(made, tmp_path):
+    """Real time: what is shown is at most 0.3 s old, and a pause holds."""
+    bench = [sys.executable, "-m", "tests.realtime", "--out", tmp_path / "live"]
+    process = subprocess.Popen([*map(str, bench), "--seconds", "25", "--busy", "0"])
+    try:
+        with serving(tmp_path / "live" / "run") as one, page(made, one) as opened:
+            drawn(opened)
+            until(opened, "runs[0].state === 'live'")
+            epoch_s = float(opened.evaluate("Number(runs[0].epoch_ns) * 1e-9"))
+            ages, count = [], frames(opened)
+            begin = time.monotonic()
+            while time.monotonic() < begin + 5.0:
+                drawn(opened, frames(opened))
+                ages.append(time.time() - epoch_s - in_sight(opened)[1])
+            print(f"{(frames(opened) - count) / 5.0:.1f} frames a second, oldest {max(ages):.3f} s")
+            assert sorted(ages)[len(ages) // 2] < 0.3
+            opened.keyboard.press(" ")
+            held = in_sight(opened)
+            opened.wait_for_timeout(1000)
+            assert in_sight(opened) == held
+            opened.keyboard.press("End")
+            until(opened, f"view.end > {held[1] + 1.0}")
+            assert process.wait(60) in (0, 1)  # 1: a tick was missed
+            until(opened, "runs[0].state !== 'live'")
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            process.wait()
