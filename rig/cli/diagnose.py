@@ -25,15 +25,23 @@ def diagnose(
         list[Path] | None,
         typer.Option("--held-out", metavar="RUN", help="Held-out run; once for each."),
     ] = None,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Print the report too; wants Chromium, Chrome or Edge.")
+    ] = False,
 ) -> None:
     """Trace what the model lacks to named effects, correct it, and judge it on other data."""
     from dart_model.spec import load_model, model_file
     from rig.diagnosis.command import diagnose_runs
+    from rig.pages.paper import print_page
     from rig.pages.report import write_report
 
     spec = load_model(model_file(model, Path()))
     with progress_bar() as bar:
         result = diagnose_runs(runs, spec, held_out or [], out, bar)
         write_report(result, out / "report.html")
+        if pdf:
+            print_page(out / "report.html", out / "report.pdf")
     print_diagnosis(result.diagnosis, struts=len(spec.struts))
     console.print(f"Written: {out}/diagnosis.json, {out}/corrected.yaml, {out}/report.html")
+    if pdf:
+        console.print(f"Printed: {out}/report.pdf")

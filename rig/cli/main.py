@@ -15,6 +15,7 @@ from rig.cli import (
     exchange,
     init,
     replay,
+    report,
     run,
     scoreboard,
     timing,
@@ -44,6 +45,7 @@ app.command("diagnose", epilog=diagnose.EXAMPLES)(diagnose.diagnose)
 app.command("import", epilog=exchange.IMPORT_EXAMPLES)(exchange.import_command)
 app.command("export", epilog=exchange.EXPORT_EXAMPLES)(exchange.export_command)
 app.command("docs", epilog=docs.EXAMPLES)(docs.docs)
+app.command("report", epilog=report.EXAMPLES)(report.report)
 app.command("scoreboard", epilog=scoreboard.EXAMPLES)(scoreboard.scoreboard)
 
 _INTERRUPTED = 130

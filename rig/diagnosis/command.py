@@ -2,15 +2,17 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 
-from dart_model.spec import FileSkeleton, ModelSpec
+from dart_model.spec import FileSkeleton, ModelSpec, dump_model
 from rig.diagnosis.diagnose import diagnose
-from rig.diagnosis.outcome import CORRECTED_FILE, DIAGNOSIS_FILE, Result, write_results
+from rig.diagnosis.outcome import CORRECTED_FILE, DIAGNOSIS_FILE, Result, Source, write_results
 from rig.diagnosis.progress import Progress
 from rig.diagnosis.recording import read_recording
 from rig.inputs.errors import InputError
-from rig.io.run_log import RUN_FILE
+from rig.io.run_log import RUN_FILE, STEPS_FILE, parts
 
 
 def diagnose_runs(
@@ -58,9 +60,25 @@ def diagnose_runs(
         [read_recording(path, names) for path in held_out],
         progress,
     )
+    sources = [
+        Source("nominal model", model.name, sha256(dump_model(model).encode()).hexdigest()),
+        *(Source("fitted", str(path), _fingerprint(path)) for path in runs),
+        *(Source("held out", str(path), _fingerprint(path)) for path in held_out),
+    ]
+    result = replace(result, sources=tuple(sources))
     progress("writing what was found", 1.0)
     try:
         write_results(result, model, out)
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from error
     return result
+
+
+def _fingerprint(path: Path) -> str:
+    """SHA-256 of a recording: of a run's steps, part by part, or of the file."""
+    found = sha256()
+    for part in parts(path, STEPS_FILE) if path.is_dir() else [path]:
+        with part.open("rb") as file:
+            while piece := file.read(1 << 20):
+                found.update(piece)
+    return found.hexdigest()

@@ -263,6 +263,21 @@ class HeldOutSeries:
 
 
 @dataclass(frozen=True)
+class Source:
+    """What a diagnosis was made from.
+
+    Attributes:
+        role: ``fitted``, ``held out`` or ``nominal model``.
+        name: Its path, or the name of the model.
+        sha256: Of the CSV file, of a run's steps, or of the model's text, in hex.
+    """
+
+    role: str
+    name: str
+    sha256: str
+
+
+@dataclass(frozen=True)
 class Result:
     """All that a diagnosis gives.
 
@@ -271,12 +286,14 @@ class Result:
         corrected: The corrected model.
         fitted: Residual force along the recordings that were learnt from, for the report.
         held_out: Held-out runs, for the report.
+        sources: What it was made from, where that are files.
     """
 
     diagnosis: Diagnosis
     corrected: ModelSpec
     fitted: tuple[FittedSeries, ...]
     held_out: tuple[HeldOutSeries, ...]
+    sources: tuple[Source, ...] = ()
 
 
 def to_json(diagnosis: Diagnosis) -> str:

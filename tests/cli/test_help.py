@@ -10,7 +10,7 @@ from rig.cli.main import app
 from rig.demo.cases import CASES
 from rig.exchange.exported import FORMATS
 
-SLOW = ("asammdf", "can", "dartpy", "matplotlib", "numba", "numpy", "plotly", "pyarrow", "scipy")
+SLOW = ("asammdf", "can", "dartpy", "matplotlib", "numba", "numpy", "pyarrow", "scipy")
 """What takes long to import; together seconds."""
 
 HELP = """

@@ -12,9 +12,8 @@ from pathlib import Path
 _UPLOT = Path(str(resources.files("uplot.static")))
 _HERE = Path(__file__).parent
 
-ASSETS = (
-    (_UPLOT / "uPlot.iife.js", "text/javascript; charset=utf-8"),
-    (_UPLOT / "uPlot.min.css", "text/css; charset=utf-8"),
-    (_HERE / "charts.js", "text/javascript; charset=utf-8"),
-)
-"""Files that a page with charts needs, and their kinds."""
+STYLES = (_UPLOT / "uPlot.min.css",)
+"""Style sheets that a page with charts needs."""
+
+SCRIPTS = (_UPLOT / "uPlot.iife.js", _HERE / "charts.js")
+"""Scripts that it needs, in this order."""

@@ -51,17 +51,44 @@ const Charts = (() => {
   const width = (place) => Math.max(200, Math.floor(place.clientWidth));
   const height = (place) => parseInt(getComputedStyle(place).getPropertyValue("--height"), 10);
 
+  const sizeOf = (place) => ({ width: width(place), height: height(place) });
+
   // A chart follows the width of its place, at the height that the place's style names; its legend
   // stands below.
   const fitted = (place, chart) => {
     const observer = new ResizeObserver(() => {
-      if (chart.width !== width(place)) chart.setSize({ width: width(place), height: height(place) });
+      if (chart.width !== width(place) && !matchMedia("print").matches) chart.setSize(sizeOf(place));
     });
     observer.observe(place);
     return () => {
       observer.disconnect();
       chart.destroy();
     };
+  };
+
+  // A grey band about zero, and marks where recordings begin, behind the curves.
+  const behind = (spec) => (u) => {
+    const { left, top, width: wide, height: high } = u.bbox;
+    const ctx = u.ctx;
+    ctx.save();
+    if (spec.reach > 0) {
+      const inside = (v) => Math.min(Math.max(u.valToPos(v, "y", true), top), top + high);
+      const [upper, lower] = [inside(spec.reach), inside(-spec.reach)];
+      ctx.fillStyle = colour("--band");
+      ctx.fillRect(left, upper, wide, lower - upper);
+    }
+    ctx.fillStyle = ctx.strokeStyle = colour("--axis");
+    ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
+    for (const mark of spec.marks ?? []) {
+      const [x, end] = [mark.begin, mark.end].map((v) => u.valToPos(v, "x", true));
+      if (x < left || x > left + wide) continue;
+      ctx.globalAlpha = 0.5;
+      ctx.fillRect(x, top, devicePixelRatio, high);
+      ctx.globalAlpha = 1;
+      // A name that would run into the next one says nothing.
+      if (ctx.measureText(mark.name).width < end - x - 8) ctx.fillText(mark.name, x + 4, top + 12 * devicePixelRatio);
+    }
+    ctx.restore();
   };
 
   // Lines over a common axis. `onSelect` is given the ends of a stretch that was drawn.
@@ -92,6 +119,7 @@ const Charts = (() => {
         ],
         bands: spec.bands?.map((band) => ({ series: band.series, fill: () => colour(band.colour) })),
         hooks: {
+          drawAxes: [behind(spec)],
           setSelect: [
             (u) => {
               if (spec.onSelect === undefined || u.select.width < 4) return;
@@ -106,6 +134,7 @@ const Charts = (() => {
       [[], ...spec.series.map(() => [])],
       place,
     );
+    place.querySelector(".u-series").classList.add("abscissa");
     spec.named?.forEach((isNamed, i) => {
       place.querySelectorAll(".u-series")[i + 1].hidden = !isNamed;
     });
@@ -183,6 +212,7 @@ const Charts = (() => {
         padding: [8, 12, 0, 0],
         cursor: { drag: { x: false, y: false }, points: { show: false } },
         legend: { live: false },
+        hooks: { drawAxes: [behind(spec)] },
         scales: {
           x: { time: false, range: () => padded(data.map((pair) => pair[0])) },
           y: { range: () => padded(data.map((pair) => pair[1])) },
@@ -220,6 +250,51 @@ const Charts = (() => {
     };
   }
 
+  // Blue above zero, red below: they stay apart for colour-blind readers. Zero is grey, so that it
+  // is not taken for a cell without samples.
+  const diverging = (share) => {
+    const end = share > 0 ? [5, 90, 160] : [190, 60, 20];
+    const part = Math.min(1, Math.abs(share)) ** 0.7;
+    return `rgb(${end.map((v) => Math.round(236 + part * (v - 236))).join(",")})`;
+  };
+
+  // Cells of a plane by their middles; `z` row by row, null where there is nothing.
+  function cells(place, spec, xs, ys, z) {
+    const half = (list) => 0.5 * (list[1] - list[0]);
+    const [dx, dy] = [half(xs), half(ys)];
+    const fill = (u) => {
+      const ctx = u.ctx;
+      z.forEach((value, i) => {
+        if (value === null) return;
+        const [x, y] = [xs[i % xs.length], ys[Math.floor(i / xs.length)]];
+        const [left, right] = [x - dx, x + dx].map((v) => Math.round(u.valToPos(v, "x", true)));
+        const [upper, lower] = [y + dy, y - dy].map((v) => Math.round(u.valToPos(v, "y", true)));
+        ctx.fillStyle = diverging(value / spec.largest);
+        ctx.fillRect(left, upper, right - left, lower - upper);
+      });
+    };
+    const chart = new uPlot(
+      {
+        width: width(place),
+        height: height(place),
+        title: spec.title,
+        padding: [8, 12, 0, 0],
+        cursor: { drag: { x: false, y: false }, points: { show: false } },
+        legend: { show: false },
+        hooks: { draw: [fill] },
+        scales: {
+          x: { time: false, range: [xs[0] - dx, xs.at(-1) + dx] },
+          y: { range: [ys[0] - dy, ys.at(-1) + dy] },
+        },
+        axes: [axis(spec.xLabel, 24, { values: short }), axis(spec.yLabel, 62, { values: short })],
+        series: [{}, { show: false }],
+      },
+      [xs, xs.map(() => null)],
+      place,
+    );
+    return { chart, destroy: fitted(place, chart), redraw: () => chart.redraw(false, true) };
+  }
+
   const steps = uPlot.paths.stepped({ align: 1 });
-  return { lines, plane, steps, number };
+  return { lines, plane, cells, steps, number, sizeOf };
 })();

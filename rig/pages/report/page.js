@@ -1,27 +1,37 @@
 "use strict";
-const sources = new Map();
-for (const data of document.querySelectorAll("script[data-plot]")) {
-  const place = document.getElementById(data.dataset.plot);
-  const figure = JSON.parse(data.textContent);
-  Plotly.newPlot(place, figure.data, figure.layout, {
-    responsive: true,
-    displaylogo: false,
-    displayModeBar: "hover",
-    modeBarButtons: [["toImage", "zoom2d", "pan2d", "resetScale2d"]],
-    toImageButtonOptions: { filename: data.dataset.plot },
-  });
-  sources.set(place, data);
+// Draws the plots, whose numbers stand in the page as single-precision floats in base 64.
+const unpacked = (text) =>
+  Array.from(new Float32Array(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer), (v) => (Number.isNaN(v) ? null : v));
+
+const drawnPanels = [];
+// Paper is narrower than the window: charts are drawn again at the width of its columns.
+const PAPER = { whole: 690, half: 335, height: 205 };
+
+function draw(place, panel) {
+  const x = unpacked(panel.x);
+  const values = panel.values.map(unpacked);
+  const series = panel.curves.map((curve) => ({ ...curve, label: curve.name, dash: curve.dash.length ? curve.dash : undefined, dots: panel.kind === "points", spanGaps: panel.gaps, paths: panel.steps ? Charts.steps : undefined }));
+  const [name, unit] = panel.xLabel.split(" / ");
+  const spec = { ...panel, series, xName: name, xUnit: unit };
+  if (panel.kind === "cells") return Charts.cells(place, spec, x, unpacked(panel.y), values[0]);
+  if (panel.kind === "lines") {
+    const chart = Charts.lines(place, { ...spec, logX: panel.log, logY: panel.log, rangeY: panel.y_range });
+    chart.set([x, ...values]);
+    return chart;
+  }
+  const chart = Charts.plane(place, spec);
+  chart.set(values.map((y) => [x, y]));
+  return chart;
 }
-// Paper is narrower than the window: draw again at the width of the page.
-const ON_PAPER = { width: 700, "font.size": 9 };
-const ON_SCREEN = { width: null, autosize: true };
+
+for (const data of document.querySelectorAll("script[data-plot]")) {
+  const places = document.getElementById(data.dataset.plot).querySelectorAll(".chart");
+  const half = places[0].parentElement.classList.contains("panels2");
+  JSON.parse(data.textContent).forEach((panel, i) => drawnPanels.push({ half, place: places[i], ...draw(places[i], panel) }));
+}
 window.addEventListener("beforeprint", () => {
-  for (const folded of document.querySelectorAll("details")) folded.open = true;
-  for (const place of sources.keys()) Plotly.relayout(place, ON_PAPER);
+  for (const { chart, half } of drawnPanels) chart.setSize({ width: half ? PAPER.half : PAPER.whole, height: PAPER.height });
 });
 window.addEventListener("afterprint", () => {
-  for (const place of sources.keys()) {
-    const size = JSON.parse(sources.get(place).textContent).layout.font.size;
-    Plotly.relayout(place, { ...ON_SCREEN, "font.size": size });
-  }
+  for (const { chart, place } of drawnPanels) chart.setSize(Charts.sizeOf(place));
 });

@@ -3,14 +3,15 @@
 import base64
 import hashlib
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from plotly import offline
 
 from dart_model.effects import FAMILY_WORDS, effect
 from rig.diagnosis.outcome import Diagnosis, Result, write_text
 from rig.inputs.errors import InputError
+from rig.pages import charts
 from rig.pages.report import tables
 from rig.pages.report.figures import (
     Plot,
@@ -48,6 +49,12 @@ _ASSUMPTIONS = (
     "Held-out data took no part in the search, only their initial states are fitted. Laws without "
     "which they are at the noise floor are taken back.",
 )
+_SPLITS = {
+    "runs": "Whole recordings were held out; they took no part in search and fit.",
+    "blocks": "No recording was held out: blocks spread over the recordings took no part in search "
+    "and fit.",
+}
+_PACKAGES = ("rig", "dartpy", "numpy", "scipy", "numba")
 _OF_A_FREE_RUN = ("The free-run simulation has the applied force as its only input.",)
 
 
@@ -61,11 +68,34 @@ def write_report(result: Result, path: Path) -> None:
     Raises:
         InputError: The file cannot be written.
     """
-    text = page(result)
+    write_page(page(result), path)
+
+
+def write_page(text: str, path: Path) -> None:
+    """Write a page, whole or not at all.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
     try:
         write_text(path, text)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def render(template: str, **content: object) -> str:
+    """A page from its template, with the scripts and styles of its charts."""
+    scripts = [path.read_text("utf-8") for path in (*charts.SCRIPTS, _HERE / "page.js")]
+    environment = Environment(
+        loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    return environment.get_template(template).render(
+        styles=[path.read_text("utf-8") for path in (*charts.STYLES, _HERE / "page.css")],
+        scripts=scripts,
+        script_hashes=[_hash(script) for script in scripts],
+        **content,
+    )
 
 
 def page(result: Result) -> str:
@@ -78,14 +108,9 @@ def page(result: Result) -> str:
     for series in (*result.fitted, *result.held_out):
         check_series(series)
     struts = tuple(dict.fromkeys(item.strut for item in (*result.fitted, *result.held_out)))
-    plotly_script = offline.get_plotlyjs()
-    own_script = (_HERE / "page.js").read_text("utf-8")
     tone, sign, badge = _BADGES[found.verdict]
-    environment = Environment(
-        loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    return environment.get_template("page.html").render(
+    return render(
+        "page.html",
         found=found,
         sentence=sentence(found, len(struts)),
         tone=tone,
@@ -108,10 +133,9 @@ def page(result: Result) -> str:
         families=FAMILY_WORDS,
         excitations=tables.listed_excitations,
         percent=percent,
-        style=(_HERE / "page.css").read_text("utf-8"),
-        plotly_script=plotly_script,
-        own_script=own_script,
-        script_hashes=(_hash(plotly_script), _hash(own_script)),
+        sources=result.sources,
+        split=_SPLITS[found.held_out.source],
+        versions=[f"{name} {version(name)}" for name in _PACKAGES],
     )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from dart_model.spec import ModelSpec
 from rig.inputs.errors import InputError
 from rig.operation.timing import read_histograms
-from rig.pages.charts import ASSETS
+from rig.pages import charts
 from rig.pages.view import closely
 from rig.pages.view.watched import WatchedRun
 
@@ -26,12 +26,12 @@ HOST = "127.0.0.1"
 
 _MOST_POINTS = 4000
 _HERE = Path(__file__).parent
+_STYLES, _SCRIPTS = (*charts.STYLES, _HERE / "page.css"), (*charts.SCRIPTS, _HERE / "page.js")
 
 _FILES: Mapping[str, tuple[Path, str]] = {
     "/": (_HERE / "page.html", "text/html; charset=utf-8"),
-    "/page.css": (_HERE / "page.css", "text/css; charset=utf-8"),
-    "/page.js": (_HERE / "page.js", "text/javascript; charset=utf-8"),
-    **{f"/{path.name}": (path, kind) for path, kind in ASSETS},
+    **{f"/{path.name}": (path, "text/css; charset=utf-8") for path in _STYLES},
+    **{f"/{path.name}": (path, "text/javascript; charset=utf-8") for path in _SCRIPTS},
 }
 
 _HEADERS = {

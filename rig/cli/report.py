@@ -1,0 +1,37 @@
+"""`rig report`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.output import console
+from rig.inputs.errors import InputError
+
+EXAMPLES = "Examples: `rig report runs/7` · `rig report runs/7 --out handed_over.html --pdf`"
+
+
+def report(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="File to write; RUN/report.html by default."),
+    ] = None,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Print it too; wants Chromium, Chrome or Edge.")
+    ] = False,
+) -> None:
+    """Write a page about a run: what ran, how well, timing, faults. One file, no network."""
+    from rig.pages.paper import print_page
+    from rig.pages.run_report import write_run_report
+
+    path = out or run / "report.html"
+    paper = path.with_suffix(".pdf")
+    for existing in (path, paper) if pdf else (path,):
+        if existing.exists():
+            raise InputError(f"{existing}: exists, expected another name (--out)")
+    write_run_report(run, path)
+    console.print(f"Written: {path}")
+    if pdf:
+        print_page(path, paper)
+        console.print(f"Printed: {paper}")
