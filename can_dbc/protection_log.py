@@ -33,7 +33,6 @@ def in_sequence(
     intact = lengths == length
     intact &= check_crc_log(payloads[:, :length], protection)
     counters = (payloads[:, 1] & 0x0F).astype(np.int64)
-    intact &= counters < modulus
     follows[1:] = intact[1:] & intact[:-1]
     follows[1:] &= np.diff(counters) % modulus == 1
     follows[1:] &= np.diff(t_ns) < protection.silence_ns

@@ -78,3 +78,9 @@ def test_a_group_of_several_messages_says_nothing(tmp_path):
 def test_filters_let_in_what_has_a_place(two, number):
     let_in = any(number & f.mask == f.arbitration_id & f.mask for f in two.filters)
     assert let_in is (two.place(number, True) is not None)
+
+
+def test_the_byte_behind_a_format_is_a_destination_or_part_of_the_group(two):
+    """SAE J1939-21: PDU formats from 240 on have a group extension there, others a destination."""
+    assert two.place(BROADCAST ^ 0x0100, True) is None
+    assert two.place(DIRECTED ^ 0x0100, True) == 1

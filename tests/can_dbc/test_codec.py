@@ -14,7 +14,7 @@ from cantools.database.conversion import BaseConversion
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.codec import compile_decoder, compile_encoder, decode_log
+from can_dbc.codec import compile_decoder, compile_encoder, decode_log, si_range
 from can_dbc.database import Database, Message, load_database
 from can_dbc.errors import DatabaseError
 from can_dbc.units import Dimension
@@ -365,3 +365,44 @@ def test_encoder_wants_all_its_values(rig: Database) -> None:
     encode = compile_encoder(rig.message("BENCH_MEASUREMENT"), ["HEIGHT"], [Dimension.LENGTH])
     with pytest.raises(ValueError, match="expected 1"):
         encode([1.0, 2.0])
+
+
+BESIDE_OFFSETS = """BO_ 1 M: 8 BENCH
+ SG_ WARM : 0|8@1+ (0.5,-40) [-30|60] "degC" RIG
+ SG_ FALLING : 8|16@1+ (-0.01,100) [-20|80] "N" RIG
+ SG_ FLOAT : 32|32@1- (1,0) [-2|3] "N" RIG
+"""
+
+
+@pytest.mark.parametrize(
+    ("signal", "dimension", "low", "high", "step"),
+    [
+        ("WARM", Dimension.TEMPERATURE, -30.0, 60.0, 0.5),
+        ("FALLING", Dimension.FORCE, -20.0, 80.0, 0.01),
+        ("FLOAT", Dimension.FORCE, -2.0, 3.0, 0.0),
+    ],
+)
+def test_a_range_beside_an_offset_is_that_of_the_dbc(
+    write_dbc: Callable[..., Path],
+    signal: str,
+    dimension: Dimension,
+    low: float,
+    high: float,
+    step: float,
+) -> None:
+    message = load_database(write_dbc(BESIDE_OFFSETS, "SIG_VALTYPE_ 1 FLOAT : 1;")).message("M")
+    assert si_range(message, signal, dimension) == pytest.approx((low, high), abs=1e-9)
+    encode = compile_encoder(message, [signal], [dimension])
+    decode = compile_decoder(message, [signal], [dimension])
+    for value, sent, is_held in (
+        (low, low, False),
+        (high, high, False),
+        (low - 0.4 * step, low, False),
+        (high + 0.4 * step, high, False),
+        (low - 10.0, low, True),
+        (high + 10.0, high, True),
+        (0.5 * (low + high), 0.5 * (low + high), False),
+    ):
+        payload, held = encode([value])
+        assert decode(payload) == pytest.approx((sent,), abs=0.5 * step + 1e-6)
+        assert held is is_held

@@ -4,6 +4,7 @@ import cantools.database
 import msgspec
 
 from can_dbc.database import DEFAULT_DATABASE
+from can_dbc.frame import Frame
 from rig.core import bridge, contract, messages, prescribed, record, step, supervisor
 from rig.core.contract import Mode
 from rig.core.messages import Conditions
@@ -67,3 +68,56 @@ def test_a_state_of_the_core_cannot_be_changed():
     } - {msgspec.Struct}
     assert len(structs) > 10
     assert all(made.__struct_config__.frozen for made in structs)
+
+
+def statuses(ticks):
+    return [
+        (frame.t_ns, STATUS.decode(frame.data, decode_choices=False))
+        for tick in ticks
+        for frame in tick.result.frames
+        if frame.arbitration_id == STATUS.frame_id
+    ]
+
+
+def test_a_fault_of_the_bus_is_set_in_one_status_and_clear_in_the_next():
+    estimate = 0x110
+
+    def second_sender(t_ns, frames):
+        ours = [Frame(t_ns, estimate, bytes(8))] if t_ns == 450 * MS else []
+        return [*frames, *ours]
+
+    ticks = Trial().run(1000, second_sender)
+    assert ticks[-1].counts.second_sender == 1
+    set_at = [t_ns // MS for t_ns, values in statuses(ticks) if values["BUS_FAULT"]]
+    assert len(set_at) == 1
+    assert 450 <= set_at[0] <= 550
+
+
+def test_an_error_frame_and_a_stranger_s_are_nobodys_under_our_ids():
+    def others(t_ns, frames):
+        error = Frame(t_ns, 0x110, bytes(8), is_error=True)
+        stranger = Frame(t_ns, 0x6FF, bytes(8))
+        return [*frames, error, stranger]
+
+    ticks = Trial().run(300, others)
+    assert ticks[-1].counts.second_sender == 0
+
+
+def test_a_height_that_cannot_be_is_counted_once():
+    limits = [{"value": "measured_height_m", "low": 0.1, "high": 0.4, "action": "refuse"}]
+    trial = Trial(limits=limits)
+    ticks = trial.run(800)
+    truth = [trial.bench.truth(tick.t_ns).struts[0].height_m for tick in ticks]
+    beyond = sum(height > 0.4 for height in truth)
+    assert beyond > 20
+    counts = ticks[-1].counts
+    assert counts.implausible == counts.refused
+    assert abs(counts.implausible - beyond) <= 2  # a sensor's step at either end
+
+
+def test_the_strut_that_ran_away_is_named():
+    right = contract.StrutOutput(1.0, 0.0, True, 0.5, 0.0, 0.0, 0.0)
+    for wrong in ({"force_n": float("nan")}, {"height_m": 1e30}, {"velocity_m_per_s": -1e30}):
+        away = msgspec.structs.replace(right, **wrong)
+        assert step._first_diverged((right, away)) == 1
+        assert step._first_diverged((away, right)) == 0

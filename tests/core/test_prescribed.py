@@ -115,6 +115,33 @@ def test_a_measured_temperature_holds_until_the_next() -> None:
             assert output.struts[0].virtual_force_n == pytest.approx(0.0, abs=2.5)
 
 
+def test_the_safe_state_publishes_the_last_valid_force_where_that_is_asked_for() -> None:
+    holds = Supervision(5 * TICK_NS, 50 * TICK_NS, True)
+    core = PrescribedCore(plant(), 0.002, holds)
+    state = core.init(0)
+    for number in range(20):
+        state, output = core.step(state, step_input(number, 100.0 + number))
+    for number in range(20, 120):
+        state, output = core.step(state, step_input(number, None, measured=False))
+    assert output.mode is Mode.SAFE
+    assert not output.struts[0].valid
+    # The cell's last force counts as valid as long as it is fresh.
+    assert output.struts[0].force_n == 119.0
+
+
+def test_effects_age_with_the_time_of_the_run() -> None:
+    fade = EffectSpec(name="time_fade", parameters={"final_fraction": 0.0, "time_constant_s": 0.5})
+    core = PrescribedCore(plant(fade), 0.002, SUPERVISION)
+    state = core.init(0)
+    for number in range(1500):
+        height_m, velocity = motion(number * 1e-3)
+        left = math.exp(-number * 1e-3 / 0.5)
+        law_n = -5000.0 * (height_m - 0.3) - 2000.0 * left * velocity
+        state, output = core.step(state, step_input(number, law_n))
+        if number > 50:
+            assert output.struts[0].virtual_force_n == pytest.approx(0.0, abs=3.0)
+
+
 def test_nothing_is_said_before_both_channels_came() -> None:
     core = PrescribedCore(plant(), 0.002, SUPERVISION)
     state, output = core.step(core.init(0), step_input(0, None))
