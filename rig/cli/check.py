@@ -1,14 +1,29 @@
 """`rig check`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
-from rig.cli.output import FAILED, ConfigFile, console, write_summary
+from rig.cli.output import (
+    FAILED,
+    ConfigFile,
+    JsonFlag,
+    JUnitFile,
+    Outcome,
+    console,
+    print_json,
+    table,
+    write_junit,
+    write_summary,
+)
 
-EXAMPLES = "Example: `rig check rig.yaml`"
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rig.operation.check import Finding
+
+EXAMPLES = "Examples: `rig check rig.yaml` · `rig check rig.yaml --junit check.xml`"
 
 
 def check_command(
@@ -16,19 +31,34 @@ def check_command(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Write summary.json there.")
     ] = None,
+    as_json: JsonFlag = False,
+    junit: JUnitFile = None,
 ) -> None:
     """Say what is wrong before a bench moves: signals, units, rate, bus load, poles."""
     from rig.operation.check import Severity, check
     from rig.operation.setup import load_setup
 
     findings = check(load_setup(config))
-    table = Table("", "What", "Finding", title=f"Check of {config}")
+    if as_json:
+        print_json([finding.as_dict() for finding in findings])
+    else:
+        _print(config, findings)
+    if out is not None:
+        write_summary(out, {"findings": [finding.as_dict() for finding in findings]})
+    if junit is not None:
+        wrong = Severity.ERROR
+        outcomes = [Outcome(item.what, item.text, item.severity is wrong) for item in findings]
+        write_junit(junit, f"rig check {config}", outcomes)
+    if any(finding.severity is Severity.ERROR for finding in findings):
+        raise typer.Exit(FAILED)
+
+
+def _print(config: Path, findings: "Sequence[Finding]") -> None:
+    from rig.operation.check import Severity
+
+    shown = table("", "What", "Finding", title=f"Check of {config}")
     styles = {Severity.OK: "green", Severity.WARNING: "yellow", Severity.ERROR: "red"}
     for finding in findings:
         style = styles[finding.severity]
-        table.add_row(f"[{style}]{finding.severity.value}[/]", finding.what, finding.text)
-    console.print(table)
-    if out is not None:
-        write_summary(out, {"findings": [finding.as_dict() for finding in findings]})
-    if any(finding.severity is Severity.ERROR for finding in findings):
-        raise typer.Exit(FAILED)
+        shown.add_row(f"[{style}]{finding.severity.value}[/]", finding.what, finding.text)
+    console.print(shown)

@@ -7,7 +7,7 @@ import typer
 
 from rig.cli.output import console, free_folder
 from rig.cli.results import print_case, print_diagnosis, print_ended
-from rig.cli.watching import progress_bar, progress_line, stoppable
+from rig.cli.watching import progress_bar, status_line, stoppable
 from rig.inputs.errors import InputError
 from rig.inputs.folders import refuse_full
 
@@ -54,10 +54,8 @@ def demo(
     if case == STORY:
         _tell(seed, out, lockstep=lockstep, duration_s=duration_s)
         return
-    with stoppable() as stop, progress_line(duration_s) as progress:
-        done = run_case(
-            case, out, lockstep=lockstep, duration_s=duration_s, stop=stop, progress=progress
-        )
+    with stoppable() as stop, status_line(duration_s) as watch:
+        done = run_case(case, out, lockstep=lockstep, duration_s=duration_s, stop=stop, watch=watch)
     print_case(done)
     print_ended(done.run, with_timing=not lockstep)
     console.print(f"Written: {out}/summary.json, a picture of each strut, and the run {out}/run")
@@ -66,7 +64,7 @@ def demo(
 def _tell(seed: int, out: Path, *, lockstep: bool, duration_s: float | None) -> None:
     from rig.demo.story import tell
 
-    with stoppable() as stop, progress_line(duration_s) as progress, progress_bar() as bar:
+    with stoppable() as stop, status_line(duration_s) as watch, progress_bar() as bar:
         story = tell(
             seed,
             out,
@@ -74,7 +72,7 @@ def _tell(seed: int, out: Path, *, lockstep: bool, duration_s: float | None) -> 
             lockstep=lockstep,
             stop=stop,
             chapter=lambda text: console.print(f"- {text}"),
-            progress=progress,
+            watch=watch,
             diagnosis_progress=bar,
         )
     print_ended(story.first_run, with_timing=not lockstep)
@@ -85,5 +83,6 @@ def _tell(seed: int, out: Path, *, lockstep: bool, duration_s: float | None) -> 
         f"On a fresh run the virtual force falls from {before:.2f} N to {after:.2f} N RMS.\n"
         f"What the bench carried, and the diagnosis did not know: {story.effect.name} "
         f"(family {story.family}): {parameters}.\n"
-        f"Report: {out}/diagnosis/report.html"
+        f"Report: {out}/diagnosis/report.html\n"
+        f"See both runs: rig view {out}/fresh_before {out}/fresh_after"
     )

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import console
-from rig.cli.results import print_diagnosis
+from rig.cli.output import JsonFlag, JUnitFile, console, write_junit
+from rig.cli.results import print_diagnosis, verdict
 from rig.cli.watching import progress_bar
 
 EXAMPLES = "Example: `rig diagnose runs/7 --model bench.yaml --held-out runs/8 --out found`"
@@ -28,10 +28,13 @@ def diagnose(
     pdf: Annotated[
         bool, typer.Option("--pdf", help="Print the report too; wants Chromium, Chrome or Edge.")
     ] = False,
+    as_json: JsonFlag = False,
+    junit: JUnitFile = None,
 ) -> None:
     """Trace what the model lacks to named effects, correct it, and judge it on other data."""
     from dart_model.spec import load_model, model_file
     from rig.diagnosis.command import diagnose_runs
+    from rig.diagnosis.outcome import to_json
     from rig.pages.paper import print_page
     from rig.pages.report import write_report
 
@@ -41,6 +44,11 @@ def diagnose(
         write_report(result, out / "report.html")
         if pdf:
             print_page(out / "report.html", out / "report.pdf")
+    if junit is not None:
+        write_junit(junit, f"rig diagnose {spec.name}", verdict(result.diagnosis, spec))
+    if as_json:
+        typer.echo(to_json(result.diagnosis), nl=False)
+        return
     print_diagnosis(result.diagnosis, struts=len(spec.struts))
     console.print(f"Written: {out}/diagnosis.json, {out}/corrected.yaml, {out}/report.html")
     if pdf:

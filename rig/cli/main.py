@@ -1,7 +1,9 @@
 """The command line whole: every command, and what a wrong input or an interruption ends with."""
 
+import platform
 import sys
-from typing import cast
+from importlib.metadata import version
+from typing import Annotated, cast
 
 import typer
 from rich.console import Console
@@ -29,7 +31,6 @@ __all__ = ["app", "main"]
 app = typer.Typer(
     name="rig",
     help="Bridge between a shock-absorber bench on CAN and a DART multibody model.",
-    add_completion=False,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
@@ -47,6 +48,31 @@ app.command("export", epilog=exchange.EXPORT_EXAMPLES)(exchange.export_command)
 app.command("docs", epilog=docs.EXAMPLES)(docs.docs)
 app.command("report", epilog=report.EXAMPLES)(report.report)
 app.command("scoreboard", epilog=scoreboard.EXAMPLES)(scoreboard.scoreboard)
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        for name in ("rig", "dartpy", "python-can", "numpy"):
+            typer.echo(f"{name} {version(name)}")
+        typer.echo(f"Python {platform.python_version()}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    *,
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version",
+            callback=_show_version,
+            is_eager=True,
+            help="Versions of rig and what it stands on.",
+        ),
+    ] = False,
+) -> None:
+    """Options that stand before a command."""
+
 
 _INTERRUPTED = 130
 """What a shell expects of a program that Ctrl-C ended: 128 and the number of SIGINT."""

@@ -2,17 +2,82 @@
 
 import itertools
 import json
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple, cast
+from xml.etree import ElementTree
 
 import typer
 from rich.console import Console
+from rich.table import Column, Table
 
 from rig.inputs.errors import InputError
 
 OK, FAILED, WRONG_INPUT = 0, 1, 2
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file.")]
 console = Console()
+
+JsonFlag = Annotated[bool, typer.Option("--json", help="Print the same as JSON, and nothing else.")]
+JUnitFile = Annotated[
+    Path | None,
+    typer.Option("--junit", metavar="FILE", help="Write it as JUnit XML too, for a CI server."),
+]
+
+
+class Outcome(NamedTuple):
+    """One line of a check, for a CI server.
+
+    Attributes:
+        what: What was checked.
+        text: What was found.
+        failed: Whether that is a failure.
+    """
+
+    what: str
+    text: str
+    failed: bool
+
+
+def table(*heads: str, title: str | None = None) -> Table:
+    """A table whose cells are folded, and never cut."""
+    return Table(*(Column(head, overflow="fold") for head in heads), title=title)
+
+
+def print_json(content: object) -> None:
+    """Print as JSON; numbers that are not finite become null."""
+    typer.echo(json.dumps(_finite(content), indent=2, ensure_ascii=False))
+
+
+def _finite(content: object) -> object:
+    if isinstance(content, dict):
+        items = cast("dict[object, object]", content).items()
+        return {str(key): _finite(item) for key, item in items}
+    if isinstance(content, list | tuple):
+        return [_finite(item) for item in cast("list[object]", content)]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
+def write_junit(path: Path, suite: str, outcomes: Sequence[Outcome]) -> None:
+    """Write outcomes as JUnit XML, a test case each.
+
+    Raises:
+        InputError: The file exists, or cannot be written.
+    """
+    if path.exists():
+        raise InputError(f"--junit {path}: exists, expected a new file")
+    failures = sum(outcome.failed for outcome in outcomes)
+    root = ElementTree.Element(
+        "testsuite", name=suite, tests=str(len(outcomes)), failures=str(failures), errors="0"
+    )
+    for outcome in outcomes:
+        case = ElementTree.SubElement(root, "testcase", classname=suite, name=outcome.what)
+        kind = "failure" if outcome.failed else "system-out"
+        ElementTree.SubElement(case, kind).text = outcome.text
+    try:
+        ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+    except OSError as error:
+        raise InputError(f"--junit {path}: cannot be written: {error.strerror}") from error
 
 
 def free_folder(name: str) -> Path:

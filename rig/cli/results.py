@@ -2,11 +2,10 @@
 
 from typing import TYPE_CHECKING
 
-from rich.table import Table
-
-from rig.cli.output import console
+from rig.cli.output import Outcome, console, table
 
 if TYPE_CHECKING:
+    from dart_model.spec import ModelSpec
     from rig.demo.cases import Case
     from rig.diagnosis.outcome import Diagnosis
     from rig.operation.logged_run import Ended
@@ -18,25 +17,25 @@ _OF_TICKS = ("stale", "overruns", "limited", "bus_faulty")
 def print_case(case: "Case") -> None:
     """Print how far the model was from the bench, strut by strut."""
     for strut in case.struts:
-        table = Table(
+        shown = table(
             "after the first 0.5 s",
             "model alone",
             "with virtual force",
             title=f"Bench and model, strut “{strut.name}”",
         )
         alone, observed = strut.figures(strut.defective), strut.figures(strut.observed)
-        table.add_row(
+        shown.add_row(
             "height error, largest",
             f"{alone.height_error_max_m * 1e3:.3f} mm",
             f"{observed.height_error_max_m * 1e3:.3f} mm",
         )
         for name, label in (("force_error_rms_n", "RMS"), ("force_error_max_n", "largest")):
-            table.add_row(
+            shown.add_row(
                 f"force error, {label}",
                 *(_share(getattr(item, name), item.force_peak_n) for item in (alone, observed)),
             )
-        table.add_row("force of the bench, peak", f"{alone.force_peak_n:.1f} N", "")
-        console.print(table)
+        shown.add_row("force of the bench, peak", f"{alone.force_peak_n:.1f} N", "")
+        console.print(shown)
 
 
 def print_diagnosis(diagnosis: "Diagnosis", *, struts: int) -> None:
@@ -52,16 +51,25 @@ def print_diagnosis(diagnosis: "Diagnosis", *, struts: int) -> None:
         console.print(f"- {note}", markup=False)
 
 
+def verdict(diagnosis: "Diagnosis", spec: "ModelSpec") -> list[Outcome]:
+    """The verdict for a CI server: a model that lacks nothing passes."""
+    from rig.pages.report import sentence
+
+    is_right = diagnosis.verdict == "nothing_missing"
+    text = sentence(diagnosis, len(spec.struts))
+    return [Outcome("the model lacks nothing", f"{diagnosis.verdict}: {text}", not is_right)]
+
+
 def _print_linear(diagnosis: "Diagnosis", *, struts: int) -> None:
     from rig.pages.report.tables import linear
 
     if diagnosis.linear:
-        table = Table(
+        shown = table(
             "linear correction", "nominal", "corrected", "95 % interval", "", title="Linear part"
         )
         for name, _, strut, *cells in linear(diagnosis):
-            table.add_row(f"{name} ({strut})" if struts > 1 else name, *cells)
-        console.print(table)
+            shown.add_row(f"{name} ({strut})" if struts > 1 else name, *cells)
+        console.print(shown)
 
 
 def _print_effects(diagnosis: "Diagnosis") -> None:
@@ -69,11 +77,11 @@ def _print_effects(diagnosis: "Diagnosis") -> None:
 
     missing, changed = effects(diagnosis), existing(diagnosis)
     if missing:
-        table = Table("effect", "parameter", "value", "95 % interval", title="What is missing")
+        shown = table("effect", "parameter", "value", "95 % interval", title="What is missing")
         for law, _, rows in missing:
             for *_, value, interval, _, key in rows:
-                table.add_row(f"{law.family}: {law.name}", key, value, interval)
-        console.print(table)
+                shown.add_row(f"{law.family}: {law.name}", key, value, interval)
+        console.print(shown)
     for law, note, rows in changed:
         values = [f"{key} {before} → {value}" for _, before, value, _, _, key in rows]
         console.print(f"- {law.name}, {'; '.join((note, *values))}", markup=False)
@@ -82,10 +90,10 @@ def _print_effects(diagnosis: "Diagnosis") -> None:
 def _print_held_out(diagnosis: "Diagnosis") -> None:
     from rig.pages.report.tables import errors
 
-    table = Table("on held-out data", "before", "after", "noise floor", title="RMS error")
+    shown = table("on held-out data", "before", "after", "noise floor", title="RMS error")
     for name, before, after, _, floor, _ in errors(diagnosis):
-        table.add_row(name[:1].lower() + name[1:], before, after, floor)
-    console.print(table)
+        shown.add_row(name[:1].lower() + name[1:], before, after, floor)
+    console.print(shown)
 
 
 def _share(force_n: float, peak_n: float) -> str:
@@ -94,23 +102,23 @@ def _share(force_n: float, peak_n: float) -> str:
 
 def print_ended(ended: "Ended", *, with_timing: bool) -> None:
     """Print how a run ended."""
-    table = Table("Run", f"{ended.ticks} ticks, ended {ended.state.core.mode.name}")
+    shown = table("Run", f"{ended.ticks} ticks, ended {ended.state.core.mode.name}")
     for name, value in ended.state.counts._asdict().items():
         if value or name in ("lost", "refused", "overruns"):
             what = "ticks" if name in _OF_TICKS else "frames"
-            table.add_row(f"{name.replace('_', ' ')} ({what})", str(value))
+            shown.add_row(f"{name.replace('_', ' ')} ({what})", str(value))
     if with_timing:
         timing = ended.timing
         for label, figures in (("lateness", timing.lateness_us()), ("work", timing.work_us())):
             text = " · ".join(f"{level} {value:.0f}" for level, value in figures.items())
-            table.add_row(f"{label} of a tick, µs", text)
-        table.add_row("longest gap, µs", f"{timing.extremes_ns[2] / 1000:.0f}")
+            shown.add_row(f"{label} of a tick, µs", text)
+        shown.add_row("longest gap, µs", f"{timing.extremes_ns[2] / 1000:.0f}")
     if ended.diverged is not None:
         where = f"strut {ended.diverged['strut']} at {ended.diverged['t_s']:.3f} s"
-        table.add_row("model diverged", f"[red]{where}[/]")
+        shown.add_row("model diverged", f"[red]{where}[/]")
     if ended.log_fault is not None:
-        table.add_row("log", f"[red]{ended.log_fault}[/]")
-    console.print(table)
+        shown.add_row("log", f"[red]{ended.log_fault}[/]")
+    console.print(shown)
     if with_timing:
         _draw_timing(ended)
 

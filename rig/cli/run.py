@@ -4,15 +4,20 @@ import contextlib
 import json
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Console
 
-from rig.cli.output import FAILED, ConfigFile, console
+from rig.cli.output import FAILED, ConfigFile, JsonFlag, console
 from rig.cli.results import print_ended
-from rig.cli.watching import progress_line, stoppable
+from rig.cli.watching import status_line, stoppable
 from rig.inputs.errors import InputError
 from rig.inputs.folders import refuse_full
+
+if TYPE_CHECKING:
+    from rig.operation.logged_run import Ended
+    from rig.operation.setup import Setup
 
 EXAMPLES = "Examples: `rig run rig.yaml` · `rig run rig.yaml --out runs/7 --listen-only`"
 
@@ -48,9 +53,9 @@ def run(
     trace: Annotated[
         bool, typer.Option("--trace", help="Keep what became of late ticks, for `rig timing`.")
     ] = False,
+    as_json: JsonFlag = False,
 ) -> None:
     """Run the bridge on a bus; Ctrl-C ends it in order."""
-    from rig.core.contract import Mode
     from rig.operation.check import errors
     from rig.operation.live import live
     from rig.operation.setup import load_setup
@@ -64,7 +69,7 @@ def run(
         )
     folder = out or Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
     refuse_full(folder)
-    with stoppable() as stop, progress_line(ready.config.duration_s) as progress:
+    with stoppable() as stop, status_line(ready.config.duration_s) as watch:
         ended = live(
             ready,
             folder,
@@ -72,18 +77,28 @@ def run(
             trace=Trace(ready.config.period_ns) if trace else None,
             forced=[finding.as_dict() for finding in wrong],
             stop=stop,
-            progress=progress,
+            watch=watch,
         )
         # Inside: a second Ctrl-C must not lose it.
         text = json.dumps(ended.summary(), indent=2) + "\n"
         with contextlib.suppress(OSError):  # a full disk, which the table below reports
             (folder / "summary.json").write_text(text, "utf-8")
-    print_ended(ended, with_timing=True)
-    console.print(f"Run: {folder}")
+    if as_json:
+        typer.echo(text, nl=False)
+    else:
+        print_ended(ended, with_timing=True)
+        console.print(f"Run: {folder}")
+    _refuse_bad_ends(ready, ended)
+
+
+def _refuse_bad_ends(ready: "Setup", ended: "Ended") -> None:
+    from rig.core.contract import Mode
+
+    said = Console(stderr=True)
     if ended.state.core.mode is Mode.WAITING:
         wanted = sorted({entry.message for entry in ready.config.signals.height.values()})
-        console.print(f"No valid height came: expected frames of {', '.join(wanted)}.", style="red")
+        said.print(f"No valid height came: expected frames of {', '.join(wanted)}.", style="red")
         raise typer.Exit(FAILED)
     if ended.state.core.mode is Mode.SAFE:
-        console.print("The run ended in its safe state.", style="red")
+        said.print("The run ended in its safe state.", style="red")
         raise typer.Exit(FAILED)

@@ -1,12 +1,12 @@
 """`rig scoreboard`."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
-from rig.cli.output import console
+from rig.cli.output import JsonFlag, console, print_json, table
 from rig.cli.watching import progress_bar
 
 EXAMPLES = "Example: `rig scoreboard --data measured --set emps --out scores`"
@@ -26,15 +26,19 @@ def scoreboard(
         list[str] | None,
         typer.Option("--set", metavar="NAME", help="Only this set; may be given several times."),
     ] = None,
+    as_json: JsonFlag = False,
 ) -> None:
     """Diagnose published measured sets and print our figures beside the published ones."""
     from rig.scoreboard.run import run_scoreboard
 
     with progress_bar() as bar:
         rows = run_scoreboard(data, out, bar, only or ())
-    table = Table("set", "test", "model", "figure", "source", title="Measured sets")
+    if as_json:
+        print_json([asdict(row) for row in rows])
+        return
+    shown = table("set", "test", "model", "figure", "source", title="Measured sets")
     for row in rows:
         figure = "-" if row.value is None else f"{row.value:.4g} {row.unit}"
-        table.add_row(row.dataset, row.test, row.model, figure, row.source)
-    console.print(table)
+        shown.add_row(row.dataset, row.test, row.model, figure, row.source)
+    console.print(shown)
     console.print(f"Written: {out}/scoreboard.csv, {out}/scoreboard.md")

@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
-from rig.cli.output import console, write_summary
+from rig.cli.output import JsonFlag, console, print_json, table, write_summary
 
 EXAMPLES = "Example: `rig run rig.yaml --trace --out runs/7`, then `rig timing runs/7`"
 
@@ -20,6 +19,7 @@ def timing(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Write summary.json there.")
     ] = None,
+    as_json: JsonFlag = False,
 ) -> None:
     """Say of each missed tick of a traced run in which part the time went, and who took it."""
     from rig.operation.late_ticks import late_ticks
@@ -28,10 +28,17 @@ def timing(
 
     _, ready = setup_of_run(folder)
     late = late_ticks(read_trace(folder), ready.config.period_ns)
-    if not late:
+    summary: dict[str, object] = {
+        "late": [{**item._asdict(), "cause": item.cause.name.lower()} for item in late]
+    }
+    if out is not None:
+        write_summary(out, summary)
+    if as_json:
+        print_json(summary)
+    elif not late:
         console.print("No tick was missed.")
     else:
-        one_by_one = Table("time / s", "missed", "part", "longer by / ms", "cause", title="Gaps")
+        one_by_one = table("time / s", "missed", "part", "longer by / ms", "cause", title="Gaps")
         for item in late[:_MOST_ROWS]:
             when, longer = f"{item.t_ns * 1e-9:.3f}", f"{item.excess_ns * 1e-6:.2f}"
             one_by_one.add_row(when, str(item.missed), item.part, longer, item.cause.value)
@@ -42,10 +49,7 @@ def timing(
         for item in late:
             gaps[item.cause.value] += 1
             missed[item.cause.value] += item.missed
-        causes = Table("cause", "gaps", "missed ticks", title="Causes")
+        causes = table("cause", "gaps", "missed ticks", title="Causes")
         for cause, count in gaps.most_common():
             causes.add_row(cause, str(count), str(missed[cause]))
         console.print(causes)
-    if out is not None:
-        rows = [{**item._asdict(), "cause": item.cause.name.lower()} for item in late]
-        write_summary(out, {"late": rows})

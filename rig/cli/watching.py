@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Generator
@@ -13,7 +14,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
     from rig.core.contract import Mode
+    from rig.operation.loop import Look
 
+
+_PLAIN_EVERY_NS = 10_000_000_000
+"""Time between two lines where they cannot be written over: ten seconds."""
 
 _REFRESH_NS = 200_000_000
 """Five times a second: as fast as a person reads."""
@@ -49,6 +54,43 @@ def progress_bar() -> Generator[Callable[[str, float], None]]:
             bars.update(task, description=what, completed=share, visible=share < 1.0)
 
         yield show
+
+
+@contextlib.contextmanager
+def status_line(duration_s: float | None) -> Generator[Callable[["Look"], None]]:
+    """State, lateness, force and losses of a run, in place; plain lines where that cannot be.
+
+    A single write, because the loop itself calls it.
+    """
+    is_terminal = sys.stderr.isatty()
+    total = "" if duration_s is None else f" of {duration_s:g}"
+    due_ns = 0 if is_terminal else _PLAIN_EVERY_NS
+
+    def show(look: "Look") -> None:
+        nonlocal due_ns
+        if look.t_ns < due_ns:
+            return
+        due_ns = look.t_ns + (0 if is_terminal else _PLAIN_EVERY_NS)
+        text = f"{look.t_ns * 1e-9:8.1f}{total} s  {look.mode.name:<7}"
+        # The largest force stands for all struts: a line is no table.
+        for strut in sorted(look.struts, key=lambda item: -abs(item.force_n))[:1]:
+            text += f"  force {strut.force_n:+8.1f} N"
+            text += f"  virtual {strut.virtual_force_n:+8.1f} N"
+            text += f"  innovation {strut.innovation_m * 1e3:+8.4f} mm"
+        text += f"  lost {look.counts.lost}  refused {look.counts.refused}"
+        if look.late_ns is not None:
+            text += f"  missed {look.counts.overruns}  late ≤ {look.late_ns * 1e-6:.2f} ms"
+        if is_terminal:
+            width = shutil.get_terminal_size().columns - 1
+            os.write(2, f"\r{text[:width]:<{width}}".encode())
+        else:
+            os.write(2, f"{text.strip()}\n".encode())
+
+    try:
+        yield show
+    finally:
+        if is_terminal:
+            os.write(2, b"\r\x1b[K")
 
 
 @contextlib.contextmanager

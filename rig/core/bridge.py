@@ -110,11 +110,13 @@ class TickResult(Struct, frozen=True, gc=False):
         frames: Frames to send, stamped with the tick's time.
         step_input: What the core was given.
         output: What the core published.
+        counts: What has been counted since the start.
     """
 
     frames: list[Frame]
     step_input: StepInput
     output: StepOutput
+    counts: Counts
 
 
 class _Received(Struct, frozen=True, gc=False):
@@ -202,7 +204,7 @@ class Bridge:
         ledger = _noted(received.ledger, output, action, conditions)
         sendings, sent, ledger = self._sent(state.sendings, t_ns, output, ledger, conditions)
         after = BridgeState(core, tuple(received.sequences), sendings, ledger)
-        return after, TickResult(sent, step_input, output)
+        return after, TickResult(sent, step_input, output, ledger.counts)
 
     def _received(self, state: BridgeState, t_ns: int, frames: Sequence[Frame]) -> _Received:
         """Refuse or read every frame.

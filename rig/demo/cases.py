@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig
 from rig.bench.trajectory import simulate
-from rig.core.contract import Mode
 from rig.core.observers.pi import PiObserver
 from rig.io.run_log import read_run
 from rig.operation.config import CONFIGS
 from rig.operation.live import with_bench
 from rig.operation.logged_run import Ended
+from rig.operation.loop import Watch
 from rig.operation.replay import replay
 from rig.operation.setup import Setup, load_setup
 
@@ -116,7 +116,7 @@ def run_case(
     lockstep: bool,
     duration_s: float | None,
     stop: Callable[[], bool],
-    progress: Callable[[int, Mode], None],
+    watch: Watch,
 ) -> Case:
     """Run a case into ``folder/run`` and write its summary and picture into `folder`.
 
@@ -126,16 +126,14 @@ def run_case(
         lockstep: Simulated time, as fast as the machine allows; otherwise real time.
         duration_s: Length; the configuration's own if None.
         stop: Asked before each tick whether to end.
-        progress: Called with time and mode of every tick.
+        watch: Given a look five times a second.
 
     Raises:
         InputError: The folder cannot be written.
     """
     ready = load_setup(CONFIGS / f"{name}.yaml", duration_s=duration_s)
     bench = load_bench_config(CONFIGS / f"{name}_bench.yaml")
-    ended = with_bench(
-        ready, bench, folder / "run", lockstep=lockstep, stop=stop, progress=progress
-    )
+    ended = with_bench(ready, bench, folder / "run", lockstep=lockstep, stop=stop, watch=watch)
     case = compared(ended, ready, bench)
     (folder / "summary.json").write_text(json.dumps(case.summary(), indent=2) + "\n", "utf-8")
     for strut in case.struts:

@@ -11,7 +11,6 @@ import numpy as np
 from dart_model.spec import load_model
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig, Effect
-from rig.core.contract import Mode
 from rig.demo.cases import SETTLED_NS
 from rig.diagnosis.command import diagnose_runs
 from rig.diagnosis.outcome import CORRECTED_FILE, Diagnosis, to_json
@@ -19,6 +18,7 @@ from rig.io.run_log import read_run
 from rig.operation.config import CONFIGS
 from rig.operation.live import with_bench
 from rig.operation.logged_run import Ended
+from rig.operation.loop import Watch
 from rig.operation.setup import Setup, load_setup
 from rig.pages.report import write_report
 
@@ -93,7 +93,7 @@ def tell(
     lockstep: bool,
     stop: Callable[[], bool],
     chapter: Callable[[str], None],
-    progress: Callable[[int, Mode], None],
+    watch: Watch,
     diagnosis_progress: Callable[[str, float], None],
 ) -> Story:
     """Run the story into `folder`.
@@ -108,7 +108,7 @@ def tell(
         lockstep: Simulated time also for the first run.
         stop: Asked before each tick whether to end.
         chapter: Called with what comes next.
-        progress: Called with time and mode of every tick.
+        watch: Given a look five times a second.
         diagnosis_progress: Called with the diagnosis's steps and how far they are.
 
     Raises:
@@ -125,7 +125,7 @@ def tell(
             folder / name,
             lockstep=in_lockstep,
             stop=stop,
-            progress=progress,
+            watch=watch,
         )
 
     chapter("The bridge runs with a bench that carries an undeclared effect")

@@ -19,7 +19,7 @@ from rig.io.secoc import Authentication, Authenticator
 from rig.operation.assembly import build_bridge
 from rig.operation.config import RunConfig
 from rig.operation.logged_run import Ended, logged, on_signal
-from rig.operation.loop import Progress
+from rig.operation.loop import Progress, Watch, unnoted, unwatched
 from rig.operation.ports import BenchOnBus, BusPort
 from rig.operation.setup import Setup, load_authentication
 from rig.operation.trace import Trace
@@ -58,7 +58,8 @@ def live(
     trace: Trace | None = None,
     forced: Sequence[Mapping[str, str]] = (),
     stop: Callable[[], bool],
-    progress: Progress,
+    progress: Progress = unnoted,
+    watch: Watch = unwatched,
 ) -> Ended:
     """Run on the configured bus in real time.
 
@@ -70,6 +71,7 @@ def live(
         forced: Errors of the check that somebody passed over, for `run.yaml`.
         stop: Asked before each tick whether to end.
         progress: Called with time and mode of every tick.
+        watch: Given a look five times a second.
 
     Raises:
         InputError: Something of the configuration is wrong, or the folder cannot be written.
@@ -93,6 +95,7 @@ def live(
                     forced=forced,
                     stop=stop,
                     progress=progress,
+                    watch=watch,
                 )
         finally:
             link.close()
@@ -126,7 +129,8 @@ def with_bench(
     lockstep: bool,
     trace: Trace | None = None,
     stop: Callable[[], bool],
-    progress: Progress,
+    progress: Progress = unnoted,
+    watch: Watch = unwatched,
 ) -> Ended:
     """Run with a simulated bench at the other end of the configured bus.
 
@@ -138,6 +142,7 @@ def with_bench(
         trace: Where the parts of ticks that are late are kept; None keeps nothing.
         stop: Asked before each tick whether to end.
         progress: Called with time and mode of every tick.
+        watch: Given a look five times a second.
 
     Raises:
         InputError: Something of the configuration is wrong, or the folder cannot be written.
@@ -171,6 +176,7 @@ def with_bench(
             while_waiting=(on_bus.send_up_to,),
             stop=stop,
             progress=progress,
+            watch=watch,
         )
 
 

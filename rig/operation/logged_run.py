@@ -24,7 +24,18 @@ from rig.io.realtime import Granted
 from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_SCHEMA
 from rig.io.run_writer import RunLog
 from rig.io.steps import Step
-from rig.operation.loop import Port, Progress, Sink, regular_ticks, run
+from rig.operation.loop import (
+    SHOWN_EVERY_NS,
+    Look,
+    Port,
+    Progress,
+    Sink,
+    Watch,
+    regular_ticks,
+    run,
+    unnoted,
+    unwatched,
+)
 from rig.operation.ports import InformedPort
 from rig.operation.setup import Setup
 from rig.operation.timing import HISTOGRAMS_FILE, Timing
@@ -116,7 +127,8 @@ def logged(
     begin: Callable[[], None] | None = None,
     while_waiting: Sequence[Callable[[int], None]] = (),
     stop: Callable[[], bool],
-    progress: Progress,
+    progress: Progress = unnoted,
+    watch: Watch = unwatched,
 ) -> Ended:
     """Run on a port and log it.
 
@@ -134,6 +146,7 @@ def logged(
         while_waiting: Called before each wait with the time that is awaited.
         stop: Asked before each tick whether to end.
         progress: Called with time and mode of every tick.
+        watch: Given a look five times a second.
 
     Raises:
         InputError: The folder cannot be written.
@@ -159,16 +172,21 @@ def logged(
         aside=None if granted is None else (HISTOGRAMS_FILE, timing.histograms),
     )
     count = None if config.duration_s is None else _ticks(config.duration_s, config.rate_hz)
-    ticks, status = 0, "failed"
+    ticks, shown_ns, status = 0, 0, "failed"
     state = bridge.init(0)
 
     def sink(
         received: Sequence[Frame], sent: Sequence[Frame], result: TickResult, step: Step
     ) -> None:
-        nonlocal ticks
+        nonlocal ticks, shown_ns
         log.add(received, sent, step)
         ticks += 1
         progress(step.t_ns, result.output.mode)
+        if step.t_ns >= shown_ns:
+            shown_ns = step.t_ns + SHOWN_EVERY_NS
+            late_ns = int(timing.extremes_ns[0]) if granted is not None else None
+            output = result.output
+            watch(Look(step.t_ns, output.mode, output.struts, result.counts, late_ns))
 
     try:
         if begin is not None:

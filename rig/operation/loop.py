@@ -1,14 +1,14 @@
 """The one loop: live, simulated and replayed runs differ only in ticks, source and sink."""
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from msgspec import Struct
 
 from can_dbc.frame import Frame
 from rig.core.bridge import Bridge, BridgeState, TickResult
-from rig.core.contract import Mode
-from rig.core.messages import Conditions
+from rig.core.contract import Mode, StrutOutput
+from rig.core.messages import Conditions, Counts
 from rig.core.quantities import Quantity
 from rig.core.record import Record
 from rig.io.clock import Clock
@@ -44,6 +44,41 @@ Sink = Callable[[Sequence[Frame], Sequence[Frame], TickResult, Step], None]
 """What a tick received and sent, what it did, and the record of it."""
 
 Progress = Callable[[int, Mode], None]
+
+SHOWN_EVERY_NS = 200_000_000
+"""Time between two looks at a run: five a second, as fast as a person reads."""
+
+
+class Look(NamedTuple):
+    """A look at a run.
+
+    Attributes:
+        t_ns: Time of the tick.
+        mode: State of the bridge.
+        struts: What was published of each strut; none before the model has started.
+        counts: What has been counted since the start.
+        late_ns: Largest lateness so far; None where nothing waits for a clock.
+    """
+
+    t_ns: int
+    mode: Mode
+    struts: tuple[StrutOutput, ...]
+    counts: Counts
+    late_ns: int | None
+
+
+Watch = Callable[[Look], None]
+"""Given a look now and then; the loop itself calls it, so it must be quick."""
+
+
+def unnoted(_t_ns: int, _mode: Mode) -> None:
+    """Nobody counts the ticks."""
+
+
+def unwatched(_look: Look) -> None:
+    """Nobody looks."""
+
+
 """Called with time and mode of a tick."""
 
 

@@ -166,7 +166,7 @@ def test_a_run_that_never_had_a_height_is_no_success(tmp_path, monkeypatch, caps
     path.write_text(text + "realtime: {fifo_priority: 0, lock_memory: false}\n")
     arguments = ("run", path, "--out", tmp_path / "run", "--duration-s", 0.05)
     assert rig(monkeypatch, *arguments) == 1
-    assert "expected frames of BENCH_MEASUREMENT" in capsys.readouterr().out
+    assert "expected frames of BENCH_MEASUREMENT" in capsys.readouterr().err
 
 
 def test_a_run_with_heights_alone_is_not_diagnosed(tmp_path, monkeypatch, capsys):

@@ -161,7 +161,7 @@ def test_the_case_that_comes_with_the_package_tells_how_far_the_model_is(tmp_pat
         lockstep=True,
         duration_s=1.5,
         stop=lambda: False,
-        progress=lambda _t, _mode: None,
+        watch=lambda _look: None,
     )
     (strut,) = case.struts
     alone, observed = strut.figures(strut.defective), strut.figures(strut.observed)

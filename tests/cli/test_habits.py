@@ -1,0 +1,109 @@
+"""Habits of other tools: JSON, JUnit, versions, colours, a status where there is no terminal."""
+
+import json
+import sys
+from xml.etree import ElementTree
+
+import pytest
+
+from rig.cli.main import main
+from rig.cli.output import console, table
+from rig.cli.watching import status_line
+from rig.core.contract import Mode, StrutOutput
+from rig.core.messages import Counts
+from rig.operation.config import CONFIGS
+from rig.operation.loop import Look
+from tests.view.serving import make_run
+
+
+def rig(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["rig", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+def test_versions_are_those_of_rig_and_what_it_stands_on(monkeypatch, capsys):
+    assert rig(monkeypatch, "--version") == 0
+    said = capsys.readouterr()
+    assert [line.split()[0] for line in said.out.splitlines()] == [
+        "rig", "dartpy", "python-can", "numpy", "Python",
+    ]  # fmt: skip
+    assert said.err == ""
+
+
+def test_a_check_as_json_and_as_junit(monkeypatch, capsys, tmp_path):
+    path = tmp_path / "check.xml"
+    config = CONFIGS / "reference.yaml"
+    assert rig(monkeypatch, "check", config, "--json", "--junit", path) == 0
+    findings = json.loads(capsys.readouterr().out)
+    suite = ElementTree.parse(path).getroot()
+    assert suite.tag == "testsuite"
+    assert int(suite.get("tests")) == len(findings) == len(suite.findall("testcase"))
+    assert suite.get("failures") == "0"
+    assert [case.get("name") for case in suite] == [item["what"] for item in findings]
+    assert rig(monkeypatch, "check", config, "--junit", path) == 2
+    assert "exists, expected a new file" in capsys.readouterr().err
+
+
+def test_what_fails_a_check_fails_its_test_case(monkeypatch, capsys, tmp_path):
+    text = (CONFIGS / "reference.yaml").read_text()
+    (tmp_path / "far.yaml").write_text(
+        text + "\nrate_hz: 20\n"
+        if "rate_hz" not in text
+        else text.replace("rate_hz: 1000", "rate_hz: 20")
+    )
+    path = tmp_path / "check.xml"
+    assert rig(monkeypatch, "check", tmp_path / "far.yaml", "--json", "--junit", path) == 1
+    findings = json.loads(capsys.readouterr().out)
+    failed = {
+        case.get("name")
+        for case in ElementTree.parse(path).getroot()
+        if case.find("failure") is not None
+    }
+    assert failed == {item["what"] for item in findings if item["severity"] == "error"} != set()
+
+
+def test_a_replay_as_json(monkeypatch, capsys, tmp_path):
+    make_run(tmp_path / "run", 200)
+    assert rig(monkeypatch, "replay", tmp_path / "run", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["different_ticks"] == 0
+    assert found["ticks"] == 200
+    assert found["changed_files"] == []
+
+
+def test_no_name_is_cut_in_a_table(capsys):
+    name = "nonlinear_stiffness: centred_cubic_stiffness"
+    shown = table("effect", "parameter", "value", "95 % interval")
+    shown.add_row(name, "stiffness_n_per_m3", "1" * 30, "2" * 40)
+    console.print(shown)
+    said = capsys.readouterr().out
+    assert "…" not in said
+    cells = [line.split("│")[1].strip() for line in said.splitlines() if line.startswith("│")]
+    assert "".join(cells).replace(" ", "") == name.replace(" ", "")
+
+
+def look(t_s, force_n=-123.4):
+    strut = StrutOutput(force_n, 5.0, True, 0.4, 0.1, 0.0, 2e-5)
+    return Look(round(t_s * 1e9), Mode.RUNNING, (strut,), Counts(lost=3, overruns=2), 120_000)
+
+
+def test_without_a_terminal_the_status_is_a_line_every_ten_seconds(capfd):
+    with status_line(60.0) as watch:
+        for tenth in range(0, 400, 2):
+            watch(look(tenth / 10))
+    lines = capfd.readouterr().err.splitlines()
+    assert [line.split()[0] for line in lines] == ["10.0", "20.0", "30.0"]
+    assert "of 60 s" in lines[0]
+    for part in (
+        "RUNNING",
+        "force   -123.4 N",
+        "innovation  +0.0200 mm",
+        "lost 3",
+        "missed 2",
+        "late ≤ 0.12 ms",
+    ):
+        assert part in lines[0]
+    assert "\r" not in lines[0]
+    assert "\x1b" not in "".join(lines)
