@@ -20,6 +20,7 @@ from rig.cli import (
     report,
     run,
     scoreboard,
+    setting,
     timing,
     view,
 )
@@ -40,6 +41,7 @@ app.command("check", epilog=check.EXAMPLES)(check.check_command)
 app.command("run", epilog=run.EXAMPLES)(run.run)
 app.command("bench", epilog=bench.EXAMPLES)(bench.bench)
 app.command("view", epilog=view.EXAMPLES)(view.view)
+app.command("set", epilog=setting.EXAMPLES)(setting.set_command)
 app.command("timing", epilog=timing.EXAMPLES)(timing.timing)
 app.command("replay", epilog=replay.EXAMPLES)(replay.replay_command)
 app.command("diagnose", epilog=diagnose.EXAMPLES)(diagnose.diagnose)

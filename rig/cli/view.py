@@ -1,5 +1,6 @@
 """`rig view`."""
 
+import secrets
 import webbrowser
 from pathlib import Path
 from typing import Annotated
@@ -25,6 +26,10 @@ def view(
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="Port on this machine; 0 takes a free one.")
     ] = 8321,
+    control: Annotated[
+        bool,
+        typer.Option("--control", help="Let the page change gains and limits of a live run."),
+    ] = False,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Open no browser, only say where the page is.")
     ] = False,
@@ -36,11 +41,14 @@ def view(
     from rig.pages.view.server import ViewServer
 
     models = {name: load_model(model_file(name, Path())) for name in model or ()}
-    server = ViewServer(runs, models, port)
+    token = secrets.token_urlsafe(16) if control else None
+    server = ViewServer(runs, models, port, token)
     server.serving()
-    console.print(f"{server.address} (on this machine only; Ctrl-C ends it)")
+    # Behind the hash: a browser sends that to nobody.
+    address = server.address if token is None else f"{server.address}#{token}"
+    console.print(f"{address} (on this machine only; Ctrl-C ends it)", soft_wrap=True)
     if not no_browser:
-        webbrowser.open(server.address)
+        webbrowser.open(address)
     with stoppable() as stop:
         while not stop():
             time.sleep(0.1)

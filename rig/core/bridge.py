@@ -168,6 +168,10 @@ class Bridge:
         self.filters = Directory(item.message for item in (*incoming, *outgoing)).filters
         """What lets in the frames that the bridge subscribes to, its own among them."""
 
+    def changed(self, core: Core, limits: Sequence[Limit]) -> "Bridge":
+        """The same with another core and other limits; it goes on from the state of this one."""
+        return Bridge(core, self.incoming, self._outgoing, limits)
+
     def init(self, t_ns: int) -> BridgeState:
         """State before the first tick."""
         messages = len(self.incoming)

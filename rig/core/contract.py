@@ -280,6 +280,10 @@ class Core(Protocol):
         """State after a tick, and what it publishes; `state` is what `init` or `step` gave."""
         ...
 
+    def changed(self, observers: Sequence[Any], supervision: Any) -> "Core":
+        """The same with other observers and supervision; states of one are states of the other."""
+        ...
+
 
 AMBIENT_C = 20.0
 """Damper temperature where none was measured."""

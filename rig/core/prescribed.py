@@ -9,7 +9,7 @@ fading-memory polynomial filter of second degree.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Protocol
 
@@ -148,6 +148,11 @@ class PrescribedCore:
     def struts(self) -> int:
         """Number of struts."""
         return 1
+
+    def changed(self, observers: Sequence[object], supervision: Supervision) -> "PrescribedCore":
+        """The same with another supervision; it has no use for an observer."""
+        del observers
+        return PrescribedCore(self._model, self._settling_s, supervision)
 
     def init(self, t_ns: int) -> PrescribedCoreState:
         """State before the first tick."""

@@ -68,6 +68,10 @@ class RigCore:
         """Number of struts, each with an observer."""
         return len(self._observers)
 
+    def changed(self, observers: Sequence[Observer], supervision: Supervision) -> "RigCore":
+        """The same model with other observers and supervision."""
+        return RigCore(self._plant, observers, supervision)
+
     def init(self, t_ns: int) -> RigState:
         """State before the first tick."""
         return RigState(t_ns, Mode.WAITING, AMBIENT_C, first=(None,) * self.struts)

@@ -182,6 +182,7 @@ class RunLog:
         except OSError as error:
             raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
         self._waiting: deque[Entry] = deque()
+        self._notes: deque[tuple[str, str]] = deque()
         self._lines = b""
         self._priority = priority
         self._closing = threading.Event()
@@ -208,6 +209,11 @@ class RunLog:
             # the middle of it and take the interpreter from the loop.
             self._woken_ns = step.t_ns
             self._wake.set()
+
+    def note(self, name: str, line: str) -> None:
+        """Add a line to another file of the run, before what is logged of the next tick."""
+        self._notes.append((name, line))
+        self._wake.set()
 
     def trigger(self, why: str) -> None:
         """Capture a window around the next tick, if windows are captured at all.
@@ -280,6 +286,7 @@ class RunLog:
         """Write what waits; what the disk does not take is kept, and tried again the next time."""
         self.is_busy = True
         try:
+            self._write_notes()
             self._write_lines()
             self._flush_if_due()
             while self._waiting:
@@ -294,6 +301,13 @@ class RunLog:
             self.fault = None
         finally:
             self.is_busy = False
+
+    def _write_notes(self) -> None:
+        while self._notes:
+            name, line = self._notes[0]
+            with (self.folder / name).open("a", encoding="utf-8") as file:
+                file.write(line)
+            self._notes.popleft()
 
     def _give_way(self) -> None:
         """Let the loop have the interpreter, if it waits for it."""

@@ -93,6 +93,7 @@ def live(
                     granted=granted,
                     trace=trace,
                     forced=forced,
+                    acknowledge=port.acknowledge,
                     stop=stop,
                     progress=progress,
                     watch=watch,
@@ -162,7 +163,8 @@ def with_bench(
         bench_bus = Bus(ready.config.bus.config(), epoch_ns=clock.epoch_ns)
         stack.callback(bench_bus.close)
         authenticator = _authenticator(ready, clock)
-        on_bus = BenchOnBus(bench, bench_bus, BusPort(link), authenticator)
+        port = BusPort(link)
+        on_bus = BenchOnBus(bench, bench_bus, port, authenticator)
         return logged(
             ready,
             bridge,
@@ -174,6 +176,7 @@ def with_bench(
             trace=trace,
             begin=None if lockstep else partial(on_bus.begin, clock),
             while_waiting=(on_bus.send_up_to,),
+            acknowledge=None if lockstep else port.acknowledge,
             stop=stop,
             progress=progress,
             watch=watch,

@@ -8,6 +8,7 @@ import signal
 import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from rig.io.realtime import Granted
 from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_SCHEMA
 from rig.io.run_writer import RunLog
 from rig.io.steps import Step
+from rig.operation.changes import CHANGES_FILE, Changes, unchanged
 from rig.operation.loop import (
     SHOWN_EVERY_NS,
     Look,
@@ -37,6 +39,7 @@ from rig.operation.loop import (
     unwatched,
 )
 from rig.operation.ports import InformedPort
+from rig.operation.requests import Requests
 from rig.operation.setup import Setup
 from rig.operation.timing import HISTOGRAMS_FILE, Timing
 from rig.operation.trace import Trace
@@ -127,6 +130,7 @@ def logged(
     begin: Callable[[], None] | None = None,
     while_waiting: Sequence[Callable[[int], None]] = (),
     stop: Callable[[], bool],
+    acknowledge: Callable[[], None] | None = None,
     progress: Progress = unnoted,
     watch: Watch = unwatched,
 ) -> Ended:
@@ -145,6 +149,7 @@ def logged(
         begin: Called when all is set up, before the first tick.
         while_waiting: Called before each wait with the time that is awaited.
         stop: Asked before each tick whether to end.
+        acknowledge: Acknowledges the safe state; with it, the run takes requests to change it.
         progress: Called with time and mode of every tick.
         watch: Given a look five times a second.
 
@@ -158,6 +163,7 @@ def logged(
     if forced:
         header["forced"] = [dict(finding) for finding in forced]
     timing = Timing.empty()
+    priority = config.realtime.fifo_priority if granted is not None and granted.fifo else 0
     log = RunLog(
         folder,
         header,
@@ -165,7 +171,7 @@ def logged(
         clock.epoch_ns,
         config.bus.channel,
         paced=granted is not None,
-        priority=config.realtime.fifo_priority if granted is not None and granted.fifo else 0,
+        priority=priority,
         rotation=config.log.rotation(),
         window=config.log.window(),
         capture_name=_capture_name,
@@ -200,8 +206,15 @@ def logged(
         for occupation in (*while_waiting, informed.look):
             waiting = OccupiedClock(waiting, occupation)
         due = regular_ticks(waiting, config.period_ns, count, stop, timing)
-        with on_signal(signal.SIGUSR2, lambda: log.trigger("user")):
-            state = run(bridge, state, due, source, keep, config.signals.measured)
+        with contextlib.ExitStack() as around:
+            around.enter_context(on_signal(signal.SIGUSR2, lambda: log.trigger("user")))
+            changes: Changes = unchanged
+            if acknowledge is not None:
+                note = partial(log.note, CHANGES_FILE)
+                requests = Requests(folder, ready, bridge, acknowledge, note, priority)
+                around.enter_context(requests.served())
+                changes = requests.changes
+            state = run(bridge, state, due, source, keep, config.signals.measured, changes)
         status = "safe" if state.core.mode is Mode.SAFE else "done"
     finally:
         diverged = _divergence(ready, state)

@@ -13,6 +13,7 @@ from rig.core.quantities import Quantity
 from rig.core.record import Record
 from rig.io.clock import Clock
 from rig.io.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step
+from rig.operation.changes import Changes, unchanged
 from rig.operation.timing import BINS, Timing
 
 
@@ -131,6 +132,7 @@ def run(
     port: Port,
     sink: Sink,
     measured: Sequence[Quantity],
+    changes: Changes = unchanged,
 ) -> BridgeState:
     """Run the bridge over ticks.
 
@@ -141,12 +143,14 @@ def run(
         port: Where frames come from and go to.
         sink: Where the record of every tick goes.
         measured: Quantities beside heights that the bench sends, for the record.
+        changes: Asked at every tick for another bridge from there on.
 
     Returns:
         The state at the end.
     """
     record = Record(measured)
     for tick in ticks:
+        bridge = changes(tick.t_ns) or bridge
         frames, conditions = port.receive(tick.t_ns)
         if tick.overruns:
             conditions = conditions._replace(overruns=tick.overruns)

@@ -24,6 +24,7 @@ from rig.io.frame_columns import FrameColumns, received_frames
 from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE, RunFolder, last_frame_ns, read_run
 from rig.io.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step, StepRows
 from rig.operation.assembly import build_bridge
+from rig.operation.changes import replayed_changes, unchanged
 from rig.operation.config import RunConfig
 from rig.operation.loop import Progress, Tick, run
 from rig.operation.setup import Setup, put_together
@@ -123,7 +124,9 @@ def replay(
         progress(step.t_ns, result.output.mode)
 
     port = _LogPort(frames, ticks)
-    state = run(bridge, bridge.init(0), port.ticks(), port, keep, config.signals.measured)
+    # With another configuration the run's own changes would undo what is tried.
+    changes = replayed_changes(folder, own, bridge) if ready is own else unchanged
+    state = run(bridge, bridge.init(0), port.ticks(), port, keep, config.signals.measured, changes)
     batches.append(rows.batch())
     steps = _pa.Table.from_batches(batches, schema=rows.schema)
     different = _different(found.steps, steps)

@@ -29,14 +29,14 @@ def browser():
 
 
 @contextlib.contextmanager
-def page(made, server, width=1400, height=900, scheme="light"):
+def page(made, server, width=1400, height=900, scheme="light", path=""):
     """The page of a server, with all that its console says as errors."""
     opened = made.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
     errors = []
     opened.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
     opened.on("pageerror", lambda error: errors.append(str(error)))
     opened.set_default_timeout(30_000)
-    opened.goto(server.address)
+    opened.goto(server.address + path)
     try:
         yield opened
         assert errors == []

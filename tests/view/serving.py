@@ -24,9 +24,9 @@ def make_run(folder, count=COUNT):
 
 
 @contextlib.contextmanager
-def serving(*folders, models=None):
+def serving(*folders, models=None, token=None):
     """A server on a free port."""
-    server = ViewServer(folders, models or {}, 0)
+    server = ViewServer(folders, models or {}, 0, token)
     thread = server.serving()
     try:
         yield server

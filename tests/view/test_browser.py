@@ -12,6 +12,8 @@ import time
 import pytest
 import yaml
 
+from rig.operation.changes import logged_changes
+from rig.operation.replay import replay
 from tests.view.browser import browser, drawn, frames, in_sight, needs_chromium, page, until
 from tests.view.serving import COUNT, make_run, serving
 
@@ -187,7 +189,8 @@ def test_a_live_run_is_followed(made, tmp_path):
     bench = [sys.executable, "-m", "tests.realtime", "--out", tmp_path / "live"]
     process = subprocess.Popen([*map(str, bench), "--seconds", "25", "--busy", "0"])
     try:
-        with serving(tmp_path / "live" / "run") as one, page(made, one) as opened:
+        live = tmp_path / "live" / "run"
+        with serving(live, token="secret") as one, page(made, one, path="#secret") as opened:
             drawn(opened)
             until(opened, "runs[0].state === 'live'")
             epoch_s = float(opened.evaluate("Number(runs[0].epoch_ns) * 1e-9"))
@@ -204,8 +207,20 @@ def test_a_live_run_is_followed(made, tmp_path):
             assert in_sight(opened) == held
             opened.keyboard.press("End")
             until(opened, f"view.end > {held[1] + 1.0}")
+            opened.select_option("#key", "observers.strut.proportional_n_per_m")
+            opened.fill("#value", "-1")
+            opened.click("#change button")
+            until(opened, "document.getElementById('answer').textContent.includes('greater than')")
+            opened.fill("#value", "5e4")
+            opened.click("#change button")
+            until(opened, "document.getElementById('answer').textContent.startsWith('Changed')")
+            said = opened.locator("#answer").inner_text()
             assert process.wait(60) in (0, 1)  # 1: a tick was missed
             until(opened, "runs[0].state !== 'live'")
+        ((t_ns, assignments),) = logged_changes(live)
+        assert said == f"Changed from {t_ns * 1e-9:.3f} s on."
+        assert assignments == {"observers.strut.proportional_n_per_m": 50_000}
+        assert replay(live).different == 0
     finally:
         if process.poll() is None:
             process.terminate()

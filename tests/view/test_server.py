@@ -1,5 +1,6 @@
 """What the page's server answers, and to whom."""
 
+import http.client
 import json
 import shutil
 import socket
@@ -171,6 +172,34 @@ def test_a_port_that_is_taken_is_one_line(run):
     wrong = pytest.raises(InputError, match=r"--port \d+: .*expected a port that is free")
     with socket.create_server((HOST, 0)) as taken, wrong:
         ViewServer([run], {}, taken.getsockname()[1])
+
+
+def post(server, content, headers):
+    connection = http.client.HTTPConnection(*server.server_address, timeout=20)
+    try:
+        connection.request("POST", "/set?run=0", content, headers)
+        answer = connection.getresponse()
+        return answer.status, answer.read().decode()
+    finally:
+        connection.close()
+
+
+def test_without_control_nothing_is_changed(server):
+    for token in ("", "None", "x"):
+        assert post(server, "{}", {"X-Rig-Token": token})[0] == 403
+
+
+def test_only_a_page_that_knows_the_token_changes_a_run(run):
+    right = {"X-Rig-Token": "secret"}
+    with serving(run, token="secret") as server:
+        assert post(server, "{}", {})[0] == 403
+        assert post(server, "{}", {"X-Rig-Token": "secreT"})[0] == 403
+        assert post(server, "{}", {**right, "Host": "other.example"})[0] == 403
+        assert post(server, "no json", right)[0] == 400
+        assert post(server, "[" * 20_000, right)[0] == 400
+        status, text = post(server, '{"set": {"observers.strut.kind": 1}}', right)
+    assert status == 200
+    assert "the run has ended" in json.loads(text)["error"]
 
 
 def test_a_stalled_browser_delays_no_other(server):

@@ -238,6 +238,39 @@ function update() {
   at("pause").textContent = view.follow ? "Pause" : "Resume";
 }
 
+// --- Changes of a live run ---------------------------------------------------------------------
+
+const token = decodeURIComponent(location.hash.slice(1));
+
+function control() {
+  const live = runs.findIndex((run) => run.state === "live");
+  at("control").hidden = token === "" || live < 0;
+  const keys = Object.entries(runs[Math.max(live, 0)].observers).flatMap(([name, observer]) =>
+    Object.entries(observer).filter(([key]) => key !== "kind").map(([key, value]) => [`observers.${name}.${key}`, value]));
+  if (at("key").options.length !== keys.length) at("key").replaceChildren(...keys.map(([key, value]) => new Option(`${key} (${value} at the start)`, key)));
+}
+
+async function change(content) {
+  const run = runs.findIndex((item) => item.state === "live");
+  const options = { method: "POST", headers: { "X-Rig-Token": token, "Content-Type": "application/json" }, body: JSON.stringify(content) };
+  const answer = await fetch(`set?run=${run}`, options);
+  const found = answer.ok ? await answer.json() : { error: await answer.text() };
+  at("answer").className = found.error ? "bad" : "good";
+  at("answer").textContent = found.error ?? (found.acknowledged ? "Acknowledged." : `Changed from ${(found.t_ns * 1e-9).toFixed(3)} s on.`);
+}
+
+at("change").addEventListener("submit", (event) => {
+  event.preventDefault();
+  const value = Number(at("value").value);
+  if (at("value").value.trim() === "" || Number.isNaN(value)) {
+    at("answer").className = "bad";
+    at("answer").textContent = "Value: expected a number.";
+    return;
+  }
+  change({ set: { [at("key").value]: value } });
+});
+at("acknowledge").addEventListener("click", () => change({ acknowledge: true }));
+
 // --- The runs --------------------------------------------------------------------------------
 
 async function readRuns() {
@@ -257,6 +290,7 @@ async function readRuns() {
   const said = runs.filter((run) => !["live", "done"].includes(run.state)).map((run) => run.words);
   at("message").hidden = said.length === 0;
   at("message").textContent = said.join(" ");
+  control();
   const struts = [...new Set(runs.flatMap((run) => run.struts))];
   const ready = runs.some((run) => run.steps > 0) && struts.length > 0;
   at("charts").hidden = !ready;
@@ -315,7 +349,7 @@ function lost() {
 }
 
 function keyboard(event) {
-  if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+  if (event.ctrlKey || event.metaKey || event.altKey || ["SELECT", "INPUT"].includes(event.target.tagName)) return;
   const actions = {
     " ": pause, ArrowLeft: () => move(-0.25), ArrowRight: () => move(0.25), "+": () => zoom(0.5),
     "-": () => zoom(2), Home: () => follow(null), End: newest,

@@ -5,6 +5,7 @@ one that lost its connection only asks again. The server keeps no state of a pag
 """
 
 import json
+import secrets
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from http import HTTPStatus
@@ -17,6 +18,7 @@ import numpy as np
 
 from dart_model.spec import ModelSpec
 from rig.inputs.errors import InputError
+from rig.operation.requests import ask
 from rig.operation.timing import read_histograms
 from rig.pages import charts
 from rig.pages.view import closely
@@ -25,6 +27,7 @@ from rig.pages.view.watched import WatchedRun
 HOST = "127.0.0.1"
 
 _MOST_POINTS = 4000
+_MOST_ASKED_BYTES = 10_000
 _HERE = Path(__file__).parent
 _STYLES, _SCRIPTS = (*charts.STYLES, _HERE / "page.css"), (*charts.SCRIPTS, _HERE / "page.js")
 
@@ -44,6 +47,13 @@ _HEADERS = {
 }
 
 
+def _answered(folder: Path, asked: Mapping[str, object]) -> Mapping[str, object]:
+    try:
+        return ask(folder, asked)
+    except InputError as error:
+        return {"error": str(error)}  # what the run says no to is an answer too
+
+
 class _WrongQuestionError(Exception):
     """A question that has no answer; its text is for whoever asked."""
 
@@ -55,6 +65,7 @@ class ViewServer(ThreadingHTTPServer):
         folders: Folders of runs.
         models: Models whose laws are drawn beside those of the runs, by name.
         port: Port on loopback; 0 for a free one.
+        token: What a page must know to change a run; None lets nobody change one.
 
     Raises:
         InputError: The port is taken.
@@ -62,7 +73,14 @@ class ViewServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, folders: Sequence[Path], models: Mapping[str, ModelSpec], port: int) -> None:
+    def __init__(
+        self,
+        folders: Sequence[Path],
+        models: Mapping[str, ModelSpec],
+        port: int,
+        token: str | None = None,
+    ) -> None:
+        self.token = token
         self.runs = tuple(WatchedRun(folder) for folder in folders)
         self.models = models
         try:
@@ -99,10 +117,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """Answer a question."""
         asked = urlsplit(self.path)
-        # A page of another site must not read through a name that it points at this machine.
-        port = self._view.server_address[1]
-        if self.headers.get("Host") not in (f"{HOST}:{port}", f"localhost:{port}"):
-            self._send(HTTPStatus.FORBIDDEN, b"another host", "text/plain")
+        if not self._is_asked_here():
             return
         if asked.path in _FILES:
             path, kind = _FILES[asked.path]
@@ -118,6 +133,35 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.BAD_REQUEST, str(error).encode(), "text/plain; charset=utf-8")
         else:
             self._send(HTTPStatus.OK, content, kind)
+
+    def do_POST(self) -> None:
+        """Change a run that goes on, for a page that knows the token."""
+        if not self._is_asked_here():
+            return
+        token, given = self._view.token, self.headers.get("X-Rig-Token", "")
+        if token is None or not secrets.compare_digest(token.encode(), given.encode()):
+            self._send(HTTPStatus.FORBIDDEN, b"read only", "text/plain")
+            return
+        length = self.headers.get("Content-Length", "")
+        if not length.isdigit() or int(length) > _MOST_ASKED_BYTES:
+            self._send(HTTPStatus.BAD_REQUEST, b"too long", "text/plain")
+            return
+        try:
+            asked: Any = json.loads(self.rfile.read(int(length)))
+            run = _Question(urlsplit(self.path).query).run(self._view)
+            content = _json(_answered(run.folder, dict(asked)))[0]
+        except (_WrongQuestionError, ValueError, TypeError) as error:
+            self._send(HTTPStatus.BAD_REQUEST, str(error).encode(), "text/plain; charset=utf-8")
+        else:
+            self._send(HTTPStatus.OK, content, "application/json")
+
+    def _is_asked_here(self) -> bool:
+        # A page of another site must not read through a name that it points at this machine.
+        port = self._view.server_address[1]
+        if self.headers.get("Host") in (f"{HOST}:{port}", f"localhost:{port}"):
+            return True
+        self._send(HTTPStatus.FORBIDDEN, b"another host", "text/plain")
+        return False
 
     def _send(self, status: HTTPStatus, content: bytes, kind: str) -> None:
         self.send_response(status)
@@ -192,6 +236,7 @@ def _described(run: WatchedRun) -> dict[str, Any]:
             "steps": run.follower.steps,
             "counts": ending.get("counts"),
             "diverged": ending.get("diverged"),
+            "observers": config.get("observers", {}),
         }
 
 

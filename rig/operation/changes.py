@@ -1,0 +1,148 @@
+"""What is changed while a run goes on: gains and limits, from one tick on.
+
+A change is checked as the configuration is. It becomes another bridge, made ready beside the loop,
+which goes on from the state of the one before; the log says from which tick on, so that a replay
+changes there too.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+from rig.core.bridge import Bridge
+from rig.inputs.errors import InputError
+from rig.inputs.yaml_file import parse_mapping, read_text, validated
+from rig.operation.config import RunConfig
+from rig.operation.setup import Setup
+
+CHANGES_FILE = "changes.jsonl"
+"""Changes of a run in its folder: one a line, with the time of the first tick that had it."""
+
+CHANGEABLE = ("observers", "supervision")
+"""Sections of the configuration that can be changed while a run goes on."""
+
+Assignments = Mapping[str, object]
+"""Values by their keys in the configuration, sections joined by dots."""
+
+Changes = Callable[[int], Bridge | None]
+"""Time of a tick -> the bridge from that tick on, if it is another one."""
+
+
+def unchanged(_t_ns: int) -> None:
+    """Nothing is changed."""
+
+
+def parse_assignments(texts: Sequence[str]) -> dict[str, object]:
+    """Assignments from texts such as ``observers.strut.proportional_n_per_m=2e5``.
+
+    Raises:
+        InputError: A text is none.
+    """
+    found: dict[str, object] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not (key and equals and value):
+            raise InputError(
+                f"{text!r}: expected KEY=VALUE, as in observers.strut.force_limit_n=900"
+            )
+        found[key.strip()] = parse_mapping(f"value: {value}", repr(text))["value"]
+    return found
+
+
+def reassigned(ready: Setup, assignments: Assignments, source: str) -> Setup:
+    """A configuration with other values.
+
+    Args:
+        ready: The configuration.
+        assignments: What is changed.
+        source: What to call the change in an error.
+
+    Raises:
+        InputError: A key cannot be changed or is unknown, or a value is wrong.
+    """
+    content = ready.config.model_dump(mode="json")
+    for key, value in assignments.items():
+        section, *names = key.split(".")
+        if section not in CHANGEABLE or not names:
+            raise InputError(
+                f"{source}: {key}: cannot be changed in a run, expected a key under "
+                f"{' or '.join(CHANGEABLE)}"
+            )
+        place = content[section]
+        for number, name in enumerate(names):
+            if not isinstance(place, dict) or name not in place:
+                known = ", ".join(cast("dict[str, Any]", place)) if isinstance(place, dict) else ""
+                raise InputError(f"{source}: {key}: no {name!r}, expected one of {known}")
+            if number == len(names) - 1:
+                place[name] = value
+            else:
+                place = cast("Any", place[name])
+    config = validated(RunConfig, content, source)
+    for name, observer in config.observers.items():
+        if type(observer) is not type(ready.config.observers[name]):
+            raise InputError(
+                f"{source}: observers.{name}.kind: cannot be changed in a run, whose state is "
+                "that of the observer it has"
+            )
+    return ready.model_copy(update={"config": config})
+
+
+def changed_bridge(bridge: Bridge, ready: Setup) -> Bridge:
+    """The bridge with a configuration's observers and limits; model and messages are its own."""
+    supervision = ready.config.supervision.supervision()
+    core = bridge.core.changed(tuple(ready.config.observers.values()), supervision)
+    return bridge.changed(core, supervision.limits)
+
+
+def change_line(t_ns: int, assignments: Assignments) -> str:
+    """A line of `CHANGES_FILE`."""
+    return json.dumps({"t_ns": t_ns, "set": assignments}) + "\n"
+
+
+def logged_changes(folder: Path) -> list[tuple[int, dict[str, object]]]:
+    """Changes of a run, in their order: time of the first tick, and what was changed.
+
+    Raises:
+        InputError: A line other than the last, which a kill may have cut, is none.
+    """
+    path = folder / CHANGES_FILE
+    if not path.exists():
+        return []
+    found: list[tuple[int, dict[str, object]]] = []
+    for number, line in enumerate(read_text(path).splitlines(keepends=True), start=1):
+        try:
+            entry = cast("dict[str, Any]", json.loads(line))
+            found.append((int(entry["t_ns"]), dict(entry["set"])))
+        except (ValueError, TypeError, KeyError) as error:
+            if not line.endswith("\n"):
+                break
+            raise InputError(
+                f"{path}: line {number}: {line.strip()[:60]!r}: expected a change such as "
+                '{"t_ns": 0, "set": {}}'
+            ) from error
+    return found
+
+
+def replayed_changes(folder: Path, ready: Setup, bridge: Bridge) -> Changes:
+    """The changes of a run, for its replay.
+
+    Raises:
+        InputError: A change cannot be read or made.
+    """
+    coming: list[tuple[int, Bridge]] = []
+    for t_ns, assignments in logged_changes(folder):
+        ready = reassigned(ready, assignments, str(folder / CHANGES_FILE))
+        bridge = changed_bridge(bridge, ready)
+        coming.append((t_ns, bridge))
+    if not coming:
+        return unchanged
+    coming.reverse()
+
+    def changes(t_ns: int) -> Bridge | None:
+        now = None
+        while coming and coming[-1][0] <= t_ns:
+            now = coming.pop()[1]
+        return now
+
+    return changes

@@ -1,0 +1,158 @@
+"""Requests to a run that goes on, through its folder: gains, limits, acknowledgement.
+
+Whoever may write into the folder may ask; nothing listens on a network. A request is a file, which
+a thread of the run reads, checks and answers with another; the loop only takes what is ready.
+"""
+
+import contextlib
+import json
+import threading
+import time
+import uuid
+from collections.abc import Callable, Generator, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+from rig.core.bridge import Bridge
+from rig.inputs.errors import InputError
+from rig.io.realtime import follow
+from rig.io.run_log import RUN_FILE, read_header
+from rig.operation.changes import Assignments, change_line, changed_bridge, reassigned
+from rig.operation.setup import Setup
+
+_FOLDER = "requests"
+_LOOK_S = 0.05
+_ANSWER_S = 5.0
+_MOST_BYTES = 100_000
+
+Answer = Mapping[str, Any]
+"""`t_ns` of the first tick with the change; or `error`."""
+
+
+class Requests:
+    """The requests to a run.
+
+    Args:
+        folder: Folder of the run.
+        ready: Its configuration.
+        bridge: Its bridge.
+        acknowledge: Acknowledges the safe state.
+        log: Takes the line of a change.
+        priority: Real-time priority of the loop, which the thread follows; 0 for none.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        ready: Setup,
+        bridge: Bridge,
+        acknowledge: Callable[[], None],
+        log: Callable[[str], None],
+        priority: int,
+    ) -> None:
+        self._folder = folder / _FOLDER
+        self._ready, self._bridge = ready, bridge
+        self._acknowledge, self._log = acknowledge, log
+        self._priority = priority
+        self._waiting: tuple[Bridge, Assignments] | None = None
+        self._taken_ns = 0
+        self._taken = threading.Event()
+        self._ended = threading.Event()
+
+    def changes(self, t_ns: int) -> Bridge | None:
+        """The bridge from this tick on, if a change is ready; called by the loop."""
+        waiting = self._waiting
+        if waiting is None:
+            return None
+        bridge, assignments = waiting
+        self._log(change_line(t_ns, assignments))
+        self._waiting, self._taken_ns = None, t_ns
+        self._taken.set()
+        return bridge
+
+    @contextlib.contextmanager
+    def served(self) -> Generator[None]:
+        """Requests are read while this lasts."""
+        self._folder.mkdir(exist_ok=True)
+        thread = threading.Thread(target=self._serve, name="requests")
+        thread.start()
+        try:
+            yield
+        finally:
+            self._ended.set()
+            thread.join()
+            with contextlib.suppress(OSError):
+                self._folder.rmdir()
+
+    def _serve(self) -> None:
+        follow(self._priority)
+        while not self._ended.wait(_LOOK_S):
+            for path in sorted(self._folder.glob("*.request")):
+                answer = self._answered(path)
+                with contextlib.suppress(OSError):
+                    path.unlink()
+                    _write(path.with_suffix(".answer"), answer)
+
+    def _answered(self, path: Path) -> Answer:
+        try:
+            with path.open("rb") as file:
+                content: Any = json.loads(file.read(_MOST_BYTES))
+            if content == {"acknowledge": True}:
+                self._acknowledge()
+                return {"acknowledged": True}
+            return self._changed(dict(content["set"]))
+        except InputError as error:
+            return {"error": str(error)}
+        except (OSError, ValueError, TypeError, KeyError):
+            return {"error": f"{path.name}: is no request"}
+
+    def _changed(self, assignments: Assignments) -> Answer:
+        ready = reassigned(self._ready, assignments, "set")
+        bridge = changed_bridge(self._bridge, ready)
+        self._taken.clear()
+        self._waiting = bridge, assignments
+        while not self._taken.wait(_LOOK_S):
+            if self._ended.is_set():
+                return {"error": "the run has ended"}
+        self._ready, self._bridge = ready, bridge
+        return {"t_ns": self._taken_ns}
+
+
+def ask(folder: Path, content: Mapping[str, object]) -> Answer:
+    """Ask a run that goes on, and wait for its answer.
+
+    Args:
+        folder: Folder of the run.
+        content: ``{"set": assignments}`` or ``{"acknowledge": True}``.
+
+    Raises:
+        InputError: It is no run, it has ended, or it refuses.
+    """
+    if "ending" in read_header(folder):
+        raise InputError(f"{folder}: the run has ended, expected one that goes on")
+    place = folder / _FOLDER
+    if not place.is_dir():
+        raise InputError(f"{folder}: takes no requests, expected a run of `rig run`")
+    path = place / f"{time.time_ns()}-{uuid.uuid4().hex}.request"
+    answer = path.with_suffix(".answer")
+    try:
+        _write(path, content)
+        for _ in range(round(_ANSWER_S / 0.02)):
+            if answer.exists():
+                found = cast("Answer", json.loads(answer.read_text("utf-8")))
+                answer.unlink()
+                if "error" in found:
+                    raise InputError(str(found["error"]))
+                return found
+            time.sleep(0.02)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+    with contextlib.suppress(OSError):
+        path.unlink()
+    raise InputError(f"{folder / RUN_FILE}: no answer in {_ANSWER_S:g} s: is the run still going?")
+
+
+def _write(path: Path, content: Mapping[str, object]) -> None:
+    beside = path.with_suffix(".tmp")
+    beside.write_text(json.dumps(content), "utf-8")
+    beside.replace(path)
