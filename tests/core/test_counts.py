@@ -121,3 +121,26 @@ def test_the_strut_that_ran_away_is_named():
         away = msgspec.structs.replace(right, **wrong)
         assert step._first_diverged((right, away)) == 1
         assert step._first_diverged((away, right)) == 0
+
+
+def test_nothing_is_counted_at_the_start_and_exactly_what_came_afterwards():
+    trial = Trial()
+    assert set(trial.state.counts) == {0}
+
+    def faults(t_ns, frames):
+        heights = [frame for frame in frames if frame.arbitration_id == 0x100]
+        if t_ns in (400 * MS, 450 * MS):
+            return [*frames, *heights]  # twice
+        if t_ns in (500 * MS, 550 * MS, 600 * MS):
+            return [
+                msgspec.structs.replace(f, data=f.data[:3]) if f in heights else f for f in frames
+            ]
+        return frames
+
+    counts = trial.run(800, faults)[-1].counts
+    assert counts.repeated == 2
+    assert counts.wrong_length == 3
+    assert counts.refused == 5
+    assert counts.lost == 3  # the counters of those that were cut short
+    assert counts.out_of_sequence == counts.masquerade == counts.wrong_crc == 0
+    assert counts.implausible == counts.saturated == counts.second_sender == 0

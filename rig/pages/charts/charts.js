@@ -110,8 +110,8 @@ const Charts = (() => {
           y: { distr: spec.logY ? 3 : 1, range: spec.rangeY },
         },
         axes: [
-          axis(spec.xLabel, 24, { values: spec.logX ? undefined : short }),
-          axis(spec.yLabel, 62, { values: spec.yValues ?? (spec.logY ? undefined : short), ...spec.yAxis }),
+          axis(spec.xLabel, 24, { values: short }),
+          axis(spec.yLabel, 62, { values: spec.yValues ?? short, ...spec.yAxis }),
         ],
         series: [
           { label: spec.xName ?? "t", value: (_u, v) => (v === null ? "–" : `${number(v)} ${spec.xUnit ?? ""}`) },

@@ -131,6 +131,8 @@ function draw(found) {
     runs[i].span_s = item.head.span_s;
     runs[i].state = item.head.state;
   });
+  // A long run is read piece by piece: the whole of it is longer the next time.
+  if (view.follow && last() > view.end + 1e-6) changed = true;
   const width = columnsOf(strut).length;
   const t = found.length === 1 ? [first.t, ...first.lists] : uPlot.join(found.map((item) => [item.t, ...item.lists]));
   for (const id of Object.keys(shown)) {
