@@ -14,6 +14,9 @@ import yaml
 
 from rig.operation.changes import logged_changes
 from rig.operation.replay import replay
+from rig.pages.report import page as page_of
+from rig.pages.run_report import write_run_report
+from tests.pages.test_report import report
 from tests.view.browser import browser, drawn, frames, in_sight, needs_chromium, page, until
 from tests.view.serving import COUNT, make_run, serving
 
@@ -134,6 +137,27 @@ def test_nothing_keeps_anybody_out(made, run, scheme, width):
         assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
 
 
+@pytest.mark.parametrize("width", [1100, 390])
+@pytest.mark.parametrize("kind", ["run", "diagnosis"])
+def test_reports_keep_nobody_out(made, run, tmp_path, kind, width):
+    path = tmp_path / "report.html"
+    if kind == "run":
+        write_run_report(run, path)
+    else:
+        path.write_text(page_of(report()), "utf-8")
+    opened, errors = made.new_page(viewport={"width": width, "height": 900}), []
+    opened.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+    opened.on("pageerror", lambda error: errors.append(str(error)))
+    opened.goto(path.as_uri())
+    assert opened.locator("canvas").count() > 2
+    found = axe.Axe().run(opened).response["violations"]
+    serious = [item for item in found if item["impact"] in ("serious", "critical")]
+    assert serious == [], [(item["id"], item["nodes"][0]["html"]) for item in serious]
+    assert opened.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert errors == []
+    opened.close()
+
+
 def test_a_name_is_never_executed(made, run, tmp_path):
     bad = "<img src=x onerror=document.body.dataset.hit=1>"
     folder = tmp_path / bad.replace("/", "")
@@ -207,6 +231,14 @@ def test_a_live_run_is_followed(made, tmp_path):
             assert in_sight(opened) == held
             opened.keyboard.press("End")
             until(opened, f"view.end > {held[1] + 1.0}")
+            # A second browser, and one that asks and never reads, slow nobody.
+            with socket.create_connection(one.server_address) as stalled, page(made, one) as other:
+                asked = "GET /stretch?run=0&begin=0&end=9&points=4000&columns=mode HTTP/1.1\r\n"
+                stalled.sendall(
+                    (asked + f"Host: 127.0.0.1:{one.server_address[1]}\r\n\r\n").encode()
+                )
+                drawn(other, 20)
+                drawn(opened, frames(opened) + 20)
             opened.select_option("#key", "observers.strut.proportional_n_per_m")
             opened.fill("#value", "-1")
             opened.click("#change button")

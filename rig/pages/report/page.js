@@ -35,3 +35,7 @@ window.addEventListener("beforeprint", () => {
 window.addEventListener("afterprint", () => {
   for (const { chart, place } of drawnPanels) chart.setSize(Charts.sizeOf(place));
 });
+// A table that is wider than the screen is scrolled by keyboard too.
+for (const table of document.querySelectorAll("main table")) {
+  if (table.scrollWidth > table.clientWidth) table.tabIndex = 0;
+}
