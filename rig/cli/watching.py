@@ -71,15 +71,18 @@ def status_line(duration_s: float | None) -> Generator[Callable[["Look"], None]]
         if look.t_ns < due_ns:
             return
         due_ns = look.t_ns + (0 if is_terminal else _PLAIN_EVERY_NS)
+        # What is wrong stands first: a narrow terminal cuts the end.
         text = f"{look.t_ns * 1e-9:8.1f}{total} s  {look.mode.name:<7}"
-        # The largest force stands for all struts: a line is no table.
-        for strut in sorted(look.struts, key=lambda item: -abs(item.force_n))[:1]:
-            text += f"  force {strut.force_n:+8.1f} N"
-            text += f"  virtual {strut.virtual_force_n:+8.1f} N"
-            text += f"  innovation {strut.innovation_m * 1e3:+8.4f} mm"
-        text += f"  lost {look.counts.lost}  refused {look.counts.refused}"
+        text += f"  lost {look.counts.lost}"
+        if look.counts.refused:
+            text += f"  refused {look.counts.refused}"
         if look.late_ns is not None:
             text += f"  missed {look.counts.overruns}  late ≤ {look.late_ns * 1e-6:.2f} ms"
+        # The largest force stands for all struts: a line is no table.
+        for strut in sorted(look.struts, key=lambda item: -abs(item.force_n))[:1]:
+            text += f"  force {strut.force_n:+7.1f} N"
+            text += f"  innovation {strut.innovation_m * 1e3:+7.3f} mm"
+            text += f"  virtual {strut.virtual_force_n:+7.1f} N"
         if is_terminal:
             width = shutil.get_terminal_size().columns - 1
             os.write(2, f"\r{text[:width]:<{width}}".encode())

@@ -98,8 +98,8 @@ def test_without_a_terminal_the_status_is_a_line_every_ten_seconds(capfd):
     assert "of 60 s" in lines[0]
     for part in (
         "RUNNING",
-        "force   -123.4 N",
-        "innovation  +0.0200 mm",
+        "force  -123.4 N",
+        "innovation  +0.020 mm",
         "lost 3",
         "missed 2",
         "late ≤ 0.12 ms",
