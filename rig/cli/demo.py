@@ -58,7 +58,9 @@ def demo(
         done = run_case(case, out, lockstep=lockstep, duration_s=duration_s, stop=stop, watch=watch)
     print_case(done)
     print_ended(done.run, with_timing=not lockstep)
-    console.print(f"Written: {out}/summary.json, a picture of each strut, and the run {out}/run")
+    console.print(
+        f"Written: {out}/summary.json, a picture of each strut, and the run {out}/run", markup=False
+    )
 
 
 def _tell(seed: int, out: Path, *, lockstep: bool, duration_s: float | None) -> None:

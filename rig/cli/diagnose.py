@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import JsonFlag, JUnitFile, console, write_junit
+from rig.cli.output import JsonFlag, JUnitFile, console, refuse_existing, write_junit
 from rig.cli.results import print_diagnosis, verdict
 from rig.cli.watching import progress_bar
 
@@ -35,9 +35,13 @@ def diagnose(
     from dart_model.spec import load_model, model_file
     from rig.diagnosis.command import diagnose_runs
     from rig.diagnosis.outcome import to_json
-    from rig.pages.paper import print_page
+    from rig.pages.paper import browser, print_page
     from rig.pages.report import write_report
 
+    if pdf:
+        browser()  # before a search that takes minutes, not after it
+    if junit is not None:
+        refuse_existing(junit)
     spec = load_model(model_file(model, Path()))
     with progress_bar() as bar:
         result = diagnose_runs(runs, spec, held_out or [], out, bar)
@@ -50,6 +54,8 @@ def diagnose(
         typer.echo(to_json(result.diagnosis), nl=False)
         return
     print_diagnosis(result.diagnosis, struts=len(spec.struts))
-    console.print(f"Written: {out}/diagnosis.json, {out}/corrected.yaml, {out}/report.html")
+    console.print(
+        f"Written: {out}/diagnosis.json, {out}/corrected.yaml, {out}/report.html", markup=False
+    )
     if pdf:
-        console.print(f"Printed: {out}/report.pdf")
+        console.print(f"Printed: {out}/report.pdf", markup=False)

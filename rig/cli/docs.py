@@ -19,7 +19,7 @@ def docs(
 
     parent: Any = context.parent
     texts = {name: _help(parent, name) for name in parent.command.list_commands(parent)}
-    console.print(f"Written: {write_reference(folder, texts)}")
+    console.print(f"Written: {write_reference(folder, texts)}", markup=False)
 
 
 def _help(parent: Any, name: str) -> str:

@@ -49,7 +49,7 @@ def import_command(
             report = import_log(source, load_setup(config), out, progress)
     else:
         import_run(source, out)
-        console.print(f"Run: {out}")
+        console.print(f"Run: {out}", markup=False)
         return
     console.print(
         f"{report.samples} samples, {report.duration_s:.3f} s at {report.rate_hz:g} a second: "
@@ -57,7 +57,7 @@ def import_command(
     )
     for line in report.assumptions:
         console.print(f"- {line}", markup=False)
-    console.print(f"Written: {report.out}")
+    console.print(f"Written: {report.out}", markup=False)
 
 
 EXPORT_EXAMPLES = (
@@ -77,4 +77,4 @@ def export_command(
     from rig.exchange.exported import export_run
 
     for path in export_run(folder, kind, out):
-        console.print(f"Written: {path}")
+        console.print(f"Written: {path}", markup=False)

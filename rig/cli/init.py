@@ -34,4 +34,6 @@ def init(
         out.write_text(text, "utf-8")
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
-    console.print(f"Written: {out}. Read it, set bus and model, then `rig check {out}`.")
+    console.print(
+        f"Written: {out}. Read it, set bus and model, then `rig check {out}`.", markup=False
+    )

@@ -58,14 +58,23 @@ def _finite(content: object) -> object:
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
+def refuse_existing(path: Path) -> None:
+    """Refuse to overwrite a file.
+
+    Raises:
+        InputError: It exists.
+    """
+    if path.exists():
+        raise InputError(f"--junit {path}: exists, expected a new file")
+
+
 def write_junit(path: Path, suite: str, outcomes: Sequence[Outcome]) -> None:
     """Write outcomes as JUnit XML, a test case each.
 
     Raises:
         InputError: The file exists, or cannot be written.
     """
-    if path.exists():
-        raise InputError(f"--junit {path}: exists, expected a new file")
+    refuse_existing(path)
     failures = sum(outcome.failed for outcome in outcomes)
     root = ElementTree.Element(
         "testsuite", name=suite, tests=str(len(outcomes)), failures=str(failures), errors="0"

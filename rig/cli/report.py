@@ -26,12 +26,14 @@ def report(
     from rig.pages.run_report import write_run_report
 
     path = out or run / "report.html"
+    if path.suffix == ".pdf":
+        raise InputError(f"--out {path}: expected the name of the page; --pdf prints beside it")
     paper = path.with_suffix(".pdf")
     for existing in (path, paper) if pdf else (path,):
         if existing.exists():
             raise InputError(f"{existing}: exists, expected another name (--out)")
     write_run_report(run, path)
-    console.print(f"Written: {path}")
+    console.print(f"Written: {path}", markup=False)
     if pdf:
         print_page(path, paper)
-        console.print(f"Printed: {paper}")
+        console.print(f"Printed: {paper}", markup=False)

@@ -127,6 +127,6 @@ def _draw_timing(ended: "Ended") -> None:
     from rig.pages.timing_picture import draw_run
 
     try:
-        console.print(f"Histograms of lateness and work: {draw_run(ended)}")
+        console.print(f"Histograms of lateness and work: {draw_run(ended)}", markup=False)
     except OSError as error:  # a disk that is full takes no picture, and the run is over anyway
         console.print(f"No histograms: {error.strerror}", style="yellow")

@@ -87,7 +87,7 @@ def run(
         typer.echo(text, nl=False)
     else:
         print_ended(ended, with_timing=True)
-        console.print(f"Run: {folder}")
+        console.print(f"Run: {folder}", markup=False)
     _refuse_bad_ends(ready, ended)
 
 

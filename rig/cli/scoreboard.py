@@ -41,4 +41,4 @@ def scoreboard(
         figure = "-" if row.value is None else f"{row.value:.4g} {row.unit}"
         shown.add_row(row.dataset, row.test, row.model, figure, row.source)
     console.print(shown)
-    console.print(f"Written: {out}/scoreboard.csv, {out}/scoreboard.md")
+    console.print(f"Written: {out}/scoreboard.csv, {out}/scoreboard.md", markup=False)

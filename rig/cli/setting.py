@@ -26,6 +26,9 @@ def set_command(
     acknowledge: Annotated[
         bool, typer.Option("--acknowledge", help="Acknowledge the safe state.")
     ] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Change it although `rig check` finds an error.")
+    ] = False,
 ) -> None:
     """Change gains or limits of a run that goes on, or acknowledge its safe state."""
     from rig.operation.changes import parse_assignments
@@ -37,5 +40,5 @@ def set_command(
         ask(run, {"acknowledge": True})
         console.print("Acknowledged.")
         return
-    found = ask(run, {"set": parse_assignments(assignments or ())})
+    found = ask(run, {"set": parse_assignments(assignments or ())}, force=force)
     console.print(f"Changed from {found['t_ns'] * 1e-9:.3f} s on.")

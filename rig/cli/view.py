@@ -28,7 +28,9 @@ def view(
     ] = 8321,
     control: Annotated[
         bool,
-        typer.Option("--control", help="Let the page change gains and limits of a live run."),
+        typer.Option(
+            "--control", help="Let the page change gains of a live run; open the address it prints."
+        ),
     ] = False,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Open no browser, only say where the page is.")
@@ -47,7 +49,8 @@ def view(
     # Behind the hash: a browser sends that to nobody.
     address = server.address if token is None else f"{server.address}#{token}"
     console.print(f"{address} (on this machine only; Ctrl-C ends it)", soft_wrap=True)
-    if not no_browser:
+    # A browser's command line, with the token on it, is there for every user to read.
+    if not no_browser and token is None:
         webbrowser.open(address)
     with stoppable() as stop:
         while not stop():

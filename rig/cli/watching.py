@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import select
 import shutil
 import signal
 import sys
@@ -22,6 +23,13 @@ _PLAIN_EVERY_NS = 10_000_000_000
 
 _REFRESH_NS = 200_000_000
 """Five times a second: as fast as a person reads."""
+
+
+def _say(text: bytes) -> None:
+    """Write to standard error, where that neither waits nor fails: the loop itself calls it."""
+    with contextlib.suppress(OSError):
+        if select.select((), (2,), (), 0.0)[1]:
+            os.write(2, text)
 
 
 @contextlib.contextmanager
@@ -65,10 +73,14 @@ def status_line(duration_s: float | None) -> Generator[Callable[["Look"], None]]
     is_terminal = sys.stderr.isatty()
     total = "" if duration_s is None else f" of {duration_s:g}"
     due_ns = 0 if is_terminal else _PLAIN_EVERY_NS
+    last_ns = 0
 
     def show(look: "Look") -> None:
-        nonlocal due_ns
-        if look.t_ns < due_ns:
+        nonlocal due_ns, last_ns
+        # A run after another begins at zero again.
+        is_due = look.t_ns >= due_ns or look.t_ns < last_ns
+        last_ns = look.t_ns
+        if not is_due:
             return
         due_ns = look.t_ns + (0 if is_terminal else _PLAIN_EVERY_NS)
         # What is wrong stands first: a narrow terminal cuts the end.
@@ -85,15 +97,15 @@ def status_line(duration_s: float | None) -> Generator[Callable[["Look"], None]]
             text += f"  virtual {strut.virtual_force_n:+7.1f} N"
         if is_terminal:
             width = shutil.get_terminal_size().columns - 1
-            os.write(2, f"\r{text[:width]:<{width}}".encode())
+            _say(f"\r{text[:width]:<{width}}".encode())
         else:
-            os.write(2, f"{text.strip()}\n".encode())
+            _say(f"{text.strip()}\n".encode())
 
     try:
         yield show
     finally:
         if is_terminal:
-            os.write(2, b"\r\x1b[K")
+            _say(b"\r\x1b[K")
 
 
 @contextlib.contextmanager
@@ -107,10 +119,10 @@ def progress_line(duration_s: float | None) -> Generator[Callable[[int, "Mode"],
         nonlocal due_ns
         if shown and t_ns >= due_ns:
             due_ns = t_ns + _REFRESH_NS
-            os.write(2, f"\r{t_ns * 1e-9:9.1f} s{total}  {mode.name:<8}".encode())
+            _say(f"\r{t_ns * 1e-9:9.1f} s{total}  {mode.name:<8}".encode())
 
     try:
         yield show
     finally:
         if shown:
-            os.write(2, b"\r\x1b[K")
+            _say(b"\r\x1b[K")

@@ -39,7 +39,7 @@ def diagnose_runs(
     if (out / RUN_FILE).exists():
         raise InputError(f"{out}: holds a run, expected another folder for what was found")
     # Before a search that takes minutes, not after it.
-    for name in (DIAGNOSIS_FILE, CORRECTED_FILE, "report.html"):
+    for name in (DIAGNOSIS_FILE, CORRECTED_FILE, "report.html", "report.pdf"):
         if (out / name).exists():
             raise InputError(f"{out}: holds {name} already, expected a folder without one")
     if isinstance(model.skeleton, FileSkeleton):

@@ -17,7 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from rig.io.run_log import END_OF_STREAM, STEPS_FILE, part_name
-from rig.io.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT
+from rig.io.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, step_schema
 
 Array = NDArray[np.float64]
 _pa = cast("Any", pa)
@@ -81,6 +81,13 @@ class RunFollower:
         with contextlib.suppress(OSError):
             return max(0, self._path.stat().st_size - self._offset)
         return 0
+
+    @property
+    def is_another(self) -> bool:
+        """Whether the file is shorter than what was read of it: another run's."""
+        with contextlib.suppress(OSError):
+            return self._path.stat().st_size < self._offset
+        return False
 
     @property
     def share_read(self) -> float:
@@ -171,11 +178,15 @@ class RunFollower:
         # Behind the last whole batch may stand one that is still on its way to the disk.
         with (
             contextlib.suppress(_pa.ArrowException, EOFError, OSError),
-            _pa.memory_map(str(self._path)) as source,
+            # No mapping: a piece that the disk did not take is cut off again under it.
+            _pa.OSFile(str(self._path)) as source,
         ):
             if self._offset == 0:
-                self._schema = _pa.ipc.open_stream(source).schema
-                self._offset = source.tell()
+                schema = _pa.ipc.open_stream(source).schema
+                common = step_schema()
+                if schema.names[: len(common)] != common.names:
+                    return []  # not a run's steps
+                self._schema, self._offset = schema, source.tell()
             source.seek(self._offset)
             while len(batches) < _AT_ONCE:
                 message = _pa.ipc.read_message(source)
@@ -190,11 +201,13 @@ class RunFollower:
     def _go_on(self) -> None:
         """Go on to the next part, where this one has ended and there is one."""
         following = self._folder / part_name(STEPS_FILE, self._part + 1)
-        if self.unread_bytes == len(END_OF_STREAM) and following.exists():
-            self._part, self._offset = self._part + 1, 0
+        # A full disk may have kept the end from this one.
+        with contextlib.suppress(OSError):
+            if following.stat().st_size and self.unread_bytes <= len(END_OF_STREAM):
+                self._part, self._offset = self._part + 1, 0
 
     def _read_again(self, part: int, offset: int) -> Any:
-        with _pa.memory_map(str(self._folder / part_name(STEPS_FILE, part))) as source:
+        with _pa.OSFile(str(self._folder / part_name(STEPS_FILE, part))) as source:
             source.seek(offset)
             return _pa.ipc.read_record_batch(_pa.ipc.read_message(source), self._schema)
 

@@ -183,6 +183,7 @@ class RunLog:
             raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
         self._waiting: deque[Entry] = deque()
         self._notes: deque[tuple[str, str]] = deque()
+        self._noted: dict[str, WholeFile] = {}
         self._lines = b""
         self._priority = priority
         self._closing = threading.Event()
@@ -256,6 +257,8 @@ class RunLog:
                 self._flush()
             finally:
                 self._part.close()
+                for file in self._noted.values():
+                    file.close()
         except OSError as error:
             self._failed(str(error.strerror))
 
@@ -291,7 +294,9 @@ class RunLog:
             self._flush_if_due()
             while self._waiting:
                 room = _MOST_STEPS - self._rows.count
-                self._take(min(_MOST_AT_ONCE, room, len(self._waiting)))
+                count = min(_MOST_AT_ONCE, room, len(self._waiting))
+                self._write_notes()  # after the count, so that a note precedes its tick
+                self._take(count)
                 self._write_lines()
                 self._give_way()
                 self._flush_if_due()
@@ -305,8 +310,9 @@ class RunLog:
     def _write_notes(self) -> None:
         while self._notes:
             name, line = self._notes[0]
-            with (self.folder / name).open("a", encoding="utf-8") as file:
-                file.write(line)
+            if name not in self._noted:
+                self._noted[name] = WholeFile(self.folder / name)
+            self._noted[name].append(line.encode())
             self._notes.popleft()
 
     def _give_way(self) -> None:

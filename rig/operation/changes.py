@@ -72,10 +72,14 @@ def reassigned(ready: Setup, assignments: Assignments, source: str) -> Setup:
         place = content[section]
         for number, name in enumerate(names):
             if not isinstance(place, dict) or name not in place:
-                known = ", ".join(cast("dict[str, Any]", place)) if isinstance(place, dict) else ""
-                raise InputError(f"{source}: {key}: no {name!r}, expected one of {known}")
-            if number == len(names) - 1:
+                keys = cast("dict[str, Any]", place) if isinstance(place, dict) else {}
+                known = f"one of {', '.join(keys)}" if keys else "the key before it as a whole"
+                raise InputError(f"{source}: {key}: no {name!r}, expected {known}")
+            if number == len(names) - 1 and not isinstance(place[name], dict):
                 place[name] = value
+            elif number == len(names) - 1:
+                keys = ", ".join(f"{key}.{item}" for item in cast("dict[str, Any]", place[name]))
+                raise InputError(f"{source}: {key}: expected one of {keys}")
             else:
                 place = cast("Any", place[name])
     config = validated(RunConfig, content, source)

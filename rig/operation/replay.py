@@ -12,22 +12,18 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from can_dbc.database import load_database
 from can_dbc.frame import Frame
-from dart_model.spec import load_model
 from rig.core.bridge import TickResult
 from rig.core.messages import Conditions
 from rig.core.record import columns
 from rig.inputs.errors import InputError
-from rig.inputs.yaml_file import validated
 from rig.io.frame_columns import FrameColumns, received_frames
-from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE, RunFolder, last_frame_ns, read_run
+from rig.io.run_log import RunFolder, last_frame_ns, read_run
 from rig.io.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step, StepRows
 from rig.operation.assembly import build_bridge
 from rig.operation.changes import replayed_changes, unchanged
-from rig.operation.config import RunConfig
 from rig.operation.loop import Progress, Tick, run
-from rig.operation.setup import Setup, put_together
+from rig.operation.setup import Setup, setup_of_folder
 
 _TICKS_AT_ONCE = 4096
 """Ticks whose frames and steps are objects in memory at once."""
@@ -83,11 +79,7 @@ def setup_of_run(folder: Path) -> tuple[RunFolder, Setup]:
         InputError: A file of the run is missing or damaged.
         DatabaseError: Its DBC is.
     """
-    found = read_run(folder)
-    config = validated(RunConfig, found.header.get("config"), f"{folder / RUN_FILE}: config")
-    model = load_model(folder / MODEL_FILE)
-    database = load_database(folder / DBC_FILE)
-    return found, put_together(config, folder / RUN_FILE, model, database)
+    return read_run(folder), setup_of_folder(folder)
 
 
 def replay(

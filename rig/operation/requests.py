@@ -17,8 +17,15 @@ from rig.core.bridge import Bridge
 from rig.inputs.errors import InputError
 from rig.io.realtime import follow
 from rig.io.run_log import RUN_FILE, read_header
-from rig.operation.changes import Assignments, change_line, changed_bridge, reassigned
-from rig.operation.setup import Setup
+from rig.operation.changes import (
+    Assignments,
+    change_line,
+    changed_bridge,
+    logged_changes,
+    reassigned,
+)
+from rig.operation.check import errors
+from rig.operation.setup import Setup, setup_of_folder
 
 _FOLDER = "requests"
 _LOOK_S = 0.05
@@ -100,36 +107,42 @@ class Requests:
             if content == {"acknowledge": True}:
                 self._acknowledge()
                 return {"acknowledged": True}
-            return self._changed(dict(content["set"]))
+            return self._changed(path, dict(content["set"]))
         except InputError as error:
             return {"error": str(error)}
-        except (OSError, ValueError, TypeError, KeyError):
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return {"error": f"{path.name}: is no request"}
 
-    def _changed(self, assignments: Assignments) -> Answer:
+    def _changed(self, path: Path, assignments: Assignments) -> Answer:
         ready = reassigned(self._ready, assignments, "set")
         bridge = changed_bridge(self._bridge, ready)
         self._taken.clear()
         self._waiting = bridge, assignments
         while not self._taken.wait(_LOOK_S):
-            if self._ended.is_set():
-                return {"error": "the run has ended"}
+            # Whoever asked may have gone: what nobody waits for any more is not done.
+            if self._ended.is_set() or not path.exists():
+                self._waiting = None
+                if not self._taken.wait(_LOOK_S):
+                    return {"error": "the run has ended, or nobody waits for the change any more"}
         self._ready, self._bridge = ready, bridge
         return {"t_ns": self._taken_ns}
 
 
-def ask(folder: Path, content: Mapping[str, object]) -> Answer:
+def ask(folder: Path, content: Mapping[str, object], *, force: bool = False) -> Answer:
     """Ask a run that goes on, and wait for its answer.
 
     Args:
         folder: Folder of the run.
         content: ``{"set": assignments}`` or ``{"acknowledge": True}``.
+        force: Ask although the check of the changed configuration finds an error.
 
     Raises:
-        InputError: It is no run, it has ended, or it refuses.
+        InputError: It is no run, it has ended, the check finds an error, or it refuses.
     """
     if "ending" in read_header(folder):
         raise InputError(f"{folder}: the run has ended, expected one that goes on")
+    if "set" in content and not force:
+        _refuse_errors(folder, cast("Assignments", content["set"]))
     place = folder / _FOLDER
     if not place.is_dir():
         raise InputError(f"{folder}: takes no requests, expected a run of `rig run`")
@@ -150,6 +163,19 @@ def ask(folder: Path, content: Mapping[str, object]) -> Answer:
     with contextlib.suppress(OSError):
         path.unlink()
     raise InputError(f"{folder / RUN_FILE}: no answer in {_ANSWER_S:g} s: is the run still going?")
+
+
+def _refuse_errors(folder: Path, assignments: Assignments) -> None:
+    """Check the changed configuration as `rig run` does, here and not beside the loop."""
+    try:
+        ready = setup_of_folder(folder)
+        for _, before in logged_changes(folder):
+            ready = reassigned(ready, before, str(folder))
+        wrong = errors(reassigned(ready, assignments, "set"))
+    except (TypeError, AttributeError) as error:
+        raise InputError("set: expected keys and values") from error
+    if wrong:
+        raise InputError(f"set: {wrong[0].what}: {wrong[0].text} (--force sets it all the same)")
 
 
 def _write(path: Path, content: Mapping[str, object]) -> None:

@@ -12,7 +12,8 @@ from dart_model.spec import ModelSpec, load_model, model_file
 from rig.core.messages import ESTIMATE, KINEMATICS, STATUS, Publication
 from rig.core.observers.pi import PiObserver
 from rig.inputs.errors import InputError
-from rig.inputs.yaml_file import load_validated
+from rig.inputs.yaml_file import load_validated, validated
+from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE, read_header
 from rig.io.secoc import FD_LENGTHS, Authentication, read_key
 from rig.operation.config import AuthenticationConfig, Mapped, RunConfig, SignalName
 
@@ -69,6 +70,19 @@ def setup(config: RunConfig, source: Path, model_path: Path | None = None) -> Se
     """
     model = load_model(model_path or _model_path(config.model, source))
     database = load_database(DEFAULT_DATABASE if config.dbc is None else source.parent / config.dbc)
+    return put_together(config, source, model, database)
+
+
+def setup_of_folder(folder: Path) -> Setup:
+    """The configuration, model and DBC that a run goes on with, or went.
+
+    Raises:
+        InputError: A file of the run is missing or damaged.
+        DatabaseError: Its DBC is.
+    """
+    source = folder / RUN_FILE
+    config = validated(RunConfig, read_header(folder).get("config"), f"{source}: config")
+    model, database = load_model(folder / MODEL_FILE), load_database(folder / DBC_FILE)
     return put_together(config, source, model, database)
 
 

@@ -21,6 +21,18 @@ _BROWSERS = (
 _LONGEST_S = 120.0
 
 
+def browser() -> str:
+    """The browser that prints.
+
+    Raises:
+        InputError: There is none.
+    """
+    found = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
+    if found is None:
+        raise InputError("--pdf: expected Chromium, Chrome or Edge on this machine to print with")
+    return found
+
+
 def print_page(page: Path, pdf: Path) -> None:
     """Print a page that needs no network.
 
@@ -31,12 +43,12 @@ def print_page(page: Path, pdf: Path) -> None:
     Raises:
         InputError: There is no browser, it fails, or the file cannot be written.
     """
-    browser = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
-    if browser is None:
-        raise InputError("--pdf: expected Chromium, Chrome or Edge on this machine to print with")
-    with tempfile.TemporaryDirectory(prefix="rig-print-") as profile:
+    program = browser()
+    # Its children may still write into it when it is gone.
+    place = tempfile.TemporaryDirectory(prefix="rig-print-", ignore_cleanup_errors=True)
+    with place as profile:
         command = [
-            browser,
+            program,
             "--headless",
             "--disable-gpu",
             "--no-first-run",
@@ -50,8 +62,8 @@ def print_page(page: Path, pdf: Path) -> None:
         try:
             ended = subprocess.run(command, capture_output=True, timeout=_LONGEST_S, check=False)  # noqa: S603 - a browser, and a page of ours
         except (OSError, subprocess.TimeoutExpired) as error:
-            raise InputError(f"{pdf}: {browser} did not print it: {error}") from error
+            raise InputError(f"{pdf}: {program} did not print it: {error}") from error
     if ended.returncode != 0 or not pdf.exists():
         said = ended.stderr.decode("utf-8", "replace").strip().splitlines()
         why = said[-1][:200] if said else f"exit code {ended.returncode}"
-        raise InputError(f"{pdf}: {browser} did not print it: {why}")
+        raise InputError(f"{pdf}: {program} did not print it: {why}")

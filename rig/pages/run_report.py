@@ -9,6 +9,7 @@ import numpy as np
 from rig.inputs.errors import InputError
 from rig.io.run_follower import RunFollower, Window
 from rig.io.run_log import read_header
+from rig.operation.changes import logged_changes
 from rig.operation.timing import read_histograms
 from rig.pages.report.figures import Curve, Panel, Plot, plot
 from rig.pages.report.page import render, write_page
@@ -44,10 +45,7 @@ def write_run_report(folder: Path, path: Path) -> None:
     """
     header = cast("Mapping[str, Any]", read_header(folder))
     follower = RunFollower(folder)
-    while (before := follower.steps) >= 0:
-        follower.update(_ALL_STEPS)
-        if follower.steps == before:
-            break
+    follower.update(_ALL_STEPS)
     if not follower.steps:
         raise InputError(f"{folder}: holds no tick, expected a run to report on")
     config = cast("Mapping[str, Any]", header.get("config", {}))
@@ -56,7 +54,8 @@ def write_run_report(folder: Path, path: Path) -> None:
     tone, sign, badge = _STATUS.get(str(ending.get("status")), _KILLED)
     text = render(
         "run.html",
-        name=folder.name,
+        name=folder.resolve().name,
+        changes=[(t_ns * 1e-9, assignments) for t_ns, assignments in logged_changes(folder)],
         tone=tone,
         sign=sign,
         badge=badge,

@@ -1,6 +1,7 @@
 """Habits of other tools: JSON, JUnit, versions, colours, a status where there is no terminal."""
 
 import json
+import os
 import sys
 from xml.etree import ElementTree
 
@@ -87,6 +88,44 @@ def test_no_name_is_cut_in_a_table(capsys):
 def look(t_s, force_n=-123.4):
     strut = StrutOutput(force_n, 5.0, True, 0.4, 0.1, 0.0, 2e-5)
     return Look(round(t_s * 1e9), Mode.RUNNING, (strut,), Counts(lost=3, overruns=2), 120_000)
+
+
+def test_a_reader_that_went_away_ends_no_run():
+    read, write = os.pipe()
+    kept = os.dup(2)
+    os.dup2(write, 2)
+    os.close(write)
+    os.close(read)  # as `| head -1` leaves it
+    try:
+        with status_line(60.0) as watch:
+            for second in range(0, 60, 10):
+                watch(look(second))
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+def test_a_reader_that_does_not_read_stops_no_run():
+    read, write = os.pipe()
+    kept = os.dup(2)
+    os.dup2(write, 2)
+    os.close(write)
+    try:
+        with status_line(None) as watch:
+            for second in range(0, 20_000_000, 1000):
+                watch(look(second))
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(read)
+
+
+def test_the_status_of_a_second_run_is_shown_too(capfd):
+    with status_line(20.0) as watch:
+        for _ in range(2):
+            for second in range(21):
+                watch(look(second))
+    assert len(capfd.readouterr().err.splitlines()) >= 4
 
 
 def test_without_a_terminal_the_status_is_a_line_every_ten_seconds(capfd):

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 import rig.io.run_log
-import rig.operation.replay
+import rig.operation.setup
 from can_dbc.errors import DatabaseError
 from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfigError
@@ -108,8 +108,8 @@ def run(tmp_path_factory):
 def known(monkeypatch):
     """Reads what stays the same once."""
     for module, name in (
-        (rig.operation.replay, "load_database"),
-        (rig.operation.replay, "load_model"),
+        (rig.operation.setup, "load_database"),
+        (rig.operation.setup, "load_model"),
     ):
         monkeypatch.setattr(module, name, once_for_each_content(getattr(module, name)))
     parse, texts = rig.io.run_log.parse_mapping, {}

@@ -83,6 +83,43 @@ def test_a_request_is_taken_at_a_tick_and_answered_with_its_time(tmp_path, ready
     assert not (run / "requests").exists()
 
 
+def test_what_the_check_refuses_is_not_set_without_force(tmp_path):
+    run = make_run(tmp_path / "run", 20)
+    header = (run / "run.yaml").read_text()
+    (run / "run.yaml").write_text(header[: header.index("ending:")])
+    with pytest.raises(InputError, match=r"unstable.*--force sets it all the same"):
+        ask(run, {"set": {GAIN: 1e8}})
+    with pytest.raises(InputError, match="takes no requests"):
+        ask(run, {"set": {GAIN: 1e8}}, force=True)
+
+
+def test_what_nobody_waits_for_any_more_is_not_done(tmp_path, ready):
+    lines, path = [], tmp_path / "1.request"
+    path.write_text(json.dumps({"set": {GAIN: 5e4}}))
+    requests, answers = served(tmp_path, ready, lines), []
+    thread = threading.Thread(target=lambda: answers.append(requests._answered(path)))
+    thread.start()
+    while requests._waiting is None:
+        pass
+    path.unlink()
+    thread.join()
+    assert requests.changes(5) is None
+    assert lines == []
+    assert "nobody waits" in answers[0]["error"]
+
+
+@pytest.mark.parametrize("content", ['{"set": [[1, 2]]}', "[" * 50_000, "{", '{"set": {"": 1}}'])
+def test_no_request_ends_the_reading_of_requests(tmp_path, ready, content):
+    path = tmp_path / "1.request"
+    path.write_text(content)
+    assert "error" in served(tmp_path, ready, [])._answered(path)
+
+
+def test_a_group_of_values_is_not_replaced(ready):
+    with pytest.raises(InputError, match=r"observers.strut: expected one of observers.strut.kind"):
+        reassigned(ready, {"observers.strut": {"proportional_n_per_m": 5e4}}, "set")
+
+
 def test_a_run_that_has_ended_takes_no_request(tmp_path):
     with pytest.raises(InputError, match="the run has ended"):
         ask(make_run(tmp_path / "run", 20), {"acknowledge": True})

@@ -11,6 +11,7 @@ import yaml
 
 from rig.exchange.arrays import open_run
 from rig.inputs.errors import InputError
+from rig.operation.changes import change_line
 from rig.pages import paper
 from rig.pages.run_report import write_run_report
 from tests.view.serving import make_run
@@ -46,6 +47,15 @@ def test_its_curves_are_the_log_s(run, tmp_path):
     drawn = np.frombuffer(base64.b64decode(height["values"][1]), np.float32)
     expected = logged["strut.height_m"] * 1e3
     np.testing.assert_array_equal(drawn, expected.astype(np.float32))
+
+
+def test_what_was_changed_stands_in_it(run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+    (folder / "changes.jsonl").write_text(change_line(250_000_000, {"observers.strut.x": 5e4}))
+    text = written(folder, tmp_path)
+    assert "0.250 s" in text
+    assert "observers.strut.x" in text
 
 
 def test_a_name_is_text_and_nothing_else(run, tmp_path):

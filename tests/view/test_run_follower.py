@@ -140,6 +140,16 @@ def test_a_rotated_run_is_followed_into_its_next_part(tmp_path):
     np.testing.assert_array_equal(follower.rows(480, 520)[:, column], np.arange(480.0, 520.0))
 
 
+def test_a_part_that_a_full_disk_left_without_an_end_is_no_end(tmp_path):
+    schema, batches = stream(np.arange(500.0))
+    (tmp_path / "steps.arrow").write_bytes(schema + b"".join(batches))
+    schema, batches = stream(np.arange(500.0, 800.0), begin=500)
+    (tmp_path / part_name("steps.arrow", 1)).write_bytes(schema + b"".join(batches))
+    follower = followed(tmp_path)
+    follower.update(10**9)
+    assert follower.steps == 800
+
+
 @pytest.mark.parametrize("content", [b"", b"no stream at all" * 100, b"\xff" * 4000])
 def test_what_is_no_stream_has_no_steps(tmp_path, content):
     (tmp_path / "steps.arrow").write_bytes(content)

@@ -1,9 +1,11 @@
 """What the page's server answers, and to whom."""
 
+import copy
 import http.client
 import json
 import shutil
 import socket
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import yaml
 from dart_model.spec import MODELS, load_model
 from rig.exchange.arrays import open_run
 from rig.inputs.errors import InputError
+from rig.pages.view import closely
 from rig.pages.view.server import HOST, ViewServer
 from tests.view.serving import COUNT, described, get, grown_old, make_run, serving, stretch
 
@@ -200,6 +203,57 @@ def test_only_a_page_that_knows_the_token_changes_a_run(run):
         status, text = post(server, '{"set": {"observers.strut.kind": 1}}', right)
     assert status == 200
     assert "the run has ended" in json.loads(text)["error"]
+
+
+def test_what_stands_in_a_refused_question_is_no_question(server):
+    """A page of another host could hide a question with the right host in the body of one."""
+    port = server.server_address[1]
+    hidden = f"GET /runs HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n"
+    text = f"POST /x HTTP/1.1\r\nHost: other.example\r\nContent-Length: {len(hidden)}\r\n\r\n"
+    with socket.create_connection(server.server_address, timeout=10) as asking:
+        asking.sendall((text + hidden).encode())
+        answer = b""
+        while piece := asking.recv(4096):
+            answer += piece
+    assert answer.startswith(b"HTTP/1.1 403")
+    assert answer.count(b"HTTP/1.1") == 1
+
+
+def test_a_page_of_another_site_is_refused(server):
+    assert get(server, "/runs", headers={"Sec-Fetch-Site": "cross-site"})[0] == 403
+    assert get(server, "/runs", headers={"Sec-Fetch-Site": "same-origin"})[0] == 200
+
+
+def test_a_folder_that_is_run_again_shows_the_new_run(tmp_path, run):
+    folder = tmp_path / "again"
+    shutil.copytree(run, folder)
+    with serving(folder) as server:
+        assert described(server)[0]["steps"] == COUNT
+        shutil.rmtree(folder)
+        assert described(server)[0]["words"]
+        make_run(folder, 300)
+        assert described(server)[0]["steps"] == 300
+
+
+def test_a_law_with_internal_states_behind_another_one_is_drawn(tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(make_run(tmp_path / "plain", 50), folder)
+    friction = {
+        "name": "maxwell",
+        "parameters": {"stiffness_n_per_m": 800.0, "relaxation_time_s": 0.03},
+    }
+    model = yaml.safe_load((MODELS / "quarter_car.yaml").read_text())
+    for strut in model["struts"]:
+        strut["effects"] = [copy.deepcopy(friction)]
+    path = tmp_path / "two.yaml"
+    path.write_text(yaml.safe_dump(model))
+    spec = load_model(path)
+    rows = np.zeros((80, 3))
+    rows[:, 1], rows[:, 2] = np.linspace(0.3, 0.4, 80), np.linspace(-1.0, 1.0, 80)
+    name = spec.struts[-1].name
+    follower = SimpleNamespace(columns=("t_ns", f"{name}.height_m", f"{name}.velocity_m_per_s"))
+    drawn = closely.laws({"two": spec}, follower, rows, name)["two"]
+    assert len(drawn["height_m"][1]) == len(drawn["velocity_m_per_s"][1]) > 10
 
 
 def test_a_stalled_browser_delays_no_other(server):

@@ -183,7 +183,15 @@ const Charts = (() => {
     ctx.lineWidth = series.width * devicePixelRatio;
     ctx.setLineDash((series.dash ?? []).map((d) => d * devicePixelRatio));
     ctx.beginPath();
-    for (let i = 0; i < count; i++) ctx.lineTo(...at(i));
+    let down = false;
+    for (let i = 0; i < count; i++) {
+      const [x, y] = at(i);
+      // Where there is no number the pen is lifted.
+      if (Number.isNaN(x)) down = false;
+      else if (down) ctx.lineTo(x, y);
+      else ctx.moveTo(x, y);
+      down = down || !Number.isNaN(x);
+    }
     ctx.stroke();
   });
 
@@ -296,5 +304,5 @@ const Charts = (() => {
   }
 
   const steps = uPlot.paths.stepped({ align: 1 });
-  return { lines, plane, cells, steps, number, sizeOf };
+  return { lines, plane, cells, steps, sizeOf };
 })();

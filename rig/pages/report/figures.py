@@ -318,7 +318,7 @@ def plot(key: str, title: str, caption: str, panels: Sequence[Panel], columns: i
             "kind": panel.kind,
             "xLabel": panel.x_label,
             "yLabel": panel.y_label,
-            "x": _packed(panel.x),
+            "x": base64.b64encode(panel.x.astype("<f8").tobytes()).decode("ascii"),
             "curves": [curve._asdict() for curve in panel.curves],
             "values": [_packed(values) for values in panel.values],
             **panel.extra,

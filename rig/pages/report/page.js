@@ -1,15 +1,16 @@
 "use strict";
-// Draws the plots, whose numbers stand in the page as single-precision floats in base 64.
-const unpacked = (text) =>
-  Array.from(new Float32Array(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer), (v) => (Number.isNaN(v) ? null : v));
+// Draws the plots, whose numbers stand in the page in base 64: abscissae as doubles, since times are
+// long, and all else as floats.
+const unpacked = (text, kind = Float32Array) =>
+  Array.from(new kind(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer), (v) => (Number.isNaN(v) ? null : v));
 
 const drawnPanels = [];
 // Paper is narrower than the window: charts are drawn again at the width of its columns.
 const PAPER = { whole: 690, half: 335, height: 205 };
 
 function draw(place, panel) {
-  const x = unpacked(panel.x);
-  const values = panel.values.map(unpacked);
+  const x = unpacked(panel.x, Float64Array);
+  const values = panel.values.map((text) => unpacked(text));
   const series = panel.curves.map((curve) => ({ ...curve, label: curve.name, dash: curve.dash.length ? curve.dash : undefined, dots: panel.kind === "points", spanGaps: panel.gaps, paths: panel.steps ? Charts.steps : undefined }));
   const [name, unit] = panel.xLabel.split(" / ");
   const spec = { ...panel, series, xName: name, xUnit: unit };

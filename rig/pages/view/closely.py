@@ -1,5 +1,6 @@
 """What is computed of the stretch of a run that is in sight."""
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -66,14 +67,16 @@ def laws(
     velocities = np.linspace(*velocity, _LINE_POINTS)
     found: dict[str, Any] = {}
     for name, spec in models.items():
-        law = next((item for item in struts_of(spec) if item.name == strut), None)
+        struts = struts_of(spec)
+        law = next((item for item in struts if item.name == strut), None)
         if law is not None:
-            found[name] = {
-                "height_m": _line(law, heights, np.zeros(_LINE_POINTS), heights, warm_c),
-                "velocity_m_per_s": _line(
-                    law, np.full(_LINE_POINTS, middle), velocities, velocities, warm_c
-                ),
-            }
+            rest = [0.0] * sum(item.states for item in struts)
+            still, amid = np.zeros(_LINE_POINTS), np.full(_LINE_POINTS, middle)
+            with contextlib.suppress(ArithmeticError, ValueError):  # outside of where it holds
+                found[name] = {
+                    "height_m": _line(law, rest, heights, still, heights, warm_c),
+                    "velocity_m_per_s": _line(law, rest, amid, velocities, velocities, warm_c),
+                }
     return found
 
 
@@ -131,6 +134,8 @@ def _lines_before(folder: Path, epoch_ns: int, end_ns: int) -> Sequence[bytes]:
         try:
             size = path.stat().st_size
             with path.open("rb") as file:
+                if _stamp_ns(file.readline(), epoch_ns) > end_ns:
+                    continue
                 low, high = 0, size
                 while high - low > _LINES_READ // 8:
                     middle = (low + high) // 2
@@ -138,8 +143,6 @@ def _lines_before(folder: Path, epoch_ns: int, end_ns: int) -> Sequence[bytes]:
                     file.readline()
                     stamp = _stamp_ns(file.readline(), epoch_ns)
                     low, high = (middle, high) if stamp <= end_ns else (low, middle)
-                if high == 0:
-                    continue
                 file.seek(max(0, high - _LINES_READ))
                 lines = file.read(high - file.tell()).split(b"\n")[1:-1]
         except OSError:
@@ -182,9 +185,13 @@ def _cell(values: Array, cells: int) -> NDArray[np.int64]:
 
 
 def _line(
-    law: Strut, heights: Array, velocities: Array, along: Array, warm_c: float
+    law: Strut,
+    rest: list[float],
+    heights: Array,
+    velocities: Array,
+    along: Array,
+    warm_c: float,
 ) -> list[list[float]]:
-    rest = [0.0] * law.states
     force = [
         law.force_n(float(h), float(v), rest, 0.0, 0.0, warm_c, list(rest))
         for h, v in zip(heights, velocities, strict=True)

@@ -33,11 +33,15 @@ const columnsOf = (name) => [
   `${name}.virtual_force_n`, `${name}.innovation_m`, "mode", "overruns", "bus_fault", "log_fault",
 ];
 
+// Whether the server is asked for the newest steps, whatever their time.
+const isFollowing = () => view.follow && runs.length === 1 && view.span !== null;
+
 // A stretch as plain lists: uPlot takes null for nothing.
 async function stretch(index, points) {
   const columns = columnsOf(strut);
-  const given = { run: index, begin: view.begin, end: view.end, points, columns: columns.join(",") };
-  if (view.follow && runs.length === 1 && view.span !== null) given.follow = 1;
+  const [begin_s, end_s] = isFollowing() ? [0, view.span] : [view.begin, view.end];
+  const given = { run: index, begin: begin_s, end: end_s, points, columns: columns.join(",") };
+  if (isFollowing()) given.follow = 1;
   const content = await (await ask("stretch", given)).arrayBuffer();
   const length = new DataView(content).getUint32(0, true);
   const head = JSON.parse(new TextDecoder().decode(new Uint8Array(content, 4, length)));
@@ -62,7 +66,7 @@ function seriesOf(several) {
   const thin = several ? { dash: [4, 4], width: 1 } : { width: 2 };
   const found = { height: [], force: [], virtual: [], innovation: [], state: [] };
   runs.forEach((run, index) => {
-    const own = { colour: COLOURS[index % 4], spanGaps: several };
+    const own = { run: index, colour: COLOURS[index % 4], spanGaps: several };
     found.height.push({ column: 1, label: named(index, "measured"), unit: "m", ...own, ...thin, colour: measured(index), spanGaps: true });
     found.height.push({ column: 0, label: named(index, "model"), unit: "m", ...own });
     if (run.columns.includes("strut_force_n")) {
@@ -72,7 +76,7 @@ function seriesOf(several) {
     found.virtual.push({ column: 4, label: named(index, "virtual force"), unit: "N", ...own });
     found.innovation.push({ column: 5, label: named(index, "innovation"), unit: "m", ...own });
     found.state.push({ column: 6, label: named(index, "state"), width: 3, paths: Charts.steps, ...own, level: (v) => v + FIRST_MODE });
-    const mark = (column, level) => ({ column, label: "", width: 0, points: true, colour: several ? own.colour : "--bad", level: (v) => (v > 0 ? level : null) });
+    const mark = (column, level) => ({ run: index, column, label: "", width: 0, points: true, colour: several ? own.colour : "--bad", level: (v) => (v > 0 ? level : null) });
     found.state.push(mark(8, 2), mark(9, 1), mark(7, 0));
   });
   return found;
@@ -81,6 +85,7 @@ function seriesOf(several) {
 let shown = {};
 
 function build() {
+  askedCloselyFor = "";
   for (const chart of Object.values(charts)) chart.destroy();
   const several = runs.length > 1;
   shown = seriesOf(several);
@@ -123,9 +128,9 @@ function build() {
 
 function draw(found) {
   const [first] = found;
-  if (view.follow && runs.length === 1 && view.span !== null) {
-    view.begin = first.head.begin_s;
+  if (isFollowing()) {
     view.end = first.head.end_s;
+    view.begin = view.end - view.span;
   }
   found.forEach((item, i) => {
     runs[i].span_s = item.head.span_s;
@@ -136,9 +141,8 @@ function draw(found) {
   const width = columnsOf(strut).length;
   const t = found.length === 1 ? [first.t, ...first.lists] : uPlot.join(found.map((item) => [item.t, ...item.lists]));
   for (const id of Object.keys(shown)) {
-    const perRun = shown[id].length / found.length;
-    const lists = shown[id].map((item, i) => {
-      const list = t[1 + Math.floor(i / perRun) * width + item.column];
+    const lists = shown[id].map((item) => {
+      const list = t[1 + item.run * width + item.column];
       return item.level ? list.map((v) => (v === null || v === undefined ? null : item.level(v))) : list;
     });
     charts[id].set([t[0], ...lists], view.begin, view.end);
@@ -152,7 +156,6 @@ function draw(found) {
 async function lookClosely() {
   const key = [view.begin, view.end, strut].join();
   if (document.hidden || shape === "" || key === askedCloselyFor) return;
-  askedCloselyFor = key;
   const given = { begin: view.begin, end: view.end, strut };
   const found = await Promise.all(runs.map(async (_run, run) => (await ask("closely", { run, ...given })).json()));
   for (const id of ["velocity_m_per_s", "height_m"]) {
@@ -160,7 +163,7 @@ async function lookClosely() {
     const own = found.map((item) => item.laws.model?.[id] ?? [[], []]);
     const others = Object.entries(found[0].laws).filter(([name]) => name !== "model").map(([, law]) => law[id]);
     // One line for all others, with a gap between two.
-    const joined = others.reduce(([xs, ys], [x, y]) => [[...xs, ...x], [...ys, ...y]], [[], []]);
+    const joined = others.reduce(([xs, ys], [x, y]) => [[...xs, NaN, ...x], [...ys, NaN, ...y]], [[], []]);
     charts[id === "height_m" ? "plane-height" : "plane-velocity"].set([...points, ...own, joined]);
   }
   const spectra = found.map((item) => [item.spectrum.frequency_hz, item.spectrum.density]);
@@ -173,6 +176,7 @@ async function lookClosely() {
   }
   at("longest").textContent = found[0].longest_s;
   figures(found);
+  askedCloselyFor = key;
 }
 
 function figures(found) {
@@ -247,16 +251,26 @@ const token = decodeURIComponent(location.hash.slice(1));
 function control() {
   const live = runs.findIndex((run) => run.state === "live");
   at("control").hidden = token === "" || live < 0;
+  const named = runs.length > 1 && live >= 0 ? `Control of ${runs[live].name}` : "Control";
+  at("control").querySelector("h2").textContent = named;
   const keys = Object.entries(runs[Math.max(live, 0)].observers).flatMap(([name, observer]) =>
     Object.entries(observer).filter(([key]) => key !== "kind").map(([key, value]) => [`observers.${name}.${key}`, value]));
-  if (at("key").options.length !== keys.length) at("key").replaceChildren(...keys.map(([key, value]) => new Option(`${key} (${value} at the start)`, key)));
+  const asked = JSON.stringify([live, keys]);
+  if (at("key").dataset.asked === asked) return;
+  at("key").dataset.asked = asked;
+  at("key").replaceChildren(...keys.map(([key, value]) => new Option(`${key} (${value} at the start)`, key)));
 }
 
 async function change(content) {
   const run = runs.findIndex((item) => item.state === "live");
   const options = { method: "POST", headers: { "X-Rig-Token": token, "Content-Type": "application/json" }, body: JSON.stringify(content) };
-  const answer = await fetch(`set?run=${run}`, options);
-  const found = answer.ok ? await answer.json() : { error: await answer.text() };
+  let found = { error: "No answer from rig view." };
+  try {
+    const answer = await fetch(`set?run=${run}`, options);
+    found = answer.ok ? await answer.json() : { error: await answer.text() };
+  } catch {
+    // said below
+  }
   at("answer").className = found.error ? "bad" : "good";
   at("answer").textContent = found.error ?? (found.acknowledged ? "Acknowledged." : `Changed from ${(found.t_ns * 1e-9).toFixed(3)} s on.`);
 }
@@ -333,7 +347,6 @@ function every(period, action) {
     const begin = performance.now();
     try {
       await action();
-      at("runs").dataset.lost = "";
     } catch (error) {
       changed = true;
       if (error instanceof TypeError && /fetch/i.test(error.message)) lost();

@@ -6,6 +6,7 @@ one that lost its connection only asks again. The server keeps no state of a pag
 
 import json
 import secrets
+import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from http import HTTPStatus
@@ -28,6 +29,9 @@ HOST = "127.0.0.1"
 
 _MOST_POINTS = 4000
 _MOST_ASKED_BYTES = 10_000
+_MOST_COLUMNS = 64
+_HTTP_PORT = 80
+"""Which a browser leaves out of the host's name."""
 _HERE = Path(__file__).parent
 _STYLES, _SCRIPTS = (*charts.STYLES, _HERE / "page.css"), (*charts.SCRIPTS, _HERE / "page.js")
 
@@ -95,6 +99,11 @@ class ViewServer(ThreadingHTTPServer):
         """Where a browser finds the page."""
         return f"http://{HOST}:{self.server_address[1]}/"
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A browser that went away in the middle of an answer is no news."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
+
     def serving(self) -> threading.Thread:
         """Serve in a thread, until `shutdown`."""
         thread = threading.Thread(target=self.serve_forever, args=(0.1,), name="view", daemon=True)
@@ -131,6 +140,10 @@ class _Handler(BaseHTTPRequestHandler):
             content, kind = answer(self._view, _Question(asked.query))
         except _WrongQuestionError as error:
             self._send(HTTPStatus.BAD_REQUEST, str(error).encode(), "text/plain; charset=utf-8")
+        except (OSError, ValueError, ArithmeticError) as error:
+            # A run's files may go while they are read; the other runs are still to be seen.
+            why = f"{type(error).__name__}: {error}"
+            self._send(HTTPStatus.INTERNAL_SERVER_ERROR, why.encode(), "text/plain; charset=utf-8")
         else:
             self._send(HTTPStatus.OK, content, kind)
 
@@ -158,7 +171,10 @@ class _Handler(BaseHTTPRequestHandler):
     def _is_asked_here(self) -> bool:
         # A page of another site must not read through a name that it points at this machine.
         port = self._view.server_address[1]
-        if self.headers.get("Host") in (f"{HOST}:{port}", f"localhost:{port}"):
+        hosts = [f"{name}:{port}" for name in (HOST, "localhost")]
+        hosts += [HOST, "localhost"] if port == _HTTP_PORT else []
+        site = self.headers.get("Sec-Fetch-Site", "none")
+        if self.headers.get("Host") in hosts and site in ("same-origin", "none"):
             return True
         self._send(HTTPStatus.FORBIDDEN, b"another host", "text/plain")
         return False
@@ -167,6 +183,9 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))
+        if status is not HTTPStatus.OK:
+            # What was not read of a question must not be taken for the next one.
+            self.send_header("Connection", "close")
         for name, value in _HEADERS.items():
             self.send_header(name, value)
         self.end_headers()
@@ -248,7 +267,7 @@ def _stretch(view: ViewServer, question: _Question) -> Answer:
     run = question.run(view)
     begin_s, end_s = question.stretch()
     points = int(min(max(question.number("points"), 1), _MOST_POINTS))
-    names = [name for name in question.text("columns").split(",") if name]
+    names = [name for name in question.text("columns").split(",") if name][:_MOST_COLUMNS]
     with run.lock:
         run.update()
         if question.text("follow"):

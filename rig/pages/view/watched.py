@@ -1,5 +1,6 @@
 """What is known of a run's folder, whatever state it is in."""
 
+import contextlib
 import threading
 import time
 from collections.abc import Mapping
@@ -43,6 +44,7 @@ class WatchedRun:
         self.frame_times_s: Mapping[tuple[int, bool], float] = {}
         """Time that a frame occupies the bus, by identifier and whether that is extended."""
         self._stamp = -1.0
+        self._epoch_ns: object = None
         self._wrong: str | None = None
 
     def update(self) -> None:
@@ -55,12 +57,19 @@ class WatchedRun:
         if stamp != self._stamp:
             self._stamp, self._wrong = stamp, None
             try:
-                self.header = read_header(self.folder)
+                header = read_header(self.folder)
+                if self.follower.is_another or header["epoch_ns"] != self._epoch_ns:
+                    self._begin_anew()
+                self.header, self._epoch_ns = header, header["epoch_ns"]
                 self._read_copies()
             except InputError as error:
                 self._wrong = str(error)
         if self._wrong is None:
             self.follower.update(_STEPS_AT_ONCE)
+
+    def _begin_anew(self) -> None:
+        """Forget what was known: the folder holds another run."""
+        self.follower, self.model, self.frame_times_s = RunFollower(self.folder), None, {}
 
     def state(self) -> tuple[str, str]:
         """A word for the state of the run, and a sentence about it."""
@@ -70,9 +79,8 @@ class WatchedRun:
             return self._without_header()
         if self.follower.unread_bytes > _MUCH_BYTES:
             return "reading", f"Reading: {self.follower.share_read:.0%}"
-        ending = cast("Mapping[str, Any] | None", self.header.get("ending"))
-        if ending is not None:
-            return self._ended(str(ending.get("status")))
+        if "ending" in self.header or "capture" in self.header:
+            return self._ended()
         if self._age_s() < _SILENT_S:
             return "live", "Being written."
         return "killed", (
@@ -87,20 +95,24 @@ class WatchedRun:
             return "unreadable", f"{self.folder}: is no folder, expected a run"
         return "absent", f"{self.folder}: holds no run yet; it is shown once it does."
 
-    def _ended(self, status: str) -> tuple[str, str]:
+    def _ended(self) -> tuple[str, str]:
+        capture = cast("Mapping[str, Any] | None", self.header.get("capture"))
+        if capture is not None:
+            return "done", f"A window around a fault: {capture.get('why')}."
+        status = str(cast("Mapping[str, Any]", self.header["ending"]).get("status"))
         if not self.follower.steps:
             return "empty", f"Ended ({status}) without a single tick."
         words = {"done": "Ended in order.", "safe": "Ended in its safe state."}
         return status, words.get(status, f"Ended: {status}.")
 
     def _age_s(self) -> float:
-        """Time since something was last written, by the file system's clock."""
-        stamps = [
-            entry.stat().st_mtime
-            for entry in self.folder.iterdir()
-            if entry.suffix in (".log", ".arrow", ".yaml")
-        ]
-        return time.time() - max(stamps, default=0.0)
+        """Time since something was last written."""
+        stamps = [0.0]
+        with contextlib.suppress(OSError):  # somebody may delete it meanwhile
+            written = (".log", ".arrow", ".yaml")
+            entries = [entry for entry in self.folder.iterdir() if entry.suffix in written]
+            stamps += [entry.stat().st_mtime for entry in entries]
+        return time.time() - max(stamps)
 
     def _read_copies(self) -> None:
         model, dbc = self.folder / MODEL_FILE, self.folder / DBC_FILE
