@@ -6,6 +6,7 @@ a thread of the run reads, checks and answers with another; the loop only takes 
 
 import contextlib
 import json
+import os
 import threading
 import time
 import uuid
@@ -28,7 +29,9 @@ from rig.operation.check import errors
 from rig.operation.setup import Setup, setup_of_folder
 
 _FOLDER = "requests"
-_LOOK_S = 0.05
+_LOOK_S = 0.1
+"""Time between two looks for requests, and for whether one still waits."""
+
 _ANSWER_S = 5.0
 _MOST_BYTES = 100_000
 
@@ -94,11 +97,16 @@ class Requests:
     def _serve(self) -> None:
         follow(self._priority)
         while not self._ended.wait(_LOOK_S):
-            for path in sorted(self._folder.glob("*.request")):
-                answer = self._answered(path)
-                with contextlib.suppress(OSError):
-                    path.unlink()
-                    _write(path.with_suffix(".answer"), answer)
+            with contextlib.suppress(OSError):  # a disk that is full, a folder that is gone
+                self._serve_once()
+
+    def _serve_once(self) -> None:
+        # A list of names takes the interpreter from the loop for some microseconds only.
+        names = os.listdir(self._folder)  # noqa: PTH208
+        for path in [self._folder / name for name in sorted(names) if name.endswith(".request")]:
+            answer = self._answered(path)
+            path.unlink()
+            _write(path.with_suffix(".answer"), answer)
 
     def _answered(self, path: Path) -> Answer:
         try:
