@@ -62,8 +62,11 @@ def write_run_report(folder: Path, path: Path) -> None:
         headline=_headline(header, follower, ending),
         facts=_facts(header, follower, ending),
         counts=_counts(ending),
-        timing=_timing(ending),
-        strut_plots=[(strut, _plots(follower, strut, index)) for index, strut in enumerate(struts)],
+        timing=_timing(ending) if header.get("granted") is not None else [],
+        strut_plots=[
+            (strut, _plots(follower, strut, index, with_cell=len(struts) == 1))
+            for index, strut in enumerate(struts)
+        ],
         timing_plot=_timing_plot(folder),
         versions=header.get("versions", {}),
         files=header.get("files_sha256", {}),
@@ -90,8 +93,9 @@ def _facts(
     bus = cast("Mapping[str, Any]", config.get("bus", {}))
     begin_s, end_s = follower.span_s
     begun = np.datetime64(int(header.get("epoch_ns", 0)), "ns").astype("datetime64[s]")
+    is_real = header.get("granted") is not None
     facts = [
-        ("Begun", f"{str(begun).replace('T', ' ')} UTC"),
+        ("Begun", f"{str(begun).replace('T', ' ')} UTC" if is_real else "in simulated time"),
         ("Duration", f"{end_s - begin_s:.3f} s, {follower.steps} ticks"),
         ("Rate", f"{config.get('rate_hz', '?')} Hz"),
         ("Model", str(config.get("model", "?"))),
@@ -128,12 +132,13 @@ def _timing(ending: Mapping[str, Any]) -> list[tuple[str, dict[str, float]]]:
     return [(name, timing[key]) for name, key in named if timing.get(key)]
 
 
-def _plots(follower: RunFollower, strut: str, number: int) -> list[Plot]:
+def _plots(follower: RunFollower, strut: str, number: int, *, with_cell: bool) -> list[Plot]:
+    # With several struts the log does not say whose force the cell measured.
     names = ("measured_height_m", "height_m", "force_n", "virtual_force_n", "innovation_m")
     columns = [f"{strut}.{name}" for name in names]
     found = follower.window([*columns, "strut_force_n"], *follower.span_s, _POINTS)
     measured, model, force, virtual, innovation, cell = found.values
-    of_cell = bool(np.isfinite(cell).any())
+    of_cell = with_cell and bool(np.isfinite(cell).any())
     forces = ([_CELL] if of_cell else []) + [_ESTIMATED]
     panels = [
         _panel(found, "height / mm", [_MEASURED, _MODEL], [measured * 1e3, model * 1e3]),

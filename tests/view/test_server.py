@@ -264,3 +264,14 @@ def test_a_stalled_browser_delays_no_other(server):
             assert stretch(server, run=0, begin=0, end=1, points=50, columns="mode")[0]["count"]
     finally:
         stalled.close()
+
+
+def test_a_load_cell_is_drawn_only_where_it_can_be_one_struts():
+    rows = np.column_stack([np.arange(80.0), *(np.linspace(0.1, 0.9, 80),) * 4])
+    names = ("a.height_m", "a.velocity_m_per_s", "a.force_n", "strut_force_n")
+    follower = SimpleNamespace(columns=("t_ns", *names))
+    alone = closely.planes(follower, rows, "a", with_cell=True)
+    beside = closely.planes(follower, rows, "a", with_cell=False)
+    assert len(alone["height_m:measured"][0]) == 80
+    assert beside["height_m:measured"] == [[], []]
+    assert beside["height_m:estimated"] == alone["height_m:estimated"]

@@ -6,7 +6,7 @@ const unpacked = (text, kind = Float32Array) =>
 
 const drawnPanels = [];
 // Paper is narrower than the window: charts are drawn again at the width of its columns.
-const PAPER = { whole: 690, half: 335, height: 205 };
+const PAPER = { whole: 690, half: 335, height: 205, low: 165 };
 
 function draw(place, panel) {
   const x = unpacked(panel.x, Float64Array);
@@ -31,7 +31,10 @@ for (const data of document.querySelectorAll("script[data-plot]")) {
   JSON.parse(data.textContent).forEach((panel, i) => drawnPanels.push({ half, place: places[i], ...draw(places[i], panel) }));
 }
 window.addEventListener("beforeprint", () => {
-  for (const { chart, half } of drawnPanels) chart.setSize({ width: half ? PAPER.half : PAPER.whole, height: PAPER.height });
+  for (const { chart, half, place } of drawnPanels) {
+    const height = place.classList.contains("low") ? PAPER.low : PAPER.height;
+    chart.setSize({ width: half ? PAPER.half : PAPER.whole, height });
+  }
 });
 window.addEventListener("afterprint", () => {
   for (const { chart, place } of drawnPanels) chart.setSize(Charts.sizeOf(place));

@@ -35,8 +35,17 @@ def rows_between(follower: RunFollower, begin_s: float, end_s: float) -> Array:
     return rows[(rows[:, 0] >= begin_s * 1e9) & (rows[:, 0] <= end_s * 1e9 + 0.5)]
 
 
-def planes(follower: RunFollower, rows: Array, strut: str) -> dict[str, list[list[float]]]:
-    """Force over velocity and over height: points of what was estimated, and of the load cell."""
+def planes(
+    follower: RunFollower, rows: Array, strut: str, *, with_cell: bool
+) -> dict[str, list[list[float]]]:
+    """Force over velocity and over height: points of what was estimated, and of the load cell.
+
+    Args:
+        follower: The run.
+        rows: Steps, as `rows_between` gives them.
+        strut: Name of the strut.
+        with_cell: Whether the load cell is that strut's.
+    """
     columns = follower.columns
     force = _column(rows, columns, f"{strut}.force_n")
     cell = _column(rows, columns, "strut_force_n")
@@ -44,7 +53,7 @@ def planes(follower: RunFollower, rows: Array, strut: str) -> dict[str, list[lis
     for name in ("velocity_m_per_s", "height_m"):
         motion = _column(rows, columns, f"{strut}.{name}")
         found[f"{name}:estimated"] = _points(motion, force)
-        found[f"{name}:measured"] = _points(motion, cell)
+        found[f"{name}:measured"] = _points(motion, cell) if with_cell else [[], []]
     return found
 
 

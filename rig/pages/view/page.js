@@ -69,7 +69,8 @@ function seriesOf(several) {
     const own = { run: index, colour: COLOURS[index % 4], spanGaps: several };
     found.height.push({ column: 1, label: named(index, "measured"), unit: "m", ...own, ...thin, colour: measured(index), spanGaps: true });
     found.height.push({ column: 0, label: named(index, "model"), unit: "m", ...own });
-    if (run.columns.includes("strut_force_n")) {
+    // With several struts the log does not say whose force the cell measured.
+    if (run.columns.includes("strut_force_n") && run.struts.length === 1) {
       found.force.push({ column: 3, label: named(index, "load cell"), unit: "N", ...own, ...thin, colour: measured(index), spanGaps: true });
     }
     found.force.push({ column: 2, label: named(index, "estimated"), unit: "N", ...own });

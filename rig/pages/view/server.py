@@ -294,11 +294,13 @@ def _closely(view: ViewServer, question: _Question) -> Answer:
     strut = question.text("strut")
     with run.lock:
         rows = closely.rows_between(run.follower, begin_s, end_s)
+        # With several struts the log does not say whose force the cell measured.
+        is_only = run.model is not None and len(run.model.struts) == 1
         models = {"model": run.model} if run.model is not None else {}
         return _json(
             {
                 "longest_s": closely.LONGEST_S,
-                "planes": closely.planes(run.follower, rows, strut),
+                "planes": closely.planes(run.follower, rows, strut, with_cell=is_only),
                 "laws": closely.laws({**models, **view.models}, run.follower, rows, strut),
                 "spectrum": closely.spectrum(run.follower, rows, strut),
                 "bus": closely.bus_load(
