@@ -45,6 +45,7 @@ Sink = Callable[[Sequence[Frame], Sequence[Frame], TickResult, Step], None]
 """What a tick received and sent, what it did, and the record of it."""
 
 Progress = Callable[[int, Mode], None]
+"""Called with time and mode of a tick."""
 
 SHOWN_EVERY_NS = 200_000_000
 """Time between two looks at a run: five a second, as fast as a person reads."""
@@ -78,9 +79,6 @@ def unnoted(_t_ns: int, _mode: Mode) -> None:
 
 def unwatched(_look: Look) -> None:
     """Nobody looks."""
-
-
-"""Called with time and mode of a tick."""
 
 
 def regular_ticks(

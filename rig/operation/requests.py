@@ -33,6 +33,8 @@ _LOOK_S = 0.1
 """Time between two looks for requests, and for whether one still waits."""
 
 _ANSWER_S = 5.0
+"""How long whoever asks waits: many looks, and a tick of the slowest rate that is of use."""
+
 _MOST_BYTES = 100_000
 
 Answer = Mapping[str, Any]

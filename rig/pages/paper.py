@@ -18,7 +18,9 @@ _BROWSERS = (
     "msedge",
     "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
 )
+
 _LONGEST_S = 120.0
+"""Time after which a browser that prints nothing is taken for stuck; it takes seconds."""
 
 
 def browser() -> str:

@@ -15,6 +15,8 @@ from rig.pages.report.figures import Curve, Panel, Plot, plot
 from rig.pages.report.page import render, write_page
 
 _POINTS = 1500
+"""Buckets of a curve: two for each pixel of the page's width are not seen."""
+
 _ALL_STEPS = 1_000_000_000
 
 _MEASURED = Curve("measured", "--measured", (), 2.4)

@@ -52,7 +52,7 @@ class Panel(NamedTuple):
         x: The common abscissa, shape (N,); that of the cells' middles for ``cells``.
         curves: How each is shown.
         values: Ordinates of each curve, shape (N,); the cells' values, row by row, for ``cells``.
-        extra: What else the page's script is told: `title`, `reach` of a grey band about zero,
+        extra: What else the page's script is given: `title`, `reach` of a grey band about zero,
             `marks` where recordings begin, `log` for both axes, `y_range`, `gaps` that are bridged,
             `steps` of a histogram, and `largest` and `y` of the cells.
     """

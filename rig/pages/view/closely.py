@@ -23,6 +23,8 @@ _ACROSS, _UP = 240, 160
 """Cells of the plane in which points are drawn: of those in one cell one is enough."""
 
 _LINE_POINTS = 81
+"""Points of a law's curve: a few pixels apart in a chart."""
+
 _SPECTRUM_POINTS = 4096
 _LINES_READ = 60_000
 """Bytes of the frames' log from which the bus load is taken."""

@@ -27,9 +27,12 @@ from rig.pages.view.watched import WatchedRun
 
 HOST = "127.0.0.1"
 
-_MOST_POINTS = 4000
+_MOST_POINTS, _MOST_COLUMNS = 4000, 64
+"""Of one answer: a wide screen, and several times what the page asks for; it bounds the memory."""
+
 _MOST_ASKED_BYTES = 10_000
-_MOST_COLUMNS = 64
+"""Of one change: hundreds of keys."""
+
 _HTTP_PORT = 80
 """Which a browser leaves out of the host's name."""
 _HERE = Path(__file__).parent
