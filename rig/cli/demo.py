@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import console, free_folder
+from rig.cli.output import console
 from rig.cli.results import print_case, print_diagnosis, print_ended
 from rig.cli.watching import progress_bar, status_line, stoppable
 from rig.inputs.errors import InputError
-from rig.inputs.folders import refuse_full
+from rig.inputs.folders import free_folder, refuse_full
 
 STORY = "story"
 
@@ -49,7 +49,7 @@ def demo(
 
     if case not in (STORY, *CASES):
         raise InputError(f"--case {case!r}: expected one of {', '.join((STORY, *CASES))}")
-    out = out or free_folder("rig-demo")
+    out = out or free_folder(Path("rig-demo"))
     refuse_full(out)
     if case == STORY:
         _tell(seed, out, lockstep=lockstep, duration_s=duration_s)

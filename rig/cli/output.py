@@ -1,6 +1,5 @@
 """Where commands print and write, and the exit codes they end with."""
 
-import itertools
 import json
 import math
 from collections.abc import Sequence
@@ -87,12 +86,6 @@ def write_junit(path: Path, suite: str, outcomes: Sequence[Outcome]) -> None:
         ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
     except OSError as error:
         raise InputError(f"--junit {path}: cannot be written: {error.strerror}") from error
-
-
-def free_folder(name: str) -> Path:
-    """`name`, or with the first number that makes it new."""
-    numbered = (Path(f"{name}-{number}") for number in itertools.count(2))
-    return next(path for path in itertools.chain([Path(name)], numbered) if not path.exists())
 
 
 def write_summary(folder: Path, summary: dict[str, object]) -> None:

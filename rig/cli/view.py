@@ -29,7 +29,9 @@ def view(
     control: Annotated[
         bool,
         typer.Option(
-            "--control", help="Let the page change gains of a live run; open the address it prints."
+            "--control",
+            help="Let the page change gains and limits of a live run, and start a diagnosis of a "
+            "finished one; open the address it prints.",
         ),
     ] = False,
     no_browser: Annotated[
@@ -56,3 +58,4 @@ def view(
         while not stop():
             time.sleep(0.1)
     server.shutdown()
+    server.server_close()

@@ -6,6 +6,7 @@ import select
 import shutil
 import signal
 import sys
+import time
 from collections.abc import Callable, Generator
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 
 _PLAIN_EVERY_NS = 10_000_000_000
 """Time between two lines where they cannot be written over: ten seconds."""
+
+_PLAIN_PROGRESS_S = 2.0
+"""Time between two lines of long work."""
 
 _REFRESH_NS = 200_000_000
 """Five times a second: as fast as a person reads."""
@@ -51,17 +55,33 @@ def stoppable() -> Generator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def progress_bar() -> Generator[Callable[[str, float], None]]:
-    """A bar for the diagnosis, which has no tick to miss."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    """A bar for the diagnosis, which has no tick to miss; plain lines where that cannot be."""
     shown = Console(stderr=True)
-    # Where it cannot be rewritten it would leave an empty line behind.
-    with Progress(*columns, console=shown, transient=True, disable=not shown.is_terminal) as bars:
+    if not shown.is_terminal:
+        yield _plain_progress()
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=shown, transient=True) as bars:
         task = bars.add_task("diagnosis", total=1.0, visible=False)
 
         def show(what: str, share: float) -> None:
             bars.update(task, description=what, completed=share, visible=share < 1.0)
 
         yield show
+
+
+def _plain_progress() -> Callable[[str, float], None]:
+    """Lines such as "  12 % reading", which `rig view` reads too; none for what is quick."""
+    due_s = time.monotonic() + _PLAIN_PROGRESS_S
+
+    def show(what: str, share: float) -> None:
+        nonlocal due_s
+        now_s = time.monotonic()
+        if now_s >= due_s:
+            due_s = now_s + _PLAIN_PROGRESS_S
+            _say(f"{100 * share:4.0f} % {what}\n".encode())
+
+    return show
 
 
 @contextlib.contextmanager

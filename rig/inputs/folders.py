@@ -1,5 +1,6 @@
 """Folders that are written into."""
 
+import itertools
 from pathlib import Path
 
 from rig.inputs.errors import InputError
@@ -13,3 +14,9 @@ def refuse_full(folder: Path) -> None:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: is not empty, expected a new or an empty folder")
+
+
+def free_folder(folder: Path) -> Path:
+    """`folder`, or with the first number behind its name that makes it new."""
+    numbered = (folder.with_name(f"{folder.name}-{number}") for number in itertools.count(2))
+    return next(path for path in itertools.chain([folder], numbered) if not path.exists())

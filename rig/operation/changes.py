@@ -69,19 +69,7 @@ def reassigned(ready: Setup, assignments: Assignments, source: str) -> Setup:
                 f"{source}: {key}: cannot be changed in a run, expected a key under "
                 f"{' or '.join(CHANGEABLE)}"
             )
-        place = content[section]
-        for number, name in enumerate(names):
-            if not isinstance(place, dict) or name not in place:
-                keys = cast("dict[str, Any]", place) if isinstance(place, dict) else {}
-                known = f"one of {', '.join(keys)}" if keys else "the key before it as a whole"
-                raise InputError(f"{source}: {key}: no {name!r}, expected {known}")
-            if number == len(names) - 1 and not isinstance(place[name], dict):
-                place[name] = value
-            elif number == len(names) - 1:
-                keys = ", ".join(f"{key}.{item}" for item in cast("dict[str, Any]", place[name]))
-                raise InputError(f"{source}: {key}: expected one of {keys}")
-            else:
-                place = cast("Any", place[name])
+        _assign(content[section], names, value, source, key)
     config = validated(RunConfig, content, source)
     for name, observer in config.observers.items():
         if type(observer) is not type(ready.config.observers[name]):
@@ -90,6 +78,28 @@ def reassigned(ready: Setup, assignments: Assignments, source: str) -> Setup:
                 "that of the observer it has"
             )
     return ready.model_copy(update={"config": config})
+
+
+def _assign(place: object, names: Sequence[str], value: object, source: str, key: str) -> None:
+    """Set a value in a section; a row of a list goes by its number, from 0 on."""
+    name, *others = names
+    known: list[str] = []
+    if isinstance(place, dict):
+        known = list(cast("dict[str, object]", place))
+    elif isinstance(place, list):
+        known = [str(number) for number in range(len(cast("list[object]", place)))]
+    if name not in known:
+        expected = f"one of {', '.join(known)}" if known else "the key before it as a whole"
+        raise InputError(f"{source}: {key}: no {name!r}, expected {expected}")
+    holder = cast("dict[str | int, object]", place)
+    index = int(name) if isinstance(place, list) else name
+    if others:
+        _assign(holder[index], others, value, source, key)
+    elif isinstance(holder[index], dict):
+        keys = ", ".join(f"{key}.{item}" for item in cast("dict[str, Any]", holder[index]))
+        raise InputError(f"{source}: {key}: expected one of {keys}")
+    else:
+        holder[index] = value
 
 
 def changed_bridge(bridge: Bridge, ready: Setup) -> Bridge:

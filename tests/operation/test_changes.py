@@ -115,6 +115,18 @@ def test_no_request_ends_the_reading_of_requests(tmp_path, ready, content):
     assert "error" in served(tmp_path, ready, [])._answered(path)
 
 
+def test_a_limit_goes_by_the_number_of_its_row(ready):
+    content = ready.config.model_dump(mode="json")
+    content["supervision"]["limits"] = [{"value": "force_n", "high": 900.0, "action": "hold"}]
+    limited = ready.model_copy(update={"config": type(ready.config).model_validate(content)})
+    found = reassigned(limited, {"supervision.limits.0.high": 700.0}, "set")
+    assert found.config.supervision.limits[0].high == 700.0
+    with pytest.raises(InputError, match=r"limits.1.high: no '1', expected one of 0"):
+        reassigned(limited, {"supervision.limits.1.high": 700.0}, "set")
+    with pytest.raises(InputError, match=r"limits.0: expected one of supervision.limits.0.value"):
+        reassigned(limited, {"supervision.limits.0": 700.0}, "set")
+
+
 def test_a_group_of_values_is_not_replaced(ready):
     with pytest.raises(InputError, match=r"observers.strut: expected one of observers.strut.kind"):
         reassigned(ready, {"observers.strut": {"proportional_n_per_m": 5e4}}, "set")

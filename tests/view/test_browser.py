@@ -1,6 +1,7 @@
 """The page in a browser, by mouse and by keyboard alone."""
 
 import contextlib
+import json
 import re
 import shutil
 import signal
@@ -257,3 +258,35 @@ def test_a_live_run_is_followed(made, tmp_path):
         if process.poll() is None:
             process.terminate()
             process.wait()
+
+
+def test_a_button_diagnoses_a_finished_run(made, tmp_path):
+    run = make_run(tmp_path / "bench", 3000)
+    with serving(run, token="secret") as one, page(made, one, path="#secret") as opened:
+        drawn(opened)
+        until(opened, "!document.getElementById('diagnosis').hidden")
+        opened.get_by_role("button", name="Diagnose").click()
+        until(opened, "!document.getElementById('progress-of').hidden")
+        assert opened.get_by_role("button", name="Cancel").is_visible()
+        until(opened, "!document.getElementById('report-of').hidden")
+        found = json.loads((tmp_path / "bench-diagnosis/diagnosis.json").read_text())
+        said = found["verdict"].replace("_", " ")
+        assert opened.locator("#outcome").inner_text() == f"Verdict: {said}."
+        with opened.context.expect_page() as popped:
+            opened.get_by_role("link", name="Open the report").click()
+        report_page, errors = popped.value, []
+        report_page.wait_for_load_state()
+        report_page.on("pageerror", lambda error: errors.append(str(error)))
+        report_page.on(
+            "console", lambda said: errors.append(said.text) if said.type == "error" else None
+        )
+        report_page.reload()
+        assert report_page.locator("#finding").is_visible()
+        until(report_page, "document.querySelectorAll('canvas').length > 3")
+        assert report_page.evaluate("origin") == "null"  # it reads nothing of the page
+        assert errors == []
+    # Whoever may only look sees what was found.
+    with serving(run) as one, page(made, one) as opened:
+        drawn(opened)
+        until(opened, "!document.getElementById('report-of').hidden")
+        assert not opened.get_by_role("button", name="Diagnose").is_visible()

@@ -254,24 +254,33 @@ function control() {
   at("control").hidden = token === "" || live < 0;
   const named = runs.length > 1 && live >= 0 ? `Control of ${runs[live].name}` : "Control";
   at("control").querySelector("h2").textContent = named;
-  const keys = Object.entries(runs[Math.max(live, 0)].observers).flatMap(([name, observer]) =>
-    Object.entries(observer).filter(([key]) => key !== "kind").map(([key, value]) => [`observers.${name}.${key}`, value]));
+  const { observers, supervision } = runs[Math.max(live, 0)];
+  const keys = [...numbers("observers", observers), ...numbers("supervision", supervision)];
   const asked = JSON.stringify([live, keys]);
   if (at("key").dataset.asked === asked) return;
   at("key").dataset.asked = asked;
   at("key").replaceChildren(...keys.map(([key, value]) => new Option(`${key} (${value} at the start)`, key)));
 }
 
-async function change(content) {
-  const run = runs.findIndex((item) => item.state === "live");
+// Keys and values of all numbers in a section; null is a limit that is not set.
+function numbers(key, value) {
+  if (value === null || typeof value === "number") return [[key, value ?? "none"]];
+  if (typeof value !== "object") return [];
+  return Object.entries(value).flatMap(([name, item]) => numbers(`${key}.${name}`, item));
+}
+
+async function demand(action, run, content) {
   const options = { method: "POST", headers: { "X-Rig-Token": token, "Content-Type": "application/json" }, body: JSON.stringify(content) };
-  let found = { error: "No answer from rig view." };
   try {
-    const answer = await fetch(`set?run=${run}`, options);
-    found = answer.ok ? await answer.json() : { error: await answer.text() };
+    const answer = await fetch(`${action}?run=${run}`, options);
+    return answer.ok ? await answer.json() : { error: await answer.text() };
   } catch {
-    // said below
+    return { error: "No answer from rig view." };
   }
+}
+
+async function change(content) {
+  const found = await demand("set", runs.findIndex((item) => item.state === "live"), content);
   at("answer").className = found.error ? "bad" : "good";
   at("answer").textContent = found.error ?? (found.acknowledged ? "Acknowledged." : `Changed from ${(found.t_ns * 1e-9).toFixed(3)} s on.`);
 }
@@ -287,6 +296,66 @@ at("change").addEventListener("submit", (event) => {
   change({ set: { [at("key").value]: value } });
 });
 at("acknowledge").addEventListener("click", () => change({ acknowledge: true }));
+
+// --- The diagnosis of a finished run -----------------------------------------------------------
+
+const FINISHED = ["done", "safe", "failed", "killed"];
+const diagnosed = () => Number(at("diagnosed").value);
+
+function offerDiagnosis() {
+  const finished = runs.map((run, i) => [run, i]).filter(([run]) => FINISHED.includes(run.state) && run.steps > 0);
+  const asked = JSON.stringify([finished.map(([run, i]) => [run.name, i]), runs[0].models]);
+  if (at("diagnosis").dataset.asked === asked) return;
+  at("diagnosis").dataset.asked = asked;
+  const before = at("diagnosed").value;
+  at("diagnosed").replaceChildren(...finished.map(([run, i]) => new Option(run.name, i)));
+  if (finished.some(([, i]) => String(i) === before)) at("diagnosed").value = before;
+  at("nominal").replaceChildren(new Option("as it ran", ""), ...runs[0].models.map((name) => new Option(name, name)));
+  at("nominal-label").hidden = runs[0].models.length === 0;
+  at("diagnosed").closest("label").hidden = finished.length < 2;
+  offerHeldOut();
+}
+
+// Every other finished run may be held out: the model is judged on it and learns nothing from it.
+function offerHeldOut() {
+  const others = [...at("diagnosed").options].filter((option) => Number(option.value) !== diagnosed());
+  at("held-out").replaceChildren(...others.map((option) => {
+    const label = document.createElement("label");
+    const box = Object.assign(document.createElement("input"), { type: "checkbox", value: option.value });
+    label.append(box, ` held out: ${option.text}`);
+    return label;
+  }));
+}
+
+async function readDiagnosis() {
+  if (runs.length === 0) return;
+  offerDiagnosis();
+  const none = at("diagnosed").options.length === 0;
+  const found = none ? { state: "none" } : await (await ask("diagnosis", { run: diagnosed() })).json();
+  at("diagnosis").hidden = none || (token === "" && found.state === "none");
+  const running = found.state === "running";
+  at("start").hidden = token === "" || running;
+  at("cancel").hidden = token === "" || !running;
+  at("progress-of").hidden = !running;
+  at("progress").value = found.share ?? 0;
+  at("doing").textContent = running ? `${Math.round(100 * found.share)} %, ${found.what}` : "";
+  const words = { done: `Verdict: ${found.verdict}.`, failed: `It failed: ${found.why}`, cancelled: "Cancelled." };
+  if (found.state !== "none") at("outcome").textContent = words[found.state] ?? "";
+  at("outcome").className = found.state === "failed" ? "bad" : "";
+  at("report-of").hidden = found.state !== "done";
+  at("report").href = `report?run=${diagnosed()}`;
+  at("report-folder").textContent = found.folder ?? "";
+}
+
+at("diagnosed").addEventListener("change", offerHeldOut);
+at("diagnose").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const held_out = [...at("held-out").querySelectorAll("input:checked")].map((box) => Number(box.value));
+  const found = await demand("diagnose", diagnosed(), { held_out, model: at("nominal").value });
+  at("outcome").className = found.error ? "bad" : "";
+  at("outcome").textContent = found.error ?? "";
+});
+at("cancel").addEventListener("click", () => demand("cancel", diagnosed(), {}));
 
 // --- The runs --------------------------------------------------------------------------------
 
@@ -403,3 +472,4 @@ theme(localStorage.getItem("theme") ?? (matchMedia("(prefers-color-scheme: dark)
 every(RUNS_MS, readRuns);
 every(FRAME_MS, frame);
 every(CLOSELY_MS, lookClosely);
+every(RUNS_MS, readDiagnosis);

@@ -19,10 +19,12 @@ import numpy as np
 
 from dart_model.spec import ModelSpec
 from rig.inputs.errors import InputError
+from rig.io.run_log import MODEL_FILE
 from rig.operation.requests import ask
 from rig.operation.timing import read_histograms
 from rig.pages import charts
 from rig.pages.view import closely
+from rig.pages.view.diagnosing import REPORT_FILE, Diagnosing
 from rig.pages.view.watched import WatchedRun
 
 HOST = "127.0.0.1"
@@ -44,21 +46,24 @@ _FILES: Mapping[str, tuple[Path, str]] = {
     **{f"/{path.name}": (path, "text/javascript; charset=utf-8") for path in _SCRIPTS},
 }
 
-_HEADERS = {
+_POLICY: dict[str, str] = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "connect-src 'self'; img-src 'self' data:; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'",
+}
+
+_REPORTS_POLICY = {
+    # It brings its own script; in an origin of its own that reads nothing of the page.
+    "Content-Security-Policy": "sandbox allow-scripts allow-popups; default-src 'none'; "
+    "script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'",
+}
+
+_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-
-
-def _answered(folder: Path, asked: Mapping[str, object]) -> Mapping[str, object]:
-    try:
-        return ask(folder, asked)
-    except InputError as error:
-        return {"error": str(error)}  # what the run says no to is an answer too
 
 
 class _WrongQuestionError(Exception):
@@ -70,7 +75,7 @@ class ViewServer(ThreadingHTTPServer):
 
     Args:
         folders: Folders of runs.
-        models: Models whose laws are drawn beside those of the runs, by name.
+        models: Models whose laws are drawn beside those of the runs, by file or name.
         port: Port on loopback; 0 for a free one.
         token: What a page must know to change a run; None lets nobody change one.
 
@@ -89,6 +94,7 @@ class ViewServer(ThreadingHTTPServer):
     ) -> None:
         self.token = token
         self.runs = tuple(WatchedRun(folder) for folder in folders)
+        self.diagnoses = tuple(Diagnosing(folder) for folder in folders)
         self.models = models
         try:
             super().__init__((HOST, port), _Handler)
@@ -101,6 +107,12 @@ class ViewServer(ThreadingHTTPServer):
     def address(self) -> str:
         """Where a browser finds the page."""
         return f"http://{HOST}:{self.server_address[1]}/"
+
+    def server_close(self) -> None:
+        """End; nobody waits for a diagnosis any more."""
+        super().server_close()
+        for diagnosis in getattr(self, "diagnoses", ()):
+            diagnosis.cancel()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A browser that went away in the middle of an answer is no news."""
@@ -140,7 +152,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.NOT_FOUND, b"no such page", "text/plain")
             return
         try:
-            content, kind = answer(self._view, _Question(asked.query))
+            content, kind, policy = answer(self._view, _Question(asked.query))
         except _WrongQuestionError as error:
             self._send(HTTPStatus.BAD_REQUEST, str(error).encode(), "text/plain; charset=utf-8")
         except (OSError, ValueError, ArithmeticError) as error:
@@ -148,28 +160,34 @@ class _Handler(BaseHTTPRequestHandler):
             why = f"{type(error).__name__}: {error}"
             self._send(HTTPStatus.INTERNAL_SERVER_ERROR, why.encode(), "text/plain; charset=utf-8")
         else:
-            self._send(HTTPStatus.OK, content, kind)
+            self._send(HTTPStatus.OK, content, kind, policy)
 
     def do_POST(self) -> None:
-        """Change a run that goes on, for a page that knows the token."""
+        """Do what is asked, for a page that knows the token."""
         if not self._is_asked_here():
             return
         token, given = self._view.token, self.headers.get("X-Rig-Token", "")
         if token is None or not secrets.compare_digest(token.encode(), given.encode()):
             self._send(HTTPStatus.FORBIDDEN, b"read only", "text/plain")
             return
+        asked = urlsplit(self.path)
+        action = _ACTIONS.get(asked.path)
+        if action is None:
+            self._send(HTTPStatus.NOT_FOUND, b"no such action", "text/plain")
+            return
         length = self.headers.get("Content-Length", "")
         if not length.isdigit() or int(length) > _MOST_ASKED_BYTES:
             self._send(HTTPStatus.BAD_REQUEST, b"too long", "text/plain")
             return
         try:
-            asked: Any = json.loads(self.rfile.read(int(length)))
-            run = _Question(urlsplit(self.path).query).run(self._view)
-            content = _json(_answered(run.folder, dict(asked)))[0]
-        except (_WrongQuestionError, ValueError, TypeError) as error:
+            given: Any = json.loads(self.rfile.read(int(length)))
+            content = action(self._view, _Question(asked.query), dict(given))
+        except InputError as error:
+            content = {"error": str(error)}  # what the run says no to is an answer too
+        except (_WrongQuestionError, OSError, ValueError, TypeError, RecursionError) as error:
             self._send(HTTPStatus.BAD_REQUEST, str(error).encode(), "text/plain; charset=utf-8")
-        else:
-            self._send(HTTPStatus.OK, content, "application/json")
+            return
+        self._send(HTTPStatus.OK, *_json(content))
 
     def _is_asked_here(self) -> bool:
         # A page of another site must not read through a name that it points at this machine.
@@ -182,14 +200,16 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(HTTPStatus.FORBIDDEN, b"another host", "text/plain")
         return False
 
-    def _send(self, status: HTTPStatus, content: bytes, kind: str) -> None:
+    def _send(
+        self, status: HTTPStatus, content: bytes, kind: str, policy: dict[str, str] = _POLICY
+    ) -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))
         if status is not HTTPStatus.OK:
             # What was not read of a question must not be taken for the next one.
             self.send_header("Connection", "close")
-        for name, value in _HEADERS.items():
+        for name, value in (policy | _HEADERS).items():
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(content)
@@ -213,11 +233,11 @@ class _Question:
             raise _WrongQuestionError(f"{name}: {self.text(name)!r}: expected a number")
         return value
 
+    def index(self, view: ViewServer) -> int:
+        return _index(view, self.number("run"))
+
     def run(self, view: ViewServer) -> WatchedRun:
-        number = self.number("run")
-        if number not in range(len(view.runs)):
-            raise _WrongQuestionError(f"run: {number:g}: expected 0 to {len(view.runs) - 1}")
-        return view.runs[int(number)]
+        return view.runs[self.index(view)]
 
     def stretch(self) -> tuple[float, float]:
         begin_s, end_s = self.number("begin"), self.number("end")
@@ -226,19 +246,26 @@ class _Question:
         return begin_s, end_s
 
 
-Answer = tuple[bytes, str]
+def _index(view: ViewServer, number: object) -> int:
+    if number not in range(len(view.runs)):
+        shown = f"{number:g}" if isinstance(number, float) else repr(number)
+        raise _WrongQuestionError(f"run: {shown}: expected 0 to {len(view.runs) - 1}")
+    return int(cast("float", number))
+
+
+Answer = tuple[bytes, str, dict[str, str]]
 
 
 def _json(content: Any) -> Answer:
     # No number that JSON does not have gets here: what is not finite is None or was left out.
-    return json.dumps(content, allow_nan=False).encode(), "application/json"
+    return json.dumps(content, allow_nan=False).encode(), "application/json", _POLICY
 
 
 def _runs(view: ViewServer, _question: _Question) -> Answer:
-    return _json([_described(run) for run in view.runs])
+    return _json([_described(view, run) for run in view.runs])
 
 
-def _described(run: WatchedRun) -> dict[str, Any]:
+def _described(view: ViewServer, run: WatchedRun) -> dict[str, Any]:
     with run.lock:
         run.update()
         state, words = run.state()
@@ -259,6 +286,8 @@ def _described(run: WatchedRun) -> dict[str, Any]:
             "counts": ending.get("counts"),
             "diverged": ending.get("diverged"),
             "observers": config.get("observers", {}),
+            "supervision": config.get("supervision", {}),
+            "models": list(view.models),
         }
 
 
@@ -288,7 +317,7 @@ def _stretch(view: ViewServer, question: _Question) -> Answer:
     text += b" " * (-(len(text) + 4) % 8)
     columns = found.values.astype(np.float32).tobytes()
     content = len(text).to_bytes(4, "little") + text + found.t_s.tobytes() + columns
-    return content, "application/octet-stream"
+    return content, "application/octet-stream", _POLICY
 
 
 def _closely(view: ViewServer, question: _Question) -> Answer:
@@ -314,8 +343,65 @@ def _closely(view: ViewServer, question: _Question) -> Answer:
         )
 
 
+def _diagnosis(view: ViewServer, question: _Question) -> Answer:
+    return _json(view.diagnoses[question.index(view)].state())
+
+
+def _report(view: ViewServer, question: _Question) -> Answer:
+    folder = view.diagnoses[question.index(view)].report()
+    if folder is None:
+        raise _WrongQuestionError("no report of this run")
+    return (folder / REPORT_FILE).read_bytes(), "text/html; charset=utf-8", _REPORTS_POLICY
+
+
 _ANSWERS: Mapping[str, Callable[[ViewServer, _Question], Answer]] = {
     "/runs": _runs,
     "/stretch": _stretch,
     "/closely": _closely,
+    "/diagnosis": _diagnosis,
+    "/report": _report,
+}
+
+_Given = dict[str, Any]
+
+
+def _set(view: ViewServer, question: _Question, given: _Given) -> Mapping[str, Any]:
+    return ask(question.run(view).folder, given)
+
+
+def _diagnose(view: ViewServer, question: _Question, given: _Given) -> Mapping[str, Any]:
+    """Start a diagnosis; `held_out` are numbers of runs, `model` one of the view's or empty."""
+    index = question.index(view)
+    others = [_index(view, number) for number in given.get("held_out", [])]
+    states = {i: _state(view.runs[i]) for i in range(len(view.runs))}
+    for i in (index, *others):
+        if states[i] in ("absent", "empty", "live", "reading", "unreadable"):
+            raise InputError(
+                f"{view.runs[i].folder}: is {states[i]}, expected a run that has ended"
+            )
+    if "live" in states.values():
+        raise InputError("a run goes on: a diagnosis beside it could make its ticks late")
+    model = given.get("model") or str(view.runs[index].folder / MODEL_FILE)
+    if given.get("model") and model not in view.models:
+        raise InputError(f"model: {model}: expected one that `rig view` was given")
+    view.diagnoses[index].start(model, [view.runs[i].folder for i in others])
+    return view.diagnoses[index].state()
+
+
+def _state(run: WatchedRun) -> str:
+    with run.lock:
+        run.update()
+        return run.state()[0]
+
+
+def _cancel(view: ViewServer, question: _Question, _given: _Given) -> Mapping[str, Any]:
+    diagnosis = view.diagnoses[question.index(view)]
+    diagnosis.cancel()
+    return diagnosis.state()
+
+
+_ACTIONS: Mapping[str, Callable[[ViewServer, _Question, _Given], Mapping[str, Any]]] = {
+    "/set": _set,
+    "/diagnose": _diagnose,
+    "/cancel": _cancel,
 }
