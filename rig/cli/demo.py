@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import console
+from rig.cli.output import JsonFlag, console, print_json
 from rig.cli.results import print_case, print_diagnosis, print_ended
 from rig.cli.watching import progress_bar, status_line, stoppable
 from rig.inputs.errors import InputError
@@ -39,6 +39,7 @@ def demo(
     duration_s: Annotated[
         float | None, typer.Option("--duration-s", min=1.0, help="Length of a run in s.")
     ] = None,
+    as_json: JsonFlag = False,
 ) -> None:
     """Run a simulated bench and the bridge on this machine, over virtual CAN.
 
@@ -52,10 +53,13 @@ def demo(
     out = out or free_folder(Path("rig-demo"))
     refuse_full(out)
     if case == STORY:
-        _tell(seed, out, lockstep=lockstep, duration_s=duration_s)
+        _tell(seed, out, lockstep=lockstep, duration_s=duration_s, as_json=as_json)
         return
     with stoppable() as stop, status_line(duration_s) as watch:
         done = run_case(case, out, lockstep=lockstep, duration_s=duration_s, stop=stop, watch=watch)
+    if as_json:
+        print_json(done.summary())
+        return
     print_case(done)
     print_ended(done.run, with_timing=not lockstep)
     console.print(
@@ -63,7 +67,7 @@ def demo(
     )
 
 
-def _tell(seed: int, out: Path, *, lockstep: bool, duration_s: float | None) -> None:
+def _tell(seed: int, out: Path, *, lockstep: bool, duration_s: float | None, as_json: bool) -> None:
     from rig.demo.story import tell
 
     with stoppable() as stop, status_line(duration_s) as watch, progress_bar() as bar:
@@ -73,10 +77,13 @@ def _tell(seed: int, out: Path, *, lockstep: bool, duration_s: float | None) -> 
             duration_s=duration_s,
             lockstep=lockstep,
             stop=stop,
-            chapter=lambda text: console.print(f"- {text}"),
+            chapter=lambda text: None if as_json else console.print(f"- {text}"),
             watch=watch,
             diagnosis_progress=bar,
         )
+    if as_json:
+        print_json(story.summary())
+        return
     print_ended(story.first_run, with_timing=not lockstep)
     print_diagnosis(story.diagnosis, struts=1)
     before, after = story.virtual_force_rms_n

@@ -9,10 +9,14 @@ import typer
 
 from rig.cli.output import console
 from rig.cli.watching import stoppable
+from rig.inputs.errors import InputError
 
 EXAMPLES = (
     "Examples: `rig view runs/7` while it runs · `rig view before after --model corrected.yaml`"
 )
+
+
+_PORT, _FOXGLOVE_PORT = 8321, 8765
 
 
 def view(
@@ -24,8 +28,14 @@ def view(
         ),
     ] = None,
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Port on this machine; 0 takes a free one.")
-    ] = 8321,
+        int | None,
+        typer.Option(
+            min=0,
+            max=65535,
+            help=f"Port on this machine; 0 takes a free one. {_PORT} by default, Foxglove's is "
+            f"{_FOXGLOVE_PORT}.",
+        ),
+    ] = None,
     control: Annotated[
         bool,
         typer.Option(
@@ -37,6 +47,14 @@ def view(
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Open no browser, only say where the page is.")
     ] = False,
+    foxglove: Annotated[
+        bool,
+        typer.Option(
+            "--foxglove",
+            help="Publish the runs to Foxglove or Lichtblick in place of a page; wants the extra "
+            "of that name.",
+        ),
+    ] = False,
 ) -> None:
     """Show runs in the browser, while they are written or afterwards; Ctrl-C ends it."""
     import time
@@ -44,9 +62,14 @@ def view(
     from dart_model.spec import load_model, model_file
     from rig.pages.view.server import ViewServer
 
+    if foxglove:
+        if control or model:
+            raise InputError("--foxglove: takes neither --control nor --model")
+        _publish(runs, _FOXGLOVE_PORT if port is None else port)
+        return
     models = {name: load_model(model_file(name, Path())) for name in model or ()}
     token = secrets.token_urlsafe(16) if control else None
-    server = ViewServer(runs, models, port, token)
+    server = ViewServer(runs, models, _PORT if port is None else port, token)
     server.serving()
     # Behind the hash: a browser sends that to nobody.
     address = server.address if token is None else f"{server.address}#{token}"
@@ -59,3 +82,21 @@ def view(
             time.sleep(0.1)
     server.shutdown()
     server.server_close()
+
+
+def _publish(runs: list[Path], port: int) -> None:
+    import time
+
+    from rig.pages.view.foxglove import FoxgloveView
+
+    with stoppable() as stop:
+        view = FoxgloveView(runs, port)
+        console.print(
+            f"{view.address} (open it in Foxglove or Lichtblick as a Foxglove WebSocket; on this "
+            "machine only, to whoever connects; Ctrl-C ends it)",
+            soft_wrap=True,
+        )
+        while not stop():
+            view.publish(time.monotonic_ns())
+            time.sleep(0.05)
+        view.close()

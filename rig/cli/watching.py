@@ -86,17 +86,17 @@ def _plain_progress() -> Callable[[str, float], None]:
 
 @contextlib.contextmanager
 def status_line(duration_s: float | None) -> Generator[Callable[["Look"], None]]:
-    """State, lateness, force and losses of a run, in place; plain lines where that cannot be.
+    """State, rate, lateness, force and losses of a run, in place, or lines where that cannot be.
 
     A single write, because the loop itself calls it.
     """
     is_terminal = sys.stderr.isatty()
     total = "" if duration_s is None else f" of {duration_s:g}"
     due_ns = 0 if is_terminal else _PLAIN_EVERY_NS
-    last_ns = 0
+    last_ns = shown_ns = shown_ticks = 0
 
     def show(look: "Look") -> None:
-        nonlocal due_ns, last_ns
+        nonlocal due_ns, last_ns, shown_ns, shown_ticks
         # A run after another begins at zero again.
         is_due = look.t_ns >= due_ns or look.t_ns < last_ns
         last_ns = look.t_ns
@@ -105,6 +105,10 @@ def status_line(duration_s: float | None) -> Generator[Callable[["Look"], None]]
         due_ns = look.t_ns + (0 if is_terminal else _PLAIN_EVERY_NS)
         # What is wrong stands first: a narrow terminal cuts the end.
         text = f"{look.t_ns * 1e-9:8.1f}{total} s  {look.mode.name:<7}"
+        # Since the last line: what the run keeps now.
+        if look.t_ns > shown_ns and look.ticks > shown_ticks:
+            text += f"  {(look.ticks - shown_ticks) / (look.t_ns - shown_ns) * 1e9:.0f} Hz"
+        shown_ns, shown_ticks = look.t_ns, look.ticks
         text += f"  lost {look.counts.lost}"
         if look.counts.refused:
             text += f"  refused {look.counts.refused}"

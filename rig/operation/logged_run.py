@@ -192,7 +192,7 @@ def logged(
             shown_ns = step.t_ns + SHOWN_EVERY_NS
             late_ns = int(timing.extremes_ns[0]) if granted is not None else None
             output = result.output
-            watch(Look(step.t_ns, output.mode, output.struts, result.counts, late_ns))
+            watch(Look(step.t_ns, ticks, output.mode, output.struts, result.counts, late_ns))
 
     try:
         if begin is not None:

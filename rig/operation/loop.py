@@ -56,6 +56,7 @@ class Look(NamedTuple):
 
     Attributes:
         t_ns: Time of the tick.
+        ticks: How many there have been with it.
         mode: State of the bridge.
         struts: What was published of each strut; none before the model has started.
         counts: What has been counted since the start.
@@ -63,6 +64,7 @@ class Look(NamedTuple):
     """
 
     t_ns: int
+    ticks: int
     mode: Mode
     struts: tuple[StrutOutput, ...]
     counts: Counts

@@ -87,7 +87,14 @@ def test_no_name_is_cut_in_a_table(capsys):
 
 def look(t_s, force_n=-123.4):
     strut = StrutOutput(force_n, 5.0, True, 0.4, 0.1, 0.0, 2e-5)
-    return Look(round(t_s * 1e9), Mode.RUNNING, (strut,), Counts(lost=3, overruns=2), 120_000)
+    return Look(
+        round(t_s * 1e9),
+        round(t_s * 990),
+        Mode.RUNNING,
+        (strut,),
+        Counts(lost=3, overruns=2),
+        120_000,
+    )
 
 
 def test_a_reader_that_went_away_ends_no_run():
@@ -146,3 +153,26 @@ def test_without_a_terminal_the_status_is_a_line_every_ten_seconds(capfd):
         assert part in lines[0]
     assert "\r" not in lines[0]
     assert "\x1b" not in "".join(lines)
+
+
+def test_a_line_says_the_rate_that_was_kept(monkeypatch):
+    said = []
+    monkeypatch.setattr("rig.cli.watching._say", lambda text: said.append(text.decode()))
+    with status_line(60.0) as watch:
+        for second in (10.0, 20.0):
+            watch(look(second))
+    assert all("  990 Hz  " in line for line in said)
+    assert len(said) == 2
+
+
+def test_a_case_as_json(monkeypatch, capsys, tmp_path):
+    asked = ("--case", "dyno", "--lockstep", "--duration-s", 1, "--json")
+    assert rig(monkeypatch, "demo", *asked, "--out", tmp_path / "dyno") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found == json.loads((tmp_path / "dyno" / "summary.json").read_text())
+    assert found["counts"]["lost"] == 0
+
+
+def test_foxglove_takes_no_control(monkeypatch, capsys, tmp_path):
+    assert rig(monkeypatch, "view", tmp_path, "--foxglove", "--control") == 2
+    assert "--foxglove: takes neither --control nor --model" in capsys.readouterr().err

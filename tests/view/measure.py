@@ -58,9 +58,9 @@ def hour(folder):
 @contextlib.contextmanager
 def view(folder):
     """`rig view` as a process of its own."""
-    call = ["from rig.cli.main import main; main()", "view", folder, "--port", 0, "--no-browser"]
+    call = ["-m", "rig", "view", folder, "--port", 0, "--no-browser"]
     with subprocess.Popen(
-        [sys.executable, "-c", *map(str, call)], stdout=subprocess.PIPE, text=True
+        [sys.executable, *map(str, call)], stdout=subprocess.PIPE, text=True
     ) as process:
         try:
             yield process, ADDRESS.search(process.stdout.readline()).group()

@@ -16,7 +16,7 @@ from rig.inputs.folders import free_folder
 
 REPORT_FILE = "report.html"
 
-_COMMAND = (sys.executable, "-c", "from rig.cli.main import main; main()", "diagnose")
+_COMMAND = (sys.executable, "-m", "rig", "diagnose")
 _PROGRESS = re.compile(r" *(\d+) % (.+)")
 _NICENESS = 19
 """Lowest: it takes what nobody else wants."""

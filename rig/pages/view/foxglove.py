@@ -1,0 +1,353 @@
+"""Publishes runs through Foxglove's SDK, for whoever has layouts of their own there.
+
+Steps go out as JSON, a topic a run, with their time after the epoch of the first run, so that
+finished runs lie over one another. The protocol knows no token: nothing can be changed through it,
+and whatever page a browser of this machine has open may connect and read.
+"""
+
+import importlib
+import math
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.inputs.errors import InputError
+from rig.operation.changes import logged_changes
+from rig.pages.view.watched import WatchedRun
+
+HOST = "127.0.0.1"
+
+_STEPS_AT_ONCE = 20_000
+"""Steps that are published in one go: half a second's work."""
+
+_BACKLOG = 2 * _STEPS_AT_ONCE
+"""Messages that wait for a slow client before the oldest are dropped."""
+
+_SECOND_NS = 1_000_000_000
+
+
+class Playback(NamedTuple):
+    """How finished runs are played.
+
+    Attributes:
+        position_ns: Time after the runs' beginning, at `since_ns`.
+        since_ns: Time of the clock.
+        speed: Time of the runs over the clock's.
+        is_playing: Whether it goes on.
+    """
+
+    position_ns: int
+    since_ns: int
+    speed: float = 1.0
+    is_playing: bool = False
+
+    def at(self, now_ns: int, end_ns: int) -> "Playback":
+        """Where it stands later; it stops at the end."""
+        position_ns = self.position_ns
+        if self.is_playing:
+            position_ns += round((now_ns - self.since_ns) * self.speed)
+        goes_on = self.is_playing and position_ns < end_ns
+        return Playback(min(position_ns, end_ns), now_ns, self.speed, goes_on)
+
+
+class Topic:
+    """A run, and how far it has been published.
+
+    Args:
+        run: The run.
+        name: Name of the topic.
+        new_channel: Makes a channel of the SDK.
+    """
+
+    def __init__(self, run: WatchedRun, name: str, new_channel: Callable[..., Any]) -> None:
+        self.run, self.name, self._new_channel = run, name, new_channel
+        self._channel: Any = None
+        self._places: tuple[tuple[str, ...], ...] = ()
+        self._published = 0
+
+    @property
+    def epoch_ns(self) -> int | None:
+        """Epoch of the run; None before it has begun."""
+        found = self.run.header.get("epoch_ns")
+        return None if found is None else int(found)
+
+    @property
+    def is_subscribed(self) -> bool:
+        """Whether somebody takes what is published."""
+        return self._channel is not None and bool(self._channel.has_sinks())
+
+    def read(self) -> str:
+        """Take in what has been written, and say in what state the run is."""
+        self.run.update()
+        if self._channel is None and self.run.follower.columns:
+            self._places = tuple(tuple(name.split(".")) for name in self.run.follower.columns)
+            self._channel = self._new_channel(f"/{self.name}", schema=_schema(self._places))
+        return self.run.state()[0]
+
+    def publish(self, epoch_ns: int, until_ns: int | None) -> None:
+        """Publish what has not been: up to a time of the run, or all that is there."""
+        follower = self.run.follower
+        end = min(follower.steps, self._published + _STEPS_AT_ONCE)
+        if self._channel is None or end <= self._published:
+            return
+        if until_ns is not None:
+            end = min(end, follower.between(0.0, until_ns * 1e-9)[1])
+        rows = follower.rows(self._published, end)
+        if until_ns is not None:
+            rows = rows[rows[:, 0] <= until_ns]
+        for row in rows:
+            self._channel.log(_message(self._places, row), log_time=epoch_ns + int(row[0]))
+        self._published += len(rows)
+
+    def seek(self, t_ns: int) -> None:
+        """Go on from a time."""
+        follower = self.run.follower
+        begin, end = follower.between(t_ns * 1e-9, t_ns * 1e-9)
+        rows = follower.rows(begin, end)
+        self._published = begin + int(np.searchsorted(rows[:, 0], t_ns))
+
+    def skip(self) -> None:
+        """Publish nothing of what is there already: nobody has asked for it."""
+        self._published = self.run.follower.steps
+
+    def parameters(self) -> dict[str, object]:
+        """Numbers and words of the configuration, with what was changed meanwhile."""
+        found = dict(_flat(self.name, self.run.header.get("config", {})))
+        for _, changed in logged_changes(self.run.folder):
+            found |= {f"{self.name}.{key}": value for key, value in changed.items()}
+        return found
+
+
+class FoxgloveView:
+    """A server of Foxglove's protocol, on loopback.
+
+    Runs that have ended when it starts are played from their beginning as soon as somebody
+    subscribes, and a client may pause, seek and change the speed. If any of them is still written,
+    steps are published as they come.
+
+    Args:
+        folders: Folders of runs.
+        port: Port on loopback; 0 for a free one.
+
+    Raises:
+        InputError: The SDK is not installed, the port is taken, or none of the runs can be read.
+    """
+
+    def __init__(self, folders: Sequence[Path], port: int) -> None:
+        self._sdk = _sdk()
+        context = self._sdk.Context()
+        channel = partial(self._sdk.Channel, context=context)
+        names = _names(folders)
+        self._topics = [
+            Topic(WatchedRun(folder), name, channel)
+            for folder, name in zip(folders, names, strict=True)
+        ]
+        states = [_whole(topic) for topic in self._topics]
+        for topic, state in zip(self._topics, states, strict=True):
+            if state == "unreadable":
+                raise InputError(topic.run.state()[1])
+        self._is_live = any(state in ("live", "absent") for state in states)
+        if self._is_live:
+            for topic in self._topics:
+                topic.skip()
+        self._end_ns = round(1e9 * max(topic.run.follower.span_s[1] for topic in self._topics))
+        self._playback = Playback(0, 0)
+        self._has_begun = False
+        self._lock = threading.Lock()
+        epoch_ns = self._epoch_ns()
+        span = None if self._is_live or epoch_ns is None else (epoch_ns, epoch_ns + self._end_ns)
+        try:
+            self._server = self._sdk.start_server(
+                name="rig view",
+                host=HOST,
+                port=port,
+                capabilities=[self._sdk.Capability.Parameters],
+                server_listener=_listener(self._sdk, self),
+                playback_time_range=span,
+                message_backlog_size=_BACKLOG,
+                context=context,
+            )
+        except RuntimeError as error:
+            raise InputError(f"--port {port}: {error}, expected a port that is free") from error
+        self._told, self._told_ns = self._all_parameters(), 0
+
+    @property
+    def address(self) -> str:
+        """Where a client connects to."""
+        return f"ws://{HOST}:{self._server.port}"
+
+    def close(self) -> None:
+        """End the server."""
+        self._server.stop()
+
+    def play(self, request: Any) -> Any:
+        """Do what a client asks of the playback; called by a thread of the SDK."""
+        with self._lock:
+            epoch_ns, before = cast("int", self._epoch_ns()), self._playback
+            position_ns = before.position_ns
+            if request.seek_time is not None:
+                position_ns = min(max(0, request.seek_time - epoch_ns), self._end_ns)
+                for topic in self._topics:
+                    topic.seek(position_ns)
+            speed = request.playback_speed
+            self._playback = Playback(
+                position_ns,
+                before.since_ns,
+                speed if math.isfinite(speed) and speed > 0.0 else before.speed,
+                request.playback_command == self._sdk.websocket.PlaybackCommand.Play,
+            )
+            self._has_begun = True
+            return self._state(epoch_ns, request.seek_time is not None, request.request_id)
+
+    def parameters(self, names: Sequence[str]) -> list[Any]:
+        """Parameters by name, or all of them."""
+        found = self._all_parameters()
+        wanted = {name: found[name] for name in names or found if name in found}
+        return [self._sdk.Parameter(name, value=value) for name, value in wanted.items()]
+
+    def publish(self, now_ns: int) -> None:
+        """Publish what is due.
+
+        Args:
+            now_ns: Time of a clock that never jumps.
+        """
+        epoch_ns = self._epoch_ns()
+        if epoch_ns is None:
+            for topic in self._topics:
+                topic.read()
+            return
+        if self._is_live:
+            for topic in self._topics:
+                topic.read()
+                if topic.is_subscribed:
+                    topic.publish(epoch_ns, None)
+                else:
+                    topic.skip()
+            self._tell_parameters(now_ns)
+        else:
+            with self._lock:
+                self._play(now_ns, epoch_ns)
+
+    def _all_parameters(self) -> dict[str, object]:
+        return {key: value for t in self._topics for key, value in t.parameters().items()}
+
+    def _epoch_ns(self) -> int | None:
+        return next((epoch for t in self._topics if (epoch := t.epoch_ns) is not None), None)
+
+    def _play(self, now_ns: int, epoch_ns: int) -> None:
+        before = self._playback
+        if not self._has_begun:
+            self._has_begun = any(topic.is_subscribed for topic in self._topics)
+            self._playback = Playback(0, now_ns, is_playing=self._has_begun)
+        self._playback = self._playback.at(now_ns, self._end_ns)
+        for topic in self._topics:
+            topic.publish(epoch_ns, self._playback.position_ns)
+        if before.is_playing != self._playback.is_playing:
+            self._server.broadcast_playback_state(self._state(epoch_ns, did_seek=False))
+
+    def _state(self, epoch_ns: int, did_seek: bool, request: str | None = None) -> Any:
+        playback, words = self._playback, self._sdk.websocket.PlaybackStatus
+        at_rest = words.Paused if playback.position_ns < self._end_ns else words.Ended
+        return self._sdk.websocket.PlaybackState(
+            status=words.Playing if playback.is_playing else at_rest,
+            current_time=epoch_ns + playback.position_ns,
+            playback_speed=playback.speed,
+            did_seek=did_seek,
+            request_id=request,
+        )
+
+    def _tell_parameters(self, now_ns: int) -> None:
+        """Tell what `rig set` changed, once a second."""
+        if now_ns - self._told_ns < _SECOND_NS:
+            return
+        self._told_ns = now_ns
+        now = self._all_parameters()
+        other = {key: value for key, value in now.items() if self._told.get(key) != value}
+        if other:
+            self._server.publish_parameter_values(self.parameters(list(other)))
+        self._told = now
+
+
+def _listener(sdk: Any, view: FoxgloveView) -> Any:
+    """What the SDK calls, from threads of its own."""
+
+    class Listener(sdk.websocket.ServerListener):
+        def on_get_parameters(self, _client: Any, names: list[str], _id: str | None = None) -> Any:
+            return view.parameters(names)
+
+        def on_set_parameters(self, _client: Any, given: list[Any], _id: str | None = None) -> Any:
+            # Whoever may connect may not change anything: they get what is.
+            return view.parameters([parameter.name for parameter in given])
+
+        def on_playback_control_request(self, request: Any) -> Any:
+            return view.play(request)
+
+    return Listener()
+
+
+def _sdk() -> Any:
+    try:
+        foxglove = importlib.import_module("foxglove")  # an extra that may not be there
+        importlib.import_module("foxglove.websocket")
+    except ImportError as error:
+        raise InputError(
+            "--foxglove wants the package foxglove-sdk: pip install 'rig[foxglove]'"
+        ) from error
+    foxglove.set_log_level("ERROR")
+    return foxglove
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """Names of the folders, with a number where two have the same."""
+    found: list[str] = []
+    for folder in folders:
+        name = folder.absolute().name
+        same = sum(other.absolute().name == name for other in folders[: len(found)])
+        found.append(f"{name}-{same + 1}" if same else name)
+    return found
+
+
+def _whole(topic: Topic) -> str:
+    """Read a run as far as it goes, and say in what state it is."""
+    while (state := topic.read()) == "reading":
+        pass
+    return state
+
+
+def _schema(places: Sequence[Sequence[str]]) -> dict[str, Any]:
+    root: dict[str, Any] = {"type": "object", "title": "rig.Step", "properties": {}}
+    for place in places:
+        within = root
+        for name in place[:-1]:
+            empty: dict[str, Any] = {"type": "object", "properties": {}}
+            within = within["properties"].setdefault(name, empty)
+        within["properties"][place[-1]] = {"type": "number"}
+    return root
+
+
+def _message(places: Sequence[Sequence[str]], row: NDArray[np.float64]) -> dict[str, Any]:
+    """A step; what has no value is left out, because JSON has no NaN."""
+    root: dict[str, Any] = {}
+    for place, value in zip(places, row.tolist(), strict=True):
+        if not math.isfinite(value):
+            continue
+        within = root
+        for name in place[:-1]:
+            within = within.setdefault(name, {})
+        within[place[-1]] = value
+    return root
+
+
+def _flat(key: str, value: object) -> list[tuple[str, object]]:
+    if isinstance(value, Mapping):
+        items: Any = cast("Mapping[str, object]", value).items()
+    elif isinstance(value, list):
+        items = enumerate(cast("list[object]", value))
+    else:
+        return [] if value is None else [(key, value)]
+    return [found for name, item in items for found in _flat(f"{key}.{name}", item)]

@@ -1,0 +1,25 @@
+"""The notebook, run as Jupyter runs it."""
+
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+
+import rig
+
+NOTEBOOK = Path(rig.__file__).parent / "demo" / "what_does_the_model_lack.ipynb"
+
+
+def test_the_notebook_runs_and_finds_the_effect(tmp_path):
+    book = nbformat.read(NOTEBOOK, as_version=4)
+    nbformat.validate(book)
+    assert all(not cell.get("outputs") for cell in book.cells)  # nobody committed old results
+    resources = {"metadata": {"path": str(tmp_path)}}
+    NotebookClient(book, timeout=300, kernel_name="python3", resources=resources).execute()
+    outputs = [output for cell in book.cells for output in cell.get("outputs", [])]
+    pictures = [item for item in outputs if "image/png" in item.get("data", {})]
+    assert len(pictures) == 2
+    [table] = [item.data["text/html"] for item in outputs if "text/html" in item.get("data", {})]
+    assert "explained: The model lacks" in table
+    assert "cubic_stiffness" in table
+    assert (tmp_path / "notebook" / "again" / "report.html").exists()
