@@ -290,3 +290,7 @@ def test_a_button_diagnoses_a_finished_run(made, tmp_path):
         drawn(opened)
         until(opened, "!document.getElementById('report-of').hidden")
         assert not opened.get_by_role("button", name="Diagnose").is_visible()
+    with serving(run, token="secret") as one, page(made, one, path="#secret") as opened:
+        until(opened, "!document.getElementById('report-of').hidden")
+        found = axe.Axe().run(opened).response["violations"]
+        assert [item["id"] for item in found if item["impact"] in ("serious", "critical")] == []
