@@ -239,7 +239,9 @@ class Bridge:
                 heights, others = self._no_heights.copy(), list(NO_OTHERS)
             arrived_ns = min(frame.t_ns, t_ns)
             for target in incoming.heights:
-                heights[target.strut] = Measurement(values[target.value], arrived_ns)
+                delay_ns = target.delay_ns
+                height_m = values[target.value]
+                heights[target.strut] = Measurement(height_m, arrived_ns - delay_ns, delay_ns)
             for target in incoming.others:
                 others[target.place] = values[target.value]
         return _Received(core, heights, others, sequences, ledger, action)
@@ -248,7 +250,7 @@ class Bridge:
         self, core: CoreState, heights: list[Measurement | None], others: list[float | None]
     ) -> CoreState:
         """The core at the time of measurements that newer ones follow."""
-        t_ns = max([core.t_ns, *[item.t_ns for item in heights if item]])
+        t_ns = max([core.t_ns, *[item.t_ns + item.delay_ns for item in heights if item]])
         return self.core.step(core, StepInput(t_ns, tuple(heights), tuple(others)))[0]
 
     def _foreign(self, ledger: Ledger, frame: Frame) -> Ledger:

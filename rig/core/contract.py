@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from enum import IntEnum
+from math import nan
 from typing import Any, Protocol
 
 from msgspec import Struct
@@ -25,10 +26,40 @@ class Measurement(Struct, frozen=True, gc=False):
     Attributes:
         height_m: Measured strut height.
         t_ns: Time at which it was true.
+        delay_ns: How much later it came, as far as that is known beforehand.
     """
 
     height_m: float
     t_ns: int
+    delay_ns: int = 0
+
+
+class Innovation(Struct, frozen=True, gc=False):
+    """A measured height held against the model.
+
+    Attributes:
+        value_m: Measured less model height, both at the time of the measurement.
+        t_ns: That time.
+    """
+
+    value_m: float
+    t_ns: int
+
+
+class Start(Struct, frozen=True, gc=False):
+    """What an observer is told when the model starts.
+
+    Attributes:
+        t_ns: Time of the measurement that it starts with.
+        mobility_per_kg: Acceleration of the strut's height per newton in the strut.
+        interval_ns: Time between two measurements.
+        delay_ns: How much later a measurement comes than it is true.
+    """
+
+    t_ns: int
+    mobility_per_kg: float
+    interval_ns: int
+    delay_ns: int = 0
 
 
 NO_OTHERS: tuple[float | None, ...] = (None,) * len(OTHERS)
@@ -160,6 +191,16 @@ class ObserverState(Protocol):
         ...
 
     @property
+    def residual_force_n(self) -> float:
+        """Estimate of the force that the model's law lacks; published with the law's own."""
+        ...
+
+    @property
+    def force_std_n(self) -> float:
+        """Standard deviation of that estimate; NaN where the observer does not know it."""
+        ...
+
+    @property
     def measured_ns(self) -> int:
         """Time of the last measurement."""
         ...
@@ -168,35 +209,35 @@ class ObserverState(Protocol):
 class Observer(Protocol):
     """What makes the model of one strut follow its bench. It knows no other strut."""
 
-    def init(self, measured: Measurement) -> Any:
-        """State at the first measurement, an `ObserverState` without virtual force."""
+    @property
+    def first_measurements(self) -> int:
+        """Measurements that the model's start is found from; with more than one it moves."""
         ...
 
-    def step(
-        self,
-        state: Any,
-        t_ns: int,
-        height_m: float,
-        velocity_m_per_s: float,
-        measured: Measurement | None,
-    ) -> Any:
+    def init(self, start: Start) -> Any:
+        """State at the model's start, an `ObserverState` without virtual force."""
+        ...
+
+    def settled(self, start: Start) -> Any:
+        """State after a long time at rest, whose variances no longer change."""
+        ...
+
+    def step(self, state: Any, t_ns: int, innovation: Innovation | None) -> Any:
         """State after a tick.
 
         Args:
             state: State after the last tick.
             t_ns: Time of the tick.
-            height_m: Height of the model at the tick.
-            velocity_m_per_s: Its velocity.
-            measured: New measurement; None where no frame came.
+            innovation: Of a new measurement; None where no frame came.
         """
         ...
 
     def numbers(self, state: Any) -> Sequence[float]:
-        """What of a state the next one depends on."""
+        """What of a state the next one depends on, but for times and variances."""
         ...
 
-    def state_of(self, numbers: Sequence[float]) -> Any:
-        """The state of what `numbers` gave, last measured at time zero."""
+    def with_numbers(self, state: Any, numbers: Sequence[float]) -> Any:
+        """A state with other numbers, as `numbers` gives them."""
         ...
 
 
@@ -204,13 +245,14 @@ class StrutOutput(Struct, frozen=True, gc=False):
     """What a tick publishes of one strut; each attribute is a column of the log.
 
     Attributes:
-        force_n: Estimated spring-damper force, virtual force included.
+        force_n: Estimated spring-damper force: the law's, and the residual force.
         virtual_force_n: Virtual force.
         valid: Whether the estimate rests on a fresh measurement.
         height_m: Model height.
         velocity_m_per_s: Model velocity.
         acceleration_m_per_s2: Model acceleration.
         innovation_m: Innovation.
+        force_std_n: Standard deviation of the estimated force; NaN where it is not known.
     """
 
     force_n: float
@@ -220,6 +262,7 @@ class StrutOutput(Struct, frozen=True, gc=False):
     velocity_m_per_s: float
     acceleration_m_per_s2: float
     innovation_m: float
+    force_std_n: float = nan
 
 
 class StepOutput(Struct, frozen=True, gc=False):

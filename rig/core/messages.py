@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import inf, isnan
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -23,11 +24,13 @@ class Wanted(NamedTuple):
         signal: Name of the signal.
         quantity: What it means.
         strut: Index of the strut of a height, else 0.
+        delay_ns: How much later a height comes than it is true.
     """
 
     signal: str
     quantity: Quantity
     strut: int = 0
+    delay_ns: int = 0
 
 
 class HeightTarget(Struct, frozen=True, gc=False):
@@ -36,10 +39,12 @@ class HeightTarget(Struct, frozen=True, gc=False):
     Attributes:
         value: Its place among the frame's values.
         strut: Index of the strut.
+        delay_ns: How much later the value comes than it is true.
     """
 
     value: int
     strut: int
+    delay_ns: int = 0
 
 
 class OtherTarget(Struct, frozen=True, gc=False):
@@ -212,7 +217,22 @@ KINEMATICS = (
     ),
     Publication("innovation", Dimension.LENGTH, _of_strut("innovation_m"), "INNOVATION"),
 )
-STRUT = (*ESTIMATE, *KINEMATICS)
+
+
+def _known(std_n: float) -> float:
+    return inf if isnan(std_n) else std_n
+
+
+UNCERTAINTY = (
+    Publication(
+        "force_std",
+        Dimension.FORCE,
+        lambda report, strut: _known(report.output.struts[strut].force_std_n),
+        "FORCE_STD",
+        stops_at_range=True,
+    ),
+)
+STRUT = (*ESTIMATE, *KINEMATICS, *UNCERTAINTY)
 """What is published of a strut."""
 
 
@@ -314,7 +334,7 @@ def incoming(message: Message, wanted: Sequence[Wanted]) -> Incoming:
     names = [item.signal for item in wanted]
     decode = compile_decoder(message, names, [item.quantity.dimension for item in wanted])
     heights = [
-        HeightTarget(value, item.strut)
+        HeightTarget(value, item.strut, item.delay_ns)
         for value, item in enumerate(wanted)
         if item.quantity is HEIGHT
     ]

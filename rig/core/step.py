@@ -1,19 +1,22 @@
 """One tick: advance the model, compare it with the bench, correct it, publish."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 from msgspec.structs import replace
 
 from rig.core.contract import (
     AMBIENT_C,
     CoreState,
     Divergence,
+    Innovation,
     LoadedModel,
     Measurement,
     Mode,
     Observer,
     Plant,
+    Start,
     StepInput,
     StepOutput,
     StrutOutput,
@@ -27,13 +30,28 @@ class RigState(CoreState, frozen=True, gc=False, kw_only=True):
 
     Attributes:
         observers: State of each strut's observer; empty before the first measurements.
-        first: Measurements that came before every strut had one.
+        first: Of each strut the measurements that came before the model started, the oldest first.
         model: The model under its forces; None before the first measurements.
+        past: Times of the last ticks and the model's heights and velocities at them, the newest
+            first, as far back as a measurement may be old; empty where none comes late.
     """
 
     observers: tuple[Any, ...] = ()
-    first: tuple[Measurement | None, ...]
+    first: tuple[tuple[Measurement, ...], ...]
     model: Any = None
+    past: tuple[tuple[int, Sequence[tuple[float, float]]], ...] = ()
+
+
+class Arrival(NamedTuple):
+    """How the measurements of a strut come.
+
+    Attributes:
+        interval_ns: Time between two.
+        delay_ns: How much later one comes than it is true.
+    """
+
+    interval_ns: int = 1_000_000
+    delay_ns: int = 0
 
 
 class RigCore:
@@ -47,13 +65,18 @@ class RigCore:
         plant: The model.
         observers: One for each of the model's struts, in their order.
         supervision: Ages and safe output.
+        arrivals: How each strut's measurements come; one a millisecond, at once, if absent.
 
     Raises:
         ValueError: There are more or fewer observers than struts.
     """
 
     def __init__(
-        self, plant: Plant, observers: Sequence[Observer], supervision: Supervision
+        self,
+        plant: Plant,
+        observers: Sequence[Observer],
+        supervision: Supervision,
+        arrivals: Sequence[Arrival] | None = None,
     ) -> None:
         if len(observers) != plant.struts:
             raise ValueError(
@@ -62,6 +85,8 @@ class RigCore:
         self._plant = plant
         self._observers = tuple(observers)
         self._supervision = supervision
+        self._arrivals = tuple(arrivals or [Arrival()] * len(observers))
+        self._oldest_ns = max(arrival.delay_ns for arrival in self._arrivals)
 
     @property
     def struts(self) -> int:
@@ -70,11 +95,11 @@ class RigCore:
 
     def changed(self, observers: Sequence[Observer], supervision: Supervision) -> "RigCore":
         """The same model with other observers and supervision."""
-        return RigCore(self._plant, observers, supervision)
+        return RigCore(self._plant, observers, supervision, self._arrivals)
 
     def init(self, t_ns: int) -> RigState:
         """State before the first tick."""
-        return RigState(t_ns, Mode.WAITING, AMBIENT_C, first=(None,) * self.struts)
+        return RigState(t_ns, Mode.WAITING, AMBIENT_C, first=((),) * self.struts)
 
     def step(self, state: RigState, step_input: StepInput) -> tuple[RigState, StepOutput]:
         """Advance by one tick.
@@ -90,7 +115,7 @@ class RigCore:
             return self._observe(state, state.model, step_input)
         if state.mode is Mode.SAFE and step_input.acknowledged:
             mode = next_mode(state.mode, Event.ACKNOWLEDGED)
-            state = replace(state, mode=mode, first=(None,) * self.struts)
+            state = replace(state, mode=mode, first=((),) * self.struts)
         if state.mode is Mode.WAITING:
             return self._try_to_start(state, step_input)
         if state.model is None or state.mode is Mode.SAFE:
@@ -99,21 +124,32 @@ class RigCore:
         return self._observe(state, state.model, step_input)
 
     def _try_to_start(self, state: RigState, step_input: StepInput) -> tuple[RigState, StepOutput]:
-        """Start the model at rest at the first measured heights, once every strut has one."""
+        """Start the model at the measured heights, once every strut has enough of them."""
         t_ns = step_input.t_ns
-        first = tuple(new or old for new, old in zip(step_input.heights, state.first, strict=True))
+        wanted = [observer.first_measurements for observer in self._observers]
+        first = tuple(
+            (*old, new)[-count:] if new is not None else old
+            for new, old, count in zip(step_input.heights, state.first, wanted, strict=True)
+        )
         temperature_c = _latest(step_input.temperature_c, state.temperature_c)
         state = replace(state, t_ns=t_ns, first=first, temperature_c=temperature_c)
-        measurements = [item for item in first if item is not None]
-        if len(measurements) < len(first) or not self._fresh(measurements, t_ns):
+        is_enough = all(len(given) == count for given, count in zip(first, wanted, strict=True))
+        newest = [given[-1] for given in first if given]
+        if not is_enough or not self._fresh(newest, t_ns):
             return state, StepOutput(state.mode, ())
-        observers = tuple(
-            observer.init(item)
-            for observer, item in zip(self._observers, measurements, strict=True)
-        )
-        model = self._plant.init([item.height_m for item in measurements], t_s=t_ns * 1e-9)
+        started = [started_at(given, t_ns) for given in first]
+        heights, velocities = [[item[i] for item in started] for i in (0, 1)]
+        model = self._plant.init(heights, velocities, t_s=t_ns * 1e-9)
         applied_n = _latest(step_input.applied_force_n, 0.0)
-        loaded = self._plant.load(model, (0.0,) * len(first), applied_n, temperature_c)
+        without = (0.0,) * len(first)
+        loaded = self._plant.load(model, without, applied_n, temperature_c)
+        mobilities = strut_mobilities(self._plant, model)
+        observers = tuple(
+            observer.init(Start(item.t_ns, mobility, arrival.interval_ns, arrival.delay_ns))
+            for observer, item, mobility, arrival in zip(
+                self._observers, newest, mobilities, self._arrivals, strict=True
+            )
+        )
         mode = next_mode(state.mode, Event.FRESH)
         return self._published(state, t_ns, mode, observers, loaded)
 
@@ -132,17 +168,36 @@ class RigCore:
         observers: list[Any] = []
         virtual_n: list[float] = []
         oldest_ns = t_ns
+        past = self._remembered(state, t_ns, model.struts)
         for index, observer in enumerate(self._observers):
-            height_m, velocity_m_per_s = model.struts[index]
-            observed = observer.step(
-                state.observers[index], t_ns, height_m, velocity_m_per_s, step_input.heights[index]
-            )
+            measured = step_input.heights[index]
+            innovation = None
+            if measured is not None:
+                model_m = _height_at(measured.t_ns, index, t_ns, model.struts, past)
+                innovation = Innovation(measured.height_m - model_m, measured.t_ns)
+            observed = observer.step(state.observers[index], t_ns, innovation)
             observers.append(observed)
             virtual_n.append(observed.virtual_force_n)
             oldest_ns = min(oldest_ns, observed.measured_ns)
         loaded = self._plant.load(model, virtual_n, applied_n, temperature_c)
         mode = mode_at_age(self._supervision, state.mode, t_ns - oldest_ns)
+        if past:
+            state = replace(state, past=past)
         return self._published(state, t_ns, mode, tuple(observers), loaded)
+
+    def _remembered(
+        self, state: RigState, t_ns: int, struts: Sequence[tuple[float, float]]
+    ) -> tuple[tuple[int, Sequence[tuple[float, float]]], ...]:
+        """The model's last heights, as far back as a measurement may be old."""
+        if not self._oldest_ns:
+            return ()
+        oldest_ns = t_ns - self._oldest_ns
+        kept = [(t_ns, struts)]
+        for record in state.past:
+            if kept[-1][0] <= oldest_ns:
+                break
+            kept.append(record)
+        return tuple(kept)
 
     def _published(
         self,
@@ -158,7 +213,7 @@ class RigCore:
         size = loaded.applied_force_n
         for index, observer in enumerate(observers):
             height_m, velocity_m_per_s = loaded.state.struts[index]
-            force_n = loaded.forces_n[index] + observer.virtual_force_n
+            force_n = loaded.forces_n[index] + observer.residual_force_n
             strut = StrutOutput(
                 force_n,
                 observer.virtual_force_n,
@@ -167,6 +222,7 @@ class RigCore:
                 velocity_m_per_s,
                 loaded.accelerations_m_per_s2[index],
                 observer.innovation_m,
+                observer.force_std_n,
             )
             struts.append(strut)
             size += force_n + height_m + velocity_m_per_s
@@ -187,6 +243,7 @@ class RigCore:
             observers=observers,
             first=before.first,
             model=loaded,
+            past=before.past,
         )
         return state, StepOutput(mode, published)
 
@@ -202,6 +259,52 @@ class RigCore:
             for force_n, (height_m, _) in zip(forces, state.model.state.struts, strict=True)
         )
         return StepOutput(state.mode, struts)
+
+
+def started_at(measurements: Sequence[Measurement], t_ns: int) -> tuple[float, float]:
+    """Height and velocity at a time, from the measurements before it.
+
+    Args:
+        measurements: One: the model starts at rest there. Three or more: a parabola through them.
+        t_ns: The time.
+    """
+    if len(measurements) == 1:
+        return measurements[0].height_m, 0.0
+    since_s = [(item.t_ns - t_ns) * 1e-9 for item in measurements]
+    longest_s = max(map(abs, since_s))
+    share = np.array(since_s) / longest_s
+    heights = np.array([item.height_m for item in measurements])
+    powers = np.column_stack([np.ones_like(share), share, share * share])
+    height, slope, _ = np.linalg.lstsq(powers, heights, rcond=None)[0]
+    return float(height), float(slope) / longest_s
+
+
+def strut_mobilities(plant: Plant, model: Any) -> list[float]:
+    """Acceleration of each strut's height per newton in that strut alone, in 1/kg."""
+    nothing = [0.0] * plant.struts
+    resting = plant.load(model, nothing, 0.0, AMBIENT_C).accelerations_m_per_s2
+    found: list[float] = []
+    for index in range(plant.struts):
+        pushed = [*nothing[:index], 1.0, *nothing[index + 1 :]]
+        moved = plant.load(model, pushed, 0.0, AMBIENT_C).accelerations_m_per_s2
+        found.append(moved[index] - resting[index])
+    return found
+
+
+def _height_at(
+    measured_ns: int,
+    index: int,
+    t_ns: int,
+    struts: Sequence[tuple[float, float]],
+    past: Sequence[tuple[int, Sequence[tuple[float, float]]]],
+) -> float:
+    """Height of the model when a measurement was true, to first order from the tick behind it."""
+    for earlier_ns, earlier in past:
+        if earlier_ns < measured_ns:
+            break
+        t_ns, struts = earlier_ns, earlier
+    height_m, velocity_m_per_s = struts[index]
+    return height_m - velocity_m_per_s * (t_ns - measured_ns) * 1e-9
 
 
 def _first_diverged(struts: Sequence[StrutOutput]) -> int:

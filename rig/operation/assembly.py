@@ -20,7 +20,7 @@ from rig.core.messages import (
 )
 from rig.core.prescribed import PrescribedCore
 from rig.core.quantities import HEIGHT
-from rig.core.step import RigCore
+from rig.core.step import Arrival, RigCore
 from rig.inputs.errors import InputError
 from rig.operation.setup import Setup
 
@@ -66,14 +66,25 @@ def _core(ready: Setup, model: ModelSpec) -> Core:
         settling_s = config.prescribed_motion.settling_s
         return PrescribedCore(PrescribedStrut(model), settling_s, supervision)
     observers = tuple(config.observers.values())
-    return RigCore(build_plant(ready, model), observers, supervision)
+    return RigCore(build_plant(ready, model), observers, supervision, arrivals(ready))
+
+
+def arrivals(ready: Setup) -> tuple[Arrival, ...]:
+    """How the measurements of each strut come: at their message's cycle, or one at each tick."""
+    found: list[Arrival] = []
+    for entry in ready.config.signals.height.values():
+        cycle_ns = ready.database.message(entry.message).cycle_time_ns or ready.config.period_ns
+        found.append(Arrival(cycle_ns, entry.delay_ns))
+    return tuple(found)
 
 
 def _incoming(ready: Setup) -> list[Incoming]:
     signals = ready.config.signals
     wanted: dict[str, list[Wanted]] = {}
     for index, entry in enumerate(signals.height.values()):
-        wanted.setdefault(entry.message, []).append(Wanted(entry.signal, HEIGHT, index))
+        wanted.setdefault(entry.message, []).append(
+            Wanted(entry.signal, HEIGHT, index, entry.delay_ns)
+        )
     for quantity, entry in signals.others.items():
         wanted.setdefault(entry.message, []).append(Wanted(entry.signal, quantity))
     return [incoming(ready.database.message(name), found) for name, found in wanted.items()]

@@ -6,6 +6,7 @@ from enum import Enum
 
 from can_dbc.bus_load import frame_time_s
 from can_dbc.database import Message
+from rig.core.closed_loop import Rhythm
 from rig.core.quantities import LOAD_CELL_FORCE
 from rig.core.stability import Pole, closed_loop_poles
 from rig.operation.assembly import build_bridge, build_plant
@@ -121,12 +122,16 @@ def _staleness(ready: Setup, heights: list[Message]) -> Finding:
         cell = ready.config.signals.others[LOAD_CELL_FORCE]
         messages.append(ready.database.message(cell.message))
     slowest_ns = max(message.cycle_time_ns or 0 for message in messages)
+    delay_ns = max(entry.delay_ns for entry in ready.config.signals.height.values())
     text = f"stale after {stale_ns * 1e-6:g} ms, slowest measurement every {slowest_ns * 1e-6:g} ms"
-    if stale_ns < slowest_ns + ready.config.period_ns:
+    if delay_ns:
+        text += f", {delay_ns * 1e-6:g} ms old when it comes"
+    if stale_ns < slowest_ns + delay_ns + ready.config.period_ns:
         return Finding(
             Severity.ERROR,
             "supervision.stale_after_s",
-            f"{text}: expected more than one cycle and one tick, or the bridge holds all the time",
+            f"{text}: expected more than one cycle, one tick and the delay, or the bridge holds "
+            "all the time",
         )
     return Finding(Severity.OK, "supervision.stale_after_s", text)
 
@@ -182,9 +187,12 @@ def _stability(ready: Setup, heights: list[Message]) -> list[Finding]:
     rest = tuple(strut.free_length_m for strut in ready.model.struts)
     slowest_ns = max(message.cycle_time_ns or 0 for message in heights)
     every = max(1, round(slowest_ns / config.period_ns))
-    poles = closed_loop_poles(plant, observers, rest, config.period_ns, every)
+    delay_ns = max(entry.delay_ns for entry in config.signals.height.values())
+    delay = round(delay_ns / (every * config.period_ns))
+    rhythm = Rhythm(config.period_ns, every, delay)
+    poles = closed_loop_poles(plant, observers, rest, rhythm)
     findings = [_worst(poles)]
-    late = closed_loop_poles(plant, observers, rest, config.period_ns, every, delay=1)
+    late = closed_loop_poles(plant, observers, rest, rhythm._replace(delay=delay + 1))
     worst = max(pole.magnitude for pole in late)
     text = f"largest |z| {worst:.5f} with measurements one cycle late"
     if worst < 1.0:

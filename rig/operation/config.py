@@ -51,6 +51,24 @@ class SignalName(_Frozen):
     signal: Text
 
 
+class HeightSignal(SignalName):
+    """Where a height stands on the bus, and how late it comes.
+
+    Attributes:
+        message: Message of the DBC.
+        signal: Signal of the message; its unit is converted.
+        delay_s: How much later its frame comes than it was true: filters of the sensor, its cycle,
+            the bus. The model's height of that time is compared with it.
+    """
+
+    delay_s: Annotated[float, Field(ge=0, le=1.0, allow_inf_nan=False)] = 0.0
+
+    @property
+    def delay_ns(self) -> int:
+        """The delay in ns."""
+        return round(self.delay_s * 1e9)
+
+
 class Signals(_Frozen):
     """What is read from the bus: heights, and any other quantity of `OTHERS` under its key.
 
@@ -63,7 +81,7 @@ class Signals(_Frozen):
         init=False
     )
 
-    height: Annotated[dict[str, SignalName], Field(min_length=1)]
+    height: Annotated[dict[str, HeightSignal], Field(min_length=1)]
 
     @model_validator(mode="before")
     @classmethod
@@ -88,7 +106,9 @@ class Signals(_Frozen):
 
     def named(self) -> dict[str, SignalName]:
         """All signals by their keys, heights first."""
-        heights = {f"signals.height.{name}": entry for name, entry in self.height.items()}
+        heights: dict[str, SignalName] = {
+            f"signals.height.{name}": entry for name, entry in self.height.items()
+        }
         others = {f"signals.{quantity.key}": entry for quantity, entry in self.others.items()}
         return {**heights, **others}
 

@@ -9,7 +9,8 @@ from pydantic import BaseModel, ConfigDict
 from can_dbc.database import DEFAULT_DATABASE, Database, Message, load_database
 from can_dbc.errors import DatabaseError
 from dart_model.spec import ModelSpec, load_model, model_file
-from rig.core.messages import ESTIMATE, KINEMATICS, STATUS, Publication
+from rig.core.messages import ESTIMATE, KINEMATICS, STATUS, UNCERTAINTY, Publication
+from rig.core.observers.kalman import KalmanObserver
 from rig.core.observers.pi import PiObserver
 from rig.inputs.errors import InputError
 from rig.inputs.yaml_file import load_validated, validated
@@ -121,7 +122,7 @@ def _with_names(config: RunConfig, model: ModelSpec, database: Database, source:
     heights = _named(config.signals.height, struts, f"{source}: signals.height")
     publish = config.publish
     if publish is None:
-        publish = _default_messages(struts, database)
+        publish = _default_messages(struts, database, config)
     publish = _named(publish, struts, f"{source}: publish")
     for key, names in (
         ("signals.height", heights),
@@ -166,13 +167,17 @@ def _named(given: Mapping[str, _Entry], struts: list[str], place: str) -> Mappin
     return {struts[0]: given[""]}
 
 
-def _default_messages(struts: list[str], database: Database) -> dict[str, Mapped]:
+def _default_messages(
+    struts: list[str], database: Database, config: RunConfig
+) -> dict[str, Mapped]:
     found: dict[str, Mapped] = {}
     for index, name in enumerate(struts):
         ending = "" if index == 0 else f"_{index + 1}"
         estimate = _all_in(f"RIG_ESTIMATE{ending}", ESTIMATE, database)
         kinematics = _all_in(f"RIG_KINEMATICS{ending}", KINEMATICS, database)
         found[name] = {**estimate, **kinematics}
+        if isinstance(config.observers.get(name), KalmanObserver):
+            found[name] |= _all_in(f"RIG_UNCERTAINTY{ending}", UNCERTAINTY, database)
     return found
 
 

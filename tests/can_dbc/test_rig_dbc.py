@@ -38,6 +38,7 @@ PHYSICAL = {
         ("RIG_KINEMATICS", "MODEL_VELOCITY", 2e-3, (-4.0, 4.0)),
         ("RIG_KINEMATICS", "MODEL_ACCELERATION", 0.1, (-200.0, 200.0)),
         ("RIG_KINEMATICS", "INNOVATION", 5e-6, (-0.01, 0.01)),
+        ("RIG_UNCERTAINTY", "FORCE_STD", 1e-3, (0.0, 1000.0)),
     ],
 )
 def test_range_and_resolution(
@@ -57,6 +58,8 @@ def test_range_and_resolution(
         ("BENCH_MEASUREMENT", 1, "BENCH"),
         ("BENCH_MEASUREMENT_2", 1, "BENCH"),
         ("DYNO_MEASUREMENT", 1, "BENCH"),
+        ("RIG_UNCERTAINTY", 10, "RIG"),
+        ("RIG_UNCERTAINTY_2", 10, "RIG"),
         ("BENCH_AUXILIARY", 10, "BENCH"),
         ("RIG_ESTIMATE", 1, "RIG"),
         ("RIG_ESTIMATE_2", 1, "RIG"),
@@ -89,13 +92,16 @@ def test_urgent_messages_win_arbitration(rig: Database) -> None:
         "DYNO_MEASUREMENT",
         "RIG_ESTIMATE",
         "RIG_KINEMATICS",
+        "RIG_UNCERTAINTY",
         "BENCH_AUXILIARY",
         "RIG_STATUS",
         "RIG_TIMING",
     ]
 
 
-@pytest.mark.parametrize("name", ["BENCH_MEASUREMENT", "RIG_ESTIMATE", "RIG_KINEMATICS"])
+@pytest.mark.parametrize(
+    "name", ["BENCH_MEASUREMENT", "RIG_ESTIMATE", "RIG_KINEMATICS", "RIG_UNCERTAINTY"]
+)
 def test_second_strut_has_the_same_signals(rig: Database, name: str) -> None:
     first, second = rig.message(name), rig.message(f"{name}_2")
     assert dict(first.signals) == dict(second.signals)

@@ -74,25 +74,34 @@ class Held(NamedTuple):
     innovation_m: float
     virtual_force_n: float
     measured_ns: int
+    force_std_n: float = float("nan")
+
+    @property
+    def residual_force_n(self):
+        return self.virtual_force_n
 
 @dataclass(frozen=True)
 class Proportional:
     kind: Literal["proportional"] = "proportional"
     gain_n_per_m: float = 1e5
 
-    def init(self, measured):
-        return Held(0.0, 0.0, measured.t_ns)
+    first_measurements = 1
 
-    def step(self, state, t_ns, height_m, velocity_m_per_s, measured):
-        if measured is None:
+    def init(self, start):
+        return Held(0.0, 0.0, start.t_ns)
+
+    settled = init
+
+    def step(self, state, t_ns, innovation):
+        if innovation is None:
             return state
-        innovation_m = measured.height_m - height_m
-        return Held(innovation_m, self.gain_n_per_m * innovation_m, measured.t_ns)
+        force_n = self.gain_n_per_m * innovation.value_m
+        return Held(innovation.value_m, force_n, innovation.t_ns)
 
     def numbers(self, state):
         return (state.virtual_force_n,)
 
-    def state_of(self, numbers):
+    def with_numbers(self, state, numbers):
         return Held(0.0, numbers[0], 0)
 
 import rig.core.observers as observers

@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
+from rig.core.observers.kalman import KalmanObserver
 from rig.core.observers.pi import PiObserver
 
-OBSERVERS: Mapping[str, type[Any]] = MappingProxyType({"pi": PiObserver})
+OBSERVERS: Mapping[str, type[Any]] = MappingProxyType({"pi": PiObserver, "kalman": KalmanObserver})
 """`kind` in a configuration -> a frozen pydantic dataclass that is an `Observer`."""
 
 DEFAULT_KIND = "pi"

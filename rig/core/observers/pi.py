@@ -4,17 +4,21 @@
 
 Reference: Cuesta, Luque, Mantaras, "A methodology to improve simulation of multibody systems using
 estimation techniques" (2021), equations (6) and (7). Anti-windup by conditional integration:
-Åström and Hägglund, "Advanced PID Control" (2006), section 3.5.
+Åström and Hägglund, "Advanced PID Control" (2006), section 3.5. With a `filter` the innovation is
+that of now, predicted from one that is some milliseconds old; and with a derivative gain its rate
+damps the loop, which the published method leaves to the model.
 """
 
 from collections.abc import Sequence
+from math import nan
 from typing import Literal
 
 from msgspec import Struct
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
-from rig.core.contract import Measurement
+from rig.core.contract import Innovation, Start
+from rig.core.observers.model_error import ErrorFilter, ErrorState
 from rig.inputs.yaml_file import NotNegative, Positive
 
 
@@ -26,12 +30,24 @@ class PiState(Struct, frozen=True, gc=False):
         innovation_m: Last innovation.
         virtual_force_n: Virtual force, constant until the next measurement.
         measured_ns: Time of the last measurement.
+        error: State of the filter; None without one.
     """
 
     integral_m_s: float
     innovation_m: float
     virtual_force_n: float
     measured_ns: int
+    error: ErrorState | None = None
+
+    @property
+    def residual_force_n(self) -> float:
+        """The virtual force: it is the estimate."""
+        return self.virtual_force_n
+
+    @property
+    def force_std_n(self) -> float:
+        """Not known."""
+        return nan
 
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
@@ -42,39 +58,57 @@ class PiObserver:
         kind: Tag of this observer in a configuration.
         proportional_n_per_m: K_P.
         integral_n_per_m_s: K_I.
+        derivative_n_s_per_m: Gain of the innovation's rate; wants `filter`.
         force_limit_n: Largest magnitude of the virtual force.
+        filter: Tells the innovation of now; without one the last is taken as it is.
     """
 
     kind: Literal["pi"] = "pi"
     proportional_n_per_m: NotNegative = 1.0e5
     integral_n_per_m_s: NotNegative = 1.0e4
+    derivative_n_s_per_m: NotNegative = 0.0
     force_limit_n: Positive = 1.0e4
+    filter: ErrorFilter | None = None
 
-    def init(self, measured: Measurement) -> PiState:
-        """State at the first measurement."""
-        return PiState(0.0, 0.0, 0.0, measured.t_ns)
+    def __post_init__(self) -> None:
+        """Refuse a derivative of the raw innovation: that is noise."""
+        if self.derivative_n_s_per_m and self.filter is None:
+            raise ValueError(
+                f"derivative_n_s_per_m {self.derivative_n_s_per_m:g}: expected filter beside it"
+            )
 
-    def step(
-        self,
-        state: PiState,
-        t_ns: int,
-        height_m: float,
-        velocity_m_per_s: float,
-        measured: Measurement | None,
-    ) -> PiState:
+    @property
+    def first_measurements(self) -> int:
+        """The model starts at rest, at the first measured height."""
+        return 1
+
+    def init(self, start: Start) -> PiState:
+        """State at the model's start."""
+        error = None if self.filter is None else self.filter.init(start)
+        return PiState(0.0, 0.0, 0.0, start.t_ns, error)
+
+    def settled(self, start: Start) -> PiState:
+        """State after a long time at rest."""
+        error = None if self.filter is None else self.filter.settled(start)
+        return PiState(0.0, 0.0, 0.0, start.t_ns, error)
+
+    def step(self, state: PiState, t_ns: int, innovation: Innovation | None) -> PiState:
         """State after a tick; arguments as of `Observer.step`.
 
         Between measurements the virtual force is constant. At the limit the integral grows no
         further.
         """
-        if measured is None:
+        if innovation is None:
             return state
-        # The model's height when the measurement was true, to first order.
-        model_m = height_m - velocity_m_per_s * (t_ns - measured.t_ns) * 1e-9
-        innovation_m = measured.height_m - model_m
-        elapsed_s = (measured.t_ns - state.measured_ns) * 1e-9
+        error, innovation_m, rate_m_per_s = state.error, innovation.value_m, 0.0
+        if self.filter is not None and error is not None:
+            error = self.filter.updated(error, innovation)
+            innovation_m, rate_m_per_s, *_ = self.filter.predicted(error, t_ns)
+        elapsed_s = (innovation.t_ns - state.measured_ns) * 1e-9
         integral_m_s = state.integral_m_s + innovation_m * elapsed_s
         proportional_n = self.proportional_n_per_m * innovation_m
+        if self.derivative_n_s_per_m:
+            proportional_n += self.derivative_n_s_per_m * rate_m_per_s
         force_n = proportional_n + self.integral_n_per_m_s * integral_m_s
         limit_n = self.force_limit_n
         if not -limit_n <= force_n <= limit_n:
@@ -82,13 +116,22 @@ class PiObserver:
                 integral_m_s = state.integral_m_s
                 force_n = proportional_n + self.integral_n_per_m_s * integral_m_s
             force_n = min(max(force_n, -limit_n), limit_n)
-        return PiState(integral_m_s, innovation_m, force_n, measured.t_ns)
+        if self.filter is not None and error is not None:
+            acceleration = -force_n * error.start.mobility_per_kg
+            error = self.filter.with_input(error, t_ns, acceleration)
+        return PiState(integral_m_s, innovation.value_m, force_n, innovation.t_ns, error)
 
-    def numbers(self, state: PiState) -> tuple[float, float]:
-        """Integral and virtual force: what the next state depends on."""
-        return state.integral_m_s, state.virtual_force_n
+    def numbers(self, state: PiState) -> tuple[float, ...]:
+        """Integral, virtual force and filter: what the next state depends on."""
+        own = state.integral_m_s, state.virtual_force_n
+        if self.filter is None or state.error is None:
+            return own
+        return (*own, *self.filter.numbers(state.error))
 
-    def state_of(self, numbers: Sequence[float]) -> PiState:
-        """The state of what `numbers` gave, last measured at time zero."""
-        integral_m_s, virtual_force_n = numbers
-        return PiState(integral_m_s, 0.0, virtual_force_n, 0)
+    def with_numbers(self, state: PiState, numbers: Sequence[float]) -> PiState:
+        """The state with other numbers, as `numbers` gives them."""
+        integral_m_s, virtual_force_n, *others = numbers
+        error = state.error
+        if self.filter is not None and error is not None:
+            error = self.filter.with_numbers(error, others)
+        return PiState(integral_m_s, state.innovation_m, virtual_force_n, state.measured_ns, error)

@@ -1,0 +1,118 @@
+"""The noise-aware observer: a filter of the model's error, which the virtual force takes away.
+
+The filter tells error, rate and residual force. The virtual force is the residual force and a
+feedback of error and rate,
+
+    F_v = m (d/m + omega_c² x + 2 zeta omega_c dx/dt),
+
+so that the model follows the filtered height through a force alone: its height and velocity stay
+what the integrator makes of them. What is published is the residual force, not the feedback beside
+it.
+
+Reference: Åström and Wittenmark, "Computer-Controlled Systems" (1997), 9.5, for the disturbance
+that is estimated and cancelled.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+from msgspec import Struct
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
+
+from rig.core.contract import Innovation, Start
+from rig.core.observers.model_error import ErrorFilter, ErrorState
+from rig.inputs.yaml_file import Positive
+
+_DAMPING = 0.8
+"""Damping ratio of the feedback: settles fast, hardly overshoots."""
+
+_MOST_PER_INTERVAL = 0.3
+"""Largest product of the feedback's corner and the time between two measurements: the hold of the
+virtual force takes half an interval of phase."""
+
+
+class KalmanState(Struct, frozen=True, gc=False):
+    """State of a noise-aware observer.
+
+    Attributes:
+        error: What is known of the model's error.
+        innovation_m: Last innovation.
+        virtual_force_n: Virtual force, constant until the next tick.
+        residual_force_n: Estimated residual force.
+        force_std_n: Its standard deviation.
+        measured_ns: Time of the last measurement.
+    """
+
+    error: ErrorState
+    innovation_m: float
+    virtual_force_n: float
+    residual_force_n: float
+    force_std_n: float
+    measured_ns: int
+
+
+@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
+class KalmanObserver:
+    """The noise-aware observer of one strut.
+
+    Attributes:
+        kind: Tag of this observer in a configuration.
+        filter: The filter; `rig tune` finds its bandwidth.
+        force_limit_n: Largest magnitude of the virtual force.
+    """
+
+    kind: Literal["kalman"]
+    filter: ErrorFilter
+    force_limit_n: Positive = 1.0e4
+
+    @property
+    def first_measurements(self) -> int:
+        """Enough for height and velocity: a parabola through twelve of them."""
+        return 12
+
+    def init(self, start: Start) -> KalmanState:
+        """State at the model's start."""
+        return self._at(self.filter.init(start), start)
+
+    def settled(self, start: Start) -> KalmanState:
+        """State after a long time at rest."""
+        return self._at(self.filter.settled(start), start)
+
+    def _at(self, error: ErrorState, start: Start) -> KalmanState:
+        std_n = self.filter.acceleration_std(error, start.t_ns) / start.mobility_per_kg
+        return KalmanState(error, 0.0, 0.0, 0.0, std_n, start.t_ns)
+
+    def step(self, state: KalmanState, t_ns: int, innovation: Innovation | None) -> KalmanState:
+        """State after a tick; arguments as of `Observer.step`."""
+        follower, error, innovation_m = self.filter, state.error, state.innovation_m
+        if innovation is not None:
+            error = follower.updated(error, innovation)
+            innovation_m = innovation.value_m
+        start = error.start
+        x, v, a, *_ = follower.predicted(error, t_ns)
+        interval_s = start.interval_ns * 1e-9
+        corner = min(follower.omega, _MOST_PER_INTERVAL / interval_s)
+        wanted = a + corner * corner * x + 2.0 * _DAMPING * corner * v
+        limit_n = self.force_limit_n
+        force_n = min(max(wanted / start.mobility_per_kg, -limit_n), limit_n)
+        std_n = follower.acceleration_std(error, t_ns) / start.mobility_per_kg
+        error = follower.with_input(error, t_ns, -force_n * start.mobility_per_kg)
+        residual_n = a / start.mobility_per_kg
+        return KalmanState(error, innovation_m, force_n, residual_n, std_n, error.t_ns)
+
+    def numbers(self, state: KalmanState) -> tuple[float, ...]:
+        """What the next state depends on."""
+        return (state.virtual_force_n, *self.filter.numbers(state.error))
+
+    def with_numbers(self, state: KalmanState, numbers: Sequence[float]) -> KalmanState:
+        """The state with other numbers, as `numbers` gives them."""
+        virtual_force_n, *others = numbers
+        return KalmanState(
+            self.filter.with_numbers(state.error, others),
+            state.innovation_m,
+            virtual_force_n,
+            state.residual_force_n,
+            state.force_std_n,
+            state.measured_ns,
+        )
