@@ -135,6 +135,16 @@ def si_range(message: Message, signal_name: str, dimension: Dimension) -> tuple[
     return min(ends), max(ends)
 
 
+def si_step(message: Message, signal_name: str, dimension: Dimension) -> float:
+    """Step of an integer signal in SI; of a float, what it resolves is not known: zero.
+
+    Raises:
+        DatabaseError: As for `compile_decoder`.
+    """
+    (field,) = _fields(message, [signal_name], [dimension])
+    return 0.0 if field.float_format else abs(field.scale)
+
+
 def decode_log(
     message: Message,
     signal_names: Sequence[str],

@@ -22,6 +22,7 @@ from rig.cli import (
     scoreboard,
     setting,
     timing,
+    tune,
     view,
 )
 from rig.cli.output import OK, WRONG_INPUT
@@ -42,6 +43,7 @@ app.command("run", epilog=run.EXAMPLES)(run.run)
 app.command("bench", epilog=bench.EXAMPLES)(bench.bench)
 app.command("view", epilog=view.EXAMPLES)(view.view)
 app.command("set", epilog=setting.EXAMPLES)(setting.set_command)
+app.command("tune", epilog=tune.EXAMPLES)(tune.tune_command)
 app.command("timing", epilog=timing.EXAMPLES)(timing.timing)
 app.command("replay", epilog=replay.EXAMPLES)(replay.replay_command)
 app.command("diagnose", epilog=diagnose.EXAMPLES)(diagnose.diagnose)

@@ -253,6 +253,7 @@ class StrutOutput(Struct, frozen=True, gc=False):
         acceleration_m_per_s2: Model acceleration.
         innovation_m: Innovation.
         force_std_n: Standard deviation of the estimated force; NaN where it is not known.
+        law_force_n: Force of the model's law alone, part of the estimated force.
     """
 
     force_n: float
@@ -263,6 +264,7 @@ class StrutOutput(Struct, frozen=True, gc=False):
     acceleration_m_per_s2: float
     innovation_m: float
     force_std_n: float = nan
+    law_force_n: float = nan
 
 
 class StepOutput(Struct, frozen=True, gc=False):

@@ -213,7 +213,8 @@ class RigCore:
         size = loaded.applied_force_n
         for index, observer in enumerate(observers):
             height_m, velocity_m_per_s = loaded.state.struts[index]
-            force_n = loaded.forces_n[index] + observer.residual_force_n
+            law_force_n = loaded.forces_n[index]
+            force_n = law_force_n + observer.residual_force_n
             strut = StrutOutput(
                 force_n,
                 observer.virtual_force_n,
@@ -223,6 +224,7 @@ class RigCore:
                 loaded.accelerations_m_per_s2[index],
                 observer.innovation_m,
                 observer.force_std_n,
+                law_force_n,
             )
             struts.append(strut)
             size += force_n + height_m + velocity_m_per_s

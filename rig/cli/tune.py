@@ -1,0 +1,185 @@
+"""`rig tune`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.output import ConfigFile, JsonFlag, console, print_json, table
+from rig.cli.watching import progress_bar
+from rig.inputs.errors import InputError
+
+if TYPE_CHECKING:
+    from rig.tuning.command import Stated, TunedStrut
+
+EXAMPLES = (
+    "Examples: `rig tune rig.yaml --run runs/7 --out tuned.yaml` · "
+    "`rig tune rig.yaml --residual-n 80 --up-to-hz 5 --observer pi`"
+)
+
+
+def tune_command(
+    config: ConfigFile,
+    run: Annotated[
+        Path | None,
+        typer.Option(
+            "--run",
+            metavar="RUN",
+            help="A run of the bench, some seconds of its usual motion: noise, residual force and "
+            "latency are taken from it.",
+        ),
+    ] = None,
+    residual_n: Annotated[
+        float | None,
+        typer.Option("--residual-n", min=0.0, help="Without a run: RMS of the residual force, N."),
+    ] = None,
+    up_to_hz: Annotated[
+        float | None,
+        typer.Option("--up-to-hz", min=0.0, help="Without a run: its highest frequency, Hz."),
+    ] = None,
+    noise_std_m: Annotated[
+        float | None,
+        typer.Option(
+            "--noise-std-m",
+            min=0.0,
+            help="Without a run: standard deviation of the height, m; absent: by the DBC's steps.",
+        ),
+    ] = None,
+    observer: Annotated[str, typer.Option("--observer", help="kalman (noise-aware), or pi.")] = (
+        "kalman"
+    ),
+    damping_ratio: Annotated[
+        float, typer.Option("--damping-ratio", min=0.0, max=1.0, help="Least that a pole keeps.")
+    ] = 0.1,
+    gain_margin: Annotated[
+        float, typer.Option("--gain-margin", min=1.0, max=20.0, help="Least factor to instability.")
+    ] = 2.0,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="Write the configuration, beside CONFIG."),
+    ] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option("--plot", metavar="FILE", help="Draw the expected error over bandwidth, PNG."),
+    ] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Find the gains of the observers with the smallest expected error of the force."""
+    from rig.operation.setup import load_setup
+    from rig.pages.tuning_picture import draw_tuning
+    from rig.tuning.command import tune, write_config
+    from rig.tuning.gains import KINDS, Aim
+
+    if observer not in KINDS:
+        raise InputError(f"--observer {observer!r}: expected one of {', '.join(KINDS)}")
+    for path in (out, plot):
+        if path is not None and path.exists():
+            raise InputError(f"{path}: exists, expected a new file")
+    stated = (residual_n, up_to_hz, noise_std_m)
+    source = _source(run, stated)
+    ready = load_setup(config)
+    with progress_bar() as bar:
+        found = tune(ready, source, observer, Aim(damping_ratio, gain_margin), bar)
+    if out is not None:
+        write_config(ready, found, out)
+    if plot is not None:
+        draw_tuning(found, plot)
+    if as_json:
+        print_json([_as_dict(strut) for strut in found])
+        return
+    for strut in found:
+        _print(strut, damping_ratio)
+    for path in (out, plot):
+        if path is not None:
+            console.print(f"Written: {path}", markup=False)
+
+
+def _source(run: Path | None, stated: tuple[float | None, ...]) -> "Path | Stated":
+    from rig.tuning.command import Stated
+
+    residual_n, up_to_hz, noise_std_m = stated
+    if run is not None:
+        if stated != (None, None, None):
+            raise InputError("--run: says what is to be expected, expected nothing stated beside")
+        return run
+    if not residual_n or not up_to_hz:
+        raise InputError("rig tune: expected --run RUN, or --residual-n and --up-to-hz above zero")
+    return Stated(residual_n, up_to_hz, noise_std_m)
+
+
+def _as_dict(strut: "TunedStrut") -> dict[str, object]:
+    from rig.tuning.command import plain
+
+    chosen, (_, published) = strut.found, strut.paper
+    return {
+        "strut": strut.name,
+        "observer": plain(chosen.observer),
+        "noise_std_m": strut.expectation.noise_std_m,
+        "delay_s": strut.delay_s,
+        "latency": None
+        if strut.latency is None
+        else {"value_s": strut.latency.delay_s, "std_s": strut.latency.std_s},
+        "bandwidth_hz": strut.bandwidth_hz,
+        "expected_force_error_n": {
+            "noise": chosen.expected.noise_n,
+            "lag": chosen.expected.lag_n,
+            "all": chosen.expected.force_n,
+            "paper": published.force_n,
+        },
+        "damping_ratio": chosen.expected.damping_ratio,
+        "gain_margin": chosen.gain_margin,
+        "poles": [pole._asdict() for pole in chosen.expected.poles],
+    }
+
+
+def _print(strut: "TunedStrut", damping_ratio: float) -> None:
+    from rig.tuning.command import plain
+
+    chosen, (_, published) = strut.found, strut.paper
+    shown = table(
+        "expected error of the force",
+        "tuned",
+        "published gains, by mass",
+        title=f"Observer of “{strut.name}”",
+    )
+    for label, name in (("by noise", "noise_n"), ("by lag", "lag_n"), ("RMS", "force_n")):
+        values = [getattr(item, name) for item in (chosen.expected, published)]
+        shown.add_row(label, *(f"{v:.3g} N" if v < 1e9 else "unstable" for v in values))
+    shown.add_row("bandwidth", f"{strut.bandwidth_hz:.3g} Hz", f"{strut.paper_hz:.3g} Hz")
+    shown.add_row(
+        "least damping ratio",
+        f"{chosen.expected.damping_ratio:.3f}",
+        f"{published.damping_ratio:.3f}",
+    )
+    margin = chosen.gain_margin
+    shown.add_row("gain margin", f"{margin:.3g}" if margin < 20.0 else "20 or more", "")
+    console.print(shown)
+    expectation = strut.expectation
+    rms_n = float(expectation.power_n2.sum()) ** 0.5
+    console.print(
+        f"Height: noise {1e6 * expectation.noise_std_m:.3g} µm. Residual force: {rms_n:.3g} N RMS "
+        f"({expectation.source}).",
+        markup=False,
+    )
+    if strut.latency is not None and strut.latency.std_s == float("inf"):
+        console.print("Latency of the height: this run does not tell it (one frequency alone?).")
+    elif strut.latency is not None:
+        low_ms, high_ms = 1e3 * max(strut.latency.low_s, 0.0), 1e3 * strut.latency.high_s
+        verdict = "" if strut.delay_s else "; not told from none, so none is set"
+        console.print(
+            f"Latency of the height: {1e3 * strut.latency.delay_s:.3g} ms (95 %: {low_ms:.3g} to "
+            f"{high_ms:.3g} ms){verdict}.",
+            markup=False,
+        )
+    slowest = ", ".join(
+        f"{pole.frequency_hz:.3g} Hz with {pole.damping_ratio:.2f}"
+        for pole in chosen.expected.poles[:6]
+    )
+    console.print(f"Poles, the slowest first: {slowest}.", markup=False)
+    console.print(f"observers.{strut.name}: {plain(chosen.observer)}", markup=False)
+    if chosen.expected.damping_ratio < damping_ratio - 1e-3:
+        console.print(
+            f"No gains keep a damping ratio of {damping_ratio:g}; the best that were found keep "
+            f"{chosen.expected.damping_ratio:.3f}.",
+            style="yellow",
+        )

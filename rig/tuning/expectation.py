@@ -1,0 +1,211 @@
+"""What an observer has to expect of a strut: noise of its height, spectrum of its residual force.
+
+From a run: the error that the model would have had without virtual force is the innovation plus the
+virtual force's double integral over the effective mass; its second derivative is the residual force
+over that mass, smoothed as in a diagnosis, which also finds the sensor's noise.
+"""
+
+import itertools
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.core.contract import Mode
+from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise, smooth
+from rig.inputs.errors import InputError
+from rig.io.run_log import read_run
+
+Array = NDArray[np.float64]
+
+_LONGEST_S = 60.0
+"""Of a run: enough for a spectrum, and short enough for a double integral in doubles."""
+
+_SHORTEST_S = 1.0
+_FEWEST = 200
+"""Measurements: fewer tell little of noise and spectrum."""
+
+_LINES = 120
+"""Frequencies into which a spectrum is gathered."""
+
+
+class Followed(NamedTuple):
+    """A stretch of a run, as the observer of one strut saw it.
+
+    Attributes:
+        t_s: Times at which the measured heights were true, shape (N,).
+        free_error_m: Error of the model had there been no virtual force, but for a straight line,
+            shape (N,).
+        tick_s: Times of the ticks, shape (M,).
+        law_force_n: Force of the model's law at them, shape (M,).
+        height_m: Model heights at them, shape (M,).
+        velocity_m_per_s: Model velocities at them, shape (M,).
+    """
+
+    t_s: Array
+    free_error_m: Array
+    tick_s: Array
+    law_force_n: Array
+    height_m: Array
+    velocity_m_per_s: Array
+
+
+class Residual(NamedTuple):
+    """Residual force of a stretch, smoothed over all of it.
+
+    Attributes:
+        noise_std_m: Standard deviation of the measured height.
+        t_s: Times, shape (N,).
+        force_n: Residual force, shape (N,).
+        std_n: Its standard deviation, shape (N,).
+    """
+
+    noise_std_m: float
+    t_s: Array
+    force_n: Array
+    std_n: Array
+
+
+class Expectation(NamedTuple):
+    """What an observer has to expect.
+
+    Attributes:
+        noise_std_m: Standard deviation of the measured height.
+        frequency_hz: Frequencies of the residual force, shape (N,).
+        power_n2: Its mean square at them, shape (N,).
+        source: Where that comes from, as a phrase.
+    """
+
+    noise_std_m: float
+    frequency_hz: Array
+    power_n2: Array
+    source: str
+
+
+def followed(steps: Any, folder: Path, strut: str, mobility_per_kg: float) -> Followed:
+    """The longest stretch of a run in which the observer followed its bench.
+
+    Args:
+        steps: Its steps, as an Arrow table.
+        folder: Folder of the run, to name it.
+        strut: Name of the strut.
+        mobility_per_kg: Acceleration of its height per newton in it.
+
+    Raises:
+        InputError: It has no such strut, or is too short.
+    """
+    if f"{strut}.force_n" not in steps.schema.names:
+        raise InputError(f"{folder}: no strut {strut}, expected a run of this configuration")
+
+    def column(name: str) -> Array:
+        return np.asarray(steps.column(name).to_numpy(), dtype=np.float64)
+
+    stretch = _longest(column("mode") == Mode.RUNNING)
+    tick_s = column("t_ns")[stretch] * 1e-9
+    stretch = slice(stretch.start, stretch.start + int(np.sum(tick_s <= tick_s[:1] + _LONGEST_S)))
+    tick_s = column("t_ns")[stretch] * 1e-9
+    virtual_n = column(f"{strut}.virtual_force_n")[stretch]
+    measured_s = column(f"{strut}.measured_t_ns")[stretch] * 1e-9
+    innovation_m = column(f"{strut}.innovation_m")[stretch]
+    fresh = np.isfinite(measured_s) & (measured_s >= tick_s[:1])
+    if np.sum(fresh) < _FEWEST or tick_s[-1] - tick_s[0] < _SHORTEST_S:
+        raise InputError(
+            f"{folder}: {np.sum(fresh)} heights in {np.ptp(tick_s) if len(tick_s) else 0.0:.2g} s "
+            f"of RUNNING without a break, expected {_FEWEST} in {_SHORTEST_S:g} s"
+        )
+    by_force = -virtual_n * mobility_per_kg
+    moved_m = _twice_integrated(tick_s, by_force, measured_s[fresh])
+    free_m = innovation_m[fresh] - moved_m
+    t_s = measured_s[fresh]
+    line = np.polynomial.Polynomial.fit(t_s, free_m, 1)
+    law = ("law_force_n", "height_m", "velocity_m_per_s")
+    law_n, height_m, velocity = (column(f"{strut}.{name}")[stretch] for name in law)
+    return Followed(t_s, free_m - line(t_s), tick_s, law_n, height_m, velocity)
+
+
+def residual(given: Followed, mobility_per_kg: float) -> Residual:
+    """The residual force of a stretch, smoothed, with what the data say of the sensor's noise."""
+    noise = estimate_noise(given.t_s, given.free_error_m)
+    found: Smoothed = smooth(given.t_s, given.free_error_m, noise)
+    return Residual(
+        float(np.sqrt(noise.variance)),
+        given.t_s,
+        found.states[:, 2] / mobility_per_kg,
+        found.deviations[:, 2] / mobility_per_kg,
+    )
+
+
+def of_run(folder: Path, strut: str, mobility_per_kg: float) -> Expectation:
+    """What a run says.
+
+    Args:
+        folder: Folder of the run.
+        strut: Name of the strut.
+        mobility_per_kg: Acceleration of its height per newton in it.
+
+    Raises:
+        InputError: It is no run, has no such strut, or is too short.
+    """
+    given = followed(read_run(folder).steps, folder, strut, mobility_per_kg)
+    found = residual(given, mobility_per_kg)
+    return Expectation(found.noise_std_m, *spectrum(found.t_s, found.force_n), str(folder))
+
+
+def stated(noise_std_m: float, rms_n: float, up_to_hz: float) -> Expectation:
+    """A residual force whose mean square is spread evenly over frequencies up to a highest one.
+
+    Args:
+        noise_std_m: Standard deviation of the measured height.
+        rms_n: Root mean square of the residual force.
+        up_to_hz: The highest frequency.
+    """
+    frequency_hz = np.asarray(up_to_hz * (np.arange(20) + 0.5) / 20.0, dtype=np.float64)
+    power_n2 = np.full(20, rms_n**2 / 20.0)
+    source = f"{rms_n:g} N up to {up_to_hz:g} Hz, as stated"
+    return Expectation(noise_std_m, frequency_hz, power_n2, source)
+
+
+def _longest(holds: NDArray[np.bool_]) -> slice:
+    """The longest stretch in which something holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], holds.astype(np.int8), [0]])))
+    if not len(edges):
+        return slice(0, 0)
+    begins, ends = edges[::2], edges[1::2]
+    best = int(np.argmax(ends - begins))
+    return slice(int(begins[best]), int(ends[best]))
+
+
+def _twice_integrated(tick_s: Array, acceleration: Array, t_s: Array) -> Array:
+    """An acceleration that is constant from each tick to the next, integrated twice."""
+    h = np.diff(tick_s)
+    rate = np.concatenate([[0.0], np.cumsum(acceleration[:-1] * h)])
+    moved = np.concatenate([[0.0], np.cumsum(rate[:-1] * h + 0.5 * acceleration[:-1] * h * h)])
+    tick = np.clip(np.searchsorted(tick_s, t_s, side="right") - 1, 0, len(tick_s) - 1)
+    since = t_s - tick_s[tick]
+    return moved[tick] + rate[tick] * since + 0.5 * acceleration[tick] * since * since
+
+
+def spectrum(t_s: Array, force_n: Array) -> tuple[Array, Array]:
+    """Mean square over frequency, gathered into some lines; a Hann window keeps the ends apart.
+
+    Args:
+        t_s: Times, shape (N,).
+        force_n: Force, shape (N,).
+
+    Returns:
+        Frequencies in Hz and mean squares in N².
+    """
+    even_s = np.linspace(t_s[0], t_s[-1], len(t_s))
+    even_n = np.interp(even_s, t_s, force_n)
+    window = np.hanning(len(even_n))
+    transform: Any = np.fft.rfft((even_n - np.average(even_n, weights=window)) * window)
+    power = 2.0 * np.abs(transform) ** 2 / (len(even_n) * np.sum(window**2))
+    frequency: Any = np.fft.rfftfreq(len(even_n), (t_s[-1] - t_s[0]) / (len(t_s) - 1))
+    edges = np.unique(np.geomspace(1, len(frequency), _LINES).astype(int))
+    lines = [slice(a, b) for a, b in itertools.pairwise(edges)]
+    powers = np.array([np.sum(power[line]) for line in lines])
+    centres = np.array(
+        [np.average(frequency[line], weights=power[line] + 1e-300) for line in lines]
+    )
+    return centres, powers

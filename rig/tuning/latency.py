@@ -1,0 +1,179 @@
+"""How much later a height comes than it is true, from a run of the bench.
+
+The applied force comes at once and the height late: held against a model that does not know it,
+the strut's force seems to depend on the applied force. With the right delay it is a function of
+height and of velocity, as far as the strut is one. So the run is computed again with a delay, the
+estimated force smoothed, and fitted with functions of height and velocity and with its own
+derivative by the delay: what of that derivative the functions cannot give says how far off the
+delay is, and how well that is known. Repeated until it stays (Gauss and Newton).
+
+A bench moved by a single sine tells nothing: whatever is periodic is a function of height and
+velocity there. The interval says so.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace as replaced
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.core.observers.kalman import KalmanObserver
+from rig.operation.replay import replay
+from rig.operation.setup import Setup
+from rig.tuning.expectation import followed, residual
+
+Array = NDArray[np.float64]
+
+_DEGREE = 7
+"""Of the polynomials in height and in velocity: enough for a knee or a progressive spring."""
+
+_ITERATIONS = 6
+_LEAST_SHARE = 0.1
+"""Of the derivative's power that the functions must not be able to give. Of one sine, whose start
+is in the run, they leave 0.02 and the delay comes out 2 ms wrong; of three sines 0.8, and 5 us."""
+
+_STEP_S = 0.5e-3
+"""Step of the derivative by the delay."""
+
+_SETTLED_S = 0.3
+"""After the start, when the observer follows."""
+
+
+class Latency(NamedTuple):
+    """A delay.
+
+    Attributes:
+        delay_s: Its value.
+        std_s: Its standard deviation; infinite where the run does not tell it.
+    """
+
+    delay_s: float
+    std_s: float
+
+    @property
+    def low_s(self) -> float:
+        """Lower end of the 95 % interval."""
+        return self.delay_s - 1.96 * self.std_s
+
+    @property
+    def high_s(self) -> float:
+        """Upper end of the 95 % interval."""
+        return self.delay_s + 1.96 * self.std_s
+
+
+class _Series(NamedTuple):
+    """A strut as a delay lets it look, by the time at which its heights came."""
+
+    arrived_s: Array
+    height_m: Array
+    velocity_m_per_s: Array
+    force_n: Array
+
+
+def delayed(ready: Setup, delay_s: float) -> Setup:
+    """A configuration whose heights come late by some time; they go stale later by it too."""
+    config = ready.config
+    heights = {
+        name: entry.model_copy(update={"delay_s": delay_s})
+        for name, entry in config.signals.height.items()
+    }
+    supervision = config.supervision.model_copy(
+        update={
+            "stale_after_s": config.supervision.stale_after_s + delay_s,
+            "safe_after_s": config.supervision.safe_after_s + delay_s,
+        }
+    )
+    signals = config.signals.model_copy(update={"height": heights})
+    config = config.model_copy(update={"signals": signals, "supervision": supervision})
+    return ready.model_copy(update={"config": config})
+
+
+def estimate_latency(
+    folder: Path,
+    ready: Setup,
+    strut: str,
+    mobility_per_kg: float,
+    observer: KalmanObserver,
+    longest_s: float,
+    progress: Callable[[float], None] = lambda _share: None,
+) -> Latency:
+    """The delay of a strut's height.
+
+    Args:
+        folder: Folder of the run.
+        ready: Its configuration.
+        strut: Name of the strut.
+        mobility_per_kg: Acceleration of its height per newton in it.
+        observer: A noise-aware observer that fits its noise and its residual force.
+        longest_s: Longest delay that is looked for.
+        progress: Called with the share that is done.
+
+    Raises:
+        InputError: The run is damaged or too short.
+    """
+    observers = {**ready.config.observers, strut: replaced(observer)}
+    config = ready.config.model_copy(update={"observers": observers})
+    ready = ready.model_copy(update={"config": config})
+
+    def series(delay_s: float) -> _Series:
+        steps = replay(folder, ready=delayed(ready, delay_s)).steps
+        given = followed(steps, folder, strut, mobility_per_kg)
+        found = residual(given, mobility_per_kg)
+        wanted = (found.t_s > given.tick_s[0] + _SETTLED_S) & (found.t_s <= given.tick_s[-1])
+        t_s = found.t_s[wanted]
+        law_n, height, velocity = (
+            np.interp(t_s, given.tick_s, column)
+            for column in (given.law_force_n, given.height_m, given.velocity_m_per_s)
+        )
+        return _Series(t_s + delay_s, height, velocity, law_n + found.force_n[wanted])
+
+    delay_s, std_s = 0.0, math.inf
+    for number in range(_ITERATIONS):
+        step_s, std_s = _step(series(delay_s), series(delay_s + _STEP_S))
+        progress((number + 1) / _ITERATIONS)
+        before_s = delay_s
+        delay_s = min(max(delay_s + step_s, 0.0), longest_s)
+        if not math.isfinite(std_s) or abs(delay_s - before_s) < 0.1 * std_s:
+            break
+    return Latency(delay_s, std_s)
+
+
+def _step(here: _Series, beside: _Series) -> tuple[float, float]:
+    """How far off the delay is, and the standard deviation of that."""
+    slope = np.interp(here.arrived_s, beside.arrived_s, beside.force_n) - here.force_n
+    slope = slope / _STEP_S
+    rows = _functions(here.height_m, here.velocity_m_per_s)
+
+    def unexplained(signal: Array) -> Array:
+        return signal - rows @ np.linalg.lstsq(rows, signal, rcond=None)[0]
+
+    missed, told = unexplained(here.force_n), unexplained(slope)
+    power = float(told @ told)
+    if power <= _LEAST_SHARE * float(slope @ slope):
+        return 0.0, math.inf
+    step_s = -float(missed @ told) / power
+    # Correlated errors: the variance of a product's sum, from its own spectrum at zero (Newey and
+    # West), with what the fit leaves as error.
+    errors = (missed + step_s * told) * told
+    return step_s, math.sqrt(max(_long_run_variance(errors), 0.0)) / power
+
+
+def _functions(height: Array, velocity: Array) -> Array:
+    """Polynomials of height and of velocity, a product and absolute velocity: (N, functions)."""
+    z = 2.0 * (height - height.mean()) / max(float(np.ptp(height)), 1e-12)
+    v = velocity / max(float(np.abs(velocity).max()), 1e-12)
+    powers = [item**power for item in (z, v) for power in range(1, _DEGREE + 1)]
+    return np.column_stack([np.ones_like(z), *powers, np.abs(v), np.abs(v) * v, z * v])
+
+
+def _long_run_variance(values: Array) -> float:
+    """Variance of the sum of a correlated series, lags up to a tenth of it, Bartlett weights."""
+    count = len(values)
+    lags = max(1, count // 10)
+    spectrum: Any = np.fft.rfft(values, 2 * count)
+    correlation = np.fft.irfft(np.abs(spectrum) ** 2)[: lags + 1]
+    weights = 1.0 - np.arange(lags + 1) / (lags + 1)
+    return float(correlation[0] + 2.0 * np.sum(weights[1:] * correlation[1:]))

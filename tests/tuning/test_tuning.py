@@ -1,0 +1,164 @@
+"""`rig tune` on runs of a simulated bench: noise, latency and gains against what is known."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+from can_dbc.database import DEFAULT_DATABASE
+from rig.bench.config import load_bench_config
+from rig.cli.main import main
+from rig.inputs.errors import InputError
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup, setup_of_folder
+from rig.tuning.command import Stated, tune, write_config
+from rig.tuning.gains import Aim
+
+STEP_M = 15e-6
+NOISE_M = 20e-6
+SINES = ((60.0, 8.0), (50.0, 19.3), (40.0, 37.7))
+
+
+def bench(folder, latency_ns=0, sines=SINES):
+    """A run of 8 s, from a bench with a noisy height of coarse steps that comes late."""
+    dbc = DEFAULT_DATABASE.read_text("utf-8")
+    fine = "SG_ HEIGHT : 12|20@1- (2E-006,0) [-1.048576|1.048574]"
+    (folder / "noisy.dbc").write_text(
+        dbc.replace(fine, f"SG_ HEIGHT : 12|20@1- ({STEP_M},0) [-7|7]")
+    )
+    content = yaml.safe_load((CONFIGS / "reference_bench.yaml").read_text())
+    height = {"signal": "HEIGHT", "strut": "strut", "noise_std_m": NOISE_M}
+    content["transmissions"] = [
+        {"message": "BENCH_MEASUREMENT", "latency_ns": latency_ns, "height": height},
+        {"message": "BENCH_MEASUREMENT_2", "applied_force": {"signal": "APPLIED_FORCE"}},
+    ]
+    content["applied_force"]["components"] = [
+        {"kind": "sine", "amplitude_n": n, "angular_frequency_rad_per_s": w} for n, w in sines
+    ]
+    (folder / "bench.yaml").write_text(yaml.safe_dump(content))
+    config = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
+    del config["timing"]
+    follower = {"bandwidth_hz": 16.0, "noise_std_m": 1e-5}
+    config |= {
+        "dbc": "noisy.dbc",
+        "signals": {
+            "height": {"message": "BENCH_MEASUREMENT", "signal": "HEIGHT"},
+            "applied_force": {"message": "BENCH_MEASUREMENT_2", "signal": "APPLIED_FORCE"},
+        },
+        "observers": {"strut": {"kind": "kalman", "filter": follower}},
+        "publish": {"force": {"message": "RIG_ESTIMATE", "signal": "SPRING_DAMPER_FORCE"}},
+    }
+    (folder / "rig.yaml").write_text(yaml.safe_dump(config))
+    ready = load_setup(folder / "rig.yaml", duration_s=8.0)
+    made = load_bench_config(folder / "bench.yaml")
+    with_bench(ready, made, folder / "run", lockstep=True, stop=lambda: False)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def late(tmp_path_factory):
+    return bench(tmp_path_factory.mktemp("late"), latency_ns=2_300_000)
+
+
+def tuned(folder, kind="kalman", source=None):
+    ready = load_setup(folder / "rig.yaml")
+    [found] = tune(ready, source or folder / "run", kind, Aim(), lambda _what, _share: None)
+    return ready, found
+
+
+def test_noise_latency_and_gains_come_from_a_run(late):
+    ready, found = tuned(late)
+    # The sensor's noise and the rounding of its steps.
+    assert found.expectation.noise_std_m == pytest.approx(
+        np.hypot(NOISE_M, STEP_M / 12**0.5), rel=0.03
+    )
+    # A tick's time is the first at which a frame is there: 2.3 ms are seen at the third tick.
+    assert found.latency.delay_s == pytest.approx(2.3e-3, abs=5e-5)
+    assert found.latency.low_s < found.delay_s < found.latency.high_s
+    assert found.found.expected.damping_ratio > 0.1
+    assert found.found.gain_margin > 2.0
+    path = late / "tuned.yaml"
+    write_config(ready, [found], path)
+    made = load_setup(path).config
+    assert made.observers["strut"].filter.bandwidth_hz == found.found.observer.filter.bandwidth_hz
+    assert made.signals.height["strut"].delay_s == found.delay_s
+    assert made.supervision.stale_after_s == pytest.approx(0.01 + found.delay_s)
+    with pytest.raises(InputError, match="File exists"):
+        write_config(ready, [found], path)
+    with pytest.raises(InputError, match="expected a file beside"):
+        write_config(ready, [found], late / "run" / "tuned.yaml")
+
+
+def test_one_sine_does_not_tell_the_latency(tmp_path):
+    folder = bench(tmp_path, latency_ns=5_000_000, sines=((100.0, 10.0),))
+    _, found = tuned(folder)
+    assert found.latency.std_s == float("inf")
+    assert found.delay_s == 0.0
+
+
+def test_the_choice_is_the_least_of_its_neighbours(late):
+    for kind in ("kalman", "pi"):
+        _, found = tuned(late, kind, Stated(60.0, 5.0))
+        assert found.expectation.noise_std_m == pytest.approx(STEP_M / 12**0.5)
+        least = min(item.force_n for _, item in found.sweep)
+        assert found.found.expected.force_n < 1.02 * least
+        # Stated is what no run told.
+        assert found.latency is None
+
+
+def test_less_noise_and_less_force_give_a_smaller_error(late):
+    some, less, quieter = (
+        tuned(late, source=Stated(*given))[1].found
+        for given in ((60.0, 5.0, 2e-5), (20.0, 5.0, 2e-5), (60.0, 5.0, 2e-6))
+    )
+    assert less.expected.force_n < some.expected.force_n
+    assert quieter.expected.force_n < some.expected.force_n
+    assert quieter.observer.filter.bandwidth_hz > some.observer.filter.bandwidth_hz
+
+
+def rig(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["rig", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+def test_the_command(late, monkeypatch, capsys, tmp_path):
+    asked = ("tune", late / "rig.yaml", "--residual-n", 60, "--up-to-hz", 5)
+    assert rig(monkeypatch, *asked, "--plot", tmp_path / "plot.png") == 0
+    said = capsys.readouterr().out
+    assert "published gains, by mass" in said
+    assert (tmp_path / "plot.png").stat().st_size > 10_000
+    assert rig(monkeypatch, *asked, "--json") == 0
+    [found] = json.loads(capsys.readouterr().out)
+    assert found["observer"]["kind"] == "kalman"
+    parts = found["expected_force_error_n"]
+    assert parts["all"] == pytest.approx(np.hypot(parts["noise"], parts["lag"]))
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        ((), "expected --run RUN, or --residual-n and --up-to-hz above zero"),
+        (("--residual-n", 5), "expected --run RUN"),
+        (("--run", "{run}", "--residual-n", 5), "--run: says what is to be expected"),
+        (("--run", "{run}", "--observer", "luenberger"), "expected one of kalman, pi"),
+        (("--run", "{folder}"), "run.yaml"),
+        (("--run", "{run}", "--out", "{folder}/rig.yaml"), "exists, expected a new file"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(late, monkeypatch, capsys, asked, says):
+    given = [str(item).format(run=late / "run", folder=late) for item in asked]
+    assert rig(monkeypatch, "tune", late / "rig.yaml", *given) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert says in said[0]
+
+
+def test_a_tuned_run_is_replayed_bit_by_bit(late):
+    assert replay(late / "run").different == 0
+    assert setup_of_folder(late / "run").config.observers["strut"].kind == "kalman"
