@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.core.contract import AMBIENT_C, Innovation, Observer, Plant, Start
-from rig.core.step import strut_mobilities
+from rig.core.step import Answer, strut_answers
 
 Array = NDArray[np.float64]
 
@@ -113,9 +113,9 @@ class Loop:
         start = plant.init(heights_m)
         self._law_n = plant.load(start, [0.0] * plant.struts, 0.0, AMBIENT_C).forces_n
         self._states = [
-            self._settled(observer, mobility)
-            for observer, mobility in zip(
-                self._observers, strut_mobilities(plant, start), strict=True
+            self._settled(observer, answer)
+            for observer, answer in zip(
+                self._observers, strut_answers(plant, heights_m), strict=True
             )
         ]
         parts = [
@@ -204,12 +204,13 @@ class Loop:
             b[:, column], d[column] = (up[0] - down[0]) / width, (up[1] - down[1]) / width
         return LinearLoop(a, b, c, d, self._rhythm.interval_ns * 1e-9)
 
-    def _settled(self, observer: Observer, mobility_per_kg: float) -> Any:
+    def _settled(self, observer: Observer, answer: Answer) -> Any:
         """An observer that has followed a bench at rest for long, its last tick at time zero."""
         rhythm = self._rhythm
         delay_ns, ticks = rhythm.delay * rhythm.interval_ns, rhythm.delay + 2
         begin_ns = -ticks * rhythm.interval_ns
-        start = Start(begin_ns - delay_ns, mobility_per_kg, rhythm.interval_ns, delay_ns)
+        mobility_per_kg, *law = answer
+        start = Start(begin_ns - delay_ns, mobility_per_kg, rhythm.interval_ns, delay_ns, *law)
         state = observer.settled(start)
         for number in range(1 - ticks, 1):
             for tick in range(1 - rhythm.measured_every, 1):

@@ -54,12 +54,17 @@ class Start(Struct, frozen=True, gc=False):
         mobility_per_kg: Acceleration of the strut's height per newton in the strut.
         interval_ns: Time between two measurements.
         delay_ns: How much later a measurement comes than it is true.
+        stiffness_per_s2: By how much that acceleration falls per metre of height: of the model's
+            own law, its stiffness over the effective mass.
+        damping_per_s: The same per m/s.
     """
 
     t_ns: int
     mobility_per_kg: float
     interval_ns: int
     delay_ns: int = 0
+    stiffness_per_s2: float = 0.0
+    damping_per_s: float = 0.0
 
 
 NO_OTHERS: tuple[float | None, ...] = (None,) * len(OTHERS)

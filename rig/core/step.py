@@ -42,6 +42,11 @@ class RigState(CoreState, frozen=True, gc=False, kw_only=True):
     past: tuple[tuple[int, Sequence[tuple[float, float]]], ...] = ()
 
 
+_SECANT_M, _SECANT_M_PER_S = 2e-3, 0.1
+"""Of the law's secants: a share of a usual stroke and speed, so that friction, which is infinitely
+steep at rest, counts as what it is on the way."""
+
+
 class Arrival(NamedTuple):
     """How the measurements of a strut come.
 
@@ -143,11 +148,11 @@ class RigCore:
         applied_n = _latest(step_input.applied_force_n, 0.0)
         without = (0.0,) * len(first)
         loaded = self._plant.load(model, without, applied_n, temperature_c)
-        mobilities = strut_mobilities(self._plant, model)
+        answers = strut_answers(self._plant, heights)
         observers = tuple(
-            observer.init(Start(item.t_ns, mobility, arrival.interval_ns, arrival.delay_ns))
-            for observer, item, mobility, arrival in zip(
-                self._observers, newest, mobilities, self._arrivals, strict=True
+            observer.init(Start(item.t_ns, answer[0], *arrival, *answer[1:]))
+            for observer, item, answer, arrival in zip(
+                self._observers, newest, answers, self._arrivals, strict=True
             )
         )
         mode = next_mode(state.mode, Event.FRESH)
@@ -281,15 +286,47 @@ def started_at(measurements: Sequence[Measurement], t_ns: int) -> tuple[float, f
     return float(height), float(slope) / longest_s
 
 
-def strut_mobilities(plant: Plant, model: Any) -> list[float]:
-    """Acceleration of each strut's height per newton in that strut alone, in 1/kg."""
+class Answer(NamedTuple):
+    """How the acceleration of a strut's height answers to that strut alone.
+
+    Attributes:
+        mobility_per_kg: To a newton in the strut.
+        stiffness_per_s2: To a metre of height, with the other sign.
+        damping_per_s: To a metre per second, with the other sign.
+    """
+
+    mobility_per_kg: float
+    stiffness_per_s2: float
+    damping_per_s: float
+
+
+def strut_answers(plant: Plant, heights_m: Sequence[float]) -> list[Answer]:
+    """How a model answers at rest at some heights, by secants of its accelerations."""
     nothing = [0.0] * plant.struts
-    resting = plant.load(model, nothing, 0.0, AMBIENT_C).accelerations_m_per_s2
-    found: list[float] = []
+
+    def acceleration(
+        index: int, *, height_m: float = 0.0, velocity: float = 0.0, force_n: float = 0.0
+    ) -> float:
+        def one(value: float) -> list[float]:
+            return [*nothing[:index], value, *nothing[index + 1 :]]
+
+        heights = [z + dz for z, dz in zip(heights_m, one(height_m), strict=True)]
+        state = plant.init(heights, one(velocity))
+        loaded = plant.load(state, one(force_n), 0.0, AMBIENT_C)
+        return loaded.accelerations_m_per_s2[index]
+
+    found: list[Answer] = []
     for index in range(plant.struts):
-        pushed = [*nothing[:index], 1.0, *nothing[index + 1 :]]
-        moved = plant.load(model, pushed, 0.0, AMBIENT_C).accelerations_m_per_s2
-        found.append(moved[index] - resting[index])
+        slopes = [
+            (acceleration(index, **{key: step}) - acceleration(index, **{key: -step}))
+            / (2.0 * step)
+            for key, step in (
+                ("force_n", 1.0),
+                ("height_m", _SECANT_M),
+                ("velocity", _SECANT_M_PER_S),
+            )
+        ]
+        found.append(Answer(slopes[0], -slopes[1], -slopes[2]))
     return found
 
 

@@ -13,7 +13,7 @@ from can_dbc.units import Dimension
 from rig.core.closed_loop import Rhythm
 from rig.core.observers.kalman import KalmanObserver
 from rig.core.observers.model_error import ErrorFilter
-from rig.core.step import strut_mobilities
+from rig.core.step import strut_answers
 from rig.inputs.errors import InputError
 from rig.inputs.yaml_file import parse_mapping, read_text
 from rig.operation.assembly import arrivals, build_plant
@@ -103,7 +103,7 @@ def tune(
         )
     plant = build_plant(ready)
     heights = [strut.free_length_m for strut in ready.model.struts]
-    mobilities = strut_mobilities(plant, plant.init(heights))
+    mobilities = [answer.mobility_per_kg for answer in strut_answers(plant, heights)]
     names = list(ready.config.observers)
     expectations: list[Expectation] = []
     for index, name in enumerate(names):

@@ -9,7 +9,14 @@ from hypothesis import strategies as st
 
 from rig.core.contract import Innovation, Start
 from rig.core.observers.kalman import KalmanObserver
-from rig.core.observers.model_error import ErrorFilter, _gain, _predicted, _steady, _transition
+from rig.core.observers.model_error import (
+    ErrorFilter,
+    Pace,
+    _gain,
+    _predicted,
+    _steady,
+    _transition,
+)
 from rig.core.observers.pi import PiObserver
 
 MS = 1_000_000
@@ -19,8 +26,8 @@ FILTER = ErrorFilter(bandwidth_hz=20.0, noise_std_m=2e-5)
 
 def test_the_steady_covariance_solves_the_riccati_equation():
     for interval in (0.02, 0.1, 0.5):
-        steady = _steady(interval)
-        gain, after = _gain(_predicted(steady.covariance, interval, 1))
+        steady = _steady(Pace(interval))
+        gain, after = _gain(_predicted(steady.covariance, Pace(interval), 1))
         assert np.allclose(after, steady.covariance, rtol=1e-5)
         assert np.allclose(gain, steady.gain, rtol=1e-5)
         assert np.all(np.linalg.eigvalsh(steady.covariance) > 0.0)
@@ -28,8 +35,8 @@ def test_the_steady_covariance_solves_the_riccati_equation():
 
 def test_a_fast_sampled_filter_is_a_butterworth_filter_of_fifth_order():
     interval = 0.002
-    transition, _ = _transition(interval)
-    gain = _steady(interval).gain
+    transition, _ = _transition(interval, 0.0, 0.0)
+    gain = _steady(Pace(interval)).gain
     loop = transition @ (np.eye(5) - np.outer(gain, np.eye(5)[0]))
     poles = np.log(np.linalg.eigvals(loop).astype(complex)) / interval
     expected = [np.exp(1j * math.pi * (0.5 + (2 * k + 1) / 10)) for k in range(5)]
@@ -37,11 +44,44 @@ def test_a_fast_sampled_filter_is_a_butterworth_filter_of_fifth_order():
         assert min(abs(poles - pole)) < 5e-3
 
 
-@given(first=st.floats(0.01, 0.5), second=st.floats(0.01, 0.5))
-def test_two_steps_are_one_step_of_their_sum(first, second):
-    (a, p), (b, q), (c, r) = (_transition(t) for t in (first, second, first + second))
-    assert np.allclose(b @ a, c, atol=1e-14)
-    assert np.allclose(b @ p @ b.T + q, r, rtol=1e-9, atol=1e-18)
+@settings(deadline=None)
+@given(
+    first=st.floats(0.01, 0.5),
+    second=st.floats(0.01, 0.5),
+    stiffness=st.floats(0.0, 2.0),
+    damping=st.floats(0.0, 2.0),
+)
+def test_two_steps_are_one_step_of_their_sum(first, second, stiffness, damping):
+    times = (first, second, first + second)
+    (a, p), (b, q), (c, r) = (_transition(t, stiffness, damping) for t in times)
+    assert np.allclose(b @ a, c, atol=1e-13)
+    assert np.allclose(b @ p @ b.T + q, r, rtol=1e-7, atol=1e-16)
+
+
+@given(time=st.floats(0.01, 2.0))
+def test_without_a_law_the_noise_is_that_of_integrators(time):
+    """Closed form of the integrated random walk."""
+    transition, noise = _transition(time, 0.0, 0.0)
+    for row in range(5):
+        for column in range(5):
+            up, left = 4 - row, 4 - column
+            power = up + left + 1
+            expected = time**power / (power * math.factorial(up) * math.factorial(left))
+            assert noise[row, column] == pytest.approx(expected, rel=1e-6)
+            if column >= row:
+                gap = column - row
+                expected = time**gap / math.factorial(gap)
+                assert transition[row, column] == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_mean_moves_as_the_transition_says():
+    """At steps of a quarter of the model's own radian; the Taylor series ends at the fifth."""
+    follower = ErrorFilter(bandwidth_hz=1.0 / (2.0 * math.pi), noise_std_m=1.0)
+    start = Start(0, 1.0, 250 * MS, 0, 1.0, 0.4)
+    state = follower.with_numbers(follower.settled(start), (0.3, -0.2, 0.5, 0.1, -0.4, 0.0))
+    moved = follower.predicted(state, 250 * MS)
+    transition, _ = _transition(0.25, 1.0, 0.4)
+    assert moved == pytest.approx(transition @ np.array(state.mean), abs=1e-5)
 
 
 def run_filter(error_m, inputs, follower=FILTER, start=START):
@@ -80,7 +120,7 @@ def test_its_standard_deviation_is_that_of_its_errors():
     """Over 400 random walks and sensors: the chi-square of the error at the end."""
     rng = np.random.default_rng(2)
     interval = FILTER.omega * 1e-3
-    transition, noise = _transition(interval)
+    transition, noise = _transition(interval, 0.0, 0.0)
     root = np.linalg.cholesky(interval * noise)
     unit = np.array([FILTER.omega**k for k in range(5)]) * FILTER.noise_std_m
     squares = []
@@ -92,7 +132,7 @@ def test_its_standard_deviation_is_that_of_its_errors():
             walk = transition @ walk + root @ rng.standard_normal(5)
             seen = (walk[0] + rng.standard_normal()) * FILTER.noise_std_m
             state = FILTER.updated(state, Innovation(seen, tick * MS))
-        std = FILTER.acceleration_std(state, 160 * MS) / math.sqrt(state.scale)
+        std = FILTER.residual_std(state, 160 * MS) / math.sqrt(state.scale)
         squares.append(((state.mean[2] - walk[2] * unit[2]) / std) ** 2)
     # The sum of 400 squares of standard normal numbers, within four deviations.
     assert np.sum(squares) == pytest.approx(400.0, abs=4.0 * math.sqrt(800.0))
@@ -109,9 +149,9 @@ def test_the_scale_follows_a_sensor_that_is_noisier_than_configured():
 def test_after_missing_measurements_it_knows_less_and_then_as_much_again(missing, seed):
     rng = np.random.default_rng(seed)
     state = FILTER.settled(START)
-    steady = FILTER.acceleration_std(state, 0)
+    steady = FILTER.residual_std(state, 0)
     t_ns = missing * MS + MS
-    assert FILTER.acceleration_std(state, t_ns) > steady
+    assert FILTER.residual_std(state, t_ns) > steady
     state = FILTER.updated(state, Innovation(2e-5 * rng.standard_normal(), t_ns))
     assert state.covariance is not None
     for tick in range(1, 400):

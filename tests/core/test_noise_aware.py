@@ -16,7 +16,7 @@ from rig.core.observers.kalman import KalmanObserver
 from rig.core.observers.model_error import ErrorFilter
 from rig.core.observers.pi import PiObserver
 from rig.core.stability import closed_loop_poles
-from rig.core.step import Arrival, RigCore, started_at, strut_mobilities
+from rig.core.step import Arrival, RigCore, started_at, strut_answers
 from rig.core.supervisor import Supervision
 from rig.operation.config import CONFIGS
 from tests.core.cores import MS, others
@@ -172,7 +172,9 @@ def test_a_start_from_several_heights_is_a_parabola_through_them():
     assert started_at(given[:1], 0) == (heights[0], 0.0)
 
 
-def test_mobilities_are_those_of_the_masses():
+def test_answers_are_those_of_masses_springs_and_dampers():
     plant = DartPlant(load_model(MODELS / "quarter_car.yaml"))
-    found = strut_mobilities(plant, plant.init((0.29, 0.35)))
-    assert found == pytest.approx([1.0 / 3.0, 1.0 / 3.0 + 1.0 / 15.0], rel=1e-9)
+    tyre, suspension = strut_answers(plant, (0.29, 0.35))
+    both = 1.0 / 3.0 + 1.0 / 15.0
+    assert tyre == pytest.approx((1.0 / 3.0, 20000.0 / 3.0, 130.0 / 3.0), rel=1e-6)
+    assert suspension == pytest.approx((both, 800.0 * both, 120.0 * both), rel=1e-6)

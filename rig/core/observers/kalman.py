@@ -1,13 +1,13 @@
 """The noise-aware observer: a filter of the model's error, which the virtual force takes away.
 
-The filter tells error, rate and residual force. The virtual force is the residual force and a
+The filter tells error, rate and residual force d. The virtual force is the residual force and a
 feedback of error and rate,
 
-    F_v = m (d/m + omega_c² x + 2 zeta omega_c dx/dt),
+    F_v = d + m omega_c² x + 2 m zeta omega_c dx/dt,
 
 so that the model follows the filtered height through a force alone: its height and velocity stay
-what the integrator makes of them. What is published is the residual force, not the feedback beside
-it.
+what the integrator makes of them. What is published is the force that the model's law
+lacks where the model is, d - k x - c dx/dt, not the feedback beside it.
 
 Reference: Åström and Wittenmark, "Computer-Controlled Systems" (1997), 9.5, for the disturbance
 that is estimated and cancelled.
@@ -80,7 +80,7 @@ class KalmanObserver:
         return self._at(self.filter.settled(start), start)
 
     def _at(self, error: ErrorState, start: Start) -> KalmanState:
-        std_n = self.filter.acceleration_std(error, start.t_ns) / start.mobility_per_kg
+        std_n = self.filter.residual_std(error, start.t_ns) / start.mobility_per_kg
         return KalmanState(error, 0.0, 0.0, 0.0, std_n, start.t_ns)
 
     def step(self, state: KalmanState, t_ns: int, innovation: Innovation | None) -> KalmanState:
@@ -90,15 +90,16 @@ class KalmanObserver:
             error = follower.updated(error, innovation)
             innovation_m = innovation.value_m
         start = error.start
-        x, v, a, *_ = follower.predicted(error, t_ns)
+        mean = follower.predicted(error, t_ns)
+        x, v, a, *_ = mean
         interval_s = start.interval_ns * 1e-9
         corner = min(follower.omega, _MOST_PER_INTERVAL / interval_s)
         wanted = a + corner * corner * x + 2.0 * _DAMPING * corner * v
         limit_n = self.force_limit_n
         force_n = min(max(wanted / start.mobility_per_kg, -limit_n), limit_n)
-        std_n = follower.acceleration_std(error, t_ns) / start.mobility_per_kg
+        std_n = follower.residual_std(error, t_ns) / start.mobility_per_kg
         error = follower.with_input(error, t_ns, -force_n * start.mobility_per_kg)
-        residual_n = a / start.mobility_per_kg
+        residual_n = follower.residual(error, mean) / start.mobility_per_kg
         return KalmanState(error, innovation_m, force_n, residual_n, std_n, error.t_ns)
 
     def numbers(self, state: KalmanState) -> tuple[float, ...]:

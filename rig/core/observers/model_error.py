@@ -3,9 +3,10 @@
 Bench and model carry the same loads but for the residual force d and the virtual force F_v, so that
 the error of the model's height, x = z - z_model, obeys
 
-    d²x/dt² = (d - F_v) / m,    m the effective mass that the strut's force moves,
+    m d²x/dt² = d - F_v - k x - c dx/dt,
 
-whatever law the model has. The residual force is an integrated random walk of third order (the
+m the effective mass that the strut's force moves, k and c the slopes of the model's own law, which
+is not where the bench is. The residual force is an integrated random walk of third order (the
 third derivative of d is white noise): a smooth force that nothing else is known of. State: x, its
 rate, and the acceleration d / m with its first two derivatives. The virtual force is a known input,
 so that the filter also tells where the error stands now, when the newest measurement is some
@@ -25,7 +26,7 @@ References:
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from msgspec import Struct
@@ -33,6 +34,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
+from scipy.linalg import expm  # pyright: ignore[reportUnknownVariableType]
 
 from rig.core.contract import Innovation, Start
 from rig.inputs.yaml_file import Positive
@@ -41,15 +43,15 @@ Array = NDArray[np.float64]
 Mean = tuple[float, float, float, float, float]
 
 ORDER = 5
-"""States: error, rate, acceleration and two derivatives of it. With three or four the reference
-case's force error is 2.7 or 1.05 % of the peak at its best bandwidth, with five 0.85 %, under 20 um
-of noise."""
+"""States: error, rate, acceleration by the residual force and two derivatives of it. With three or
+four the reference case's force error is 2.7 or 1.05 % of the peak at its best bandwidth, with five
+0.85 %, under 20 um of noise."""
 
 _SETTLED = 1e-6
 """Relative distance of the variances from their limit below which the gains are constant."""
 
-_MOST_UPDATES = 1_000_000
-"""Updates until the limit is reached: bandwidths below 1e-5 of the rate take longer."""
+_MOST_DOUBLINGS = 60
+"""Of the recursion for the limit: more updates than any run has."""
 
 _ACCELERATION_STD_M_PER_S2 = 30.0
 """Of the residual force over the mass, before anything was measured: three times gravity."""
@@ -140,10 +142,10 @@ class ErrorFilter:
         """
         if innovation.t_ns <= state.t_ns:
             return state
-        mean = _moved(state.mean, state.inputs, state.t_ns, innovation.t_ns)
+        mean = _moved(state, innovation.t_ns)
         interval_ns = state.start.interval_ns
         number = max(1, round((innovation.t_ns - state.t_ns) / interval_ns))
-        steady = self._steady(interval_ns)
+        steady = self._steady(state.start)
         covariance, scale = state.covariance, state.scale
         # What is new in a measurement: its distance from the error that was predicted.
         new_m = innovation.value_m - mean[0]
@@ -155,7 +157,7 @@ class ErrorFilter:
             scale = min(max(scale, _SMALLEST_SCALE), _LARGEST_SCALE)
         else:
             before = steady.covariance if covariance is None else covariance
-            gain, covariance = self._gain(before, number, interval_ns)
+            gain, covariance = _gain(_predicted(before, self._pace(state.start), number))
             limit = np.diagonal(steady.covariance)
             if np.all(np.abs(np.diagonal(covariance) - limit) <= _SETTLED * limit):
                 covariance = None
@@ -182,16 +184,27 @@ class ErrorFilter:
         polynomial would run away: the error is predicted up to there.
         """
         end_ns = min(t_ns, state.t_ns + self._longest_ns(state))
-        return _moved(state.mean, state.inputs, state.t_ns, end_ns)
+        return _moved(state, end_ns)
 
-    def acceleration_std(self, state: ErrorState, t_ns: int) -> float:
-        """Standard deviation of the acceleration by the residual force, at a time, in m/s²."""
+    def residual(self, state: ErrorState, mean: Mean) -> float:
+        """Acceleration by the force that the model lacks where it is now, in m/s².
+
+        Args:
+            state: The state.
+            mean: Of now, from `predicted`.
+        """
+        x, v, a, *_ = mean
+        return a - state.start.stiffness_per_s2 * x - state.start.damping_per_s * v
+
+    def residual_std(self, state: ErrorState, t_ns: int) -> float:
+        """Standard deviation of `residual`, at a time, in m/s²."""
         interval_ns = state.start.interval_ns
         number = (t_ns - state.t_ns + interval_ns // 2) // interval_ns
+        pace = self._pace(state.start)
         if state.covariance is None:
-            variance = self._steady_ahead(interval_ns, number)
+            variance = _steady_ahead(pace, number)
         else:
-            variance = _ahead(state.covariance, self.omega * interval_ns * 1e-9, number)
+            variance = _ahead(state.covariance, pace, number)
         return math.sqrt(state.scale * variance) * self.noise_std_m * self.omega**2
 
     def with_input(self, state: ErrorState, t_ns: int, acceleration: float) -> ErrorState:
@@ -218,23 +231,34 @@ class ErrorFilter:
         )
         return replace(state, mean=(x, v, a, j, s), inputs=inputs)
 
-    def innovation_variance(self, interval_ns: int) -> float:
-        """Variance of a steady filter's innovation, in units of the sensor's."""
-        return self._steady(interval_ns).innovation
-
     def _longest_ns(self, state: ErrorState) -> int:
         """How long after the last measurement the error is predicted."""
         return state.start.delay_ns + 2 * state.start.interval_ns + round(1e9 / self.omega)
 
-    def _steady(self, interval_ns: int) -> Steady:
-        return _steady(self.omega * interval_ns * 1e-9)
+    def _pace(self, start: Start) -> "Pace":
+        omega = self.omega
+        return Pace(
+            omega * start.interval_ns * 1e-9,
+            start.stiffness_per_s2 / omega**2,
+            start.damping_per_s / omega,
+        )
 
-    def _steady_ahead(self, interval_ns: int, number: int) -> float:
-        return _steady_ahead(self.omega * interval_ns * 1e-9, number)
+    def _steady(self, start: Start) -> Steady:
+        return _steady(self._pace(start))
 
-    def _gain(self, covariance: Array, number: int, interval_ns: int) -> tuple[Array, Array]:
-        interval = self.omega * interval_ns * 1e-9
-        return _gain(_predicted(covariance, interval, number))
+
+class Pace(NamedTuple):
+    """What the variances depend on, in units of 1 / omega.
+
+    Attributes:
+        interval: Time between two measurements.
+        stiffness: Of the model's law over the mass.
+        damping: Of the model's law over the mass.
+    """
+
+    interval: float
+    stiffness: float = 0.0
+    damping: float = 0.0
 
 
 def _from(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tuple[int, float], ...]:
@@ -245,9 +269,11 @@ def _from(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tuple[int, 
     return inputs[first:]
 
 
-def _moved(mean: Mean, inputs: tuple[tuple[int, float], ...], from_ns: int, to_ns: int) -> Mean:
+def _moved(state: ErrorState, to_ns: int) -> Mean:
     """The mean at a later time, under the inputs in between."""
-    x, v, a, j, s = mean
+    x, v, a, j, s = state.mean
+    inputs, from_ns = state.inputs, state.t_ns
+    stiffness, damping = state.start.stiffness_per_s2, state.start.damping_per_s
     last = len(inputs) - 1
     for index, (_, by_force) in enumerate(inputs):
         end_ns = to_ns if index == last else min(inputs[index + 1][0], to_ns)
@@ -255,9 +281,14 @@ def _moved(mean: Mean, inputs: tuple[tuple[int, float], ...], from_ns: int, to_n
             continue
         h = (end_ns - from_ns) * 1e-9
         from_ns = end_ns
-        b = a + by_force
-        x += h * (v + h * (b / 2.0 + h * (j / 6.0 + h * s / 24.0)))
-        v += h * (b + h * (j / 2.0 + h * s / 6.0))
+        # The error's derivatives, for its Taylor series up to the fifth: at one radian a step of
+        # the model's own oscillation a thousandth is left out.
+        x2 = a + by_force - stiffness * x - damping * v
+        x3 = j - stiffness * v - damping * x2
+        x4 = s - stiffness * x2 - damping * x3
+        x5 = -stiffness * x3 - damping * x4
+        x += h * (v + h * (x2 / 2.0 + h * (x3 / 6.0 + h * (x4 / 24.0 + h * x5 / 120.0))))
+        v += h * (x2 + h * (x3 / 2.0 + h * (x4 / 6.0 + h * x5 / 24.0)))
         a += h * (j + h * s / 2.0)
         j += h * s
     return x, v, a, j, s
@@ -270,53 +301,61 @@ def _gain(ahead: Array) -> tuple[Array, Array]:
     return gain, 0.5 * (after + after.T)
 
 
-def _predicted(covariance: Array, interval: float, number: int) -> Array:
+def _predicted(covariance: Array, pace: Pace, number: int) -> Array:
     """Covariance some intervals later; a sensor's noise is a density of one an interval."""
-    transition, noise = _transition(interval * number)
-    return transition @ covariance @ transition.T + interval * noise
+    transition, noise = _transition(pace.interval * number, pace.stiffness, pace.damping)
+    return transition @ covariance @ transition.T + pace.interval * noise
 
 
-def _ahead(covariance: Array, interval: float, number: int) -> float:
-    """Variance of the acceleration some intervals later."""
-    if number < 1:
-        return float(covariance[2, 2])
-    return float(_predicted(covariance, interval, number)[2, 2])
-
-
-@lru_cache(maxsize=256)
-def _transition(time: float) -> tuple[Array, Array]:
-    """Transition over a time, and covariance of what unit white noise adds meanwhile."""
-    transition, noise = np.eye(ORDER), np.empty((ORDER, ORDER))
-    for row in range(ORDER):
-        for column in range(ORDER):
-            if column > row:
-                transition[row, column] = time ** (column - row) / math.factorial(column - row)
-            up, left = ORDER - 1 - row, ORDER - 1 - column
-            power = up + left + 1
-            noise[row, column] = time**power / (power * math.factorial(up) * math.factorial(left))
-    return transition, noise
-
-
-@lru_cache(maxsize=256)
-def _steady(interval: float) -> Steady:
-    """The limit of the filter's recursion, from unit covariance on.
-
-    Args:
-        interval: Time between two measurements, in units of 1 / omega.
-    """
-    covariance = np.eye(ORDER)
-    for _ in range(_MOST_UPDATES):
-        ahead = _predicted(covariance, interval, 1)
-        gain, after = _gain(ahead)
-        change = np.abs(np.diagonal(after) - np.diagonal(covariance))
-        if np.all(change <= 0.01 * _SETTLED * interval * np.diagonal(after)):
-            return Steady(gain, float(ahead[0, 0]) + 1.0, after)
-        covariance = after
-    raise ArithmeticError(
-        f"a bandwidth of {interval / 2.0 / math.pi:g} of the rate does not settle"
-    )
+def _ahead(covariance: Array, pace: Pace, number: int) -> float:
+    """Variance of the residual force's acceleration some intervals later."""
+    if number >= 1:
+        covariance = _predicted(covariance, pace, number)
+    row = np.array([-pace.stiffness, -pace.damping, 1.0, 0.0, 0.0])
+    return float(row @ covariance @ row)
 
 
 @lru_cache(maxsize=1024)
-def _steady_ahead(interval: float, number: int) -> float:
-    return _ahead(_steady(interval).covariance, interval, number)
+def _transition(time: float, stiffness: float, damping: float) -> tuple[Array, Array]:
+    """Transition over a time, and covariance of what unit white noise adds meanwhile.
+
+    Reference: Van Loan, Computing integrals involving the matrix exponential, IEEE TAC 23 (1978).
+    """
+    rates = np.diag(np.ones(ORDER - 1), 1)
+    rates[1, :2] = -stiffness, -damping
+    driven = np.zeros((ORDER, ORDER))
+    driven[-1, -1] = 1.0
+    both = cast("Any", expm)(time * np.block([[-rates, driven], [np.zeros_like(rates), rates.T]]))
+    transition = np.ascontiguousarray(both[ORDER:, ORDER:].T)
+    noise = transition @ both[:ORDER, ORDER:]
+    return transition, 0.5 * (noise + noise.T)
+
+
+@lru_cache(maxsize=256)
+def _steady(pace: Pace) -> Steady:
+    """The limit of the filter's recursion, by doubling its length in each iteration.
+
+    Reference: Chu, Fan, Lin, Wang, Structure-preserving algorithms for periodic discrete-time
+    algebraic Riccati equations, Int. J. Control 77 (2004).
+    """
+    transition, noise = _transition(pace.interval, pace.stiffness, pace.damping)
+    a, g, ahead = transition.T, np.zeros((ORDER, ORDER)), pace.interval * noise
+    g[0, 0] = 1.0
+    for _ in range(_MOST_DOUBLINGS):
+        between = np.linalg.inv(np.eye(ORDER) + g @ ahead)
+        before = ahead
+        ahead = ahead + a.T @ ahead @ between @ a
+        ahead = 0.5 * (ahead + ahead.T)
+        g = g + a @ between @ g @ a.T
+        g = 0.5 * (g + g.T)
+        a = a @ between @ a
+        change = np.abs(np.diagonal(ahead) - np.diagonal(before))
+        if np.all(change <= 1e-12 * np.diagonal(ahead)):
+            break
+    gain, after = _gain(ahead)
+    return Steady(gain, float(ahead[0, 0]) + 1.0, after)
+
+
+@lru_cache(maxsize=1024)
+def _steady_ahead(pace: Pace, number: int) -> float:
+    return _ahead(_steady(pace).covariance, pace, number)

@@ -1,0 +1,213 @@
+"""Tables of the observers' errors: `python -m tests.observers`.
+
+The grid: masses, natural frequencies, noises and rates. Each bench is run once with an observer
+that is not tuned, what `rig tune` reads is taken from that run, and the tuned observers follow
+another draw of the noise. The reference case runs through CAN, tuned with another seed than it is
+run with.
+"""
+
+import argparse
+import itertools
+import math
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from rig.core.closed_loop import Rhythm
+from rig.core.observers.kalman import KalmanObserver
+from rig.core.observers.model_error import ErrorFilter
+from rig.core.step import strut_answers
+from rig.tuning.expectation import Expectation, followed, residual, spectrum
+from rig.tuning.gains import Aim, Bench, expected, gain_margin, paper, tuned
+from tests.observers.benches import STRUT, Truth, follow, judged
+
+MASSES_KG = (1.0, 10.0, 100.0, 1000.0)
+NATURAL_HZ = (0.5, 2.0, 7.0, 20.0)
+NOISES_M = (1e-6, 20e-6, 200e-6)
+RATES_HZ = (100.0, 500.0, 2000.0)
+
+
+def point(given):
+    """Errors of the published gains, the tuned PI and the noise-aware observer at one point."""
+    mass_kg, natural_hz, noise_m, rate_hz = given
+    truth = Truth(mass_kg, natural_hz, rate_hz, max(4.0, 8.0 / natural_hz))
+    rng = np.random.default_rng(abs(hash(given)) % 2**32)
+    first, fresh = (
+        truth.height_m + noise_m * rng.standard_normal(len(truth.height_m)) for _ in range(2)
+    )
+    corner_hz = 0.1 * rate_hz / 2.0 / math.pi
+    start = KalmanObserver("kalman", ErrorFilter(bandwidth_hz=corner_hz, noise_std_m=noise_m), 1e7)
+    [(mobility, *_)] = strut_answers(truth.plant, [truth.rest_m])
+    seen = followed(follow(truth, first, start), Path("grid"), STRUT, mobility)
+    smoothed = residual(seen, mobility)
+    expectation = Expectation(
+        smoothed.noise_std_m, *spectrum(smoothed.t_s, smoothed.force_n), "its run"
+    )
+    rhythm = Rhythm(truth.period_ns)
+    bench = Bench(truth.plant, (start,), 0, mobility, [truth.rest_m], rhythm, expectation, 1e7)
+    settled = round(min(2.0, 0.25 * len(fresh) / rate_hz) * rate_hz)
+    row = {"given": given, "noise_std_m": smoothed.noise_std_m}
+    for name, observer in (
+        ("paper", paper(bench)),
+        *((kind, tuned(bench, kind, Aim()).observer) for kind in ("pi", "kalman")),
+    ):
+        share, coverage = judged(truth, follow(truth, fresh, observer), settled)
+        row[name] = share
+        row[f"{name}_expected"] = expected(bench, observer).force_n
+        row[f"{name}_coverage"] = coverage
+        if name != "paper":
+            row[f"{name}_damping"] = expected(bench, observer).damping_ratio
+            row[f"{name}_margin"] = gain_margin(bench, observer)
+    return row
+
+
+def grid(jobs):
+    points = list(itertools.product(MASSES_KG, NATURAL_HZ, NOISES_M, RATES_HZ))
+    with ProcessPoolExecutor(jobs) as pool:
+        rows = list(pool.map(point, points))
+    print("mass/kg  f/Hz  noise/um  rate/Hz   paper/%  pi/%  kalman/%  coverage")
+    for row in rows:
+        mass, natural, noise, rate = row["given"]
+        print(
+            f"{mass:7g} {natural:5g} {noise * 1e6:9g} {rate:8g} {100 * row['paper']:9.3g}"
+            f" {100 * row['pi']:6.3g} {100 * row['kalman']:8.3g} {row['kalman_coverage']:9.3f}"
+            f"  {row['pi_damping']:.2f} {row['pi_margin']:.1f}",
+            flush=True,
+        )
+    for kind in ("pi", "kalman"):
+        ratios = np.array([row[kind] / row["paper"] for row in rows])
+        print(
+            f"{kind}: unstable {sum(not math.isfinite(row[kind]) for row in rows)} of {len(rows)};"
+            f" over the published gains' median {np.median(ratios):.3f}, worst {ratios.max():.3f}"
+        )
+    print("published gains unstable:", sum(not math.isfinite(row["paper"]) for row in rows))
+    coverages = np.array([row["kalman_coverage"] for row in rows])
+    print(
+        f"coverage of the 95 % intervals: mean {coverages.mean():.3f}, 5 to 95 % of the benches "
+        f"{np.percentile(coverages, 5):.3f} to {np.percentile(coverages, 95):.3f}"
+    )
+
+
+def reference(folder, seed, noise_m, step_m, latency_ns=0, observers=None, delay_s=0.0):
+    """A run of 20 s through CAN; returns its folder and its case."""
+    folder.mkdir(parents=True)
+    dbc = DEFAULT_DATABASE.read_text("utf-8")
+    fine = "SG_ HEIGHT : 12|20@1- (2E-006,0) [-1.048576|1.048574]"
+    (folder / "steps.dbc").write_text(
+        dbc.replace(fine, f"SG_ HEIGHT : 12|20@1- ({step_m},0) [-1|1]")
+    )
+    content = yaml.safe_load((CONFIGS / "reference_bench.yaml").read_text()) | {"seed": seed}
+    height = {"signal": "HEIGHT", "strut": STRUT, "noise_std_m": noise_m}
+    content["transmissions"] = [
+        {"message": "BENCH_MEASUREMENT", "latency_ns": latency_ns, "height": height},
+        {"message": "BENCH_MEASUREMENT_2", "applied_force": {"signal": "APPLIED_FORCE"}},
+    ]
+    (folder / "bench.yaml").write_text(yaml.safe_dump(content))
+    config = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
+    del config["timing"]
+    signals = {
+        "height": {"message": "BENCH_MEASUREMENT", "signal": "HEIGHT", "delay_s": delay_s},
+        "applied_force": {"message": "BENCH_MEASUREMENT_2", "signal": "APPLIED_FORCE"},
+    }
+    config |= {
+        "dbc": "steps.dbc",
+        "signals": signals,
+        "publish": {"force": {"message": "RIG_ESTIMATE", "signal": "SPRING_DAMPER_FORCE"}},
+        "supervision": {"stale_after_s": 0.02},
+    }
+    if observers is not None:
+        config["observers"] = observers
+    (folder / "rig.yaml").write_text(yaml.safe_dump(config))
+    ready = load_setup(folder / "rig.yaml")
+    bench = load_bench_config(folder / "bench.yaml")
+    ended = with_bench(ready, bench, folder / "run", lockstep=True, stop=lambda: False)
+    return compared(ended, ready, bench).struts[0]
+
+
+def share(case):
+    """RMS error of the force over the peak."""
+    figures = case.figures(case.observed)
+    return figures.force_error_rms_n / figures.force_peak_n
+
+
+def smoothed_share(case, folder):
+    """The same of the force that is smoothed over the whole run."""
+    seen = followed(open_steps(folder), folder, STRUT, 0.1)
+    found = residual(seen, 0.1)
+    force_n = found.force_n + np.interp(found.t_s, seen.tick_s, seen.law_force_n)
+    settled = found.t_s >= 0.5
+    truth = np.interp(found.t_s, case.t_s, case.truth[:, 2])
+    missed = (force_n - truth)[settled]
+    return float(np.sqrt(np.mean(missed**2)) / case.figures(case.observed).force_peak_n)
+
+
+def open_steps(folder):
+    return read_run(folder).steps
+
+
+def reference_table(seeds):
+    print("reference case through CAN, force error RMS over the peak in %, after 0.5 s")
+    for name, noise_m, step_m in (
+        ("exact, 2 um steps", 0.0, 2e-6),
+        ("20 um noise, 15 um steps", 20e-6, 15e-6),
+    ):
+        with tempfile.TemporaryDirectory() as temporary:
+            place = Path(temporary)
+            reference(place / "tuning", 1000, noise_m, step_m)
+            ready = load_setup(place / "tuning" / "rig.yaml")
+            observers = {"paper": None}
+            for kind in ("pi", "kalman"):
+                [found] = tune(ready, place / "tuning" / "run", kind, Aim(), lambda _w, _s: None)
+                observers[kind] = {STRUT: plain(found.found.observer)}
+            shares = {kind: [] for kind in (*observers, "smoothed")}
+            for seed, (kind, given) in itertools.product(range(1, seeds + 1), observers.items()):
+                folder = place / f"{kind}{seed}"
+                case = reference(folder, seed, noise_m, step_m, observers=given)
+                shares[kind].append(share(case))
+                if kind == "kalman":
+                    shares["smoothed"].append(smoothed_share(case, folder / "run"))
+        medians = ", ".join(f"{kind} {100 * np.median(v):.3f}" for kind, v in shares.items())
+        print(f"  {name}: {medians}  (medians of {seeds} seeds)", flush=True)
+
+
+def latency_table():
+    print("height 5 ms old, exact: force error RMS over the peak in %")
+    paper_gains = {"kind": "pi", "proportional_n_per_m": 1e5, "integral_n_per_m_s": 1e4}
+    follower = {"bandwidth_hz": 40.0, "noise_std_m": 5.8e-7}
+    cases = (
+        ("published gains, no latency", paper_gains, 0, 0.0),
+        ("published gains, latency not configured", paper_gains, 5, 0.0),
+        ("published gains, latency configured, no filter", paper_gains, 5, 0.005),
+        (
+            "published gains, latency configured, filter",
+            paper_gains | {"filter": follower},
+            5,
+            0.005,
+        ),
+        ("noise-aware, latency configured", {"kind": "kalman", "filter": follower}, 5, 0.005),
+    )
+    for name, observer, late_ms, delay_s in cases:
+        with tempfile.TemporaryDirectory() as temporary:
+            given = {STRUT: observer}
+            folder = Path(temporary) / "case"
+            case = reference(folder, 1, 0.0, 2e-6, late_ms * 1_000_000, given, delay_s)
+            print(f"  {name}: {100 * share(case):.3g}", flush=True)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--only", choices=("reference", "latency", "grid"))
+    given = parser.parse_args()
+    if given.only in (None, "reference"):
+        reference_table(given.seeds)
+    if given.only in (None, "latency"):
+        latency_table()
+    if given.only in (None, "grid"):
+        grid(given.jobs)
+
+
+if __name__ == "__main__":
+    main()
