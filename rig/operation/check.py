@@ -7,6 +7,7 @@ from enum import Enum
 from can_dbc.bus_load import frame_time_s
 from can_dbc.database import Message
 from rig.core.closed_loop import Rhythm
+from rig.core.observability import Unknown, observability
 from rig.core.quantities import LOAD_CELL_FORCE
 from rig.core.stability import Pole, closed_loop_poles
 from rig.operation.assembly import build_bridge, build_plant
@@ -77,7 +78,7 @@ def check(ready: Setup) -> list[Finding]:
     if config.prescribed_motion is not None:
         text = "the motion is prescribed: no loop is closed that could become unstable"
         return [*findings, Finding(Severity.OK, "poles", text)]
-    return findings + _stability(ready, heights)
+    return [*findings, *_stability(ready, heights), *_observability(ready)]
 
 
 def errors(ready: Setup) -> list[Finding]:
@@ -201,6 +202,46 @@ def _stability(ready: Setup, heights: list[Message]) -> list[Finding]:
         text += ": unstable; keep bench and bridge in step, or lower K_P or raise the rate"
         findings.append(Finding(Severity.WARNING, "poles, one cycle late", text))
     return findings
+
+
+def _observability(ready: Setup) -> list[Finding]:
+    """What the heights tell of the struts' forces, and what they cannot, in words."""
+    plant, names = build_plant(ready), [strut.name for strut in ready.model.struts]
+    rest = [strut.free_length_m for strut in ready.model.struts]
+    every = range(len(names))
+    forces = [Unknown(f"the residual force of {name}", i) for i, name in enumerate(names)]
+    found = observability(plant, rest, every, forces)
+    text = f"the heights tell the residual force of {', '.join(names)}"
+    wrong = [*(item.name for item in found.hidden), *map(_apart, found.confused)]
+    findings = [
+        Finding(Severity.WARNING, "observability", f"the heights do not tell {'; '.join(wrong)}")
+        if wrong
+        else Finding(Severity.OK, "observability", text)
+    ]
+    untold: list[str] = []
+    for i, name in enumerate(names):
+        of_strut = (
+            Unknown(f"the spring's force of {name}", i),
+            Unknown("the damper's", i),
+            Unknown(f"a preload of {name}", i),
+            Unknown("an offset of its height sensor", i, is_offset=True),
+        )
+        for pair in (of_strut[:2], of_strut[2:]):
+            untold += map(_apart, observability(plant, rest, every, pair).confused)
+    if untold:
+        text = f"the heights do not tell {'; '.join(untold)}: a law or a load cell does"
+        findings.append(Finding(Severity.OK, "what heights cannot tell", text))
+    for i, name in enumerate(names if len(names) > 1 else ()):
+        found = observability(plant, rest, [j for j in every if j != i], forces)
+        lost = [*(item.name for item in found.hidden), *map(_apart, found.confused)]
+        if lost:
+            text = f"the others would not tell {'; '.join(lost)}"
+            findings.append(Finding(Severity.OK, f"without the height of {name}", text))
+    return findings
+
+
+def _apart(pair: tuple[Unknown, Unknown]) -> str:
+    return f"{pair[0].name} from {pair[1].name}"
 
 
 def _worst(poles: list[Pole]) -> Finding:

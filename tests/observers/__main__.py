@@ -9,15 +9,25 @@ run with.
 import argparse
 import itertools
 import math
+import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import yaml
 
+from can_dbc.database import DEFAULT_DATABASE
+from rig.bench.config import load_bench_config
 from rig.core.closed_loop import Rhythm
 from rig.core.observers.kalman import KalmanObserver
 from rig.core.observers.model_error import ErrorFilter
 from rig.core.step import strut_answers
+from rig.demo.cases import compared
+from rig.io.run_log import read_run
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.setup import load_setup
+from rig.tuning.command import plain, tune
 from rig.tuning.expectation import Expectation, followed, residual, spectrum
 from rig.tuning.gains import Aim, Bench, expected, gain_margin, paper, tuned
 from tests.observers.benches import STRUT, Truth, follow, judged
@@ -175,6 +185,7 @@ def latency_table():
     print("height 5 ms old, exact: force error RMS over the peak in %")
     paper_gains = {"kind": "pi", "proportional_n_per_m": 1e5, "integral_n_per_m_s": 1e4}
     follower = {"bandwidth_hz": 40.0, "noise_std_m": 5.8e-7}
+    paper_gains | {"filter": follower}
     cases = (
         ("published gains, no latency", paper_gains, 0, 0.0),
         ("published gains, latency not configured", paper_gains, 5, 0.0),
