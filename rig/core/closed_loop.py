@@ -22,8 +22,8 @@ _STEP = 1e-8
 """Step of the central differences, in units of the state: so small that no observer comes near its
 limit."""
 
-_FORCE_STEP_N = 1e-3
-"""Step of the residual force."""
+_ACCELERATION_STEP_M_PER_S2 = 1e-2
+"""Step of the residual force, over the effective mass."""
 
 
 class Rhythm(NamedTuple):
@@ -112,11 +112,10 @@ class Loop:
         self._heights_m = list(heights_m)
         start = plant.init(heights_m)
         self._law_n = plant.load(start, [0.0] * plant.struts, 0.0, AMBIENT_C).forces_n
+        self._answers = strut_answers(plant, heights_m)
         self._states = [
             self._settled(observer, answer)
-            for observer, answer in zip(
-                self._observers, strut_answers(plant, heights_m), strict=True
-            )
+            for observer, answer in zip(self._observers, self._answers, strict=True)
         ]
         parts = [
             list(plant.numbers(start)),
@@ -195,7 +194,8 @@ class Loop:
             a[:, index] = (up[0] - down[0]) / (2.0 * step)
             c[index] = (up[1] - down[1]) / (2.0 * step)
         b, d = np.empty((size, 2)), np.empty(2)
-        for column, (noise_m, residual_n) in enumerate(((_STEP, 0.0), (0.0, _FORCE_STEP_N))):
+        step_n = _ACCELERATION_STEP_M_PER_S2 / self._answers[strut].mobility_per_kg
+        for column, (noise_m, residual_n) in enumerate(((_STEP, 0.0), (0.0, step_n))):
             up, down = (
                 self.after(self.at_rest, strut, sign * noise_m, sign * residual_n)
                 for sign in (1.0, -1.0)

@@ -15,7 +15,7 @@ Francis and Wonham, The internal model principle of control theory, Automatica 1
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,8 +79,10 @@ def observability(
         # The model's own motion must not explain it: only what it leaves of the columns counts.
         rest: Any = np.column_stack([columns[i] / np.linalg.norm(columns[i]) for i in which])
         scaled = base / np.maximum(np.linalg.norm(base, axis=0), 1e-300)
-        rest = rest - scaled @ np.linalg.lstsq(scaled, rest, rcond=1e-10)[0]
-        return bool(np.linalg.svd(rest, compute_uv=False)[-1] > _INDEPENDENT)
+        explained: Any = cast("Any", np.linalg.lstsq)(scaled, rest, rcond=1e-10)[0]
+        rest = rest - scaled @ explained
+        least = cast("Any", np.linalg.svd)(rest, compute_uv=False)[-1]
+        return bool(least > _INDEPENDENT)
 
     alone = [bool(columns[i].any()) and is_told(i) for i in range(len(unknowns))]
     pairs = [

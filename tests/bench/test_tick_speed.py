@@ -22,7 +22,7 @@ from can_dbc.frame import Frame
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model
 from rig.core.bridge import Bridge, BridgeState
-from rig.core.contract import Measurement, StepInput
+from rig.core.contract import Innovation, Measurement, Start, StepInput
 from rig.core.observers.pi import PiState
 from rig.core.step import RigCore, RigState
 from rig.core.supervisor import Supervision
@@ -90,10 +90,12 @@ def array_loop(*, observing: bool) -> Subject:
             step()
 
     def observed() -> None:
-        observer = PiState(0.0, 0.0, 0.0, 0)
+        observer = PiState(0.0, 0.0, 0.0, 0, Start(0, 0.1, MS))
         for t_ns, applied_n, measurement in zip(TIMES_NS, APPLIED_N, MEASURED, strict=True):
             q, v = float(positions()[0]), float(velocities()[0])
-            observer = GAINS.step(observer, t_ns, q, v, measurement)
+            model_m = q - v * (t_ns - measurement.t_ns) * 1e-9
+            innovation = Innovation(measurement.height_m - model_m, measurement.t_ns)
+            observer = GAINS.step(observer, t_ns, innovation)
             put_forces([500.0 * (0.5 - q) - 100.0 * v + applied_n + observer.virtual_force_n])
             step()
 
@@ -113,10 +115,12 @@ def scalar_loop(*, observing: bool) -> Subject:
             step()
 
     def observed() -> None:
-        observer = PiState(0.0, 0.0, 0.0, 0)
+        observer = PiState(0.0, 0.0, 0.0, 0, Start(0, 0.1, MS))
         for t_ns, applied_n, measurement in zip(TIMES_NS, APPLIED_N, MEASURED, strict=True):
             q, v = position(0), velocity(0)
-            observer = GAINS.step(observer, t_ns, q, v, measurement)
+            model_m = q - v * (t_ns - measurement.t_ns) * 1e-9
+            innovation = Innovation(measurement.height_m - model_m, measurement.t_ns)
+            observer = GAINS.step(observer, t_ns, innovation)
             put_force(0, 500.0 * (0.5 - q) - 100.0 * v + applied_n + observer.virtual_force_n)
             step()
 

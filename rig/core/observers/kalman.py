@@ -103,14 +103,15 @@ class KalmanObserver:
         return KalmanState(error, innovation_m, force_n, residual_n, std_n, error.t_ns)
 
     def numbers(self, state: KalmanState) -> tuple[float, ...]:
-        """What the next state depends on."""
-        return (state.virtual_force_n, *self.filter.numbers(state.error))
+        """What the next state depends on: all of it is in the filter's inputs."""
+        return self.filter.numbers(state.error)
 
     def with_numbers(self, state: KalmanState, numbers: Sequence[float]) -> KalmanState:
         """The state with other numbers, as `numbers` gives them."""
-        virtual_force_n, *others = numbers
+        error = self.filter.with_numbers(state.error, numbers)
+        virtual_force_n = -error.inputs[-1][1] / error.start.mobility_per_kg
         return KalmanState(
-            self.filter.with_numbers(state.error, others),
+            error,
             state.innovation_m,
             virtual_force_n,
             state.residual_force_n,

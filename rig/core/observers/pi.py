@@ -30,6 +30,7 @@ class PiState(Struct, frozen=True, gc=False):
         innovation_m: Last innovation.
         virtual_force_n: Virtual force, constant until the next measurement.
         measured_ns: Time of the last measurement.
+        start: What the observer was started with.
         error: State of the filter; None without one.
     """
 
@@ -37,6 +38,7 @@ class PiState(Struct, frozen=True, gc=False):
     innovation_m: float
     virtual_force_n: float
     measured_ns: int
+    start: Start
     error: ErrorState | None = None
 
     @property
@@ -85,12 +87,12 @@ class PiObserver:
     def init(self, start: Start) -> PiState:
         """State at the model's start."""
         error = None if self.filter is None else self.filter.init(start)
-        return PiState(0.0, 0.0, 0.0, start.t_ns, error)
+        return PiState(0.0, 0.0, 0.0, start.t_ns, start, error)
 
     def settled(self, start: Start) -> PiState:
         """State after a long time at rest."""
         error = None if self.filter is None else self.filter.settled(start)
-        return PiState(0.0, 0.0, 0.0, start.t_ns, error)
+        return PiState(0.0, 0.0, 0.0, start.t_ns, start, error)
 
     def step(self, state: PiState, t_ns: int, innovation: Innovation | None) -> PiState:
         """State after a tick; arguments as of `Observer.step`.
@@ -119,19 +121,35 @@ class PiObserver:
         if self.filter is not None and error is not None:
             acceleration = -force_n * error.start.mobility_per_kg
             error = self.filter.with_input(error, t_ns, acceleration)
-        return PiState(integral_m_s, innovation.value_m, force_n, innovation.t_ns, error)
+        measured_ns = innovation.t_ns
+        return PiState(integral_m_s, innovation.value_m, force_n, measured_ns, state.start, error)
 
     def numbers(self, state: PiState) -> tuple[float, ...]:
-        """Integral, virtual force and filter: what the next state depends on."""
-        own = state.integral_m_s, state.virtual_force_n
+        """Integral, virtual force and filter, all in m: what the next state depends on."""
+        interval_s, moved = _scales(state.start)
+        own = state.integral_m_s / interval_s, state.virtual_force_n * moved
         if self.filter is None or state.error is None:
             return own
         return (*own, *self.filter.numbers(state.error))
 
     def with_numbers(self, state: PiState, numbers: Sequence[float]) -> PiState:
         """The state with other numbers, as `numbers` gives them."""
-        integral_m_s, virtual_force_n, *others = numbers
+        interval_s, moved = _scales(state.start)
+        integral, force, *others = numbers
         error = state.error
         if self.filter is not None and error is not None:
             error = self.filter.with_numbers(error, others)
-        return PiState(integral_m_s, state.innovation_m, virtual_force_n, state.measured_ns, error)
+        return PiState(
+            integral * interval_s,
+            state.innovation_m,
+            force / moved,
+            state.measured_ns,
+            state.start,
+            error,
+        )
+
+
+def _scales(start: Start) -> tuple[float, float]:
+    """Time between measurements, and how far a newton moves the strut meanwhile."""
+    interval_s = start.interval_ns * 1e-9
+    return interval_s, start.mobility_per_kg * interval_s**2
