@@ -103,7 +103,7 @@ class DartPlant:
         """State with given strut heights and velocities; internal states are zero.
 
         Args:
-            heights_m: One height a strut.
+            heights_m: One height a strut; NaN where none is given.
             velocities_m_per_s: One velocity a strut; at rest if absent.
             t_s: Time.
 
@@ -113,8 +113,9 @@ class DartPlant:
         q = self._geometry.reaching(np.asarray(heights_m, np.float64), np.zeros(self.coordinates))
         v = np.zeros(self.coordinates)
         if velocities_m_per_s is not None:
-            struts = self._geometry.at(q).struts
-            v = np.linalg.lstsq(struts, np.asarray(velocities_m_per_s), rcond=None)[0]
+            given = np.isfinite(heights_m)
+            struts = self._geometry.at(q).struts[given]
+            v = np.linalg.lstsq(struts, np.asarray(velocities_m_per_s)[given], rcond=None)[0]
         return self.state(q.tolist(), v.tolist(), (0.0,) * self.internal_states, t_s)
 
     def state(

@@ -18,6 +18,9 @@ _NEWTON_STEPS = 50
 _REACHED_M, _OUT_OF_REACH_M = 1e-13, 1e-9
 """Error of a height at which Newton's method ends, and above which it has failed."""
 
+_DISAGREEMENT_M = 5e-4
+"""By which sensors of more struts than coordinates may disagree: more is no noise."""
+
 _RATE_STEP_S = 1e-6
 """Step of the central difference of a Jacobian in time."""
 
@@ -87,21 +90,29 @@ class Geometry:
     def reaching(self, heights_m: Array, near: Array) -> Array:
         """Coordinates with given strut heights, found by Newton's method.
 
+        Heights of more struts than coordinates are those of sensors that disagree by their noise:
+        the coordinates are the nearest, in the least squares.
+
         Args:
-            heights_m: One height a strut, shape (struts,).
+            heights_m: One height a strut, shape (struts,); NaN where none is given.
             near: Where to begin, shape (n,).
 
         Raises:
             InputError: The joints cannot reach the heights.
         """
-        q = near
+        q, given = near, np.isfinite(heights_m)
         for _ in range(_NEWTON_STEPS):
             here = self.at(q)
-            error = heights_m - here.heights_m(q)
-            if float(np.max(np.abs(error))) < _REACHED_M:
+            error = (heights_m - here.heights_m(q))[given]
+            if float(np.max(np.abs(error), initial=0.0)) < _REACHED_M:
                 break
-            q = q + np.linalg.lstsq(here.struts, error, rcond=None)[0]
-        if not np.allclose(self.at(q).heights_m(q), heights_m, rtol=0.0, atol=_OUT_OF_REACH_M):
+            step = np.linalg.lstsq(here.struts[given], error, rcond=None)[0]
+            q = q + step
+            if float(np.max(np.abs(step))) < _REACHED_M:
+                break
+        allowed_m = _OUT_OF_REACH_M if np.sum(given) <= len(q) else _DISAGREEMENT_M
+        reached = self.at(q).heights_m(q)[given]
+        if not np.allclose(reached, heights_m[given], rtol=0.0, atol=allowed_m):
             raise InputError(
                 f"model {self._spec.name}: heights {heights_m.tolist()} m: out of the joints' reach"
             )

@@ -75,7 +75,7 @@ class LinearLoop(NamedTuple):
             if np.abs(added).max(initial=0.0) <= 1e-14 * np.abs(covariance).max(initial=0.0):
                 break
         variance = float(self.c @ covariance @ self.c) + float(self.d[0]) ** 2
-        return float(np.sqrt(variance)) if np.isfinite(variance) else float("inf")
+        return variance**0.5 if np.isfinite(variance) and variance >= 0.0 else float("inf")
 
     def lag_gain(self, frequency_hz: Array) -> Array:
         """Error of the published force over the residual force, at frequencies; shape (N,)."""

@@ -53,10 +53,12 @@ class Verdict(NamedTuple):
     Attributes:
         hidden: Unknowns that they do not tell at all.
         confused: Pairs of unknowns, each told if the other is known, that they do not tell apart.
+        together: Whether they tell all at once that is not hidden.
     """
 
     hidden: tuple[Unknown, ...]
     confused: tuple[tuple[Unknown, Unknown], ...]
+    together: bool
 
 
 def observability(
@@ -91,7 +93,8 @@ def observability(
         if alone[i] and alone[j] and not is_told(i, j)
     ]
     hidden = [item for item, told in zip(unknowns, alone, strict=True) if not told]
-    return Verdict(tuple(hidden), tuple(pairs))
+    shown = [i for i, told in enumerate(alone) if told]
+    return Verdict(tuple(hidden), tuple(pairs), not shown or is_told(*shown))
 
 
 def _column(unknown: Unknown, by_force: Array, measured: Sequence[int], outputs: int) -> Array:

@@ -1,5 +1,6 @@
 """One tick: advance the model, compare it with the bench, correct it, publish."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -133,7 +134,7 @@ class RigCore:
         t_ns = step_input.t_ns
         wanted = [observer.first_measurements for observer in self._observers]
         first = tuple(
-            (*old, new)[-count:] if new is not None else old
+            (*old, new)[-count:] if new is not None and count else old
             for new, old, count in zip(step_input.heights, state.first, wanted, strict=True)
         )
         temperature_c = _latest(step_input.temperature_c, state.temperature_c)
@@ -149,10 +150,11 @@ class RigCore:
         without = (0.0,) * len(first)
         loaded = self._plant.load(model, without, applied_n, temperature_c)
         answers = strut_answers(self._plant, heights)
+        starts_ns = [given[-1].t_ns if given else t_ns for given in first]
         observers = tuple(
-            observer.init(Start(item.t_ns, answer[0], *arrival, *answer[1:]))
-            for observer, item, answer, arrival in zip(
-                self._observers, newest, answers, self._arrivals, strict=True
+            observer.init(Start(start_ns, answer[0], *arrival, *answer[1:]))
+            for observer, start_ns, answer, arrival in zip(
+                self._observers, starts_ns, answers, self._arrivals, strict=True
             )
         )
         mode = next_mode(state.mode, Event.FRESH)
@@ -273,8 +275,11 @@ def started_at(measurements: Sequence[Measurement], t_ns: int) -> tuple[float, f
 
     Args:
         measurements: One: the model starts at rest there. Three or more: a parabola through them.
+            None: NaN, the strut starts where the others leave it.
         t_ns: The time.
     """
+    if not measurements:
+        return math.nan, 0.0
     if len(measurements) == 1:
         return measurements[0].height_m, 0.0
     since_s = [(item.t_ns - t_ns) * 1e-9 for item in measurements]

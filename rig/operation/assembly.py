@@ -72,7 +72,11 @@ def _core(ready: Setup, model: ModelSpec) -> Core:
 def arrivals(ready: Setup) -> tuple[Arrival, ...]:
     """How the measurements of each strut come: at their message's cycle, or one at each tick."""
     found: list[Arrival] = []
-    for entry in ready.config.signals.height.values():
+    for name in ready.config.observers:
+        entry = ready.config.signals.height.get(name)
+        if entry is None:
+            found.append(Arrival(ready.config.period_ns))
+            continue
         cycle_ns = ready.database.message(entry.message).cycle_time_ns or ready.config.period_ns
         found.append(Arrival(cycle_ns, entry.delay_ns))
     return tuple(found)
@@ -81,7 +85,9 @@ def arrivals(ready: Setup) -> tuple[Arrival, ...]:
 def _incoming(ready: Setup) -> list[Incoming]:
     signals = ready.config.signals
     wanted: dict[str, list[Wanted]] = {}
-    for index, entry in enumerate(signals.height.values()):
+    struts = list(ready.config.observers)
+    for name, entry in signals.height.items():
+        index = struts.index(name)
         wanted.setdefault(entry.message, []).append(
             Wanted(entry.signal, HEIGHT, index, entry.delay_ns)
         )

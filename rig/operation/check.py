@@ -208,18 +208,21 @@ def _observability(ready: Setup) -> list[Finding]:
     """What the heights tell of the struts' forces, and what they cannot, in words."""
     plant, names = build_plant(ready), [strut.name for strut in ready.model.struts]
     rest = [strut.free_length_m for strut in ready.model.struts]
-    every = range(len(names))
-    forces = [Unknown(f"the residual force of {name}", i) for i, name in enumerate(names)]
+    every = [i for i, name in enumerate(names) if name in ready.config.signals.height]
+    forces = [Unknown(f"the residual force of {names[i]}", i) for i in every]
     found = observability(plant, rest, every, forces)
-    text = f"the heights tell the residual force of {', '.join(names)}"
+    text = f"the heights tell the residual force of {', '.join(names[i] for i in every)}"
     wrong = [*(item.name for item in found.hidden), *map(_apart, found.confused)]
+    if not wrong and not found.together:
+        wrong = ["all of these forces at once, which can be in balance: leave out one observer"]
     findings = [
         Finding(Severity.WARNING, "observability", f"the heights do not tell {'; '.join(wrong)}")
         if wrong
         else Finding(Severity.OK, "observability", text)
     ]
     untold: list[str] = []
-    for i, name in enumerate(names):
+    for i in every:
+        name = names[i]
         of_strut = (
             Unknown(f"the spring's force of {name}", i),
             Unknown("the damper's", i),
@@ -231,7 +234,8 @@ def _observability(ready: Setup) -> list[Finding]:
     if untold:
         text = f"the heights do not tell {'; '.join(untold)}: a law or a load cell does"
         findings.append(Finding(Severity.OK, "what heights cannot tell", text))
-    for i, name in enumerate(names if len(names) > 1 else ()):
+    for i in every if len(every) > 1 else ():
+        name = names[i]
         found = observability(plant, rest, [j for j in every if j != i], forces)
         lost = [*(item.name for item in found.hidden), *map(_apart, found.confused)]
         if lost:

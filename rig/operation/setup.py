@@ -11,6 +11,7 @@ from can_dbc.errors import DatabaseError
 from dart_model.spec import ModelSpec, load_model, model_file
 from rig.core.messages import ESTIMATE, KINEMATICS, STATUS, UNCERTAINTY, Publication
 from rig.core.observers.kalman import KalmanObserver
+from rig.core.observers.none import NoObserver
 from rig.core.observers.pi import PiObserver
 from rig.inputs.errors import InputError
 from rig.inputs.yaml_file import load_validated, validated
@@ -135,13 +136,22 @@ def _with_names(config: RunConfig, model: ModelSpec, database: Database, source:
                     f"{source}: {key}.{name}: no such strut, expected {', '.join(struts)}"
                 )
     for name in struts:
-        if name not in heights:
-            raise InputError(f"{source}: signals.height.{name}: is missing, expected its signal")
+        unobserved = isinstance(config.observers.get(name), NoObserver)
+        if name not in heights and not unobserved:
+            raise InputError(
+                f"{source}: signals.height.{name}: is missing, expected its signal, or observers."
+                f"{name}: {{kind: none}} for a strut that nobody measures"
+            )
+        if name in heights and unobserved:
+            raise InputError(
+                f"{source}: observers.{name}.kind: none takes no height, expected "
+                f"signals.height.{name} to be left out"
+            )
     status = config.status
     if "status" not in config.model_fields_set:
         status = _all_in("RIG_STATUS", STATUS, database) or None
     observers = {name: config.observers.get(name, PiObserver()) for name in struts}
-    height = {name: heights[name] for name in struts}
+    height = {name: heights[name] for name in struts if name in heights}
     return config.model_copy(
         update={
             "signals": config.signals.model_copy(update={"height": height}),

@@ -105,6 +105,11 @@ def tune(
     heights = [strut.free_length_m for strut in ready.model.struts]
     mobilities = [answer.mobility_per_kg for answer in strut_answers(plant, heights)]
     names = list(ready.config.observers)
+    if len(names) > len(ready.config.signals.height):
+        raise InputError(
+            f"{ready.source}: observers: kind none beside others cannot be tuned, expected a "
+            "height of each strut"
+        )
     expectations: list[Expectation] = []
     for index, name in enumerate(names):
         if isinstance(source, Path):

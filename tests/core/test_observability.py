@@ -24,7 +24,7 @@ def offset(strut):
 
 def test_a_strut_is_told_from_its_height():
     found = observability(plant("reference"), ONE, [0], [force(0)])
-    assert found == ((), ())
+    assert found == ((), (), True)
 
 
 def test_spring_and_damper_are_not_told_apart():
@@ -36,22 +36,22 @@ def test_spring_and_damper_are_not_told_apart():
 
 def test_a_preload_is_not_told_from_an_offset_but_each_is_without_the_other():
     found = observability(plant("reference"), ONE, [0], [force(0), offset(0)])
-    assert found == ((), ((force(0), offset(0)),))
-    assert observability(plant("reference"), ONE, [0], [offset(0)]) == ((), ())
+    assert found == ((), ((force(0), offset(0)),), False)
+    assert observability(plant("reference"), ONE, [0], [offset(0)]) == ((), (), True)
 
 
 def test_two_struts_in_series_want_two_heights():
     car = plant("quarter_car")
-    assert observability(car, TWO, [0, 1], [force(0), force(1)]) == ((), ())
+    assert observability(car, TWO, [0, 1], [force(0), force(1)]) == ((), (), True)
     for seen, unseen in ((0, 1), (1, 0)):
         # What rests on the other strut moves nothing in this one.
         found = observability(car, TWO, [seen], [force(0), force(1)])
-        assert found == ((force(unseen),), ())
+        assert found == ((force(unseen),), (), True)
 
 
 def test_offsets_of_two_sensors_are_told_where_the_forces_are_known():
     found = observability(plant("quarter_car"), TWO, [0, 1], [offset(0), offset(1)])
-    assert found == ((), ())
+    assert found == ((), (), True)
 
 
 def test_two_bodies_that_share_nothing_do_not_accuse_one_another():
@@ -79,7 +79,7 @@ struts:
     effects: []
 """
     both = DartPlant(parse_model(text, "two"))
-    assert observability(both, (0.4, 0.4), [0, 1], [force(0), force(1)]) == ((), ())
+    assert observability(both, (0.4, 0.4), [0, 1], [force(0), force(1)]) == ((), (), True)
     assert observability(both, (0.4, 0.4), [0], [force(0), force(1)]).hidden == (force(1),)
 
 
@@ -88,5 +88,5 @@ def test_stiffness_does_not_matter(stiffness):
     spec = load_model(MODELS / "reference.yaml")
     strut = spec.struts[0].model_copy(update={"stiffness_n_per_m": stiffness})
     changed = DartPlant(spec.model_copy(update={"struts": (strut,)}))
-    assert observability(changed, ONE, [0], [force(0)]) == ((), ())
+    assert observability(changed, ONE, [0], [force(0)]) == ((), (), True)
     assert observability(changed, ONE, [0], [force(0), offset(0)]).confused

@@ -5,9 +5,12 @@ from types import MappingProxyType
 from typing import Any
 
 from rig.core.observers.kalman import KalmanObserver
+from rig.core.observers.none import NoObserver
 from rig.core.observers.pi import PiObserver
 
-OBSERVERS: Mapping[str, type[Any]] = MappingProxyType({"pi": PiObserver, "kalman": KalmanObserver})
+OBSERVERS: Mapping[str, type[Any]] = MappingProxyType(
+    {"pi": PiObserver, "kalman": KalmanObserver, "none": NoObserver}
+)
 """`kind` in a configuration -> a frozen pydantic dataclass that is an `Observer`."""
 
 DEFAULT_KIND = "pi"

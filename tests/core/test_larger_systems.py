@@ -1,0 +1,220 @@
+"""Observers of struts on a trailing arm and in a quarter car; what a full car's heights tell.
+
+Each bench has equations of its own, those of the diagnosis' tests.
+"""
+
+from typing import ClassVar
+
+import numpy as np
+
+from dart_model.plant import DartPlant
+from dart_model.spec import load_model
+from rig.core.contract import Measurement, StepInput
+from rig.core.observability import Unknown, observability
+from rig.core.observers.kalman import KalmanObserver
+from rig.core.observers.model_error import ErrorFilter
+from rig.core.observers.none import NoObserver
+from rig.core.step import Arrival, RigCore
+from rig.core.supervisor import Supervision
+from tests.core.cores import MS, others
+from tests.diagnosis.mechanisms import QuarterCar, TrailingArm
+
+SUPERVISION = Supervision(30 * MS, 500 * MS, safe_holds_last=False)
+OBSERVER = KalmanObserver(
+    "kalman", ErrorFilter(bandwidth_hz=25.0, noise_std_m=1e-5), force_limit_n=20_000.0
+)
+RATE_HZ = 1000
+
+
+def follow(plant, heights_m, applied_n, observers=None):
+    """Published forces, shape (N, struts), NaN before the model started."""
+    count = heights_m.shape[1]
+    period_ns = round(1e9 / RATE_HZ)
+    core = RigCore(
+        plant, observers or (OBSERVER,) * count, SUPERVISION, (Arrival(period_ns),) * count
+    )
+    state = core.init(0)
+    found = np.full(heights_m.shape, np.nan)
+    for tick, (heights, force) in enumerate(zip(heights_m, applied_n, strict=True)):
+        measured = tuple(
+            None if np.isnan(h) else Measurement(float(h), tick * period_ns) for h in heights
+        )
+        given = StepInput(tick * period_ns, measured, others(applied_force=float(force)))
+        state, output = core.step(state, given)
+        for index, strut in enumerate(output.struts):
+            found[tick, index] = strut.force_n
+    return found
+
+
+def noisy(heights_m, seed=1):
+    return heights_m + 1e-5 * np.random.default_rng(seed).standard_normal(heights_m.shape)
+
+
+def error(found, truth):
+    """RMS error of each strut's force over the deviation of that force, after half a second."""
+    return np.sqrt(np.mean((found - truth)[500:] ** 2, axis=0)) / np.std(truth[500:], axis=0)
+
+
+def wrong(model, share=0.7, names=None):
+    """The same model with springs and dampers too weak."""
+    struts = tuple(
+        strut.model_copy(
+            update={
+                "stiffness_n_per_m": share * strut.stiffness_n_per_m,
+                "damping_n_s_per_m": share * strut.damping_n_s_per_m,
+            }
+        )
+        if names is None or strut.name in names
+        else strut
+        for strut in model.struts
+    )
+    return DartPlant(model.model_copy(update={"struts": struts}))
+
+
+def test_a_strut_on_a_trailing_arm(tmp_path):
+    arm = TrailingArm()
+    t_s, heights_m = arm.heights(duration_s=4.0, rate_hz=RATE_HZ)
+    applied_n = np.array([arm.load_n(t) for t in t_s])
+    velocity = np.gradient(heights_m[:, 0], t_s)
+    truth = -arm.stiffness * (heights_m[:, 0] - arm.free_m) - arm.damping * velocity
+    found = follow(wrong(arm.model(tmp_path)), noisy(heights_m), applied_n)
+    assert error(found, truth[:, None])[0] < 0.06
+
+
+QUARTER = """
+name: quarter
+gravity_m_per_s2: 9.81
+skeleton:
+  bodies:
+    - {name: wheel, mass_kg: 3.0, joint: {type: prismatic, axis: [0, 0, 1], parent: world}}
+    - {name: body, mass_kg: 15.0, joint: {type: prismatic, axis: [0, 0, 1], parent: wheel}}
+struts:
+  - name: tyre
+    between: [world, wheel]
+    free_length_m: 0.3
+    stiffness_n_per_m: 20000.0
+    damping_n_s_per_m: 130.0
+  - name: suspension
+    between: [wheel, body]
+    free_length_m: 0.5
+    stiffness_n_per_m: 800.0
+    damping_n_s_per_m: 120.0
+"""
+
+
+def test_errors_of_two_struts_are_corrected_at_once(tmp_path):
+    (tmp_path / "quarter.yaml").write_text(QUARTER)
+    model, car = load_model(tmp_path / "quarter.yaml"), QuarterCar()
+    t_s, heights_m = car.heights(duration_s=4.0, rate_hz=RATE_HZ)
+    applied_n = np.array([car.load_n(t) for t in t_s])
+    velocity = np.gradient(heights_m, t_s, axis=0)
+    truth = np.column_stack(
+        [
+            -car.tyre * (heights_m[:, 0] - car.tyre_free_m) - car.tyre_damping * velocity[:, 0],
+            -car.stiffness * (heights_m[:, 1] - car.free_m) - car.damping * velocity[:, 1],
+        ]
+    )
+    both = error(follow(wrong(model), noisy(heights_m), applied_n), truth)
+    for index, name in enumerate(("tyre", "suspension")):
+        alone = error(follow(wrong(model, names=[name]), noisy(heights_m), applied_n), truth)
+        assert both[index] < 1.1 * alone[index]
+
+
+class FullCar:
+    """A body that heaves, pitches and rolls on four wheels, as a URDF file."""
+
+    corners: ClassVar = {"fl": (1.3, 0.7), "fr": (1.3, -0.7), "rl": (-1.4, 0.7), "rr": (-1.4, -0.7)}
+    body_kg, pitch_kg_m2, roll_kg_m2, wheel_kg = 1200.0, 1500.0, 500.0, 40.0
+    stiffness: ClassVar = {"fl": 22e3, "fr": 22e3, "rl": 26e3, "rr": 30e3}
+    damping: ClassVar = {"fl": 1500.0, "fr": 1500.0, "rl": 1700.0, "rr": 1900.0}
+    tyre, tyre_damping, tyre_free_m, free_m = 200e3, 300.0, 0.35, 0.45
+
+    def urdf(self):
+        def link(name, mass_kg, xx, yy, zz):
+            return (
+                f'<link name="{name}"><inertial><mass value="{mass_kg}"/><inertia ixx="{xx}" '
+                f'iyy="{yy}" izz="{zz}" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+            )
+
+        links = [
+            link("heaving", 1e-6, 1e-9, 1e-9, 1e-9),
+            link("pitching", 1e-6, 1e-9, 1e-9, 1e-9),
+            link("body", self.body_kg, self.roll_kg_m2, self.pitch_kg_m2, 1800.0),
+            *(link(name, self.wheel_kg, 1.0, 1.0, 1.0) for name in self.corners),
+        ]
+        joints = [
+            ("heave", "prismatic", "ground", "heaving", "0 0 1", "0 0 0.66"),
+            ("pitch", "revolute", "heaving", "pitching", "0 1 0", "0 0 0"),
+            ("roll", "revolute", "pitching", "body", "1 0 0", "0 0 0"),
+            *(
+                (f"of_{name}", "prismatic", "ground", name, "0 0 1", f"{x} {y} 0.33")
+                for name, (x, y) in self.corners.items()
+            ),
+        ]
+        texts = [
+            f'<joint name="{name}" type="{kind}"><origin xyz="{origin}"/>'
+            f'<parent link="{parent}"/><child link="{child}"/><axis xyz="{axis}"/>'
+            f'<limit lower="-10" upper="10" effort="1e9" velocity="1e4"/></joint>'
+            for name, kind, parent, child, axis, origin in joints
+        ]
+        head = '<?xml version="1.0"?>\n<robot name="full_car">\n<link name="ground"/>'
+        return "\n".join([head, *links, *texts, "</robot>"])
+
+    def model(self, folder):
+        (folder / "full_car.urdf").write_text(self.urdf())
+        lines = [
+            "name: full_car",
+            "gravity_m_per_s2: 9.81",
+            "skeleton: {file: full_car.urdf}",
+            "applied_force_body: body",
+            "struts:",
+        ]
+        for name, (x, y) in self.corners.items():
+            lines += [
+                f"  - name: tyre_{name}",
+                f"    between: [world, {name}]",
+                f"    attachments_m: [[{x}, {y}, 0], [0, 0, 0]]",
+                f"    free_length_m: {self.tyre_free_m}",
+                f"    stiffness_n_per_m: {self.tyre}",
+                f"    damping_n_s_per_m: {self.tyre_damping}",
+            ]
+        for name, (x, y) in self.corners.items():
+            lines += [
+                f"  - name: suspension_{name}",
+                f"    between: [{name}, body]",
+                f"    attachments_m: [[0, 0, 0], [{x}, {y}, 0]]",
+                f"    free_length_m: {self.free_m}",
+                f"    stiffness_n_per_m: {self.stiffness[name]}",
+                f"    damping_n_s_per_m: {self.damping[name]}",
+            ]
+        (folder / "full_car.yaml").write_text("\n".join(lines) + "\n")
+        return load_model(folder / "full_car.yaml")
+
+
+def test_eight_heights_of_a_full_car_do_not_tell_eight_forces(tmp_path):
+    """Body and wheels have seven coordinates: eight forces can be in balance with one another."""
+    model = FullCar().model(tmp_path)
+    plant = DartPlant(model)
+    forces = [Unknown(strut.name, i) for i, strut in enumerate(model.struts)]
+    rest = [FullCar.tyre_free_m] * 4 + [FullCar.free_m] * 4
+    found = observability(plant, rest, range(8), forces)
+    assert found == ((), (), False)
+    for left_out in range(8):
+        seven = [force for force in forces if force.strut != left_out]
+        assert observability(plant, rest, range(8), seven) == ((), (), True)
+
+
+def test_a_tyre_that_nobody_measures_is_what_its_law_says(tmp_path):
+    (tmp_path / "quarter.yaml").write_text(QUARTER)
+    model, car = load_model(tmp_path / "quarter.yaml"), QuarterCar()
+    t_s, heights_m = car.heights(duration_s=6.0, rate_hz=RATE_HZ)
+    applied_n = np.array([car.load_n(t) for t in t_s])
+    velocity = np.gradient(heights_m[:, 1], t_s)
+    truth = -car.stiffness * (heights_m[:, 1] - car.free_m) - car.damping * velocity
+    seen = noisy(heights_m)
+    seen[:, 0] = np.nan
+    plant = wrong(model, names=["suspension"])
+    found = follow(plant, seen, applied_n, (NoObserver("none"), OBSERVER))
+    # Its height at the start is not known: the car bounces on it until its own damper ends that.
+    missed = (found[:, 1] - truth)[3000:]
+    assert np.sqrt(np.mean(missed**2)) < 0.1 * np.std(truth)
