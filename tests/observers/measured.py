@@ -1,0 +1,105 @@
+"""Observers on measured data: `python -m tests.observers.measured DATA`.
+
+EMPS: a carriage whose model has mass and viscous damping, without its friction. What is estimated
+is the force beside the applied one; nobody measured it, so it is held against the force smoothed
+over the whole record. MR damper: a dyno's record made a free body's: the applied force is what 100 kg at
+the measured motion, smoothed, would need beside the measured damper force; the observers are given
+that force and the raw displacement, and their force is held against the load cell's.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from dart_model.plant import DartPlant
+from dart_model.spec import parse_model
+from rig.core.closed_loop import Rhythm
+from rig.core.observers.kalman import KalmanObserver
+from rig.core.observers.model_error import ErrorFilter
+from rig.core.step import strut_answers
+from rig.diagnosis.numerics.smoother import estimate_noise, smooth
+from rig.tuning.expectation import Expectation, followed, residual, spectrum
+from rig.tuning.gains import Aim, Bench, paper, tuned
+from tests.observers.benches import STRUT, follow
+
+MODEL = """
+name: measured
+gravity_m_per_s2: 0.0
+skeleton:
+  bodies:
+    - {{name: body, mass_kg: {mass}, joint: {{type: prismatic, axis: [0, 0, 1], parent: world}}}}
+struts:
+  - name: strut
+    between: [world, body]
+    free_length_m: {rest}
+    stiffness_n_per_m: {stiffness}
+    damping_n_s_per_m: {damping}
+"""
+
+
+class Record:
+    """A record as `follow` takes it."""
+
+    def __init__(self, t_s, height_m, applied_n, mass, stiffness, damping):
+        self.period_ns = round(1e9 * (t_s[-1] - t_s[0]) / (len(t_s) - 1))
+        self.height_m, self.applied_n, self.rest_m = height_m, applied_n, float(height_m[0])
+        text = MODEL.format(mass=mass, rest=self.rest_m, stiffness=stiffness, damping=damping)
+        self.plant = DartPlant(parse_model(text, "measured"))
+
+
+def compare(name, record, force_n=None):
+    """Print the errors of the published gains, the tuned PI and the noise-aware observer."""
+    [(mobility, *_)] = strut_answers(record.plant, [record.rest_m])
+    corner_hz = 0.1 / (record.period_ns * 1e-9) / 6.2832
+    start = KalmanObserver("kalman", ErrorFilter(bandwidth_hz=corner_hz, noise_std_m=1e-5), 1e6)
+    seen = followed(follow(record, record.height_m, start), Path(name), STRUT, mobility)
+    found = residual(seen, mobility)
+    smoothed = np.interp(seen.tick_s, found.t_s, found.force_n) + seen.law_force_n
+    first = len(record.height_m) - len(seen.tick_s)
+    truth = smoothed if force_n is None else force_n[first : first + len(smoothed)]
+    expectation = Expectation(found.noise_std_m, *spectrum(found.t_s, found.force_n), name)
+    rhythm = Rhythm(record.period_ns)
+    bench = Bench(record.plant, (start,), 0, mobility, [record.rest_m], rhythm, expectation, 1e6)
+    settled = round(0.5e9 / record.period_ns)
+    deviation = np.std(truth[settled:])
+    figures = [f"noise {1e6 * found.noise_std_m:.2g} um"]
+    for kind, observer in (
+        ("published", paper(bench)),
+        *((kind, tuned(bench, kind, Aim()).observer) for kind in ("pi", "kalman")),
+    ):
+        force = follow(record, record.height_m, observer).column(f"{STRUT}.force_n").to_numpy()
+        missed = (force[first : first + len(truth)] - truth)[settled:]
+        figures.append(f"{kind} {100 * np.sqrt(np.mean(missed**2)) / deviation:.1f} %")
+    if force_n is not None:
+        missed = (smoothed - truth)[settled:]
+        figures.append(f"smoothed {100 * np.sqrt(np.mean(missed**2)) / deviation:.1f} %")
+    print(f"{name}: {', '.join(figures)} of the force's deviation {deviation:.3g} N", flush=True)
+
+
+def emps(folder, name):
+    t_s, height_m, applied_n = np.loadtxt(folder / name, delimiter=",", skiprows=1).T[:3]
+    compare(f"EMPS {name}", Record(t_s, height_m, applied_n, 95.1, 0.0001, 203.5))
+
+
+def mr_damper(path, mass=100.0):
+    t_s, displacement_mm, _, force_n = np.loadtxt(path).T[:4]
+    t_s = np.linspace(t_s[0], t_s[-1], len(t_s))
+    height_m = 0.5 + 1e-3 * displacement_mm
+    states = smooth(t_s, height_m, estimate_noise(t_s, height_m)).states
+    sign = -np.sign(np.sum(states[:, 1] * force_n))  # a damper's force is against its motion
+    applied_n = mass * states[:, 2] - sign * force_n
+    record = Record(t_s - t_s[0], height_m, applied_n, mass, 0.0001, 0.0001)
+    compare(f"MR damper {path.stem}", record, sign * force_n)
+
+
+def main():
+    data = Path(sys.argv[1])
+    for name in ("train.csv", "pulses.csv"):
+        emps(data / "emps", name)
+    for path in sorted((data / "mr_damper").glob("*.txt"))[:6]:
+        mr_damper(path)
+
+
+if __name__ == "__main__":
+    main()
