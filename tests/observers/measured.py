@@ -2,9 +2,9 @@
 
 EMPS: a carriage whose model has mass and viscous damping, without its friction. What is estimated
 is the force beside the applied one; nobody measured it, so it is held against the force smoothed
-over the whole record. MR damper: a dyno's record made a free body's: the applied force is what 100 kg at
-the measured motion, smoothed, would need beside the measured damper force; the observers are given
-that force and the raw displacement, and their force is held against the load cell's.
+over the whole record. MR damper: a dyno's record made a free body's: the applied force is what
+100 kg at the measured motion, smoothed, would need beside the measured damper force; the observers
+are given that force and the raw displacement, and their force is held against the load cell's.
 """
 
 import sys
