@@ -72,7 +72,13 @@ def reassigned(ready: Setup, assignments: Assignments, source: str) -> Setup:
         _assign(content[section], names, value, source, key)
     config = validated(RunConfig, content, source)
     for name, observer in config.observers.items():
-        if type(observer) is not type(ready.config.observers[name]):
+        before = ready.config.observers[name]
+        if (getattr(observer, "filter", None) is None) != (getattr(before, "filter", None) is None):
+            raise InputError(
+                f"{source}: observers.{name}.filter: cannot be added or taken away in a run, whose "
+                "state is that of the filter it has"
+            )
+        if type(observer) is not type(before):
             raise InputError(
                 f"{source}: observers.{name}.kind: cannot be changed in a run, whose state is "
                 "that of the observer it has"

@@ -10,11 +10,14 @@ from rig.core.closed_loop import Rhythm
 from rig.core.observability import Unknown, observability
 from rig.core.quantities import LOAD_CELL_FORCE
 from rig.core.stability import Pole, closed_loop_poles
-from rig.operation.assembly import build_bridge, build_plant
+from rig.operation.assembly import arrivals, build_bridge, build_plant
 from rig.operation.setup import Setup, load_authentication
 
 LITTLE_DAMPING = 0.02
 """Damping ratio below which a pole is warned of: it rings for some 8 periods to a third."""
+
+_WIDEST_OF_RATE = 1.0 / 3.0
+"""Corner of a filter over the rate of its measurements beyond which it smooths nothing."""
 
 _OTHERS_MAY_READ = stat.S_IRGRP | stat.S_IROTH
 FULL_LOAD, HIGH_LOAD = 1.0, 0.7
@@ -192,7 +195,7 @@ def _stability(ready: Setup, heights: list[Message]) -> list[Finding]:
     delay = round(delay_ns / (every * config.period_ns))
     rhythm = Rhythm(config.period_ns, every, delay)
     poles = closed_loop_poles(plant, observers, rest, rhythm)
-    findings = [_worst(poles)]
+    findings = [_worst(poles), *_bandwidths(ready)]
     late = closed_loop_poles(plant, observers, rest, rhythm._replace(delay=delay + 1))
     worst = max(pole.magnitude for pole in late)
     text = f"largest |z| {worst:.5f} with measurements one cycle late"
@@ -201,6 +204,25 @@ def _stability(ready: Setup, heights: list[Message]) -> list[Finding]:
     elif findings[0].severity is not Severity.ERROR:
         text += ": unstable; keep bench and bridge in step, or lower K_P or raise the rate"
         findings.append(Finding(Severity.WARNING, "poles, one cycle late", text))
+    return findings
+
+
+def _bandwidths(ready: Setup) -> list[Finding]:
+    """Filters that follow single measurements, because their corner is near the rate's."""
+    findings: list[Finding] = []
+    for (name, observer), arrival in zip(
+        ready.config.observers.items(), arrivals(ready), strict=True
+    ):
+        follower = getattr(observer, "filter", None)
+        if follower is None:
+            continue
+        rate_hz = 1e9 / arrival.interval_ns
+        text = f"{follower.bandwidth_hz:g} Hz of {rate_hz:g} measurements a second"
+        if follower.bandwidth_hz > _WIDEST_OF_RATE * rate_hz:
+            text += ": follows single measurements, expected a third of them at most; see rig tune"
+            findings.append(Finding(Severity.WARNING, f"filter of {name}", text))
+        else:
+            findings.append(Finding(Severity.OK, f"filter of {name}", text))
     return findings
 
 

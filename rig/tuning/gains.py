@@ -279,9 +279,8 @@ def _corners(bench: Bench) -> tuple[float, float]:
 def _filter(bench: Bench, log_corner: float) -> ErrorFilter:
     low, high = _corners(bench)
     corner = min(max(math.exp(log_corner), low), high)
-    return ErrorFilter(
-        bandwidth_hz=corner / (2.0 * math.pi), noise_std_m=bench.expectation.noise_std_m
-    )
+    noise_std_m = min(max(bench.expectation.noise_std_m, 1e-12), 1.0)
+    return ErrorFilter(bandwidth_hz=corner / (2.0 * math.pi), noise_std_m=noise_std_m)
 
 
 def _kalman(bench: Bench) -> _Choice:

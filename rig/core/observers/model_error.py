@@ -26,18 +26,17 @@ References:
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from scipy.linalg import expm  # pyright: ignore[reportUnknownVariableType]
 
 from rig.core.contract import Innovation, Start
-from rig.inputs.yaml_file import Positive
 
 Array = NDArray[np.float64]
 Mean = tuple[float, float, float, float, float]
@@ -111,8 +110,8 @@ class ErrorFilter:
             (a step over the square root of 12).
     """
 
-    bandwidth_hz: Positive
-    noise_std_m: Positive
+    bandwidth_hz: Annotated[float, Field(ge=0.01, le=1e4)]
+    noise_std_m: Annotated[float, Field(ge=1e-12, le=1.0)]
 
     @property
     def omega(self) -> float:
