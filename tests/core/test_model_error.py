@@ -196,3 +196,16 @@ def test_without_measurements_the_virtual_force_comes_to_rest():
 def test_a_derivative_of_the_raw_innovation_is_refused():
     with pytest.raises(ValueError, match="expected filter beside it"):
         PiObserver(derivative_n_s_per_m=5.0)
+
+
+@pytest.mark.parametrize("gap_ms", [200, 5_000, 3_600_000])
+def test_after_a_long_gap_it_starts_anew(gap_ms):
+    observer = KalmanObserver("kalman", FILTER)
+    state = observer.settled(START)
+    for tick in range(1, 50):
+        state = observer.step(state, tick * MS, Innovation(1e-3 * math.sin(0.1 * tick), tick * MS))
+    for tick in range(gap_ms, gap_ms + 400):
+        state = observer.step(state, tick * MS, Innovation(2e-3, tick * MS))
+        assert math.isfinite(state.virtual_force_n)
+        assert math.isfinite(state.force_std_n)
+    assert state.error.covariance is None

@@ -58,6 +58,12 @@ _ACCELERATION_STD_M_PER_S2 = 30.0
 _RATE_STD_M_PER_S = 1.0
 """Of the model's velocity at its start: dampers move at up to two metres a second."""
 
+_NOTHING: Mean = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+_FORGOTTEN = 20.0
+"""Time without a measurement, in units of 1 / omega, after which what was known is worth nothing: a
+polynomial of third order is 20³ times as uncertain as at one."""
+
 _FADING_S = 1.0
 """Time constant with which the innovations' variance is followed."""
 
@@ -72,11 +78,13 @@ class Steady(NamedTuple):
         gain: Gain, shape (5,).
         innovation: Variance of the innovation.
         covariance: Of the estimate after an update, shape (5, 5).
+        residual: Variance of the residual force's acceleration after an update.
     """
 
     gain: Array
     innovation: float
     covariance: Array
+    residual: float
 
 
 class ErrorState(Struct, frozen=True, gc=False):
@@ -90,6 +98,7 @@ class ErrorState(Struct, frozen=True, gc=False):
         inputs: Accelerations by the virtual force, and from when on; the first one from `t_ns` or
             before.
         start: What the filter was started with.
+        steady: What its variances come to.
     """
 
     t_ns: int
@@ -98,6 +107,7 @@ class ErrorState(Struct, frozen=True, gc=False):
     scale: float
     inputs: tuple[tuple[int, float], ...]
     start: Start
+    steady: Steady
 
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
@@ -120,13 +130,8 @@ class ErrorFilter:
 
     def init(self, start: Start) -> ErrorState:
         """State at the model's start, at the first measured height."""
-        omega, sigma = self.omega, self.noise_std_m
-        rate = _RATE_STD_M_PER_S / (sigma * omega)
-        acceleration = _ACCELERATION_STD_M_PER_S2 / (sigma * omega**2)
-        deviations = np.array([1.0, rate, acceleration, acceleration, acceleration])
-        nothing = (0.0, 0.0, 0.0, 0.0, 0.0)
-        inputs = ((start.t_ns, 0.0),)
-        return ErrorState(start.t_ns, nothing, np.diag(deviations**2), 1.0, inputs, start)
+        steady, inputs = _steady(self._pace(start)), ((start.t_ns, 0.0),)
+        return ErrorState(start.t_ns, _NOTHING, self._prior(), 1.0, inputs, start, steady)
 
     def settled(self, start: Start) -> ErrorState:
         """State after a long time without an error."""
@@ -141,10 +146,12 @@ class ErrorFilter:
         """
         if innovation.t_ns <= state.t_ns:
             return state
+        interval_ns, steady = state.start.interval_ns, state.steady
+        if (innovation.t_ns - state.t_ns) * 1e-9 * self.omega > _FORGOTTEN:
+            before_ns, prior = innovation.t_ns - interval_ns, self._prior()
+            state = replace(state, t_ns=before_ns, mean=_NOTHING, covariance=prior)
         mean = _moved(state, innovation.t_ns)
-        interval_ns = state.start.interval_ns
         number = max(1, round((innovation.t_ns - state.t_ns) / interval_ns))
-        steady = self._steady(state.start)
         covariance, scale = state.covariance, state.scale
         # What is new in a measurement: its distance from the error that was predicted.
         new_m = innovation.value_m - mean[0]
@@ -160,20 +167,14 @@ class ErrorFilter:
             limit = np.diagonal(steady.covariance)
             if np.all(np.abs(np.diagonal(covariance) - limit) <= _SETTLED * limit):
                 covariance = None
-        omega = self.omega
-        physical = new_m
-        corrected: list[float] = []
-        for value, share_of_it in zip(mean, gain.tolist(), strict=True):
-            corrected.append(value + share_of_it * physical)
-            physical *= omega
-        inputs = _from(state.inputs, innovation.t_ns)
         return ErrorState(
             innovation.t_ns,
-            (corrected[0], corrected[1], corrected[2], corrected[3], corrected[4]),
+            _corrected(mean, gain.tolist(), new_m, self.omega),
             covariance,
             scale,
-            inputs,
+            _from(state.inputs, innovation.t_ns),
             state.start,
+            steady,
         )
 
     def predicted(self, state: ErrorState, t_ns: int) -> Mean:
@@ -199,11 +200,12 @@ class ErrorFilter:
         """Standard deviation of `residual`, at a time, in m/s²."""
         interval_ns = state.start.interval_ns
         number = (t_ns - state.t_ns + interval_ns // 2) // interval_ns
-        pace = self._pace(state.start)
-        if state.covariance is None:
-            variance = _steady_ahead(pace, number)
+        if state.covariance is not None:
+            variance = _ahead(state.covariance, self._pace(state.start), number)
+        elif number < 1:
+            variance = state.steady.residual
         else:
-            variance = _ahead(state.covariance, pace, number)
+            variance = _steady_ahead(self._pace(state.start), number)
         return math.sqrt(state.scale * variance) * self.noise_std_m * self.omega**2
 
     def with_input(self, state: ErrorState, t_ns: int, acceleration: float) -> ErrorState:
@@ -242,8 +244,12 @@ class ErrorFilter:
             start.damping_per_s / omega,
         )
 
-    def _steady(self, start: Start) -> Steady:
-        return _steady(self._pace(start))
+    def _prior(self) -> Array:
+        """Covariance before anything was measured."""
+        omega, sigma = self.omega, self.noise_std_m
+        rate = _RATE_STD_M_PER_S / (sigma * omega)
+        acceleration = _ACCELERATION_STD_M_PER_S2 / (sigma * omega**2)
+        return np.diag(np.array([1.0, rate, acceleration, acceleration, acceleration]) ** 2)
 
 
 class Pace(NamedTuple):
@@ -258,6 +264,20 @@ class Pace(NamedTuple):
     interval: float
     stiffness: float = 0.0
     damping: float = 0.0
+
+
+def _corrected(mean: Mean, gain: Sequence[float], new_m: float, omega: float) -> Mean:
+    """The mean after an update; the gain is in units of sigma and 1 / omega."""
+    x, v, a, j, s = mean
+    of_x, of_v, of_a, of_j, of_s = gain
+    squared = omega * omega
+    return (
+        x + of_x * new_m,
+        v + of_v * new_m * omega,
+        a + of_a * new_m * squared,
+        j + of_j * new_m * squared * omega,
+        s + of_s * new_m * squared * squared,
+    )
 
 
 def _from(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tuple[int, float], ...]:
@@ -352,7 +372,7 @@ def _steady(pace: Pace) -> Steady:
         if np.all(change <= 1e-12 * np.diagonal(ahead)):
             break
     gain, after = _gain(ahead)
-    return Steady(gain, float(ahead[0, 0]) + 1.0, after)
+    return Steady(gain, float(ahead[0, 0]) + 1.0, after, _ahead(after, pace, 0))
 
 
 @lru_cache(maxsize=1024)
