@@ -120,6 +120,25 @@ def test_errors_of_two_struts_are_corrected_at_once(tmp_path):
         assert both[index] < 1.1 * alone[index]
 
 
+def test_a_corrected_strut_lacks_nothing_in_the_car_either(tmp_path):
+    """The suspension's law, right by itself, in a car whose tyre is wrong: no force is missing."""
+    (tmp_path / "quarter.yaml").write_text(QUARTER)
+    model, car = load_model(tmp_path / "quarter.yaml"), QuarterCar()
+    t_s, heights_m = car.heights(duration_s=4.0, rate_hz=RATE_HZ)
+    applied_n = np.array([car.load_n(t) for t in t_s])
+    velocity = np.gradient(heights_m[:, 1], t_s)
+    truth = -car.stiffness * (heights_m[:, 1] - car.free_m) - car.damping * velocity
+    missed = []
+    for names in (["tyre"], ["tyre", "suspension"]):
+        plant = wrong(model, names=names)
+        found = follow(plant, noisy(heights_m), applied_n)[:, 1]
+        missed.append(np.sqrt(np.mean((found - truth)[500:] ** 2)))
+    corrected, rough = missed
+    right = follow(DartPlant(model), noisy(heights_m), applied_n)[:, 1]
+    assert corrected < 1.1 * np.sqrt(np.mean((right - truth)[500:] ** 2))
+    assert corrected < rough
+
+
 class FullCar:
     """A body that heaves, pitches and rolls on four wheels, as a URDF file."""
 
