@@ -41,7 +41,8 @@ def tune_command(
         float | None,
         typer.Option(
             "--noise-std-m",
-            min=0.0,
+            min=1e-12,
+            max=1.0,
             help="Without a run: standard deviation of the height, m; absent: by the DBC's steps.",
         ),
     ] = None,
@@ -52,8 +53,15 @@ def tune_command(
         float, typer.Option("--damping-ratio", min=0.0, max=1.0, help="Least that a pole keeps.")
     ] = 0.1,
     gain_margin: Annotated[
-        float, typer.Option("--gain-margin", min=1.0, max=20.0, help="Least factor to instability.")
-    ] = 2.0,
+        float | None,
+        typer.Option(
+            "--gain-margin",
+            min=1.0,
+            max=20.0,
+            help="Factor by which the model may answer more, or less, and stay stable; 1.1 for "
+            "kalman and 2 for pi by default.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="FILE", help="Write the configuration, beside CONFIG."),
@@ -77,9 +85,9 @@ def tune_command(
             raise InputError(f"{path}: exists, expected a new file")
     stated = (residual_n, up_to_hz, noise_std_m)
     source = _source(run, stated)
-    ready = load_setup(config)
+    ready, aim = load_setup(config), Aim(damping_ratio, gain_margin)
     with progress_bar() as bar:
-        found = tune(ready, source, observer, Aim(damping_ratio, gain_margin), bar)
+        found = tune(ready, source, observer, aim, bar)
     if out is not None:
         write_config(ready, found, out)
     if plot is not None:
@@ -88,7 +96,7 @@ def tune_command(
         print_json([_as_dict(strut) for strut in found])
         return
     for strut in found:
-        _print(strut, damping_ratio)
+        _print(strut, damping_ratio, aim.margin(observer))
     for path in (out, plot):
         if path is not None:
             console.print(f"Written: {path}", markup=False)
@@ -132,7 +140,7 @@ def _as_dict(strut: "TunedStrut") -> dict[str, object]:
     }
 
 
-def _print(strut: "TunedStrut", damping_ratio: float) -> None:
+def _print(strut: "TunedStrut", damping_ratio: float, least_margin: float) -> None:
     from rig.tuning.command import plain
 
     chosen, (_, published) = strut.found, strut.paper
@@ -177,9 +185,15 @@ def _print(strut: "TunedStrut", damping_ratio: float) -> None:
     )
     console.print(f"Poles, the slowest first: {slowest}.", markup=False)
     console.print(f"observers.{strut.name}: {plain(chosen.observer)}", markup=False)
-    if chosen.expected.damping_ratio < damping_ratio - 1e-3:
+    if chosen.expected.damping_ratio < 0.99 * damping_ratio:
         console.print(
-            f"No gains keep a damping ratio of {damping_ratio:g}; the best that were found keep "
-            f"{chosen.expected.damping_ratio:.3f}.",
+            f"No gains keep a damping ratio of {damping_ratio:g}; the best that were found "
+            f"keep {chosen.expected.damping_ratio:.3f}.",
+            style="yellow",
+        )
+    if margin < 0.97 * least_margin:
+        console.print(
+            f"No gains keep a gain margin of {least_margin:g}; the best that were found keep "
+            f"{margin:.3g}.",
             style="yellow",
         )

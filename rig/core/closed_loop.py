@@ -99,6 +99,7 @@ class Loop:
         observers: One for each of its struts.
         heights_m: Strut heights at which the bench is assumed to rest.
         rhythm: When the loop is closed.
+        answers: What the observers are told of the model; by differences on it if absent.
     """
 
     def __init__(
@@ -107,12 +108,13 @@ class Loop:
         observers: Sequence[Observer],
         heights_m: Sequence[float],
         rhythm: Rhythm,
+        answers: Sequence[Answer] | None = None,
     ) -> None:
         self._plant, self._observers, self._rhythm = plant, tuple(observers), rhythm
         self._heights_m = list(heights_m)
         start = plant.init(heights_m)
         self._law_n = plant.load(start, [0.0] * plant.struts, 0.0, AMBIENT_C).forces_n
-        self._answers = strut_answers(plant, heights_m)
+        self._answers = answers or strut_answers(plant, heights_m)
         self._states = [
             self._settled(observer, answer)
             for observer, answer in zip(self._observers, self._answers, strict=True)

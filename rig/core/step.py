@@ -139,6 +139,8 @@ class RigCore:
         )
         temperature_c = _latest(step_input.temperature_c, state.temperature_c)
         state = replace(state, t_ns=t_ns, first=first, temperature_c=temperature_c)
+        if not self._belong_together(first):
+            return state, StepOutput(state.mode, ())
         is_enough = all(len(given) == count for given, count in zip(first, wanted, strict=True))
         newest = [given[-1] for given in first if given]
         if not is_enough or not self._fresh(newest, t_ns):
@@ -159,6 +161,14 @@ class RigCore:
         )
         mode = next_mode(state.mode, Event.FRESH)
         return self._published(state, t_ns, mode, observers, loaded)
+
+    def _belong_together(self, first: Sequence[tuple[Measurement, ...]]) -> bool:
+        """Whether no strut's measurements have a break: a velocity is taken from them."""
+        return all(
+            given[-1].t_ns - given[0].t_ns <= 2 * len(given) * arrival.interval_ns
+            for given, arrival in zip(first, self._arrivals, strict=True)
+            if given
+        )
 
     def _fresh(self, measurements: list[Measurement], t_ns: int) -> bool:
         oldest_ns = min(item.t_ns for item in measurements)

@@ -73,10 +73,10 @@ def reassigned(ready: Setup, assignments: Assignments, source: str) -> Setup:
     config = validated(RunConfig, content, source)
     for name, observer in config.observers.items():
         before = ready.config.observers[name]
-        if (getattr(observer, "filter", None) is None) != (getattr(before, "filter", None) is None):
+        if getattr(observer, "filter", None) != getattr(before, "filter", None):
             raise InputError(
-                f"{source}: observers.{name}.filter: cannot be added or taken away in a run, whose "
-                "state is that of the filter it has"
+                f"{source}: observers.{name}.filter: cannot be changed in a run, whose state is "
+                "that of the filter it has"
             )
         if type(observer) is not type(before):
             raise InputError(

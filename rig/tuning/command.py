@@ -1,5 +1,6 @@
 """`rig tune` but for its words: from a configuration and a run to a configuration."""
 
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -229,7 +230,7 @@ def _with_model_of(ready: Setup, run: Path) -> Setup:
 
 def _first_filter(noise_std_m: float, interval_ns: int) -> ErrorFilter:
     corner = _FIRST_CORNER_PER_INTERVAL / (interval_ns * 1e-9)
-    return ErrorFilter(bandwidth_hz=corner / 6.283185307, noise_std_m=noise_std_m)
+    return ErrorFilter.within(corner / (2.0 * math.pi), noise_std_m)
 
 
 def _rhythm(ready: Setup, interval_ns: int, delay_s: float) -> Rhythm:

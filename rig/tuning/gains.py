@@ -21,9 +21,15 @@ from rig.core.observers.kalman import KalmanObserver
 from rig.core.observers.model_error import ErrorFilter
 from rig.core.observers.pi import PiObserver
 from rig.core.stability import Pole, poles_of
+from rig.core.step import strut_answers
 from rig.tuning.expectation import Expectation
 
 KINDS = ("kalman", "pi")
+
+MARGINS = {"kalman": 1.1, "pi": 2.0}
+"""Gain margins by kind. Two is usual for a PI loop. A noise-aware observer cancels the residual
+force with the effective mass that the model itself gives, which is known: it bears a tenth or a
+fifth."""
 
 PAPER_PER_S2, PAPER_PER_S3 = 1.0e4, 1.0e3
 """Gains of the reference case over its mass of 10 kg."""
@@ -45,11 +51,16 @@ class Aim(NamedTuple):
 
     Attributes:
         damping_ratio: Least damping ratio of its poles.
-        gain_margin: Factor by which the model may answer more strongly, or less, and stay stable.
+        gain_margin: Factor by which the model may answer more strongly, or less, and stay stable;
+            None: that of `MARGINS`.
     """
 
     damping_ratio: float = 0.1
-    gain_margin: float = 2.0
+    gain_margin: float | None = None
+
+    def margin(self, kind: str) -> float:
+        """The gain margin for a kind of observer."""
+        return MARGINS[kind] if self.gain_margin is None else self.gain_margin
 
 
 class Expected(NamedTuple):
@@ -84,7 +95,8 @@ class Tuned(NamedTuple):
     Attributes:
         observer: The observer.
         expected: What is expected of it.
-        gain_margin: Factor by which the model may answer more strongly; 20 means that or more.
+        gain_margin: Factor by which the model may answer more strongly, or less; 20 means that or
+            more.
     """
 
     observer: Any
@@ -144,7 +156,7 @@ def expected(bench: Bench, observer: Any) -> Expected:
 
 
 def gain_margin(bench: Bench, observer: Any, most: float = 20.0) -> float:
-    """Factor by which the model may answer more strongly until the loop is unstable.
+    """Factor by which the model may answer more strongly, or less, until the loop is unstable.
 
     Args:
         bench: The strut.
@@ -153,12 +165,12 @@ def gain_margin(bench: Bench, observer: Any, most: float = 20.0) -> float:
     """
     if not _keeps(bench, observer, 1.0):
         return 1.0
-    if _keeps(bench, observer, most):
-        return most
     low, high = 1.0, most
+    if _has_margin(bench, observer, most):
+        return most
     while high / low > 1.01:
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if _keeps(bench, observer, middle) else (low, middle)
+        low, high = (middle, high) if _has_margin(bench, observer, middle) else (low, middle)
     return low
 
 
@@ -179,25 +191,30 @@ def tuned(bench: Bench, kind: str, aim: Aim) -> Tuned:
         kind: One of `KINDS`.
         aim: What the loop must keep.
     """
-    make, starts = _CHOICES[kind](bench)
 
-    def cost(x: Any) -> float:
-        try:
-            observer = make(x)
-        except OverflowError:
-            return 1e12
+    def cost(observer: Any) -> float:
         found = expected(bench, observer)
         if not math.isfinite(found.force_n):
             return 1e12
         short = max(0.0, aim.damping_ratio - found.damping_ratio)
-        wanting = 0.0 if _has_margin(bench, observer, aim.gain_margin) else 1.0
-        # In logarithms, so that newtons and penalties compare on every bench.
-        return math.log(found.force_n + 1e-12) + 20.0 * short + wanting
+        if not _has_margin(bench, observer, aim.margin(kind)):
+            short += 1.0
+        # What misses the aim is worse than all that keeps it, and the worse the more it misses.
+        return math.log(found.force_n + 1e-12) + (1e3 * (1.0 + short) if short > 0.0 else 0.0)
+
+    make, starts = _CHOICES[kind](bench, cost)
+
+    def of_numbers(x: Any) -> float:
+        try:
+            observer = make(x)
+        except (OverflowError, ValueError):
+            return 1e12
+        return cost(observer)
 
     best = min(
         (
             minimize(
-                cost,
+                of_numbers,
                 start,
                 method="Nelder-Mead",
                 options={"maxfev": _EVALUATIONS // len(starts), "xatol": 0.01, "fatol": 1e-3},
@@ -230,8 +247,8 @@ def faster(observer: Any, factor: float) -> Any:
     """An observer with another bandwidth."""
     changed: dict[str, Any] = {}
     if observer.filter is not None:
-        corner_hz = factor * observer.filter.bandwidth_hz
-        changed["filter"] = replace(observer.filter, bandwidth_hz=corner_hz)
+        follower = observer.filter
+        changed["filter"] = follower.within(factor * follower.bandwidth_hz, follower.noise_std_m)
     if isinstance(observer, PiObserver):
         changed["proportional_n_per_m"] = factor**2 * observer.proportional_n_per_m
         changed["integral_n_per_m_s"] = factor**2 * observer.integral_n_per_m_s
@@ -259,7 +276,9 @@ def _is_stable(poles: Sequence[Pole]) -> bool:
 
 def _keeps(bench: Bench, observer: Any, factor: float) -> bool:
     plant: Any = _Stronger(bench.plant, factor)
-    loop = Loop(plant, bench.with_observer(observer), bench.heights_m, bench.rhythm)
+    # The observers are told what the model answers by itself.
+    told = strut_answers(bench.plant, bench.heights_m)
+    loop = Loop(plant, bench.with_observer(observer), bench.heights_m, bench.rhythm, told)
     return _is_stable(poles_of(loop.linear(bench.strut).a, bench.rhythm.interval_ns * 1e-9))
 
 
@@ -267,6 +286,7 @@ def _has_margin(bench: Bench, observer: Any, factor: float) -> bool:
     return _keeps(bench, observer, factor) and _keeps(bench, observer, 1.0 / factor)
 
 
+_Cost = Callable[[Any], float]
 _Choice = tuple[Callable[[Any], Any], list[list[float]]]
 
 
@@ -279,11 +299,10 @@ def _corners(bench: Bench) -> tuple[float, float]:
 def _filter(bench: Bench, log_corner: float) -> ErrorFilter:
     low, high = _corners(bench)
     corner = min(max(math.exp(log_corner), low), high)
-    noise_std_m = min(max(bench.expectation.noise_std_m, 1e-12), 1.0)
-    return ErrorFilter(bandwidth_hz=corner / (2.0 * math.pi), noise_std_m=noise_std_m)
+    return ErrorFilter.within(corner / (2.0 * math.pi), bench.expectation.noise_std_m)
 
 
-def _kalman(bench: Bench) -> _Choice:
+def _kalman(bench: Bench, cost: _Cost) -> _Choice:
     low, high = _corners(bench)
 
     def make(x: Any) -> KalmanObserver:
@@ -291,11 +310,11 @@ def _kalman(bench: Bench) -> _Choice:
 
     # The error has several least values over the bandwidth where the force has lines.
     grid = np.linspace(math.log(low), math.log(high), _GRID)
-    costs = [expected(bench, make([x])).force_n for x in grid]
+    costs = [cost(make([x])) for x in grid]
     return make, [[float(grid[int(np.argmin(costs))])]]
 
 
-def _pi(bench: Bench) -> _Choice:
+def _pi(bench: Bench, cost: _Cost) -> _Choice:
     low, high = _corners(bench)
     mass_kg = 1.0 / bench.mobility_per_kg
 
@@ -311,12 +330,12 @@ def _pi(bench: Bench) -> _Choice:
         )
 
     starts = np.linspace(math.log(low), math.log(high), 7)[1:-1]
-    costs = [expected(bench, make([x, math.log(0.3), x + 0.3])).force_n for x in starts]
+    costs = [cost(make([x, math.log(0.3), x + 0.3])) for x in starts]
     best = [float(starts[i]) for i in np.argsort(costs)[:2]]
     return make, [[start, math.log(0.3), start + 0.3] for start in best]
 
 
-_CHOICES: dict[str, Callable[[Bench], _Choice]] = {"kalman": _kalman, "pi": _pi}
+_CHOICES: dict[str, Callable[[Bench, _Cost], _Choice]] = {"kalman": _kalman, "pi": _pi}
 
 
 def _rounded(observer: Any) -> Any:

@@ -209,3 +209,37 @@ def test_after_a_long_gap_it_starts_anew(gap_ms):
         assert math.isfinite(state.virtual_force_n)
         assert math.isfinite(state.force_std_n)
     assert state.error.covariance is None
+
+
+@pytest.mark.parametrize("damping_per_s", [0.0, 10.0, 200.0, 1000.0])
+@pytest.mark.parametrize("gap_ms", [50, 150, 262, 400])
+def test_a_gap_on_a_stiffly_damped_model_stays_finite_and_sane(damping_per_s, gap_ms):
+    observer = KalmanObserver("kalman", FILTER)
+    start = Start(0, 0.1, MS, 0, 500.0, damping_per_s)
+    state = observer.settled(start)
+    for tick in range(1, gap_ms):
+        state = observer.step(state, tick * MS, None)
+        assert math.isfinite(state.force_std_n)
+    x, v = 2e-5, 0.0
+    for tick in range(gap_ms, gap_ms + 300):
+        state = observer.step(state, tick * MS, Innovation(x, tick * MS))
+        # A height that is off by its noise asks for little.
+        assert abs(state.residual_force_n) < 40.0
+        for _ in range(10):
+            v += 1e-4 * (-0.1 * state.virtual_force_n - 500.0 * x - damping_per_s * v)
+            x += 1e-4 * v
+    assert abs(x) < 1e-5
+
+
+def test_a_bench_two_millimetres_off_after_a_gap_is_no_blow():
+    observer = KalmanObserver("kalman", FILTER)
+    state = observer.settled(START)
+    x = 2e-3
+    v, forces = 0.0, []
+    for tick in range(300, 700):
+        state = observer.step(state, tick * MS, Innovation(x, tick * MS))
+        forces.append(state.residual_force_n)
+        v += -0.1 * state.virtual_force_n * 1e-3
+        x += v * 1e-3
+    assert max(map(abs, forces)) < 1500.0
+    assert abs(x) < 1e-4

@@ -127,15 +127,17 @@ def test_a_limit_goes_by_the_number_of_its_row(ready):
         reassigned(limited, {"supervision.limits.0": 700.0}, "set")
 
 
-def test_a_filter_is_changed_but_neither_added_nor_taken_away(ready):
+def test_a_filter_is_not_changed_in_a_run(ready):
     added = {"observers.strut.filter": {"bandwidth_hz": 20.0, "noise_std_m": 1e-5}}
-    with pytest.raises(InputError, match="filter: cannot be added or taken away in a run"):
+    with pytest.raises(InputError, match="filter: cannot be changed in a run"):
         reassigned(ready, added, "set")
     content = ready.config.model_dump(mode="json")
     content["observers"]["strut"]["filter"] = added["observers.strut.filter"]
     filtered = ready.model_copy(update={"config": type(ready.config).model_validate(content)})
-    found = reassigned(filtered, {"observers.strut.filter.bandwidth_hz": 25.0}, "set")
-    assert found.config.observers["strut"].filter.bandwidth_hz == 25.0
+    with pytest.raises(InputError, match="filter: cannot be changed in a run"):
+        reassigned(filtered, {"observers.strut.filter.bandwidth_hz": 25.0}, "set")
+    found = reassigned(filtered, {"observers.strut.force_limit_n": 700.0}, "set")
+    assert found.config.observers["strut"].force_limit_n == 700.0
 
 
 def test_a_group_of_values_is_not_replaced(ready):

@@ -16,7 +16,7 @@ from rig.operation.live import with_bench
 from rig.operation.replay import replay
 from rig.operation.setup import load_setup, setup_of_folder
 from rig.tuning.command import Stated, tune, write_config
-from rig.tuning.gains import Aim
+from rig.tuning.gains import MARGINS, Aim
 
 STEP_M = 15e-6
 NOISE_M = 20e-6
@@ -80,7 +80,7 @@ def test_noise_latency_and_gains_come_from_a_run(late):
     assert found.latency.delay_s == pytest.approx(2.3e-3, abs=5e-5)
     assert found.latency.low_s < found.delay_s < found.latency.high_s
     assert found.found.expected.damping_ratio > 0.1
-    assert found.found.gain_margin > 2.0
+    assert found.found.gain_margin > 1.09
     path = late / "tuned.yaml"
     write_config(ready, [found], path)
     made = load_setup(path).config
@@ -104,8 +104,11 @@ def test_the_choice_is_the_least_of_its_neighbours(late):
     for kind in ("kalman", "pi"):
         _, found = tuned(late, kind, Stated(60.0, 5.0))
         assert found.expectation.noise_std_m == pytest.approx(STEP_M / 12**0.5)
-        least = min(item.force_n for _, item in found.sweep)
-        assert found.found.expected.force_n < 1.02 * least
+        keeping = [item for _, item in found.sweep if item.damping_ratio > 0.1]
+        least = min(item.force_n for item in keeping)
+        # The gain margin may forbid the very least.
+        assert found.found.expected.force_n < 1.3 * least
+        assert found.found.gain_margin > 0.98 * MARGINS[kind]
         # Stated is what no run told.
         assert found.latency is None
 

@@ -58,11 +58,19 @@ _ACCELERATION_STD_M_PER_S2 = 30.0
 _RATE_STD_M_PER_S = 1.0
 """Of the model's velocity at its start: dampers move at up to two metres a second."""
 
+_LOWEST_HZ, _HIGHEST_HZ = 0.01, 1e4
+_LEAST_STD_M, _LARGEST_STD_M = 1e-12, 1.0
+"""Bounds of what a filter can be asked for."""
+
 _NOTHING: Mean = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 _FORGOTTEN = 20.0
 """Time without a measurement, in units of 1 / omega, after which what was known is worth nothing: a
 polynomial of third order is 20³ times as uncertain as at one."""
+
+_STEP_OF_MODEL = 0.5
+"""Of a step of the mean, in radians or time constants of the model's own law: a ten-thousandth of
+its change is left out."""
 
 _FADING_S = 1.0
 """Time constant with which the innovations' variance is followed."""
@@ -120,8 +128,16 @@ class ErrorFilter:
             (a step over the square root of 12).
     """
 
-    bandwidth_hz: Annotated[float, Field(ge=0.01, le=1e4)]
-    noise_std_m: Annotated[float, Field(ge=1e-12, le=1.0)]
+    bandwidth_hz: Annotated[float, Field(ge=_LOWEST_HZ, le=_HIGHEST_HZ)]
+    noise_std_m: Annotated[float, Field(ge=_LEAST_STD_M, le=_LARGEST_STD_M)]
+
+    @classmethod
+    def within(cls, bandwidth_hz: float, noise_std_m: float) -> "ErrorFilter":
+        """The filter whose values are the nearest within their bounds."""
+        return cls(
+            bandwidth_hz=min(max(bandwidth_hz, _LOWEST_HZ), _HIGHEST_HZ),
+            noise_std_m=min(max(noise_std_m, _LEAST_STD_M), _LARGEST_STD_M),
+        )
 
     @property
     def omega(self) -> float:
@@ -148,8 +164,13 @@ class ErrorFilter:
             return state
         interval_ns, steady = state.start.interval_ns, state.steady
         if (innovation.t_ns - state.t_ns) * 1e-9 * self.omega > _FORGOTTEN:
-            before_ns, prior = innovation.t_ns - interval_ns, self._prior()
-            state = replace(state, t_ns=before_ns, mean=_NOTHING, covariance=prior)
+            return replace(
+                state,
+                t_ns=innovation.t_ns,
+                mean=(innovation.value_m, 0.0, 0.0, 0.0, 0.0),
+                covariance=self._prior(),
+                inputs=_from(state.inputs, innovation.t_ns),
+            )
         mean = _moved(state, innovation.t_ns)
         number = max(1, round((innovation.t_ns - state.t_ns) / interval_ns))
         covariance, scale = state.covariance, state.scale
@@ -199,14 +220,16 @@ class ErrorFilter:
     def residual_std(self, state: ErrorState, t_ns: int) -> float:
         """Standard deviation of `residual`, at a time, in m/s²."""
         interval_ns = state.start.interval_ns
-        number = (t_ns - state.t_ns + interval_ns // 2) // interval_ns
+        longest_ns = round(_FORGOTTEN / self.omega * 1e9)
+        number = (min(t_ns - state.t_ns, longest_ns) + interval_ns // 2) // interval_ns
         if state.covariance is not None:
             variance = _ahead(state.covariance, self._pace(state.start), number)
         elif number < 1:
             variance = state.steady.residual
         else:
             variance = _steady_ahead(self._pace(state.start), number)
-        return math.sqrt(state.scale * variance) * self.noise_std_m * self.omega**2
+        std = math.sqrt(state.scale * max(variance, 0.0))
+        return std * self.noise_std_m * self.omega**2
 
     def with_input(self, state: ErrorState, t_ns: int, acceleration: float) -> ErrorState:
         """State after the virtual force has changed."""
@@ -290,27 +313,40 @@ def _from(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tuple[int, 
 
 def _moved(state: ErrorState, to_ns: int) -> Mean:
     """The mean at a later time, under the inputs in between."""
-    x, v, a, j, s = state.mean
-    inputs, from_ns = state.inputs, state.t_ns
-    stiffness, damping = state.start.stiffness_per_s2, state.start.damping_per_s
-    last = len(inputs) - 1
+    mean, inputs, from_ns = state.mean, state.inputs, state.t_ns
+    start, last = state.start, len(inputs) - 1
     for index, (_, by_force) in enumerate(inputs):
         end_ns = to_ns if index == last else min(inputs[index + 1][0], to_ns)
         if end_ns <= from_ns:
             continue
         h = (end_ns - from_ns) * 1e-9
         from_ns = end_ns
-        # The error's derivatives, for its Taylor series up to the fifth: at one radian a step of
-        # the model's own oscillation a thousandth is left out.
-        x2 = a + by_force - stiffness * x - damping * v
-        x3 = j - stiffness * v - damping * x2
-        x4 = s - stiffness * x2 - damping * x3
-        x5 = -stiffness * x3 - damping * x4
-        x += h * (v + h * (x2 / 2.0 + h * (x3 / 6.0 + h * (x4 / 24.0 + h * x5 / 120.0))))
-        v += h * (x2 + h * (x3 / 2.0 + h * (x4 / 6.0 + h * x5 / 24.0)))
-        a += h * (j + h * s / 2.0)
-        j += h * s
-    return x, v, a, j, s
+        # A step in which the model itself hardly moves: what its law does is a Taylor series.
+        quick = h * max(abs(start.damping_per_s), math.sqrt(abs(start.stiffness_per_s2)))
+        if quick <= _STEP_OF_MODEL:
+            mean = _stepped(mean, by_force, h, start)
+            continue
+        count = math.ceil(quick / _STEP_OF_MODEL)
+        for _ in range(count):
+            mean = _stepped(mean, by_force, h / count, start)
+    return mean
+
+
+def _stepped(mean: Mean, by_force: float, h: float, start: Start) -> Mean:
+    """The mean after a step, to the fifth order of the error's Taylor series."""
+    x, v, a, j, s = mean
+    stiffness, damping = start.stiffness_per_s2, start.damping_per_s
+    x2 = a + by_force - stiffness * x - damping * v
+    x3 = j - stiffness * v - damping * x2
+    x4 = s - stiffness * x2 - damping * x3
+    x5 = -stiffness * x3 - damping * x4
+    return (
+        x + h * (v + h * (x2 / 2.0 + h * (x3 / 6.0 + h * (x4 / 24.0 + h * x5 / 120.0)))),
+        v + h * (x2 + h * (x3 / 2.0 + h * (x4 / 6.0 + h * x5 / 24.0))),
+        a + h * (j + h * s / 2.0),
+        j + h * s,
+        s,
+    )
 
 
 def _gain(ahead: Array) -> tuple[Array, Array]:
@@ -340,13 +376,19 @@ def _transition(time: float, stiffness: float, damping: float) -> tuple[Array, A
 
     Reference: Van Loan, Computing integrals involving the matrix exponential, IEEE TAC 23 (1978).
     """
+    # Van Loan's matrix grows where the model's own motion decays: a short time, doubled.
+    doublings = max(0, math.ceil(math.log2(max(time * (damping + math.sqrt(abs(stiffness))), 1.0))))
+    short = time / 2**doublings
     rates = np.diag(np.ones(ORDER - 1), 1)
     rates[1, :2] = -stiffness, -damping
     driven = np.zeros((ORDER, ORDER))
     driven[-1, -1] = 1.0
-    both = cast("Any", expm)(time * np.block([[-rates, driven], [np.zeros_like(rates), rates.T]]))
+    both = cast("Any", expm)(short * np.block([[-rates, driven], [np.zeros((5, 5)), rates.T]]))
     transition = np.ascontiguousarray(both[ORDER:, ORDER:].T)
     noise = transition @ both[:ORDER, ORDER:]
+    for _ in range(doublings):
+        noise = noise + transition @ noise @ transition.T
+        transition = transition @ transition
     return transition, 0.5 * (noise + noise.T)
 
 

@@ -36,6 +36,7 @@ class Diagnosing:
         self._run = folder.absolute()
         self._process: subprocess.Popen[str] | None = None
         self._out = self._run
+        self._reader: threading.Thread | None = None
         self._lock = threading.Lock()
         self._what, self._share, self._said = "", 0.0, ""
         self._is_cancelled = False
@@ -66,10 +67,10 @@ class Diagnosing:
             )
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICENESS)
-        reader = threading.Thread(
+        self._reader = threading.Thread(
             target=self._read, args=(self._process,), name="diagnosis", daemon=True
         )
-        reader.start()
+        self._reader.start()
 
     def cancel(self) -> None:
         """End it, if it goes on; what it found so far is lost."""
@@ -82,7 +83,9 @@ class Diagnosing:
         """What a page shows of it: `state`, and what belongs to that state."""
         process = self._process
         code = None if process is None else process.poll()
-        if process is not None and code is None:
+        # What it says last is read after it has ended.
+        is_read = self._reader is None or not self._reader.is_alive()
+        if process is not None and (code is None or not is_read):
             return {"state": "running", "what": self._what, "share": self._share}
         if process is not None and self._is_cancelled:
             return {"state": "cancelled"}

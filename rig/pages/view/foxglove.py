@@ -244,6 +244,8 @@ class FoxgloveView:
         if not self._has_begun:
             self._has_begun = any(topic.is_subscribed for topic in self._topics)
             self._playback = Playback(0, now_ns, is_playing=self._has_begun)
+        if not self._playback.since_ns:  # asked for before the first round
+            self._playback = self._playback._replace(since_ns=now_ns)
         self._playback = self._playback.at(now_ns, self._end_ns)
         for topic in self._topics:
             topic.publish(epoch_ns, self._playback.position_ns)

@@ -176,7 +176,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.NOT_FOUND, b"no such action", "text/plain")
             return
         length = self.headers.get("Content-Length", "")
-        if not length.isdigit() or int(length) > _MOST_ASKED_BYTES:
+        if not (length.isascii() and length.isdecimal()) or int(length) > _MOST_ASKED_BYTES:
             self._send(HTTPStatus.BAD_REQUEST, b"too long", "text/plain")
             return
         try:
