@@ -34,7 +34,7 @@ def diagnose(
     """Trace what the model lacks to named effects, correct it, and judge it on other data."""
     from dart_model.spec import load_model, model_file
     from rig.diagnosis.command import diagnose_runs
-    from rig.diagnosis.outcome import to_json
+    from rig.diagnosis.outcome import REPORT_FILE, to_json
     from rig.pages.paper import browser, print_page
     from rig.pages.report import write_report
 
@@ -45,9 +45,9 @@ def diagnose(
     spec = load_model(model_file(model, Path()))
     with progress_bar() as bar:
         result = diagnose_runs(runs, spec, held_out or [], out, bar)
-        write_report(result, out / "report.html")
+        write_report(result, out / REPORT_FILE)
         if pdf:
-            print_page(out / "report.html", out / "report.pdf")
+            print_page(out / REPORT_FILE, out / "report.pdf")
     if junit is not None:
         write_junit(junit, f"rig diagnose {spec.name}", verdict(result.diagnosis, spec))
     if as_json:

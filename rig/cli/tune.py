@@ -118,7 +118,7 @@ def _source(run: Path | None, stated: tuple[float | None, ...]) -> "Path | State
 def _as_dict(strut: "TunedStrut") -> dict[str, object]:
     from rig.tuning.command import plain
 
-    chosen, (_, published) = strut.found, strut.paper
+    chosen, published = strut.found, strut.paper
     return {
         "strut": strut.name,
         "observer": plain(chosen.observer),
@@ -142,8 +142,9 @@ def _as_dict(strut: "TunedStrut") -> dict[str, object]:
 
 def _print(strut: "TunedStrut", damping_ratio: float, least_margin: float) -> None:
     from rig.tuning.command import plain
+    from rig.tuning.gains import PAPER_HZ
 
-    chosen, (_, published) = strut.found, strut.paper
+    chosen, published = strut.found, strut.paper
     shown = table(
         "expected error of the force",
         "tuned",
@@ -153,7 +154,7 @@ def _print(strut: "TunedStrut", damping_ratio: float, least_margin: float) -> No
     for label, name in (("by noise", "noise_n"), ("by lag", "lag_n"), ("RMS", "force_n")):
         values = [getattr(item, name) for item in (chosen.expected, published)]
         shown.add_row(label, *(f"{v:.3g} N" if v < 1e9 else "unstable" for v in values))
-    shown.add_row("bandwidth", f"{strut.bandwidth_hz:.3g} Hz", f"{strut.paper_hz:.3g} Hz")
+    shown.add_row("bandwidth", f"{strut.bandwidth_hz:.3g} Hz", f"{PAPER_HZ:.3g} Hz")
     shown.add_row(
         "least damping ratio",
         f"{chosen.expected.damping_ratio:.3f}",
@@ -173,7 +174,7 @@ def _print(strut: "TunedStrut", damping_ratio: float, least_margin: float) -> No
         console.print("Latency of the height: this run does not tell it (one frequency alone?).")
     elif strut.latency is not None:
         low_ms, high_ms = 1e3 * max(strut.latency.low_s, 0.0), 1e3 * strut.latency.high_s
-        verdict = "" if strut.delay_s else "; not told from none, so none is set"
+        verdict = "" if strut.delay_s else "; not distinguished from none, so none is set"
         console.print(
             f"Latency of the height: {1e3 * strut.latency.delay_s:.3g} ms (95 %: {low_ms:.3g} to "
             f"{high_ms:.3g} ms){verdict}.",

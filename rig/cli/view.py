@@ -17,6 +17,8 @@ EXAMPLES = (
 
 
 _PORT, _FOXGLOVE_PORT = 8321, 8765
+_PUBLISH_EVERY_S = 0.05
+"""Time between two rounds of what is published: twenty a second are smooth."""
 
 
 def view(
@@ -98,5 +100,5 @@ def _publish(runs: list[Path], port: int) -> None:
         )
         while not stop():
             view.publish(time.monotonic_ns())
-            time.sleep(0.05)
+            time.sleep(_PUBLISH_EVERY_S)
         view.close()

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.core.contract import AMBIENT_C, Innovation, Observer, Plant, Start
+from rig.core.differences import slopes
 from rig.core.step import Answer, strut_answers
 
 Array = NDArray[np.float64]
@@ -38,6 +39,12 @@ class Rhythm(NamedTuple):
     period_ns: int
     measured_every: int = 1
     delay: int = 0
+
+    @classmethod
+    def of(cls, period_ns: int, interval_ns: int, delay_ns: int) -> "Rhythm":
+        """The rhythm of a tick and of its measurements, in whole ticks and measurement periods."""
+        every = max(1, round(interval_ns / period_ns))
+        return cls(period_ns, every, round(delay_ns / (every * period_ns)))
 
     @property
     def interval_ns(self) -> int:
@@ -99,7 +106,7 @@ class Loop:
         observers: One for each of its struts.
         heights_m: Strut heights at which the bench is assumed to rest.
         rhythm: When the loop is closed.
-        answers: What the observers are told of the model; by differences on it if absent.
+        answers: What the observers take the model to answer; by differences on it if absent.
     """
 
     def __init__(
@@ -187,23 +194,15 @@ class Loop:
     def linear(self, strut: int = 0) -> LinearLoop:
         """The loop about rest, as one strut's noise and residual force drive it."""
         size = len(self.at_rest)
-        a, c = np.empty((size, size)), np.empty(size)
-        for index, value in enumerate(self.at_rest.tolist()):
-            step = _STEP * max(1.0, abs(value))
-            moved = np.zeros(size)
-            moved[index] = step
-            up, down = (self.after(self.at_rest + sign * moved, strut) for sign in (1.0, -1.0))
-            a[:, index] = (up[0] - down[0]) / (2.0 * step)
-            c[index] = (up[1] - down[1]) / (2.0 * step)
-        b, d = np.empty((size, 2)), np.empty(2)
+        widths = [_STEP * max(1.0, abs(value)) for value in self.at_rest.tolist()]
         step_n = _ACCELERATION_STEP_M_PER_S2 / self._answers[strut].mobility_per_kg
-        for column, (noise_m, residual_n) in enumerate(((_STEP, 0.0), (0.0, step_n))):
-            up, down = (
-                self.after(self.at_rest, strut, sign * noise_m, sign * residual_n)
-                for sign in (1.0, -1.0)
-            )
-            width = 2.0 * (noise_m + residual_n)
-            b[:, column], d[column] = (up[0] - down[0]) / width, (up[1] - down[1]) / width
+
+        def after(u: Array) -> Array:
+            noise_m, residual_n = u[size:].tolist()
+            return np.append(*self.after(self.at_rest + u[:size], strut, noise_m, residual_n))
+
+        found = slopes(after, [*widths, _STEP, step_n])
+        a, b, c, d = found[:-1, :size], found[:-1, size:], found[-1, :size], found[-1, size:]
         return LinearLoop(a, b, c, d, self._rhythm.interval_ns * 1e-9)
 
     def _settled(self, observer: Observer, answer: Answer) -> Any:

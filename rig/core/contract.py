@@ -47,7 +47,7 @@ class Innovation(Struct, frozen=True, gc=False):
 
 
 class Start(Struct, frozen=True, gc=False):
-    """What an observer is told when the model starts.
+    """What an observer is given when the model starts.
 
     Attributes:
         t_ns: Time of the measurement that it starts with.

@@ -1,7 +1,7 @@
-"""What measured heights can tell of unknown forces and offsets, and what they cannot.
+"""Which unknown forces and offsets can be observed from measured heights.
 
 An unknown that is constant, or changes without a law, is one more state that stays where it is. It
-can be told if no motion of the model explains it away: if the matrix
+is observable if no motion of the model explains it away: if the matrix
 
     [ A - 1   B ]
     [   C     D ]
@@ -14,13 +14,14 @@ Francis and Wonham, The internal model principle of control theory, Automatica 1
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.core.contract import AMBIENT_C, Plant
+from rig.core.differences import slopes
 
 Array = NDArray[np.float64]
 
@@ -28,7 +29,11 @@ _TIME_S = 0.02
 """Time of the map: long enough that it differs from one, short for a bench."""
 
 _STEP = 1e-6
+"""Of the model's numbers (m or rad, and per second): a third of the digits of a double."""
+
 _FORCE_STEP_N = 1e-2
+"""Of the forces, whose effect is linear."""
+
 _INDEPENDENT = 1e-6
 """Least singular value of columns of unit length: a hundred times what the differences leave."""
 
@@ -48,12 +53,13 @@ class Unknown(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What measured heights tell.
+    """What is observable from measured heights.
 
     Attributes:
-        hidden: Unknowns that they do not tell at all.
-        confused: Pairs of unknowns, each told if the other is known, that they do not tell apart.
-        together: Whether they tell all at once that is not hidden.
+        hidden: Unknowns that are not observable at all.
+        confused: Pairs of unknowns, each observable if the other is known, that cannot be
+            distinguished.
+        together: Whether all that is not hidden is observable at once.
     """
 
     hidden: tuple[Unknown, ...]
@@ -61,52 +67,22 @@ class Verdict(NamedTuple):
     together: bool
 
 
-def observability(
-    plant: Plant, heights_m: Sequence[float], measured: Sequence[int], unknowns: Sequence[Unknown]
-) -> Verdict:
-    """What the heights of some struts tell of unknowns, about a model at rest.
+class Linear(NamedTuple):
+    """A model about rest, from one time to another.
 
-    Args:
-        plant: The model.
-        heights_m: Heights of all struts at rest.
-        measured: Indices of the struts whose heights are measured.
-        unknowns: What is asked.
+    Attributes:
+        model: The model's numbers by those before, shape (n, n).
+        by_force: The same by forces in its struts, shape (n, struts).
+        heights: Heights by the model's numbers, shape (struts, n).
     """
-    model, by_force, seen = _linear(plant, heights_m)
-    seen = seen[list(measured)]
-    columns = [_column(unknown, by_force, measured, len(seen)) for unknown in unknowns]
-    base = np.vstack([model - np.eye(len(model)), seen])
 
-    def is_told(*which: int) -> bool:
-        # The model's own motion must not explain it: only what it leaves of the columns counts.
-        rest: Any = np.column_stack([columns[i] / np.linalg.norm(columns[i]) for i in which])
-        scaled = base / np.maximum(np.linalg.norm(base, axis=0), 1e-300)
-        explained: Any = cast("Any", np.linalg.lstsq)(scaled, rest, rcond=1e-10)[0]
-        rest = rest - scaled @ explained
-        least = cast("Any", np.linalg.svd)(rest, compute_uv=False)[-1]
-        return bool(least > _INDEPENDENT)
-
-    alone = [bool(columns[i].any()) and is_told(i) for i in range(len(unknowns))]
-    pairs = [
-        (unknowns[i], unknowns[j])
-        for i, j in itertools.combinations(range(len(unknowns)), 2)
-        if alone[i] and alone[j] and not is_told(i, j)
-    ]
-    hidden = [item for item, told in zip(unknowns, alone, strict=True) if not told]
-    shown = [i for i, told in enumerate(alone) if told]
-    return Verdict(tuple(hidden), tuple(pairs), not shown or is_told(*shown))
+    model: Array
+    by_force: Array
+    heights: Array
 
 
-def _column(unknown: Unknown, by_force: Array, measured: Sequence[int], outputs: int) -> Array:
-    """What an unknown does to the model's numbers and to the measured heights."""
-    if not unknown.is_offset:
-        return np.concatenate([by_force[:, unknown.strut], np.zeros(outputs)])
-    to_heights = np.array([float(strut == unknown.strut) for strut in measured])
-    return np.concatenate([np.zeros(len(by_force)), to_heights])
-
-
-def _linear(plant: Plant, heights_m: Sequence[float]) -> tuple[Array, Array, Array]:
-    """Map of the model's numbers over a time, what forces in struts add, and heights by numbers."""
+def linear_model(plant: Plant, heights_m: Sequence[float]) -> Linear:
+    """A model about rest at some heights of all its struts."""
     start = np.array(plant.numbers(plant.init(heights_m)))
     nothing = np.zeros(plant.struts)
 
@@ -118,11 +94,50 @@ def _linear(plant: Plant, heights_m: Sequence[float]) -> tuple[Array, Array, Arr
     def heights(x: Array) -> Array:
         return np.array([height_m for height_m, _ in plant.state_of(x.tolist()).struts])
 
-    def slopes(function: Callable[[Array], Array], count: int, step: float) -> Array:
-        changed = [step * row for row in np.eye(count)]
-        return np.column_stack([(function(d) - function(-d)) / (2.0 * step) for d in changed])
+    steps = [_STEP] * len(start)
+    return Linear(
+        slopes(lambda d: after(start + d, nothing), steps),
+        slopes(lambda d: after(start, d), [_FORCE_STEP_N] * plant.struts),
+        slopes(lambda d: heights(start + d), steps),
+    )
 
-    size = len(start)
-    model = slopes(lambda d: after(start + d, nothing), size, _STEP)
-    by_force = slopes(lambda d: after(start, d), plant.struts, _FORCE_STEP_N)
-    return model, by_force, slopes(lambda d: heights(start + d), size, _STEP)
+
+def observability(linear: Linear, measured: Sequence[int], unknowns: Sequence[Unknown]) -> Verdict:
+    """Which unknowns can be observed from the heights of some struts.
+
+    Args:
+        linear: The model about rest.
+        measured: Indices of the struts whose heights are measured.
+        unknowns: What is asked.
+    """
+    model, by_force = linear.model, linear.by_force
+    seen = linear.heights[list(measured)]
+    columns = [_column(unknown, by_force, measured, len(seen)) for unknown in unknowns]
+    base = np.vstack([model - np.eye(len(model)), seen])
+    scaled = base / np.maximum(np.linalg.norm(base, axis=0), 1e-300)
+
+    def is_observable(*which: int) -> bool:
+        # The model's own motion must not explain it: only what it leaves of the columns counts.
+        rest: Any = np.column_stack([columns[i] / np.linalg.norm(columns[i]) for i in which])
+        explained: Any = cast("Any", np.linalg.lstsq)(scaled, rest, rcond=1e-10)[0]
+        rest = rest - scaled @ explained
+        least = cast("Any", np.linalg.svd)(rest, compute_uv=False)[-1]
+        return bool(least > _INDEPENDENT)
+
+    alone = [bool(columns[i].any()) and is_observable(i) for i in range(len(unknowns))]
+    pairs = [
+        (unknowns[i], unknowns[j])
+        for i, j in itertools.combinations(range(len(unknowns)), 2)
+        if alone[i] and alone[j] and not is_observable(i, j)
+    ]
+    hidden = [item for item, observed in zip(unknowns, alone, strict=True) if not observed]
+    shown = [i for i, observed in enumerate(alone) if observed]
+    return Verdict(tuple(hidden), tuple(pairs), not shown or is_observable(*shown))
+
+
+def _column(unknown: Unknown, by_force: Array, measured: Sequence[int], outputs: int) -> Array:
+    """What an unknown does to the model's numbers and to the measured heights."""
+    if not unknown.is_offset:
+        return np.concatenate([by_force[:, unknown.strut], np.zeros(outputs)])
+    to_heights = np.array([float(strut == unknown.strut) for strut in measured])
+    return np.concatenate([np.zeros(len(by_force)), to_heights])

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from rig.core.contract import (
     AMBIENT_C,
@@ -23,6 +24,7 @@ from rig.core.contract import (
     StrutOutput,
     is_sensible,
 )
+from rig.core.differences import slopes
 from rig.core.supervisor import Event, Supervision, age_event, mode_at_age, next_mode
 
 
@@ -46,6 +48,9 @@ class RigState(CoreState, frozen=True, gc=False, kw_only=True):
 _SECANT_M, _SECANT_M_PER_S = 2e-3, 0.1
 """Of the law's secants: a share of a usual stroke and speed, so that friction, which is infinitely
 steep at rest, counts as what it is on the way."""
+
+_SECANT_N = 1.0
+"""Of the force, whose answer is linear."""
 
 
 class Arrival(NamedTuple):
@@ -317,32 +322,23 @@ class Answer(NamedTuple):
 
 def strut_answers(plant: Plant, heights_m: Sequence[float]) -> list[Answer]:
     """How a model answers at rest at some heights, by secants of its accelerations."""
-    nothing = [0.0] * plant.struts
+    return [_strut_answer(plant, np.asarray(heights_m), index) for index in range(plant.struts)]
 
-    def acceleration(
-        index: int, *, height_m: float = 0.0, velocity: float = 0.0, force_n: float = 0.0
-    ) -> float:
-        def one(value: float) -> list[float]:
-            return [*nothing[:index], value, *nothing[index + 1 :]]
 
-        heights = [z + dz for z, dz in zip(heights_m, one(height_m), strict=True)]
-        state = plant.init(heights, one(velocity))
-        loaded = plant.load(state, one(force_n), 0.0, AMBIENT_C)
-        return loaded.accelerations_m_per_s2[index]
+def _strut_answer(plant: Plant, heights_m: NDArray[np.float64], index: int) -> Answer:
+    alone = np.eye(plant.struts)[index]
 
-    found: list[Answer] = []
-    for index in range(plant.struts):
-        slopes = [
-            (acceleration(index, **{key: step}) - acceleration(index, **{key: -step}))
-            / (2.0 * step)
-            for key, step in (
-                ("force_n", 1.0),
-                ("height_m", _SECANT_M),
-                ("velocity", _SECANT_M_PER_S),
-            )
-        ]
-        found.append(Answer(slopes[0], -slopes[1], -slopes[2]))
-    return found
+    def acceleration(u: NDArray[np.float64]) -> NDArray[np.float64]:
+        force_n, height_m, velocity_m_per_s = u.tolist()
+        heights, velocities = heights_m + height_m * alone, velocity_m_per_s * alone
+        state = plant.init(heights.tolist(), velocities.tolist())
+        loaded = plant.load(state, (force_n * alone).tolist(), 0.0, AMBIENT_C)
+        return np.array([loaded.accelerations_m_per_s2[index]])
+
+    ((mobility, stiffness, damping),) = slopes(
+        acceleration, (_SECANT_N, _SECANT_M, _SECANT_M_PER_S)
+    ).tolist()
+    return Answer(mobility, -stiffness, -damping)
 
 
 def _height_at(

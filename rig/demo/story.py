@@ -13,7 +13,7 @@ from rig.bench.config import load_bench_config
 from rig.bench.schema import BenchConfig, Effect
 from rig.demo.cases import SETTLED_NS
 from rig.diagnosis.command import diagnose_runs
-from rig.diagnosis.outcome import CORRECTED_FILE, Diagnosis, to_json
+from rig.diagnosis.outcome import CORRECTED_FILE, REPORT_FILE, Diagnosis, to_json
 from rig.io.run_log import read_run
 from rig.operation.config import CONFIGS
 from rig.operation.live import with_bench
@@ -135,7 +135,7 @@ def tell(
     chapter("The first run is diagnosed")
     out = folder / "diagnosis"
     result = diagnose_runs([first.folder], ready.model, [held_out.folder], out, diagnosis_progress)
-    write_report(result, out / "report.html")
+    write_report(result, out / REPORT_FILE)
     chapter("A fresh run, with the model as it was and with the corrected one")
     before = run(2, "fresh_before", ready, in_lockstep=True)
     corrected = load_model(out / CORRECTED_FILE)

@@ -8,7 +8,14 @@ from pathlib import Path
 
 from dart_model.spec import FileSkeleton, ModelSpec, dump_model
 from rig.diagnosis.diagnose import diagnose
-from rig.diagnosis.outcome import CORRECTED_FILE, DIAGNOSIS_FILE, Result, Source, write_results
+from rig.diagnosis.outcome import (
+    CORRECTED_FILE,
+    DIAGNOSIS_FILE,
+    REPORT_FILE,
+    Result,
+    Source,
+    write_results,
+)
 from rig.diagnosis.progress import Progress
 from rig.diagnosis.recording import read_recording
 from rig.inputs.errors import InputError
@@ -39,7 +46,7 @@ def diagnose_runs(
     if (out / RUN_FILE).exists():
         raise InputError(f"{out}: holds a run, expected another folder for what was found")
     # Before a search that takes minutes, not after it.
-    for name in (DIAGNOSIS_FILE, CORRECTED_FILE, "report.html", "report.pdf"):
+    for name in (DIAGNOSIS_FILE, CORRECTED_FILE, REPORT_FILE, "report.pdf"):
         if (out / name).exists():
             raise InputError(f"{out}: holds {name} already, expected a folder without one")
     if isinstance(model.skeleton, FileSkeleton):

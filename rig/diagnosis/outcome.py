@@ -19,7 +19,7 @@ Verdict = Literal["nothing_missing", "explained", "partly_explained", "ambiguous
 Change = Literal["refitted", "superfluous"]
 
 SCHEMA = 1
-DIAGNOSIS_FILE, CORRECTED_FILE = "diagnosis.json", "corrected.yaml"
+DIAGNOSIS_FILE, CORRECTED_FILE, REPORT_FILE = "diagnosis.json", "corrected.yaml", "report.html"
 
 
 @dataclass(frozen=True)

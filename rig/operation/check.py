@@ -7,7 +7,8 @@ from enum import Enum
 from can_dbc.bus_load import frame_time_s
 from can_dbc.database import Message
 from rig.core.closed_loop import Rhythm
-from rig.core.observability import Unknown, observability
+from rig.core.contract import Plant
+from rig.core.observability import Unknown, linear_model, observability
 from rig.core.quantities import LOAD_CELL_FORCE
 from rig.core.stability import Pole, closed_loop_poles
 from rig.operation.assembly import arrivals, build_bridge, build_plant
@@ -81,7 +82,8 @@ def check(ready: Setup) -> list[Finding]:
     if config.prescribed_motion is not None:
         text = "the motion is prescribed: no loop is closed that could become unstable"
         return [*findings, Finding(Severity.OK, "poles", text)]
-    return [*findings, *_stability(ready, heights), *_observability(ready)]
+    plant = build_plant(ready)
+    return [*findings, *_stability(ready, plant), *_observability(ready, plant)]
 
 
 def errors(ready: Setup) -> list[Finding]:
@@ -184,19 +186,18 @@ def _load(ready: Setup) -> Finding:
     return Finding(Severity.WARNING if load > HIGH_LOAD else Severity.OK, "bus load", text)
 
 
-def _stability(ready: Setup, heights: list[Message]) -> list[Finding]:
-    config = ready.config
-    plant = build_plant(ready)
-    observers = tuple(config.observers.values())
+def _stability(ready: Setup, plant: Plant) -> list[Finding]:
+    observers = tuple(ready.config.observers.values())
     rest = tuple(strut.free_length_m for strut in ready.model.struts)
-    slowest_ns = max(message.cycle_time_ns or 0 for message in heights)
-    every = max(1, round(slowest_ns / config.period_ns))
-    delay_ns = max(entry.delay_ns for entry in config.signals.height.values())
-    delay = round(delay_ns / (every * config.period_ns))
-    rhythm = Rhythm(config.period_ns, every, delay)
+    every = arrivals(ready)
+    rhythm = Rhythm.of(
+        ready.config.period_ns,
+        max(arrival.interval_ns for arrival in every),
+        max(arrival.delay_ns for arrival in every),
+    )
     poles = closed_loop_poles(plant, observers, rest, rhythm)
     findings = [_worst(poles), *_bandwidths(ready)]
-    late = closed_loop_poles(plant, observers, rest, rhythm._replace(delay=delay + 1))
+    late = closed_loop_poles(plant, observers, rest, rhythm._replace(delay=rhythm.delay + 1))
     worst = max(pole.magnitude for pole in late)
     text = f"largest |z| {worst:.5f} with measurements one cycle late"
     if worst < 1.0:
@@ -226,13 +227,13 @@ def _bandwidths(ready: Setup) -> list[Finding]:
     return findings
 
 
-def _observability(ready: Setup) -> list[Finding]:
-    """What the heights tell of the struts' forces, and what they cannot, in words."""
-    plant, names = build_plant(ready), [strut.name for strut in ready.model.struts]
-    rest = [strut.free_length_m for strut in ready.model.struts]
+def _observability(ready: Setup, plant: Plant) -> list[Finding]:
+    """Which of the struts' forces are observable from the heights, and which are not, in words."""
+    names = [strut.name for strut in ready.model.struts]
+    linear = linear_model(plant, [strut.free_length_m for strut in ready.model.struts])
     every = [i for i, name in enumerate(names) if name in ready.config.signals.height]
     forces = [Unknown(f"the residual force of {names[i]}", i) for i in every]
-    found = observability(plant, rest, every, forces)
+    found = observability(linear, every, forces)
     text = f"the heights tell the residual force of {', '.join(names[i] for i in every)}"
     wrong = [*(item.name for item in found.hidden), *map(_apart, found.confused)]
     if not wrong and not found.together:
@@ -252,13 +253,13 @@ def _observability(ready: Setup) -> list[Finding]:
             Unknown("an offset of its height sensor", i, is_offset=True),
         )
         for pair in (of_strut[:2], of_strut[2:]):
-            untold += map(_apart, observability(plant, rest, every, pair).confused)
+            untold += map(_apart, observability(linear, every, pair).confused)
     if untold:
         text = f"the heights do not tell {'; '.join(untold)}: a law or a load cell does"
         findings.append(Finding(Severity.OK, "what heights cannot tell", text))
     for i in every if len(every) > 1 else ():
         name = names[i]
-        found = observability(plant, rest, [j for j in every if j != i], forces)
+        found = observability(linear, [j for j in every if j != i], forces)
         lost = [*(item.name for item in found.hidden), *map(_apart, found.confused)]
         if lost:
             text = f"the others would not tell {'; '.join(lost)}"

@@ -5,7 +5,7 @@ from html import escape
 from pathlib import Path
 
 from dart_model.spec import ModelSpec
-from rig.diagnosis.outcome import Diagnosis, Result, write_results
+from rig.diagnosis.outcome import REPORT_FILE, Diagnosis, Result, write_results
 from rig.pages.report import sentence, tables, write_report
 
 _HEADINGS = ("on held-out data", "before", "after", "change", "noise floor", "ratio")
@@ -41,7 +41,7 @@ class Found:
             OSError: The folder cannot be written.
         """
         write_results(self.result, self.nominal, Path(folder))
-        write_report(self.result, Path(folder) / "report.html")
+        write_report(self.result, Path(folder) / REPORT_FILE)
 
     def __str__(self) -> str:
         return f"{self.diagnosis.verdict}: {sentence(self.diagnosis, len(self.nominal.struts))}"

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from rig.inputs.errors import InputError
 from rig.tuning.command import TunedStrut
+from rig.tuning.gains import PAPER_HZ
 
 _TOTAL, _NOISE, _LAG, _PAPER = "#1b1f24", "#0072b2", "#d55e00", "#a3458f"
 
@@ -48,10 +49,10 @@ def _draw(axes: Any, strut: TunedStrut) -> None:
         axes.loglog(frequency, values, color=colour, linewidth=width, label=label)
     chosen = strut.found.expected.force_n
     axes.plot(strut.bandwidth_hz, chosen, "o", color=_TOTAL, markersize=9, label="chosen")
-    _, published = strut.paper
+    published = strut.paper
     if np.isfinite(published.force_n):
         label = "published gains, by mass"
-        axes.plot(strut.paper_hz, published.force_n, "X", color=_PAPER, markersize=9, label=label)
+        axes.plot(PAPER_HZ, published.force_n, "X", color=_PAPER, markersize=9, label=label)
     else:
         label = "published gains, by mass: unstable"
         axes.plot([], [], "X", color=_PAPER, markersize=9, label=label)

@@ -2,8 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -15,6 +14,7 @@ from rig.core.closed_loop import Rhythm
 from rig.core.observers.kalman import KalmanObserver
 from rig.core.observers.model_error import ErrorFilter
 from rig.core.step import strut_answers
+from rig.diagnosis.progress import Progress, within
 from rig.inputs.errors import InputError
 from rig.inputs.yaml_file import parse_mapping, read_text
 from rig.operation.assembly import arrivals, build_plant
@@ -33,13 +33,14 @@ from rig.tuning.gains import (
 )
 from rig.tuning.latency import Latency, delayed, estimate_latency
 
-Progress = Callable[[str, float], None]
-
 _FIRST_CORNER_PER_INTERVAL = 0.1
 """Bandwidth in rad/s times the interval of the observers that are not tuned yet: quick and tame."""
 
 _FACTORS = tuple(2.0 ** (step / 6.0) for step in range(-15, 16))
+"""Of the bandwidths that are drawn: from a sixth to six times the choice."""
+
 _LONGEST_DELAY_S = 0.05
+"""That is looked for: a height that is older is not one to close a loop with."""
 
 
 class Stated(NamedTuple):
@@ -66,9 +67,8 @@ class TunedStrut:
         latency: Delay of its height as the run shows it; None where it was given.
         delay_s: Delay that it was tuned with.
         found: The observer.
-        paper: The published gains scaled by the effective mass, and what is expected of them.
+        paper: What is expected of the published gains, scaled by the effective mass.
         bandwidth_hz: Bandwidth of the observer.
-        paper_hz: Natural frequency of the published gains.
         sweep: What is expected at other bandwidths.
     """
 
@@ -77,9 +77,8 @@ class TunedStrut:
     latency: Latency | None
     delay_s: float
     found: Tuned
-    paper: tuple[Any, Expected]
+    paper: Expected
     bandwidth_hz: float
-    paper_hz: float
     sweep: list[tuple[float, Expected]]
 
 
@@ -102,64 +101,48 @@ def tune(
         raise InputError(
             f"{ready.source}: prescribed_motion: no loop is closed, expected a free model"
         )
-    plant = build_plant(ready)
-    heights = [strut.free_length_m for strut in ready.model.struts]
-    mobilities = [answer.mobility_per_kg for answer in strut_answers(plant, heights)]
     names = list(ready.config.observers)
     if len(names) > len(ready.config.signals.height):
         raise InputError(
             f"{ready.source}: observers: kind none beside others cannot be tuned, expected a "
             "height of each strut"
         )
-    expectations: list[Expectation] = []
-    for index, name in enumerate(names):
-        if isinstance(source, Path):
-            progress(f"reading {name}", 0.0)
-            expectations.append(of_run(source, name, mobilities[index]))
-        else:
-            noise = source.noise_std_m or _quantisation_m(ready, name)
-            expectations.append(stated(noise, source.rms_n, source.up_to_hz))
+    plant = build_plant(ready)
+    heights = [strut.free_length_m for strut in ready.model.struts]
+    answers = strut_answers(plant, heights)
+    progress("reading what is to be expected", 0.0)
+    expectations = [
+        _expectation(ready, source, name, answer.mobility_per_kg)
+        for name, answer in zip(names, answers, strict=True)
+    ]
     every = arrivals(ready)
-    first = [
+    first = tuple(
         KalmanObserver("kalman", _first_filter(item.noise_std_m, arrival.interval_ns))
         for item, arrival in zip(expectations, every, strict=True)
-    ]
+    )
     found: list[TunedStrut] = []
     for index, name in enumerate(names):
-
-        def part(what: str, share: float, index: int = index, name: str = name) -> None:
-            progress(f"{name}: {what}", (index + share) / len(names))
-
+        share = index / len(names), (index + 1) / len(names)
+        part = within(progress, *share, of=name)
+        mobility_per_kg = answers[index].mobility_per_kg
+        latency = _latency(ready, source, name, mobility_per_kg, first[index], part)
         delay_s = ready.config.signals.height[name].delay_s
-        latency = None
-        if isinstance(source, Path) and delay_s == 0.0:
-            latency = estimate_latency(
-                source,
-                _with_model_of(ready, source),
-                name,
-                mobilities[index],
-                first[index],
-                _LONGEST_DELAY_S,
-                lambda share, part=part: part("latency", 0.7 * share),
-            )
-            if latency.low_s > 0.0:
-                delay_s = float(f"{latency.delay_s:.3g}")
+        if latency is not None and latency.low_s > 0.0:
+            delay_s = float(f"{latency.delay_s:.3g}")
         part("gains", 0.7)
-        rhythm = _rhythm(ready, every[index].interval_ns, delay_s)
-        limit_n = cast("Any", ready.config.observers[name]).force_limit_n
+        interval_ns, limit = every[index].interval_ns, cast("Any", ready.config.observers[name])
         bench = Bench(
             plant,
-            tuple(first),
+            first,
             index,
-            mobilities[index],
+            answers,
             heights,
-            rhythm,
+            Rhythm.of(ready.config.period_ns, interval_ns, round(delay_s * 1e9)),
             expectations[index],
-            limit_n,
+            limit.force_limit_n,
         )
         best = tuned(bench, kind, aim)
         part("other bandwidths", 0.9)
-        published = paper(bench)
         found.append(
             TunedStrut(
                 name,
@@ -167,13 +150,45 @@ def tune(
                 latency,
                 delay_s,
                 best,
-                (published, expected(bench, published)),
-                bandwidth_hz(best.observer, mobilities[index]),
-                bandwidth_hz(published, mobilities[index]),
+                expected(bench, paper(bench)),
+                bandwidth_hz(best.observer, mobility_per_kg),
                 swept(bench, best.observer, _FACTORS),
             )
         )
     return found
+
+
+def _expectation(
+    ready: Setup, source: Path | Stated, name: str, mobility_per_kg: float
+) -> Expectation:
+    if isinstance(source, Path):
+        return of_run(source, name, mobility_per_kg)
+    noise_std_m = source.noise_std_m or _quantisation_m(ready, name)
+    return stated(noise_std_m, source.rms_n, source.up_to_hz)
+
+
+def _latency(
+    ready: Setup,
+    source: Path | Stated,
+    name: str,
+    mobility_per_kg: float,
+    observer: KalmanObserver,
+    progress: Progress,
+) -> Latency | None:
+    """The latency of a height; None where there is no run, or the configuration gives it."""
+    if not isinstance(source, Path) or ready.config.signals.height[name].delay_s:
+        return None
+    # The run's own signals and bus, with the model that is tuned.
+    own = setup_of_folder(source).model_copy(update={"model": ready.model})
+    return estimate_latency(
+        source,
+        own,
+        name,
+        mobility_per_kg,
+        observer,
+        _LONGEST_DELAY_S,
+        lambda share: progress("latency", 0.7 * share),
+    )
 
 
 def write_config(ready: Setup, found: list[TunedStrut], path: Path) -> None:
@@ -213,30 +228,12 @@ def write_config(ready: Setup, found: list[TunedStrut], path: Path) -> None:
 
 def plain(observer: Any) -> dict[str, Any]:
     """An observer as it stands in a configuration; what is absent or zero there is left out."""
-    found: dict[str, Any] = {}
-    for key in observer.__dataclass_fields__:
-        value = getattr(observer, key)
-        if value is None or value == 0.0:
-            continue
-        found[key] = plain(value) if hasattr(value, "__dataclass_fields__") else value
-    return found
-
-
-def _with_model_of(ready: Setup, run: Path) -> Setup:
-    """The run's own signals and bus, with the model and the observers that are tuned."""
-    own = setup_of_folder(run)
-    return own.model_copy(update={"model": ready.model})
+    return {key: value for key, value in asdict(observer).items() if value}
 
 
 def _first_filter(noise_std_m: float, interval_ns: int) -> ErrorFilter:
     corner = _FIRST_CORNER_PER_INTERVAL / (interval_ns * 1e-9)
     return ErrorFilter.within(corner / (2.0 * math.pi), noise_std_m)
-
-
-def _rhythm(ready: Setup, interval_ns: int, delay_s: float) -> Rhythm:
-    every = max(1, round(interval_ns / ready.config.period_ns))
-    delay = round(delay_s * 1e9 / (every * ready.config.period_ns))
-    return Rhythm(ready.config.period_ns, every, delay)
 
 
 def _quantisation_m(ready: Setup, name: str) -> float:

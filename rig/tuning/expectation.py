@@ -23,8 +23,10 @@ _LONGEST_S = 60.0
 """Of a run: enough for a spectrum, and short enough for a double integral in doubles."""
 
 _SHORTEST_S = 1.0
+"""Of a run: a spectrum down to some hertz."""
+
 _FEWEST = 200
-"""Measurements: fewer tell little of noise and spectrum."""
+"""Measurements: a standard deviation within a tenth."""
 
 _LINES = 120
 """Frequencies into which a spectrum is gathered."""
@@ -58,13 +60,11 @@ class Residual(NamedTuple):
         noise_std_m: Standard deviation of the measured height.
         t_s: Times, shape (N,).
         force_n: Residual force, shape (N,).
-        std_n: Its standard deviation, shape (N,).
     """
 
     noise_std_m: float
     t_s: Array
     force_n: Array
-    std_n: Array
 
 
 class Expectation(NamedTuple):
@@ -95,7 +95,7 @@ def followed(steps: Any, folder: Path, strut: str, mobility_per_kg: float) -> Fo
     Raises:
         InputError: It has no such strut, or is too short.
     """
-    if f"{strut}.force_n" not in steps.schema.names:
+    if f"{strut}.law_force_n" not in steps.schema.names:
         raise InputError(f"{folder}: no strut {strut}, expected a run of this configuration")
 
     def column(name: str) -> Array:
@@ -132,7 +132,6 @@ def residual(given: Followed, mobility_per_kg: float) -> Residual:
         float(np.sqrt(noise.variance)),
         given.t_s,
         found.states[:, 2] / mobility_per_kg,
-        found.deviations[:, 2] / mobility_per_kg,
     )
 
 

@@ -21,18 +21,21 @@ from rig.core.observers.kalman import KalmanObserver
 from rig.core.observers.model_error import ErrorFilter
 from rig.core.observers.pi import PiObserver
 from rig.core.stability import Pole, poles_of
-from rig.core.step import strut_answers
+from rig.core.step import Answer
 from rig.tuning.expectation import Expectation
-
-KINDS = ("kalman", "pi")
 
 MARGINS = {"kalman": 1.1, "pi": 2.0}
 """Gain margins by kind. Two is usual for a PI loop. A noise-aware observer cancels the residual
 force with the effective mass that the model itself gives, which is known: it bears a tenth or a
 fifth."""
 
+KINDS = tuple(MARGINS)
+
 PAPER_PER_S2, PAPER_PER_S3 = 1.0e4, 1.0e3
 """Gains of the reference case over its mass of 10 kg."""
+
+PAPER_HZ = math.sqrt(PAPER_PER_S2) / (2.0 * math.pi)
+"""Natural frequency of the published gains by mass."""
 
 _EVALUATIONS = 250
 _GRID = 30
@@ -111,7 +114,7 @@ class Bench(NamedTuple):
         plant: The model.
         observers: Observers of all its struts.
         strut: Index of the strut.
-        mobility_per_kg: Acceleration of its height per newton in it.
+        answers: What the model answers, strut by strut.
         heights_m: Heights at which the bench rests.
         rhythm: When the loop is closed.
         expectation: What is expected of the strut.
@@ -121,11 +124,29 @@ class Bench(NamedTuple):
     plant: Plant
     observers: tuple[Observer, ...]
     strut: int
-    mobility_per_kg: float
+    answers: Sequence[Answer]
     heights_m: Sequence[float]
     rhythm: Rhythm
     expectation: Expectation
     force_limit_n: float
+
+    @property
+    def mobility_per_kg(self) -> float:
+        """Acceleration of the strut's height per newton in it."""
+        return self.answers[self.strut].mobility_per_kg
+
+    def linear(self, observer: Any, factor: float = 1.0) -> LinearLoop:
+        """The loop with another observer of this strut.
+
+        Args:
+            observer: The observer.
+            factor: By how much the model answers a virtual force more strongly than the observers
+                take it to.
+        """
+        plant: Any = self.plant if factor == 1.0 else _Stronger(self.plant, factor)
+        observers = self.with_observer(observer)
+        loop = Loop(plant, observers, self.heights_m, self.rhythm, self.answers)
+        return loop.linear(self.strut)
 
     def with_observer(self, observer: Any) -> tuple[Observer, ...]:
         """All observers, with another one of this strut."""
@@ -147,8 +168,7 @@ class _Stronger:
 
 def expected(bench: Bench, observer: Any) -> Expected:
     """What is expected of an observer of a strut."""
-    loop = Loop(bench.plant, bench.with_observer(observer), bench.heights_m, bench.rhythm)
-    linear = loop.linear(bench.strut)
+    linear = bench.linear(observer)
     poles = poles_of(linear.a, linear.interval_s)
     if not _is_stable(poles):
         return Expected(math.inf, math.inf, poles)
@@ -275,11 +295,8 @@ def _is_stable(poles: Sequence[Pole]) -> bool:
 
 
 def _keeps(bench: Bench, observer: Any, factor: float) -> bool:
-    plant: Any = _Stronger(bench.plant, factor)
-    # The observers are told what the model answers by itself.
-    told = strut_answers(bench.plant, bench.heights_m)
-    loop = Loop(plant, bench.with_observer(observer), bench.heights_m, bench.rhythm, told)
-    return _is_stable(poles_of(loop.linear(bench.strut).a, bench.rhythm.interval_ns * 1e-9))
+    linear = bench.linear(observer, factor)
+    return _is_stable(poles_of(linear.a, linear.interval_s))
 
 
 def _has_margin(bench: Bench, observer: Any, factor: float) -> bool:

@@ -4,14 +4,18 @@ import pytest
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model, parse_model
-from rig.core.observability import Unknown, observability
+from rig.core.observability import Unknown, linear_model, observability
 
 ONE = (0.3,)
 TWO = (0.29, 0.35)
 
 
-def plant(name):
-    return DartPlant(load_model(MODELS / f"{name}.yaml"))
+def reference():
+    return linear_model(DartPlant(load_model(MODELS / "reference.yaml")), ONE)
+
+
+def quarter_car():
+    return linear_model(DartPlant(load_model(MODELS / "quarter_car.yaml")), TWO)
 
 
 def force(strut, name="force"):
@@ -23,34 +27,34 @@ def offset(strut):
 
 
 def test_a_strut_is_told_from_its_height():
-    found = observability(plant("reference"), ONE, [0], [force(0)])
+    found = observability(reference(), [0], [force(0)])
     assert found == ((), (), True)
 
 
 def test_spring_and_damper_are_not_told_apart():
     spring, damper = force(0, "spring"), force(0, "damper")
-    found = observability(plant("reference"), ONE, [0], [spring, damper])
+    found = observability(reference(), [0], [spring, damper])
     assert found.hidden == ()
     assert found.confused == ((spring, damper),)
 
 
 def test_a_preload_is_not_told_from_an_offset_but_each_is_without_the_other():
-    found = observability(plant("reference"), ONE, [0], [force(0), offset(0)])
+    found = observability(reference(), [0], [force(0), offset(0)])
     assert found == ((), ((force(0), offset(0)),), False)
-    assert observability(plant("reference"), ONE, [0], [offset(0)]) == ((), (), True)
+    assert observability(reference(), [0], [offset(0)]) == ((), (), True)
 
 
 def test_two_struts_in_series_want_two_heights():
-    car = plant("quarter_car")
-    assert observability(car, TWO, [0, 1], [force(0), force(1)]) == ((), (), True)
+    car = quarter_car()
+    assert observability(car, [0, 1], [force(0), force(1)]) == ((), (), True)
     for seen, unseen in ((0, 1), (1, 0)):
         # What rests on the other strut moves nothing in this one.
-        found = observability(car, TWO, [seen], [force(0), force(1)])
+        found = observability(car, [seen], [force(0), force(1)])
         assert found == ((force(unseen),), (), True)
 
 
 def test_offsets_of_two_sensors_are_told_where_the_forces_are_known():
-    found = observability(plant("quarter_car"), TWO, [0, 1], [offset(0), offset(1)])
+    found = observability(quarter_car(), [0, 1], [offset(0), offset(1)])
     assert found == ((), (), True)
 
 
@@ -78,15 +82,15 @@ struts:
     damping_n_s_per_m: 30.0
     effects: []
 """
-    both = DartPlant(parse_model(text, "two"))
-    assert observability(both, (0.4, 0.4), [0, 1], [force(0), force(1)]) == ((), (), True)
-    assert observability(both, (0.4, 0.4), [0], [force(0), force(1)]).hidden == (force(1),)
+    both = linear_model(DartPlant(parse_model(text, "two")), (0.4, 0.4))
+    assert observability(both, [0, 1], [force(0), force(1)]) == ((), (), True)
+    assert observability(both, [0], [force(0), force(1)]).hidden == (force(1),)
 
 
 @pytest.mark.parametrize("stiffness", [1.0, 1e3, 1e5])
 def test_stiffness_does_not_matter(stiffness):
     spec = load_model(MODELS / "reference.yaml")
     strut = spec.struts[0].model_copy(update={"stiffness_n_per_m": stiffness})
-    changed = DartPlant(spec.model_copy(update={"struts": (strut,)}))
-    assert observability(changed, ONE, [0], [force(0)]) == ((), (), True)
-    assert observability(changed, ONE, [0], [force(0), offset(0)]).confused
+    changed = linear_model(DartPlant(spec.model_copy(update={"struts": (strut,)})), ONE)
+    assert observability(changed, [0], [force(0)]) == ((), (), True)
+    assert observability(changed, [0], [force(0), offset(0)]).confused

@@ -48,14 +48,15 @@ def point(given):
     )
     corner_hz = 0.1 * rate_hz / 2.0 / math.pi
     start = KalmanObserver("kalman", ErrorFilter(bandwidth_hz=corner_hz, noise_std_m=noise_m), 1e7)
-    [(mobility, *_)] = strut_answers(truth.plant, [truth.rest_m])
+    answers = strut_answers(truth.plant, [truth.rest_m])
+    [(mobility, *_)] = answers
     seen = followed(follow(truth, first, start), Path("grid"), STRUT, mobility)
     smoothed = residual(seen, mobility)
     expectation = Expectation(
         smoothed.noise_std_m, *spectrum(smoothed.t_s, smoothed.force_n), "its run"
     )
     rhythm = Rhythm(truth.period_ns)
-    bench = Bench(truth.plant, (start,), 0, mobility, [truth.rest_m], rhythm, expectation, 1e7)
+    bench = Bench(truth.plant, (start,), 0, answers, [truth.rest_m], rhythm, expectation, 1e7)
     settled = round(min(2.0, 0.25 * len(fresh) / rate_hz) * rate_hz)
     row = {"given": given, "noise_std_m": smoothed.noise_std_m}
     for name, observer in (

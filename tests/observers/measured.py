@@ -50,7 +50,8 @@ class Record:
 
 def compare(name, record, force_n=None):
     """Print the errors of the published gains, the tuned PI and the noise-aware observer."""
-    [(mobility, *_)] = strut_answers(record.plant, [record.rest_m])
+    answers = strut_answers(record.plant, [record.rest_m])
+    [(mobility, *_)] = answers
     corner_hz = 0.1 / (record.period_ns * 1e-9) / 6.2832
     start = KalmanObserver("kalman", ErrorFilter(bandwidth_hz=corner_hz, noise_std_m=1e-5), 1e6)
     seen = followed(follow(record, record.height_m, start), Path(name), STRUT, mobility)
@@ -60,7 +61,7 @@ def compare(name, record, force_n=None):
     truth = smoothed if force_n is None else force_n[first : first + len(smoothed)]
     expectation = Expectation(found.noise_std_m, *spectrum(found.t_s, found.force_n), name)
     rhythm = Rhythm(record.period_ns)
-    bench = Bench(record.plant, (start,), 0, mobility, [record.rest_m], rhythm, expectation, 1e6)
+    bench = Bench(record.plant, (start,), 0, answers, [record.rest_m], rhythm, expectation, 1e6)
     settled = round(0.5e9 / record.period_ns)
     deviation = np.std(truth[settled:])
     figures = [f"noise {1e6 * found.noise_std_m:.2g} um"]

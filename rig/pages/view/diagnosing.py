@@ -11,10 +11,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, cast
 
-from rig.diagnosis.outcome import DIAGNOSIS_FILE
+from rig.diagnosis.outcome import DIAGNOSIS_FILE, REPORT_FILE
 from rig.inputs.folders import free_folder
-
-REPORT_FILE = "report.html"
 
 _COMMAND = (sys.executable, "-m", "rig", "diagnose")
 _PROGRESS = re.compile(r" *(\d+) % (.+)")

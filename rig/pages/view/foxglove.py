@@ -28,7 +28,8 @@ _STEPS_AT_ONCE = 20_000
 _BACKLOG = 2 * _STEPS_AT_ONCE
 """Messages that wait for a slow client before the oldest are dropped."""
 
-_SECOND_NS = 1_000_000_000
+_PARAMETERS_EVERY_NS = 1_000_000_000
+"""Time between two looks at what `rig set` changed: one a second."""
 
 
 class Playback(NamedTuple):
@@ -265,7 +266,7 @@ class FoxgloveView:
 
     def _tell_parameters(self, now_ns: int) -> None:
         """Tell what `rig set` changed, once a second."""
-        if now_ns - self._told_ns < _SECOND_NS:
+        if now_ns - self._told_ns < _PARAMETERS_EVERY_NS:
             return
         self._told_ns = now_ns
         now = self._all_parameters()

@@ -18,13 +18,14 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 
 from dart_model.spec import ModelSpec
+from rig.diagnosis.outcome import REPORT_FILE
 from rig.inputs.errors import InputError
 from rig.io.run_log import MODEL_FILE
 from rig.operation.requests import ask
 from rig.operation.timing import read_histograms
 from rig.pages import charts
 from rig.pages.view import closely
-from rig.pages.view.diagnosing import REPORT_FILE, Diagnosing
+from rig.pages.view.diagnosing import Diagnosing
 from rig.pages.view.watched import WatchedRun
 
 HOST = "127.0.0.1"
