@@ -69,7 +69,8 @@ def run(
         )
     folder = out or Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
     refuse_full(folder)
-    with stoppable() as stop, status_line(ready.config.duration_s) as watch:
+    further = [name for name, *_ in ready.config.signals.sensors()]
+    with stoppable() as stop, status_line(ready.config.duration_s, further) as watch:
         ended = live(
             ready,
             folder,

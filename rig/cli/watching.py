@@ -7,7 +7,7 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from types import FrameType
 from typing import TYPE_CHECKING
 
@@ -85,10 +85,16 @@ def _plain_progress() -> Callable[[str, float], None]:
 
 
 @contextlib.contextmanager
-def status_line(duration_s: float | None) -> Generator[Callable[["Look"], None]]:
+def status_line(
+    duration_s: float | None, sensors: Sequence[str] = ()
+) -> Generator[Callable[["Look"], None]]:
     """State, rate, lateness, force and losses of a run, in place, or lines where that cannot be.
 
     A single write, because the loop itself calls it.
+
+    Args:
+        duration_s: Length of the run; None if it has none.
+        sensors: Names of the further sensors.
     """
     is_terminal = sys.stderr.isatty()
     total = "" if duration_s is None else f" of {duration_s:g}"
@@ -104,7 +110,7 @@ def status_line(duration_s: float | None) -> Generator[Callable[["Look"], None]]
             return
         due_ns = look.t_ns + (0 if is_terminal else _PLAIN_EVERY_NS)
         # What is wrong stands first: a narrow terminal cuts the end.
-        text = f"{look.t_ns * 1e-9:8.1f}{total} s  {look.mode.name:<7}"
+        text = f"{look.t_ns * 1e-9:8.1f}{total} s  {look.output.mode.name:<7}"
         # Since the last line: what the run keeps now.
         if look.t_ns > shown_ns and look.ticks > shown_ticks:
             text += f"  {(look.ticks - shown_ticks) / (look.t_ns - shown_ns) * 1e9:.0f} Hz"
@@ -112,10 +118,12 @@ def status_line(duration_s: float | None) -> Generator[Callable[["Look"], None]]
         text += f"  lost {look.counts.lost}"
         if look.counts.refused:
             text += f"  refused {look.counts.refused}"
+        if look.output.left_out:
+            text += f"  left out {', '.join(sensors[place] for place in look.output.left_out)}"
         if look.late_ns is not None:
             text += f"  missed {look.counts.overruns}  late ≤ {look.late_ns * 1e-6:.2f} ms"
         # The largest force stands for all struts: a line is no table.
-        for strut in sorted(look.struts, key=lambda item: -abs(item.force_n))[:1]:
+        for strut in sorted(look.output.struts, key=lambda item: -abs(item.force_n))[:1]:
             text += f"  force {strut.force_n:+7.1f} N"
             text += f"  innovation {strut.innovation_m * 1e3:+7.3f} mm"
             text += f"  virtual {strut.virtual_force_n:+7.1f} N"

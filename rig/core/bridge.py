@@ -18,6 +18,7 @@ from rig.core.contract import (
     CoreState,
     Measurement,
     Mode,
+    Reading,
     StepInput,
     StepOutput,
 )
@@ -126,6 +127,7 @@ class _Received(Struct, frozen=True, gc=False):
         core: The core after all measurements that newer ones followed.
         heights: What is left of heights.
         others: What is left of other quantities.
+        readings: What is left of readings of further sensors.
         sequences: Counter state of each incoming message.
         ledger: What is remembered beside.
         action: The severest action that the limits on measurements ask for, 0 if none.
@@ -134,6 +136,7 @@ class _Received(Struct, frozen=True, gc=False):
     core: CoreState
     heights: list[Measurement | None]
     others: list[float | None]
+    readings: list[Reading]
     sequences: list[SequenceState]
     ledger: Ledger
     action: int
@@ -199,7 +202,11 @@ class Bridge:
         """
         received = self._received(state, t_ns, frames)
         step_input = StepInput(
-            t_ns, tuple(received.heights), tuple(received.others), conditions.acknowledged
+            t_ns,
+            tuple(received.heights),
+            tuple(received.others),
+            conditions.acknowledged,
+            tuple(received.readings),
         )
         core, output = self.core.step(received.core, step_input)
         action = received.action
@@ -218,6 +225,7 @@ class Bridge:
         """
         core, ledger, sequences, action = state.core, state.ledger, list(state.sequences), 0
         heights, others = self._no_heights.copy(), list(NO_OTHERS)
+        readings: list[Reading] = []
         for frame in frames:
             place = self.directory.place(frame.arbitration_id, frame.is_extended)
             if place is None or frame.is_error:
@@ -235,8 +243,8 @@ class Bridge:
                 if asked >= Action.REFUSE:
                     continue
             if incoming.heights and heights[incoming.heights[0].strut] is not None:
-                core = self._caught_up(core, heights, others)
-                heights, others = self._no_heights.copy(), list(NO_OTHERS)
+                core = self._caught_up(core, heights, others, readings)
+                heights, others, readings = self._no_heights.copy(), list(NO_OTHERS), []
             arrived_ns = min(frame.t_ns, t_ns)
             for target in incoming.heights:
                 delay_ns = target.delay_ns
@@ -244,14 +252,20 @@ class Bridge:
                 heights[target.strut] = Measurement(height_m, arrived_ns - delay_ns, delay_ns)
             for target in incoming.others:
                 others[target.place] = values[target.value]
-        return _Received(core, heights, others, sequences, ledger, action)
+            readings += _read(incoming, arrived_ns, values)
+        return _Received(core, heights, others, readings, sequences, ledger, action)
 
     def _caught_up(
-        self, core: CoreState, heights: list[Measurement | None], others: list[float | None]
+        self,
+        core: CoreState,
+        heights: list[Measurement | None],
+        others: list[float | None],
+        readings: list[Reading],
     ) -> CoreState:
         """The core at the time of measurements that newer ones follow."""
         t_ns = max([core.t_ns, *[item.t_ns + item.delay_ns for item in heights if item]])
-        return self.core.step(core, StepInput(t_ns, tuple(heights), tuple(others)))[0]
+        given = StepInput(t_ns, tuple(heights), tuple(others), readings=tuple(readings))
+        return self.core.step(core, given)[0]
 
     def _foreign(self, ledger: Ledger, frame: Frame) -> Ledger:
         """After a frame of no incoming message: error frames, or somebody under our ids."""
@@ -316,7 +330,7 @@ class Bridge:
         elif mode is Mode.HOLD:
             core = replace(core, mode=mode, last_valid=before.last_valid)
             struts = tuple([replace(strut, valid=False) for strut in output.struts])
-            output = StepOutput(mode, struts)
+            output = StepOutput(mode, struts, output.left_out)
         return core, output, action
 
     def _sent(
@@ -346,10 +360,18 @@ class Bridge:
         return tuple(after), frames, ledger
 
 
+def _read(incoming: Incoming, arrived_ns: int, values: Sequence[float]) -> list[Reading]:
+    """Readings of further sensors in a frame."""
+    return [
+        Reading(target.sensor, values[target.value], arrived_ns - target.delay_ns)
+        for target in incoming.sensors
+    ]
+
+
 def _noted(ledger: Ledger, output: StepOutput, action: int, conditions: Conditions) -> Ledger:
     """After a tick; most are as they should be."""
     holds = output.mode is Mode.HOLD
-    if not (action or holds or conditions.overruns or conditions.bus_fault):
+    if not (action or holds or conditions.overruns or conditions.bus_fault or output.left_out):
         return ledger
     counts = ledger.counts
     counts = counts._replace(
@@ -357,6 +379,7 @@ def _noted(ledger: Ledger, output: StepOutput, action: int, conditions: Conditio
         stale=counts.stale + holds,
         limited=counts.limited + (action > 0),
         bus_faulty=counts.bus_faulty + conditions.bus_fault,
+        left_out=counts.left_out + len(output.left_out),
     )
     return replace(ledger, counts=counts)
 

@@ -210,8 +210,9 @@ class Loop:
         rhythm = self._rhythm
         delay_ns, ticks = rhythm.delay * rhythm.interval_ns, rhythm.delay + 2
         begin_ns = -ticks * rhythm.interval_ns
-        mobility_per_kg, *law = answer
-        start = Start(begin_ns - delay_ns, mobility_per_kg, rhythm.interval_ns, delay_ns, *law)
+        start = Start(
+            begin_ns - delay_ns, answer[0], rhythm.interval_ns, delay_ns, answer[1], answer[2]
+        )
         state = observer.settled(start)
         for number in range(1 - ticks, 1):
             for tick in range(1 - rhythm.measured_every, 1):

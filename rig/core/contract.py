@@ -1,7 +1,7 @@
 """What a step is given and gives, and what its parts must be able to do."""
 
 from collections.abc import Sequence
-from enum import IntEnum
+from enum import Enum, IntEnum
 from math import nan
 from typing import Any, Protocol
 
@@ -34,6 +34,63 @@ class Measurement(Struct, frozen=True, gc=False):
     delay_ns: int = 0
 
 
+class Measures(Enum):
+    """What a further sensor of a strut measures, in SI; a force is positive as a strut's."""
+
+    HEIGHT = "height"
+    VELOCITY = "velocity"
+    FORCE = "force"
+
+
+class Sensor(Struct, frozen=True, gc=False):
+    """A sensor beside the height of a strut.
+
+    Attributes:
+        name: What it is called, after its strut's name and a dot.
+        strut: Index of the strut.
+        measures: What it measures.
+        noise_std: Standard deviation of a reading in SI, quantisation included.
+        interval_ns: Time between two readings.
+        delay_ns: How much later one comes than it is true.
+    """
+
+    name: str
+    strut: int
+    measures: Measures
+    noise_std: float
+    interval_ns: int
+    delay_ns: int = 0
+
+
+class Reading(Struct, frozen=True, gc=False):
+    """What a further sensor sent.
+
+    Attributes:
+        sensor: Place of the sensor among those of the core.
+        value: Measured value in SI.
+        t_ns: Time at which it was true.
+    """
+
+    sensor: int
+    value: float
+    t_ns: int
+
+
+class Deviation(Struct, frozen=True, gc=False):
+    """A reading held against the model.
+
+    Attributes:
+        sensor: Place of the sensor among those of the core.
+        value: Measured value less the model's, both at the time of the reading, in SI; of a force
+            that of the model's law.
+        t_ns: That time.
+    """
+
+    sensor: int
+    value: float
+    t_ns: int
+
+
 class Innovation(Struct, frozen=True, gc=False):
     """A measured height held against the model.
 
@@ -57,6 +114,7 @@ class Start(Struct, frozen=True, gc=False):
         stiffness_per_s2: By how much that acceleration falls per metre of height: of the model's
             own law, its stiffness over the effective mass.
         damping_per_s: The same per m/s.
+        sensors: Further sensors of the strut, by their places among those of the core.
     """
 
     t_ns: int
@@ -65,6 +123,7 @@ class Start(Struct, frozen=True, gc=False):
     delay_ns: int = 0
     stiffness_per_s2: float = 0.0
     damping_per_s: float = 0.0
+    sensors: tuple[tuple[int, Sensor], ...] = ()
 
 
 NO_OTHERS: tuple[float | None, ...] = (None,) * len(OTHERS)
@@ -81,12 +140,14 @@ class StepInput(Struct, frozen=True, gc=False):
         heights: New measurement of each observed strut, None where no frame came.
         others: New value of each of `OTHERS`, in SI, None where no frame came.
         acknowledged: Somebody acknowledged the safe state.
+        readings: What further sensors sent, in the order in which it came.
     """
 
     t_ns: int
     heights: tuple[Measurement | None, ...]
     others: tuple[float | None, ...] = NO_OTHERS
     acknowledged: bool = False
+    readings: tuple[Reading, ...] = ()
 
     @property
     def applied_force_n(self) -> float | None:
@@ -207,7 +268,7 @@ class ObserverState(Protocol):
 
     @property
     def measured_ns(self) -> int:
-        """Time of the last measurement."""
+        """Time of the last measurement of the height."""
         ...
 
 
@@ -246,6 +307,27 @@ class Observer(Protocol):
         ...
 
 
+class FusingObserver(Observer, Protocol):
+    """An observer that also uses further sensors; its states have `left_out`, their places."""
+
+    def fuse(
+        self,
+        state: Any,
+        t_ns: int,
+        innovation: Innovation | None,
+        deviations: Sequence[Deviation],
+    ) -> Any:
+        """State after a tick.
+
+        Args:
+            state: State after the last tick.
+            t_ns: Time of the tick.
+            innovation: Of a new measurement; None where no frame came.
+            deviations: Of new readings of further sensors.
+        """
+        ...
+
+
 class StrutOutput(Struct, frozen=True, gc=False):
     """What a tick publishes of one strut; each attribute is a column of the log.
 
@@ -278,10 +360,12 @@ class StepOutput(Struct, frozen=True, gc=False):
     Attributes:
         mode: State of the bridge.
         struts: One a strut, in the model's order; empty before the first measurements.
+        left_out: Places of further sensors that are not used now.
     """
 
     mode: Mode
     struts: tuple[StrutOutput, ...]
+    left_out: tuple[int, ...] = ()
 
 
 class Divergence(Struct, frozen=True, gc=False):

@@ -24,13 +24,15 @@ class Wanted(NamedTuple):
         signal: Name of the signal.
         quantity: What it means.
         strut: Index of the strut of a height, else 0.
-        delay_ns: How much later a height comes than it is true.
+        delay_ns: How much later a height or a reading comes than it is true.
+        sensor: Place of the further sensor that it is a reading of; None for all else.
     """
 
     signal: str
     quantity: Quantity
     strut: int = 0
     delay_ns: int = 0
+    sensor: int | None = None
 
 
 class HeightTarget(Struct, frozen=True, gc=False):
@@ -59,6 +61,20 @@ class OtherTarget(Struct, frozen=True, gc=False):
     place: int
 
 
+class SensorTarget(Struct, frozen=True, gc=False):
+    """Where a value of a frame goes: a reading of a further sensor.
+
+    Attributes:
+        value: Its place among the frame's values.
+        sensor: Place of the sensor.
+        delay_ns: How much later the value comes than it is true.
+    """
+
+    value: int
+    sensor: int
+    delay_ns: int = 0
+
+
 Reader = Callable[[SequenceState, Frame], tuple[SequenceState, Verdict, tuple[float, ...] | None]]
 """What is remembered of a message's counter, and a frame of it -> the same after the frame, what
 the frame is, and its values in SI; None where there are none to be used."""
@@ -73,12 +89,14 @@ class Incoming:
         read: What reads its frames.
         heights: Where heights among its values go.
         others: Where other values go.
+        sensors: Where readings of further sensors go.
     """
 
     message: Message
     read: Reader
     heights: tuple[HeightTarget, ...]
     others: tuple[OtherTarget, ...]
+    sensors: tuple[SensorTarget, ...] = ()
 
 
 class Counts(NamedTuple):
@@ -101,6 +119,7 @@ class Counts(NamedTuple):
             persistently contradict the counter of the bench's.
         limited: Ticks beyond a limit.
         bus_faulty: Ticks with a fault of the bus.
+        left_out: Ticks at which a further sensor was left out, one for each sensor.
     """
 
     lost: int = 0
@@ -118,6 +137,7 @@ class Counts(NamedTuple):
     second_sender: int = 0
     limited: int = 0
     bus_faulty: int = 0
+    left_out: int = 0
 
 
 Levels = tuple[float, float, float, float]
@@ -248,6 +268,11 @@ def _is_bus_faulty(report: Report) -> bool:
     return counts.bus_faulty > reported.bus_faulty or counts.second_sender > reported.second_sender
 
 
+def _is_measurement_faulty(report: Report) -> bool:
+    """Now: no estimate that rests on fresh heights, or a further sensor that is left out."""
+    return report.output.mode is not Mode.RUNNING or bool(report.output.left_out)
+
+
 STATUS = (
     _status("state", lambda report: report.output.mode),
     _status("encoding_saturated", lambda r: r.counts.saturated > r.reported.saturated),
@@ -255,7 +280,7 @@ STATUS = (
     _status("lost_frames", lambda report: report.counts.lost),
     _status("refused_frames", lambda report: report.counts.refused),
     _status("stale_frames", lambda report: report.counts.stale),
-    _status("measurement_fault", lambda report: report.output.mode is not Mode.RUNNING),
+    _status("measurement_fault", _is_measurement_faulty),
     _status("limit_fault", lambda report: report.counts.limited > report.reported.limited),
     _status("bus_fault", _is_bus_faulty),
     _status("log_fault", lambda report: report.conditions.log_fault),
@@ -331,19 +356,27 @@ def incoming(message: Message, wanted: Sequence[Wanted]) -> Incoming:
     Raises:
         DatabaseError: A signal is missing, or its unit does not fit what it is for.
     """
-    names = [item.signal for item in wanted]
-    decode = compile_decoder(message, names, [item.quantity.dimension for item in wanted])
+    # A load cell may be recorded and also be a further sensor: one value, two places.
+    signals = list(dict.fromkeys((item.signal, item.quantity.dimension) for item in wanted))
+    decode = compile_decoder(message, [name for name, _ in signals], [unit for _, unit in signals])
+    placed = [(signals.index((item.signal, item.quantity.dimension)), item) for item in wanted]
+    sensors = [
+        SensorTarget(value, item.sensor, item.delay_ns)
+        for value, item in placed
+        if item.sensor is not None
+    ]
     heights = [
         HeightTarget(value, item.strut, item.delay_ns)
-        for value, item in enumerate(wanted)
+        for value, item in placed
         if item.quantity is HEIGHT
     ]
     others = [
         OtherTarget(value, PLACES[item.quantity])
-        for value, item in enumerate(wanted)
-        if item.quantity is not HEIGHT
+        for value, item in placed
+        if item.quantity in PLACES
     ]
-    return Incoming(message, _reader(message, decode), tuple(heights), tuple(others))
+    read = _reader(message, decode)
+    return Incoming(message, read, tuple(heights), tuple(others), tuple(sensors))
 
 
 def _reader(message: Message, decode: Decoder) -> Reader:

@@ -41,5 +41,13 @@ TEMPERATURE = Quantity(
 OTHERS = (APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE)
 """All but heights, in the order in which a step is given them."""
 
+FURTHER = {
+    "height": Quantity("height", "measured_height_m", Dimension.LENGTH, "further height"),
+    "velocity": Quantity("velocity", "measured_velocity_m_per_s", Dimension.VELOCITY, "velocity"),
+    "force": Quantity("force", "measured_force_n", Dimension.FORCE, "force"),
+}
+"""What a further sensor of a strut may measure, by what `measures` says in a configuration; the
+column is that of the log, after the names of strut and sensor."""
+
 PLACES = {quantity: place for place, quantity in enumerate(OTHERS)}
 """Where each stands among `OTHERS`."""

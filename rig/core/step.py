@@ -1,8 +1,9 @@
 """One tick: advance the model, compare it with the bench, correct it, publish."""
 
+import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from msgspec.structs import replace
@@ -11,13 +12,18 @@ from numpy.typing import NDArray
 from rig.core.contract import (
     AMBIENT_C,
     CoreState,
+    Deviation,
     Divergence,
+    FusingObserver,
     Innovation,
     LoadedModel,
     Measurement,
+    Measures,
     Mode,
     Observer,
     Plant,
+    Reading,
+    Sensor,
     Start,
     StepInput,
     StepOutput,
@@ -28,6 +34,20 @@ from rig.core.differences import slopes
 from rig.core.supervisor import Event, Supervision, age_event, mode_at_age, next_mode
 
 
+class Instant(NamedTuple):
+    """The model at a time.
+
+    Attributes:
+        t_ns: The time.
+        struts: Height (m) and velocity (m/s) of each strut.
+        forces_n: Force of each strut's law; empty where nobody asks for it.
+    """
+
+    t_ns: int
+    struts: Sequence[tuple[float, float]]
+    forces_n: Sequence[float]
+
+
 class RigState(CoreState, frozen=True, gc=False, kw_only=True):
     """State of a bridge whose model runs by itself.
 
@@ -35,14 +55,14 @@ class RigState(CoreState, frozen=True, gc=False, kw_only=True):
         observers: State of each strut's observer; empty before the first measurements.
         first: Of each strut the measurements that came before the model started, the oldest first.
         model: The model under its forces; None before the first measurements.
-        past: Times of the last ticks and the model's heights and velocities at them, the newest
-            first, as far back as a measurement may be old; empty where none comes late.
+        past: The model at the ticks before the last, the newest first, as far back as a measurement
+            may be old; empty where none comes late.
     """
 
     observers: tuple[Any, ...] = ()
     first: tuple[tuple[Measurement, ...], ...]
     model: Any = None
-    past: tuple[tuple[int, Sequence[tuple[float, float]]], ...] = ()
+    past: tuple[Instant, ...] = ()
 
 
 _SECANT_M, _SECANT_M_PER_S = 2e-3, 0.1
@@ -77,6 +97,7 @@ class RigCore:
         observers: One for each of the model's struts, in their order.
         supervision: Ages and safe output.
         arrivals: How each strut's measurements come; one a millisecond, at once, if absent.
+        sensors: Sensors beside the heights.
 
     Raises:
         ValueError: There are more or fewer observers than struts.
@@ -88,6 +109,7 @@ class RigCore:
         observers: Sequence[Observer],
         supervision: Supervision,
         arrivals: Sequence[Arrival] | None = None,
+        sensors: Sequence[Sensor] = (),
     ) -> None:
         if len(observers) != plant.struts:
             raise ValueError(
@@ -97,7 +119,11 @@ class RigCore:
         self._observers = tuple(observers)
         self._supervision = supervision
         self._arrivals = tuple(arrivals or [Arrival()] * len(observers))
-        self._oldest_ns = max(arrival.delay_ns for arrival in self._arrivals)
+        self._sensors = tuple(sensors)
+        self._is_fusing = tuple(bool(self._at(strut)) for strut in range(plant.struts))
+        latest = max([item.delay_ns for item in (*self._arrivals, *self._sensors)])
+        # A reading lies between two ticks: both are kept for it.
+        self._oldest_ns = latest + 1 if sensors else latest
 
     @property
     def struts(self) -> int:
@@ -106,7 +132,7 @@ class RigCore:
 
     def changed(self, observers: Sequence[Observer], supervision: Supervision) -> "RigCore":
         """The same model with other observers and supervision."""
-        return RigCore(self._plant, observers, supervision, self._arrivals)
+        return RigCore(self._plant, observers, supervision, self._arrivals, self._sensors)
 
     def init(self, t_ns: int) -> RigState:
         """State before the first tick."""
@@ -159,13 +185,19 @@ class RigCore:
         answers = strut_answers(self._plant, heights)
         starts_ns = [given[-1].t_ns if given else t_ns for given in first]
         observers = tuple(
-            observer.init(Start(start_ns, answer[0], *arrival, *answer[1:]))
-            for observer, start_ns, answer, arrival in zip(
-                self._observers, starts_ns, answers, self._arrivals, strict=True
+            observer.init(
+                Start(starts_ns[i], answers[i][0], *arrival, *answers[i][1:], self._at(i))
+            )
+            for i, (observer, arrival) in enumerate(
+                zip(self._observers, self._arrivals, strict=True)
             )
         )
         mode = next_mode(state.mode, Event.FRESH)
         return self._published(state, t_ns, mode, observers, loaded)
+
+    def _at(self, strut: int) -> tuple[tuple[int, Sensor], ...]:
+        """Further sensors of a strut, by their places."""
+        return tuple(item for item in enumerate(self._sensors) if item[1].strut == strut)
 
     def _belong_together(self, first: Sequence[tuple[Measurement, ...]]) -> bool:
         """Whether no strut's measurements have a break: a velocity is taken from them."""
@@ -190,36 +222,59 @@ class RigCore:
         observers: list[Any] = []
         virtual_n: list[float] = []
         oldest_ns = t_ns
-        past = self._remembered(state, t_ns, model.struts)
+        instants: tuple[Instant, ...] = ()
+        deviations: list[tuple[Deviation, ...]] | None = None
+        if self._oldest_ns:
+            forces_n: Sequence[float] = ()
+            if step_input.readings:
+                nothing = (0.0,) * self.struts
+                forces_n = self._plant.load(model, nothing, applied_n, temperature_c).forces_n
+            instants = self._remembered(state, Instant(t_ns, model.struts, forces_n))
+            deviations = self._deviations(step_input.readings, instants)
         for index, observer in enumerate(self._observers):
             measured = step_input.heights[index]
             innovation = None
             if measured is not None:
-                model_m = _height_at(measured.t_ns, index, t_ns, model.struts, past)
+                model_m = _height_at(measured.t_ns, index, t_ns, model.struts, instants)
                 innovation = Innovation(measured.height_m - model_m, measured.t_ns)
-            observed = observer.step(state.observers[index], t_ns, innovation)
+            before = state.observers[index]
+            if self._is_fusing[index]:
+                given = deviations[index] if deviations else ()
+                observed = cast("FusingObserver", observer).fuse(before, t_ns, innovation, given)
+            else:
+                observed = observer.step(before, t_ns, innovation)
             observers.append(observed)
             virtual_n.append(observed.virtual_force_n)
             oldest_ns = min(oldest_ns, observed.measured_ns)
         loaded = self._plant.load(model, virtual_n, applied_n, temperature_c)
         mode = mode_at_age(self._supervision, state.mode, t_ns - oldest_ns)
-        if past:
-            state = replace(state, past=past)
+        if instants:
+            state = replace(state, past=instants[1:])
         return self._published(state, t_ns, mode, tuple(observers), loaded)
 
-    def _remembered(
-        self, state: RigState, t_ns: int, struts: Sequence[tuple[float, float]]
-    ) -> tuple[tuple[int, Sequence[tuple[float, float]]], ...]:
-        """The model's last heights, as far back as a measurement may be old."""
-        if not self._oldest_ns:
-            return ()
-        oldest_ns = t_ns - self._oldest_ns
-        kept = [(t_ns, struts)]
-        for record in state.past:
-            if kept[-1][0] <= oldest_ns:
+    def _remembered(self, state: RigState, now: Instant) -> tuple[Instant, ...]:
+        """The model now and before, as far back as a measurement may be old."""
+        oldest_ns = now.t_ns - self._oldest_ns
+        before = state.model
+        kept = [now]
+        for instant in (Instant(state.t_ns, before.state.struts, before.forces_n), *state.past):
+            if kept[-1].t_ns <= oldest_ns:
                 break
-            kept.append(record)
+            kept.append(instant)
         return tuple(kept)
+
+    def _deviations(
+        self, readings: Sequence[Reading], instants: Sequence[Instant]
+    ) -> list[tuple[Deviation, ...]] | None:
+        """Readings held against the model, by strut; None where there are none."""
+        if not readings:
+            return None
+        found: list[tuple[Deviation, ...]] = [()] * self.struts
+        for reading in readings:
+            sensor = self._sensors[reading.sensor]
+            value = reading.value - _model_at(reading.t_ns, sensor, instants)
+            found[sensor.strut] += (Deviation(reading.sensor, value, reading.t_ns),)
+        return found
 
     def _published(
         self,
@@ -269,7 +324,11 @@ class RigCore:
             model=loaded,
             past=before.past,
         )
-        return state, StepOutput(mode, published)
+        left_out: tuple[int, ...] = ()
+        if self._sensors:
+            fusing = itertools.compress(observers, self._is_fusing)
+            left_out = tuple(place for observer in fusing for place in observer.left_out)
+        return state, StepOutput(mode, published, left_out)
 
     def _safe_output(self, state: RigState) -> StepOutput:
         """The defined output of the safe state: the model stands still where it was left."""
@@ -346,15 +405,35 @@ def _height_at(
     index: int,
     t_ns: int,
     struts: Sequence[tuple[float, float]],
-    past: Sequence[tuple[int, Sequence[tuple[float, float]]]],
+    instants: Sequence[Instant],
 ) -> float:
     """Height of the model when a measurement was true, to first order from the tick behind it."""
-    for earlier_ns, earlier in past:
-        if earlier_ns < measured_ns:
+    for earlier in instants:
+        if earlier.t_ns < measured_ns:
             break
-        t_ns, struts = earlier_ns, earlier
+        t_ns, struts = earlier.t_ns, earlier.struts
     height_m, velocity_m_per_s = struts[index]
     return height_m - velocity_m_per_s * (t_ns - measured_ns) * 1e-9
+
+
+def _model_at(t_ns: int, sensor: Sensor, instants: Sequence[Instant]) -> float:
+    """What a sensor of the model would have read: velocity and force between two ticks."""
+    now, strut = instants[0], sensor.strut
+    if sensor.measures is Measures.HEIGHT:
+        return _height_at(t_ns, strut, now.t_ns, now.struts, instants)
+    before = after = now
+    for before in instants[1:]:
+        if before.t_ns <= t_ns:
+            break
+        after = before
+    values = [
+        at.forces_n[strut] if sensor.measures is Measures.FORCE else at.struts[strut][1]
+        for at in (before, after)
+    ]
+    if after.t_ns == before.t_ns:
+        return values[1]
+    share = min(max((t_ns - before.t_ns) / (after.t_ns - before.t_ns), 0.0), 1.0)
+    return values[0] + share * (values[1] - values[0])
 
 
 def _first_diverged(struts: Sequence[StrutOutput]) -> int:

@@ -6,7 +6,7 @@ from types import MappingProxyType
 from dart_model.plant import DartPlant, PrescribedStrut
 from dart_model.spec import ModelSpec
 from rig.core.bridge import Bridge
-from rig.core.contract import Core, Plant
+from rig.core.contract import Core, Measures, Plant, Sensor
 from rig.core.messages import (
     STATUS,
     STRUT,
@@ -19,7 +19,7 @@ from rig.core.messages import (
     outgoing,
 )
 from rig.core.prescribed import PrescribedCore
-from rig.core.quantities import HEIGHT
+from rig.core.quantities import FURTHER, HEIGHT
 from rig.core.step import Arrival, RigCore
 from rig.inputs.errors import InputError
 from rig.operation.setup import Setup
@@ -66,7 +66,9 @@ def _core(ready: Setup, model: ModelSpec) -> Core:
         settling_s = config.prescribed_motion.settling_s
         return PrescribedCore(PrescribedStrut(model), settling_s, supervision)
     observers = tuple(config.observers.values())
-    return RigCore(build_plant(ready, model), observers, supervision, arrivals(ready))
+    return RigCore(
+        build_plant(ready, model), observers, supervision, arrivals(ready), sensors(ready)
+    )
 
 
 def arrivals(ready: Setup) -> tuple[Arrival, ...]:
@@ -82,6 +84,24 @@ def arrivals(ready: Setup) -> tuple[Arrival, ...]:
     return tuple(found)
 
 
+def sensors(ready: Setup) -> tuple[Sensor, ...]:
+    """Further sensors, at their messages' cycles."""
+    struts = list(ready.config.observers)
+    found: list[Sensor] = []
+    for name, strut, entry in ready.config.signals.sensors():
+        cycle_ns = ready.database.message(entry.message).cycle_time_ns or ready.config.period_ns
+        sensor = Sensor(
+            name,
+            struts.index(strut),
+            Measures(entry.measures),
+            entry.noise_std,
+            cycle_ns,
+            entry.delay_ns,
+        )
+        found.append(sensor)
+    return tuple(found)
+
+
 def _incoming(ready: Setup) -> list[Incoming]:
     signals = ready.config.signals
     wanted: dict[str, list[Wanted]] = {}
@@ -93,6 +113,10 @@ def _incoming(ready: Setup) -> list[Incoming]:
         )
     for quantity, entry in signals.others.items():
         wanted.setdefault(entry.message, []).append(Wanted(entry.signal, quantity))
+    for place, (_, _, entry) in enumerate(signals.sensors()):
+        wanted.setdefault(entry.message, []).append(
+            Wanted(entry.signal, FURTHER[entry.measures], 0, entry.delay_ns, place)
+        )
     return [incoming(ready.database.message(name), found) for name, found in wanted.items()]
 
 

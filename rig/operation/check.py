@@ -67,13 +67,16 @@ def check(ready: Setup) -> list[Finding]:
     build_bridge(ready)
     config = ready.config
     heights = [ready.database.message(entry.message) for entry in config.signals.height.values()]
+    further = {entry.message for _, _, entry in config.signals.sensors()}
+    read = {message.name: message for message in heights}
+    read |= {name: ready.database.message(name) for name in sorted(further)}
     findings = [
         Finding(
             Severity.OK,
             "signals",
             f"all in {ready.database.path.name}, units converted to SI",
         ),
-        *[_protected(message) for message in heights],
+        *[_protected(message) for message in read.values()],
         *[_rate(message, config.period_ns) for message in heights],
         _staleness(ready, heights),
         _load(ready),

@@ -27,12 +27,13 @@ from rig.io.captures import Window
 from rig.io.run_writer import Rotation
 from rig.io.secoc import Authentication
 
-_KEYS = (HEIGHT.key, *(quantity.key for quantity in OTHERS))
+_KEYS = (HEIGHT.key, "further", *(quantity.key for quantity in OTHERS))
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 """Folder of the configurations that come with the package."""
 
 Text = Annotated[str, Field(min_length=1, max_length=255)]
+SensorName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}$")]
 
 
 class _Frozen(BaseModel):
@@ -69,11 +70,68 @@ class HeightSignal(SignalName):
         return round(self.delay_s * 1e9)
 
 
+class FurtherHeight(HeightSignal):
+    """Another height of a strut.
+
+    Attributes:
+        measures: Tag.
+        noise_std_m: Standard deviation of a reading, quantisation included.
+    """
+
+    measures: Literal["height"]
+    noise_std_m: Positive
+
+    @property
+    def noise_std(self) -> float:
+        """In SI."""
+        return self.noise_std_m
+
+
+class FurtherVelocity(HeightSignal):
+    """A velocity of the height, positive in rebound.
+
+    Attributes:
+        measures: Tag.
+        noise_std_m_per_s: Standard deviation of a reading, quantisation included.
+    """
+
+    measures: Literal["velocity"]
+    noise_std_m_per_s: Positive
+
+    @property
+    def noise_std(self) -> float:
+        """In SI."""
+        return self.noise_std_m_per_s
+
+
+class FurtherForce(HeightSignal):
+    """A load cell in the strut, positive when the strut pushes.
+
+    Attributes:
+        measures: Tag.
+        noise_std_n: Standard deviation of a reading, quantisation included.
+    """
+
+    measures: Literal["force"]
+    noise_std_n: Positive
+
+    @property
+    def noise_std(self) -> float:
+        """In SI."""
+        return self.noise_std_n
+
+
+FurtherSensor = Annotated[
+    FurtherHeight | FurtherVelocity | FurtherForce, Field(discriminator="measures")
+]
+
+
 class Signals(_Frozen):
     """What is read from the bus: heights, and any other quantity of `OTHERS` under its key.
 
     Attributes:
         height: Measured height of each strut, by strut name.
+        further: Sensors beside it, by the names of strut and sensor.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")
@@ -82,6 +140,9 @@ class Signals(_Frozen):
     )
 
     height: Annotated[dict[str, HeightSignal], Field(min_length=1)]
+    further: dict[str, dict[SensorName, FurtherSensor]] = Field(
+        default_factory=dict[str, dict[str, FurtherSensor]]
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -104,13 +165,24 @@ class Signals(_Frozen):
         """Quantities beside heights that the bench sends."""
         return tuple(self.others)
 
+    def sensors(self) -> list[tuple[str, str, FurtherHeight | FurtherVelocity | FurtherForce]]:
+        """Further sensors: name with the strut's before it, strut, and the sensor itself."""
+        return [
+            (f"{strut}.{name}", strut, entry)
+            for strut, group in self.further.items()
+            for name, entry in group.items()
+        ]
+
     def named(self) -> dict[str, SignalName]:
         """All signals by their keys, heights first."""
+        further: dict[str, SignalName] = {
+            f"signals.further.{name}": entry for name, _, entry in self.sensors()
+        }
         heights: dict[str, SignalName] = {
             f"signals.height.{name}": entry for name, entry in self.height.items()
         }
         others = {f"signals.{quantity.key}": entry for quantity, entry in self.others.items()}
-        return {**heights, **others}
+        return {**heights, **others, **further}
 
 
 def _observer_kind(data: object) -> object:
@@ -417,6 +489,10 @@ class RunConfig(_Frozen):
     def _prescribed_or_driven(self) -> "RunConfig":
         if self.prescribed_motion is None:
             return self
+        if self.signals.further:
+            raise ValueError(
+                "signals.further: expected none beside prescribed_motion, which uses no observer"
+            )
         if LOAD_CELL_FORCE not in self.signals.others:
             raise ValueError("prescribed_motion: expected signals.load_cell_force beside it")
         if APPLIED_FORCE in self.signals.others:

@@ -16,7 +16,7 @@ from can_dbc.frame import Frame
 from dart_model.spec import copy_skeleton, dump_model
 from rig.core.bridge import Bridge, BridgeState, TickResult
 from rig.core.contract import Mode
-from rig.core.record import columns
+from rig.core.record import Record, columns
 from rig.inputs.errors import InputError
 from rig.inputs.folders import refuse_full
 from rig.io.clock import Clock, OccupiedClock
@@ -25,6 +25,7 @@ from rig.io.realtime import Granted
 from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_SCHEMA
 from rig.io.run_writer import RunLog
 from rig.io.steps import Step
+from rig.operation.assembly import sensors
 from rig.operation.changes import CHANGES_FILE, Changes, unchanged
 from rig.operation.loop import (
     SHOWN_EVERY_NS,
@@ -162,12 +163,13 @@ def logged(
     header = _header(ready, clock.epoch_ns, granted, folder)
     if forced:
         header["forced"] = [dict(finding) for finding in forced]
-    timing = Timing.empty()
+    timing, further = Timing.empty(), sensors(ready)
+    record = Record(config.signals.measured, len(further))
     priority = config.realtime.fifo_priority if granted is not None and granted.fifo else 0
     log = RunLog(
         folder,
         header,
-        columns(list(config.observers), config.signals.measured),
+        columns(list(config.observers), config.signals.measured, further),
         clock.epoch_ns,
         config.bus.channel,
         paced=granted is not None,
@@ -191,8 +193,7 @@ def logged(
         if step.t_ns >= shown_ns:
             shown_ns = step.t_ns + SHOWN_EVERY_NS
             late_ns = int(timing.extremes_ns[0]) if granted is not None else None
-            output = result.output
-            watch(Look(step.t_ns, ticks, output.mode, output.struts, result.counts, late_ns))
+            watch(Look(step.t_ns, ticks, result.output, result.counts, late_ns))
 
     try:
         if begin is not None:
@@ -214,7 +215,7 @@ def logged(
                 requests = Requests(folder, ready, bridge, acknowledge, note, priority)
                 around.enter_context(requests.served())
                 changes = requests.changes
-            state = run(bridge, state, due, source, keep, config.signals.measured, changes)
+            state = run(bridge, state, due, source, keep, record, changes)
         status = "safe" if state.core.mode is Mode.SAFE else "done"
     finally:
         diverged = _divergence(ready, state)

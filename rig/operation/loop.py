@@ -7,9 +7,8 @@ from msgspec import Struct
 
 from can_dbc.frame import Frame
 from rig.core.bridge import Bridge, BridgeState, TickResult
-from rig.core.contract import Mode, StrutOutput
+from rig.core.contract import Mode, StepOutput
 from rig.core.messages import Conditions, Counts
-from rig.core.quantities import Quantity
 from rig.core.record import Record
 from rig.io.clock import Clock
 from rig.io.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step
@@ -57,16 +56,14 @@ class Look(NamedTuple):
     Attributes:
         t_ns: Time of the tick.
         ticks: How many there have been with it.
-        mode: State of the bridge.
-        struts: What was published of each strut; none before the model has started.
+        output: What it published.
         counts: What has been counted since the start.
         late_ns: Largest lateness so far; None where nothing waits for a clock.
     """
 
     t_ns: int
     ticks: int
-    mode: Mode
-    struts: tuple[StrutOutput, ...]
+    output: StepOutput
     counts: Counts
     late_ns: int | None
 
@@ -131,7 +128,7 @@ def run(
     ticks: Iterator[Tick],
     port: Port,
     sink: Sink,
-    measured: Sequence[Quantity],
+    record: Record,
     changes: Changes = unchanged,
 ) -> BridgeState:
     """Run the bridge over ticks.
@@ -142,13 +139,12 @@ def run(
         ticks: When.
         port: Where frames come from and go to.
         sink: Where the record of every tick goes.
-        measured: Quantities beside heights that the bench sends, for the record.
+        record: What is kept of a tick.
         changes: Asked at every tick for another bridge from there on.
 
     Returns:
         The state at the end.
     """
-    record = Record(measured)
     for tick in ticks:
         bridge = changes(tick.t_ns) or bridge
         frames, conditions = port.receive(tick.t_ns)

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from can_dbc.frame import Frame
 from rig.core.bridge import TickResult
 from rig.core.messages import Conditions
-from rig.core.record import columns
+from rig.core.record import Record, columns
 from rig.inputs.errors import InputError
 from rig.io.frame_columns import FrameColumns, received_frames
 from rig.io.run_log import RunFolder, last_frame_ns, read_run
 from rig.io.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step, StepRows
-from rig.operation.assembly import build_bridge
+from rig.operation.assembly import build_bridge, sensors
 from rig.operation.changes import replayed_changes, unchanged
 from rig.operation.loop import Progress, Tick, run
 from rig.operation.setup import Setup, setup_of_folder
@@ -103,7 +103,8 @@ def replay(
     frames = received_frames(found.frame_files, found.epoch_ns)
     ticks = _ticks(found, frames, ready.config.period_ns)
     config = ready.config
-    rows = StepRows(columns(list(config.observers), config.signals.measured))
+    further = sensors(ready)
+    rows = StepRows(columns(list(config.observers), config.signals.measured, further))
     batches: list[Any] = []
 
     def keep(
@@ -118,7 +119,8 @@ def replay(
     port = _LogPort(frames, ticks)
     # With another configuration the run's own changes would undo what is tried.
     changes = replayed_changes(folder, own, bridge) if ready is own else unchanged
-    state = run(bridge, bridge.init(0), port.ticks(), port, keep, config.signals.measured, changes)
+    record = Record(config.signals.measured, len(further))
+    state = run(bridge, bridge.init(0), port.ticks(), port, keep, record, changes)
     batches.append(rows.batch())
     steps = _pa.Table.from_batches(batches, schema=rows.schema)
     different = _different(found.steps, steps)

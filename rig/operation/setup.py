@@ -127,6 +127,7 @@ def _with_names(config: RunConfig, model: ModelSpec, database: Database, source:
     publish = _named(publish, struts, f"{source}: publish")
     for key, names in (
         ("signals.height", heights),
+        ("signals.further", config.signals.further),
         ("observers", config.observers),
         ("publish", publish),
     ):
@@ -135,18 +136,7 @@ def _with_names(config: RunConfig, model: ModelSpec, database: Database, source:
                 raise InputError(
                     f"{source}: {key}.{name}: no such strut, expected {', '.join(struts)}"
                 )
-    for name in struts:
-        unobserved = isinstance(config.observers.get(name), NoObserver)
-        if name not in heights and not unobserved:
-            raise InputError(
-                f"{source}: signals.height.{name}: is missing, expected its signal, or observers."
-                f"{name}: {{kind: none}} for a strut that nobody measures"
-            )
-        if name in heights and unobserved:
-            raise InputError(
-                f"{source}: observers.{name}.kind: none takes no height, expected "
-                f"signals.height.{name} to be left out"
-            )
+    _check_observed(config, struts, heights, source)
     status = config.status
     if "status" not in config.model_fields_set:
         status = _all_in("RIG_STATUS", STATUS, database) or None
@@ -160,6 +150,30 @@ def _with_names(config: RunConfig, model: ModelSpec, database: Database, source:
             "status": status,
         }
     )
+
+
+def _check_observed(
+    config: RunConfig, struts: list[str], heights: Mapping[str, object], source: Path
+) -> None:
+    """Refuse an observer without a height, a height without one, and sensors that nobody uses."""
+    for name in struts:
+        unobserved = isinstance(config.observers.get(name), NoObserver)
+        if name not in heights and not unobserved:
+            raise InputError(
+                f"{source}: signals.height.{name}: is missing, expected its signal, or observers."
+                f"{name}: {{kind: none}} for a strut that nobody measures"
+            )
+        if name in heights and unobserved:
+            raise InputError(
+                f"{source}: observers.{name}.kind: none takes no height, expected "
+                f"signals.height.{name} to be left out"
+            )
+    for name in config.signals.further:
+        if not isinstance(config.observers.get(name), KalmanObserver):
+            raise InputError(
+                f"{source}: signals.further.{name}: expected observers.{name}.kind kalman, "
+                "because the others use the height alone"
+            )
 
 
 _Entry = TypeVar("_Entry")

@@ -10,7 +10,7 @@ import pytest
 from rig.cli.main import main
 from rig.cli.output import console, table
 from rig.cli.watching import status_line
-from rig.core.contract import Mode, StrutOutput
+from rig.core.contract import Mode, StepOutput, StrutOutput
 from rig.core.messages import Counts
 from rig.operation.config import CONFIGS
 from rig.operation.loop import Look
@@ -90,8 +90,7 @@ def look(t_s, force_n=-123.4):
     return Look(
         round(t_s * 1e9),
         round(t_s * 990),
-        Mode.RUNNING,
-        (strut,),
+        StepOutput(Mode.RUNNING, (strut,)),
         Counts(lost=3, overruns=2),
         120_000,
     )

@@ -13,9 +13,9 @@ from rig.core.observers.model_error import (
     ErrorFilter,
     Pace,
     _gain,
-    _predicted,
     _steady,
     _transition,
+    spread,
 )
 from rig.core.observers.pi import PiObserver
 
@@ -27,7 +27,7 @@ FILTER = ErrorFilter(bandwidth_hz=20.0, noise_std_m=2e-5)
 def test_the_steady_covariance_solves_the_riccati_equation():
     for interval in (0.02, 0.1, 0.5):
         steady = _steady(Pace(interval))
-        gain, after = _gain(_predicted(steady.covariance, Pace(interval), 1))
+        gain, after = _gain(spread(steady.covariance, Pace(interval), 1))
         assert np.allclose(after, steady.covariance, rtol=1e-5)
         assert np.allclose(gain, steady.gain, rtol=1e-5)
         assert np.all(np.linalg.eigvalsh(steady.covariance) > 0.0)

@@ -20,8 +20,9 @@ from msgspec import Struct
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
-from rig.core.contract import Innovation, Start
+from rig.core.contract import Deviation, Innovation, Start
 from rig.core.observers.model_error import ErrorFilter, ErrorState
+from rig.core.observers.several import Several, begun, fused
 from rig.inputs.yaml_file import Positive
 
 _DAMPING = 0.8
@@ -41,7 +42,8 @@ class KalmanState(Struct, frozen=True, gc=False):
         virtual_force_n: Virtual force, constant until the next tick.
         residual_force_n: Estimated residual force.
         force_std_n: Its standard deviation.
-        measured_ns: Time of the last measurement.
+        measured_ns: Time of the last measurement of the height.
+        several: What is remembered of further sensors; None without any.
     """
 
     error: ErrorState
@@ -50,6 +52,12 @@ class KalmanState(Struct, frozen=True, gc=False):
     residual_force_n: float
     force_std_n: float
     measured_ns: int
+    several: Several | None = None
+
+    @property
+    def left_out(self) -> tuple[int, ...]:
+        """Places of further sensors that are not used now."""
+        return () if self.several is None else self.several.left_out
 
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
@@ -85,10 +93,33 @@ class KalmanObserver:
 
     def step(self, state: KalmanState, t_ns: int, innovation: Innovation | None) -> KalmanState:
         """State after a tick; arguments as of `Observer.step`."""
-        follower, error, innovation_m = self.filter, state.error, state.innovation_m
-        if innovation is not None:
-            error = follower.updated(error, innovation)
-            innovation_m = innovation.value_m
+        if innovation is None:
+            return self._driven(t_ns, state.error, state.innovation_m)
+        error = self.filter.updated(state.error, innovation)
+        return self._driven(t_ns, error, innovation.value_m)
+
+    def fuse(
+        self,
+        state: KalmanState,
+        t_ns: int,
+        innovation: Innovation | None,
+        deviations: Sequence[Deviation],
+    ) -> KalmanState:
+        """State after a tick; arguments as of `FusingObserver.fuse`."""
+        several = state.several or begun(state.error.start)
+        error, several = fused(self.filter, state.error, several, t_ns, innovation, deviations)
+        innovation_m = state.innovation_m if innovation is None else innovation.value_m
+        return self._driven(t_ns, error, innovation_m, several)
+
+    def _driven(
+        self,
+        t_ns: int,
+        error: ErrorState,
+        innovation_m: float,
+        several: Several | None = None,
+    ) -> KalmanState:
+        """State with the virtual force that a new estimate asks for."""
+        follower = self.filter
         start = error.start
         mean = follower.predicted(error, t_ns)
         x, v, a, *_ = mean
@@ -100,7 +131,8 @@ class KalmanObserver:
         std_n = follower.residual_std(error, t_ns) / start.mobility_per_kg
         error = follower.with_input(error, t_ns, -force_n * start.mobility_per_kg)
         residual_n = follower.residual(error, mean) / start.mobility_per_kg
-        return KalmanState(error, innovation_m, force_n, residual_n, std_n, error.t_ns)
+        measured_ns = error.t_ns if several is None else several.measured_ns
+        return KalmanState(error, innovation_m, force_n, residual_n, std_n, measured_ns, several)
 
     def numbers(self, state: KalmanState) -> tuple[float, ...]:
         """What the next state depends on: all of it is in the filter's inputs."""
@@ -117,4 +149,5 @@ class KalmanObserver:
             state.residual_force_n,
             state.force_std_n,
             state.measured_ns,
+            state.several,
         )

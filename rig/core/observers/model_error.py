@@ -146,7 +146,7 @@ class ErrorFilter:
 
     def init(self, start: Start) -> ErrorState:
         """State at the model's start, at the first measured height."""
-        steady, inputs = _steady(self._pace(start)), ((start.t_ns, 0.0),)
+        steady, inputs = _steady(self.pace(start)), ((start.t_ns, 0.0),)
         return ErrorState(start.t_ns, _NOTHING, self._prior(), 1.0, inputs, start, steady)
 
     def settled(self, start: Start) -> ErrorState:
@@ -163,40 +163,53 @@ class ErrorFilter:
         if innovation.t_ns <= state.t_ns:
             return state
         interval_ns, steady = state.start.interval_ns, state.steady
-        if (innovation.t_ns - state.t_ns) * 1e-9 * self.omega > _FORGOTTEN:
-            return replace(
-                state,
-                t_ns=innovation.t_ns,
-                mean=(innovation.value_m, 0.0, 0.0, 0.0, 0.0),
-                covariance=self._prior(),
-                inputs=_from(state.inputs, innovation.t_ns),
-            )
-        mean = _moved(state, innovation.t_ns)
+        if forget(self, state, innovation.t_ns):
+            return self.anew(state, innovation)
+        mean = moved(state, innovation.t_ns)
         number = max(1, round((innovation.t_ns - state.t_ns) / interval_ns))
         covariance, scale = state.covariance, state.scale
         # What is new in a measurement: its distance from the error that was predicted.
         new_m = innovation.value_m - mean[0]
         if covariance is None and number == 1:
             gain = steady.gain
-            share = min(1.0, interval_ns * 1e-9 / _FADING_S)
             squared = new_m * new_m / (steady.innovation * self.noise_std_m**2)
-            scale += share * (squared - scale)
-            scale = min(max(scale, _SMALLEST_SCALE), _LARGEST_SCALE)
+            scale = self.rescaled(scale, squared, interval_ns)
         else:
             before = steady.covariance if covariance is None else covariance
-            gain, covariance = _gain(_predicted(before, self._pace(state.start), number))
+            gain, covariance = _gain(spread(before, self.pace(state.start), number))
             limit = np.diagonal(steady.covariance)
             if np.all(np.abs(np.diagonal(covariance) - limit) <= _SETTLED * limit):
                 covariance = None
         return ErrorState(
             innovation.t_ns,
-            _corrected(mean, gain.tolist(), new_m, self.omega),
+            corrected(mean, gain.tolist(), new_m, self.omega),
             covariance,
             scale,
-            _from(state.inputs, innovation.t_ns),
+            since(state.inputs, innovation.t_ns),
             state.start,
             steady,
         )
+
+    def anew(self, state: ErrorState, innovation: Innovation) -> ErrorState:
+        """State at a measurement before which nothing is known any more."""
+        return replace(
+            state,
+            t_ns=innovation.t_ns,
+            mean=(innovation.value_m, 0.0, 0.0, 0.0, 0.0),
+            covariance=self._prior(),
+            inputs=since(state.inputs, innovation.t_ns),
+        )
+
+    def rescaled(self, scale: float, squared: float, interval_ns: int) -> float:
+        """The variances' scale after a measurement whose squared innovation is over its variance.
+
+        Args:
+            scale: The scale before.
+            squared: That ratio, one on average where the variances are right.
+            interval_ns: Time between two measurements.
+        """
+        scale += min(1.0, interval_ns * 1e-9 / _FADING_S) * (squared - scale)
+        return min(max(scale, _SMALLEST_SCALE), _LARGEST_SCALE)
 
     def predicted(self, state: ErrorState, t_ns: int) -> Mean:
         """Mean at a time after the last measurement.
@@ -205,7 +218,7 @@ class ErrorFilter:
         polynomial would run away: the error is predicted up to there.
         """
         end_ns = min(t_ns, state.t_ns + self._longest_ns(state))
-        return _moved(state, end_ns)
+        return moved(state, end_ns)
 
     def residual(self, state: ErrorState, mean: Mean) -> float:
         """Acceleration by the force that the model lacks where it is now, in m/s².
@@ -223,11 +236,11 @@ class ErrorFilter:
         longest_ns = round(_FORGOTTEN / self.omega * 1e9)
         number = (min(t_ns - state.t_ns, longest_ns) + interval_ns // 2) // interval_ns
         if state.covariance is not None:
-            variance = _ahead(state.covariance, self._pace(state.start), number)
+            variance = _ahead(state.covariance, self.pace(state.start), number)
         elif number < 1:
             variance = state.steady.residual
         else:
-            variance = _steady_ahead(self._pace(state.start), number)
+            variance = _steady_ahead(self.pace(state.start), number)
         std = math.sqrt(state.scale * max(variance, 0.0))
         return std * self.noise_std_m * self.omega**2
 
@@ -259,7 +272,8 @@ class ErrorFilter:
         """How long after the last measurement the error is predicted."""
         return state.start.delay_ns + 2 * state.start.interval_ns + round(1e9 / self.omega)
 
-    def _pace(self, start: Start) -> "Pace":
+    def pace(self, start: Start) -> "Pace":
+        """What the variances depend on."""
         omega = self.omega
         return Pace(
             omega * start.interval_ns * 1e-9,
@@ -289,7 +303,12 @@ class Pace(NamedTuple):
     damping: float = 0.0
 
 
-def _corrected(mean: Mean, gain: Sequence[float], new_m: float, omega: float) -> Mean:
+def forget(follower: ErrorFilter, state: ErrorState, t_ns: int) -> bool:
+    """Whether the last measurement lies so far back that it says nothing of a time."""
+    return (t_ns - state.t_ns) * 1e-9 * follower.omega > _FORGOTTEN
+
+
+def corrected(mean: Mean, gain: Sequence[float], new_m: float, omega: float) -> Mean:
     """The mean after an update; the gain is in units of sigma and 1 / omega."""
     x, v, a, j, s = mean
     of_x, of_v, of_a, of_j, of_s = gain
@@ -303,7 +322,7 @@ def _corrected(mean: Mean, gain: Sequence[float], new_m: float, omega: float) ->
     )
 
 
-def _from(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tuple[int, float], ...]:
+def since(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tuple[int, float], ...]:
     """Those inputs that still act at a time or begin after it."""
     first = 0
     while first + 1 < len(inputs) and inputs[first + 1][0] <= t_ns:
@@ -311,7 +330,7 @@ def _from(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tuple[int, 
     return inputs[first:]
 
 
-def _moved(state: ErrorState, to_ns: int) -> Mean:
+def moved(state: ErrorState, to_ns: int) -> Mean:
     """The mean at a later time, under the inputs in between."""
     mean, inputs, from_ns = state.mean, state.inputs, state.t_ns
     start, last = state.start, len(inputs) - 1
@@ -356,7 +375,7 @@ def _gain(ahead: Array) -> tuple[Array, Array]:
     return gain, 0.5 * (after + after.T)
 
 
-def _predicted(covariance: Array, pace: Pace, number: int) -> Array:
+def spread(covariance: Array, pace: Pace, number: float) -> Array:
     """Covariance some intervals later; a sensor's noise is a density of one an interval."""
     transition, noise = _transition(pace.interval * number, pace.stiffness, pace.damping)
     return transition @ covariance @ transition.T + pace.interval * noise
@@ -365,7 +384,7 @@ def _predicted(covariance: Array, pace: Pace, number: int) -> Array:
 def _ahead(covariance: Array, pace: Pace, number: int) -> float:
     """Variance of the residual force's acceleration some intervals later."""
     if number >= 1:
-        covariance = _predicted(covariance, pace, number)
+        covariance = spread(covariance, pace, number)
     row = np.array([-pace.stiffness, -pace.damping, 1.0, 0.0, 0.0])
     return float(row @ covariance @ row)
 
