@@ -225,12 +225,13 @@ def _rows(model: type[Any], prefix: str) -> Iterator[tuple[str, str, str]]:
         if getattr(field, "exclude", False):
             continue
         default = field.get_default(call_default_factory=True)
-        section = _section(field.annotation)
+        sections = _sections(field.annotation)
         meaning = meanings.get(name, "")
-        if section is not None:
-            first = (inspect.getdoc(section) or "").partition("\n")[0]
+        if sections:
+            first = (inspect.getdoc(sections[0]) or "").partition("\n")[0]
             yield f"{prefix}{name}", "", meaning or first
-            yield from _rows(section, f"{prefix}{name}.")
+            rows = [row for section in sections for row in _rows(section, f"{prefix}{name}.")]
+            yield from {row[0]: row for row in rows}.values()
         else:
             shown = "required" if default is PydanticUndefined else _shown(default)
             yield f"{prefix}{name}", shown, meaning
@@ -242,19 +243,25 @@ def _shown(default: object) -> str:
     return str(default) if isinstance(default, str | int | float | bool) else ""
 
 
-def _section(annotation: Any) -> type[BaseModel] | None:
-    """The section that a key holds, through unions, tuples and mappings."""
+def _sections(annotation: Any) -> list[type[BaseModel]]:
+    """The sections that a key may hold, through unions, tuples and mappings."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
+        return [annotation]
     origin = typing.get_origin(annotation)
     if origin in (typing.Union, types.UnionType, tuple, dict, typing.Annotated):
-        found = (_section(part) for part in typing.get_args(annotation))
-        return next((section for section in found if section is not None), None)
-    return None
+        return [section for part in typing.get_args(annotation) for section in _sections(part)]
+    return []
 
 
 def _attributes(model: type[Any]) -> dict[str, str]:
-    """What a docstring says under "Attributes"."""
+    """What a docstring says under "Attributes", and those of what the class is made from."""
+    found: dict[str, str] = {}
+    for base in reversed(model.__mro__):
+        found |= _own_attributes(base)
+    return found
+
+
+def _own_attributes(model: type[Any]) -> dict[str, str]:
     _, _, block = (inspect.getdoc(model) or "").partition("Attributes:\n")
     found: dict[str, str] = {}
     name = ""
