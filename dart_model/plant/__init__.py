@@ -13,8 +13,10 @@ Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008).
 """
 
 from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
+from scipy.linalg import null_space  # pyright: ignore[reportUnknownVariableType]
 
 from dart_model.plant.backend import ManyCoordinates, OneCoordinate
 from dart_model.plant.geometry import Array, Geometry, Jacobians, sample_positions
@@ -43,6 +45,13 @@ __all__ = [
     "PrescribedState",
     "PrescribedStrut",
 ]
+
+AMBIENT_C = 20.0
+"""Temperature at which a bench rests."""
+
+_RESTING_STEPS, _RESTING_STEP, _RESTED, _LONGEST_MOVE, _SPRINGLESS = 50, 1e-6, 1e-9, 0.1, 1e-9
+"""Newton's method for a bench at rest: steps, difference and end (m or rad), longest move, and the
+share of the largest stiffness below which a direction counts as free."""
 
 _DIFFERENCE = 1e-6
 """Step of the coordinates (m or rad, and per second) in central differences of the bias force: a
@@ -102,6 +111,8 @@ class DartPlant:
     ) -> PlantState:
         """State with given strut heights and velocities; internal states are zero.
 
+        What the heights leave free is where the model would rest under its weight.
+
         Args:
             heights_m: One height a strut; NaN where none is given.
             velocities_m_per_s: One velocity a strut; at rest if absent.
@@ -112,11 +123,48 @@ class DartPlant:
         """
         q = self._geometry.reaching(np.asarray(heights_m, np.float64), np.zeros(self.coordinates))
         v = np.zeros(self.coordinates)
+        given = np.isfinite(heights_m)
+        if not given.all():
+            q = self._resting(q, np.asarray(heights_m, np.float64))
         if velocities_m_per_s is not None:
-            given = np.isfinite(heights_m)
             struts = self._geometry.at(q).struts[given]
             v = np.linalg.lstsq(struts, np.asarray(velocities_m_per_s)[given], rcond=None)[0]
         return self.state(q.tolist(), v.tolist(), (0.0,) * self.internal_states, t_s)
+
+    def _resting(self, q: Array, heights_m: Array) -> Array:
+        """Coordinates with the given heights, at rest in the directions that these leave free.
+
+        Args:
+            q: Coordinates with those heights, shape (n,).
+            heights_m: One height a strut, shape (struts,); NaN where none is given.
+        """
+        for _ in range(_RESTING_STEPS):
+            given = self._geometry.at(q).struts[np.isfinite(heights_m)]
+            free: Array = cast("Any", null_space)(given)
+            if not free.size:
+                return q
+            force = free.T @ self._force_at_rest(q)
+            slopes = [
+                self._force_at_rest(q + _RESTING_STEP * direction)
+                - self._force_at_rest(q - _RESTING_STEP * direction)
+                for direction in free.T
+            ]
+            stiffness = -free.T @ np.column_stack(slopes) / (2.0 * _RESTING_STEP)
+            # No spring holds some directions: they stay where they are.
+            move = np.linalg.lstsq(stiffness, force, rcond=_SPRINGLESS)[0]
+            move *= min(1.0, _LONGEST_MOVE / max(float(np.abs(move).max()), 1e-300))
+            q = self._geometry.reaching(heights_m, q + free @ move)
+            if np.abs(move).max() < _RESTED:
+                break
+        return q
+
+    def _force_at_rest(self, q: Array) -> Array:
+        """Generalised force of weight and struts at coordinates `q` at rest, shape (n,)."""
+        zeros = np.zeros(self.coordinates)
+        here = self.mechanics(q, zeros)
+        state = self.state(q.tolist(), zeros.tolist(), (0.0,) * self.internal_states, 0.0)
+        forces_n = self.load(state, (0.0,) * self.struts, 0.0, AMBIENT_C).forces_n
+        return here.bias + here.struts.T @ np.array(forces_n)
 
     def state(
         self,

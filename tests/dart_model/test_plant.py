@@ -390,6 +390,21 @@ def test_initial_reaches_heights_and_velocities():
     ]
 
 
+def test_what_no_height_gives_rests_under_its_weight():
+    """The tyre that nobody measures carries wheel and body; the springless guide stays."""
+    model = load_model(MODELS / "quarter_car.yaml")
+    plant, nan = DartPlant(model), math.nan
+    (tyre_m, _), (rise_m, _) = plant.init([nan, 0.31]).struts
+    masses = sum(body.mass_kg for body in model.skeleton.bodies)
+    tyre = model.struts[0]
+    weight_n = masses * model.gravity_m_per_s2
+    assert tyre_m == pytest.approx(tyre.free_length_m - weight_n / tyre.stiffness_n_per_m, abs=1e-9)
+    assert rise_m == pytest.approx(0.31, abs=1e-12)
+    slack = tyre.model_copy(update={"stiffness_n_per_m": 0.0})
+    free = DartPlant(model.model_copy(update={"struts": (slack, model.struts[1])}))
+    assert free.init([nan, 0.31]).struts[1][0] == pytest.approx(0.31, abs=1e-12)
+
+
 def test_initial_says_what_cannot_be_reached():
     spec = parse_model(
         PENDULUM.replace("JOINT", "revolute").replace("AXIS", "axis: [0, 1, 0],"), "pendulum.yaml"
