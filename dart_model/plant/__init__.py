@@ -53,6 +53,9 @@ _RESTING_STEPS, _RESTING_STEP, _RESTED, _LONGEST_MOVE, _SPRINGLESS = 50, 1e-6, 1
 """Newton's method for a bench at rest: steps, difference and end (m or rad), longest move, and the
 share of the largest stiffness below which a direction counts as free."""
 
+_FARTHEST = 1.0
+"""Distance of a rest (m or rad) beyond which nothing holds the bench: no strut is as long."""
+
 _DIFFERENCE = 1e-6
 """Step of the coordinates (m or rad, and per second) in central differences of the bias force: a
 third of the digits of a double, where rounding and truncation are about equal."""
@@ -134,10 +137,13 @@ class DartPlant:
     def _resting(self, q: Array, heights_m: Array) -> Array:
         """Coordinates with the given heights, at rest in the directions that these leave free.
 
+        Where there is no such place within a metre, the directions stay as they are.
+
         Args:
             q: Coordinates with those heights, shape (n,).
             heights_m: One height a strut, shape (struts,); NaN where none is given.
         """
+        start = q
         for _ in range(_RESTING_STEPS):
             given = self._geometry.at(q).struts[np.isfinite(heights_m)]
             free: Array = cast("Any", null_space)(given)
@@ -155,8 +161,8 @@ class DartPlant:
             move *= min(1.0, _LONGEST_MOVE / max(float(np.abs(move).max()), 1e-300))
             q = self._geometry.reaching(heights_m, q + free @ move)
             if np.abs(move).max() < _RESTED:
-                break
-        return q
+                return q if np.abs(q - start).max() < _FARTHEST else start
+        return start
 
     def _force_at_rest(self, q: Array) -> Array:
         """Generalised force of weight and struts at coordinates `q` at rest, shape (n,)."""

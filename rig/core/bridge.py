@@ -243,8 +243,8 @@ class Bridge:
                 if asked >= Action.REFUSE:
                     continue
             if incoming.heights and heights[incoming.heights[0].strut] is not None:
-                core = self._caught_up(core, heights, others, readings)
-                heights, others, readings = self._no_heights.copy(), list(NO_OTHERS), []
+                core, readings = self._caught_up(core, heights, others, readings)
+                heights, others = self._no_heights.copy(), list(NO_OTHERS)
             arrived_ns = min(frame.t_ns, t_ns)
             for target in incoming.heights:
                 delay_ns = target.delay_ns
@@ -261,11 +261,12 @@ class Bridge:
         heights: list[Measurement | None],
         others: list[float | None],
         readings: list[Reading],
-    ) -> CoreState:
-        """The core at the time of measurements that newer ones follow."""
+    ) -> tuple[CoreState, list[Reading]]:
+        """The core at the time of measurements that newer ones follow, and what is later still."""
         t_ns = max([core.t_ns, *[item.t_ns + item.delay_ns for item in heights if item]])
-        given = StepInput(t_ns, tuple(heights), tuple(others), readings=tuple(readings))
-        return self.core.step(core, given)[0]
+        due = tuple(reading for reading in readings if reading.t_ns <= t_ns)
+        given = StepInput(t_ns, tuple(heights), tuple(others), readings=due)
+        return self.core.step(core, given)[0], [item for item in readings if item.t_ns > t_ns]
 
     def _foreign(self, ledger: Ledger, frame: Frame) -> Ledger:
         """After a frame of no incoming message: error frames, or somebody under our ids."""

@@ -78,6 +78,15 @@ def check(ready: Setup) -> list[Finding]:
         ),
         *[_protected(message) for message in read.values()],
         *[_rate(message, config.period_ns) for message in heights],
+        *[
+            Finding(
+                Severity.WARNING,
+                f"rate of {name}",
+                "the DBC gives no cycle time: its sensors count as silent after five ticks",
+            )
+            for name in sorted(further)
+            if read[name].cycle_time_ns is None
+        ],
         _staleness(ready, heights),
         _load(ready),
         *_authenticated(ready),

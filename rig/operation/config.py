@@ -79,7 +79,7 @@ class FurtherHeight(HeightSignal):
     """
 
     measures: Literal["height"]
-    noise_std_m: Positive
+    noise_std_m: Annotated[float, Field(ge=1e-9, le=1.0)]
 
     @property
     def noise_std(self) -> float:
@@ -96,7 +96,7 @@ class FurtherVelocity(HeightSignal):
     """
 
     measures: Literal["velocity"]
-    noise_std_m_per_s: Positive
+    noise_std_m_per_s: Annotated[float, Field(ge=1e-7, le=100.0)]
 
     @property
     def noise_std(self) -> float:
@@ -113,7 +113,7 @@ class FurtherForce(HeightSignal):
     """
 
     measures: Literal["force"]
-    noise_std_n: Positive
+    noise_std_n: Annotated[float, Field(ge=1e-4, le=1e7)]
 
     @property
     def noise_std(self) -> float:

@@ -17,7 +17,17 @@ from rig.inputs.errors import InputError
 from rig.inputs.yaml_file import load_validated, validated
 from rig.io.run_log import DBC_FILE, MODEL_FILE, RUN_FILE, read_header
 from rig.io.secoc import FD_LENGTHS, Authentication, read_key
-from rig.operation.config import AuthenticationConfig, Mapped, RunConfig, SignalName
+from rig.operation.config import (
+    AuthenticationConfig,
+    HeightSignal,
+    Mapped,
+    RunConfig,
+    SignalName,
+)
+
+_MOST_APART_S = 0.02
+"""By which delays of one strut's sensors may differ: a filter that goes back by more at every
+reading takes half a tick of 1 kHz, and more than a tick from twice that on."""
 
 
 class Setup(BaseModel):
@@ -153,7 +163,7 @@ def _with_names(config: RunConfig, model: ModelSpec, database: Database, source:
 
 
 def _check_observed(
-    config: RunConfig, struts: list[str], heights: Mapping[str, object], source: Path
+    config: RunConfig, struts: list[str], heights: Mapping[str, HeightSignal], source: Path
 ) -> None:
     """Refuse an observer without a height, a height without one, and sensors that nobody uses."""
     for name in struts:
@@ -167,6 +177,20 @@ def _check_observed(
             raise InputError(
                 f"{source}: observers.{name}.kind: none takes no height, expected "
                 f"signals.height.{name} to be left out"
+            )
+    seen = [(entry.message, entry.signal) for entry in config.signals.height.values()]
+    for name, strut, entry in config.signals.sensors():
+        if (entry.message, entry.signal) in seen:
+            raise InputError(
+                f"{source}: signals.further.{name}: {entry.message}.{entry.signal} is a height or "
+                "a further sensor already, expected another signal"
+            )
+        seen.append((entry.message, entry.signal))
+        own_s = heights[strut].delay_s if strut in heights else 0.0
+        if abs(entry.delay_s - own_s) > _MOST_APART_S:
+            raise InputError(
+                f"{source}: signals.further.{name}.delay_s: {entry.delay_s:g}: expected at most "
+                f"{_MOST_APART_S:g} s more or less than that of the height ({own_s:g})"
             )
     for name in config.signals.further:
         if not isinstance(config.observers.get(name), KalmanObserver):

@@ -7,6 +7,7 @@ minimised over the gains, among those whose poles keep a damping ratio and whose
 margin.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -38,6 +39,12 @@ PAPER_HZ = math.sqrt(PAPER_PER_S2) / (2.0 * math.pi)
 """Natural frequency of the published gains by mass."""
 
 _EVALUATIONS = 250
+"""Of a search, shared among its starts."""
+
+_PI_STARTS = 8
+"""Natural frequencies that a search may begin at, its bounds among them: an octave and more
+apart. The fast ones keep their margin with strong damping and a filter well above them only."""
+
 _GRID = 30
 """Bandwidths tried before the search: steps of a fifth."""
 
@@ -346,10 +353,13 @@ def _pi(bench: Bench, cost: _Cost) -> _Choice:
             filter=_filter(bench, corner),
         )
 
-    starts = np.linspace(math.log(low), math.log(high), 7)[1:-1]
-    costs = [cost(make([x, math.log(0.3), x + 0.3])) for x in starts]
-    best = [float(starts[i]) for i in np.argsort(costs)[:2]]
-    return make, [[start, math.log(0.3), start + 0.3] for start in best]
+    naturals = np.linspace(math.log(low), math.log(high), _PI_STARTS)[1:-1].tolist()
+    starts = [
+        [natural, math.log(damping), natural + above]
+        for natural, damping, above in itertools.product(naturals, (0.3, 1.0), (0.3, 1.5))
+    ]
+    costs = [cost(make(start)) for start in starts]
+    return make, [starts[i] for i in np.argsort(costs)[:2]]
 
 
 _CHOICES: dict[str, Callable[[Bench, _Cost], _Choice]] = {"kalman": _kalman, "pi": _pi}

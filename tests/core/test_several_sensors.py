@@ -210,3 +210,29 @@ def test_another_height_carries_on_where_the_struts_own_is_lost():
     # A force or a velocity alone does not keep the model where the bench is.
     cell = follow((CELL,), lambda tick: [(0, TRUTH.force_n[tick])], heights=heights)
     assert {output.mode for output in cell[1700:1900]} == {Mode.HOLD}
+
+
+def test_a_sensor_that_is_out_does_not_come_back_without_the_reference():
+    heights, read = noisy(TRUTH.height_m, NOISE_M, 1), TRUTH.height_m.copy()
+    read[900:] += 5e-3
+    heights[1000:1400] = np.nan
+    wire = Sensor("strut.wire", 0, Measures.HEIGHT, 1e-5, MS)
+    outputs = follow((wire,), lambda tick: [(0, read[tick])], heights=heights)
+    assert all(output.left_out for output in outputs[910:])
+    assert not any(output.struts[0].valid for output in outputs[1100:1390])
+    missed, _ = errors(outputs)
+    assert rms(missed[1000:]) < 20.0
+
+
+def test_two_steps_at_one_time_keep_the_input_of_both():
+    core = RigCore(TRUTH.plant, (kalman(),), SUPERVISION, (Arrival(MS),), (WIRE,))
+    state = core.init(0)
+    for tick in range(100):
+        given_now = StepInput(tick * MS, (Measurement(0.4 + 1e-5 * tick, tick * MS),))
+        state, _ = core.step(state, given_now)
+    for height_m in (0.40, 0.41):
+        state, output = core.step(state, StepInput(100 * MS, (Measurement(height_m, 100 * MS),)))
+    driven = -output.struts[0].virtual_force_n * state.observers[0].error.start.mobility_per_kg
+    state, _ = core.step(state, StepInput(101 * MS, (Measurement(0.4, 101 * MS),)))
+    inputs = dict(state.observers[0].several.inputs)
+    assert inputs[100 * MS] == driven

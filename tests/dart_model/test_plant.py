@@ -403,6 +403,9 @@ def test_what_no_height_gives_rests_under_its_weight():
     slack = tyre.model_copy(update={"stiffness_n_per_m": 0.0})
     free = DartPlant(model.model_copy(update={"struts": (slack, model.struts[1])}))
     assert free.init([nan, 0.31]).struts[1][0] == pytest.approx(0.31, abs=1e-12)
+    weak = tyre.model_copy(update={"stiffness_n_per_m": 5.0})  # it would rest 35 m down
+    far = DartPlant(model.model_copy(update={"struts": (weak, model.struts[1])}))
+    assert far.init([nan, 0.31]).struts == free.init([nan, 0.31]).struts
 
 
 def test_initial_says_what_cannot_be_reached():

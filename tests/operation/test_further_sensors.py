@@ -1,5 +1,7 @@
 """Further sensors of a strut from the bus to the log, and configurations that cannot be."""
 
+import json
+
 import numpy as np
 import pytest
 import yaml
@@ -34,7 +36,7 @@ def configured(folder, further, observer=KALMAN):
     config = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
     config["signals"]["further"] = further
     config |= {"observers": {"strut": observer}, "duration_s": 2.0}
-    (folder / "rig.yaml").write_text(yaml.safe_dump(config))
+    (folder / "rig.yaml").write_text(json.dumps(config))
     return load_setup(folder / "rig.yaml")
 
 
@@ -102,6 +104,10 @@ def test_a_silent_sensor_is_counted_and_published(tmp_path):
         ({"strut": {"cell": WIRE | {"noise_std_n": 1.0}}}, KALMAN, "noise_std_n"),
         ({"strut": {"a cell": CELL}}, KALMAN, "a cell"),
         ({"strut": {"cell": CELL | {"signal": "NOTHING"}}}, KALMAN, "NOTHING"),
+        ({"strut": {"cell": CELL | {"delay_s": 0.5}}}, KALMAN, "cell.delay_s: 0.5: expected"),
+        ({"strut": {"cell": CELL | {"noise_std_n": 1e-30}}}, KALMAN, "noise_std_n: 1e-30"),
+        ({"strut": {"a": CELL, "b": dict(CELL)}}, KALMAN, "strut.b: BENCH_AUXILIARY.LOAD_CELL"),
+        ({"strut": {"a": WIRE | {"message": "BENCH_MEASUREMENT"}}}, KALMAN, "is a height or"),
     ],
 )
 def test_what_cannot_be_is_refused_in_a_line(tmp_path, further, observer, says):

@@ -6,7 +6,8 @@ deviation of its own. They are used one after another in the order of the times 
 true: where a reading is older than what was used already, the filter goes back to before it and
 takes the later ones once more.
 
-The strut's own height is the reference: it is always used. A further sensor is gated. A reading
+The strut's own height is the reference: it is always used, and without it no sensor that is left
+out comes back. A further sensor is gated. A reading
 beyond the gate is not used; some in a row leave the sensor out until as many are within again.
 What drifts within the gate is not found, and a reference that jumps is a case for the limits.
 
@@ -66,8 +67,16 @@ class Health(NamedTuple):
     within: int = 0
     is_out: bool = False
 
-    def after(self, t_ns: int, *, is_within: bool) -> "Health":
-        """After another reading."""
+    def after(self, t_ns: int, *, is_within: bool, counts: bool) -> "Health":
+        """After another reading.
+
+        Args:
+            t_ns: Its time.
+            is_within: Whether it is within the gate.
+            counts: Whether it counts for a sensor that is out.
+        """
+        if self.is_out and not counts:
+            return self._replace(t_ns=t_ns)
         beyond, within = (0, self.within + 1) if is_within else (self.beyond + 1, 0)
         is_out = within < _WITHIN if self.is_out else beyond >= _BEYOND
         return Health(t_ns, beyond, within, is_out)
@@ -81,6 +90,7 @@ class Several(Struct, frozen=True, gc=False):
         inputs: Accelerations by the virtual force and their times, as far back as `used`.
         health: Of each further sensor, by its place.
         measured_ns: Time of the last reading of a height that was used.
+        own_ns: Time of the last of the strut's own height.
         left_out: Places of sensors that are left out, or silent.
     """
 
@@ -88,6 +98,7 @@ class Several(Struct, frozen=True, gc=False):
     inputs: tuple[tuple[int, float], ...]
     health: dict[int, Health]
     measured_ns: int
+    own_ns: int
     left_out: tuple[int, ...] = ()
 
 
@@ -98,7 +109,7 @@ _OWN = -1
 def begun(start: Start) -> Several:
     """Before any reading of a further sensor."""
     health = {place: Health(start.t_ns) for place, _ in start.sensors}
-    return Several((), ((start.t_ns, 0.0),), health, start.t_ns)
+    return Several((), ((start.t_ns, 0.0),), health, start.t_ns, start.t_ns)
 
 
 def fused(
@@ -123,9 +134,9 @@ def fused(
     new = [*deviations]
     if innovation is not None:
         new.append(Deviation(_OWN, innovation.value_m, innovation.t_ns))
-    newest_ns = several.inputs[-1][0]
-    inputs = (*several.inputs, *(item for item in error.inputs if item[0] > newest_ns))
+    inputs = _joined(several.inputs, error.inputs)
     used, health, measured_ns = list(several.used), dict(several.health), several.measured_ns
+    own_ns = several.own_ns
     for deviation in sorted(new, key=lambda item: item.t_ns):
         at = len(used)
         while at and used[at - 1][1].t_ns > deviation.t_ns:
@@ -136,8 +147,14 @@ def fused(
             continue
         sensor = sensors.get(deviation.sensor)
         after, is_within = _updated(follower, before, deviation, sensor)
-        if sensor is not None:
-            known = health[deviation.sensor].after(deviation.t_ns, is_within=is_within)
+        if sensor is None:
+            own_ns = max(own_ns, deviation.t_ns)
+        else:
+            # Without the reference the gate grows wide, and proves nothing to one that is out.
+            has_reference = deviation.t_ns - own_ns <= _SILENT * error.start.interval_ns
+            known = health[deviation.sensor].after(
+                deviation.t_ns, is_within=is_within, counts=has_reference
+            )
             health[deviation.sensor] = known
             if known.is_out or not is_within:
                 continue
@@ -158,8 +175,18 @@ def fused(
         for place, known in health.items()
         if known.is_out or t_ns - known.t_ns > _silent_ns(sensors[place])
     )
-    memory = Several(tuple(used), since(inputs, from_ns), health, measured_ns, left_out)
+    memory = Several(tuple(used), since(inputs, from_ns), health, measured_ns, own_ns, left_out)
     return replace(error, inputs=since(inputs, error.t_ns)), memory
+
+
+def _joined(
+    known: tuple[tuple[int, float], ...], latest: tuple[tuple[int, float], ...]
+) -> tuple[tuple[int, float], ...]:
+    """All inputs: those that are remembered, and what came after the last of them."""
+    for place in range(len(latest) - 1, -1, -1):
+        if latest[place] == known[-1]:
+            return (*known, *latest[place + 1 :])
+    return (*known, *(item for item in latest if item[0] > known[-1][0]))
 
 
 def _silent_ns(sensor: Sensor) -> int:
@@ -177,7 +204,11 @@ def _updated(
     if forget(follower, state, deviation.t_ns):
         if sensor is not None and sensor.measures is not Measures.HEIGHT:
             return state, False
-        return follower.anew(state, Innovation(deviation.value, deviation.t_ns)), True
+        anew = follower.anew(state, Innovation(deviation.value, deviation.t_ns))
+        if sensor is None or anew.covariance is None:
+            return anew, True
+        of_sensor = np.diag([(sensor.noise_std / follower.noise_std_m) ** 2 - 1.0, 0, 0, 0, 0])
+        return replace(anew, covariance=anew.covariance + of_sensor), True
     mean = moved(state, deviation.t_ns)
     omega, sigma = follower.omega, follower.noise_std_m
     row, unit = _row(state.start, sensor, sigma)
