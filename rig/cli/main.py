@@ -10,6 +10,7 @@ from rich.console import Console
 
 from rig.cli import (
     bench,
+    characterise,
     check,
     demo,
     diagnose,
@@ -44,6 +45,7 @@ app.command("bench", epilog=bench.EXAMPLES)(bench.bench)
 app.command("view", epilog=view.EXAMPLES)(view.view)
 app.command("set", epilog=setting.EXAMPLES)(setting.set_command)
 app.command("tune", epilog=tune.EXAMPLES)(tune.tune_command)
+app.command("characterise", epilog=characterise.EXAMPLES)(characterise.characterise_command)
 app.command("timing", epilog=timing.EXAMPLES)(timing.timing)
 app.command("replay", epilog=replay.EXAMPLES)(replay.replay_command)
 app.command("diagnose", epilog=diagnose.EXAMPLES)(diagnose.diagnose)

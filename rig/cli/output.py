@@ -45,15 +45,16 @@ def table(*heads: str, title: str | None = None) -> Table:
 
 def print_json(content: object) -> None:
     """Print as JSON; numbers that are not finite become null."""
-    typer.echo(json.dumps(_finite(content), indent=2, ensure_ascii=False))
+    typer.echo(json.dumps(finite(content), indent=2, ensure_ascii=False))
 
 
-def _finite(content: object) -> object:
+def finite(content: object) -> object:
+    """Content for JSON, which knows no number that is not finite: these become null."""
     if isinstance(content, dict):
         items = cast("dict[object, object]", content).items()
-        return {str(key): _finite(item) for key, item in items}
+        return {str(key): finite(item) for key, item in items}
     if isinstance(content, list | tuple):
-        return [_finite(item) for item in cast("list[object]", content)]
+        return [finite(item) for item in cast("list[object]", content)]
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 

@@ -1,0 +1,263 @@
+"""A record divided into strokes by direction of motion, and like strokes into blocks.
+
+A stroke goes from one turning point of the height to the next. A turning point counts when the
+height has left it by more than a share of the record's stroke and by more than its noise, so that
+neither noise nor a tremor at rest makes strokes. Consecutive strokes of one amplitude and duration
+are a block: one step of a test. What does not move for long is a hold.
+
+The motion of a block is a Fourier series where one fits to the noise, as for the usual sine
+machines; else it is smoothed.
+"""
+
+import itertools
+from collections.abc import Iterator
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
+from scipy.optimize import minimize_scalar  # pyright: ignore[reportUnknownVariableType]
+
+from rig.diagnosis.numerics.smoother import estimate_noise, smooth
+
+Array = NDArray[np.float64]
+
+_TURN_SHARE = 0.02
+"""Of the record's stroke: a reversal by less is no stroke."""
+
+_TURN_NOISE = 8.0
+"""Standard deviations of the noise by which a reversal is more than noise."""
+
+_ALIKE = 0.15
+"""Relative difference of amplitude or duration up to which strokes are of one block: machines keep
+their steps within some per cent, and steps differ by a quarter and more."""
+
+_FEWEST_STROKES = 3
+"""Of a block: a single stroke has no repetition, and one by which a machine gets there is none."""
+
+_HOLD_S = 0.5
+"""Shortest hold."""
+
+_HARMONICS = 6
+"""Most harmonics of a motion."""
+
+_SERIES_SHARE = 0.01
+"""Residual of a series over the amplitude above which the motion is smoothed instead."""
+
+
+_PER_CYCLE, _BETWEEN = 1441, 8
+"""Points of a cycle, and of a sample of a motion without cycles, at which peaks are looked for."""
+
+
+class Stroke(NamedTuple):
+    """Samples from one turning point to the next.
+
+    Attributes:
+        first: First sample.
+        last: Last sample, the next turning point.
+        rise_m: Change of height: positive in rebound.
+        duration_s: Time that it takes.
+    """
+
+    first: int
+    last: int
+    rise_m: float
+    duration_s: float
+
+
+class Motion(NamedTuple):
+    """The motion of a block.
+
+    Attributes:
+        height_m: Height at the samples, shape (N,).
+        velocity_m_per_s: Its rate at the samples, shape (N,).
+        between_m: Height at and between the samples, over a cycle at least, shape (M,).
+        between_m_per_s: Its rate there, shape (M,).
+        velocity_std_m_per_s: Standard deviation of the largest rate.
+        period_s: Time of a cycle; NaN where the motion is not periodic.
+    """
+
+    height_m: Array
+    velocity_m_per_s: Array
+    between_m: Array
+    between_m_per_s: Array
+    velocity_std_m_per_s: float
+    period_s: float
+
+
+class Block(NamedTuple):
+    """Like strokes in a row.
+
+    Attributes:
+        strokes: The strokes, alternately up and down.
+        begin: First sample.
+        end: Past the last sample.
+    """
+
+    strokes: tuple[Stroke, ...]
+    begin: int
+    end: int
+
+
+class Hold(NamedTuple):
+    """Samples at rest: first, and past the last one."""
+
+    begin: int
+    end: int
+
+
+def strokes_of(t_s: Array, height_m: Array) -> list[Stroke]:
+    """All strokes of a record.
+
+    Args:
+        t_s: Times, increasing, shape (N,).
+        height_m: Heights, shape (N,).
+    """
+    noise_m = float(np.median(np.abs(np.diff(height_m, 3)))) / (0.6745 * np.sqrt(20.0))
+    low, high = np.percentile(height_m, (1.0, 99.0))
+    least_m = max(_TURN_SHARE * float(high - low), _TURN_NOISE * noise_m)
+    turns = list(_turns(height_m, least_m)) if least_m > 0.0 else []
+    return [
+        Stroke(a, b, float(height_m[b] - height_m[a]), float(t_s[b] - t_s[a]))
+        for a, b in itertools.pairwise(turns)
+    ]
+
+
+def _turns(height_m: Array, least_m: float) -> Iterator[int]:
+    """Turning points, each left by at least some height."""
+    values = height_m.tolist()
+    low = high = 0
+    rising: bool | None = None
+    for index, value in enumerate(values):
+        if value > values[high]:
+            high = index
+        if value < values[low]:
+            low = index
+        if rising is not False and value < values[high] - least_m:
+            yield high
+            rising, low, high = False, index, index
+        elif rising is not True and value > values[low] + least_m:
+            yield low
+            rising, low, high = True, index, index
+    if rising is not None:
+        yield high if rising else low
+
+
+def blocks_of(strokes: list[Stroke]) -> list[Block]:
+    """Blocks of a record: at least three like strokes in a row."""
+    blocks: list[Block] = []
+    run: list[Stroke] = []
+    for stroke in [*strokes, Stroke(-1, -1, 0.0, 0.0)]:
+        if run and not _alike(run, stroke):
+            if len(run) >= _FEWEST_STROKES:
+                blocks.append(Block(tuple(run), run[0].first, run[-1].last + 1))
+            # A stroke that a machine changes its step in may have been like the next by chance.
+            keeps = len(run) < _FEWEST_STROKES and _alike(run[-1:], stroke)
+            run = run[-1:] if keeps else []
+        run.append(stroke)
+    return blocks
+
+
+def _alike(run: list[Stroke], stroke: Stroke) -> bool:
+    """Whether a stroke goes on like the last one of its direction, or returns as far."""
+    before = run[-2] if len(run) > 1 else run[-1]
+    same_size = abs(abs(stroke.rise_m) - abs(run[-1].rise_m)) <= _ALIKE * abs(run[-1].rise_m)
+    if len(run) == 1:
+        return same_size and stroke.first == run[-1].last
+    same_time = abs(stroke.duration_s - before.duration_s) <= _ALIKE * before.duration_s
+    return same_size and same_time and stroke.first == run[-1].last
+
+
+def holds_of(t_s: Array, height_m: Array, blocks: list[Block]) -> list[Hold]:
+    """Times at rest between the blocks."""
+    ends = [0, *(edge for block in blocks for edge in (block.begin, block.end - 1)), len(t_s) - 1]
+    stroke_m = float(np.ptp(height_m))
+    holds: list[Hold] = []
+    for begin, end in zip(ends[::2], ends[1::2], strict=True):
+        if t_s[end] - t_s[begin] < _HOLD_S:
+            continue
+        resting = np.abs(height_m[begin : end + 1] - np.median(height_m[begin : end + 1]))
+        inside = np.flatnonzero(resting < 0.25 * _TURN_SHARE * stroke_m)
+        if not len(inside):
+            continue
+        first, last = begin + int(inside[0]), begin + int(inside[-1])
+        if t_s[last] - t_s[first] >= _HOLD_S:
+            holds.append(Hold(first, last + 1))
+    return holds
+
+
+def motion_of(t_s: Array, height_m: Array, strokes: int) -> Motion:
+    """Height and velocity of a block.
+
+    Args:
+        t_s: Its times, shape (N,).
+        height_m: Its measured heights, shape (N,).
+        strokes: Number of its strokes.
+    """
+    series = _series(t_s - t_s[0], height_m, strokes)
+    if series is not None:
+        return series
+    found = smooth(t_s, height_m, estimate_noise(t_s, height_m))
+    height, velocity = found.states[:, 0].copy(), found.states[:, 1].copy()
+    fine_s: Array = np.linspace(float(t_s[0]), float(t_s[-1]), _BETWEEN * len(t_s))
+    curve: Any = CubicHermiteSpline(t_s, height, velocity)
+    between, rate = curve(fine_s), curve.derivative()(fine_s)
+    std = float(np.median(found.deviations[:, 1]))
+    return Motion(height, velocity, between, rate, std, float("nan"))
+
+
+def _series(t_s: Array, height_m: Array, strokes: int) -> Motion | None:
+    """A Fourier series through a block; None where the motion is none."""
+    span_s = float(t_s[-1])
+    per_cycle = 2.0 * len(t_s) / strokes
+    harmonics = int(min(_HARMONICS, (per_cycle - 2.0) / 2.0))
+    if harmonics < 1:
+        return None
+    coarse_hz = strokes / (2.0 * span_s)
+
+    def misfit(frequency_hz: float, count: int) -> float:
+        made = _harmonics(t_s, frequency_hz, count)
+        left = height_m - made @ np.linalg.lstsq(made, height_m, rcond=None)[0]
+        return float(left @ left)
+
+    best, count, chosen = np.inf, 1, coarse_hz
+    for tried in range(1, harmonics + 1):
+        width = 0.35 / span_s
+        found = cast("Any", minimize_scalar)(
+            misfit,
+            bounds=(coarse_hz - width, coarse_hz + width),
+            args=(tried,),
+            method="bounded",
+            options={"xatol": 1e-6 * coarse_hz},
+        )
+        value = len(t_s) * np.log(max(float(found.fun), 1e-30)) + 2.0 * (2 * tried + 2)
+        if value < best:
+            best, count, chosen = value, tried, float(found.x)
+    made = _harmonics(t_s, chosen, count)
+    weights = np.linalg.lstsq(made, height_m, rcond=None)[0]
+    fitted = made @ weights
+    amplitude = 0.5 * float(np.ptp(fitted))
+    if float(np.std(height_m - fitted)) > _SERIES_SHARE * amplitude:
+        return None
+    order = 2.0 * np.pi * chosen * np.arange(1, count + 1)
+    rates = np.concatenate([[0.0], order * weights[1 + count :], -order * weights[1 : 1 + count]])
+    rate = made @ rates
+    fine = _harmonics(np.linspace(0.0, 1.0 / chosen, _PER_CYCLE), chosen, count)
+    # Of the amplitudes, and of the frequency (Rife and Boorstyn, IEEE Trans. IT 20, 1974).
+    freedom = max(len(t_s) - 2 * count - 2, 1)
+    noise_m = float(np.linalg.norm(height_m - fitted)) / np.sqrt(freedom)
+    size = np.sqrt(2.0 / len(t_s)) * noise_m
+    # One harmonic more than was found to be there: that it is not is not known either.
+    more = 2.0 * np.pi * chosen * np.arange(1, count + 2)
+    of_rates = size * float(np.linalg.norm(more))
+    of_frequency = (
+        np.sqrt(12.0) * size / span_s * float(np.max(np.abs(rate))) / order[0] / amplitude
+    )
+    std = float(np.hypot(of_rates, of_frequency))
+    return Motion(fitted, rate, fine @ weights, fine @ rates, std, 1.0 / chosen)
+
+
+def _harmonics(t_s: Array, frequency_hz: float, count: int) -> Array:
+    """Columns of a Fourier series: one, cosines, sines."""
+    phase = 2.0 * np.pi * frequency_hz * np.outer(t_s, np.arange(1, count + 1))
+    return np.column_stack([np.ones_like(t_s), np.cos(phase), np.sin(phase)])

@@ -1,0 +1,225 @@
+"""Damper characteristics as a page: the plots that a damper engineer knows, and tables."""
+
+import base64
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure as Drawing
+
+from rig.characteristics.command import AtRest, Characteristics
+from rig.characteristics.figures import Step
+from rig.characteristics.stroke_force import ANGLES, Figure
+from rig.pages.report.page import render, write_page
+
+# Okabe and Ito's colours, which stay apart for colour-blind readers and in grey print.
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#a3458f", "#56b4e9", "#7f6000")
+_SIGNS = (
+    "Forces are positive when the strut pushes its ends apart: compression damping is positive, "
+    "rebound damping negative. Velocity and height are positive in rebound."
+)
+_MOST_SAMPLES = 4000
+_KINDS = {
+    "warm_up": "warm-up",
+    "quasi_static": "quasi-static",
+    "velocity_step": "velocity step",
+}
+
+
+def write_characteristics_page(found: Sequence[Characteristics], path: Path) -> None:
+    """Write the page of one record, or of several laid over one another.
+
+    Args:
+        found: The records.
+        path: New HTML file.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    text = render(
+        "characteristics.html",
+        names=[item.name for item in found],
+        headline=_headline(found),
+        signs=_SIGNS,
+        picture="data:image/svg+xml;base64," + base64.b64encode(draw(found)).decode("ascii"),
+        records=[_record(item) for item in found],
+    )
+    write_page(text, path)
+
+
+def draw(found: Sequence[Characteristics]) -> bytes:
+    """Peak force over peak velocity, force over velocity and force over displacement, as SVG."""
+    style = {
+        "axes.grid": True,
+        "grid.alpha": 0.3,
+        "legend.frameon": False,
+        "svg.hashsalt": "rig",
+        "font.size": 9,
+    }
+    with cast("Any", mpl).rc_context(style):
+        figure = cast("Any", Drawing(figsize=(12.5, 4.4), layout="constrained"))
+        peaks, velocities, heights = figure.subplots(1, 3)
+        for index, item in enumerate(found):
+            colour = _COLOURS[index % len(_COLOURS)]
+            _draw_peaks(peaks, item, colour)
+            _draw_loops(velocities, heights, item, colour, with_samples=len(found) == 1)
+        for axes in (peaks, velocities, heights):
+            axes.axhline(0.0, color="#52606d", linewidth=0.8)
+        fastest = max(step.peak_speed_m_per_s for item in found for step in item.steps)
+        peaks.set_xlim(0.0, 1.08 * fastest)
+        for axes in (peaks, velocities):
+            axes.locator_params(axis="x", nbins=6)
+        peaks.set(
+            title="Peak force over peak velocity (PVP)",
+            xlabel="peak velocity / (m/s)",
+            ylabel="force / N     ← rebound · compression →",
+        )
+        velocities.axvline(0.0, color="#52606d", linewidth=0.8)
+        velocities.set(
+            title="Force over velocity (CVP)",
+            xlabel="velocity / (m/s)     ← compression · rebound →",
+            ylabel="force / N",
+        )
+        heights.set(
+            title="Force over displacement (F-x)",
+            xlabel="displacement from mid-stroke / mm",
+            ylabel="force / N",
+        )
+        peaks.legend(fontsize="small")
+        made = io.BytesIO()
+        figure.savefig(made, format="svg", metadata={"Date": None})
+    return made.getvalue()
+
+
+def _draw_peaks(axes: Any, item: Characteristics, colour: str) -> None:
+    steps = sorted(item.steps, key=lambda step: step.peak_speed_m_per_s)
+    for number, (side, marker) in enumerate((("compression", "o"), ("rebound", "s"))):
+        sides = [(step.compression, step.rebound)[number] for step in steps]
+        speeds = [one.peak_velocity.value for one in sides]
+        figures = [one.force_at_peak_velocity for one in sides]
+        values = np.array([figure.value for figure in figures])
+        errors = np.array([[f.value - f.low, f.high - f.value] for f in figures]).T
+        label = f"{item.name}: {side}" if number == 0 else side
+        axes.errorbar(
+            speeds, values, yerr=errors, color=colour, marker=marker, markersize=4, capsize=2,
+            linewidth=1.3, label=label,
+        )  # fmt: skip
+
+
+def _draw_loops(
+    velocities: Any, heights: Any, item: Characteristics, colour: str, *, with_samples: bool
+) -> None:
+    for number, step in enumerate(item.steps):
+        middle_m = step.middle_m
+        if with_samples and number == len(item.steps) - 1:
+            every = max(1, len(item.height_m) // _MOST_SAMPLES)
+            heights.plot(
+                1e3 * (item.height_m[::every] - middle_m), item.force_n[::every], ".",
+                color="#9aa5b1", markersize=1.5, zorder=1,
+            )  # fmt: skip
+        for place, stroke in enumerate(step.strokes):
+            x_mm = 1e3 * (
+                stroke.middle_m - middle_m + stroke.sign * stroke.amplitude_m * np.sin(ANGLES)
+            )
+            name = item.name if number == 0 and place == 0 else None
+            shown = {"color": colour, "linewidth": 1.3, "label": name}
+            velocities.plot(stroke.velocity_m_per_s, stroke.force_n, **shown)
+            heights.plot(x_mm, stroke.force_n, **shown)
+
+
+def _headline(found: Sequence[Characteristics]) -> str:
+    parts: list[str] = []
+    for item in found:
+        fastest = max(item.steps, key=lambda step: step.peak_speed_m_per_s)
+        down, up = fastest.compression, fastest.rebound
+        steps = f"{len(item.steps)} steps" if len(item.steps) > 1 else "one step"
+        parts.append(
+            f"{item.name}: {steps}, {down.force_at_peak_velocity.value:.0f} N in compression and "
+            f"{up.force_at_peak_velocity.value:.0f} N in rebound at "
+            f"{fastest.peak_speed_m_per_s:.3g} m/s."
+        )
+    return " ".join(parts)
+
+
+def _record(item: Characteristics) -> dict[str, object]:
+    warm = any(step.temperature_c is not None for step in item.steps)
+    rows = [
+        {"kind": kind_words(kind), "cells": _cells(step, warm=warm)}
+        for kind, step in zip(item.damper.kinds, item.steps, strict=True)
+    ]
+    name = f"{item.name}, strut {item.strut}" if item.strut else item.name
+    return {
+        "name": f"{name} (force: {item.source})",
+        "warm": warm,
+        "rows": rows,
+        "damper": damper_rows(item),
+        "notes": item.damper.notes,
+    }
+
+
+def _cells(step: Step, *, warm: bool) -> list[str]:
+    down, up = step.compression, step.rebound
+    speeds = dict.fromkeys(f"{side.peak_velocity.value:.3g}" for side in (down, up))
+    temperature = "—" if step.temperature_c is None else f"{step.temperature_c:.1f}"
+    return [
+        f"{step.cycles:g}",
+        f"±{1e3 * step.amplitude_m:.2f}",
+        "—" if step.frequency_hz is None else f"{step.frequency_hz:.3f}",
+        *([temperature] if warm else []),
+        " / ".join(speeds),
+        with_half(down.force_at_peak_velocity),
+        with_half(up.force_at_peak_velocity),
+        with_half(step.energy_per_cycle),
+        with_half(step.equivalent_damping),
+    ]
+
+
+def kind_words(kind: str) -> str:
+    """A kind of step as it is called in a sentence."""
+    return _KINDS[kind]
+
+
+def damper_rows(item: Characteristics) -> list[tuple[str, str, str, str]]:
+    """Figures over all steps and at rest: name, value, interval and method."""
+    damper = item.damper
+    named = [
+        ("gas force", damper.gas_force, "N"),
+        ("gas spring rate", damper.gas_rate, "N/m"),
+        ("friction", damper.friction, "N"),
+        *[(f"knee, {side}", figure, "m/s") for side, figure in damper.knee.items()],
+        ("rebound over compression", damper.asymmetry, ""),
+        *[
+            (f"change per kelvin, {side}", figure, "N/K")
+            for side, figure in damper.per_kelvin.items()
+        ],
+        *[(_place_of(hold), hold.force, "N") for hold in item.holds],
+    ]
+    return [_row(name, figure, unit) for name, figure, unit in named if figure is not None]
+
+
+def _place_of(hold: AtRest) -> str:
+    return f"force at rest, {1e3 * hold.height_m:.1f} mm, at {hold.begin_s:.1f} s"
+
+
+def _row(name: str, figure: Figure, unit: str) -> tuple[str, str, str, str]:
+    value = f"{_digits(figure.value, figure)} {unit}"
+    interval = f"{_digits(figure.low, figure)} to {_digits(figure.high, figure)}"
+    return name, value, interval, figure.method
+
+
+def with_half(figure: Figure) -> str:
+    """A figure with half of its interval, with the digits that this allows."""
+    half = 0.5 * (figure.high - figure.low)
+    return f"{_digits(figure.value, figure)} ± {half:.2g}"
+
+
+def _digits(value: float, figure: Figure) -> str:
+    """A value to a tenth of its interval."""
+    half = 0.5 * (figure.high - figure.low)
+    if not half > 0.0:
+        return f"{value:.5g}"
+    decimals = max(0, 1 - int(np.floor(np.log10(half))))
+    return f"{value:.{min(decimals, 9)}f}"
