@@ -42,8 +42,9 @@ per cent of its peak there."""
 _SPEEDS = (0.25, 0.5, 0.75)
 """Shares of the peak speed at which hysteresis is told."""
 
-_POINTS = 400
-"""Of the rule that integrates over a stroke."""
+_RULE: tuple[Array, Array] = np.polynomial.legendre.leggauss(400)
+_PLACE, _WEIGHT = 0.5 * np.pi * _RULE[0], 0.5 * np.pi * _RULE[1]
+"""Angles and weights of an integral over a stroke."""
 
 SIDES = ("compression", "rebound")
 
@@ -224,9 +225,9 @@ def _hysteresis(stroke: MeanStroke, down: MeanStroke, up: MeanStroke, speed: flo
 
 def _spring(down: MeanStroke, up: MeanStroke) -> list[tuple[MeanStroke, Array]]:
     """The spring rate as rows: the least-squares slope of both strokes' mean, with its sign."""
-    place, weight = _rule()
+    place = _PLACE
     inside = np.abs(place) <= np.arcsin(0.9)
-    u, w = np.sin(place[inside]), (weight * np.cos(place))[inside]
+    u, w = np.sin(place[inside]), (_WEIGHT * np.cos(place))[inside]
     slope = w * u / float(np.sum(w * u * u))
     return [
         (item, -0.5 * item.sign / item.amplitude_m * (slope @ item.row(place[inside])))
@@ -234,17 +235,11 @@ def _spring(down: MeanStroke, up: MeanStroke) -> list[tuple[MeanStroke, Array]]:
     ]
 
 
-def _rule() -> tuple[Array, Array]:
-    """Angles and weights of an integral over a stroke."""
-    x, w = np.polynomial.legendre.leggauss(_POINTS)
-    return 0.5 * np.pi * x, 0.5 * np.pi * w
-
-
 def _of_both(
     down: MeanStroke, up: MeanStroke, relative_std: float
 ) -> tuple[Figure, Figure, Figure, Figure, Figure, Figure]:
-    place, weight = _rule()
-    along = weight * np.cos(place)
+    place = _PLACE
+    along = _WEIGHT * np.cos(place)
     work = [
         (-item.sign * item.amplitude_m * (along @ item.row(place)), item) for item in (down, up)
     ]

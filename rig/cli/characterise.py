@@ -6,15 +6,28 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.output import JsonFlag, console, finite, print_json, table
+from rig.cli.output import (
+    FAILED,
+    JsonFlag,
+    JUnitFile,
+    Outcome,
+    console,
+    finite,
+    print_json,
+    refuse_existing,
+    table,
+    write_junit,
+)
 from rig.inputs.errors import InputError
 
 if TYPE_CHECKING:
     from rig.characteristics.command import Characteristics
+    from rig.characteristics.tolerance import Judged
 
 EXAMPLES = (
     "Examples: `rig characterise dyno.csv` · `rig characterise left.csv right.csv --out found` · "
-    "`rig characterise runs/7 --strut suspension`"
+    "`rig characterise runs/7 --strut suspension` · "
+    "`rig characterise dyno.csv --tolerance band.yaml --serial 0815 --out found`"
 )
 
 
@@ -32,30 +45,77 @@ def characterise_command(
             "--out", metavar="DIR", help="New folder for characteristics.json and report.html."
         ),
     ] = None,
+    tolerance: Annotated[
+        Path | None,
+        typer.Option(
+            "--tolerance",
+            metavar="FILE",
+            help="Band about a master curve, YAML or CSV: pass or fail.",
+        ),
+    ] = None,
+    serial: Annotated[
+        str | None, typer.Option("--serial", metavar="TEXT", help="Serial number, for the report.")
+    ] = None,
     as_json: JsonFlag = False,
+    junit: JUnitFile = None,
 ) -> None:
     """Find the figures of a damper: force over velocity, energy, gas, friction, knee, temperature.
 
-    Wants a record whose cycles repeat; several are laid over one another on the page.
+    Wants a record whose cycles repeat; several are laid over one another on the page. With a
+    tolerance the exit code is 1 unless every point of the band is proven to be kept.
     """
     from rig.characteristics.command import SCHEMA, characterise
+    from rig.characteristics.tolerance import judged, load_tolerance
 
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"--out {out}: holds something, expected a new or empty folder")
+    if junit is not None:
+        refuse_existing(junit)
+    if tolerance is None and junit is not None:
+        raise InputError("--junit: says what is kept and what is not, expected --tolerance")
+    band = None if tolerance is None else load_tolerance(tolerance)
     found = [characterise(path, strut) for path in runs]
-    content: dict[str, object] = {"schema": SCHEMA, "records": [item.as_dict() for item in found]}
+    points = [[] if band is None else judged(item.steps, band) for item in found]
+    content: dict[str, object] = {
+        "schema": SCHEMA,
+        "serial": serial,
+        "tolerance": None if band is None else band.name,
+        "records": [
+            item.as_dict() | {"points": [point.as_dict() for point in of]}
+            for item, of in zip(found, points, strict=True)
+        ],
+    }
     if out is not None:
-        _write(found, content, out)
+        _write(found, points, serial, content, out)
+    outcomes = [
+        Outcome(
+            f"{item.name}: {point.side} at {point.velocity_m_per_s:g} m/s",
+            f"{point.verdict}: {point.words()}",
+            point.verdict != "pass",
+        )
+        for item, of in zip(found, points, strict=True)
+        for point in of
+    ]
+    if junit is not None:
+        write_junit(junit, f"rig characterise {serial or ''}".strip(), outcomes)
     if as_json:
         print_json(content)
-        return
-    for item in found:
-        _print(item)
-    if out is not None:
-        console.print(f"Report: {out / 'report.html'}", markup=False)
+    else:
+        for item, of in zip(found, points, strict=True):
+            _print(item, of)
+        if out is not None:
+            console.print(f"Report: {out / 'report.html'}", markup=False)
+    if any(outcome.failed for outcome in outcomes):
+        raise typer.Exit(FAILED)
 
 
-def _write(found: "list[Characteristics]", content: dict[str, object], out: Path) -> None:
+def _write(
+    found: "list[Characteristics]",
+    points: "list[list[Judged]]",
+    serial: str | None,
+    content: dict[str, object],
+    out: Path,
+) -> None:
     from rig.pages.characteristics_page import write_characteristics_page
 
     try:
@@ -64,10 +124,10 @@ def _write(found: "list[Characteristics]", content: dict[str, object], out: Path
         (out / "characteristics.json").write_text(text, "utf-8")
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
-    write_characteristics_page(found, out / "report.html")
+    write_characteristics_page(found, out / "report.html", points, serial)
 
 
-def _print(item: "Characteristics") -> None:
+def _print(item: "Characteristics", points: "list[Judged]") -> None:
     from rig.pages.characteristics_page import damper_rows, kind_words, with_half
 
     shown = table(
@@ -97,5 +157,11 @@ def _print(item: "Characteristics") -> None:
         for row in rows:
             over_all.add_row(*row)
         console.print(over_all)
+    if points:
+        band = table("point", "force", "verdict")
+        for point in points:
+            where = f"{point.side} at {point.velocity_m_per_s:g} m/s"
+            band.add_row(where, point.words(), point.verdict)
+        console.print(band)
     for note in item.damper.notes:
         console.print(f"- {note}", markup=False)

@@ -12,6 +12,7 @@ from rig.cli import (
     bench,
     characterise,
     check,
+    compare,
     demo,
     diagnose,
     docs,
@@ -46,6 +47,7 @@ app.command("view", epilog=view.EXAMPLES)(view.view)
 app.command("set", epilog=setting.EXAMPLES)(setting.set_command)
 app.command("tune", epilog=tune.EXAMPLES)(tune.tune_command)
 app.command("characterise", epilog=characterise.EXAMPLES)(characterise.characterise_command)
+app.command("compare", epilog=compare.EXAMPLES)(compare.compare_command)
 app.command("timing", epilog=timing.EXAMPLES)(timing.timing)
 app.command("replay", epilog=replay.EXAMPLES)(replay.replay_command)
 app.command("diagnose", epilog=diagnose.EXAMPLES)(diagnose.diagnose)

@@ -11,8 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure as Drawing
 
 from rig.characteristics.command import AtRest, Characteristics
-from rig.characteristics.figures import Step
+from rig.characteristics.figures import SIDES, Step
 from rig.characteristics.stroke_force import ANGLES, Figure
+from rig.characteristics.tolerance import Judged
 from rig.pages.report.page import render, write_page
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers and in grey print.
@@ -29,12 +30,19 @@ _KINDS = {
 }
 
 
-def write_characteristics_page(found: Sequence[Characteristics], path: Path) -> None:
+def write_characteristics_page(
+    found: Sequence[Characteristics],
+    path: Path,
+    points: Sequence[Sequence[Judged]] = (),
+    serial: str | None = None,
+) -> None:
     """Write the page of one record, or of several laid over one another.
 
     Args:
         found: The records.
         path: New HTML file.
+        points: How each record stands in a band; empty without one.
+        serial: Serial number.
 
     Raises:
         InputError: The file cannot be written.
@@ -44,13 +52,29 @@ def write_characteristics_page(found: Sequence[Characteristics], path: Path) -> 
         names=[item.name for item in found],
         headline=_headline(found),
         signs=_SIGNS,
-        picture="data:image/svg+xml;base64," + base64.b64encode(draw(found)).decode("ascii"),
-        records=[_record(item) for item in found],
+        picture="data:image/svg+xml;base64,"
+        + base64.b64encode(draw(found, points)).decode("ascii"),
+        serial=serial,
+        badge=_badge(points),
+        records=[
+            _record(item) | {"points": of}
+            for item, of in zip(found, points or [()] * len(found), strict=True)
+        ],
     )
     write_page(text, path)
 
 
-def draw(found: Sequence[Characteristics]) -> bytes:
+def _badge(points: Sequence[Sequence[Judged]]) -> tuple[str, str, str] | None:
+    """Tone, sign and words of the whole verdict; None without a band."""
+    verdicts = {point.verdict for of in points for point in of}
+    if not verdicts:
+        return None
+    if "fail" in verdicts:
+        return "bad", "✕", "Out of tolerance"
+    return ("good", "✓", "In tolerance") if verdicts == {"pass"} else ("part", "?", "Not proven")
+
+
+def draw(found: Sequence[Characteristics], points: Sequence[Sequence[Judged]] = ()) -> bytes:
     """Peak force over peak velocity, force over velocity and force over displacement, as SVG."""
     style = {
         "axes.grid": True,
@@ -66,6 +90,7 @@ def draw(found: Sequence[Characteristics]) -> bytes:
             colour = _COLOURS[index % len(_COLOURS)]
             _draw_peaks(peaks, item, colour)
             _draw_loops(velocities, heights, item, colour, with_samples=len(found) == 1)
+        _draw_band(peaks, points)
         for axes in (peaks, velocities, heights):
             axes.axhline(0.0, color="#52606d", linewidth=0.8)
         fastest = max(step.peak_speed_m_per_s for item in found for step in item.steps)
@@ -107,6 +132,17 @@ def _draw_peaks(axes: Any, item: Characteristics, colour: str) -> None:
             speeds, values, yerr=errors, color=colour, marker=marker, markersize=4, capsize=2,
             linewidth=1.3, label=label,
         )  # fmt: skip
+
+
+def _draw_band(axes: Any, points: Sequence[Sequence[Judged]]) -> None:
+    """The band that is allowed, of either side."""
+    for side in SIDES:
+        mine = [point for point in (points[0] if points else ()) if point.side == side]
+        if mine:
+            speeds = [point.velocity_m_per_s for point in mine]
+            low, high = [point.low_n for point in mine], [point.high_n for point in mine]
+            label = "tolerance" if side == SIDES[0] else None
+            axes.fill_between(speeds, low, high, color="#8794a1", alpha=0.3, label=label, zorder=0)
 
 
 def _draw_loops(

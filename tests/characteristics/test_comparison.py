@@ -1,0 +1,173 @@
+"""States of one damper against each other and over a dose, and bands of tolerance."""
+
+import json
+import math
+from functools import cache
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from rig.characteristics.command import of_arrays
+from rig.characteristics.comparison import compared, over_dose
+from rig.characteristics.tolerance import judged, load_tolerance
+from rig.cli.main import app
+from rig.inputs.errors import InputError
+from tests.characteristics.test_characteristics import written
+
+RATE_HZ = 200.0
+SPEEDS = (0.003, 0.1, 0.3)
+
+
+def columns(seed, *, gas_n=200.0, friction_n=15.0, damping=1500.0):
+    """A slow cycle and two speeds of a linear damper with gas and friction."""
+    rng = np.random.default_rng(seed)
+    x, v = [], []
+    for speed in SPEEDS:
+        frequency = speed / (2.0 * math.pi * 0.02)
+        cycles = 2.6 if speed < 0.005 else 8.0
+        angle = 2.0 * math.pi * frequency * np.arange(round(cycles / frequency * RATE_HZ)) / RATE_HZ
+        x.append(0.02 * np.sin(angle))
+        v.append(speed * np.cos(angle))
+    x_m, rate = np.concatenate(x), np.concatenate(v)
+    force = gas_n - 3000.0 * x_m - damping * rate - friction_n * np.sign(rate)
+    t_s = np.arange(len(x_m)) / RATE_HZ
+    noise = 1e-6 * rng.standard_normal(len(t_s)), 3.0 * rng.standard_normal(len(t_s))
+    return t_s, 0.3 + x_m + noise[0], force + noise[1]
+
+
+@cache
+def state(seed, **changed):
+    return of_arrays(f"state{seed}", *columns(seed, **changed))
+
+
+def test_a_damper_does_not_differ_from_itself():
+    """One comparison in twenty may claim anything at all: three of ten come once in a hundred."""
+    claims = [
+        any(item.differs for item in compared(state(2 * k), state(2 * k + 1))) for k in range(10)
+    ]
+    assert sum(claims) <= 2
+
+
+@pytest.mark.parametrize(
+    ("changed", "name", "by", "untouched"),
+    [
+        ({"gas_n": 160.0}, "gas force", -40.0, ("friction", "energy per cycle at 0.3 m/s")),
+        ({"friction_n": 25.0}, "friction", 10.0, ("gas force", "gas spring rate")),
+        (
+            {"damping": 1350.0},
+            "compression force at 0.3 m/s",
+            -45.0,
+            ("gas force", "gas spring rate"),
+        ),
+    ],
+)
+def test_what_was_changed_is_found_and_nothing_else(changed, name, by, untouched):
+    found = {item.name: item for item in compared(state(1), state(2, **changed))}
+    item = found[name]
+    assert item.differs
+    assert item.change.low <= by <= item.change.high
+    assert not any(found[other].differs for other in untouched)
+
+
+def test_over_a_dose():
+    pressures = (2.0, 4.0, 6.0, 8.0)
+    states = [state(k, gas_n=50.0 * bar) for k, bar in enumerate(pressures)]
+    trends = {item.name: item for item in over_dose(states, pressures)}
+    gas = trends["gas force"]
+    assert gas.differs
+    assert gas.is_straight
+    assert gas.slope.low <= 50.0 <= gas.slope.high
+    assert not trends["friction"].differs
+    squared = [state(k, gas_n=10.0 * bar**2) for k, bar in enumerate(pressures)]
+    bent = {item.name: item for item in over_dose(squared, pressures)}["gas force"]
+    assert not bent.is_straight
+    with pytest.raises(InputError, match="at least three different ones"):
+        over_dose(states, (1.0, 1.0, 1.0, 1.0))
+
+
+BAND = """
+name: master
+points:
+  - {velocity_m_per_s: 0.1, compression_low_n: 350, compression_high_n: 380, rebound_low_n: 25,
+     rebound_high_n: 45}
+  - {velocity_m_per_s: 0.2, compression_low_n: 550, compression_high_n: 600, rebound_low_n: 0,
+     rebound_high_n: 20}
+  - {velocity_m_per_s: 0.9, compression_low_n: 0, compression_high_n: 1, rebound_low_n: 0,
+     rebound_high_n: 1}
+"""
+
+
+def test_points_pass_fail_or_stay_open(tmp_path):
+    (tmp_path / "band.yaml").write_text(BAND)
+    found = judged(state(1).steps, load_tolerance(tmp_path / "band.yaml"))
+    assert [item.verdict for item in found] == [
+        "pass", "pass",  # 365 N and 35 N at 0.1 m/s
+        "fail", "fail",  # 515 N and -115 N at 0.2 m/s, between two steps
+        "not measured", "not measured",
+    ]  # fmt: skip
+    # A limit at what the damper has is neither kept nor broken.
+    tight = BAND.replace("compression_low_n: 350", "compression_low_n: 365.0")
+    (tmp_path / "tight.yaml").write_text(tight)
+    assert judged(state(1).steps, load_tolerance(tmp_path / "tight.yaml"))[0].verdict == "open"
+
+
+def test_the_command_says_pass_or_fail(tmp_path):
+    path = written(tmp_path / "dyno.csv", columns(5))
+    header = "velocity_m_per_s,compression_low_n,compression_high_n,rebound_low_n,rebound_high_n"
+    (tmp_path / "good.csv").write_text(f"{header}\n0.1,350,380,20,50\n0.3,650,680,-280,-250\n")
+    (tmp_path / "bad.csv").write_text(f"{header}\n0.1,350,380,40,50\n")
+    for name, code, failures in (("good", 0, "0"), ("bad", 1, "1")):
+        junit, out = tmp_path / f"{name}.xml", tmp_path / name
+        given = ["--tolerance", str(tmp_path / f"{name}.csv"), "--serial", "0815"]
+        ended = CliRunner().invoke(
+            app, ["characterise", str(path), *given, "--junit", str(junit), "--out", str(out)]
+        )
+        assert ended.exit_code == code, ended.output
+        assert ElementTree.parse(junit).getroot().get("failures") == failures
+        page = (out / "report.html").read_text()
+        assert "0815" in page
+        assert ("In tolerance" if code == 0 else "Out of tolerance") in page
+        content = json.loads((out / "characteristics.json").read_text())
+        assert {point["verdict"] for point in content["records"][0]["points"]} >= (
+            {"pass"} if code == 0 else {"fail"}
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("a.yaml", "name: x\npoints: []\n", "points"),
+        ("a.yaml", BAND.replace("0.2,", "0.05,"), "expected velocities that increase"),
+        ("a.yaml", BAND.replace("350", "390"), "compression_low_n 390"),
+        ("a.csv", "v,f\n1,2\n", "expected the header"),
+        ("a.csv", "", "expected the header"),
+    ],
+)
+def test_a_wrong_band_is_one_line(tmp_path, name, text, says):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError) as refused:
+        load_tolerance(tmp_path / name)
+    assert says in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_the_compare_command(tmp_path):
+    files = [
+        str(written(tmp_path / f"{gas}.csv", columns(gas, gas_n=float(gas))))
+        for gas in (150, 200, 250)
+    ]
+    runner = CliRunner()
+    ended = runner.invoke(app, ["compare", files[0], files[1], "--json"])
+    assert ended.exit_code == 0, ended.output
+    first = json.loads(ended.stdout)["differences"][0]
+    assert first["differs"]
+    told = runner.invoke(app, ["compare", *files[:2]]).output
+    assert "What differs" in told
+    assert "The same within what was measured" in told
+    doses = [word for dose in ("1.5", "2.0", "2.5") for word in ("--dose", dose)]
+    ended = runner.invoke(app, ["compare", *files, *doses, "--json"])
+    trends = {item["figure"]: item for item in json.loads(ended.stdout)["trends"]}
+    assert trends["gas force"]["slope"]["value"] == pytest.approx(100.0, rel=0.02)
+    assert isinstance(runner.invoke(app, ["compare", files[0]]).exception, InputError)
