@@ -8,6 +8,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from hypothesis import settings
 
-# A busy machine is no fault of what is tested, and a draw of the day neither fails nor takes longer.
+# A busy machine is no fault of what is tested, and every day draws the same examples.
 settings.register_profile("patient", deadline=None, derandomize=True)
 settings.load_profile("patient")

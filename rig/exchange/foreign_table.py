@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rig.exchange.array_tables import READERS, array_columns
 from rig.exchange.imported import ImportReport
 from rig.exchange.mapping import Mapping, outputs_of
 from rig.exchange.mf4_channels import mf4_channels
@@ -14,12 +15,13 @@ from rig.inputs.errors import InputError
 
 
 def import_table(source: Path, mapping: Mapping, out: Path) -> ImportReport:
-    """Turn a foreign table, or the channels of an MF4 file, into the project's CSV.
+    """Turn a foreign table, or the channels of a file, into the project's CSV.
 
     The text is read in pieces, so memory does not grow with the width of the table.
 
     Args:
-        source: Text file, or MF4 file whose channels are named as the mapping's columns.
+        source: Text file, or a file of MF4, TDMS, MATLAB or a worksheet whose channels are named
+            as the mapping's columns.
         mapping: What it means.
         out: CSV file to write; it must not exist.
 
@@ -34,6 +36,8 @@ def import_table(source: Path, mapping: Mapping, out: Path) -> ImportReport:
     outputs = outputs_of(mapping)
     if source.suffix.lower() in (".mf4", ".mdf", ".dat"):
         t_s, values, said = mf4_channels(source, mapping, outputs)
+    elif source.suffix.lower() in READERS:
+        t_s, values, said = array_columns(source, mapping, outputs)
     else:
         t_s, values, said = text_columns(source, mapping, outputs)
     _check_times(source, t_s)
