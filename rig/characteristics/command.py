@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rig.characteristics.damper import Damper, damper_of
 from rig.characteristics.figures import Side, Step, step_of
+from rig.characteristics.quality import quality
 from rig.characteristics.stroke_force import Figure
 from rig.characteristics.strokes import blocks_of, holds_of, strokes_of
 from rig.diagnosis.recording import Recording, read_recording
@@ -59,6 +60,7 @@ class Characteristics:
         steps: Its steps, in time.
         holds: What stood still.
         damper: Figures over all steps.
+        quality: What in the record may mislead.
     """
 
     name: str
@@ -69,6 +71,7 @@ class Characteristics:
     steps: tuple[Step, ...]
     holds: tuple[AtRest, ...]
     damper: Damper
+    quality: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """For `characteristics.json`."""
@@ -100,6 +103,7 @@ class Characteristics:
             "force_per_kelvin_n_per_k": {
                 key: _or_none(value) for key, value in damper.per_kelvin.items()
             },
+            "quality": list(self.quality),
             "notes": list(damper.notes),
         }
 
@@ -158,7 +162,10 @@ def of_arrays(
         _at_rest(t_s, height_m, force_n, temperature_c, hold.begin, hold.end)
         for hold in holds_of(t_s, height_m, blocks)
     )
-    return Characteristics(name, strut, source, height_m, force_n, found, holds, damper_of(found))
+    rests = [(hold.begin_s, hold.height_m, hold.force) for hold in holds]
+    warned = quality(t_s, force_n, found, rests)
+    damper = damper_of(found)
+    return Characteristics(name, strut, source, height_m, force_n, found, holds, damper, warned)
 
 
 def _of_strut(

@@ -163,5 +163,5 @@ def _print(item: "Characteristics", points: "list[Judged]") -> None:
             where = f"{point.side} at {point.velocity_m_per_s:g} m/s"
             band.add_row(where, point.words(), point.verdict)
         console.print(band)
-    for note in item.damper.notes:
+    for note in (*item.quality, *item.damper.notes):
         console.print(f"- {note}", markup=False)

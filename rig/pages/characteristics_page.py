@@ -192,7 +192,7 @@ def _record(item: Characteristics) -> dict[str, object]:
         "warm": warm,
         "rows": rows,
         "damper": damper_rows(item),
-        "notes": item.damper.notes,
+        "notes": (*item.quality, *item.damper.notes),
     }
 
 

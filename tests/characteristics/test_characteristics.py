@@ -159,6 +159,38 @@ def test_two_amplitudes_are_two_steps():
     assert holds_of(t_s, x, blocks) == []
 
 
+# --- What may mislead ---------------------------------------------------------------------------
+
+
+def test_a_good_record_is_not_accused(tested):
+    assert tested.quality == ()
+
+
+def test_gaps_few_samples_and_coarse_forces_are_said():
+    rng = np.random.default_rng(9)
+    t_s, x, force = Dyno("linear", 2.0, 0.02, 12.0, 12.0, 0.0, 1e-6, 0.1).record(rng)
+    t_s = t_s.copy()
+    t_s[60:] += 0.5  # twelve samples a cycle: half a second is a cycle, the motion goes on
+    said = of_arrays("bad", t_s, x, 50.0 * np.round(force / 50.0)).quality
+    assert any("gaps between samples, the longest 0.542 s at" in text for text in said)
+    assert any("12.0 samples a cycle" in text for text in said)
+
+
+def test_a_cell_that_drifts_is_said():
+    t_s, x, force, _ = whole_test()
+    rest = np.full(1000, 0.3)
+    last_s = t_s[-1] + np.arange(1, 1001) / RATE_HZ
+    noise = 2.0 * np.random.default_rng(10).standard_normal(1000)
+    said = of_arrays(
+        "drift",
+        np.concatenate([t_s, last_s]),
+        np.concatenate([x, rest]),
+        np.concatenate([force, GAS_N - 25.0 + noise]),
+    ).quality
+    assert len(said) == 1
+    assert "changed by -2" in said[0]
+
+
 # --- The command -------------------------------------------------------------------------------
 
 

@@ -124,11 +124,15 @@ class Topic:
         return found
 
 
+_SETTLED_NS = 200_000_000
+"""Time from the first subscription to the beginning of the playback."""
+
+
 class FoxgloveView:
     """A server of Foxglove's protocol, on loopback.
 
-    Runs that have ended when it starts are played from their beginning as soon as somebody
-    subscribes, and a client may pause, seek and change the speed. If any of them is still written,
+    Runs that have ended when it starts are played from their beginning once somebody has
+    subscribed, and a client may pause, seek and change the speed. If any of them is still written,
     steps are published as they come.
 
     Args:
@@ -159,6 +163,7 @@ class FoxgloveView:
         self._end_ns = round(1e9 * max(topic.run.follower.span_s[1] for topic in self._topics))
         self._playback = Playback(0, 0)
         self._has_begun = False
+        self._asked_ns: int | None = None
         self._lock = threading.Lock()
         epoch_ns = self._epoch_ns()
         span = None if self._is_live or epoch_ns is None else (epoch_ns, epoch_ns + self._end_ns)
@@ -243,7 +248,10 @@ class FoxgloveView:
     def _play(self, now_ns: int, epoch_ns: int) -> None:
         before = self._playback
         if not self._has_begun:
-            self._has_begun = any(topic.is_subscribed for topic in self._topics)
+            if self._asked_ns is None and any(topic.is_subscribed for topic in self._topics):
+                self._asked_ns = now_ns
+            # A client subscribes to its topics one after another: none is to miss the beginning.
+            self._has_begun = self._asked_ns is not None and now_ns - self._asked_ns >= _SETTLED_NS
             self._playback = Playback(0, now_ns, is_playing=self._has_begun)
         if not self._playback.since_ns:  # asked for before the first round
             self._playback = self._playback._replace(since_ns=now_ns)

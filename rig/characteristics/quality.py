@@ -1,0 +1,95 @@
+"""What in a record may mislead, in words, before its figures are read."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.characteristics.figures import Step
+from rig.characteristics.stroke_force import Figure
+
+Array = NDArray[np.float64]
+
+_GAP = 2.5
+"""Times the usual time between samples: one is missing at least, however the clock jitters."""
+
+_FEW_A_CYCLE = 16.0
+"""Samples of a cycle below which a stroke has hardly eight: its shape is mostly the spline's."""
+
+_SAME_HEIGHT_M = 5e-4
+"""By which rests of one height may differ: of a gas spring of 2 N/mm that is 1 N."""
+
+_COARSE = 2.0
+"""Steps of a channel over its noise from which on the steps are what is seen."""
+
+
+def quality(
+    t_s: Array, force_n: Array, steps: Sequence[Step], rests: Sequence[tuple[float, float, Figure]]
+) -> tuple[str, ...]:
+    """Gaps, cycles of few samples, a coarse force and a drift at rest.
+
+    Args:
+        t_s: Times, shape (N,).
+        force_n: Forces, shape (N,).
+        steps: Steps of the test.
+        rests: Beginning, height and force of each time at rest.
+    """
+    said = [*_gaps(t_s), *_few_samples(t_s, steps), *_coarse(force_n), *_drift(rests)]
+    return tuple(said)
+
+
+def _gaps(t_s: Array) -> list[str]:
+    apart = np.diff(t_s)
+    gaps = np.flatnonzero(apart > _GAP * float(np.median(apart)))
+    if not len(gaps):
+        return []
+    longest = int(gaps[np.argmax(apart[gaps])])
+    return [
+        f"{len(gaps)} gaps between samples, the longest {apart[longest]:.3g} s at "
+        f"{t_s[longest]:.3f} s"
+    ]
+
+
+def _few_samples(t_s: Array, steps: Sequence[Step]) -> list[str]:
+    usual_s = float(np.median(np.diff(t_s)))
+    counts = [
+        (1.0 / (step.frequency_hz * usual_s), step)
+        for step in steps
+        if step.frequency_hz is not None
+    ]
+    few = [item for item in counts if item[0] < _FEW_A_CYCLE]
+    if not few:
+        return []
+    count, step = min(few, key=lambda item: item[0])
+    return [
+        f"{count:.1f} samples a cycle at {step.peak_speed_m_per_s:.3g} m/s: the shape of its "
+        "strokes is a guess, and so are peaks between samples"
+    ]
+
+
+def _coarse(force_n: Array) -> list[str]:
+    """A force whose steps are larger than its noise: the noise is then not white."""
+    apart = np.abs(np.diff(force_n))
+    levels = np.unique(np.round(apart[apart > 0.0], 9))
+    if len(levels) < 2 or np.count_nonzero(apart == 0.0) < 0.2 * len(apart):
+        return []
+    step = float(levels[0])
+    noise = float(np.median(np.abs(np.diff(force_n, 2)))) / 0.6745 / 6.0**0.5
+    if step < _COARSE * max(noise, 1e-12):
+        return []
+    return [f"the force comes in steps of {step:.3g} N, more than its noise"]
+
+
+def _drift(rests: Sequence[tuple[float, float, Figure]]) -> list[str]:
+    """Two rests at one height whose forces differ by more than both their intervals."""
+    for place, (begin_s, height_m, force) in enumerate(rests):
+        for later_s, later_m, later in rests[place + 1 :]:
+            if abs(later_m - height_m) > _SAME_HEIGHT_M:
+                continue
+            if later.low > force.high or later.high < force.low:
+                return [
+                    f"the force at rest at {1e3 * height_m:.1f} mm changed by "
+                    f"{later.value - force.value:+.3g} N from {begin_s:.1f} s to {later_s:.1f} s: "
+                    "gas that warms, friction that holds another way, or a cell that drifts"
+                ]
+    return []
