@@ -1,7 +1,7 @@
 """`rig import` and `rig export`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -9,8 +9,12 @@ from rig.cli.output import console
 from rig.cli.watching import progress_line
 from rig.inputs.errors import InputError
 
+if TYPE_CHECKING:
+    from rig.exchange.mapping import Mapping
+
 IMPORT_EXAMPLES = (
     "Examples: `rig import bench.txt --mapping bench.yaml --out bench.csv` · "
+    "`rig import specimen.dat --rebound positive --out dyno.csv` · "
     "`rig import bus.blf --config rig.yaml --out runs/9` · `rig import run.mf4 --out runs/10`"
 )
 
@@ -28,11 +32,20 @@ def import_command(
         Path | None,
         typer.Option("--config", metavar="FILE", help="Signals of a bus log, with its DBC."),
     ] = None,
+    rebound: Annotated[
+        str | None,
+        typer.Option(
+            "--rebound",
+            metavar="SIGN",
+            help="positive or negative: sign of the force in rebound, for an MTS file without "
+            "--mapping, whose names and units are then its own.",
+        ),
+    ] = None,
 ) -> None:
     """Make a CSV of a foreign table, or a run of a bus log or of an export.
 
-    A table wants --mapping, a bus log (BLF, ASC, candump, TRC, MF4) --config; what `rig export`
-    wrote wants neither.
+    A table (text, XLSX, TDMS, MF4, MTS) wants --mapping, or --rebound if it is of MTS; a bus log
+    (BLF, ASC, candump, TRC, MF4) wants --config; what `rig export` wrote wants neither.
     """
     from rig.exchange.bus_log import import_log
     from rig.exchange.exported import import_run
@@ -40,9 +53,11 @@ def import_command(
     from rig.exchange.mapping import load_mapping
     from rig.operation.setup import load_setup
 
-    if mapping is not None and config is not None:
-        raise InputError("--mapping and --config: expected one of them")
-    if mapping is not None:
+    if sum(given is not None for given in (mapping, config, rebound)) > 1:
+        raise InputError("--mapping, --config and --rebound: expected one of them")
+    if rebound is not None:
+        report = import_table(source, _of_mts(source, rebound), out)
+    elif mapping is not None:
         report = import_table(source, load_mapping(mapping), out)
     elif config is not None:
         with progress_line(None) as progress:
@@ -58,6 +73,17 @@ def import_command(
     for line in report.assumptions:
         console.print(f"- {line}", markup=False)
     console.print(f"Written: {report.out}", markup=False)
+
+
+def _of_mts(source: Path, rebound: str) -> "Mapping":
+    """What an MTS file says of itself."""
+    from rig.exchange.mts import is_mts, mts_mapping
+
+    if rebound not in ("positive", "negative"):
+        raise InputError(f"--rebound {rebound!r}: expected positive or negative")
+    if not is_mts(source):
+        raise InputError(f"{source}: is no file of MTS, expected --mapping FILE")
+    return mts_mapping(source, "positive" if rebound == "positive" else "negative")
 
 
 EXPORT_EXAMPLES = (

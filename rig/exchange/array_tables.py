@@ -1,4 +1,4 @@
-"""Reads the columns of a table that is no text: a worksheet, or a TDMS file.
+"""Reads the columns of a table that names them itself: a worksheet, a TDMS file, one of MTS.
 
 Columns are called by their names: a worksheet's by its first row, a TDMS channel's as `group/name`
 or by its name alone where that is the only one. Formulas, macros and objects are not looked at.
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from can_dbc.units import Dimension
 from rig.exchange.mapping import Mapping as TableMapping
 from rig.exchange.mapping import Output, unit_conversion
+from rig.exchange.mts import is_mts, mts_columns
 from rig.exchange.text_table import Array, Columns
 from rig.inputs.errors import InputError
 
@@ -47,7 +48,7 @@ def array_columns(source: Path, mapping: TableMapping, outputs: Sequence[Output]
         raise InputError(f"{source}: the mapping has no time, expected time: {{column: ...}}")
     if time.date_format is not None:
         raise InputError(f"{source}: time.date_format: is for texts, expected a column of numbers")
-    table = _read(source)
+    table = mts_columns(source)[0] if is_mts(source) else _read(source)
     columns = [_column(source, table, output.key, output.place) for output in outputs]
     said = [f"{len(table)} columns: {', '.join(list(table)[:12])}"]
     first, count = mapping.table.first_row, len(columns[0])

@@ -10,6 +10,7 @@ from rig.exchange.array_tables import READERS, array_columns
 from rig.exchange.imported import ImportReport
 from rig.exchange.mapping import Mapping, outputs_of
 from rig.exchange.mf4_channels import mf4_channels
+from rig.exchange.mts import is_mts
 from rig.exchange.text_table import ROWS_AT_ONCE, Array, text_columns
 from rig.inputs.errors import InputError
 
@@ -34,7 +35,9 @@ def import_table(source: Path, mapping: Mapping, out: Path) -> ImportReport:
     if out.exists():
         raise InputError(f"{out}: exists already, expected a new file")
     outputs = outputs_of(mapping)
-    if source.suffix.lower() in (".mf4", ".mdf", ".dat"):
+    if is_mts(source):
+        t_s, values, said = array_columns(source, mapping, outputs)
+    elif source.suffix.lower() in (".mf4", ".mdf", ".dat"):
         t_s, values, said = mf4_channels(source, mapping, outputs)
     elif source.suffix.lower() in READERS:
         t_s, values, said = array_columns(source, mapping, outputs)
