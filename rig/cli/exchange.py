@@ -5,11 +5,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.output import console
+from rig.cli.output import WRONG_INPUT, console
 from rig.cli.watching import progress_line
 from rig.inputs.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rig.exchange.mapping import Mapping
 
 IMPORT_EXAMPLES = (
@@ -20,9 +22,11 @@ IMPORT_EXAMPLES = (
 
 
 def import_command(
-    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Table, bus log or export.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="Table or folder of tables, bus log, export.")
+    ],
     out: Annotated[
-        Path, typer.Option("--out", metavar="PATH", help="CSV file, or folder of the run.")
+        Path, typer.Option("--out", metavar="PATH", help="CSV file, or folder: of a run, of many.")
     ],
     mapping: Annotated[
         Path | None,
@@ -55,6 +59,10 @@ def import_command(
 
     if sum(given is not None for given in (mapping, config, rebound)) > 1:
         raise InputError("--mapping, --config and --rebound: expected one of them")
+    if source.is_dir() and config is None and (mapping is not None or rebound is not None):
+        given = None if mapping is None else load_mapping(mapping)
+        _import_folder(source, out, lambda path: given or _of_mts(path, rebound or ""))
+        return
     if rebound is not None:
         report = import_table(source, _of_mts(source, rebound), out)
     elif mapping is not None:
@@ -73,6 +81,22 @@ def import_command(
     for line in report.assumptions:
         console.print(f"- {line}", markup=False)
     console.print(f"Written: {report.out}", markup=False)
+
+
+def _import_folder(source: Path, out: Path, mapping_of: "Callable[[Path], Mapping]") -> None:
+    """Import every file of a folder; exit code 2 if one is refused."""
+    from rig.exchange.folder import import_folder
+
+    refused = 0
+    for path, made in import_folder(source, mapping_of, out):
+        if isinstance(made, InputError):
+            refused += 1
+            console.print(f"refused: {made}", markup=False, style="red")
+        else:
+            console.print(f"{path.name}: {made.samples} samples, {made.out}", markup=False)
+    if refused:
+        console.print(f"{refused} refused, the others are in {out}", markup=False)
+        raise typer.Exit(WRONG_INPUT)
 
 
 def _of_mts(source: Path, rebound: str) -> "Mapping":

@@ -111,6 +111,25 @@ def test_what_a_file_does_not_say_is_asked_for(tmp_path, change, says):
     assert says in str(refused.value)
 
 
+def test_a_folder_is_imported_and_one_bad_file_stops_no_other(tmp_path):
+    source, out = tmp_path / "dyno", tmp_path / "csv"
+    source.mkdir()
+    for name, text in (("a.dat", content()), ("b.dat", content()[:40]), ("c.dat", content())):
+        written(source, text, name)
+    runner = CliRunner()
+    given = ["import", str(source), "--rebound", "positive", "--out", str(out)]
+    ended = runner.invoke(app, given)
+    assert ended.exit_code == 2
+    assert "refused" in ended.output
+    assert sorted(path.name for path in out.iterdir()) == ["a.csv", "c.csv"]
+    again = runner.invoke(app, given)
+    assert isinstance(again.exception, InputError)
+    assert "holds something" in str(again.exception)
+    written(source, content(), "a.txt")
+    twice = runner.invoke(app, [*given[:-1], str(tmp_path / "other")])
+    assert "two files are called a" in str(twice.exception)
+
+
 def mutated(folder, files):
     rng, good = random.Random("mts"), content().encode("latin-1")
     source, out, read = folder / "m.dat", folder / "m.csv", 0
