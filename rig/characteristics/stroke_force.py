@@ -34,7 +34,7 @@ _UNDERSMOOTHED = 1
 """Steps by which the spline is more flexible than the best for the curve itself: the best curve has
 a bias as large as its noise, and intervals about it miss the truth (Hall, Ann. Stat. 20, 1992)."""
 
-_VELOCITY_PIECES = 16
+_VELOCITY_PIECES = (16, 8, 4, 2, 1, 0)
 """Of the mean velocity, which has no noise to speak of."""
 
 _WIDER = 1.2
@@ -184,11 +184,20 @@ def mean_stroke(
         # What the next simpler curve and the next one would say shows what this one leaves out.
         apart = forces - _design(ANGLES, other.pieces) @ other.weights
         covariance = covariance + np.outer(apart, apart)
-    seen = _design(between, _VELOCITY_PIECES)
-    of_velocity = np.linalg.lstsq(seen, motion.between_m_per_s[along], rcond=None)[0]
-    velocity = _design(ANGLES, _VELOCITY_PIECES) @ of_velocity
+    velocity = _mean_velocity(between, motion.between_m_per_s[along])
     strokes = len(np.unique(number))
     return MeanStroke(sign, middle, amplitude, forces, covariance, freedom, velocity, strokes)
+
+
+def _mean_velocity(theta: Array, velocity_m_per_s: Array) -> Array:
+    """Velocity at `ANGLES`, by the most flexible spline that its angles carry."""
+    for pieces in _VELOCITY_PIECES:
+        design = _design(theta, pieces)
+        gram = design.T @ design
+        if pieces == 0 or np.linalg.cond(gram) < _WORST_CONDITION:
+            weights = np.linalg.lstsq(design, velocity_m_per_s, rcond=None)[0]
+            return _design(ANGLES, pieces) @ weights
+    raise AssertionError("a spline of no pieces is always there")
 
 
 def _design(theta: Array, pieces: int) -> Array:

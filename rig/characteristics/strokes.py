@@ -38,6 +38,9 @@ _FEWEST_STROKES = 3
 _HOLD_S = 0.5
 """Shortest hold."""
 
+_FEWEST_AT_REST = 20
+"""Samples of a hold: two for each of the batches whose means tell its uncertainty."""
+
 _HARMONICS = 6
 """Most harmonics of a motion."""
 
@@ -171,18 +174,18 @@ def _alike(run: list[Stroke], stroke: Stroke) -> bool:
 def holds_of(t_s: Array, height_m: Array, blocks: list[Block]) -> list[Hold]:
     """Times at rest between the blocks."""
     ends = [0, *(edge for block in blocks for edge in (block.begin, block.end - 1)), len(t_s) - 1]
-    stroke_m = float(np.ptp(height_m))
+    stroke_m, usual_s = float(np.ptp(height_m)), float(np.median(np.diff(t_s)))
     holds: list[Hold] = []
     for begin, end in zip(ends[::2], ends[1::2], strict=True):
         if t_s[end] - t_s[begin] < _HOLD_S:
             continue
         resting = np.abs(height_m[begin : end + 1] - np.median(height_m[begin : end + 1]))
         inside = np.flatnonzero(resting < 0.25 * _TURN_SHARE * stroke_m)
-        if not len(inside):
-            continue
-        first, last = begin + int(inside[0]), begin + int(inside[-1])
-        if t_s[last] - t_s[first] >= _HOLD_S:
-            holds.append(Hold(first, last + 1))
+        # The longest time at rest without a break, of motion or of samples.
+        runs = np.split(inside, np.flatnonzero(np.diff(inside) > 1) + 1)
+        run = max(runs, key=len)
+        if len(run) >= _FEWEST_AT_REST and len(run) * usual_s >= _HOLD_S:
+            holds.append(Hold(begin + int(run[0]), begin + int(run[-1]) + 1))
     return holds
 
 
@@ -202,8 +205,24 @@ def motion_of(t_s: Array, height_m: Array, strokes: int) -> Motion:
     fine_s: Array = np.linspace(float(t_s[0]), float(t_s[-1]), _BETWEEN * len(t_s))
     curve: Any = CubicHermiteSpline(t_s, height, velocity)
     between, rate = curve(fine_s), curve.derivative()(fine_s)
+    # The places of a stroke are those of the motion about its middle, which may wander.
+    height = height - _wander(t_s, t_s, height)
+    between = between - _wander(fine_s, t_s, curve(t_s))
     std = float(np.median(found.deviations[:, 1]))
     return Motion(height, velocity, between, rate, std, float("nan"))
+
+
+def _wander(at_s: Array, t_s: Array, height_m: Array) -> Array:
+    """By how much the middle of the strokes is away from its mean, at times."""
+    strokes = strokes_of(t_s, height_m)
+    if len(strokes) < _FEWEST_STROKES:
+        return np.zeros_like(at_s)
+    middles = [0.5 * (height_m[item.first] + height_m[item.last]) for item in strokes]
+    times = [0.5 * (t_s[item.first] + t_s[item.last]) for item in strokes]
+    # Two strokes, up and down, have one middle: each alone also has half of what it wanders.
+    pairs = np.convolve(middles, (0.5, 0.5), "valid"), np.convolve(times, (0.5, 0.5), "valid")
+    wandered = np.interp(at_s, pairs[1], pairs[0])
+    return wandered - float(np.mean(pairs[0]))
 
 
 def _series(t_s: Array, height_m: Array, strokes: int) -> Motion | None:

@@ -149,6 +149,30 @@ def test_strokes_of_a_triangle():
     assert step.energy_per_cycle.value == pytest.approx(2.0 * 80.0 * 0.04, rel=0.01)
 
 
+def test_a_middle_that_wanders_does_not_bend_the_figures():
+    t_s = np.arange(6000) / RATE_HZ
+    angle = 2.0 * math.pi * 1.0 * t_s
+    x = 0.02 * np.sin(angle) + 2e-3 * t_s
+    v = 0.02 * 2.0 * math.pi * np.cos(angle) + 2e-3
+    rng = np.random.default_rng(11)
+    force = 150.0 - 1000.0 * v + rng.standard_normal(6000)
+    found = of_arrays("wanders", t_s, 0.3 + x + 1e-6 * rng.standard_normal(6000), force)
+    [step] = found.steps
+    assert step.peak_speed_m_per_s == pytest.approx(0.1277, rel=0.01)
+    assert step.amplitude_m == pytest.approx(0.02, rel=0.02)
+    assert step.rebound.force_at_peak_velocity.value == pytest.approx(150.0 - 127.7, abs=2.0)
+    assert step.energy_per_cycle.value == pytest.approx(
+        1000.0 * math.pi * 2.0 * math.pi * 0.02**2, rel=0.02
+    )
+
+
+def test_a_gap_is_no_rest():
+    rng = np.random.default_rng(12)
+    t_s, x, force = Dyno("linear", 1.0, 0.02, 200.0, 12.0, 1.0, 1e-6, 0.1).record(rng)
+    keep = (t_s < 4.2) | (t_s > 6.5)
+    assert of_arrays("gap", t_s[keep], x[keep], force[keep]).holds == ()
+
+
 def test_two_amplitudes_are_two_steps():
     rng = np.random.default_rng(6)
     first = Dyno("linear", 1.0, 0.02, 100.0, 5.0, 1.0, 1e-6, 0.0).record(rng)
