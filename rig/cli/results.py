@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from rig.diagnosis.outcome import Diagnosis
     from rig.operation.logged_run import Ended
 
-_OF_TICKS = ("stale", "overruns", "limited", "bus_faulty", "left_out")
+_OF_TICKS = ("stale", "overruns", "limited", "bus_faulty", "left_out", "device_faulty")
 """Counts of ticks; the others are of frames."""
 
 

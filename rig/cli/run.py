@@ -70,7 +70,8 @@ def run(
     folder = out or Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
     refuse_full(folder)
     further = [name for name, *_ in ready.config.signals.sensors()]
-    with stoppable() as stop, status_line(ready.config.duration_s, further) as watch:
+    shown = status_line(ready.config.duration_s, further, list(ready.config.devices))
+    with stoppable() as stop, shown as watch:
         ended = live(
             ready,
             folder,

@@ -86,7 +86,7 @@ def _plain_progress() -> Callable[[str, float], None]:
 
 @contextlib.contextmanager
 def status_line(
-    duration_s: float | None, sensors: Sequence[str] = ()
+    duration_s: float | None, sensors: Sequence[str] = (), devices: Sequence[str] = ()
 ) -> Generator[Callable[["Look"], None]]:
     """State, rate, lateness, force and losses of a run, in place, or lines where that cannot be.
 
@@ -95,6 +95,7 @@ def status_line(
     Args:
         duration_s: Length of the run; None if it has none.
         sensors: Names of the further sensors.
+        devices: Names of the devices.
     """
     is_terminal = sys.stderr.isatty()
     total = "" if duration_s is None else f" of {duration_s:g}"
@@ -118,8 +119,7 @@ def status_line(
         text += f"  lost {look.counts.lost}"
         if look.counts.refused:
             text += f"  refused {look.counts.refused}"
-        if look.output.left_out:
-            text += f"  left out {', '.join(sensors[place] for place in look.output.left_out)}"
+        text += _of_sensors(look, sensors, devices)
         if look.late_ns is not None:
             text += f"  missed {look.counts.overruns}  late ≤ {look.late_ns * 1e-6:.2f} ms"
         # The largest force stands for all struts: a line is no table.
@@ -138,6 +138,14 @@ def status_line(
     finally:
         if is_terminal:
             _say(b"\r\x1b[K")
+
+
+def _of_sensors(look: "Look", sensors: Sequence[str], devices: Sequence[str]) -> str:
+    """What is not used now, and why."""
+    text = "".join(f"  {devices[place]}: {why}" for place, why in look.troubles)
+    if look.output.left_out:
+        text += f"  left out {', '.join(sensors[place] for place in look.output.left_out)}"
+    return text
 
 
 @contextlib.contextmanager

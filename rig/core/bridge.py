@@ -9,7 +9,7 @@ from typing import NamedTuple
 from msgspec import Struct
 from msgspec.structs import replace
 
-from can_dbc.addressing import Directory
+from can_dbc.addressing import Directory, Filter
 from can_dbc.frame import Frame
 from can_dbc.protection import INITIAL, SequenceState, Verdict
 from rig.core.contract import (
@@ -22,6 +22,7 @@ from rig.core.contract import (
     StepInput,
     StepOutput,
 )
+from rig.core.devices import Device, Health, after_alarm, after_frame, trouble, troubles, well
 from rig.core.messages import Conditions, Counts, Incoming, Outgoing, Report
 from rig.core.supervisor import (
     EVENTS_BEYOND,
@@ -34,6 +35,7 @@ from rig.core.supervisor import (
 )
 
 _NO_CONDITIONS = Conditions()
+_ALL_STANDARD = 0x7FF
 
 RIVAL_FRAMES = 12
 """Frames out of sequence, one hardly after the other, that only a second sender explains: a sender
@@ -91,12 +93,14 @@ class BridgeState(Struct, frozen=True, gc=False):
         sequences: Counter state of each incoming message.
         sendings: Where each outgoing message stands.
         ledger: What is remembered beside.
+        healths: What is known of each device.
     """
 
     core: CoreState
     sequences: tuple[SequenceState, ...]
     sendings: tuple[Sending, ...]
     ledger: Ledger
+    healths: tuple[Health, ...] = ()
 
     @property
     def counts(self) -> Counts:
@@ -112,12 +116,14 @@ class TickResult(Struct, frozen=True, gc=False):
         step_input: What the core was given.
         output: What the core published.
         counts: What has been counted since the start.
+        troubles: Devices with something wrong, by their places, and what it is.
     """
 
     frames: list[Frame]
     step_input: StepInput
     output: StepOutput
     counts: Counts
+    troubles: tuple[tuple[int, str], ...] = ()
 
 
 class _Received(Struct, frozen=True, gc=False):
@@ -131,6 +137,7 @@ class _Received(Struct, frozen=True, gc=False):
         sequences: Counter state of each incoming message.
         ledger: What is remembered beside.
         action: The severest action that the limits on measurements ask for, 0 if none.
+        healths: What is known of each device.
     """
 
     core: CoreState
@@ -140,6 +147,7 @@ class _Received(Struct, frozen=True, gc=False):
     sequences: list[SequenceState]
     ledger: Ledger
     action: int
+    healths: tuple[Health, ...]
 
 
 class Bridge:
@@ -150,6 +158,7 @@ class Bridge:
         incoming: Messages of the bench.
         outgoing: Messages of the bridge.
         limits: What is done beyond which values.
+        devices: Devices that say how they are.
     """
 
     def __init__(
@@ -158,8 +167,11 @@ class Bridge:
         incoming: Sequence[Incoming],
         outgoing: Sequence[Outgoing],
         limits: Sequence[Limit] = (),
+        devices: Sequence[Device] = (),
     ) -> None:
         self.core = core
+        self.devices = tuple(devices)
+        self._device_at = {key: place for place, item in enumerate(devices) for key in item.ids}
         self.incoming = tuple(incoming)
         self._measured_limits = tuple(item for item in limits if item.watched.is_measured)
         self._limits = tuple(item for item in limits if not item.watched.is_measured)
@@ -168,19 +180,22 @@ class Bridge:
         self.directory = Directory(item.message for item in incoming)
         """Which incoming message a frame is of."""
         self._own = frozenset(item.message.key for item in outgoing)
-        self.filters = Directory(item.message for item in (*incoming, *outgoing)).filters
+        of_messages = Directory(item.message for item in (*incoming, *outgoing)).filters
+        of_devices = (Filter(key, _ALL_STANDARD, is_extended=False) for key in self._device_at)
+        self.filters = (*of_messages, *of_devices)
         """What lets in the frames that the bridge subscribes to, its own among them."""
 
     def changed(self, core: Core, limits: Sequence[Limit]) -> "Bridge":
         """The same with another core and other limits; it goes on from the state of this one."""
-        return Bridge(core, self.incoming, self._outgoing, limits)
+        return Bridge(core, self.incoming, self._outgoing, limits, self.devices)
 
     def init(self, t_ns: int) -> BridgeState:
         """State before the first tick."""
         messages = len(self.incoming)
         nothing = Ledger(Counts(), Counts(), (None,) * self.core.struts, (Strays(),) * messages)
         sendings = (Sending(0, t_ns),) * len(self._outgoing)
-        return BridgeState(self.core.init(t_ns), (INITIAL,) * messages, sendings, nothing)
+        healths = tuple(well(device, t_ns) for device in self.devices)
+        return BridgeState(self.core.init(t_ns), (INITIAL,) * messages, sendings, nothing, healths)
 
     def tick(
         self,
@@ -212,10 +227,14 @@ class Bridge:
         action = received.action
         if self._limits or action:
             core, output, action = self._limited(state.core, core, output, action)
-        ledger = _noted(received.ledger, output, action, conditions)
+        wrong = troubles(self.devices, received.healths, t_ns) if self.devices else ()
+        if wrong and any(self.devices[place].is_vital for place, _ in wrong):
+            core, output, _ = self._limited(state.core, core, output, Action.HOLD)
+        ledger = _noted(received.ledger, output, action, conditions, len(wrong))
         sendings, sent, ledger = self._sent(state.sendings, t_ns, output, ledger, conditions)
-        after = BridgeState(core, tuple(received.sequences), sendings, ledger)
-        return after, TickResult(sent, step_input, output, ledger.counts)
+        sequences = tuple(received.sequences)
+        after = BridgeState(core, sequences, sendings, ledger, received.healths)
+        return after, TickResult(sent, step_input, output, ledger.counts, wrong)
 
     def _received(self, state: BridgeState, t_ns: int, frames: Sequence[Frame]) -> _Received:
         """Refuse or read every frame.
@@ -224,17 +243,21 @@ class Bridge:
         model would run away under a force that was constant over the whole gap.
         """
         core, ledger, sequences, action = state.core, state.ledger, list(state.sequences), 0
+        healths = state.healths
         heights, others = self._no_heights.copy(), list(NO_OTHERS)
         readings: list[Reading] = []
         for frame in frames:
             place = self.directory.place(frame.arbitration_id, frame.is_extended)
             if place is None or frame.is_error:
+                healths = self._told(healths, frame)
                 ledger = self._foreign(ledger, frame)
                 continue
             incoming = self.incoming[place]
             sequences[place], verdict, values = incoming.read(sequences[place], frame)
             if verdict is not Verdict.OK:
                 ledger = self._judged(ledger, place, frame.t_ns, verdict, sequences[place])
+            if incoming.device is not None:
+                healths, ledger, values = self._from_device(healths, ledger, frame, place, values)
             if values is None:
                 continue
             if self._measured_limits:
@@ -246,14 +269,9 @@ class Bridge:
                 core, readings = self._caught_up(core, heights, others, readings)
                 heights, others = self._no_heights.copy(), list(NO_OTHERS)
             arrived_ns = min(frame.t_ns, t_ns)
-            for target in incoming.heights:
-                delay_ns = target.delay_ns
-                height_m = values[target.value]
-                heights[target.strut] = Measurement(height_m, arrived_ns - delay_ns, delay_ns)
-            for target in incoming.others:
-                others[target.place] = values[target.value]
+            _put(heights, others, incoming, arrived_ns, values)
             readings += _read(incoming, arrived_ns, values)
-        return _Received(core, heights, others, readings, sequences, ledger, action)
+        return _Received(core, heights, others, readings, sequences, ledger, action, healths)
 
     def _caught_up(
         self,
@@ -267,6 +285,14 @@ class Bridge:
         due = tuple(reading for reading in readings if reading.t_ns <= t_ns)
         given = StepInput(t_ns, tuple(heights), tuple(others), readings=due)
         return self.core.step(core, given)[0], [item for item in readings if item.t_ns > t_ns]
+
+    def _told(self, healths: tuple[Health, ...], frame: Frame) -> tuple[Health, ...]:
+        """What is known of the devices after a frame of no incoming message."""
+        place = None if frame.is_extended else self._device_at.get(frame.arbitration_id)
+        if place is None or frame.is_error:
+            return healths
+        health = after_frame(self.devices[place], healths[place], frame)
+        return (*healths[:place], health, *healths[place + 1 :])
 
     def _foreign(self, ledger: Ledger, frame: Frame) -> Ledger:
         """After a frame of no incoming message: error frames, or somebody under our ids."""
@@ -295,6 +321,27 @@ class Bridge:
         follows = t_ns - before.t_ns <= _RIVAL_CYCLES * cycle_ns
         stray = Strays(before.frames + 1 if follows else 1, t_ns)
         return (*strays[:place], stray, *strays[place + 1 :]), stray.frames >= RIVAL_FRAMES
+
+    def _from_device(
+        self,
+        healths: tuple[Health, ...],
+        ledger: Ledger,
+        frame: Frame,
+        place: int,
+        values: tuple[float, ...] | None,
+    ) -> tuple[tuple[Health, ...], Ledger, tuple[float, ...] | None]:
+        """After a device's frame: its values, or None if something is wrong with the device."""
+        incoming = self.incoming[place]
+        device = incoming.device
+        if device is None or values is None:
+            return healths, ledger, values
+        healths = _alarmed(healths, incoming, values)
+        if trouble(self.devices[device], healths[device], frame.t_ns) is None:
+            return healths, ledger, values
+        counts = ledger.counts
+        refused, more = counts.refused + 1, counts.from_faulty_device + 1
+        counts = counts._replace(refused=refused, from_faulty_device=more)
+        return healths, replace(ledger, counts=counts), None
 
     def _plausible(
         self, ledger: Ledger, incoming: Incoming, arrived_ns: int, values: tuple[float, ...]
@@ -361,6 +408,22 @@ class Bridge:
         return tuple(after), frames, ledger
 
 
+def _put(
+    heights: list[Measurement | None],
+    others: list[float | None],
+    incoming: Incoming,
+    arrived_ns: int,
+    values: Sequence[float],
+) -> None:
+    """Put the heights and other quantities of a frame where they belong."""
+    for target in incoming.heights:
+        delay_ns = target.delay_ns
+        height_m = values[target.value]
+        heights[target.strut] = Measurement(height_m, arrived_ns - delay_ns, delay_ns)
+    for target in incoming.others:
+        others[target.place] = values[target.value]
+
+
 def _read(incoming: Incoming, arrived_ns: int, values: Sequence[float]) -> list[Reading]:
     """Readings of further sensors in a frame."""
     return [
@@ -369,10 +432,24 @@ def _read(incoming: Incoming, arrived_ns: int, values: Sequence[float]) -> list[
     ]
 
 
-def _noted(ledger: Ledger, output: StepOutput, action: int, conditions: Conditions) -> Ledger:
+def _alarmed(
+    healths: tuple[Health, ...], incoming: Incoming, values: Sequence[float]
+) -> tuple[Health, ...]:
+    """What is known of the devices after the alarms in a frame."""
+    for target in incoming.alarms:
+        place = target.device
+        health = after_alarm(healths[place], target.alarm, int(values[target.value]))
+        healths = (*healths[:place], health, *healths[place + 1 :])
+    return healths
+
+
+def _noted(
+    ledger: Ledger, output: StepOutput, action: int, conditions: Conditions, faulty_devices: int
+) -> Ledger:
     """After a tick; most are as they should be."""
     holds = output.mode is Mode.HOLD
-    if not (action or holds or conditions.overruns or conditions.bus_fault or output.left_out):
+    beside = conditions.overruns or conditions.bus_fault or output.left_out or faulty_devices
+    if not (action or holds or beside):
         return ledger
     counts = ledger.counts
     counts = counts._replace(
@@ -381,6 +458,7 @@ def _noted(ledger: Ledger, output: StepOutput, action: int, conditions: Conditio
         limited=counts.limited + (action > 0),
         bus_faulty=counts.bus_faulty + conditions.bus_fault,
         left_out=counts.left_out + len(output.left_out),
+        device_faulty=counts.device_faulty + faulty_devices,
     )
     return replace(ledger, counts=counts)
 

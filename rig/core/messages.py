@@ -26,6 +26,7 @@ class Wanted(NamedTuple):
         strut: Index of the strut of a height, else 0.
         delay_ns: How much later a height or a reading comes than it is true.
         sensor: Place of the further sensor that it is a reading of; None for all else.
+        alarm: Device that it is an alarm of, and which of its alarms; None for all else.
     """
 
     signal: str
@@ -33,6 +34,7 @@ class Wanted(NamedTuple):
     strut: int = 0
     delay_ns: int = 0
     sensor: int | None = None
+    alarm: tuple[int, int] | None = None
 
 
 class HeightTarget(Struct, frozen=True, gc=False):
@@ -75,6 +77,20 @@ class SensorTarget(Struct, frozen=True, gc=False):
     delay_ns: int = 0
 
 
+class AlarmTarget(Struct, frozen=True, gc=False):
+    """Where a value of a frame goes: an alarm of a device.
+
+    Attributes:
+        value: Its place among the frame's values.
+        device: Place of the device.
+        alarm: Which of the device's alarms.
+    """
+
+    value: int
+    device: int
+    alarm: int
+
+
 Reader = Callable[[SequenceState, Frame], tuple[SequenceState, Verdict, tuple[float, ...] | None]]
 """What is remembered of a message's counter, and a frame of it -> the same after the frame, what
 the frame is, and its values in SI; None where there are none to be used."""
@@ -90,6 +106,8 @@ class Incoming:
         heights: Where heights among its values go.
         others: Where other values go.
         sensors: Where readings of further sensors go.
+        alarms: Where alarms of devices go.
+        device: Place of the device that sends it; None if nothing is known of one.
     """
 
     message: Message
@@ -97,6 +115,8 @@ class Incoming:
     heights: tuple[HeightTarget, ...]
     others: tuple[OtherTarget, ...]
     sensors: tuple[SensorTarget, ...] = ()
+    alarms: tuple[AlarmTarget, ...] = ()
+    device: int | None = None
 
 
 class Counts(NamedTuple):
@@ -120,6 +140,8 @@ class Counts(NamedTuple):
         limited: Ticks beyond a limit.
         bus_faulty: Ticks with a fault of the bus.
         left_out: Ticks at which a further sensor was left out, one for each sensor.
+        device_faulty: Ticks at which a device had something wrong with it, one for each device.
+        from_faulty_device: Frames refused because something was wrong with their device.
     """
 
     lost: int = 0
@@ -138,6 +160,8 @@ class Counts(NamedTuple):
     limited: int = 0
     bus_faulty: int = 0
     left_out: int = 0
+    device_faulty: int = 0
+    from_faulty_device: int = 0
 
 
 Levels = tuple[float, float, float, float]
@@ -269,8 +293,10 @@ def _is_bus_faulty(report: Report) -> bool:
 
 
 def _is_measurement_faulty(report: Report) -> bool:
-    """Now: no estimate that rests on fresh heights, or a further sensor that is left out."""
-    return report.output.mode is not Mode.RUNNING or bool(report.output.left_out)
+    """No estimate that rests on fresh heights or a sensor left out, now, or a device at fault."""
+    output, counts, reported = report.output, report.counts, report.reported
+    is_out = output.mode is not Mode.RUNNING or bool(output.left_out)
+    return is_out or counts.device_faulty > reported.device_faulty
 
 
 STATUS = (
@@ -285,8 +311,8 @@ STATUS = (
     _status("bus_fault", _is_bus_faulty),
     _status("log_fault", lambda report: report.conditions.log_fault),
 )
-"""What is published of the bridge. Faults of encoding, limits and bus are those since the last
-status, the others are of now."""
+"""What is published of the bridge. Faults of encoding, limits, devices and bus are those since the
+last status, the others are of now."""
 
 
 def _timing(key: str, value: Callable[[TimingFigures], float]) -> Publication:
@@ -346,12 +372,13 @@ class Published(NamedTuple):
     strut: int = 0
 
 
-def incoming(message: Message, wanted: Sequence[Wanted]) -> Incoming:
+def incoming(message: Message, wanted: Sequence[Wanted], device: int | None = None) -> Incoming:
     """An incoming message, compiled.
 
     Args:
         message: Message of the bench.
         wanted: What its signals are for.
+        device: Place of the device that sends it.
 
     Raises:
         DatabaseError: A signal is missing, or its unit does not fit what it is for.
@@ -375,8 +402,9 @@ def incoming(message: Message, wanted: Sequence[Wanted]) -> Incoming:
         for value, item in placed
         if item.quantity in PLACES
     ]
+    alarms = tuple(AlarmTarget(value, *item.alarm) for value, item in placed if item.alarm)
     read = _reader(message, decode)
-    return Incoming(message, read, tuple(heights), tuple(others), tuple(sensors))
+    return Incoming(message, read, tuple(heights), tuple(others), tuple(sensors), alarms, device)
 
 
 def _reader(message: Message, decode: Decoder) -> Reader:

@@ -49,5 +49,8 @@ FURTHER = {
 """What a further sensor of a strut may measure, by what `measures` says in a configuration; the
 column is that of the log, after the names of strut and sensor."""
 
+ALARM = Quantity("alarm", "alarm", Dimension.NUMBER, "alarm of a device")
+"""A signal whose raw value is other than zero while something is wrong with its device."""
+
 PLACES = {quantity: place for place, quantity in enumerate(OTHERS)}
 """Where each stands among `OTHERS`."""

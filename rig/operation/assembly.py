@@ -7,6 +7,7 @@ from dart_model.plant import DartPlant, PrescribedStrut
 from dart_model.spec import ModelSpec
 from rig.core.bridge import Bridge
 from rig.core.contract import Core, Measures, Plant, Sensor
+from rig.core.devices import Device
 from rig.core.messages import (
     STATUS,
     STRUT,
@@ -19,7 +20,7 @@ from rig.core.messages import (
     outgoing,
 )
 from rig.core.prescribed import PrescribedCore
-from rig.core.quantities import FURTHER, HEIGHT
+from rig.core.quantities import ALARM, FURTHER, HEIGHT, LOAD_CELL_FORCE
 from rig.core.step import Arrival, RigCore
 from rig.inputs.errors import InputError
 from rig.operation.setup import Setup
@@ -42,7 +43,8 @@ def build_bridge(ready: Setup, model: ModelSpec | None = None, *, sending: bool 
     """
     outgoing = _outgoing(ready) if sending else ()
     limits = ready.config.supervision.supervision().limits
-    return Bridge(_core(ready, model or ready.model), _incoming(ready), outgoing, limits)
+    core, devices = _core(ready, model or ready.model), build_devices(ready)
+    return Bridge(core, _incoming(ready), outgoing, limits, devices)
 
 
 def build_plant(ready: Setup, model: ModelSpec | None = None) -> Plant:
@@ -68,6 +70,18 @@ def _core(ready: Setup, model: ModelSpec) -> Core:
     observers = tuple(config.observers.values())
     return RigCore(
         build_plant(ready, model), observers, supervision, arrivals(ready), sensors(ready)
+    )
+
+
+def build_devices(ready: Setup) -> tuple[Device, ...]:
+    """Devices that say how they are; the estimate rests on those that send a height."""
+    config = ready.config
+    vital = [entry.message for entry in config.signals.height.values()]
+    if config.prescribed_motion is not None:
+        vital.append(config.signals.others[LOAD_CELL_FORCE].message)
+    senders = {ready.database.message(name).sender for name in vital}
+    return tuple(
+        entry.device(name, is_vital=name in senders) for name, entry in config.devices.items()
     )
 
 
@@ -117,7 +131,21 @@ def _incoming(ready: Setup) -> list[Incoming]:
         wanted.setdefault(entry.message, []).append(
             Wanted(entry.signal, FURTHER[entry.measures], 0, entry.delay_ns, place)
         )
-    return [incoming(ready.database.message(name), found) for name, found in wanted.items()]
+    devices = list(ready.config.devices)
+    for place, entry in enumerate(ready.config.devices.values()):
+        for number, alarm in enumerate(entry.alarms):
+            wanted.setdefault(alarm.message, []).append(
+                Wanted(alarm.signal, ALARM, alarm=(place, number))
+            )
+    messages = {name: ready.database.message(name) for name in wanted}
+    return [
+        incoming(
+            messages[name],
+            found,
+            devices.index(sender) if (sender := messages[name].sender) in devices else None,
+        )
+        for name, found in wanted.items()
+    ]
 
 
 def _outgoing(ready: Setup) -> list[Outgoing]:

@@ -178,7 +178,7 @@ def _authenticated(ready: Setup) -> list[Finding]:
 def _load(ready: Setup) -> Finding:
     config, database = ready.config, ready.database
     sent = config.published_messages()
-    names = {entry.message for entry in config.signals.named().values()}.union(sent)
+    names = {entry.message for entry in config.subscribed().values()}.union(sent)
     period_ns = config.period_ns
     load = 0.0
     for name in sorted(names):

@@ -17,6 +17,7 @@ from pydantic_core import CoreSchema
 from pydantic_core.core_schema import tagged_union_schema
 
 from rig.core.contract import Observer
+from rig.core.devices import LARGEST_NODE_ID, Device
 from rig.core.messages import STATUS, STRUT, TIMING, Publication
 from rig.core.observers import DEFAULT_KIND, OBSERVERS
 from rig.core.quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, OTHERS, Quantity
@@ -27,6 +28,7 @@ from rig.io.captures import Window
 from rig.io.run_writer import Rotation
 from rig.io.secoc import Authentication
 
+_EMERGENCY_ID = 0x080
 _KEYS = (HEIGHT.key, "further", *(quantity.key for quantity in OTHERS))
 
 CONFIGS = Path(__file__).parent.parent / "configs"
@@ -254,6 +256,29 @@ def _mapping(choices: Sequence[Publication]) -> Callable[[object], object]:
     return read
 
 
+class DeviceConfig(_Frozen):
+    """A CANopen device that says how it is; its frames are refused while something is wrong.
+
+    Attributes:
+        node_id: CANopen node id.
+        emergency_id: Arbitration id of its emergency frames; 128 and the node id if absent.
+        heartbeat_s: Longest time between two heartbeats; they are not watched if absent.
+        alarms: Signals that are other than zero while something is wrong with it.
+    """
+
+    node_id: Annotated[int, Field(ge=1, le=LARGEST_NODE_ID)]
+    emergency_id: Annotated[int, Field(ge=1, le=0x7FF)] | None = None
+    heartbeat_s: Annotated[float, Field(ge=0.001, le=130.0, allow_inf_nan=False)] | None = None
+    alarms: Annotated[tuple[SignalName, ...], Field(max_length=16)] = ()
+
+    def device(self, name: str, *, is_vital: bool) -> Device:
+        """As the core takes it."""
+        emergency_id = self.emergency_id or _EMERGENCY_ID + self.node_id
+        heartbeat_ns = round((self.heartbeat_s or 0.0) * 1e9)
+        alarms = len(self.alarms)
+        return Device(name, self.node_id, emergency_id, heartbeat_ns, alarms, is_vital)
+
+
 class LimitConfig(_Frozen):
     """One row of the table of limits, for every strut.
 
@@ -438,6 +463,7 @@ class RunConfig(_Frozen):
         bus: How to open the bus.
         authentication: Authentication of all frames; none if absent.
         signals: What is read from it.
+        devices: CANopen devices that say how they are, by the names of their nodes in the DBC.
         prescribed_motion: Declares a dyno; there is then a load cell and no applied force.
         observers: One for each strut of the model, by strut name; PI where none is named.
             `kind` says which, `pi` if absent; its other keys are its own. A dyno uses none.
@@ -461,6 +487,7 @@ class RunConfig(_Frozen):
     bus: BusSettings = BusSettings()
     authentication: AuthenticationConfig | None = None
     signals: Signals
+    devices: dict[SensorName, DeviceConfig] = Field(default_factory=dict[str, DeviceConfig])
     prescribed_motion: PrescribedMotion | None = None
     observers: dict[str, Annotated[Observer, _OneOfObservers]] = Field(default_factory=dict)
     publish: dict[str, Annotated[Mapped, BeforeValidator(_mapping(STRUT))]] | None = None
@@ -501,6 +528,15 @@ class RunConfig(_Frozen):
                 "that is prescribed asks for no force"
             )
         return self
+
+    def subscribed(self) -> dict[str, SignalName]:
+        """Every signal that the bridge reads, by its key."""
+        alarms = {
+            f"devices.{name}.alarms.{place}": entry
+            for name, device in self.devices.items()
+            for place, entry in enumerate(device.alarms)
+        }
+        return {**self.signals.named(), **alarms}
 
     def published(self) -> dict[str, SignalName]:
         """Every signal that the bridge sends, by its key."""

@@ -45,6 +45,9 @@ from rig.operation.setup import Setup
 from rig.operation.timing import HISTOGRAMS_FILE, Timing
 from rig.operation.trace import Trace
 
+_MOST_REPORTS = 1000
+"""Changes of the devices' state that `run.yaml` lists; the counts go on."""
+
 _PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "autosar-e2e")
 
 
@@ -161,8 +164,7 @@ def logged(
     refuse_full(folder)
     _copy_inputs(ready, folder)
     header = _header(ready, clock.epoch_ns, granted, folder)
-    if forced:
-        header["forced"] = [dict(finding) for finding in forced]
+    header |= {"forced": [dict(finding) for finding in forced]} if forced else {}
     timing, further = Timing.empty(), sensors(ready)
     record = Record(config.signals.measured, len(further))
     priority = config.realtime.fifo_priority if granted is not None and granted.fifo else 0
@@ -181,19 +183,21 @@ def logged(
     )
     count = None if config.duration_s is None else _ticks(config.duration_s, config.rate_hz)
     ticks, shown_ns, status = 0, 0, "failed"
-    state = bridge.init(0)
+    state, reports = bridge.init(0), _Reports(list(config.devices))
 
     def sink(
         received: Sequence[Frame], sent: Sequence[Frame], result: TickResult, step: Step
     ) -> None:
         nonlocal ticks, shown_ns
         log.add(received, sent, step)
+        reports.note(step.t_ns, result.troubles)
         ticks += 1
         progress(step.t_ns, result.output.mode)
         if step.t_ns >= shown_ns:
             shown_ns = step.t_ns + SHOWN_EVERY_NS
             late_ns = int(timing.extremes_ns[0]) if granted is not None else None
-            watch(Look(step.t_ns, ticks, result.output, result.counts, late_ns))
+            seen = (result.output, result.counts, late_ns, result.troubles)
+            watch(Look(step.t_ns, ticks, *seen))
 
     try:
         if begin is not None:
@@ -203,9 +207,7 @@ def logged(
         keep: Sink = sink
         if trace is not None:
             clock, source, keep = trace.clock(clock), trace.port(informed, log), trace.sink(sink)
-        waiting: Clock = clock
-        for occupation in (*while_waiting, informed.look):
-            waiting = OccupiedClock(waiting, occupation)
+        waiting = _occupied(clock, (*while_waiting, informed.look))
         due = regular_ticks(waiting, config.period_ns, count, stop, timing)
         with contextlib.ExitStack() as around:
             around.enter_context(on_signal(signal.SIGUSR2, lambda: log.trigger("user")))
@@ -230,12 +232,38 @@ def logged(
                     "bus": figures.as_dict(),
                     "log_fault": log.trouble,
                     "dropped_steps": log.dropped,
+                    "devices": reports.listed,
                 }
             }
         )
     if trace is not None:
         trace.write(folder)
     return Ended(folder, state, timing, granted, log.trouble, ticks, config.period_ns, diverged)
+
+
+def _occupied(clock: Clock, occupations: Sequence[Callable[[int], None]]) -> Clock:
+    """A clock that does something before each wait."""
+    for occupation in occupations:
+        clock = OccupiedClock(clock, occupation)
+    return clock
+
+
+class _Reports:
+    """What was wrong with devices, from when on, for `run.yaml`."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = names
+        self._last: tuple[tuple[int, str], ...] = ()
+        self.listed: list[dict[str, object]] = []
+
+    def note(self, t_ns: int, troubles: tuple[tuple[int, str], ...]) -> None:
+        """What is wrong at a tick; kept where it is something else than before."""
+        if troubles == self._last:
+            return
+        self._last = troubles
+        if len(self.listed) < _MOST_REPORTS:
+            wrong = {self._names[place]: why for place, why in troubles}
+            self.listed.append({"t_s": t_ns * 1e-9, "wrong": wrong})
 
 
 def _divergence(ready: Setup, state: BridgeState) -> dict[str, object] | None:

@@ -59,6 +59,7 @@ class Look(NamedTuple):
         output: What it published.
         counts: What has been counted since the start.
         late_ns: Largest lateness so far; None where nothing waits for a clock.
+        troubles: Devices with something wrong, by their places, and what it is.
     """
 
     t_ns: int
@@ -66,6 +67,7 @@ class Look(NamedTuple):
     output: StepOutput
     counts: Counts
     late_ns: int | None
+    troubles: tuple[tuple[int, str], ...] = ()
 
 
 Watch = Callable[[Look], None]

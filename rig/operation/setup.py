@@ -107,6 +107,7 @@ def put_together(config: RunConfig, source: Path, model: ModelSpec, database: Da
     """
     named = _with_names(config, model, database, source)
     _check_messages(named, database, source)
+    _check_devices(named, database, source)
     return Setup(config=named, source=source, model=model, database=database)
 
 
@@ -243,7 +244,7 @@ def _all_in(message: str, publications: Iterable[Publication], database: Databas
 
 def _check_messages(config: RunConfig, database: Database, source: Path) -> None:
     outputs = config.published_messages()
-    for key, entry in config.signals.named().items():
+    for key, entry in config.subscribed().items():
         _check_signal(database, entry, f"{source}: {key}")
         if entry.message in outputs:
             raise InputError(
@@ -260,13 +261,47 @@ def _check_messages(config: RunConfig, database: Database, source: Path) -> None
                 "expected once"
             )
     if config.authentication is not None:
-        names = {entry.message for entry in config.signals.named().values()}.union(outputs)
+        names = {entry.message for entry in config.subscribed().values()}.union(outputs)
         _check_authentication(
             config,
             config.authentication,
             [database.message(name) for name in sorted(names)],
             source,
         )
+
+
+def _check_devices(config: RunConfig, database: Database, source: Path) -> None:
+    """Refuse devices that send nothing that is used, and ids that mean something else already."""
+    read = {entry.message for entry in config.subscribed().values()}
+    messages = [database.message(name) for name in (*read, *config.published_messages())]
+    taken = {
+        message.arbitration_id: message.name for message in messages if not message.is_extended
+    }
+    senders = sorted({found for name in read if (found := database.message(name).sender)})
+    for name, entry in config.devices.items():
+        place = f"{source}: devices.{name}"
+        if config.authentication is not None:
+            raise InputError(f"{place}: expected none beside authentication, which it cannot do")
+        if name not in senders:
+            raise InputError(
+                f"{place}: sends none of the signals in {database.path.name}, expected the name of "
+                f"a node that does: {', '.join(senders) or 'the DBC names none'}"
+            )
+        for arbitration_id in entry.device(name, is_vital=False).ids:
+            other = taken.setdefault(arbitration_id, f"devices.{name}")
+            if other != f"devices.{name}":
+                raise InputError(
+                    f"{place}: {arbitration_id:#x} is an id of {other} already, expected another "
+                    "node_id or emergency_id"
+                )
+        for number, alarm in enumerate(entry.alarms):
+            message = database.message(alarm.message)
+            signal = message.signal(alarm.signal)
+            if message.sender != name or signal.is_float or signal.scale != 1 or signal.offset:
+                raise InputError(
+                    f"{place}.alarms.{number}: {alarm.message}.{alarm.signal}: expected an integer "
+                    f"without scale and offset that {name} sends"
+                )
 
 
 def _check_signal(database: Database, entry: SignalName, key: str) -> None:

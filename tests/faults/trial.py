@@ -56,13 +56,14 @@ class Tick(NamedTuple):
 class Trial:
     """A bridge and a bench, joined tick by tick."""
 
-    def __init__(self, **supervision: object) -> None:
+    def __init__(self, devices: object = None, **supervision: object) -> None:
         ready = load_setup(CONFIGS / "reference.yaml")
         changed = ready.config.supervision.model_validate(
             ready.config.supervision.model_dump() | supervision
         )
         config = ready.config.model_copy(update={"supervision": changed})
-        self.ready = ready.model_copy(update={"config": config})
+        named = config.model_validate(config.model_dump() | {"devices": devices or {}})
+        self.ready = ready.model_copy(update={"config": named})
         self.bridge: Bridge = build_bridge(self.ready)
         self.bench = Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), ready.database)
         self.state: BridgeState = self.bridge.init(0)

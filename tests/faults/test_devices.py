@@ -1,0 +1,235 @@
+"""Faults that a CANopen device reports of itself, between bench and bridge, at 1 kHz."""
+
+import json
+
+import pytest
+
+from can_dbc.frame import Frame
+from rig.core.contract import Mode
+from rig.core.devices import Device, after_alarm, after_frame, trouble, well
+from rig.inputs.errors import InputError
+from rig.operation.assembly import build_bridge
+from rig.operation.setup import load_setup
+from tests.faults.trial import BEGIN_NS, MEASUREMENT, MS, Trial, after, first_ms
+
+NODE = 5
+EMERGENCY, HEARTBEAT = 0x80 + NODE, 0x700 + NODE
+OPERATIONAL, PRE_OPERATIONAL, STOPPED, BOOT_UP = b"\x05", b"\x7f", b"\x04", b"\x00"
+DEVICES = {"BENCH": {"node_id": NODE, "heartbeat_s": 0.25}}
+HEIGHT = {"message": "BENCH_MEASUREMENT", "signal": "HEIGHT"}
+END_MS = 900
+
+
+def emergency(code, register, t_ns):
+    data = code.to_bytes(2, "little") + bytes([register]) + bytes(5)
+    return Frame(t_ns, EMERGENCY, data, is_extended=False)
+
+
+def heartbeats(until_ns=10**12, state=OPERATIONAL):
+    """A heartbeat every 100 ms beside the bench's frames."""
+
+    def inject(t_ns, frames):
+        if t_ns % (100 * MS) or t_ns >= until_ns:
+            return frames
+        return [*frames, Frame(t_ns, HEARTBEAT, state, is_extended=False)]
+
+    return inject
+
+
+def beside(*injections):
+    def inject(t_ns, frames):
+        for one in injections:
+            frames = one(t_ns, frames)
+        return frames
+
+    return inject
+
+
+def at(ms, *frames):
+    return lambda t_ns, others: [*others, *frames] if t_ns == ms * MS else others
+
+
+def reported(trial):
+    """Whether RIG_STATUS says MEASUREMENT_FAULT, frame by frame."""
+    message = trial.ready.database.message("RIG_STATUS")
+    bit = message.signals["MEASUREMENT_FAULT"].start
+    return [
+        (tick.t_ns, bool(frame.data[bit // 8] >> bit % 8 & 1))
+        for tick in trial.ticks
+        for frame in tick.result.frames
+        if frame.arbitration_id == message.arbitration_id
+    ]
+
+
+def test_a_device_that_is_well_changes_nothing():
+    silent, watched = Trial(), Trial(DEVICES)
+    without = silent.run(END_MS)
+    with_heartbeats = watched.run(END_MS, heartbeats())
+    assert [tick.force_n for tick in without[5:]] == [tick.force_n for tick in with_heartbeats[5:]]
+    assert watched.state.counts == silent.state.counts
+
+
+def test_an_emergency(row):
+    trial = Trial(DEVICES)
+    begin = emergency(0x8130, 0x11, BEGIN_NS)
+    over = emergency(0x0000, 0x00, BEGIN_NS + 100 * MS)
+    begin_ms, over_ms = BEGIN_NS // MS, BEGIN_NS // MS + 100
+    ticks = trial.run(END_MS, beside(heartbeats(), at(begin_ms, begin), at(over_ms, over)))
+    found_ms = first_ms(ticks, lambda tick: tick.mode is Mode.HOLD)
+    held = [tick for tick in ticks if tick.mode is Mode.HOLD]
+    assert found_ms <= 1
+    assert len(held) in (100, 101)
+    assert not any(tick.is_valid for tick in held)
+    assert all(tick.result.step_input.heights[0] is None for tick in held[1:])
+    assert held[3].result.troubles == ((0, "emergency 0x8130"),)
+    assert ticks[-1].mode is Mode.RUNNING
+    counts = ticks[-1].counts
+    assert counts.device_faulty == 100
+    assert counts.from_faulty_device == counts.refused
+    assert 108 <= counts.refused <= 111  # every ms a height, every 10 ms the slow channels
+    assert counts.limited == 0
+    assert any(is_faulty for t_ns, is_faulty in reported(trial) if t_ns > BEGIN_NS)
+    assert not reported(trial)[-1][1]
+    row(
+        18,
+        "emergency of a CANopen device (EMCY) that sends the height",
+        "refuses its frames, estimate invalid (HOLD), MEASUREMENT_FAULT; valid again when the "
+        "device reports the error's end, the safe state if that takes longer than 0.5 s",
+        found_ms,
+        "what the device sends meanwhile",
+    )
+
+
+def test_a_lost_heartbeat(row):
+    trial = Trial(DEVICES)
+    ticks = trial.run(END_MS, heartbeats(until_ns=BEGIN_NS))
+    found_ms = first_ms(ticks, lambda tick: tick.mode is Mode.HOLD)
+    # The last one came 100 ms before the fault began, and 250 ms are allowed.
+    assert found_ms == pytest.approx(151, abs=1)
+    row(
+        19,
+        "lost heartbeat of a CANopen device (`heartbeat_s: 0.25`), its measurements go on",
+        "the same",
+        "heartbeat_s",
+        "what the device sends from then on",
+    )
+
+
+@pytest.mark.parametrize("state", [PRE_OPERATIONAL, STOPPED, BOOT_UP])
+def test_a_device_that_left_the_operational_state(state):
+    trial = Trial(DEVICES)
+    left = Frame(BEGIN_NS, HEARTBEAT, state, is_extended=False)
+    ticks = trial.run(350, beside(heartbeats(), at(BEGIN_NS // MS, left)))
+    assert ticks[-1].mode is Mode.HOLD
+
+
+def test_an_alarm_in_the_measurement_itself(row):
+    alarm = {"message": "BENCH_MEASUREMENT", "signal": "COUNTER"}
+    # The counter stands in for an alarm: 1 to 15 are alarms, 0 is none.
+    trial = Trial({"BENCH": {"node_id": NODE, "alarms": [alarm]}})
+    ticks = trial.run(200)
+    assert all(tick.mode is not Mode.RUNNING for tick in ticks if tick.result.troubles)
+    assert all(tick.result.troubles for tick in ticks[20:] if tick.mode is Mode.HOLD)
+    used = [tick for tick in ticks if tick.result.step_input.heights[0] is not None]
+    assert len(used) == pytest.approx(len(ticks) / 16, abs=2)
+    row(
+        20,
+        "alarm of a device in the measurement's own frame (`alarms`)",
+        "refuses that very frame, and the same",
+        0.0,
+        "what the device sends meanwhile",
+    )
+
+
+def test_a_payload_of_another_length(row):
+    trial = Trial(DEVICES)
+
+    def shorter(_t_ns, frames):
+        return [
+            Frame(f.t_ns, f.arbitration_id, f.data[:-1], is_extended=False)
+            if f.arbitration_id == MEASUREMENT
+            else f
+            for f in frames
+        ]
+
+    ticks = trial.run(END_MS, beside(heartbeats(), after(BEGIN_NS, shorter)))
+    found_ms = first_ms(ticks, lambda tick: tick.mode is Mode.HOLD)
+    assert found_ms <= 12
+    assert ticks[-1].counts.wrong_length == END_MS - BEGIN_NS // MS
+    row(
+        21,
+        "frames of another length (a PDO that somebody mapped anew)",
+        "refuses and counts each (`wrong_length`); estimate invalid (HOLD), then the safe state",
+        found_ms,
+        "the frames",
+    )
+
+
+def test_a_device_without_a_height_does_not_hold_the_estimate():
+    device = Device("CELL", 7, 0x87, 0, is_vital=False)
+    trial = Trial()
+    bridge = type(trial.bridge)(trial.bridge.core, trial.bridge.incoming, (), devices=(device,))
+    trial.bridge, trial.state = bridge, bridge.init(0)
+    told = Frame(BEGIN_NS, 0x87, b"\x30\x81\x01" + bytes(5), is_extended=False)
+    ticks = trial.run(400, at(BEGIN_NS // MS, told))
+    assert ticks[-1].mode is Mode.RUNNING
+    assert ticks[-1].counts.device_faulty == 100
+
+
+def test_errors_that_overlap_last_until_the_register_is_clear():
+    device = Device("D", NODE, EMERGENCY, 0)
+    health = well(device, 0)
+    health = after_frame(device, health, emergency(0x5000, 0x21, 1))
+    health = after_frame(device, health, emergency(0x8130, 0x31, 2))
+    health = after_frame(device, health, emergency(0x0000, 0x20, 3))
+    assert trouble(device, health, 4) == "emergency 0x8130"
+    health = after_frame(device, health, emergency(0x0000, 0x00, 5))
+    assert trouble(device, health, 6) is None
+
+
+def test_frames_of_another_length_say_nothing():
+    device = Device("D", NODE, EMERGENCY, MS)
+    health = well(device, 0)
+    for key, data in ((EMERGENCY, b"\x00\x50"), (HEARTBEAT, b""), (HEARTBEAT, b"\x04\x04")):
+        assert after_frame(device, health, Frame(1, key, data, is_extended=False)) == health
+
+
+def test_alarms_are_kept_apart():
+    device = Device("D", NODE, EMERGENCY, 0, alarms=2)
+    health = after_alarm(after_alarm(well(device, 0), 0, 3), 1, 9)
+    assert trouble(device, after_alarm(health, 0, 0), 1) == "alarm 0x9"
+    assert trouble(device, after_alarm(after_alarm(health, 0, 0), 1, 0), 1) is None
+
+
+@pytest.mark.parametrize(
+    ("devices", "expected"),
+    [
+        ({"NOBODY": {"node_id": 5}}, "expected the name of a node that does: BENCH"),
+        ({"BENCH": {"node_id": 0}}, "devices.BENCH.node_id"),
+        ({"BENCH": {"node_id": 5, "emergency_id": 0x100}}, "0x100 is an id of BENCH_MEASUREMENT"),
+        ({"BENCH": {"node_id": 5, "heartbeat_s": -1}}, "devices.BENCH.heartbeat_s"),
+        (
+            {
+                "BENCH": {
+                    "node_id": 5,
+                    "alarms": [{"message": "BENCH_MEASUREMENT", "signal": "HEIGHT"}],
+                }
+            },
+            "expected an integer without scale",
+        ),
+        (
+            {"BENCH": {"node_id": 5, "alarms": [{"message": "RIG_STATUS", "signal": "STATE"}]}},
+            "RIG_STATUS is also published",
+        ),
+    ],
+)
+def test_devices_that_cannot_be(tmp_path, devices, expected):
+    config = {
+        "signals": {"height": HEIGHT},
+        "devices": devices,
+    }
+    (tmp_path / "rig.yaml").write_text(json.dumps(config))
+    with pytest.raises(InputError, match=r".") as error:
+        build_bridge(load_setup(tmp_path / "rig.yaml"))
+    assert expected in str(error.value)
+    assert "\n" not in str(error.value)
