@@ -26,6 +26,9 @@ Encoder = Callable[[Sequence[float]], tuple[bytes, bool]]
 _FD_LENGTHS = frozenset({*range(9), 12, 16, 20, 24, 32, 48, 64})
 _RAW_BITS_MAX = 64
 _FLOAT_FORMATS = {32: "<f", 64: "<d"}
+_J1939_BITS, _J1939_NO_VALUE = (8, 16, 24, 32), 0xFB
+"""Parameters of whole bytes, and their highest byte from which on they hold no value but an error
+or "not available" (SAE J1939-71, 5.1.3)."""
 
 
 class _Field(NamedTuple):
@@ -400,6 +403,9 @@ def _integer_holder(field: _Field, low: int, high: int) -> _Holder:
 def _raw_limits(message: Message, field: _Field) -> tuple[int, int]:
     """Smallest and largest raw value that the bits hold and the DBC's range allows."""
     lowest, highest = -field.sign, field.mask - field.sign
+    bits = field.mask.bit_length()
+    if message.is_j1939 and not field.sign and bits in _J1939_BITS:
+        highest = (_J1939_NO_VALUE << bits - 8) - 1
     low, high = _range_in_steps(field, float(lowest), float(highest))
     # A limit that is a whole number of steps must survive its rounding in floating point.
     low_raw = max(lowest, math.ceil(low - 1e-9 * max(1.0, abs(low))))

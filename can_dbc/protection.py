@@ -98,6 +98,7 @@ class Verdict(Enum):
     REPEATED = "repeated"
     OUT_OF_SEQUENCE = "out_of_sequence"
     MASQUERADE = "masquerade"
+    NO_VALUE = "no_value"
 
     @property
     def accepted(self) -> bool:

@@ -22,6 +22,7 @@ from rig.cli import (
     report,
     run,
     scoreboard,
+    sensor,
     setting,
     timing,
     tune,
@@ -41,6 +42,7 @@ app = typer.Typer(
 app.command("demo", epilog=demo.EXAMPLES)(demo.demo)
 app.command("init", epilog=init.EXAMPLES)(init.init)
 app.command("check", epilog=check.EXAMPLES)(check.check_command)
+app.add_typer(sensor.app, name="sensor")
 app.command("run", epilog=run.EXAMPLES)(run.run)
 app.command("bench", epilog=bench.EXAMPLES)(bench.bench)
 app.command("view", epilog=view.EXAMPLES)(view.view)

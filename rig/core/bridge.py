@@ -22,7 +22,19 @@ from rig.core.contract import (
     StepInput,
     StepOutput,
 )
-from rig.core.devices import Device, Health, after_alarm, after_frame, trouble, troubles, well
+from rig.core.devices import (
+    CLAIM,
+    CLAIM_MASK,
+    Device,
+    Health,
+    after_alarm,
+    after_claim,
+    after_frame,
+    is_from,
+    trouble,
+    troubles,
+    well,
+)
 from rig.core.messages import Conditions, Counts, Incoming, Outgoing, Report
 from rig.core.supervisor import (
     EVENTS_BEYOND,
@@ -182,7 +194,9 @@ class Bridge:
         self._own = frozenset(item.message.key for item in outgoing)
         of_messages = Directory(item.message for item in (*incoming, *outgoing)).filters
         of_devices = (Filter(key, _ALL_STANDARD, is_extended=False) for key in self._device_at)
-        self.filters = (*of_messages, *of_devices)
+        by_name = any(device.j1939_name is not None for device in devices)
+        claims = (Filter(CLAIM, CLAIM_MASK, is_extended=True),) if by_name else ()
+        self.filters = (*of_messages, *of_devices, *claims)
         """What lets in the frames that the bridge subscribes to, its own among them."""
 
     def changed(self, core: Core, limits: Sequence[Limit]) -> "Bridge":
@@ -288,8 +302,13 @@ class Bridge:
 
     def _told(self, healths: tuple[Health, ...], frame: Frame) -> tuple[Health, ...]:
         """What is known of the devices after a frame of no incoming message."""
+        if not healths or frame.is_error:
+            return healths
+        if frame.is_extended and frame.arbitration_id & CLAIM_MASK == CLAIM & CLAIM_MASK:
+            pairs = zip(self.devices, healths, strict=True)
+            return tuple([after_claim(device, health, frame) for device, health in pairs])
         place = None if frame.is_extended else self._device_at.get(frame.arbitration_id)
-        if place is None or frame.is_error:
+        if place is None:
             return healths
         health = after_frame(self.devices[place], healths[place], frame)
         return (*healths[:place], health, *healths[place + 1 :])
@@ -335,6 +354,8 @@ class Bridge:
         device = incoming.device
         if device is None or values is None:
             return healths, ledger, values
+        if not is_from(self.devices[device], healths[device], frame):
+            return healths, ledger, None  # another device sends the same group
         healths = _alarmed(healths, incoming, values)
         if trouble(self.devices[device], healths[device], frame.t_ns) is None:
             return healths, ledger, values
@@ -487,6 +508,7 @@ _CAUSES = {
     Verdict.REPEATED: "repeated",
     Verdict.OUT_OF_SEQUENCE: "out_of_sequence",
     Verdict.MASQUERADE: "masquerade",
+    Verdict.NO_VALUE: "no_value",
 }
 """Verdict of a refused frame -> what counts it."""
 

@@ -1,10 +1,11 @@
-"""What CANopen devices on the bus say of themselves while a run goes on.
+"""What devices on the bus say of themselves while a run goes on.
 
-A device that reports an error, falls silent or leaves the operational state sends nothing to be
-believed: its frames are refused until it is well again.
+A CANopen device that reports an error, falls silent or leaves the operational state sends nothing
+to be believed: its frames are refused until it is well again. A J1939 device is known by its NAME:
+its frames are those from the address that it claimed last.
 
 References: CiA 301, "CANopen application layer and communication profile", 7.2.7 (emergency) and
-7.2.8.3.2 (heartbeat, boot-up).
+7.2.8.3.2 (heartbeat, boot-up); SAE J1939-81, "Network management" (address claim).
 """
 
 from collections.abc import Sequence
@@ -21,6 +22,10 @@ _STATES = {_BOOT_UP: "restarted", _STOPPED: "stopped", _PRE_OPERATIONAL: "pre-op
 _TOGGLE = 0x80
 """Bit of an answer to node guarding that is not of the state."""
 
+CLAIM, CLAIM_MASK = 0x18EEFF00, 0x03FFFF00
+"""Identifier of an address claim, and which of its bits say that it is one."""
+
+_NO_ADDRESS = 0xFE
 _NO_ERROR = 0x00
 """High byte of the error codes that report the end of an error."""
 
@@ -30,11 +35,13 @@ class Device(NamedTuple):
 
     Attributes:
         name: Name of the node in the DBC.
-        node_id: CANopen node id.
+        node_id: CANopen node id; 0 of a J1939 device.
         emergency_id: Arbitration id of its emergency frames.
         heartbeat_ns: Longest time between two heartbeats; 0 where they are not watched.
         alarms: How many signals of its frames are alarms.
         is_vital: Whether the estimate rests on it.
+        j1939_name: NAME of a J1939 device; None of a CANopen device.
+        address: Source address of a J1939 device at the start.
     """
 
     name: str
@@ -43,11 +50,13 @@ class Device(NamedTuple):
     heartbeat_ns: int
     alarms: int = 0
     is_vital: bool = True
+    j1939_name: int | None = None
+    address: int = _NO_ADDRESS
 
     @property
-    def ids(self) -> tuple[int, int]:
+    def ids(self) -> tuple[int, ...]:
         """Arbitration ids of its emergency and heartbeat frames."""
-        return self.emergency_id, HEARTBEAT_ID + self.node_id
+        return (self.emergency_id, HEARTBEAT_ID + self.node_id) if self.node_id else ()
 
 
 class Health(Struct, frozen=True, gc=False):
@@ -58,17 +67,19 @@ class Health(Struct, frozen=True, gc=False):
         state: What the last heartbeat said; operational before the first.
         error_code: Error code of the emergency that is not over, else 0.
         alarms: Raw value of each of its alarms.
+        address: Source address that it claimed last.
     """
 
     since_ns: int
     state: int = OPERATIONAL
     error_code: int = 0
     alarms: tuple[int, ...] = ()
+    address: int = _NO_ADDRESS
 
 
 def well(device: Device, t_ns: int) -> Health:
     """What is known of a device at the start."""
-    return Health(t_ns, alarms=(0,) * device.alarms)
+    return Health(t_ns, alarms=(0,) * device.alarms, address=device.address)
 
 
 def after_frame(device: Device, health: Health, frame: Frame) -> Health:
@@ -95,6 +106,28 @@ def after_frame(device: Device, health: Health, frame: Frame) -> Health:
     return replace(health, since_ns=frame.t_ns, state=state)
 
 
+def after_claim(device: Device, health: Health, frame: Frame) -> Health:
+    """Health after somebody claimed an address on a J1939 bus.
+
+    Args:
+        device: The device.
+        health: Its health before.
+        frame: An address claim.
+    """
+    if device.j1939_name is None or len(frame.data) != 8:
+        return health
+    address = frame.arbitration_id & 0xFF
+    if int.from_bytes(frame.data, "little") == device.j1939_name:
+        return replace(health, address=address)
+    # Somebody else took it: what comes from there is not the device's until it claims again.
+    return replace(health, address=_NO_ADDRESS) if address == health.address else health
+
+
+def is_from(device: Device, health: Health, frame: Frame) -> bool:
+    """Whether a frame of a device's messages is from the device itself."""
+    return device.j1939_name is None or frame.arbitration_id & 0xFF == health.address
+
+
 def after_alarm(health: Health, place: int, raw: int) -> Health:
     """Health after a frame with an alarm in it.
 
@@ -115,6 +148,8 @@ def trouble(device: Device, health: Health, t_ns: int) -> str | None:
         return f"emergency {health.error_code:#06x}"
     if any(health.alarms):
         return f"alarm {next(filter(None, health.alarms)):#x}"
+    if device.j1939_name is not None and health.address == _NO_ADDRESS:
+        return "has no address"
     if health.state != OPERATIONAL:
         return _STATES.get(health.state, f"state {health.state}")
     if device.heartbeat_ns and t_ns - health.since_ns > device.heartbeat_ns:

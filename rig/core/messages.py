@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import inf, isnan
+from math import inf, isfinite, isnan
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -142,6 +142,8 @@ class Counts(NamedTuple):
         left_out: Ticks at which a further sensor was left out, one for each sensor.
         device_faulty: Ticks at which a device had something wrong with it, one for each device.
         from_faulty_device: Frames refused because something was wrong with their device.
+        no_value: Frames refused because what should be a value is none: an error or "not available"
+            of J1939, or a float that is not finite.
     """
 
     lost: int = 0
@@ -162,6 +164,7 @@ class Counts(NamedTuple):
     left_out: int = 0
     device_faulty: int = 0
     from_faulty_device: int = 0
+    no_value: int = 0
 
 
 Levels = tuple[float, float, float, float]
@@ -403,18 +406,42 @@ def incoming(message: Message, wanted: Sequence[Wanted], device: int | None = No
         if item.quantity in PLACES
     ]
     alarms = tuple(AlarmTarget(value, *item.alarm) for value, item in placed if item.alarm)
-    read = _reader(message, decode)
+    read = _reader(message, decode, _check_of_values(message, signals))
     return Incoming(message, read, tuple(heights), tuple(others), tuple(sensors), alarms, device)
 
 
-def _reader(message: Message, decode: Decoder) -> Reader:
-    length, ok = message.length_bytes, Verdict.OK
+_Check = Callable[[tuple[float, ...]], bool]
+"""Values in SI -> whether each of them is one."""
+
+
+def _check_of_values(message: Message, signals: Sequence[tuple[str, Dimension]]) -> _Check | None:
+    """What tells values from errors, "not available" and NaN; None where all is a value."""
+    if message.is_j1939:
+        ranges = [si_range(message, name, dimension) for name, dimension in signals]
+
+        def within(values: tuple[float, ...]) -> bool:
+            # A bound may differ from the value there in its last bits.
+            return all(
+                low - 1e-9 * abs(low) <= value <= high + 1e-9 * abs(high)
+                for value, (low, high) in zip(values, ranges, strict=True)
+            )
+
+        return within
+    if any(message.signal(name).is_float for name, _ in signals):
+        return lambda values: all(map(isfinite, values))
+    return None
+
+
+def _reader(message: Message, decode: Decoder, are_values: _Check | None) -> Reader:
+    length, ok, no_value = message.length_bytes, Verdict.OK, Verdict.NO_VALUE
 
     def read_unprotected(
         sequence: SequenceState, frame: Frame
     ) -> tuple[SequenceState, Verdict, tuple[float, ...] | None]:
         values = decode(frame.data)
         # A multiplexed frame without these signals is no fault, a short one is.
+        if values is not None and are_values is not None and not are_values(values):
+            return sequence, no_value, None
         is_short = values is None and len(frame.data) != length
         return sequence, Verdict.WRONG_LENGTH if is_short else ok, values
 
@@ -427,7 +454,10 @@ def _reader(message: Message, decode: Decoder) -> Reader:
     ) -> tuple[SequenceState, Verdict, tuple[float, ...] | None]:
         data = frame.data
         sequence, verdict = check(sequence, data, frame.t_ns)
-        return sequence, verdict, decode(data) if verdict is ok or verdict.accepted else None
+        values = decode(data) if verdict is ok or verdict.accepted else None
+        if values is not None and are_values is not None and not are_values(values):
+            return sequence, no_value, None
+        return sequence, verdict, values
 
     return read
 

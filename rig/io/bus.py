@@ -85,7 +85,7 @@ class Bus:
         self._known: dict[tuple[int, bool], bool] = {}
         self.epoch_ns = epoch_ns
         """Unix time that stamps are relative to; to be set anew when the system's clock was."""
-        self._bus = _open(config, self._filters, listen_only=listen_only)
+        self._bus = opened(config, self._filters, listen_only=listen_only)
         self._receive = self._bus.recv
         self._send = None if listen_only else self._bus.send
 
@@ -187,7 +187,19 @@ def _sending_failed(error: Exception) -> BusError:
     return (BusFullError if full else BusError)(f"sending failed: {text}")
 
 
-def _open(config: BusConfig, wanted: frozenset[Filter] | None, *, listen_only: bool) -> can.BusABC:
+def opened(
+    config: BusConfig, wanted: frozenset[Filter] | None = None, *, listen_only: bool = False
+) -> can.BusABC:
+    """python-can's bus, for what needs more of it than `Bus` gives.
+
+    Args:
+        config: How to open it.
+        wanted: The only frames that are let in, where the interface can choose; None: all.
+        listen_only: Whether the controller is to keep silent, where it can.
+
+    Raises:
+        BusError: The interface cannot be opened.
+    """
     options: dict[str, Any] = dict(config.options)
     if listen_only:
         options |= _LISTEN_ONLY_OPTIONS.get(config.interface, {})

@@ -3,12 +3,17 @@
 import stat
 from dataclasses import dataclass, replace
 from enum import Enum
+from math import sqrt
 
 from can_dbc.bus_load import frame_time_s
+from can_dbc.codec import si_step
 from can_dbc.database import Message
+from can_dbc.units import Dimension
+from dart_model.spec import InlineSkeleton
 from rig.core.closed_loop import Rhythm
 from rig.core.contract import Plant
 from rig.core.observability import Unknown, linear_model, observability
+from rig.core.observers.pi import PiObserver
 from rig.core.quantities import LOAD_CELL_FORCE
 from rig.core.stability import Pole, closed_loop_poles
 from rig.operation.assembly import arrivals, build_bridge, build_plant
@@ -19,6 +24,10 @@ LITTLE_DAMPING = 0.02
 
 _WIDEST_OF_RATE = 1.0 / 3.0
 """Corner of a filter over the rate of its measurements beyond which it smooths nothing."""
+
+_COARSE_OF_WEIGHT = 0.01
+"""Force of one step of the height sensor over the model's weight from which it is warned of: the
+published method is off by 1.1 % of the strut's peak force in all."""
 
 _OTHERS_MAY_READ = stat.S_IRGRP | stat.S_IROTH
 FULL_LOAD, HIGH_LOAD = 1.0, 0.7
@@ -78,6 +87,7 @@ def check(ready: Setup) -> list[Finding]:
         ),
         *[_protected(message) for message in read.values()],
         *[_rate(message, config.period_ns) for message in heights],
+        *_resolution(ready),
         *[
             Finding(
                 Severity.WARNING,
@@ -131,6 +141,42 @@ def _rate(message: Message, period_ns: int) -> Finding:
     if cycle_ns % period_ns:
         return Finding(Severity.WARNING, what, f"{text}: no whole number of ticks a frame")
     return Finding(Severity.OK, what, text)
+
+
+def _resolution(ready: Setup) -> list[Finding]:
+    """What one step of each height sensor is to the observer."""
+    findings: list[Finding] = []
+    config = ready.config
+    for name, entry in config.signals.height.items():
+        step_m = si_step(ready.database.message(entry.message), entry.signal, Dimension.LENGTH)
+        if step_m == 0.0 or config.prescribed_motion is not None:
+            continue
+        observer = config.observers[name]
+        what, text = f"resolution of {name}", f"steps of {step_m * 1e6:.3g} µm"
+        is_coarse = False
+        if isinstance(observer, PiObserver):
+            force_n = step_m * observer.proportional_n_per_m
+            text += f", each {force_n:.3g} N at K_P"
+            weight_n = _weight_n(ready)
+            is_coarse = weight_n is not None and force_n > _COARSE_OF_WEIGHT * weight_n
+            hint = ": more than 1 % of the model's weight; see rig tune"
+        else:
+            follower = getattr(observer, "filter", None)
+            noise_m = None if follower is None else follower.noise_std_m
+            is_coarse = noise_m is not None and step_m / sqrt(12.0) > noise_m
+            hint = ": their rounding alone is more than filter.noise_std_m; see rig tune"
+        severity = Severity.WARNING if is_coarse else Severity.OK
+        findings.append(Finding(severity, what, text + hint * is_coarse))
+    return findings
+
+
+def _weight_n(ready: Setup) -> float | None:
+    """Weight of the model's bodies; None where they stand in a file of their own."""
+    skeleton = ready.model.skeleton
+    if not isinstance(skeleton, InlineSkeleton):
+        return None
+    mass_kg = sum(body.mass_kg for body in skeleton.bodies)
+    return mass_kg * abs(ready.model.gravity_m_per_s2) or None
 
 
 def _staleness(ready: Setup, heights: list[Message]) -> Finding:

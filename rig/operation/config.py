@@ -257,26 +257,50 @@ def _mapping(choices: Sequence[Publication]) -> Callable[[object], object]:
 
 
 class DeviceConfig(_Frozen):
-    """A CANopen device that says how it is; its frames are refused while something is wrong.
+    """A device that says how it is; its frames are refused while something is wrong.
 
     Attributes:
-        node_id: CANopen node id.
+        node_id: CANopen node id; a device has this or a NAME.
         emergency_id: Arbitration id of its emergency frames; 128 and the node id if absent.
         heartbeat_s: Longest time between two heartbeats; they are not watched if absent.
         alarms: Signals that are other than zero while something is wrong with it.
+        j1939_name: NAME of a J1939 device: 64 bits, as it claims its address with.
+        source_address: Address of a J1939 device at the start; a claim later on changes it.
     """
 
-    node_id: Annotated[int, Field(ge=1, le=LARGEST_NODE_ID)]
+    node_id: Annotated[int, Field(ge=1, le=LARGEST_NODE_ID)] | None = None
     emergency_id: Annotated[int, Field(ge=1, le=0x7FF)] | None = None
     heartbeat_s: Annotated[float, Field(ge=0.001, le=130.0, allow_inf_nan=False)] | None = None
     alarms: Annotated[tuple[SignalName, ...], Field(max_length=16)] = ()
+    j1939_name: Annotated[int, Field(ge=0, lt=2**64)] | None = None
+    source_address: Annotated[int, Field(ge=0, le=253)] | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "DeviceConfig":
+        of_canopen = (self.node_id, self.emergency_id, self.heartbeat_s)
+        of_j1939 = (self.j1939_name, self.source_address)
+        is_canopen = self.node_id is not None and of_j1939 == (None, None)
+        if not is_canopen and (of_canopen != (None, None, None) or None in of_j1939):
+            raise ValueError(
+                "expected node_id, with emergency_id and heartbeat_s if wanted, or j1939_name and "
+                "source_address"
+            )
+        return self
 
     def device(self, name: str, *, is_vital: bool) -> Device:
         """As the core takes it."""
-        emergency_id = self.emergency_id or _EMERGENCY_ID + self.node_id
-        heartbeat_ns = round((self.heartbeat_s or 0.0) * 1e9)
-        alarms = len(self.alarms)
-        return Device(name, self.node_id, emergency_id, heartbeat_ns, alarms, is_vital)
+        node_id = self.node_id or 0
+        device = Device(
+            name,
+            node_id,
+            self.emergency_id or _EMERGENCY_ID + node_id,
+            round((self.heartbeat_s or 0.0) * 1e9),
+            len(self.alarms),
+            is_vital,
+        )
+        if self.j1939_name is None or self.source_address is None:
+            return device
+        return device._replace(j1939_name=self.j1939_name, address=self.source_address)
 
 
 class LimitConfig(_Frozen):
@@ -463,7 +487,7 @@ class RunConfig(_Frozen):
         bus: How to open the bus.
         authentication: Authentication of all frames; none if absent.
         signals: What is read from it.
-        devices: CANopen devices that say how they are, by the names of their nodes in the DBC.
+        devices: Devices that say how they are, by the names of their nodes in the DBC.
         prescribed_motion: Declares a dyno; there is then a load cell and no applied force.
         observers: One for each strut of the model, by strut name; PI where none is named.
             `kind` says which, `pi` if absent; its other keys are its own. A dyno uses none.

@@ -76,7 +76,9 @@ def _height(frame, how):
 def test_mutated_frames():
     frames, counts = fuzz(3000, seed=1)
     assert frames > 13_000
-    causes = [verdict.value for verdict in Verdict if not verdict.accepted]
+    # The package's DBC has neither floats nor J1939: whatever passes the CRC holds values.
+    possible = [verdict for verdict in Verdict if verdict is not Verdict.NO_VALUE]
+    causes = [verdict.value for verdict in possible if not verdict.accepted]
     assert all(getattr(counts, cause) > 0 for cause in causes)
     assert sum(getattr(counts, cause) for cause in causes) == counts.refused
 

@@ -1,0 +1,93 @@
+"""Objects from an EDS or DCF file, where the sensor is not there.
+
+Reference: CiA 306, "Electronic data sheet specification for CANopen".
+"""
+
+import configparser
+import logging
+import struct
+from pathlib import Path
+from typing import Any
+
+from rig.inputs.errors import InputError
+from rig.io.canopen_network import package
+
+SIZE_MAX_BYTES = 4 * 1024 * 1024
+_SIGNED = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)
+"""Data types that are signed integers: 8, 16, 32, 24, 40, 48, 56 and 64 bits."""
+
+_ENDINGS = (".eds", ".dcf")
+
+
+class EdsObjects:
+    """Objects with their default values.
+
+    Args:
+        path: An EDS or DCF file.
+        node_id: Node id, for values such as ``$NODEID+0x180``.
+
+    Raises:
+        InputError: The file cannot be read, or is no EDS.
+    """
+
+    def __init__(self, path: Path, node_id: int) -> None:
+        self._objects = _imported(path, node_id)
+
+    def read(self, index: int, subindex: int = 0) -> bytes | None:
+        """Default value of an object, or None where there is none."""
+        found = self._variable(index, subindex)
+        if found is None:
+            return None
+        value = found.default if found.value is None else found.value
+        if value is None:
+            return None
+        if isinstance(value, str):
+            return value.encode("latin-1", "replace")
+        try:
+            return bytes(found.encode_raw(value))
+        except (struct.error, ValueError, TypeError, OverflowError):
+            return None
+
+    def is_signed(self, index: int, subindex: int) -> bool | None:
+        """Whether an object is a signed integer."""
+        found = self._variable(index, subindex)
+        return None if found is None else found.data_type in _SIGNED
+
+    def _variable(self, index: int, subindex: int) -> Any:
+        try:
+            entry = self._objects[index]
+            return entry if hasattr(entry, "data_type") else entry[subindex]
+        except KeyError:
+            return None
+
+
+def _imported(path: Path, node_id: int) -> Any:
+    if path.suffix.lower() not in _ENDINGS:
+        raise InputError(f"{path}: expected a file .eds or .dcf")
+    try:
+        size = path.stat().st_size
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read: {error}") from None
+    if size > SIZE_MAX_BYTES:
+        raise InputError(f"{path}: larger than {SIZE_MAX_BYTES} bytes, expected an EDS file")
+    canopen = package()
+    # What it cannot read it says through logging, and goes on.
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)
+    try:
+        objects = canopen.import_od(str(path), node_id)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except (
+        configparser.Error,
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        ArithmeticError,
+        struct.error,
+    ) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: is no EDS file, or is damaged: {reason}") from error
+    if 0x1000 not in objects:
+        raise InputError(f"{path}: has no device type (1000h), expected an EDS file")
+    return objects

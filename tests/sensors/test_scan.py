@@ -1,0 +1,184 @@
+"""Scanning a bus on which devices of another stack are."""
+
+import itertools
+import json
+
+import can
+import pytest
+from durand import CANBusNetwork, set_scheduler
+from durand.scheduler import VirtualScheduler
+from typer.testing import CliRunner
+
+from can_dbc.codec import compile_decoder
+from can_dbc.database import load_database
+from can_dbc.units import Dimension
+from rig.cli.main import app
+from rig.io.bus import BusConfig
+from rig.io.canopen_network import CanOpenNetwork
+from rig.operation.check import check
+from rig.operation.setup import load_setup
+from rig.sensors.scan import scan
+from rig.sensors.setting import Setting, restore, set_to_work
+from rig.sensors.undo import read_undo, write_undo
+from tests.sensors.peer import KILONEWTON, amplifier, encoder, with_timer
+
+NO_REMOTE_REQUEST = 1 << 30
+_channels = itertools.count()
+
+
+@pytest.fixture
+def channel():
+    return f"sensors-{next(_channels)}"
+
+
+@pytest.fixture
+def bus(channel):
+    """The devices' ends of a bus of its own."""
+    opened, networks = [], []
+
+    def end():
+        opened.append(can.Bus(interface="virtual", channel=channel))
+        networks.append(CANBusNetwork(opened[-1]))
+        return networks[-1]
+
+    set_scheduler(VirtualScheduler())  # no timer goes off by itself
+    yield end
+    for one in networks:
+        one.stop()
+    for one in opened:
+        one.shutdown()
+
+
+@pytest.fixture
+def network(channel):
+    made = CanOpenNetwork(BusConfig("virtual", channel, 500_000))
+    yield made
+    made.close()
+
+
+def unheard(_what, _share):
+    pass
+
+
+def found_on(network):
+    return scan(network, 0.05, progress=unheard)
+
+
+def test_an_encoder_describes_itself(bus, network):
+    encoder(bus(), 5, step_nm=5000, cycle_ms=4).object_dictionary.write(0x1017, 0, 100)
+    (device,) = found_on(network).devices
+    assert (device.node_id, device.label, device.heartbeat_s) == (5, "Linear encoder", 0.1)
+    assert device.identity == (0x1A2, 7, 0x10002, 4711)
+    assert device.kind == "encoder (CiA 406)"
+    (pdo,) = device.pdos
+    assert (pdo.arbitration_id, pdo.cycle_s, pdo.length_bytes) == (0x185, 0.004, 6)
+    position, alarms = pdo.mapped
+    assert position.meaning.scale == pytest.approx(0.005)
+    assert (position.meaning.unit, position.meaning.is_signed) == ("mm", True)
+    assert alarms.meaning.is_alarm
+    assert alarms.start == 32
+
+
+def test_an_amplifier_tells_unit_and_digits(bus, network):
+    amplifier(bus(), 6, unit=KILONEWTON, digits=3)
+    (device,) = found_on(network).devices
+    force, status = device.pdos[0].mapped
+    assert (force.meaning.name, force.meaning.unit) == ("FORCE_1", "kN")
+    assert force.meaning.scale == pytest.approx(1e-3)
+    assert status.meaning.is_alarm
+
+
+def test_who_is_silent_and_who_is_no_device(bus, network):
+    stranger = bus()
+    stranger.send(0x70A, b"\x05")
+    stranger.send(0x123, b"\x05")
+    found = found_on(network)
+    assert found.devices == ()
+    assert found.silent == (10,)
+    assert 0x123 in [item.arbitration_id for item in found.traffic]
+
+
+def test_listening_only_sends_nothing(channel):
+    other = can.Bus(interface="virtual", channel=channel)
+    network = CanOpenNetwork(BusConfig("virtual", channel, 500_000), listen_only=True)
+    found_on(network)
+    network.close()
+    assert other.recv(0) is None
+    other.shutdown()
+
+
+def test_dbc_and_configuration_are_read_back(bus, channel, tmp_path):
+    node = encoder(bus(), 5, step_nm=1000, cycle_ms=2)
+    node.object_dictionary.write(0x1017, 0, 100)
+    node.object_dictionary.write(0x6004, 0, 250_000)
+    amplifier(bus(), 6)
+    out = tmp_path / "found"
+    result = CliRunner().invoke(
+        app,
+        [
+            *("sensor", "scan", "--interface", "virtual", "--channel", channel),
+            *("--listen-s", "0.05", "--out", str(out), "--height-now-m", "0.4", "--reversed"),
+        ],
+        catch_exceptions=False,
+    )
+    assert result.exit_code == 0, result.output
+    database = load_database(out / "sensors.dbc")
+    message = database.message("NODE_5_TPDO1")
+    assert (message.sender, message.cycle_time_ns) == ("NODE_5", 2_000_000)
+    decode = compile_decoder(message, ["POSITION"], [Dimension.LENGTH])
+    # 1 µm a step, 0.4 m at 250 000 steps, and the strut shortens while it counts up.
+    assert decode((250_000).to_bytes(4, "little") + b"\0\0")[0] == pytest.approx(0.4)
+    assert decode((260_000).to_bytes(4, "little") + b"\0\0")[0] == pytest.approx(0.39)
+    force = compile_decoder(database.message("NODE_6_TPDO1"), ["FORCE_1"], [Dimension.FORCE])
+    assert force((-1234).to_bytes(4, "little", signed=True) + b"\0")[0] == pytest.approx(-123.4)
+    assert database.message("RIG_ESTIMATE").protection is not None
+    ready = load_setup(out / "rig.yaml")
+    assert ready.config.devices["NODE_5"].heartbeat_s == pytest.approx(0.25)
+    assert [item.signal for item in ready.config.devices["NODE_5"].alarms] == ["ALARMS"]
+    assert [item.signal for item in ready.config.devices["NODE_6"].alarms] == ["STATUS_1"]
+    assert any("step" in finding.text for finding in check(ready))
+
+
+def test_a_timer_of_its_own_is_set_and_put_back(bus, network, tmp_path):
+    node = encoder(bus(), 5)
+    with_timer(node, 10)
+    objects = node.object_dictionary
+    setting = Setting(network)
+    set_to_work(setting, 5, cycle_ms=2, sync=False, heartbeat_ms=100)
+    assert objects.read(0x1800, 5) == 2
+    assert objects.read(0x1017, 0) == 100
+    assert objects.read(0x1800, 1) & ~NO_REMOTE_REQUEST == 0x185
+    network.listen(0.05)
+    assert node.nmt.state == 5
+    write_undo(tmp_path / "before.yaml", setting.changed)
+    restore(network, read_undo(tmp_path / "before.yaml"))
+    assert objects.read(0x1800, 5) == 10
+    assert objects.read(0x1017, 0) == 0
+    network.listen(0.05)
+    assert node.nmt.state == 127
+
+
+def test_an_encoder_without_an_event_timer_has_its_own(bus, network):
+    node = encoder(bus(), 5, cycle_ms=10)
+    setting = Setting(network)
+    set_to_work(setting, 5, cycle_ms=3, sync=False, heartbeat_ms=None)
+    assert node.object_dictionary.read(0x6200, 0) == 3
+    assert [(item.index, item.before) for item in setting.changed] == [(0x6200, "0a00")]
+
+
+def test_a_device_without_a_node_id_is_given_one(bus, network):
+    encoder(bus(), 0xFF)
+    found = found_on(network)
+    assert found.unconfigured == (0x1A2, 7, 0x10002, 4711)
+    network.give_node_id(9)
+    network.search()
+    network.listen(0.1)
+    assert 9 in [device.node_id for device in found_on(network).devices]
+
+
+def test_json_is_json(bus, channel):
+    encoder(bus(), 5)
+    arguments = ["sensor", "scan", "--interface", "virtual", "--channel", channel]
+    result = CliRunner().invoke(app, [*arguments, "--listen-s", "0.05", "--json"])
+    (device,) = json.loads(result.stdout)["devices"]
+    assert device["pdos"][0]["mapped"][0]["meaning"]["unit"] == "mm"
