@@ -6,6 +6,7 @@ Reference: CiA 306, "Electronic data sheet specification for CANopen".
 import configparser
 import logging
 import struct
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,9 @@ def _imported(path: Path, node_id: int) -> Any:
     # What it cannot read it says through logging, and goes on.
     logging.getLogger("canopen").setLevel(logging.CRITICAL)
     try:
-        objects = canopen.import_od(str(path), node_id)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of how it logs
+            objects = canopen.import_od(str(path), node_id)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except (

@@ -21,7 +21,13 @@ _BRIDGE = "RIG"
 _HEARTBEATS_MISSED = 2.5
 """Heartbeats after which one counts as lost: a single one that is late or lost is no fault."""
 
-_LONGEST_CYCLE_MS = 65_535
+_FORMAT = "VFrameFormat"
+_FORMATS = ("StandardCAN", "ExtendedCAN", "reserved", "J1939PG")
+"""The attribute that marks a message of J1939, which cantools reads and does not write."""
+
+_EXTENDED_IN_DBC = 1 << 31
+
+_MOST_MS = 65_535
 _STALE_CYCLES = 5
 
 
@@ -91,7 +97,26 @@ def dbc_text(
         nodes=[Node(name, None) for name in names],
         dbc_specifics=own.dbc,
     )
-    return made.as_dbc_string()
+    return _marked(made.as_dbc_string(), [item.arbitration_id for item in spoken])
+
+
+def _marked(text: str, j1939_ids: Sequence[int]) -> str:
+    """A DBC with the messages of these ids marked as J1939."""
+    if not j1939_ids:
+        return text
+    choices = ",".join(f'"{choice}"' for choice in _FORMATS)
+    value = _FORMATS.index("J1939PG")
+    marks = [f'BA_ "{_FORMAT}" BO_ {key | _EXTENDED_IN_DBC} {value};' for key in j1939_ids]
+    added = {
+        "BA_DEF_DEF_ ": [f'BA_DEF_ BO_ "{_FORMAT}" ENUM {choices};'],
+        'BA_ "': [f'BA_DEF_DEF_ "{_FORMAT}" "{_FORMATS[0]}";', *marks],
+    }
+    lines: list[str] = []
+    for line in text.splitlines():
+        for start in [start for start in added if line.startswith(start)]:
+            lines += added.pop(start)
+        lines.append(line)
+    return "\n".join(lines) + "\n"
 
 
 def configuration_text(
@@ -253,7 +278,7 @@ def _cycle_ms(cycle_s: float | None) -> int | None:
     """Whole ms, as a DBC has it, and no less than the device's."""
     if cycle_s is None:
         return None
-    return min(max(1, ceil(cycle_s * 1e3 - 1e-6)), _LONGEST_CYCLE_MS)
+    return min(max(1, ceil(cycle_s * 1e3 - 1e-6)), _MOST_MS)
 
 
 def _levels(spoken: Sequence[Spoken]) -> list[Place]:
