@@ -61,7 +61,8 @@ from rig.bench.config import load_bench_config
 from rig.bench.simulated import Bench
 from rig.operation.config import CONFIGS
 Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), load_database(DEFAULT_DATABASE)).update(10**8)
-')
+'
+        timeout 600 "$python" -m tests.sensors.warm)
 }
 
 # What runs inside; its exit code comes back in a file, since the emulator has its own.
@@ -75,6 +76,7 @@ paste -d ' ' /tmp/disks "$work/folders" >/tmp/mounts
 while read -r disk _ folder; do mount -t squashfs -o ro "\$disk" "\$folder"; done </tmp/mounts
 modprobe vcan
 modprobe can-gw
+modprobe can-j1939
 cd "$project"
 export HOME=/tmp PYTHONDONTWRITEBYTECODE=1
 export NUMBA_CPU_NAME=$NUMBA_CPU_NAME NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR=$NUMBA_CACHE_DIR

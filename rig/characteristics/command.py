@@ -25,6 +25,9 @@ _BATCHES = 10
 """Parts of a hold whose means tell the uncertainty of its mean: noise may be correlated within one
 (Law, Simulation Modeling and Analysis, 2015, 9.5.3)."""
 
+_LARGEST_N = 1e8
+"""Ten times what the largest damper machines of civil engineering reach."""
+
 _FEWEST_SAMPLES_A_CYCLE = 10
 
 
@@ -149,6 +152,9 @@ def of_arrays(
     Raises:
         InputError: Nothing in it repeats.
     """
+    largest_n = float(np.abs(force_n).max(initial=0.0))
+    if largest_n > _LARGEST_N:
+        raise InputError(f"{name}: a force of {largest_n:.3g} N, expected at most {_LARGEST_N:g}")
     strokes = strokes_of(t_s, height_m)
     blocks = blocks_of(strokes)
     steps = [step_of(t_s, height_m, force_n, temperature_c, block) for block in blocks]
@@ -163,7 +169,7 @@ def of_arrays(
         for hold in holds_of(t_s, height_m, blocks)
     )
     rests = [(hold.begin_s, hold.height_m, hold.force) for hold in holds]
-    warned = quality(t_s, force_n, found, rests)
+    warned = quality(t_s, force_n, found, rests, len(strokes))
     damper = damper_of(found)
     return Characteristics(name, strut, source, height_m, force_n, found, holds, damper, warned)
 
@@ -173,6 +179,8 @@ def _of_strut(
 ) -> tuple[str, Array, Array, str, Recording]:
     """Name of the strut, its heights and forces, and where these come from."""
     if not path.is_dir():
+        if strut is not None:
+            raise InputError(f"{path}: --strut {strut}: a file has no struts, expected a run")
         if recording.heights_m.shape[1] > 1:
             raise InputError(f"{path}: holds several struts, expected a file of one")
         if recording.strut_forces_n is None:

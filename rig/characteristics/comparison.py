@@ -124,6 +124,8 @@ def over_dose(items: Sequence[Characteristics], doses: Sequence[float]) -> list[
     Raises:
         InputError: There are fewer than three doses, all of one size, or no figure in common.
     """
+    if not all(map(math.isfinite, doses)):
+        raise InputError(f"--dose: {', '.join(map(str, doses))}: expected finite numbers")
     if len(items) != len(doses) or len(set(doses)) < _FEWEST_DOSES:
         raise InputError(
             f"--dose: {len(doses)} for {len(items)} records, expected one each and at least three "
@@ -141,6 +143,24 @@ def over_dose(items: Sequence[Characteristics], doses: Sequence[float]) -> list[
         )
     ]
     return sorted(found, key=lambda item: not item.differs)
+
+
+def unpaired(items: Sequence[Characteristics]) -> list[str]:
+    """Steps that have no partner of their speed and amplitude in every other record, in words."""
+    found: list[str] = []
+    for item in items:
+        for other in items:
+            taken: set[int] = set()
+            for wanted in item.steps if other is not item else ():
+                place = _nearest(wanted, other.steps, taken)
+                if place is not None:
+                    taken.add(place)
+                    continue
+                found.append(
+                    f"{item.name}, ±{1e3 * wanted.amplitude_m:.3g} mm at "
+                    f"{wanted.peak_speed_m_per_s:.3g} m/s: no such step in {other.name}"
+                )
+    return found
 
 
 def _line(doses: "np.ndarray", figures: Sequence[Figure]) -> tuple[Figure, float, bool]:

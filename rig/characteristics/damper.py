@@ -70,10 +70,15 @@ def damper_of(steps: Sequence[Step]) -> Damper:
     gas_force = gas_rate = friction = None
     if slow:
         slowest = min(slow, key=lambda step: step.peak_speed_m_per_s)
-        gas_force, gas_rate = slowest.mean_force, slowest.spring_rate
-        friction = slowest.half_difference
         speed = 1e3 * slowest.peak_speed_m_per_s
-        notes.append(f"friction and gas force at {speed:.2g} mm/s: what bleeds there is in them")
+        gas_force, gas_rate, friction = (
+            figure._replace(method=f"{figure.method}, at {speed:.2g} mm/s")
+            for figure in (slowest.mean_force, slowest.spring_rate, slowest.half_difference)
+        )
+        notes.append(
+            f"friction and gas force are forces at {speed:.2g} mm/s: what bleeds there is in them, "
+            "and their intervals are of the measurement alone"
+        )
     else:
         notes.append(
             "no step of 5 mm/s or less: friction, gas force and its rate are not told, and "
@@ -84,7 +89,9 @@ def damper_of(steps: Sequence[Step]) -> Damper:
         name: _knee(stroke)
         for name, stroke in zip(("compression", "rebound"), fastest.strokes, strict=True)
     }
-    if not any(knee.values()):
+    if any(stroke.is_constant for stroke in fastest.strokes):
+        notes.append("no knee: the fastest step has one speed, which tells no curve")
+    elif not any(knee.values()):
         notes.append("no knee: the curve of the fastest step is straight within its noise")
     per_kelvin = {name: _per_kelvin(steps, index) for index, name in enumerate(knee)}
     if not any(per_kelvin.values()):
@@ -134,6 +141,8 @@ def _asymmetry(step: Step, gas: Figure | None) -> Figure | None:
 
 def _knee(stroke: MeanStroke) -> Figure | None:
     """Where two straight lines through the curve meet, with the percentiles of redrawn curves."""
+    if stroke.is_constant:
+        return None  # one speed tells no curve
     speed = np.abs(stroke.velocity_m_per_s)
     peak = float(speed.max())
     grid = np.linspace(0.03, 0.99, _KNEE_POINTS) * peak

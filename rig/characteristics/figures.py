@@ -11,8 +11,10 @@ positive in compression and negative in rebound. What a figure is:
     equivalent damping        the linear damping that takes the same energy from the same motion
     spring rate               fall of the mean of both strokes per height: gas, springs, and what of
                               a lag looks like one
-    hysteresis at zero speed  compression less rebound stroke at the turning points: twice the
-                              friction; by speed: speeding up less slowing down, without the spring
+    hysteresis at zero speed  compression less rebound stroke at the turning points: what friction
+                              jumps by there, nothing where it builds up over a travel
+                              (presliding); by speed: speeding up less slowing down, without the
+                              spring
 
 Reference: Dixon, The Shock Absorber Handbook (2007), 10; Lion and Loose, A thermomechanically
 coupled model for automotive shock absorbers, Vehicle System Dynamics 37 (2002).
@@ -25,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.characteristics.stroke_force import ANGLES, Figure, MeanStroke, combined, mean_stroke
-from rig.characteristics.strokes import Block, Motion, motion_of
+from rig.characteristics.strokes import Block, Motion, motion_of, repeats
 
 Array = NDArray[np.float64]
 
@@ -120,7 +122,7 @@ class Step(NamedTuple):
 def step_of(
     t_s: Array, height_m: Array, force_n: Array, temperature_c: Array | None, block: Block
 ) -> Step | None:
-    """Figures of a block; None where it has too few samples for any.
+    """Figures of a block; None where it has too few samples for any, or does not repeat.
 
     Args:
         t_s: Times of the record, shape (N,).
@@ -131,6 +133,8 @@ def step_of(
     """
     here = slice(block.begin, block.end)
     motion = motion_of(t_s[here], height_m[here], len(block.strokes))
+    if np.isnan(motion.period_s) and not repeats(t_s, height_m, block):
+        return None
     velocity = motion.velocity_m_per_s
     # A stroke ends where the velocity turns, which the samples hardly ever hit.
     turned = np.concatenate([[0], np.cumsum(np.diff(np.sign(velocity)) != 0)])
@@ -192,14 +196,21 @@ def _warmth(
 def _side(stroke: MeanStroke, down: MeanStroke, up: MeanStroke, speed_std: float) -> Side:
     speed = np.abs(stroke.velocity_m_per_s)
     peak = float(speed.max())
-    at_peak = int(np.argmax(speed))
+    row, what = np.eye(len(ANGLES))[int(np.argmax(speed))], "mean stroke at the largest speed"
+    method = "largest slope of the fitted motion"
+    if stroke.is_constant:
+        # What a smoothed motion has beside its turning points is no larger speed.
+        plateau = speed[np.abs(np.sin(ANGLES)) <= _WINDOW]
+        peak, speed_std = float(plateau.mean()), float(np.hypot(speed_std, plateau.std()))
+        row, what = stroke.row(0.0)[0], "mean stroke at mid-stroke: the speed is constant"
+        method = "speed about mid-stroke, where it is constant"
     middle = np.arcsin(np.linspace(-_WINDOW, _WINDOW, 21))
     against = int(np.argmax(-stroke.sign * stroke.force_n))
     one = np.eye(len(ANGLES))
     half = 1.96 * speed_std
     return Side(
-        Figure(peak, peak - half, peak + half, "largest slope of the fitted motion"),
-        stroke.figure(one[at_peak], "mean stroke at the largest speed"),
+        Figure(peak, peak - half, peak + half, method),
+        stroke.figure(row, what),
         stroke.figure(
             stroke.row(middle).mean(axis=0), f"window of {100 * _WINDOW:.0f} % about mid-stroke"
         ),

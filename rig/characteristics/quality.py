@@ -13,6 +13,9 @@ Array = NDArray[np.float64]
 _GAP = 2.5
 """Times the usual time between samples: one is missing at least, however the clock jitters."""
 
+_USED_SHARE = 0.8
+"""Strokes that are of a step below which it is said: ramps between steps are some in a hundred."""
+
 _FEW_A_CYCLE = 16.0
 """Samples of a cycle below which a stroke has hardly eight: its shape is mostly the spline's."""
 
@@ -24,18 +27,42 @@ _COARSE = 2.0
 
 
 def quality(
-    t_s: Array, force_n: Array, steps: Sequence[Step], rests: Sequence[tuple[float, float, Figure]]
+    t_s: Array,
+    force_n: Array,
+    steps: Sequence[Step],
+    rests: Sequence[tuple[float, float, Figure]],
+    strokes: int,
 ) -> tuple[str, ...]:
-    """Gaps, cycles of few samples, a coarse force and a drift at rest.
+    """Gaps, cycles of few samples, a coarse force, a wrong sign, what is left out, a drift at rest.
 
     Args:
         t_s: Times, shape (N,).
         force_n: Forces, shape (N,).
         steps: Steps of the test.
         rests: Beginning, height and force of each time at rest.
+        strokes: How many strokes the record has.
     """
     said = [*_gaps(t_s), *_few_samples(t_s, steps), *_coarse(force_n), *_drift(rests)]
-    return tuple(said)
+    return (*_sign(steps), *_left_out(steps, strokes), *said)
+
+
+def _sign(steps: Sequence[Step]) -> list[str]:
+    giving = [step for step in steps if step.energy_per_cycle.high < 0.0]
+    if not giving:
+        return []
+    step = min(giving, key=lambda item: item.energy_per_cycle.value)
+    return [
+        f"the strut gives energy, {-step.energy_per_cycle.value:.3g} J a cycle at "
+        f"{step.peak_speed_m_per_s:.3g} m/s, which no damper does: is the sign of its force right "
+        "(`rig import --rebound`)?"
+    ]
+
+
+def _left_out(steps: Sequence[Step], strokes: int) -> list[str]:
+    used = sum(round(2.0 * step.cycles) for step in steps)
+    if used >= _USED_SHARE * strokes:
+        return []
+    return [f"{strokes - used} of {strokes} strokes repeat nothing and are left out"]
 
 
 def _gaps(t_s: Array) -> list[str]:

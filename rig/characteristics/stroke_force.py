@@ -70,6 +70,10 @@ class Figure(NamedTuple):
         return self._asdict()
 
 
+_MIDDLE, _CONSTANT = 0.5, 0.1
+"""Half of the stroke, and how much of the speed may differ in it where it is called constant: under
+a sine 13 per cent do."""
+
 _GRID = 181
 ANGLES: Array = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _GRID)
 """Angles at which a mean stroke is kept, linear in between: its bend there is a hundredth of a per
@@ -98,6 +102,12 @@ class MeanStroke(NamedTuple):
     freedom: float
     velocity_m_per_s: Array
     strokes: int
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether the speed is the same over the middle half of the stroke: a triangle, no sine."""
+        speed = np.abs(self.velocity_m_per_s[np.abs(np.sin(ANGLES)) <= _MIDDLE])
+        return float(np.ptp(speed)) <= _CONSTANT * float(speed.mean())
 
     def row(self, theta: Array | float) -> Array:
         """The force at angles as rows over `force_n`, shape (M, 181)."""

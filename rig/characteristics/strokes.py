@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple, cast
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import minimize_scalar  # pyright: ignore[reportUnknownVariableType]
@@ -32,11 +33,34 @@ _ALIKE = 0.15
 """Relative difference of amplitude or duration up to which strokes are of one block: machines keep
 their steps within some per cent, and steps differ by a quarter and more."""
 
+_SETTLED = 0.03
+"""Relative difference from the median of a block up to which its first and last stroke are of it: a
+machine that ramps up or down takes a stroke between two amplitudes."""
+
+_SAME_SHAPE = 0.03
+"""Of a stroke: standard deviation from the mean shape up to which strokes repeat one another."""
+
+_SHAPE_POINTS = 41
+_FEWEST_UNLIKE_A_SERIES = 4
+"""Strokes of a motion that is no Fourier series: two of each direction, to hold against each other.
+"""
+
 _FEWEST_STROKES = 3
 """Of a block: a single stroke has no repetition, and one by which a machine gets there is none."""
 
 _HOLD_S = 0.5
 """Shortest hold."""
+
+_STILL_SHARE = 1e-3
+"""Of the record's stroke: a height that moves less within the shortest hold is at rest; of 50 mm
+that is 0.1 mm/s, a fifth of the slowest step that machines run."""
+
+_TAIL_SHARE = 0.02
+"""Of what is still: by how much less the ends of a rest may be away from its middle."""
+
+_BENT = 0.4
+"""Range of the parabola through a rest over what is still, from which on it is a turning point: one
+that passes for still rises by all of it, a rest with the ends of strokes beside it by a fifth."""
 
 _FEWEST_AT_REST = 20
 """Samples of a hold: two for each of the batches whose means tell its uncertainty."""
@@ -116,7 +140,7 @@ def strokes_of(t_s: Array, height_m: Array) -> list[Stroke]:
         t_s: Times, increasing, shape (N,).
         height_m: Heights, shape (N,).
     """
-    noise_m = float(np.median(np.abs(np.diff(height_m, 3)))) / (0.6745 * np.sqrt(20.0))
+    noise_m = _noise_m(height_m)
     low, high = np.percentile(height_m, (1.0, 99.0))
     least_m = max(_TURN_SHARE * float(high - low), _TURN_NOISE * noise_m)
     turns = list(_turns(height_m, least_m)) if least_m > 0.0 else []
@@ -124,6 +148,11 @@ def strokes_of(t_s: Array, height_m: Array) -> list[Stroke]:
         Stroke(a, b, float(height_m[b] - height_m[a]), float(t_s[b] - t_s[a]))
         for a, b in itertools.pairwise(turns)
     ]
+
+
+def _noise_m(height_m: Array) -> float:
+    """Standard deviation of a height's noise, by its third differences."""
+    return float(np.median(np.abs(np.diff(height_m, 3)))) / (0.6745 * np.sqrt(20.0))
 
 
 def _turns(height_m: Array, least_m: float) -> Iterator[int]:
@@ -153,12 +182,51 @@ def blocks_of(strokes: list[Stroke]) -> list[Block]:
     for stroke in [*strokes, Stroke(-1, -1, 0.0, 0.0)]:
         if run and not _alike(run, stroke):
             if len(run) >= _FEWEST_STROKES:
-                blocks.append(Block(tuple(run), run[0].first, run[-1].last + 1))
+                kept = _settled(run)
+                blocks.append(Block(tuple(kept), kept[0].first, kept[-1].last + 1))
             # A stroke that a machine changes its step in may have been like the next by chance.
             keeps = len(run) < _FEWEST_STROKES and _alike(run[-1:], stroke)
             run = run[-1:] if keeps else []
         run.append(stroke)
     return blocks
+
+
+def _settled(run: list[Stroke]) -> list[Stroke]:
+    """A run without strokes at its ends that a machine takes to get there, or back."""
+    usual_m = float(np.median([abs(stroke.rise_m) for stroke in run]))
+
+    def is_of_it(stroke: Stroke) -> bool:
+        return abs(abs(stroke.rise_m) - usual_m) <= _SETTLED * usual_m
+
+    kept = list(run)
+    while len(kept) > _FEWEST_STROKES and not is_of_it(kept[0]):
+        kept = kept[1:]
+    while len(kept) > _FEWEST_STROKES and not is_of_it(kept[-1]):
+        kept = kept[:-1]
+    return kept
+
+
+def repeats(t_s: Array, height_m: Array, block: Block) -> bool:
+    """Whether the strokes of a block are one motion again and again, and not alike by chance.
+
+    Args:
+        t_s: Times of the record, shape (N,).
+        height_m: Heights, shape (N,).
+        block: The block.
+    """
+    if len(block.strokes) < _FEWEST_UNLIKE_A_SERIES:
+        return False
+    share = np.linspace(0.0, 1.0, _SHAPE_POINTS)
+    for side in (block.strokes[::2], block.strokes[1::2]):
+        shapes: Array = np.array(
+            [np.interp(t_s[one.first] + share * one.duration_s, t_s, height_m) for one in side],
+            dtype=np.float64,
+        )
+        apart = shapes - shapes.mean(axis=1, keepdims=True)
+        usual_m = float(np.median([abs(one.rise_m) for one in side]))
+        if float(np.std(apart - apart.mean(axis=0))) > _SAME_SHAPE * usual_m:
+            return False
+    return True
 
 
 def _alike(run: list[Stroke], stroke: Stroke) -> bool:
@@ -174,19 +242,45 @@ def _alike(run: list[Stroke], stroke: Stroke) -> bool:
 def holds_of(t_s: Array, height_m: Array, blocks: list[Block]) -> list[Hold]:
     """Times at rest between the blocks."""
     ends = [0, *(edge for block in blocks for edge in (block.begin, block.end - 1)), len(t_s) - 1]
-    stroke_m, usual_s = float(np.ptp(height_m)), float(np.median(np.diff(t_s)))
+    usual_s = float(np.median(np.diff(t_s)))
+    window = max(int(np.ceil(_HOLD_S / usual_s)), _FEWEST_AT_REST)
+    still_m = max(_STILL_SHARE * float(np.ptp(height_m)), _TURN_NOISE * _noise_m(height_m))
     holds: list[Hold] = []
     for begin, end in zip(ends[::2], ends[1::2], strict=True):
-        if t_s[end] - t_s[begin] < _HOLD_S:
+        part = height_m[begin : end + 1]
+        if len(part) < window:
             continue
-        resting = np.abs(height_m[begin : end + 1] - np.median(height_m[begin : end + 1]))
-        inside = np.flatnonzero(resting < 0.25 * _TURN_SHARE * stroke_m)
-        # The longest time at rest without a break, of motion or of samples.
+        within = sliding_window_view(part, window)
+        is_still = np.ptp(within, axis=1) <= still_m
+        whole = t_s[begin + window - 1 : end + 1] - t_s[begin : end + 2 - window]
+        is_still &= whole < 2.0 * window * usual_s  # and no samples are missing
+        inside = np.flatnonzero(is_still)
+        if not len(inside):
+            continue
         runs = np.split(inside, np.flatnonzero(np.diff(inside) > 1) + 1)
-        run = max(runs, key=len)
-        if len(run) >= _FEWEST_AT_REST and len(run) * usual_s >= _HOLD_S:
-            holds.append(Hold(begin + int(run[0]), begin + int(run[-1]) + 1))
+        found = [Hold(begin + int(run[0]), begin + int(run[-1]) + window) for run in runs]
+        rests = [
+            hold for hold in found if not _turns_slowly(height_m[hold.begin : hold.end], still_m)
+        ]
+        if rests:  # the longest without a break
+            longest = max(rests, key=lambda hold: hold.end - hold.begin)
+            holds.append(_trimmed(longest, height_m, still_m))
     return holds
+
+
+def _trimmed(hold: Hold, height_m: Array, still_m: float) -> Hold:
+    """A rest without the ends of the strokes beside it."""
+    part = height_m[hold.begin : hold.end]
+    apart = np.abs(part - np.median(part))
+    inside = np.flatnonzero(apart <= max(_TAIL_SHARE * still_m, 4.0 * _noise_m(height_m)))
+    return Hold(hold.begin + int(inside[0]), hold.begin + int(inside[-1]) + 1)
+
+
+def _turns_slowly(height_m: Array, still_m: float) -> bool:
+    """Whether what looks like a rest is the turning point of a slow stroke: a parabola, or half."""
+    place = np.linspace(-1.0, 1.0, len(height_m))
+    curve = np.polynomial.Polynomial.fit(place, height_m, 2)(place)
+    return float(np.ptp(curve)) > _BENT * still_m
 
 
 def motion_of(t_s: Array, height_m: Array, strokes: int) -> Motion:

@@ -16,7 +16,7 @@ from rig.characteristics.stroke_force import Figure
 from rig.inputs.errors import InputError
 from rig.inputs.yaml_file import load_validated, read_text, validated
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Verdict = Literal["pass", "fail", "open", "not measured"]
 
 _COLUMNS = ("velocity_m_per_s", "compression_low_n", "compression_high_n", "rebound_low_n",
@@ -36,7 +36,7 @@ class Point(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    velocity_m_per_s: Annotated[float, Field(gt=0.0, le=100.0, allow_inf_nan=False)]
+    velocity_m_per_s: Annotated[float, Field(gt=0.0, le=100.0, strict=True)]
     compression_low_n: Finite
     compression_high_n: Finite
     rebound_low_n: Finite
@@ -101,8 +101,11 @@ class Judged(NamedTuple):
         band = f"{self.low_n:g} to {self.high_n:g} N"
         if self.force is None:
             return f"no step at {self.velocity_m_per_s:g} m/s, expected {band}"
-        half = 0.5 * (self.force.high - self.force.low)
-        return f"{self.force.value:.1f} ± {half:.1f} N, expected {band}"
+        low, high = self.force.low, self.force.high
+        return (
+            f"{self.force.value:.1f} N ({low:.1f} to {high:.1f}), {self.force.method}, "
+            f"expected {band}"
+        )
 
 
 def load_tolerance(path: Path) -> Tolerance:
@@ -113,24 +116,44 @@ def load_tolerance(path: Path) -> Tolerance:
     """
     if path.suffix.lower() != ".csv":
         return load_validated(Tolerance, path)
-    rows = list(csv.reader(read_text(path).splitlines()))
+    text = read_text(path).removeprefix("\ufeff")  # as spreadsheets begin a file
+    rows = list(csv.reader(text.splitlines()))
+    while rows and not any(cell.strip() for cell in rows[-1]):
+        rows.pop()
     if not rows or tuple(cell.strip() for cell in rows[0]) != _COLUMNS:
         raise InputError(f"{path}: line 1: expected the header {','.join(_COLUMNS)}")
-    points: list[dict[str, str]] = []
+    points: list[dict[str, float]] = []
     for number, row in enumerate(rows[1:], start=2):
         if len(row) != len(_COLUMNS):
             raise InputError(f"{path}: line {number}: {len(row)} cells, expected {len(_COLUMNS)}")
-        points.append(dict(zip(_COLUMNS, (cell.strip() for cell in row), strict=True)))
+        points.append(dict(zip(_COLUMNS, _numbers(path, number, row), strict=True)))
+    if not points:
+        raise InputError(f"{path}: holds no point, expected rows under the header")
     return validated(Tolerance, {"name": path.stem, "points": points}, str(path))
 
 
-def judged(steps: Sequence[Step], tolerance: Tolerance) -> list[Judged]:
+def _numbers(path: Path, line: int, row: Sequence[str]) -> list[float]:
+    try:
+        return [float(cell) for cell in row]
+    except ValueError:
+        raise InputError(f"{path}: line {line}: {','.join(row)}: expected numbers") from None
+
+
+def judged(steps: Sequence[Step], kinds: Sequence[str], tolerance: Tolerance) -> list[Judged]:
     """Every point of a band, compression and rebound.
 
-    A force at a velocity between two steps is linear between them; beyond all steps by more than
-    5 % it is not measured.
+    A point belongs to the velocity step nearest to its speed within 1 %; the force is then less
+    certain by what it may change over the difference. Between two steps the force of a damper lies
+    between theirs, since it rises with speed: that is its interval. Beyond all steps it is not
+    measured. A warm-up is no step.
+
+    Args:
+        steps: The steps of a damper.
+        kinds: What each of them is, as `damper_of` says.
+        tolerance: The band.
     """
-    ordered = sorted(steps, key=lambda step: step.peak_speed_m_per_s)
+    used = [step for step, kind in zip(steps, kinds, strict=True) if kind != "warm_up"]
+    ordered = sorted(used, key=lambda step: step.peak_speed_m_per_s)
     found: list[Judged] = []
     for point in tolerance.points:
         for side, low, high in (
@@ -143,26 +166,34 @@ def judged(steps: Sequence[Step], tolerance: Tolerance) -> list[Judged]:
     return found
 
 
-_BEYOND = 0.05
+_SAME = 0.01
 """Relative distance of a step's speed from a point's up to which it is the point's."""
+
+_STEEPEST = 2.0
+"""Power of the speed with which the force of an orifice rises: no damper's rises faster."""
 
 
 def _force_at(ordered: Sequence[Step], side: str, speed: float) -> Figure | None:
     sides = [step.compression if side == "compression" else step.rebound for step in ordered]
     speeds = [one.peak_velocity.value for one in sides]
     figures = [one.force_at_peak_velocity for one in sides]
-    for own, figure in zip(speeds, figures, strict=True):
-        if abs(own / speed - 1.0) <= _BEYOND:
-            return figure
+    if not speeds:
+        return None
+    nearest = min(range(len(speeds)), key=lambda place: abs(speeds[place] / speed - 1.0))
+    apart = abs(speeds[nearest] / speed - 1.0)
+    if apart <= _SAME:
+        found = figures[nearest]
+        more = _STEEPEST * apart * abs(found.value)
+        method = f"step at {speeds[nearest]:.4g} m/s"
+        return Figure(found.value, found.low - more, found.high + more, method)
     for place in range(len(speeds) - 1):
         if speeds[place] <= speed <= speeds[place + 1]:
             share = (speed - speeds[place]) / (speeds[place + 1] - speeds[place])
             below, above = figures[place], figures[place + 1]
-            value, low, high = (
-                (1.0 - share) * getattr(below, name) + share * getattr(above, name)
-                for name in ("value", "low", "high")
-            )
-            return Figure(value, low, high, "linear between two steps")
+            value = (1.0 - share) * below.value + share * above.value
+            low, high = min(below.low, above.low), max(below.high, above.high)
+            method = f"between steps at {speeds[place]:.3g} and {speeds[place + 1]:.3g} m/s"
+            return Figure(value, low, high, method)
     return None
 
 

@@ -75,7 +75,7 @@ def characterise_command(
         raise InputError("--junit: says what is kept and what is not, expected --tolerance")
     band = None if tolerance is None else load_tolerance(tolerance)
     found = [characterise(path, strut) for path in runs]
-    points = [[] if band is None else judged(item.steps, band) for item in found]
+    points = [[] if band is None else judged(item.steps, item.damper.kinds, band) for item in found]
     content: dict[str, object] = {
         "schema": SCHEMA,
         "serial": serial,

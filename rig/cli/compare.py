@@ -9,6 +9,7 @@ from rig.cli.output import JsonFlag, console, print_json, table
 from rig.inputs.errors import InputError
 
 if TYPE_CHECKING:
+    from rig.characteristics.command import Characteristics
     from rig.characteristics.comparison import Difference, Trend
     from rig.characteristics.stroke_force import Figure
 
@@ -52,12 +53,21 @@ def compare_command(
             print_json({"schema": 1, "trends": [item.as_dict() for item in trends]})
         else:
             _print_trends(trends)
+            _print_unpaired(found)
         return
     differences = compared(found[0], found[1])
     if as_json:
         print_json({"schema": 1, "differences": [item.as_dict() for item in differences]})
         return
     _print_differences(differences, found[0].name, found[1].name)
+    _print_unpaired(found)
+
+
+def _print_unpaired(found: "list[Characteristics]") -> None:
+    from rig.characteristics.comparison import unpaired
+
+    for text in unpaired(found):
+        console.print(f"- not compared: {text}", markup=False)
 
 
 def _print_differences(found: "list[Difference]", before: str, after: str) -> None:
@@ -65,7 +75,8 @@ def _print_differences(found: "list[Difference]", before: str, after: str) -> No
     same: list[str] = []
     for item in found:
         if not item.differs:
-            same.append(f"{item.name} (within {_reach(item.change)} {item.unit})")
+            unit = f" {item.unit}" if item.unit else ""
+            same.append(f"{item.name} (by at most {_reach(item.change)}{unit})")
             continue
         shown.add_row(
             item.name, _number(item.before), _number(item.after), _interval(item.change, item.unit)
@@ -73,9 +84,9 @@ def _print_differences(found: "list[Difference]", before: str, after: str) -> No
     if shown.rows:
         console.print(shown)
     else:
-        console.print("Nothing differs by more than chance.")
+        console.print("Nothing that was compared differs by more than chance.")
     if same:
-        console.print(f"The same within what was measured: {'; '.join(same)}.", markup=False)
+        console.print(f"Not shown to differ: {'; '.join(same)}.", markup=False)
 
 
 def _print_trends(found: "list[Trend]") -> None:

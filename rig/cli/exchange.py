@@ -71,6 +71,7 @@ def import_command(
         with progress_line(None) as progress:
             report = import_log(source, load_setup(config), out, progress)
     else:
+        _refuse_without_meaning(source)
         import_run(source, out)
         console.print(f"Run: {out}", markup=False)
         return
@@ -81,6 +82,16 @@ def import_command(
     for line in report.assumptions:
         console.print(f"- {line}", markup=False)
     console.print(f"Written: {report.out}", markup=False)
+
+
+def _refuse_without_meaning(source: Path) -> None:
+    """Refuse a table, or a folder of tables, whose columns nobody told the meaning of."""
+    from rig.exchange.mts import is_mts
+
+    if is_mts(source):
+        raise InputError(f"{source}: a file of MTS, expected --rebound positive or negative")
+    if source.is_dir() and not any(source.glob("*.parquet")):
+        raise InputError(f"{source}: a folder of tables, expected --mapping FILE or --rebound")
 
 
 def _import_folder(source: Path, out: Path, mapping_of: "Callable[[Path], Mapping]") -> None:

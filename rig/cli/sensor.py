@@ -108,7 +108,9 @@ def scan_command(
     else:
         _print(found)
     if out is not None:
-        _write(out, found, config, origin)
+        written = _write(out, found, config, origin)
+        if not as_json:
+            console.print(written, markup=False)
 
 
 @app.command("set", epilog=SET_EXAMPLES)
@@ -247,7 +249,8 @@ def _from_files(given: "Sequence[str]") -> "Found":
     return Found(tuple(devices), (), None, (), (), ())
 
 
-def _write(out: Path, found: "Found", config: "BusConfig", origin: "Origin | None") -> None:
+def _write(out: Path, found: "Found", config: "BusConfig", origin: "Origin | None") -> str:
+    """Write DBC and configuration; returns what to say of it."""
     from rig.sensors.proposal import CONFIG_NAME, DBC_NAME, configuration_text, dbc_text
 
     text = configuration_text(found.devices, found.spoken, found.claims, config)
@@ -260,11 +263,8 @@ def _write(out: Path, found: "Found", config: "BusConfig", origin: "Origin | Non
         raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
     hint = "" if origin is not None else " Heights count as the sensor does (--height-now-m)."
     path = out / CONFIG_NAME
-    console.print(
-        f"Written: {out / DBC_NAME}, {path}.{hint} Read them, set the model, then "
-        f"`rig check {path}`.",
-        markup=False,
-    )
+    what = f"Written: {out / DBC_NAME}, {path}.{hint}"
+    return f"{what} Read them, set the model, then `rig check {path}`."
 
 
 def _print(found: "Found") -> None:

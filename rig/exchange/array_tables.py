@@ -68,11 +68,14 @@ def array_columns(source: Path, mapping: TableMapping, outputs: Sequence[Output]
     last = None if mapping.table.rows is None else first + mapping.table.rows
     taken = slice(first, last)
     t_s, columns = t_s[taken], [column[taken] for column in columns]
-    if not np.all(np.isfinite(t_s)):
-        raise InputError(f"{source}: time: expected numbers in every row")
-    for output, column in zip(outputs[1:], columns[1:], strict=True):
-        if not np.all(np.isfinite(column)):
-            raise InputError(f"{source}: {output.key}: expected numbers in every row")
+    keys = [item.key for item in outputs[1:]]  # a height may be missing in a row
+    for key, column in (("time", t_s), *zip(keys, columns[1:], strict=True)):
+        wrong = np.flatnonzero(~np.isfinite(column))
+        if len(wrong):
+            raise InputError(
+                f"{source}: {key}: expected numbers in every row, found none in row "
+                f"{first + int(wrong[0]) + 1} under the names (table.first_row begins later)"
+            )
     return t_s, columns, said
 
 
@@ -136,9 +139,12 @@ def _worksheet(content: bytes) -> Mapping[str, Array]:
             raise ValueError(f"more than {_MAX_SAMPLES} rows")
     if not cells:
         raise ValueError("no rows of data under the names")
+    twice = next((name for name in names if name and names.count(name) > 1), None)
+    if twice is not None:
+        raise ValueError(f"two columns are called {twice}, expected names of their own")
     width = len(names)
     table = np.array([row + [np.nan] * (width - len(row)) for row in cells])
-    return {name: table[:, place] for place, name in enumerate(names) if name}
+    return {name or f"column {place}": table[:, place - 1] for place, name in enumerate(names, 1)}
 
 
 def _number(cell: object) -> float:

@@ -52,10 +52,15 @@ def mts_columns(source: Path) -> tuple[dict[str, Array], dict[str, str]]:
     try:
         if source.stat().st_size > _MAX_BYTES:
             raise InputError(f"{source}: expected at most {_MAX_BYTES} bytes")
-        lines = source.read_text("latin-1").splitlines()
+        text = source.read_text("latin-1")
     except OSError as error:
         raise InputError(f"{source}: cannot be read: {error.strerror}") from error
+    lines = text.splitlines()
     delimiter, comma = _layout(source, lines[0] if lines else "")
+    if not text.endswith(("\n", "\r")):
+        raise InputError(
+            f"{source}: line {len(lines)}: does not end: the file was cut, expected it whole"
+        )
     names: list[str] = []
     units: list[str] = []
     texts: list[list[str]] = []
@@ -113,6 +118,11 @@ def _heads(
     source: Path, number: int, texts: list[list[str]], names: list[str], units: list[str]
 ) -> tuple[list[str], list[str]]:
     """Names and units before a row: the last two lines of text, which every block repeats."""
+    if names and len(texts) == 1:
+        raise InputError(
+            f"{source}: line {number - 1}: {', '.join(texts[0])[:60]}: expected "
+            f"{len(names)} numbers"
+        )
     if len(texts) < 2 or len(texts[-1]) != len(texts[-2]):
         raise InputError(
             f"{source}: line {number}: expected a line of names and one of units before the rows"

@@ -301,3 +301,85 @@ def test_a_measured_damper(name, peak_n):
     largest = 1e-3 * float(np.percentile(np.abs(v_mm_per_s), 99.5))
     assert step.peak_speed_m_per_s == pytest.approx(largest, rel=0.01)
     assert -step.rebound.peak_force.value == pytest.approx(peak_n, rel=0.03)
+
+
+def sine(frequency_hz, seconds, amplitude_m=0.02, rate_hz=500.0):
+    t_s = np.arange(round(seconds * rate_hz)) / rate_hz
+    angle = 2.0 * math.pi * frequency_hz * t_s
+    return (
+        t_s,
+        amplitude_m * np.sin(angle),
+        2.0 * math.pi * frequency_hz * amplitude_m * np.cos(angle),
+    )
+
+
+def test_strokes_that_ramp_up_and_down_are_of_no_step():
+    """A damper's record whose first and last stroke are shorter: the cycles between are a sine."""
+    t_s, x_m, _v = sine(1.0, 12.0)
+    swell = np.interp(t_s, (0.0, 1.0, 1.5, 10.5, 11.0, 12.0), (0.0, 0.7, 1.0, 1.0, 0.7, 0.0))
+    height_m = 0.3 + swell * x_m
+    force_n = 200.0 - 1500.0 * np.gradient(height_m, t_s)
+    (step,) = of_arrays("ramped", t_s, height_m, force_n).steps
+    assert step.frequency_hz == pytest.approx(1.0, rel=1e-3)
+    assert step.amplitude_m == pytest.approx(0.02, rel=1e-3)
+    energy_j = math.pi * 1500.0 * 2.0 * math.pi * 0.02**2
+    assert step.energy_per_cycle.value == pytest.approx(energy_j, rel=2e-3)
+
+
+def test_a_motion_that_does_not_repeat_is_refused():
+    accepted = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        t_s = np.arange(15_000) / 500.0
+        smooth = np.exp(-0.5 * (np.arange(-600, 601) / 80.0) ** 2)
+        x_m = np.convolve(rng.standard_normal(len(t_s) + 1200), smooth, "valid")
+        height_m = 0.3 + 0.02 * x_m / np.std(x_m)
+        force_n = -1500.0 * np.gradient(height_m, t_s)
+        try:
+            said = of_arrays("random", t_s, height_m, force_n).quality
+            accepted += 1
+            assert any("left out" in text for text in said)
+        except InputError as error:
+            assert "expected a test that repeats its cycles" in str(error)  # noqa: PT017
+    assert accepted <= 2
+
+
+def test_a_speed_that_is_constant_has_its_force_at_mid_stroke():
+    t_s = np.arange(20_000) / 1000.0
+    place = 0.1 * t_s / 0.1 % 1.0  # strokes of 50 mm at 0.1 m/s, one a cycle of a second
+    x_m = 0.025 * (1.0 - 4.0 * np.abs(place - 0.5))
+    v = np.where(place < 0.5, 0.1, -0.1)
+    rng = np.random.default_rng(1)
+    force_n = 200.0 - 2000.0 * x_m - 2000.0 * v - 20.0 * np.sign(v) + rng.normal(0.0, 2.0, len(v))
+    height_m = 0.3 + x_m + 1e-6 * rng.standard_normal(len(v))
+    tested = of_arrays("triangle", t_s, height_m, force_n)
+    (step,) = tested.steps
+    for side, truth_n in ((step.compression, 420.0), (step.rebound, -20.0)):
+        force = side.force_at_peak_velocity
+        assert force.low <= truth_n <= force.high
+        assert side.peak_velocity.value == pytest.approx(0.1, rel=0.01)
+    assert not any(tested.damper.knee.values())
+    assert any("one speed" in note for note in tested.damper.notes)
+
+
+def test_a_slow_stroke_is_no_rest():
+    rest = np.full(1000, 0.0)
+    slow, fast = (sine(f, s) for f, s in ((0.004, 625.0), (2.4, 4.0)))
+    x_m = np.concatenate([rest, slow[1], rest, fast[1], rest])
+    t_s = np.arange(len(x_m)) / 500.0
+    v = np.gradient(x_m, t_s)
+    tested = of_arrays("slow", t_s, 0.3 + x_m, 200.0 - 2000.0 * x_m - 1500.0 * v)
+    assert [hold.height_m for hold in tested.holds] == pytest.approx([0.3] * 3, abs=2e-5)
+    assert tested.holds[0].end_s == pytest.approx(2.0, abs=0.1)
+
+
+def test_a_strut_that_gives_energy_is_said():
+    t_s, x_m, v = sine(2.0, 5.0)
+    said = of_arrays("wrong sign", t_s, 0.3 + x_m, 1500.0 * v + 10.0 * np.cos(40.0 * t_s)).quality
+    assert "gives energy" in said[0]
+
+
+def test_forces_that_no_machine_reaches_are_refused():
+    t_s, x_m, v = sine(2.0, 5.0)
+    with pytest.raises(InputError, match="expected at most 1e"):
+        of_arrays("huge", t_s, 0.3 + x_m, -1e155 * v)

@@ -16,6 +16,7 @@ from rig.cli.main import app
 from rig.inputs.errors import InputError
 from tests.characteristics.test_characteristics import written
 
+HEADER = "velocity_m_per_s,compression_low_n,compression_high_n,rebound_low_n,rebound_high_n"
 RATE_HZ = 200.0
 SPEEDS = (0.003, 0.1, 0.3)
 
@@ -99,25 +100,56 @@ points:
 """
 
 
+def judged_by(item, path):
+    return judged(item.steps, item.damper.kinds, load_tolerance(path))
+
+
 def test_points_pass_fail_or_stay_open(tmp_path):
     (tmp_path / "band.yaml").write_text(BAND)
-    found = judged(state(1).steps, load_tolerance(tmp_path / "band.yaml"))
+    found = judged_by(state(1), tmp_path / "band.yaml")
     assert [item.verdict for item in found] == [
         "pass", "pass",  # 365 N and 35 N at 0.1 m/s
-        "fail", "fail",  # 515 N and -115 N at 0.2 m/s, between two steps
+        "open", "open",  # at 0.2 m/s, between two steps: anything between their forces
         "not measured", "not measured",
     ]  # fmt: skip
     # A limit at what the damper has is neither kept nor broken.
     tight = BAND.replace("compression_low_n: 350", "compression_low_n: 365.0")
     (tmp_path / "tight.yaml").write_text(tight)
-    assert judged(state(1).steps, load_tolerance(tmp_path / "tight.yaml"))[0].verdict == "open"
+    assert judged_by(state(1), tmp_path / "tight.yaml")[0].verdict == "open"
+
+
+def test_a_point_between_two_steps_holds_what_a_damper_may_have_there(tmp_path):
+    """A digressive damper has more than the straight line between two steps."""
+    (tmp_path / "band.yaml").write_text(BAND)
+    at_02 = [item for item in judged_by(state(1), tmp_path / "band.yaml") if item.force][2:]
+    for item, (low_n, high_n) in zip(at_02, ((365.0, 665.0), (-265.0, 35.0)), strict=True):
+        assert item.force.low <= low_n
+        assert item.force.high >= high_n
+        assert "between steps" in item.words()
+
+
+def test_a_warm_up_is_judged_by_no_band(tmp_path):
+    (tmp_path / "band.yaml").write_text(BAND)
+    item = state(1)
+    fastest_is_warm_up = [
+        "warm_up" if step is item.steps[1] else "velocity_step" for step in item.steps
+    ]
+    found = judged(item.steps, fastest_is_warm_up, load_tolerance(tmp_path / "band.yaml"))
+    assert found[0].verdict == "open"
+
+
+def test_a_step_of_another_speed_is_no_step_of_the_point(tmp_path):
+    """4.5 % beside it the interval of the force is wider than the measurement's own."""
+    (tmp_path / "band.yaml").write_text(BAND.replace("0.1,", "0.1045,"))
+    found = judged_by(state(1), tmp_path / "band.yaml")
+    assert found[0].force.high - found[0].force.low > 100.0
 
 
 def test_the_command_says_pass_or_fail(tmp_path):
     path = written(tmp_path / "dyno.csv", columns(5))
-    header = "velocity_m_per_s,compression_low_n,compression_high_n,rebound_low_n,rebound_high_n"
-    (tmp_path / "good.csv").write_text(f"{header}\n0.1,350,380,20,50\n0.3,650,680,-280,-250\n")
-    (tmp_path / "bad.csv").write_text(f"{header}\n0.1,350,380,40,50\n")
+    rows = "0.1,350,380,20,50\n0.3,650,680,-280,-250\n\n"  # as a spreadsheet writes it
+    (tmp_path / "good.csv").write_text(f"\ufeff{HEADER}\n{rows}")
+    (tmp_path / "bad.csv").write_text(f"{HEADER}\n0.1,350,380,40,50\n")
     for name, code, failures in (("good", 0, "0"), ("bad", 1, "1")):
         junit, out = tmp_path / f"{name}.xml", tmp_path / name
         given = ["--tolerance", str(tmp_path / f"{name}.csv"), "--serial", "0815"]
@@ -141,7 +173,10 @@ def test_the_command_says_pass_or_fail(tmp_path):
         ("a.yaml", "name: x\npoints: []\n", "points"),
         ("a.yaml", BAND.replace("0.2,", "0.05,"), "expected velocities that increase"),
         ("a.yaml", BAND.replace("350", "390"), "compression_low_n 390"),
+        ("a.yaml", BAND.replace("0.2,", "true,"), "velocity_m_per_s"),
         ("a.csv", "v,f\n1,2\n", "expected the header"),
+        ("a.csv", f"{HEADER}\n0.1,350,380,x,50\n", "line 2: 0.1,350,380,x,50: expected numbers"),
+        ("a.csv", f"{HEADER}\n", "holds no point"),
         ("a.csv", "", "expected the header"),
     ],
 )
@@ -165,7 +200,10 @@ def test_the_compare_command(tmp_path):
     assert first["differs"]
     told = runner.invoke(app, ["compare", *files[:2]]).output
     assert "What differs" in told
-    assert "The same within what was measured" in told
+    assert "Not shown to differ" in told
+    doses = [word for dose in ("1", "2", "nan") for word in ("--dose", dose)]
+    refused = runner.invoke(app, ["compare", *files, *doses]).exception
+    assert "expected finite numbers" in str(refused)
     doses = [word for dose in ("1.5", "2.0", "2.5") for word in ("--dose", dose)]
     ended = runner.invoke(app, ["compare", *files, *doses, "--json"])
     trends = {item["figure"]: item for item in json.loads(ended.stdout)["trends"]}
