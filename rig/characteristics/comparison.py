@@ -145,6 +145,18 @@ def over_dose(items: Sequence[Characteristics], doses: Sequence[float]) -> list[
     return sorted(found, key=lambda item: not item.differs)
 
 
+def paired(reference: Characteristics, item: Characteristics) -> list[tuple[Step, Step]]:
+    """Steps of one speed and amplitude: of the reference, and of the other record."""
+    found: list[tuple[Step, Step]] = []
+    taken: set[int] = set()
+    for wanted in reference.steps:
+        place = _nearest(wanted, item.steps, taken)
+        if place is not None:
+            taken.add(place)
+            found.append((wanted, item.steps[place]))
+    return found
+
+
 def unpaired(items: Sequence[Characteristics]) -> list[str]:
     """Steps that have no partner of their speed and amplitude in every other record, in words."""
     found: list[str] = []

@@ -80,6 +80,10 @@ ANGLES: Array = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _GRID)
 cent of its force."""
 
 
+FINE: Array = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 361)
+"""Angles at which samples are gathered, half a degree apart."""
+
+
 class MeanStroke(NamedTuple):
     """The mean stroke of one direction.
 
@@ -92,6 +96,9 @@ class MeanStroke(NamedTuple):
         freedom: Degrees of freedom.
         velocity_m_per_s: Velocity at `ANGLES`, shape (181,).
         strokes: Number of strokes.
+        samples: How many samples lie nearest to each of `FINE`, shape (361,).
+        sums_n: Sums of their forces, shape (361,).
+        noise_n: Standard deviation of a sample about the mean stroke.
     """
 
     sign: int
@@ -102,6 +109,9 @@ class MeanStroke(NamedTuple):
     freedom: float
     velocity_m_per_s: Array
     strokes: int
+    samples: Array
+    sums_n: Array
+    noise_n: float
 
     @property
     def is_constant(self) -> bool:
@@ -196,7 +206,22 @@ def mean_stroke(
         covariance = covariance + np.outer(apart, apart)
     velocity = _mean_velocity(between, motion.between_m_per_s[along])
     strokes = len(np.unique(number))
-    return MeanStroke(sign, middle, amplitude, forces, covariance, freedom, velocity, strokes)
+    nearest = np.round((theta + 0.5 * np.pi) / np.pi * (len(FINE) - 1)).astype(np.int64)
+    samples = np.bincount(nearest, minlength=len(FINE)).astype(np.float64)
+    sums: Array = np.bincount(nearest, weights=force_n, minlength=len(FINE)).astype(np.float64)
+    return MeanStroke(
+        sign,
+        middle,
+        amplitude,
+        forces,
+        covariance,
+        freedom,
+        velocity,
+        strokes,
+        samples,
+        sums,
+        float(np.sqrt(noise)),
+    )
 
 
 def _mean_velocity(theta: Array, velocity_m_per_s: Array) -> Array:

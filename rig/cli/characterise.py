@@ -22,12 +22,14 @@ from rig.inputs.errors import InputError
 
 if TYPE_CHECKING:
     from rig.characteristics.command import Characteristics
+    from rig.characteristics.deviations import Naming
     from rig.characteristics.tolerance import Judged
 
 EXAMPLES = (
     "Examples: `rig characterise dyno.csv` · `rig characterise left.csv right.csv --out found` · "
     "`rig characterise runs/7 --strut suspension` · "
-    "`rig characterise dyno.csv --tolerance band.yaml --serial 0815 --out found`"
+    "`rig characterise dyno.csv --tolerance band.yaml --serial 0815 --out found` · "
+    "`rig characterise 0815.csv --master good.csv`"
 )
 
 
@@ -53,6 +55,23 @@ def characterise_command(
             help="Band about a master curve, YAML or CSV: pass or fail.",
         ),
     ] = None,
+    master: Annotated[
+        Path | None,
+        typer.Option(
+            "--master",
+            metavar="RUN",
+            help="Record of a good damper, same test: name what is wrong.",
+        ),
+    ] = None,
+    scatter: Annotated[
+        float,
+        typer.Option(
+            "--scatter",
+            min=0.001,
+            max=0.5,
+            help="Relative standard deviation of each property among good dampers.",
+        ),
+    ] = 0.03,
     serial: Annotated[
         str | None, typer.Option("--serial", metavar="TEXT", help="Serial number, for the report.")
     ] = None,
@@ -62,31 +81,75 @@ def characterise_command(
     """Find the figures of a damper: force over velocity, energy, gas, friction, knee, temperature.
 
     Wants a record whose cycles repeat; several are laid over one another on the page. With a
-    tolerance the exit code is 1 unless every point of the band is proven to be kept.
+    tolerance the exit code is 1 unless every point of the band is proven to be kept, with a master
+    unless the damper is as good as it.
     """
-    from rig.characteristics.command import SCHEMA, characterise
+    from rig.characteristics.command import characterise
+    from rig.characteristics.deviations import named
+    from rig.characteristics.master import master_of
     from rig.characteristics.tolerance import judged, load_tolerance
 
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"--out {out}: holds something, expected a new or empty folder")
     if junit is not None:
         refuse_existing(junit)
-    if tolerance is None and junit is not None:
-        raise InputError("--junit: says what is kept and what is not, expected --tolerance")
+    if tolerance is None and master is None and junit is not None:
+        raise InputError(
+            "--junit: says what is good and what is not, expected --tolerance or --master"
+        )
     band = None if tolerance is None else load_tolerance(tolerance)
     found = [characterise(path, strut) for path in runs]
+    good = None if master is None else master_of(characterise(master, strut))
+    namings = [None if good is None else named(item, good, scatter) for item in found]
     points = [[] if band is None else judged(item.steps, item.damper.kinds, band) for item in found]
-    content: dict[str, object] = {
+    content = _content(found, points, namings, serial, None if band is None else band.name)
+    if out is not None:
+        _write(found, points, namings, serial, content, out)
+    outcomes = _outcomes(found, points, namings)
+    if junit is not None:
+        write_junit(junit, f"rig characterise {serial or ''}".strip(), outcomes)
+    if as_json:
+        print_json(content)
+    else:
+        for item, of, naming in zip(found, points, namings, strict=True):
+            _print(item, of)
+            if naming is not None:
+                console.print(f"Against the master: {naming.words()}.", markup=False)
+        if out is not None:
+            console.print(f"Report: {out / 'report.html'}", markup=False)
+    if any(outcome.failed for outcome in outcomes):
+        raise typer.Exit(FAILED)
+
+
+def _content(
+    found: "list[Characteristics]",
+    points: "list[list[Judged]]",
+    namings: "list[Naming | None]",
+    serial: str | None,
+    band: str | None,
+) -> dict[str, object]:
+    """All of it, for a file."""
+    from rig.characteristics.command import SCHEMA
+
+    return {
         "schema": SCHEMA,
         "serial": serial,
-        "tolerance": None if band is None else band.name,
+        "tolerance": band,
         "records": [
-            item.as_dict() | {"points": [point.as_dict() for point in of]}
-            for item, of in zip(found, points, strict=True)
+            item.as_dict()
+            | {"points": [point.as_dict() for point in of]}
+            | {"against_master": None if naming is None else naming.as_dict()}
+            for item, of, naming in zip(found, points, namings, strict=True)
         ],
     }
-    if out is not None:
-        _write(found, points, serial, content, out)
+
+
+def _outcomes(
+    found: "list[Characteristics]",
+    points: "list[list[Judged]]",
+    namings: "list[Naming | None]",
+) -> list[Outcome]:
+    """What is good and what is not, for a CI server."""
     outcomes = [
         Outcome(
             f"{item.name}: {point.side} at {point.velocity_m_per_s:g} m/s",
@@ -96,22 +159,18 @@ def characterise_command(
         for item, of in zip(found, points, strict=True)
         for point in of
     ]
-    if junit is not None:
-        write_junit(junit, f"rig characterise {serial or ''}".strip(), outcomes)
-    if as_json:
-        print_json(content)
-    else:
-        for item, of in zip(found, points, strict=True):
-            _print(item, of)
-        if out is not None:
-            console.print(f"Report: {out / 'report.html'}", markup=False)
-    if any(outcome.failed for outcome in outcomes):
-        raise typer.Exit(FAILED)
+    outcomes += [
+        Outcome(f"{item.name}: against the master", naming.words(), not naming.is_good)
+        for item, naming in zip(found, namings, strict=True)
+        if naming is not None
+    ]
+    return outcomes
 
 
 def _write(
     found: "list[Characteristics]",
     points: "list[list[Judged]]",
+    namings: "list[Naming | None]",
     serial: str | None,
     content: dict[str, object],
     out: Path,
@@ -124,7 +183,7 @@ def _write(
         (out / "characteristics.json").write_text(text, "utf-8")
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
-    write_characteristics_page(found, out / "report.html", points, serial)
+    write_characteristics_page(found, out / "report.html", points, namings, serial)
 
 
 def _print(item: "Characteristics", points: "list[Judged]") -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure as Drawing
 
 from rig.characteristics.command import AtRest, Characteristics
+from rig.characteristics.deviations import Naming
 from rig.characteristics.figures import SIDES, Step
 from rig.characteristics.stroke_force import ANGLES, Figure
 from rig.characteristics.tolerance import Judged
@@ -34,6 +35,7 @@ def write_characteristics_page(
     found: Sequence[Characteristics],
     path: Path,
     points: Sequence[Sequence[Judged]] = (),
+    namings: Sequence[Naming | None] = (),
     serial: str | None = None,
 ) -> None:
     """Write the page of one record, or of several laid over one another.
@@ -42,6 +44,7 @@ def write_characteristics_page(
         found: The records.
         path: New HTML file.
         points: How each record stands in a band; empty without one.
+        namings: What each record is against a master; empty without one.
         serial: Serial number.
 
     Raises:
@@ -55,20 +58,27 @@ def write_characteristics_page(
         picture="data:image/svg+xml;base64,"
         + base64.b64encode(draw(found, points)).decode("ascii"),
         serial=serial,
-        badge=_badge(points),
+        badge=_badge(points, namings),
         records=[
-            _record(item) | {"points": of}
-            for item, of in zip(found, points or [()] * len(found), strict=True)
+            _record(item) | {"points": of, "naming": naming}
+            for item, of, naming in zip(
+                found, points or [()] * len(found), namings or [None] * len(found), strict=True
+            )
         ],
     )
     write_page(text, path)
 
 
-def _badge(points: Sequence[Sequence[Judged]]) -> tuple[str, str, str] | None:
-    """Tone, sign and words of the whole verdict; None without a band."""
+def _badge(
+    points: Sequence[Sequence[Judged]], namings: Sequence[Naming | None]
+) -> tuple[str, str, str] | None:
+    """Tone, sign and words of the whole verdict; None without a band and a master."""
     verdicts = {point.verdict for of in points for point in of}
+    against = [naming for naming in namings if naming is not None]
+    if any(not naming.is_good for naming in against) and "fail" not in verdicts:
+        return "bad", "✕", "Not as its master"
     if not verdicts:
-        return None
+        return ("good", "✓", "As its master") if against else None
     if "fail" in verdicts:
         return "bad", "✕", "Out of tolerance"
     return ("good", "✓", "In tolerance") if verdicts == {"pass"} else ("part", "?", "Not proven")

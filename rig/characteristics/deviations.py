@@ -1,0 +1,443 @@
+"""What is wrong with a damper that is not as its master: named, with its size.
+
+Every fault that is known is run in the master, step by step; what it changes there is held against
+what the damper's mean strokes differ by from the master's. Good dampers differ too: by their
+measurement, and by what manufacturing scatters in gas force, friction, damping below and above the
+knee, and the knee's place. A fault is named where it explains far more than both.
+
+The comparison is that of Gaussian likelihoods: differences are normal about what a fault of some
+size makes of them, with a covariance of measurement, scatter and the model's own coarseness; the
+best size of each fault is found, and what it lowers the chi-squared by is held against
+`_NAMED` (Wilks, Ann. Math. Stat. 9, 1938).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve  # pyright: ignore[reportUnknownVariableType]
+
+from rig.characteristics.command import Characteristics
+from rig.characteristics.comparison import paired
+from rig.characteristics.figures import Step
+from rig.characteristics.master import (
+    Curve,
+    Cycle,
+    Master,
+    cycle_of,
+    with_compliance,
+    with_play,
+)
+from rig.characteristics.stroke_force import FINE, Figure, MeanStroke
+from rig.inputs.errors import InputError
+
+Array = NDArray[np.float64]
+
+_NAMED = 25.0
+"""Fall of chi-squared from which on a fault is named: of differences that are normal one family in
+a million reaches it by chance; the rest is for dampers that are not what the model says
+(`python -m tests.characteristics.population`)."""
+
+_BINS = 24
+"""Parts of a stroke whose samples' means are held against the master."""
+
+_OWN_SHARE = 0.004
+"""Of the largest force of a step: what the model leaves out at each angle by itself."""
+
+_DAMPING_SHARE = 0.01
+"""Of the damping at each angle: the same."""
+
+_MODEL_SHARE = 0.1
+"""Of what a fault changes: how well the run of it in the master is known."""
+
+_MOST_FAULTS = 2
+_SIZES = 241
+"""Sizes of a fault that are tried."""
+
+_FALL = 3.84
+"""Rise of chi-squared at the ends of a 95 % interval of one size."""
+
+
+class Fault(NamedTuple):
+    """Something that can be wrong.
+
+    Attributes:
+        name: What it is called.
+        quantity: What its size is.
+        unit: Unit of the size.
+        sizes: Sizes that are tried, rising, shape (K,).
+        changes: What each changes of the stacked forces, shape (K, N).
+    """
+
+    name: str
+    quantity: str
+    unit: str
+    sizes: Array
+    changes: Array
+
+
+class Named(NamedTuple):
+    """A fault that was found.
+
+    Attributes:
+        name: What it is called.
+        quantity: What its size is.
+        unit: Unit of the size.
+        size: Its size, with a 95 % interval.
+        evidence: By how much it lowers chi-squared.
+    """
+
+    name: str
+    quantity: str
+    unit: str
+    size: Figure
+    evidence: float
+
+    def as_dict(self) -> dict[str, object]:
+        """For a file."""
+        return {**self._asdict(), "size": self.size.as_dict()}
+
+    def words(self) -> str:
+        """The same in a line."""
+        size, unit = self.size, f" {self.unit}" if self.unit else ""
+        return (
+            f"{self.name}: {self.quantity} {size.value:.3g}{unit} "
+            f"({size.low:.3g} to {size.high:.3g})"
+        )
+
+
+class Naming(NamedTuple):
+    """What a damper is against its master.
+
+    Attributes:
+        named: Faults, the one that explains most first; empty of a good damper.
+        is_good: Whether it differs by no more than good dampers do.
+        explained: Share of the chi-squared beyond a good damper's that the faults explain; 1 of a
+            good damper.
+    """
+
+    named: tuple[Named, ...]
+    is_good: bool
+    explained: float
+
+    def words(self) -> str:
+        """The same in a sentence."""
+        if self.is_good:
+            return "as its master, within what manufacturing scatters"
+        if not self.named:
+            return "not as its master, and no fault that is known explains it"
+        found = "; ".join(item.words() for item in self.named)
+        return f"{found}: explains {100 * self.explained:.0f} % of what differs"
+
+    def as_dict(self) -> dict[str, object]:
+        """For a file."""
+        return {**self._asdict(), "named": [item.as_dict() for item in self.named]}
+
+
+class _Stack(NamedTuple):
+    """The forces of a damper less the master's, part by part of every stroke.
+
+    Attributes:
+        strokes: The master's strokes, in their order.
+        gathers: Of each stroke the means over its parts as rows over `FINE`, shape (parts, 361).
+        less_n: Differences, shape (N,).
+        noise_n: Standard deviation of each by the noise of its samples, shape (N,).
+    """
+
+    strokes: tuple[MeanStroke, ...]
+    gathers: tuple[Array, ...]
+    less_n: Array
+    noise_n: Array
+
+    def gathered(self, fine: Sequence[Array]) -> Array:
+        """Curves over `FINE` of every stroke, shape (..., 361), as means over its parts."""
+        parts = [curve @ rows.T for curve, rows in zip(fine, self.gathers, strict=True)]
+        return np.concatenate(parts, axis=-1)
+
+
+def _stack(steps: Sequence[tuple[Step, Step]]) -> _Stack:
+    strokes: list[MeanStroke] = []
+    gathers: list[Array] = []
+    less: list[Array] = []
+    noise: list[Array] = []
+    for theirs, mine in steps:
+        for own, good in zip(mine.strokes, theirs.strokes, strict=True):
+            part = np.arange(len(FINE)) * _BINS // len(FINE)
+            counts = np.bincount(part, weights=own.samples, minlength=_BINS)
+            filled = np.flatnonzero(counts)
+            rows = (part == filled[:, None]) * own.samples / counts[filled, None]
+            means = np.bincount(part, weights=own.sums_n, minlength=_BINS)[filled] / counts[filled]
+            strokes.append(good)
+            gathers.append(rows)
+            less.append(means - rows @ _fine(good))
+            noise.append(good.noise_n / np.sqrt(counts[filled]))
+    return _Stack(tuple(strokes), tuple(gathers), np.concatenate(less), np.concatenate(noise))
+
+
+def _fine(stroke: MeanStroke) -> Array:
+    return stroke.row(FINE) @ stroke.force_n
+
+
+def named(found: Characteristics, master: Master, scatter: float) -> Naming:
+    """What is wrong with a damper.
+
+    Args:
+        found: The damper.
+        master: The good one, of the same test.
+        scatter: Relative standard deviation that manufacturing leaves of each property.
+
+    Raises:
+        InputError: No step of one has a partner in the other.
+    """
+    steps = paired(master.characteristics, found)
+    if not steps:
+        raise InputError(
+            f"{found.name}, {master.characteristics.name}: no step of one speed and amplitude in "
+            "common, expected the same test as the master's"
+        )
+    stack = _stack(steps)
+    faults = [
+        fault._replace(changes=stack.gathered(np.split(fault.changes, len(stack.strokes), axis=1)))
+        for fault in faults_of(master, [theirs for theirs, _ in steps])
+    ]
+    covariance, left = _covariance(stack, master, scatter), stack.less_n
+    count = len(left)
+    before = _chi_squared(left, covariance)
+    beyond = max(before - count, 1.0)
+    kept: list[Named] = []
+    for _ in range(_MOST_FAULTS):
+        rest = [item for item in faults if item.name not in [one.name for one in kept]]
+        best = min((_tried(item, left, covariance) for item in rest), key=lambda item: item.misfit)
+        if before - best.misfit < _NAMED:
+            break
+        fault = best.fault
+        kept.append(Named(fault.name, fault.quantity, fault.unit, best.size, before - best.misfit))
+        # What a fault makes is known but so well, and the less the more it makes.
+        left = left - best.explained_n
+        covariance = covariance + np.diag((_MODEL_SHARE * best.explained_n) ** 2)
+        before = _chi_squared(left, covariance)
+    remains = max(before - count, 0.0)
+    is_good = not kept and remains <= (_WORST_MISFIT - 1.0) * count
+    return Naming(tuple(kept), is_good, 1.0 if is_good else max(1.0 - remains / beyond, 0.0))
+
+
+_WORST_MISFIT = 1.5
+"""Chi-squared over the number of forces up to which a damper with no fault that has a name is good;
+the good ones of the study have 0.6 to 1.2."""
+
+
+class _Tried(NamedTuple):
+    """A fault at its best size.
+
+    Attributes:
+        fault: The fault.
+        size: Its best size, with its interval.
+        misfit: Chi-squared there.
+        explained_n: What it makes of the differences.
+    """
+
+    fault: Fault
+    size: Figure
+    misfit: float
+    explained_n: Array
+
+
+def _tried(fault: Fault, left: Array, covariance: Array) -> _Tried:
+    """A fault at its best size."""
+    sizes: Array = np.linspace(float(fault.sizes[0]), float(fault.sizes[-1]), _SIZES)
+    columns: list[Array] = [
+        np.interp(sizes, fault.sizes, fault.changes[:, place]).astype(np.float64)
+        for place in range(fault.changes.shape[1])
+    ]
+    changes: Array = np.array(columns).T
+    apart = left - changes
+    factor = cast("Any", cho_factor)(covariance, lower=True)
+    solved = cast("Any", cho_solve)(factor, apart.T).T
+    chi: Array = np.einsum("ij,ij->i", apart, solved)
+    best = int(np.argmin(chi))
+    within = sizes[chi <= float(chi[best]) + _FALL]
+    value, step = float(sizes[best]), float(sizes[1] - sizes[0])
+    size = Figure(
+        value, float(within[0]) - step, float(within[-1]) + step, "profile of the likelihood"
+    )
+    return _Tried(fault, size, float(chi[best]), changes[best])
+
+
+def _chi_squared(left: Array, covariance: Array) -> float:
+    factor = cast("Any", cho_factor)(covariance, lower=True)
+    return float(left @ cast("Any", cho_solve)(factor, left))
+
+
+def _covariance(stack: _Stack, master: Master, scatter: float) -> Array:
+    """Of the differences between two good dampers."""
+    whole = np.diag(stack.noise_n**2)
+    parts: dict[str, list[Array]] = {}
+    begin = 0
+    for stroke, rows in zip(stack.strokes, stack.gathers, strict=True):
+        here = slice(begin, begin + len(rows))
+        begin += len(rows)
+        columns = _properties(stroke, master)
+        damping = rows @ (columns["compression"] + columns["rebound"])
+        largest = float(np.abs(stroke.force_n).max())
+        extra = (_OWN_SHARE * largest) ** 2 + (_DAMPING_SHARE * damping) ** 2
+        of_master = rows @ stroke.row(FINE)
+        whole[here, here] += of_master @ stroke.covariance @ of_master.T + np.diag(extra)
+        for name, column in columns.items():
+            parts.setdefault(name, []).append(column)
+    for curves in parts.values():
+        column = stack.gathered(curves)
+        # The master is one of them too.
+        whole += 2.0 * scatter**2 * np.outer(column, column)
+    return whole
+
+
+def _velocity(stroke: MeanStroke) -> Array:
+    return stroke.row(FINE) @ stroke.velocity_m_per_s
+
+
+def _properties(stroke: MeanStroke, master: Master) -> Mapping[str, Array]:
+    """What each property that scatters makes of a stroke's force at `FINE`, whole."""
+    height = stroke.middle_m + stroke.sign * stroke.amplitude_m * np.sin(FINE)
+    velocity = _velocity(stroke)
+    speed = np.abs(velocity)
+    damping = master.damping(velocity)
+    columns = {
+        "gas": master.gas(height),
+        "friction": np.full_like(FINE, -stroke.sign * master.friction_n),
+    }
+    for side, sign, curve in (
+        ("compression", -1, master.compression),
+        ("rebound", 1, master.rebound),
+    ):
+        is_it = stroke.sign == sign
+        at_zero, upper = curve.upper_line()
+        opens = max(at_zero, 0.0) / max(curve.lower_slope() - upper, 1.0)
+        columns[side] = damping * is_it
+        columns[f"{side} above"] = -sign * upper * np.maximum(speed - opens, 0.0) * is_it
+        less = _less_by_opening(curve, speed, np.array([_SMALL]))[0]
+        columns[f"{side} knee"] = -sign * less / _SMALL * is_it
+    return columns
+
+
+_SMALL = 0.05
+"""Share by which a knee is moved to see what its scatter makes."""
+
+
+def _less_by_opening(curve: Curve, speed: Array, shares: Array) -> Array:
+    """By how much a valve lowers the force that opens at a speed lower by shares, shape (K, N).
+
+    Above the knee a curve is a line, and a knee at a lower speed is the same line lower down.
+    """
+    at_zero, upper = curve.upper_line()
+    good, lines = curve.force(speed), at_zero * (1.0 - shares[:, None]) + upper * speed
+    # A knee is no corner: that the curve is below its own line there is no fault.
+    return np.minimum(good, lines) - np.minimum(good, at_zero + upper * speed)
+
+
+def faults_of(master: Master, steps: Sequence[Step]) -> list[Fault]:
+    """All faults that are known, run in the master.
+
+    Args:
+        master: The good damper.
+        steps: Steps of its record.
+
+    Returns:
+        Faults whose changes are those at `FINE` of all strokes of the steps, one after the other.
+    """
+    strokes = [stroke for step in steps for stroke in step.strokes]
+    gas = np.concatenate([_properties(stroke, master)["gas"] for stroke in strokes])
+    against = np.repeat([-float(stroke.sign) for stroke in strokes], len(FINE))
+    lost = np.linspace(-1.0, 1.0, 21)
+    more_n = np.linspace(-master.friction_n, 20.0 * max(master.friction_n, 5.0), 41)
+    gives = _gives(master)
+    plays = np.concatenate([[0.0], np.geomspace(2e-5, 2e-3, 24)])
+    rates = 1e6 / np.maximum(gives, 1e-3 * gives[1])
+    return [
+        Fault("gas pressure", "share of it lost", "", lost, -lost[:, None] * gas),
+        Fault("seal friction", "more by", "N", more_n, more_n[:, None] * against),
+        Fault(
+            "air in the oil",
+            "the oil gives by",
+            "mm/kN",
+            gives,
+            _run(steps, lambda cycle: with_compliance(master, cycle, rates)),
+        ),
+        Fault(
+            "play",
+            "of",
+            "mm",
+            1e3 * plays,
+            _run(steps, lambda cycle: with_play(master, cycle, plays)),
+        ),
+        *[_early(master, strokes, sides) for sides in _SIDES if _bend(master, sides)],
+        *[_weaker(master, strokes, sides) for sides in _SIDES],
+    ]
+
+
+_SIDES = (("compression",), ("rebound",), ("compression", "rebound"))
+
+
+def _bend(master: Master, sides: Sequence[str]) -> bool:
+    """Whether the curves of some sides bend at a knee: what a valve that opens makes."""
+    curves = [getattr(master, side) for side in sides]
+    return all(curve.upper_line()[0] > _BEND * curve.force_n[-2] for curve in curves)
+
+
+_BEND = 0.1
+"""Force at no speed of the upper line, over the largest force, from which on a curve has a knee."""
+
+
+def _early(master: Master, strokes: Sequence[MeanStroke], sides: Sequence[str]) -> Fault:
+    """A valve that blows off at a lower speed, and from there on has the slope it has above."""
+    shares = np.linspace(0.0, 0.9, 31)
+    rows: list[Array] = []
+    for stroke in strokes:
+        side, curve = (
+            ("compression", master.compression) if stroke.sign < 0 else ("rebound", master.rebound)
+        )
+        if side not in sides:
+            rows.append(np.zeros((len(shares), len(FINE))))
+            continue
+        less = _less_by_opening(curve, np.abs(_velocity(stroke)), shares)
+        rows.append(-stroke.sign * less)
+    name = f"blow-off early in {' and '.join(sides)}"
+    changes = np.concatenate(rows, axis=1)
+    return Fault(name, "speed of opening lower by the share", "", shares, changes)
+
+
+def _weaker(master: Master, strokes: Sequence[MeanStroke], sides: Sequence[str]) -> Fault:
+    """Another damping at all speeds alike: a valve or an oil of another kind."""
+    shares = np.linspace(-1.0, 1.0, 21)
+    rows = [sum(_properties(stroke, master)[side] for side in sides) for stroke in strokes]
+    name = f"another damping in {' and '.join(sides)}"
+    changes = shares[:, None] * np.concatenate(rows)
+    return Fault(name, "at all speeds more by the share", "", shares, changes)
+
+
+def _gives(master: Master) -> Array:
+    """How far the oil gives way, in mm/kN, up to half the amplitude at the largest force."""
+    largest = max(float(master.compression.force_n[-2]), float(master.rebound.force_n[-2]))
+    amplitude = max(step.amplitude_m for step in master.characteristics.steps)
+    most = 0.5 * amplitude / largest * 1e6
+    return np.concatenate([[0.0], np.geomspace(1e-3 * most, most, 24)])
+
+
+def _run(steps: Sequence[Step], run: Callable[[Cycle], Array]) -> Array:
+    """What a fault's sizes change of a cycle of each step, along its strokes; first size: none."""
+    parts: list[Array] = []
+    for step in steps:
+        made = run(cycle_of(step))
+        changes = made - made[0]
+        parts += [_along(stroke, changes) for stroke in step.strokes]
+    return np.concatenate(parts, axis=1)
+
+
+def _along(stroke: MeanStroke, changes: Array) -> Array:
+    """Changes over a cycle at the angles of a stroke; a cycle begins in the middle of rebound."""
+    turn = FINE if stroke.sign > 0 else np.pi + FINE
+    times = changes.shape[1]
+    place = turn / (2.0 * np.pi) * times % times
+    grid: Array = np.arange(times + 1, dtype=np.float64)
+    closed = np.concatenate([changes, changes[:, :1]], axis=1)
+    return np.array([np.interp(place, grid, row) for row in closed], dtype=np.float64)
