@@ -89,14 +89,7 @@ def characterise_command(
     from rig.characteristics.master import master_of
     from rig.characteristics.tolerance import judged, load_tolerance
 
-    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"--out {out}: holds something, expected a new or empty folder")
-    if junit is not None:
-        refuse_existing(junit)
-    if tolerance is None and master is None and junit is not None:
-        raise InputError(
-            "--junit: says what is good and what is not, expected --tolerance or --master"
-        )
+    _refuse(out, junit, is_judged=tolerance is not None or master is not None)
     band = None if tolerance is None else load_tolerance(tolerance)
     found = [characterise(path, strut) for path in runs]
     good = None if master is None else master_of(characterise(master, strut))
@@ -119,6 +112,16 @@ def characterise_command(
             console.print(f"Report: {out / 'report.html'}", markup=False)
     if any(outcome.failed for outcome in outcomes):
         raise typer.Exit(FAILED)
+
+
+def _refuse(out: Path | None, junit: Path | None, *, is_judged: bool) -> None:
+    """Refuse what would be overwritten, and a test report of nothing."""
+    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"--out {out}: holds something, expected a new or empty folder")
+    if junit is not None:
+        refuse_existing(junit)
+        if not is_judged:
+            raise InputError("--junit: says what is good, expected --tolerance or --master")
 
 
 def _content(

@@ -91,7 +91,7 @@ def test_an_emergency(row):
     assert any(is_faulty for t_ns, is_faulty in reported(trial) if t_ns > BEGIN_NS)
     assert not reported(trial)[-1][1]
     row(
-        18,
+        31,
         "emergency of a CANopen device (EMCY) that sends the height",
         "refuses its frames, estimate invalid (HOLD), MEASUREMENT_FAULT; valid again when the "
         "device reports the error's end, the safe state if that takes longer than 0.5 s",
@@ -107,10 +107,10 @@ def test_a_lost_heartbeat(row):
     # The last one came 100 ms before the fault began, and 250 ms are allowed.
     assert found_ms == pytest.approx(151, abs=1)
     row(
-        19,
+        32,
         "lost heartbeat of a CANopen device (`heartbeat_s: 0.25`), its measurements go on",
         "the same",
-        "heartbeat_s",
+        "250 ms after the last one",
         "what the device sends from then on",
     )
 
@@ -133,7 +133,7 @@ def test_an_alarm_in_the_measurement_itself(row):
     used = [tick for tick in ticks if tick.result.step_input.heights[0] is not None]
     assert len(used) == pytest.approx(len(ticks) / 16, abs=2)
     row(
-        20,
+        33,
         "alarm of a device in the measurement's own frame (`alarms`)",
         "refuses that very frame, and the same",
         0.0,
@@ -157,7 +157,7 @@ def test_a_payload_of_another_length(row):
     assert found_ms <= 12
     assert ticks[-1].counts.wrong_length == END_MS - BEGIN_NS // MS
     row(
-        21,
+        34,
         "frames of another length (a PDO that somebody mapped anew)",
         "refuses and counts each (`wrong_length`); estimate invalid (HOLD), then the safe state",
         found_ms,
