@@ -52,6 +52,9 @@ _DAMPING_SHARE = 0.01
 _MODEL_SHARE = 0.1
 """Of what a fault changes: how well the run of it in the master is known."""
 
+_SIZE_SHARE = 0.15
+"""Of a size: how well the run of a fault in the master tells it."""
+
 _MOST_FAULTS = 2
 _SIZES = 241
 """Sizes of a fault that are tried."""
@@ -259,8 +262,13 @@ def _tried(fault: Fault, left: Array, covariance: Array) -> _Tried:
     best = int(np.argmin(chi))
     within = sizes[chi <= float(chi[best]) + _FALL]
     value, step = float(sizes[best]), float(sizes[1] - sizes[0])
+    low, high = float(within[0]) - step, float(within[-1]) + step
+    more = _SIZE_SHARE * abs(value)
     size = Figure(
-        value, float(within[0]) - step, float(within[-1]) + step, "profile of the likelihood"
+        value,
+        value - float(np.hypot(value - low, more)),
+        value + float(np.hypot(high - value, more)),
+        "profile of the likelihood, and what the run in the master is known by",
     )
     return _Tried(fault, size, float(chi[best]), changes[best])
 

@@ -1,6 +1,6 @@
 """What in a record may mislead, in words, before its figures are read."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,10 @@ Array = NDArray[np.float64]
 
 _GAP = 2.5
 """Times the usual time between samples: one is missing at least, however the clock jitters."""
+
+_CLIPPED_SAMPLES, _CLIPPED_STEPS = 4, 4.0
+"""Samples in a row at the end of a range, and steps of the channel by which it comes there, from
+which on it is cut off."""
 
 _USED_SHARE = 0.8
 """Strokes that are of a step below which it is said: ramps between steps are some in a hundred."""
@@ -42,8 +46,38 @@ def quality(
         rests: Beginning, height and force of each time at rest.
         strokes: How many strokes the record has.
     """
-    said = [*_gaps(t_s), *_few_samples(t_s, steps), *_coarse(force_n), *_drift(rests)]
+    first = preflight(t_s, {"force": force_n})
+    said = [*first, *_few_samples(t_s, steps), *_coarse(force_n), *_drift(rests)]
     return (*_sign(steps), *_left_out(steps, strokes), *said)
+
+
+def preflight(t_s: Array, channels: Mapping[str, Array]) -> tuple[str, ...]:
+    """Gaps, and channels that were cut off at an end of their range.
+
+    Args:
+        t_s: Times, increasing, shape (N,).
+        channels: Measured values by their names, each of shape (N,); NaN where there is none.
+    """
+    cut = [text for name, values in channels.items() for text in _clipped(name, values)]
+    return (*_gaps(t_s), *cut)
+
+
+def _clipped(name: str, values: Array) -> list[str]:
+    """A channel that stays at its largest or smallest value, and comes there at a jump."""
+    values = values[np.isfinite(values)]
+    apart = np.abs(np.diff(values))
+    if not np.any(apart):
+        return []
+    step = float(np.min(apart[apart > 0.0]))
+    found: list[str] = []
+    for end, what in ((float(values.max()), "largest"), (float(values.min()), "smallest")):
+        at_end = np.concatenate([[0], (values == end).astype(np.int64), [0]])
+        starts, stops = np.flatnonzero(np.diff(at_end) == 1), np.flatnonzero(np.diff(at_end) == -1)
+        long = starts[(stops - starts >= _CLIPPED_SAMPLES) & (starts > 0)]
+        # A flat top of a channel in steps is one step above its sides.
+        if len(long) and float(np.median(apart[long - 1])) > _CLIPPED_STEPS * step:
+            found.append(f"{name} stays at its {what} value {end:.6g}, {len(long)} times: clipped?")
+    return found
 
 
 def _sign(steps: Sequence[Step]) -> list[str]:

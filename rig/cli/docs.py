@@ -1,5 +1,6 @@
 """`rig docs`."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,8 +19,19 @@ def docs(
     from rig.pages.reference import write_reference
 
     parent: Any = context.parent
-    texts = {name: _help(parent, name) for name in parent.command.list_commands(parent)}
+    texts = dict(_texts(parent))
     console.print(f"Written: {write_reference(folder, texts)}", markup=False)
+
+
+def _texts(parent: Any, before: str = "") -> Iterator[tuple[str, str]]:
+    """Name and help of every command, those of a group under their whole names."""
+    for name in parent.command.list_commands(parent):
+        command = parent.command.get_command(parent, name)
+        if hasattr(command, "list_commands"):
+            group = command.make_context(name, [], parent=parent, resilient_parsing=True)
+            yield from _texts(group, f"{before}{name} ")
+        else:
+            yield f"{before}{name}", _help(parent, name)
 
 
 def _help(parent: Any, name: str) -> str:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rig.characteristics.quality import preflight
 from rig.exchange.array_tables import READERS, array_columns
 from rig.exchange.imported import ImportReport
 from rig.exchange.mapping import Mapping, outputs_of
@@ -21,7 +22,7 @@ def import_table(source: Path, mapping: Mapping, out: Path) -> ImportReport:
     The text is read in pieces, so memory does not grow with the width of the table.
 
     Args:
-        source: Text file, or a file of MF4, TDMS, MATLAB or a worksheet whose channels are named
+        source: Text file, or a file of MF4, TDMS, MTS or a worksheet whose channels are named
             as the mapping's columns.
         mapping: What it means.
         out: CSV file to write; it must not exist.
@@ -55,6 +56,7 @@ def import_table(source: Path, mapping: Mapping, out: Path) -> ImportReport:
     if missing:
         said.append(f"height_m is missing in {missing} of {len(t_s)} rows; its cells are empty")
     said += _said_of_signs(mapping)
+    said += preflight(t_s, dict(zip(names[1:], values, strict=True)))
     duration_s = float(t_s[-1] - t_s[0])
     rate_hz = 1.0 / float(np.median(np.diff(t_s)))
     return ImportReport(out, len(t_s), duration_s, rate_hz, names, tuple(said))

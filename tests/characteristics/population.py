@@ -214,13 +214,34 @@ def short(names: list[str], is_good: bool) -> str:
     )
 
 
+def true_sizes(fault, damper) -> list[float]:
+    """Size of a fault against the master; none where its equations have no such size."""
+    good = Damper()
+    if fault == "gas pressure":
+        return [1.0 - damper.gas_n / good.gas_n]
+    if fault == "seal friction":
+        return [damper.friction_n - good.friction_n]
+    if fault == "play":
+        return [1e3 * damper.play_m]
+    if fault == "blow-off early":
+        shares = [1.0 - damper.opens / good.opens, 1.0 - damper.opens_up / good.opens_up]
+        return [share for share in shares if share > 0.2]
+    return []
+
+
 def study(dampers: int, seed: int, processes: int) -> Mapping[str, Counter[str]]:
     """What dampers were named, by what they are."""
     found: dict[str, Counter[str]] = {name: Counter() for name in FAULTS}
     with ProcessPoolExecutor(processes, initializer=start) as pool:
         for fault, names, naming, damper in pool.map(one, jobs(dampers, seed), chunksize=4):
             found[fault][short(names, naming.is_good)] += 1
-            if short(names, naming.is_good) != fault:
+            if short(names, naming.is_good) == fault:
+                held = [
+                    naming.named[0].size.low <= size <= naming.named[0].size.high
+                    for size in true_sizes(fault, damper)
+                ]
+                found[fault]["(size held)"] += bool(held) and all(held)
+            else:
                 sizes = [f"{item.words()}, {item.evidence:.0f}" for item in naming.named]
                 print(f"{fault}: {sizes or 'good'}, explained {naming.explained:.2f}, {damper}")
     return found

@@ -383,3 +383,12 @@ def test_forces_that_no_machine_reaches_are_refused():
     t_s, x_m, v = sine(2.0, 5.0)
     with pytest.raises(InputError, match="expected at most 1e"):
         of_arrays("huge", t_s, 0.3 + x_m, -1e155 * v)
+
+
+def test_a_force_that_is_cut_off_is_said():
+    t_s, x_m, v = sine(2.0, 5.0)
+    force_n = -1500.0 * v
+    said = of_arrays("clipped", t_s, 0.3 + x_m, np.clip(force_n, -1e9, 250.0)).quality
+    assert "force stays at its largest value 250" in " ".join(said)
+    coarse = np.round(force_n / 20.0) * 20.0  # flat tops of a step are none
+    assert "stays" not in " ".join(of_arrays("coarse", t_s, 0.3 + x_m, coarse).quality)
