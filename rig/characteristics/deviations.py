@@ -26,6 +26,7 @@ from rig.characteristics.master import (
     Cycle,
     Master,
     cycle_of,
+    refuse_unlike,
     with_compliance,
     with_play,
 )
@@ -46,8 +47,11 @@ _BINS = 24
 _OWN_SHARE = 0.004
 """Of the largest force of a step: what the model leaves out at each angle by itself."""
 
-_DAMPING_SHARE = 0.01
+_DAMPING_SHARE = 0.02
 """Of the damping at each angle: the same."""
+
+_EXPLAINED = 0.5
+"""Share of what differs that faults have to explain to be named."""
 
 _MODEL_SHARE = 0.1
 """Of what a fault changes: how well the run of it in the master is known."""
@@ -56,7 +60,7 @@ _SIZE_SHARE = 0.15
 """Of a size: how well the run of a fault in the master tells it."""
 
 _MOST_FAULTS = 2
-_SIZES = 241
+_SIZES = 401
 """Sizes of a fault that are tried."""
 
 _FALL = 3.84
@@ -72,6 +76,8 @@ class Fault(NamedTuple):
         unit: Unit of the size.
         sizes: Sizes that are tried, rising, shape (K,).
         changes: What each changes of the stacked forces, shape (K, N).
+        least: Smallest that can be.
+        most: Largest.
     """
 
     name: str
@@ -79,6 +85,8 @@ class Fault(NamedTuple):
     unit: str
     sizes: Array
     changes: Array
+    least: float = -np.inf
+    most: float = np.inf
 
 
 class Named(NamedTuple):
@@ -105,9 +113,11 @@ class Named(NamedTuple):
     def words(self) -> str:
         """The same in a line."""
         size, unit = self.size, f" {self.unit}" if self.unit else ""
+        least = "at least " if np.isinf(size.high) else "at most " if np.isinf(size.low) else ""
+        interval = f"({size.low:.3g} to {size.high:.3g})"
         return (
-            f"{self.name}: {self.quantity} {size.value:.3g}{unit} "
-            f"({size.low:.3g} to {size.high:.3g})"
+            f"{self.name}: {self.quantity} {least}{size.value:.3g}{unit} "
+            f"{'' if least else interval}".rstrip()
         )
 
 
@@ -119,14 +129,24 @@ class Naming(NamedTuple):
         is_good: Whether it differs by no more than good dampers do.
         explained: Share of the chi-squared beyond a good damper's that the faults explain; 1 of a
             good damper.
+        not_compared: Steps of the master that the damper's record has not.
     """
 
     named: tuple[Named, ...]
     is_good: bool
     explained: float
+    not_compared: tuple[str, ...] = ()
+
+    @property
+    def passes(self) -> bool:
+        """Whether it is proven to be as its master: in all of the master's steps."""
+        return self.is_good and not self.not_compared
 
     def words(self) -> str:
         """The same in a sentence."""
+        if self.not_compared:
+            said = self._replace(not_compared=()).words()
+            return f"{said}; not compared: {', '.join(self.not_compared)}"
         if self.is_good:
             return "as its master, within what manufacturing scatters"
         if not self.named:
@@ -194,6 +214,7 @@ def named(found: Characteristics, master: Master, scatter: float) -> Naming:
     Raises:
         InputError: No step of one has a partner in the other.
     """
+    refuse_unlike(found)
     steps = paired(master.characteristics, found)
     if not steps:
         raise InputError(
@@ -223,7 +244,16 @@ def named(found: Characteristics, master: Master, scatter: float) -> Naming:
         before = _chi_squared(left, covariance)
     remains = max(before - count, 0.0)
     is_good = not kept and remains <= (_WORST_MISFIT - 1.0) * count
-    return Naming(tuple(kept), is_good, 1.0 if is_good else max(1.0 - remains / beyond, 0.0))
+    compared = [theirs for theirs, _ in steps]
+    lacking = tuple(
+        f"±{1e3 * step.amplitude_m:.3g} mm at {step.peak_speed_m_per_s:.3g} m/s"
+        for step in master.characteristics.steps
+        if not any(step is one for one in compared)
+    )
+    if kept and remains > (1.0 - _EXPLAINED) * beyond:
+        kept = []  # the nearest fault is no name
+    explained = 1.0 if is_good else max(1.0 - remains / beyond, 0.0)
+    return Naming(tuple(kept), is_good, explained, lacking)
 
 
 _WORST_MISFIT = 1.5
@@ -249,7 +279,9 @@ class _Tried(NamedTuple):
 
 def _tried(fault: Fault, left: Array, covariance: Array) -> _Tried:
     """A fault at its best size."""
-    sizes: Array = np.linspace(float(fault.sizes[0]), float(fault.sizes[-1]), _SIZES)
+    nodes: Array = np.arange(len(fault.sizes), dtype=np.float64)
+    tried: Array = np.linspace(0.0, float(nodes[-1]), _SIZES)
+    sizes: Array = np.interp(tried, nodes, fault.sizes).astype(np.float64)
     columns: list[Array] = [
         np.interp(sizes, fault.sizes, fault.changes[:, place]).astype(np.float64)
         for place in range(fault.changes.shape[1])
@@ -261,13 +293,18 @@ def _tried(fault: Fault, left: Array, covariance: Array) -> _Tried:
     chi: Array = np.einsum("ij,ij->i", apart, solved)
     best = int(np.argmin(chi))
     within = sizes[chi <= float(chi[best]) + _FALL]
-    value, step = float(sizes[best]), float(sizes[1] - sizes[0])
-    low, high = float(within[0]) - step, float(within[-1]) + step
+    value = float(sizes[best])
+    step = float(sizes[min(best + 1, len(sizes) - 1)] - sizes[max(best - 1, 0)])
     more = _SIZE_SHARE * abs(value)
+    low = value - float(np.hypot(value - float(within[0]) + step, more))
+    high = value + float(np.hypot(float(within[-1]) - value + step, more))
+    # A size at the end of those that were tried is that at least, or at most.
+    low = -np.inf if within[0] == sizes[0] and sizes[0] != 0.0 else low
+    high = np.inf if within[-1] == sizes[-1] else high
     size = Figure(
         value,
-        value - float(np.hypot(value - low, more)),
-        value + float(np.hypot(high - value, more)),
+        float(max(low, fault.least)),
+        float(min(high, fault.most)),
         "profile of the likelihood, and what the run in the master is known by",
     )
     return _Tried(fault, size, float(chi[best]), changes[best])
@@ -357,20 +394,31 @@ def faults_of(master: Master, steps: Sequence[Step]) -> list[Fault]:
     strokes = [stroke for step in steps for stroke in step.strokes]
     gas = np.concatenate([_properties(stroke, master)["gas"] for stroke in strokes])
     against = np.repeat([-float(stroke.sign) for stroke in strokes], len(FINE))
-    lost = np.linspace(-1.0, 1.0, 21)
-    more_n = np.linspace(-master.friction_n, 20.0 * max(master.friction_n, 5.0), 41)
+    lost = np.concatenate([[-4.0, -2.0], np.linspace(-1.0, 1.0, 41)])
+    usual_n = max(master.friction_n, 5.0)
+    more_n = np.concatenate(
+        [np.linspace(-master.friction_n, 10.0 * usual_n, 61), usual_n * np.array([20.0, 60.0])]
+    )
     gives = _gives(master)
-    plays = np.concatenate([[0.0], np.geomspace(2e-5, 2e-3, 24)])
+    plays = np.concatenate([[0.0], np.geomspace(2e-5, 8e-3, 32)])
     rates = 1e6 / np.maximum(gives, 1e-3 * gives[1])
     return [
-        Fault("gas pressure", "share of it lost", "", lost, -lost[:, None] * gas),
-        Fault("seal friction", "more by", "N", more_n, more_n[:, None] * against),
+        Fault("gas pressure", "share of it lost", "", lost, -lost[:, None] * gas, most=1.0),
+        Fault(
+            "seal friction",
+            "more by",
+            "N",
+            more_n,
+            more_n[:, None] * against,
+            least=-master.friction_n,
+        ),
         Fault(
             "air in the oil",
             "the oil gives by",
             "mm/kN",
             gives,
             _run(steps, lambda cycle: with_compliance(master, cycle, rates)),
+            least=0.0,
         ),
         Fault(
             "play",
@@ -378,6 +426,7 @@ def faults_of(master: Master, steps: Sequence[Step]) -> list[Fault]:
             "mm",
             1e3 * plays,
             _run(steps, lambda cycle: with_play(master, cycle, plays)),
+            least=0.0,
         ),
         *[_early(master, strokes, sides) for sides in _SIDES if _bend(master, sides)],
         *[_weaker(master, strokes, sides) for sides in _SIDES],
@@ -412,16 +461,17 @@ def _early(master: Master, strokes: Sequence[MeanStroke], sides: Sequence[str]) 
         rows.append(-stroke.sign * less)
     name = f"blow-off early in {' and '.join(sides)}"
     changes = np.concatenate(rows, axis=1)
-    return Fault(name, "speed of opening lower by the share", "", shares, changes)
+    quantity = "speed of opening lower by the share"
+    return Fault(name, quantity, "", shares, changes, least=0.0, most=1.0)
 
 
 def _weaker(master: Master, strokes: Sequence[MeanStroke], sides: Sequence[str]) -> Fault:
     """Another damping at all speeds alike: a valve or an oil of another kind."""
-    shares = np.linspace(-1.0, 1.0, 21)
+    shares = np.concatenate([np.linspace(-1.0, 1.0, 41), [2.0, 4.0]])
     rows = [sum(_properties(stroke, master)[side] for side in sides) for stroke in strokes]
     name = f"another damping in {' and '.join(sides)}"
     changes = shares[:, None] * np.concatenate(rows)
-    return Fault(name, "at all speeds more by the share", "", shares, changes)
+    return Fault(name, "at all speeds more by the share", "", shares, changes, least=-1.0)
 
 
 def _gives(master: Master) -> Array:

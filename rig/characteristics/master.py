@@ -112,6 +112,7 @@ def master_of(found: Characteristics) -> Master:
     Raises:
         InputError: It has no step slow enough for gas force and friction.
     """
+    refuse_unlike(found)
     damper = found.damper
     if damper.gas_force is None or damper.gas_rate is None or damper.friction is None:
         raise InputError(
@@ -138,6 +139,23 @@ def master_of(found: Characteristics) -> Master:
     )
     down, up = (_curve(bare, stroke) for stroke in fastest.strokes)
     return bare._replace(compression=down, rebound=up)
+
+
+def refuse_unlike(found: Characteristics) -> None:
+    """Refuse what a fault cannot be told from: a force of the wrong sign, and a constant speed.
+
+    Raises:
+        InputError: It is such a record.
+    """
+    if any(step.energy_per_cycle.high < 0.0 for step in found.steps):
+        raise InputError(
+            f"{found.name}: the strut gives energy, expected the force of a damper (is its sign "
+            "right?)"
+        )
+    if any(stroke.is_constant for step in found.steps for stroke in step.strokes):
+        raise InputError(
+            f"{found.name}: a step of constant speed, expected sines: faults are run in those"
+        )
 
 
 def _curve(bare: Master, stroke: MeanStroke) -> Curve:
@@ -243,7 +261,11 @@ def with_play(master: Master, cycle: Cycle, plays_m: Array) -> Array:
         is_pushing = (gap <= 0.0) & (held >= 0.0)
         is_pulling = (gap >= plays_m) & (held <= 0.0)
         in_contact = is_pushing | is_pulling
-        found[:, place % _TIMES] = np.where(in_contact, held, 0.0)
         moved = gap + (velocity - free) * cycle.interval_s
-        gap = np.where(in_contact, gap, np.clip(moved, 0.0, plays_m))
+        inside = np.clip(moved, 0.0, plays_m)
+        # The share of the time that is left when the gap closes within it.
+        left = np.abs(moved - inside) / max(abs(velocity - free) * cycle.interval_s, 1e-12)
+        is_held = held <= 0.0 if velocity > free else held >= 0.0
+        found[:, place % _TIMES] = np.where(in_contact, held, held * left * is_held)
+        gap = np.where(in_contact, gap, inside)
     return found

@@ -163,7 +163,7 @@ def _outcomes(
         for point in of
     ]
     outcomes += [
-        Outcome(f"{item.name}: against the master", naming.words(), not naming.is_good)
+        Outcome(f"{item.name}: against the master", naming.words(), not naming.passes)
         for item, naming in zip(found, namings, strict=True)
         if naming is not None
     ]

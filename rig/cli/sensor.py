@@ -103,14 +103,13 @@ def scan_command(
                 found = scan(network, listen_s, progress=bar)
             if height_now_m is not None:
                 origin = _origin(network, found.devices, height_now_m, is_reversed=is_reversed)
+    written = "" if out is None else _write(out, found, config, origin)
     if as_json:
         print_json(_as_dict(found))
-    else:
-        _print(found)
-    if out is not None:
-        written = _write(out, found, config, origin)
-        if not as_json:
-            console.print(written, markup=False)
+        return
+    _print(found)
+    if written:
+        console.print(written, markup=False)
 
 
 @app.command("set", epilog=SET_EXAMPLES)
@@ -156,11 +155,11 @@ def set_command(
     """
     from rig.io.bus import BusConfig
     from rig.sensors.setting import Setting, restore, set_to_work
-    from rig.sensors.undo import read_undo, write_undo
+    from rig.sensors.undo import begin_undo, read_undo, write_undo
 
     config = BusConfig(interface, channel, bitrate)
     if restore_from is not None:
-        if node_id is not None or cycle_ms or heartbeat_ms or sync or new:
+        if node_id is not None or cycle_ms or heartbeat_ms or sync or new or before:
             raise InputError("--restore: expected nothing else to be set beside it")
         changes = read_undo(restore_from)
         with _network(config) as network:
@@ -172,22 +171,26 @@ def set_command(
     if sync and cycle_ms is None:
         raise InputError("--sync: expected --cycle-ms beside it")
     kept = before or Path(f"sensor-{node_id}-before.yaml")
-    if kept.exists():
-        raise InputError(f"--before {kept}: exists, expected a new file (or --restore it first)")
     with _network(config) as network:
         if new:
             _give_node_id(network, node_id)
         setting = Setting(network)
+        begin_undo(kept)
         try:
             set_to_work(setting, node_id, cycle_ms=cycle_ms, sync=sync, heartbeat_ms=heartbeat_ms)
+        except InputError as error:
+            left = f"; what was changed is in {kept}" if setting.changed else ""
+            raise InputError(f"{error}; the device may be left pre-operational{left}") from error
         finally:
             if setting.changed:
                 write_undo(kept, setting.changed)
+            else:
+                kept.unlink(missing_ok=True)
     if setting.changed:
         text = f"{len(setting.changed)} objects were changed; `rig sensor set --restore {kept}`"
-        console.print(f"Node {node_id} is operational; {text} puts them back.", markup=False)
+        console.print(f"Node {node_id} was told to start; {text} puts them back.", markup=False)
     else:
-        console.print(f"Node {node_id} is operational; nothing else had to be changed.")
+        console.print(f"Node {node_id} was told to start; nothing else had to be changed.")
 
 
 @contextlib.contextmanager
@@ -215,6 +218,7 @@ def _origin(
     network: "CanOpenNetwork", devices: "Sequence[Device]", height_m: float, *, is_reversed: bool
 ) -> "Origin":
     """Where the first position sensor stands now."""
+    from can_dbc.units import Dimension, si_conversion
     from rig.sensors.proposal import Origin, positions
 
     if not 0.0 < height_m < 100.0:
@@ -226,8 +230,11 @@ def _origin(
     content = network.read(place.node_id, mapped.index, mapped.subindex)
     if not content or mapped.meaning.is_float:
         raise InputError(f"--height-now-m: node {place.node_id} does not tell its position")
-    raw = int.from_bytes(content, "little", signed=mapped.meaning.is_signed)
-    return Origin(height_m, raw * mapped.meaning.scale * 1e-3, is_reversed)
+    raw = int.from_bytes(content, "little") & (1 << mapped.bits) - 1
+    if mapped.meaning.is_signed and raw >> mapped.bits - 1:
+        raw -= 1 << mapped.bits
+    metre = si_conversion(mapped.meaning.unit, Dimension.LENGTH).factor
+    return Origin(height_m, raw * mapped.meaning.scale * metre, is_reversed)
 
 
 def _from_files(given: "Sequence[str]") -> "Found":

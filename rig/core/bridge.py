@@ -29,6 +29,7 @@ from rig.core.devices import (
     Health,
     after_alarm,
     after_claim,
+    after_data,
     after_frame,
     is_from,
     trouble,
@@ -356,7 +357,8 @@ class Bridge:
             return healths, ledger, values
         if not is_from(self.devices[device], healths[device], frame):
             return healths, ledger, None  # another device sends the same group
-        healths = _alarmed(healths, incoming, values)
+        health = after_data(self.devices[device], healths[device])
+        healths = _alarmed((*healths[:device], health, *healths[device + 1 :]), incoming, values)
         if trouble(self.devices[device], healths[device], frame.t_ns) is None:
             return healths, ledger, values
         counts = ledger.counts

@@ -128,6 +128,17 @@ def is_from(device: Device, health: Health, frame: Frame) -> bool:
     return device.j1939_name is None or frame.arbitration_id & 0xFF == health.address
 
 
+def after_data(device: Device, health: Health) -> Health:
+    """Health after a frame with its data.
+
+    A device that restarted sends such when it is operational, which tells what a heartbeat would
+    where none are watched.
+    """
+    if device.heartbeat_ns or health.state != _BOOT_UP:
+        return health
+    return replace(health, state=OPERATIONAL)
+
+
 def after_alarm(health: Health, place: int, raw: int) -> Health:
     """Health after a frame with an alarm in it.
 

@@ -5,6 +5,7 @@ through it.
 """
 
 import importlib
+import logging
 import struct
 import time
 from collections.abc import Sequence
@@ -33,6 +34,7 @@ def package() -> Any:
     Raises:
         InputError: It is not installed.
     """
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what it says, it also raises
     try:
         return importlib.import_module("canopen")
     except ImportError:

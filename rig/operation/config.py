@@ -268,12 +268,12 @@ class DeviceConfig(_Frozen):
         source_address: Address of a J1939 device at the start; a claim later on changes it.
     """
 
-    node_id: Annotated[int, Field(ge=1, le=LARGEST_NODE_ID)] | None = None
-    emergency_id: Annotated[int, Field(ge=1, le=0x7FF)] | None = None
-    heartbeat_s: Annotated[float, Field(ge=0.001, le=130.0, allow_inf_nan=False)] | None = None
+    node_id: Annotated[int, Field(ge=1, le=LARGEST_NODE_ID, strict=True)] | None = None
+    emergency_id: Annotated[int, Field(ge=1, le=0x7FF, strict=True)] | None = None
+    heartbeat_s: Annotated[float, Field(ge=0.001, le=165.0, allow_inf_nan=False)] | None = None
     alarms: Annotated[tuple[SignalName, ...], Field(max_length=16)] = ()
-    j1939_name: Annotated[int, Field(ge=0, lt=2**64)] | None = None
-    source_address: Annotated[int, Field(ge=0, le=253)] | None = None
+    j1939_name: Annotated[int, Field(ge=0, lt=2**64, strict=True)] | None = None
+    source_address: Annotated[int, Field(ge=0, le=253, strict=True)] | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> "DeviceConfig":

@@ -287,7 +287,11 @@ def _check_devices(config: RunConfig, database: Database, source: Path) -> None:
                 f"{place}: sends none of the signals in {database.path.name}, expected the name of "
                 f"a node that does: {', '.join(senders) or 'the DBC names none'}"
             )
-        for arbitration_id in entry.device(name, is_vital=False).ids:
+        _check_kind(config, database, name, place)
+        ids = entry.device(name, is_vital=False).ids
+        if len(set(ids)) < len(ids):
+            raise InputError(f"{place}.emergency_id: {ids[0]:#x} is the id of its heartbeats")
+        for arbitration_id in ids:
             other = taken.setdefault(arbitration_id, f"devices.{name}")
             if other != f"devices.{name}":
                 raise InputError(
@@ -302,6 +306,18 @@ def _check_devices(config: RunConfig, database: Database, source: Path) -> None:
                     f"{place}.alarms.{number}: {alarm.message}.{alarm.signal}: expected an integer "
                     f"without scale and offset that {name} sends"
                 )
+
+
+def _check_kind(config: RunConfig, database: Database, name: str, place: str) -> None:
+    """Refuse a NAME of J1939 for a device that sends anything else, and an alarm named twice."""
+    entry = config.devices[name]
+    read = {item.message for item in config.subscribed().values()}
+    own = [database.message(item) for item in sorted(read) if database.message(item).sender == name]
+    other = next((item.name for item in own if not item.is_j1939), None)
+    if entry.j1939_name is not None and other is not None:
+        raise InputError(f"{place}.j1939_name: {other} is no message of J1939 in the DBC")
+    if any(entry.alarms.count(alarm) > 1 for alarm in entry.alarms):
+        raise InputError(f"{place}.alarms: a signal stands twice, expected it once")
 
 
 def _check_signal(database: Database, entry: SignalName, key: str) -> None:

@@ -75,7 +75,7 @@ def _badge(
     """Tone, sign and words of the whole verdict; None without a band and a master."""
     verdicts = {point.verdict for of in points for point in of}
     against = [naming for naming in namings if naming is not None]
-    if any(not naming.is_good for naming in against) and "fail" not in verdicts:
+    if any(not naming.passes for naming in against) and "fail" not in verdicts:
         return "bad", "✕", "Not as its master"
     if not verdicts:
         return ("good", "✓", "As its master") if against else None

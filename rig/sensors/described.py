@@ -16,8 +16,11 @@ COB_ID, TRANSMISSION, INHIBIT, EVENT = 1, 2, 3, 5
 
 CYCLE, HEARTBEAT, EMERGENCY, SYNC, SYNC_PERIOD = 0x6200, 0x1017, 0x1014, 0x1005, 0x1006
 OFF, EXTENDED = 1 << 31, 1 << 29
-LAST_SYNCHRONOUS = 240
-"""Largest transmission type that waits for SYNC; 254 and 255 send by themselves."""
+LAST_SYNCHRONOUS, BY_ITSELF = 240, (254, 255)
+"""Largest transmission type that waits for SYNC, and those that send by themselves."""
+
+INHIBIT_UNIT_S = 1e-4
+_FLOAT_BITS = (32, 64)
 
 _MOST_PDOS, _MOST_MAPPED = 16, 64
 _LAST_DUMMY = 0x001F
@@ -56,6 +59,7 @@ class Pdo:
         transmission: Transmission type.
         cycle_s: Time between two frames; None where the device does not tell.
         mapped: What stands in it.
+        note: What of its mapping cannot be read, empty if nothing.
     """
 
     number: int
@@ -64,6 +68,7 @@ class Pdo:
     transmission: int
     cycle_s: float | None
     mapped: tuple[Mapped, ...]
+    note: str = ""
 
     @property
     def length_bytes(self) -> int:
@@ -131,6 +136,7 @@ def described(objects: Objects, node_id: int) -> Device | None:
     ]
     if not pdos:
         notes.append("it sends no process data that is switched on (1800h and after)")
+    notes += [f"TPDO {pdo.number}: {pdo.note}" for pdo in pdos if pdo.note]
     notes += [
         f"TPDO {pdo.number} tells no cycle: its frames are only expected when something changes"
         for pdo in pdos
@@ -158,8 +164,8 @@ def _pdos(objects: Objects, device_type: int) -> Iterator[Pdo]:
         cob_id = number(objects, COMMUNICATION + place, COB_ID)
         if cob_id is None or cob_id & OFF:
             continue
-        mapped = tuple(_mapped(objects, device_type, MAPPING + place))
-        if not mapped:
+        mapped, note = _mapped(objects, device_type, MAPPING + place)
+        if not mapped and not note:
             continue
         is_extended = bool(cob_id & EXTENDED)
         transmission = number(objects, COMMUNICATION + place, TRANSMISSION) or 0
@@ -170,32 +176,42 @@ def _pdos(objects: Objects, device_type: int) -> Iterator[Pdo]:
             transmission=transmission,
             cycle_s=_cycle_s(objects, device_type, place, transmission),
             mapped=mapped,
+            note=note,
         )
 
 
-def _mapped(objects: Objects, device_type: int, index: int) -> Iterator[Mapped]:
+def _mapped(objects: Objects, device_type: int, index: int) -> tuple[tuple[Mapped, ...], str]:
+    """What is mapped, and what of it cannot be read."""
+    made: list[Mapped] = []
     start = 0
     for place in range(1, min(number(objects, index) or 0, _MOST_MAPPED) + 1):
         entry = number(objects, index, place)
-        if entry is None:
-            return
-        bits, found = entry & 0xFF, entry >> 16
-        if bits == 0 or start + bits > 64:
-            return
-        subindex = entry >> 8 & 0xFF
+        bits = 0 if entry is None else entry & 0xFF
+        if entry is None or bits == 0 or start + bits > 64:
+            what = "cannot be read" if entry is None else f"has {bits} bits from bit {start} on"
+            return tuple(made), f"entry {place} {what}: it and what follows are left out"
+        found, subindex = entry >> 16, entry >> 8 & 0xFF
         if found > _LAST_DUMMY:
-            yield Mapped(
-                found, subindex, start, bits, meaning(objects, device_type, found, subindex)
-            )
+            means = meaning(objects, device_type, found, subindex)
+            if means.is_float and bits not in _FLOAT_BITS:
+                note = f"a REAL of {bits} bits, which is none"
+                means = Meaning(means.name, note=note)
+            made.append(Mapped(found, subindex, start, bits, means))
         start += bits
+    return tuple(made), ""
 
 
 def _cycle_s(objects: Objects, device_type: int, place: int, transmission: int) -> float | None:
     """Time between two frames as the objects tell it."""
-    if transmission <= LAST_SYNCHRONOUS:
-        period_us = number(objects, SYNC_PERIOD)
-        return max(transmission, 1) * period_us * 1e-6 if period_us else None
+    if transmission not in BY_ITSELF:
+        # Type 0 waits for a change and SYNC, types above 240 for a request.
+        is_cyclic = 0 < transmission <= LAST_SYNCHRONOUS
+        period_us = number(objects, SYNC_PERIOD) if is_cyclic else None
+        return transmission * period_us * 1e-6 if period_us else None
     event_ms = number(objects, COMMUNICATION + place, EVENT)
     if not event_ms and place == 0 and device_type & 0xFFFF == ENCODER:
         event_ms = number(objects, CYCLE)
-    return event_ms * 1e-3 if event_ms else None
+    if not event_ms:
+        return None
+    inhibit = number(objects, COMMUNICATION + place, INHIBIT) or 0
+    return max(event_ms * 1e-3, inhibit * INHIBIT_UNIT_S)

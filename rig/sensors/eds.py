@@ -4,7 +4,7 @@ Reference: CiA 306, "Electronic data sheet specification for CANopen".
 """
 
 import configparser
-import logging
+import io
 import struct
 import warnings
 from pathlib import Path
@@ -62,6 +62,23 @@ class EdsObjects:
             return None
 
 
+class _Text(io.StringIO):
+    """A text with the name of its file, which tells its format."""
+
+    def __init__(self, text: str, name: str) -> None:
+        super().__init__(text)
+        self.name = name.lower()
+
+
+def _decoded(path: Path) -> str:
+    """Text of a file, in UTF-8 or, as many makers write, Windows-1252."""
+    content = path.read_bytes()
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("cp1252")
+
+
 def _imported(path: Path, node_id: int) -> Any:
     if path.suffix.lower() not in _ENDINGS:
         raise InputError(f"{path}: expected a file .eds or .dcf")
@@ -72,12 +89,10 @@ def _imported(path: Path, node_id: int) -> Any:
     if size > SIZE_MAX_BYTES:
         raise InputError(f"{path}: larger than {SIZE_MAX_BYTES} bytes, expected an EDS file")
     canopen = package()
-    # What it cannot read it says through logging, and goes on.
-    logging.getLogger("canopen").setLevel(logging.CRITICAL)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of how it logs
-            objects = canopen.import_od(str(path), node_id)
+            objects = canopen.import_od(_Text(_decoded(path), path.name), node_id)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except (

@@ -124,14 +124,20 @@ def group_number(arbitration_id: int) -> int:
 
 
 def claims(frames: Sequence[Frame]) -> tuple[Claim, ...]:
-    """Devices that claimed an address, the last claim of each NAME."""
+    """Devices that claimed an address, the last claim of each NAME; of an address the lower NAME.
+
+    A device that could not get one claims the address 254, and has none.
+    """
     found: dict[int, int] = {}
     for frame in frames:
-        if frame.is_extended and group_number(frame.arbitration_id) == _CLAIM:
-            address = frame.arbitration_id & 0xFF
-            if len(frame.data) == 8 and address != _NO_ADDRESS:
-                found[int.from_bytes(frame.data, "little")] = address
-    return tuple(sorted(Claim(address, name) for name, address in found.items()))
+        is_claim = frame.is_extended and group_number(frame.arbitration_id) == _CLAIM
+        if is_claim and len(frame.data) == 8:
+            found[int.from_bytes(frame.data, "little")] = frame.arbitration_id & 0xFF
+    owners: dict[int, int] = {}
+    for name, address in found.items():
+        if address != _NO_ADDRESS:
+            owners[address] = min(name, owners.get(address, name))
+    return tuple(sorted(Claim(address, name) for address, name in owners.items()))
 
 
 def spoken(frames: Sequence[Frame]) -> tuple[Spoken, ...]:

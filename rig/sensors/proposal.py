@@ -10,7 +10,7 @@ from cantools.database.can import Database, Message, Node, Signal
 from cantools.database.conversion import BaseConversion
 
 from can_dbc.database import DEFAULT_DATABASE
-from can_dbc.units import Dimension
+from can_dbc.units import Dimension, si_conversion
 from rig.inputs.errors import InputError
 from rig.io.bus import BusConfig
 from rig.sensors.described import Device, Mapped, Pdo
@@ -90,14 +90,23 @@ def dbc_text(
     for item in spoken:
         _put(messages, _group_message(item))
     bridge = [item for item in own.messages if _BRIDGE in item.senders]
-    kept = [item for item in bridge if (item.frame_id, item.is_extended_frame) not in messages]
+    _move_out_of_the_way(bridge, {key for key, is_extended in messages if not is_extended})
     names = [_BRIDGE, *[device.name for device in devices], *sorted({_node(i) for i in spoken})]
     made = Database(
-        messages=[*messages.values(), *kept],
+        messages=[*messages.values(), *bridge],
         nodes=[Node(name, None) for name in names],
         dbc_specifics=own.dbc,
     )
     return _marked(made.as_dbc_string(), [item.arbitration_id for item in spoken])
+
+
+def _move_out_of_the_way(bridge: Sequence[Message], taken: set[int]) -> None:
+    """Give messages of the bridge whose ids a device sends under the next free ones."""
+    used = taken | {item.frame_id for item in bridge}
+    for item in bridge:
+        if item.frame_id in taken:
+            item.frame_id = next(key for key in range(item.frame_id + 1, 0x800) if key not in used)
+            used.add(item.frame_id)
 
 
 def _marked(text: str, j1939_ids: Sequence[int]) -> str:
@@ -198,10 +207,10 @@ def _message(device: Device, pdo: Pdo, height: Place | None, origin: Origin | No
     for item in pdo.mapped:
         scale, offset = item.meaning.scale, 0.0
         if origin is not None and height == (message_name, names[item], device.node_id, item):
-            # A position is in mm.
             scale = -scale if origin.is_reversed else scale
             reading_m = -origin.reading_m if origin.is_reversed else origin.reading_m
-            offset = (origin.height_m - reading_m) * 1e3
+            metre = si_conversion(item.meaning.unit, Dimension.LENGTH).factor
+            offset = (origin.height_m - reading_m) / metre
         signals.append(_signal(item, names[item], scale, offset))
     return Message(
         frame_id=pdo.arbitration_id,
@@ -325,7 +334,7 @@ def _entry(device: Device) -> dict[str, object]:
     """Entry of a device under `devices`."""
     entry: dict[str, object] = {"node_id": device.node_id, "emergency_id": device.emergency_id}
     if device.heartbeat_s:
-        entry["heartbeat_s"] = round(_HEARTBEATS_MISSED * device.heartbeat_s, 4)
+        entry["heartbeat_s"] = round(_HEARTBEATS_MISSED * device.heartbeat_s, 4)  # up to 164 s
     alarms = [
         {"message": _message_name(device, pdo), "signal": names[item]}
         for pdo in device.pdos

@@ -18,6 +18,7 @@ _ANSWERS, _HEARTBEATS = range(0x581, 0x600), range(0x701, 0x780)
 _ANSWERS_WITHIN_S, _CLAIMS_WITHIN_S = 0.5, 0.5
 """A device answers an SDO within some ms; a J1939 address is claimed within 0.25 s."""
 
+_DEVICE_TYPE, _MOST_MUTE = 0x1000, 3
 _FEWEST = 4
 """Frames of which an interval can be told."""
 
@@ -71,12 +72,24 @@ class _Remote:
         self._network = network
         self._node_id = node_id
         self._known: dict[tuple[int, int], bytes | None] = {}
+        self.mute: list[str] = []
+        """Objects to which there was no answer."""
 
     def read(self, index: int, subindex: int = 0) -> bytes | None:
-        """Content of an object, asked for once."""
+        """Content of an object; none where the device does not answer, which is noted.
+
+        Raises:
+            BusError: It does not answer at all.
+        """
         key = index, subindex
         if key not in self._known:
-            self._known[key] = self._network.read(self._node_id, index, subindex)
+            try:
+                self._known[key] = self._network.read(self._node_id, index, subindex)
+            except BusError:
+                self._known[key] = None
+                self.mute.append(f"{index:04X}h.{subindex}")
+                if index == _DEVICE_TYPE or len(self.mute) > _MOST_MUTE:
+                    raise
         return self._known[key]
 
     def is_signed(self, index: int, subindex: int) -> bool | None:
@@ -114,12 +127,15 @@ def scan(network: CanOpenNetwork, listen_s: float, *, progress: Progress) -> Fou
     devices: list[Device] = []
     for place, node_id in enumerate(nodes if not network.listens_only else ()):
         progress(f"reading node {node_id}", 0.5 + 0.5 * place / len(nodes))
+        remote = _Remote(network, node_id)
         try:
-            device = described(_Remote(network, node_id), node_id)
+            device = described(remote, node_id)
         except BusError:
             device = None  # one that does not answer is listed as silent
         if device is not None:
-            devices.append(_with_cycles(device, traffic))
+            mute = tuple(f"object {name} is not answered: taken for none" for name in remote.mute)
+            noted = replace(device, notes=(*device.notes, *mute))
+            devices.append(_with_cycles(noted, traffic))
     progress("done", 1.0)
     described_ids = [device.node_id for device in devices]
     return Found(

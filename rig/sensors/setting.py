@@ -1,6 +1,6 @@
 """A CANopen device set to work: its cycle, its heartbeat, operational; and put back as it was.
 
-Nothing is stored in the device (1010h is never written): switched off and on, it is as it was too.
+Nothing is stored in the device: switched off and on, it is as it was too.
 
 Reference: CiA 301, 7.5.2: a PDO's communication record is changed while the PDO is switched off.
 """
@@ -12,12 +12,14 @@ from typing import Protocol
 from rig.inputs.errors import InputError
 from rig.io.canopen_network import OPERATIONAL, PRE_OPERATIONAL, RefusedError
 from rig.sensors.described import (
+    BY_ITSELF,
     COB_ID,
     COMMUNICATION,
     CYCLE,
     EVENT,
     HEARTBEAT,
-    LAST_SYNCHRONOUS,
+    INHIBIT,
+    INHIBIT_UNIT_S,
     MAPPING,
     OFF,
     SYNC,
@@ -29,6 +31,10 @@ from rig.sensors.profiles import ENCODER
 _BY_EVENT, _AT_EVERY_SYNC = 255, 1
 _PRODUCES_SYNC = 1 << 30
 _MOST_PDOS = 16
+SETTABLE = frozenset(
+    {HEARTBEAT, SYNC, SYNC_PERIOD, CYCLE, *range(COMMUNICATION, COMMUNICATION + _MOST_PDOS)}
+)
+"""Indices that are ever written; 1010h, which would store them, is not among them."""
 
 
 class Line(Protocol):
@@ -99,9 +105,9 @@ class Setting:
             raise RefusedError(f"{place}: {value} does not fit in {len(before)} bytes") from None
         if content == before:
             return
-        self.line.write(node_id, index, subindex, content)
-        if noted:
+        if noted:  # before: the answer to a write may get lost
             self.changed.append(Changed(node_id, index, subindex, before.hex()))
+        self.line.write(node_id, index, subindex, content)
         after = self.line.read(node_id, index, subindex)
         if after != content:
             held = "nothing" if after is None else str(int.from_bytes(after, "little"))
@@ -125,6 +131,8 @@ def set_to_work(
         BusError: It does not answer.
     """
     line = setting.line
+    if line.read(node_id, 0x1000) is None:
+        raise InputError(f"node {node_id}: has no device type (1000h), expected a CANopen device")
     line.command(node_id, PRE_OPERATIONAL)
     if heartbeat_ms is not None:
         setting.put(node_id, HEARTBEAT, 0, heartbeat_ms, noted=True)
@@ -189,9 +197,11 @@ def _cycle(setting: Setting, node_id: int, place: int, cycle_ms: int, *, sync: b
     setting.put(node_id, index, COB_ID, cob_id | OFF, noted=False)
     try:
         before = _number(line, node_id, index, TRANSMISSION) or 0
-        by_itself = before > LAST_SYNCHRONOUS
-        wanted = _AT_EVERY_SYNC if sync else before if by_itself else _BY_EVENT
+        wanted = _AT_EVERY_SYNC if sync else before if before in BY_ITSELF else _BY_EVENT
         setting.put(node_id, index, TRANSMISSION, wanted, noted=True)
+        inhibit = _number(line, node_id, index, INHIBIT) or 0
+        if inhibit * INHIBIT_UNIT_S > cycle_ms * 1e-3:
+            setting.put(node_id, index, INHIBIT, 0, noted=True)
         if not sync:
             _own_timer(setting, node_id, place, cycle_ms)
     finally:

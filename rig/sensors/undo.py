@@ -5,21 +5,27 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from rig.inputs.errors import InputError
 from rig.inputs.yaml_file import load_validated
-from rig.sensors.setting import Changed
+from rig.sensors.setting import SETTABLE, Changed
 
 _SCHEMA = 1
 _HEX = r"^([0-9a-f]{2}){1,8}$"
+
+
+def _settable(index: int) -> int:
+    if index not in SETTABLE:
+        raise ValueError("expected an object that `rig sensor set` changes")
+    return index
 
 
 class _Entry(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     node_id: Annotated[int, Field(ge=1, le=127)]
-    index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]
+    index: Annotated[int, AfterValidator(_settable)]
     subindex: Annotated[int, Field(ge=0, le=255)]
     before: Annotated[str, Field(pattern=_HEX)]
 
@@ -32,10 +38,10 @@ class _File(BaseModel):
 
 
 def write_undo(path: Path, changes: Sequence[Changed]) -> None:
-    """Write what was held before.
+    """Write what was held before, over what was begun.
 
     Raises:
-        InputError: The file exists, or cannot be written.
+        InputError: The file cannot be written.
     """
     entries = [
         {
@@ -48,12 +54,25 @@ def write_undo(path: Path, changes: Sequence[Changed]) -> None:
     ]
     text = yaml.safe_dump({"schema": _SCHEMA, "changes": entries}, sort_keys=False)
     try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise InputError(f"{path}: exists, expected a new file") from None
+        path.write_text(text, "utf-8")
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+        raise InputError(f"{path}: cannot be written: {error.strerror}: {text!r}") from error
+
+
+def begin_undo(path: Path) -> None:
+    """Make the file before anything is changed, to know that it can be written.
+
+    Raises:
+        InputError: The file exists, or cannot be written.
+    """
+    try:
+        path.open("x").close()
+    except FileExistsError:
+        raise InputError(
+            f"--before {path}: exists, expected a new file (or --restore it first)"
+        ) from None
+    except OSError as error:
+        raise InputError(f"--before {path}: cannot be written: {error.strerror}") from error
 
 
 def read_undo(path: Path) -> list[Changed]:

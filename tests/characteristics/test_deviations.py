@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from rig.characteristics.command import of_arrays
 from rig.characteristics.deviations import named
 from rig.characteristics.master import cycle_of, master_of, with_compliance, with_play
 from rig.cli.main import app
@@ -110,3 +111,29 @@ def test_a_master_without_a_slow_step_is_refused():
     damper = fast.damper._replace(gas_force=None)
     with pytest.raises(InputError, match="5 mm/s or less"):
         master_of(type(fast)(**{**vars(fast), "damper": damper}))
+
+
+def test_what_was_not_compared_does_not_pass():
+    """A record without the fast steps says nothing of what is wrong there."""
+    slow = characterised(Damper(), 5)
+    part = type(slow)(**{**vars(slow), "steps": slow.steps[:4]})
+    naming = named(part, master(), SCATTER)
+    assert naming.is_good
+    assert not naming.passes
+    assert "not compared: ±25 mm at 0.4 m/s" in naming.words()
+
+
+def test_a_size_beyond_all_that_are_tried_is_that_at_least():
+    naming = named(characterised(replace(Damper(), play_m=0.012), 3), master(), SCATTER)
+    found = naming.named[0].size if naming.named else None
+    assert found is None or found.high == float("inf")
+    assert not naming.passes
+
+
+def test_a_force_of_the_wrong_sign_is_refused():
+    t_s, height_m, force_n = record(Damper(), np.random.default_rng(1))
+    wrong = of_arrays("wrong", t_s, height_m, -force_n)
+    with pytest.raises(InputError, match="gives energy"):
+        master_of(wrong)
+    with pytest.raises(InputError, match="gives energy"):
+        named(wrong, master(), SCATTER)

@@ -206,6 +206,10 @@ def test_alarms_are_kept_apart():
     [
         ({"NOBODY": {"node_id": 5}}, "expected the name of a node that does: BENCH"),
         ({"BENCH": {"node_id": 0}}, "devices.BENCH.node_id"),
+        ({"BENCH": {"node_id": True}}, "devices.BENCH.node_id"),
+        ({"BENCH": {"node_id": 5, "emergency_id": 0x705}}, "the id of its heartbeats"),
+        ({"BENCH": {"j1939_name": 7, "source_address": 3}}, "no message of J1939"),
+        ({"BENCH": {"j1939_name": 7}}, "expected node_id"),
         ({"BENCH": {"node_id": 5, "emergency_id": 0x100}}, "0x100 is an id of BENCH_MEASUREMENT"),
         ({"BENCH": {"node_id": 5, "heartbeat_s": -1}}, "devices.BENCH.heartbeat_s"),
         (
@@ -233,3 +237,9 @@ def test_devices_that_cannot_be(tmp_path, devices, expected):
         build_bridge(load_setup(tmp_path / "rig.yaml"))
     assert expected in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_data_after_a_restart_tells_that_a_device_is_operational_where_no_heartbeat_does():
+    trial = Trial({"BENCH": {"node_id": NODE}})
+    ticks = trial.run(400, at(BEGIN_NS // MS, Frame(BEGIN_NS, HEARTBEAT, BOOT_UP)))
+    assert ticks[-1].mode is Mode.RUNNING

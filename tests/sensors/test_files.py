@@ -148,6 +148,7 @@ def test_ten_thousand_mutated_files(tmp_path):
         "schema: 1\nchanges: [{node_id: 0, index: 6144, subindex: 5, before: '0a00'}]\n",
         "schema: 1\nchanges: [{node_id: 5, index: 6144, subindex: 5, before: xyz}]\n",
         "schema: 1\nchanges: [{node_id: 5, index: 6144, subindex: 5}]\n",
+        "schema: 1\nchanges: [{node_id: 5, index: 4112, subindex: 1, before: '73617665'}]\n",
     ],
 )
 def test_undo_files_that_are_wrong(tmp_path, content):

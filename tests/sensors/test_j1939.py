@@ -141,3 +141,10 @@ def test_a_float_that_is_no_number_is_refused(tmp_path, value):
     assert results[0].step_input.heights[0].height_m == 0.5
     assert results[1].step_input.heights[0] is None
     assert state.counts.no_value == 1
+
+
+def test_who_lost_an_address_has_none():
+    low, high = 5, 9
+    told = [claim(32, low), claim(32, high), claim(32, low), claim(0xFE, high)]
+    assert claims(told) == (Claim(32, low),)
+    assert claims([claim(32, high), claim(32, low)]) == (Claim(32, low),)

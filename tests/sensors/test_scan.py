@@ -4,6 +4,7 @@ import itertools
 import json
 
 import can
+import cantools
 import pytest
 from durand import CANBusNetwork, set_scheduler
 from durand.scheduler import VirtualScheduler
@@ -11,12 +12,14 @@ from typer.testing import CliRunner
 
 from can_dbc.codec import compile_decoder
 from can_dbc.database import load_database
-from can_dbc.units import Dimension
+from can_dbc.units import Dimension, si_conversion
 from rig.cli.main import app
 from rig.io.bus import BusConfig
 from rig.io.canopen_network import CanOpenNetwork
 from rig.operation.check import check
 from rig.operation.setup import load_setup
+from rig.sensors.described import described
+from rig.sensors.proposal import Origin, dbc_text
 from rig.sensors.scan import scan
 from rig.sensors.setting import Setting, restore, set_to_work
 from rig.sensors.undo import read_undo, write_undo
@@ -182,3 +185,124 @@ def test_json_is_json(bus, channel):
     result = CliRunner().invoke(app, [*arguments, "--listen-s", "0.05", "--json"])
     (device,) = json.loads(result.stdout)["devices"]
     assert device["pdos"][0]["mapped"][0]["meaning"]["unit"] == "mm"
+
+
+class Listed:
+    """Objects of a device that is not there."""
+
+    def __init__(self, objects):
+        self._objects = objects
+
+    def read(self, index, subindex=0):
+        found = self._objects.get((index, subindex))
+        return None if found is None else found[0].to_bytes(found[1], "little")
+
+    def is_signed(self, index, subindex):
+        return None
+
+
+def encoder_with(mapping, **changed):
+    """A linear encoder with some mapping, by index, subindex and bits."""
+    objects = {
+        (0x1000, 0): (0x00080196, 4),
+        (0x1800, 1): (0x185, 4),
+        (0x1800, 2): (changed.get("transmission", 254), 1),
+        (0x1800, 3): (changed.get("inhibit", 0), 2),
+        (0x1800, 5): (10, 2),
+        (0x1A00, 0): (len(mapping), 1),
+        (0x6005, 1): (5000, 4),
+    }
+    for place, (index, subindex, bits) in enumerate(mapping, 1):
+        objects[0x1A00, place] = (index << 16 | subindex << 8 | bits, 4)
+    return described(Listed(objects), 5)
+
+
+def test_a_mapping_that_cannot_be_read_is_said():
+    device = encoder_with([(0x6004, 0, 32), (0x6503, 0, 0), (0x6030, 1, 16)])
+    assert [item.meaning.name for item in device.pdos[0].mapped] == ["POSITION"]
+    assert any("entry 2 has 0 bits" in note for note in device.notes)
+    whole = encoder_with([(0x6004, 0, 100)])
+    assert any("entry 1 has 100 bits" in note for note in whole.notes)
+
+
+@pytest.mark.parametrize(
+    ("changed", "cycle_s"),
+    [
+        ({}, 0.01),
+        ({"inhibit": 500}, 0.05),
+        ({"transmission": 253}, None),
+        ({"transmission": 0}, None),
+    ],
+)
+def test_how_often_a_device_sends(changed, cycle_s):
+    assert encoder_with([(0x6004, 0, 32)], **changed).pdos[0].cycle_s == cycle_s
+
+
+@pytest.mark.parametrize(("unit", "digits"), [(0x00010000, 4), (0xFD010000, 1), (0xFA010000, 0)])
+def test_a_height_now_is_one_in_any_unit(unit, digits):
+    """A length of a measuring device in m, mm or µm."""
+    objects = {
+        (0x1000, 0): (0x00020194, 4),
+        (0x1800, 1): (0x185, 4),
+        (0x1800, 2): (254, 1),
+        (0x1800, 5): (10, 2),
+        (0x1A00, 0): (1, 1),
+        (0x1A00, 1): (0x91300120, 4),
+        (0x6131, 1): (unit, 4),
+        (0x6132, 1): (digits, 1),
+    }
+    device = described(Listed(objects), 5)
+    mapped = device.pdos[0].mapped[0]
+    metre = si_conversion(mapped.meaning.unit, Dimension.LENGTH).factor
+    raw = round(0.25 / (metre * mapped.meaning.scale))
+    (made,) = [
+        message
+        for message in cantools.database.load_string(
+            dbc_text([device], (), Origin(0.412, 0.25, is_reversed=False))
+        ).messages
+        if message.name == "NODE_5_TPDO1"
+    ]
+    (value,) = made.decode(raw.to_bytes(4, "little")).values()
+    assert float(value) * metre == pytest.approx(0.412, abs=1e-6)
+
+
+def test_a_real_of_no_size_is_no_number():
+    objects = {
+        (0x1000, 0): (0x00020194, 4),
+        (0x1800, 1): (0x185, 4),
+        (0x1A00, 0): (1, 1),
+        (0x1A00, 1): (0x61300110, 4),
+    }
+    device = described(Listed(objects), 5)
+    assert not device.pdos[0].mapped[0].meaning.is_float
+    assert "NODE_5_TPDO1" in dbc_text([device], ())
+
+
+def test_the_bridge_gives_way_to_a_sensor_with_one_of_its_ids():
+    objects = {
+        (0x1000, 0): (0x00080196, 4),
+        (0x1800, 1): (0x110, 4),
+        (0x1A00, 0): (1, 1),
+        (0x1A00, 1): (0x60040020, 4),
+    }
+    text = dbc_text([described(Listed(objects), 5)], ())
+    by_name = {item.name: item for item in cantools.database.load_string(text).messages}
+    assert by_name["NODE_5_TPDO1"].frame_id == 0x110
+    assert by_name["RIG_ESTIMATE"].frame_id not in (0x110, 0x111)
+
+
+def test_a_node_that_is_not_there_is_not_set(channel, tmp_path):
+    before = tmp_path / "before.yaml"
+    arguments = ["sensor", "set", "99", "--interface", "virtual", "--channel", channel]
+    result = CliRunner().invoke(app, [*arguments, "--before", str(before)])
+    assert "no answer" in str(result.exception)
+    assert not before.exists()
+
+
+def test_an_undo_that_cannot_be_written_is_said_before_anything_is_changed(bus, channel):
+    node = encoder(bus(), 5)
+    arguments = ["sensor", "set", "5", "--interface", "virtual", "--channel", channel]
+    given = ["--heartbeat-ms", "50", "--before", "/nonexistent/x.yaml"]
+    result = CliRunner().invoke(app, [*arguments, *given])
+    assert "cannot be written" in str(result.exception)
+    assert node.object_dictionary.read(0x1017, 0) == 0
