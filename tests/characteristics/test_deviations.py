@@ -30,6 +30,7 @@ def master():
     return master_of(characterised(Damper(), 0))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fault", [name for name in FAULTS if name != "another damping"])
 def test_a_fault_is_named(fault):
     rng = np.random.default_rng(7)

@@ -42,6 +42,7 @@ def bus(channel):
     def end():
         opened.append(can.Bus(interface="virtual", channel=channel))
         networks.append(CANBusNetwork(opened[-1]))
+        networks[-1]._notifier.timeout = 0.05  # a second would be waited for at the end
         return networks[-1]
 
     set_scheduler(VirtualScheduler())  # no timer goes off by itself
