@@ -284,8 +284,7 @@ class Bridge:
                 core, readings = self._caught_up(core, heights, others, readings)
                 heights, others = self._no_heights.copy(), list(NO_OTHERS)
             arrived_ns = min(frame.t_ns, t_ns)
-            _put(heights, others, incoming, arrived_ns, values)
-            readings += _read(incoming, arrived_ns, values)
+            _put(heights, others, readings, incoming, arrived_ns, values)
         return _Received(core, heights, others, readings, sequences, ledger, action, healths)
 
     def _caught_up(
@@ -434,25 +433,21 @@ class Bridge:
 def _put(
     heights: list[Measurement | None],
     others: list[float | None],
+    readings: list[Reading],
     incoming: Incoming,
     arrived_ns: int,
     values: Sequence[float],
 ) -> None:
-    """Put the heights and other quantities of a frame where they belong."""
+    """Put the values of a frame where they belong."""
     for target in incoming.heights:
         delay_ns = target.delay_ns
         height_m = values[target.value]
         heights[target.strut] = Measurement(height_m, arrived_ns - delay_ns, delay_ns)
     for target in incoming.others:
         others[target.place] = values[target.value]
-
-
-def _read(incoming: Incoming, arrived_ns: int, values: Sequence[float]) -> list[Reading]:
-    """Readings of further sensors in a frame."""
-    return [
-        Reading(target.sensor, values[target.value], arrived_ns - target.delay_ns)
-        for target in incoming.sensors
-    ]
+    for target in incoming.sensors:
+        value = values[target.value]
+        readings.append(Reading(target.sensor, value, arrived_ns - target.delay_ns))
 
 
 def _alarmed(

@@ -406,7 +406,10 @@ def incoming(message: Message, wanted: Sequence[Wanted], device: int | None = No
         if item.quantity in PLACES
     ]
     alarms = tuple(AlarmTarget(value, *item.alarm) for value, item in placed if item.alarm)
-    read = _reader(message, decode, _check_of_values(message, signals))
+    read = _reader(message, decode)
+    are_values = _check_of_values(message, signals)
+    if are_values is not None:
+        read = _of_values(read, are_values)
     return Incoming(message, read, tuple(heights), tuple(others), tuple(sensors), alarms, device)
 
 
@@ -432,16 +435,28 @@ def _check_of_values(message: Message, signals: Sequence[tuple[str, Dimension]])
     return None
 
 
-def _reader(message: Message, decode: Decoder, are_values: _Check | None) -> Reader:
-    length, ok, no_value = message.length_bytes, Verdict.OK, Verdict.NO_VALUE
+def _of_values(read: Reader, are_values: _Check) -> Reader:
+    """A reader that refuses what is no value; most messages cannot hold such."""
+
+    def checked(
+        sequence: SequenceState, frame: Frame
+    ) -> tuple[SequenceState, Verdict, tuple[float, ...] | None]:
+        sequence, verdict, values = read(sequence, frame)
+        if values is None or are_values(values):
+            return sequence, verdict, values
+        return sequence, Verdict.NO_VALUE, None
+
+    return checked
+
+
+def _reader(message: Message, decode: Decoder) -> Reader:
+    length, ok = message.length_bytes, Verdict.OK
 
     def read_unprotected(
         sequence: SequenceState, frame: Frame
     ) -> tuple[SequenceState, Verdict, tuple[float, ...] | None]:
         values = decode(frame.data)
         # A multiplexed frame without these signals is no fault, a short one is.
-        if values is not None and are_values is not None and not are_values(values):
-            return sequence, no_value, None
         is_short = values is None and len(frame.data) != length
         return sequence, Verdict.WRONG_LENGTH if is_short else ok, values
 
@@ -454,10 +469,7 @@ def _reader(message: Message, decode: Decoder, are_values: _Check | None) -> Rea
     ) -> tuple[SequenceState, Verdict, tuple[float, ...] | None]:
         data = frame.data
         sequence, verdict = check(sequence, data, frame.t_ns)
-        values = decode(data) if verdict is ok or verdict.accepted else None
-        if values is not None and are_values is not None and not are_values(values):
-            return sequence, no_value, None
-        return sequence, verdict, values
+        return sequence, verdict, decode(data) if verdict is ok or verdict.accepted else None
 
     return read
 
