@@ -33,6 +33,9 @@ from rig.inputs.errors import InputError
 
 __all__ = ["app", "main"]
 
+_GROUPS = ("sensor",)
+"""Names that stand for several commands."""
+
 app = typer.Typer(
     name="rig",
     help="Bridge between a shock-absorber bench on CAN and a DART multibody model.",
@@ -42,7 +45,7 @@ app = typer.Typer(
 app.command("demo", epilog=demo.EXAMPLES)(demo.demo)
 app.command("init", epilog=init.EXAMPLES)(init.init)
 app.command("check", epilog=check.EXAMPLES)(check.check_command)
-app.add_typer(sensor.app, name="sensor")
+app.add_typer(sensor.app, name=_GROUPS[0])
 app.command("run", epilog=run.EXAMPLES)(run.run)
 app.command("bench", epilog=bench.EXAMPLES)(bench.bench)
 app.command("view", epilog=view.EXAMPLES)(view.view)
@@ -97,7 +100,7 @@ _UsageError = cast(
 
 def main() -> None:
     """Run the command; a wrong input is one line on standard error and exit code 2."""
-    if len(sys.argv) == 1:
+    if sys.argv[1:] in ([], *([name] for name in _GROUPS)):
         sys.argv.append("--help")
     try:
         ended = app(standalone_mode=False)

@@ -84,8 +84,10 @@ def _imported(path: Path, node_id: int) -> Any:
         raise InputError(f"{path}: expected a file .eds or .dcf")
     try:
         size = path.stat().st_size
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from None
+    except ValueError:  # a name that no file can have
+        raise InputError(f"{ascii(str(path))}: no such file, expected an EDS file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     if size > SIZE_MAX_BYTES:
         raise InputError(f"{path}: larger than {SIZE_MAX_BYTES} bytes, expected an EDS file")
     canopen = package()

@@ -38,3 +38,12 @@ def test_help_names_every_choice(command: str, choices: tuple[str, ...]) -> None
     shown = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"}).output
     for choice in choices:
         assert choice in shown
+
+
+@pytest.mark.parametrize("command", [[], ["sensor"]])
+def test_a_name_alone_shows_help(command: list[str]) -> None:
+    shown = subprocess.run(
+        [sys.executable, "-m", "rig", *command], capture_output=True, text=True, check=True
+    )
+    assert "Usage" in shown.stdout
+    assert not shown.stderr
