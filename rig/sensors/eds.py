@@ -85,7 +85,7 @@ def _imported(path: Path, node_id: int) -> Any:
     try:
         size = path.stat().st_size
     except ValueError:  # a name that no file can have
-        raise InputError(f"{ascii(str(path))}: no such file, expected an EDS file") from None
+        raise InputError(f"{str(path)!a}: no such file, expected an EDS file") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     if size > SIZE_MAX_BYTES:
