@@ -5,8 +5,9 @@ import multiprocessing
 from collections.abc import Callable
 from multiprocessing.queues import Queue
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import pytest
 import yaml
 from typer.testing import CliRunner
 
@@ -22,6 +23,7 @@ from tests.sensors.dyno import (
     DAMPING_N_S_PER_M,
     ENCODER,
     FREE_LENGTH_M,
+    FRICTION_N,
     HEARTBEAT_MS,
     STANDING_M,
     STIFFNESS_N_PER_M,
@@ -110,7 +112,7 @@ def run(config: Path, folder: Path, seconds: float, at: Callable[[float], None])
     return live(ready, folder, stop=lambda: False, progress=progress)
 
 
-def diagnosed(line: Line, folder: Path, seconds: float) -> dict[str, object]:
+def diagnosed(line: Line, folder: Path, seconds: float) -> dict[str, Any]:
     """Scan, run, log, replay, diagnose: what the diagnosis found."""
     config = configured(line, folder)
     line.orders.put("move")
@@ -150,3 +152,22 @@ def with_faults(line: Line, config: Path, folder: Path) -> dict[str, Fault]:
         assert replay(folder / order).different == 0
         found[order] = Fault(wrong, set(steps["mode"].to_pylist()), ended)
     return found
+
+
+def assert_friction_was_found(found: dict[str, Any]) -> None:
+    """That a diagnosis names what the dyno has and the model lacks."""
+    assert found["verdict"] == "explained"
+    (effect,) = found["effects"]
+    assert effect["family"] == "friction"
+    friction = effect["parameters"]["coulomb_force_n"]
+    assert friction["value"] == pytest.approx(FRICTION_N, rel=0.05)
+
+
+def assert_faults_ended(found: dict[str, Fault]) -> None:
+    """That each fault ended as the table of faults says."""
+    for order, wrong in (("emergency", "emergency 0x8130"), ("silent", "no heartbeat")):
+        assert found[order].wrong == [{"NODE_5": wrong}]
+        assert found[order].modes >= {Mode.RUNNING, Mode.HOLD}
+        assert found[order].ended.state.counts.from_faulty_device > 50
+    assert found["short"].ended.state.counts.wrong_length > 50
+    assert found["short"].ended.state.core.mode is Mode.HOLD

@@ -8,9 +8,17 @@ from collections.abc import Iterator
 
 import pytest
 
-from rig.core.contract import Mode
-from tests.sensors.dyno import FRICTION_N, serve
-from tests.sensors.story import Line, configured, diagnosed, queue, rig, with_faults
+from tests.sensors.dyno import serve
+from tests.sensors.story import (
+    Line,
+    assert_faults_ended,
+    assert_friction_was_found,
+    configured,
+    diagnosed,
+    queue,
+    rig,
+    with_faults,
+)
 from tests.vcan.conftest import in_process, running
 
 pytestmark = pytest.mark.vcan
@@ -30,22 +38,13 @@ def line(second_vcan: str) -> Iterator[Line]:
 
 def test_from_a_scan_to_a_diagnosis(line, tmp_path):
     found = diagnosed(line, tmp_path, 20.0)
-    assert found["verdict"] == "explained"
-    (effect,) = found["effects"]
-    assert effect["family"] == "friction"
-    friction = effect["parameters"]["coulomb_force_n"]
-    assert friction["value"] == pytest.approx(FRICTION_N, rel=0.05)
+    assert_friction_was_found(found)
 
 
 def test_faults_of_a_sensor(line, tmp_path):
     config = configured(line, tmp_path)
     found = with_faults(line, config, tmp_path)
-    for order, wrong in (("emergency", "emergency 0x8130"), ("silent", "no heartbeat")):
-        assert found[order].wrong == [{"NODE_5": wrong}]
-        assert found[order].modes >= {Mode.RUNNING, Mode.HOLD}
-        assert found[order].ended.state.counts.from_faulty_device > 50
-    assert found["short"].ended.state.counts.wrong_length > 50
-    assert found["short"].ended.state.core.mode is Mode.HOLD
+    assert_faults_ended(found)
 
 
 def test_what_was_set_is_put_back(line, tmp_path):
