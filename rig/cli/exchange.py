@@ -123,19 +123,67 @@ def _of_mts(source: Path, rebound: str) -> "Mapping":
 
 EXPORT_EXAMPLES = (
     "Examples: `rig export runs/7 --format mf4 --out run.mf4` · "
-    "`rig export runs/7 --format candump --out run.log`"
+    "`rig export runs/7 --format candump --out run.log` · "
+    "`rig export out/corrected.yaml --fmu --out strut.fmu` · "
+    "`rig export out/corrected.yaml --fmu --bench --fmi 3.0 --out bench.fmu`"
 )
 
 
 def export_command(
-    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="Folder of a run; with --fmu a model file.")
+    ],
     out: Annotated[
         Path, typer.Option("--out", metavar="PATH", help="New file; for Parquet a folder.")
     ],
-    kind: Annotated[str, typer.Option("--format", help="One of mf4, parquet, csv, candump.")],
+    kind: Annotated[
+        str | None, typer.Option("--format", help="Of a run: mf4, parquet, csv or candump.")
+    ] = None,
+    fmu: Annotated[
+        bool, typer.Option("--fmu", help="A strut of a model as a functional mock-up unit.")
+    ] = False,
+    fmi: Annotated[str, typer.Option("--fmi", help="With --fmu: 2.0 or 3.0.")] = "2.0",
+    strut: Annotated[
+        str | None, typer.Option("--strut", help="With --fmu: which strut, if there are several.")
+    ] = None,
+    bench: Annotated[
+        bool,
+        typer.Option("--bench", help="With --fmu: the whole bench, if one guided degree moves."),
+    ] = False,
 ) -> None:
-    """Write a run for other programs: MF4, Parquet, CSV or candump."""
+    """Write a run or a model for other programs.
+
+    A run becomes MF4, Parquet, CSV or candump; a model, with --fmu, a functional mock-up unit for
+    Model Exchange and Co-Simulation, with its C sources and with binaries for Linux, Windows and
+    macOS.
+    """
+    if fmu == (kind is not None):
+        raise InputError("--format and --fmu: expected one of them")
+    if fmu:
+        _export_model(source, out, fmi, strut, bench)
+        return
+    if bench or strut is not None:
+        raise InputError("--bench and --strut: expected --fmu with them")
     from rig.exchange.exported import export_run
 
-    for path in export_run(folder, kind, out):
+    for path in export_run(source, kind or "", out):
         console.print(f"Written: {path}", markup=False)
+
+
+def _export_model(source: Path, out: Path, fmi: str, strut: str | None, bench: bool) -> None:
+    """Write a model as an FMU."""
+    from dart_model.spec import load_model
+    from rig.fmu.exported import export_fmu
+
+    if bench and strut is not None:
+        raise InputError("--bench and --strut: expected one of them")
+    spec = load_model(source)
+    with console.status("compiling") as status:
+        made = export_fmu(
+            spec, out, fmi, strut, bench, lambda target: status.update(f"{target} compiled")
+        )
+    console.print(made.meaning, markup=False)
+    for kind in ("input", "state", "output"):
+        names = [item.name for _, item in made.of(kind)]
+        console.print(f"{kind}s: {', '.join(names) or 'none'}", markup=False)
+    console.print(f"Written: {out}", markup=False)

@@ -1,0 +1,100 @@
+"""An FMU as one file: description, C sources, and binaries for every system."""
+
+import hashlib
+import html
+import io
+import zipfile
+from collections.abc import Callable, Iterable
+from importlib.metadata import version as installed
+from uuid import UUID
+
+from rig.fmu.binaries import TARGETS, Target, compile_for
+from rig.fmu.component import Component
+from rig.fmu.description import Made, build_description, description_2, description_3
+from rig.fmu.source import Fmi, compiled_files, sources
+
+_MADE_AT = (1980, 1, 1, 0, 0, 0)
+"""Of every file in the archive: the same model gives the same bytes."""
+
+_EXPERIMENT_S, _STEP_S = 10.0, 0.001
+
+
+def archive(
+    component: Component,
+    version: Fmi,
+    model: str,
+    targets: Iterable[Target] = TARGETS,
+    done: Callable[[Target], None] = lambda _: None,
+) -> bytes:
+    """An FMU for Model Exchange and Co-Simulation.
+
+    Args:
+        component: What it computes.
+        version: Version of the interface, ``2.0`` or ``3.0``.
+        model: Text of the model file, which is put beside it.
+        targets: Systems to compile for; those that the version has no name for are left out.
+        done: Called after each.
+
+    Raises:
+        InputError: There is no compiler, or it refuses.
+    """
+    tool = f"rig {installed('rig')}"
+    token = _token(component, version, tool)
+    code = sources(component, version, token)
+    compiled = compiled_files(code)
+    made = Made(tool, token, _EXPERIMENT_S, _STEP_S)
+    files: dict[str, bytes | str] = {}
+    if version == "2.0":
+        files["modelDescription.xml"] = description_2(component, made, compiled)
+    else:
+        files["modelDescription.xml"] = description_3(component, made)
+        files["sources/buildDescription.xml"] = build_description(component, compiled)
+    files |= {f"sources/{name}": text for name, text in code.items()}
+    files["resources/model.yaml"] = model
+    files["documentation/index.html"] = _page(component)
+    wanted = [target for target in targets if target.folder(version) is not None]
+    binaries = compile_for(wanted, code, component.identifier, done)
+    for target, content in binaries.items():
+        name = f"{component.identifier}{target.suffix}"
+        files[f"binaries/{target.folder(version)}/{name}"] = content
+    return _zipped(files)
+
+
+def _token(component: Component, version: Fmi, tool: str) -> str:
+    """What is the same for the same content, and for no other."""
+    code = sources(component, version, "")
+    text = "\0".join([tool, version, *(f"{name}\0{code[name]}" for name in sorted(code))])
+    return f"{{{UUID(bytes=hashlib.sha256(text.encode()).digest()[:16])}}}"
+
+
+def _zipped(files: dict[str, bytes | str]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as zipped:
+        for name, content in files.items():
+            entry = zipfile.ZipInfo(name, _MADE_AT)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.external_attr = 0o644 << 16
+            zipped.writestr(entry, content)
+    return buffer.getvalue()
+
+
+def _page(component: Component) -> str:
+    """What a person finds who unpacks the FMU."""
+    rows = "".join(
+        f"<tr><td><code>{html.escape(item.name)}</code></td><td>{item.kind}</td>"
+        f"<td>{'' if item.start is None else f'{item.start:.9g}'}</td>"
+        f"<td>{html.escape(item.unit)}</td><td>{html.escape(item.meaning)}</td></tr>\n"
+        for item in component.variables
+        if item.kind not in ("indicator", "rate")
+    )
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        f"<title>{html.escape(component.name)}</title></head><body>\n"
+        f"<h1>{html.escape(component.name)}</h1>\n<p>{html.escape(component.meaning)}</p>\n"
+        "<p>Co-Simulation advances by Kutta's method of third order in equal steps of at most "
+        "<code>longest_step_s</code>, and holds the inputs over a step, or lets them rise as "
+        "<code>fmi2SetRealInputDerivatives</code> says. In Model Exchange the laws switch at "
+        "events. The model file is <code>resources/model.yaml</code>.</p>\n"
+        "<table><tr><th>Variable</th><th>Kind</th><th>Start</th><th>Unit</th><th>Meaning</th>"
+        f"</tr>\n{rows}</table>\n</body></html>\n"
+    )

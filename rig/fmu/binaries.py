@@ -1,0 +1,114 @@
+"""The C of an FMU, compiled for this system and for others, with the compiler of `ziglang`."""
+
+import importlib.util
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from rig.fmu.source import compiled_files
+from rig.inputs.errors import InputError
+
+
+class Target(NamedTuple):
+    """A system that an FMU runs on.
+
+    Attributes:
+        words: What it is called.
+        triple: What the compiler calls it. The oldest C library of Linux that is still met.
+        fmi_2: Its folder in an FMU of FMI 2.0, or None where that has no name for it.
+        fmi_3: The same of FMI 3.0.
+        suffix: Of a shared library.
+    """
+
+    words: str
+    triple: str
+    fmi_2: str | None
+    fmi_3: str
+    suffix: str
+
+    def folder(self, version: str) -> str | None:
+        """Its folder in an FMU of a version of the interface."""
+        return self.fmi_2 if version == "2.0" else self.fmi_3
+
+
+TARGETS = (
+    Target("Linux", "x86_64-linux-gnu.2.17", "linux64", "x86_64-linux", ".so"),
+    Target("Linux on ARM", "aarch64-linux-gnu.2.17", None, "aarch64-linux", ".so"),
+    Target("Windows", "x86_64-windows-gnu", "win64", "x86_64-windows", ".dll"),
+    Target("macOS", "x86_64-macos", "darwin64", "x86_64-darwin", ".dylib"),
+    Target("macOS on ARM", "aarch64-macos", None, "aarch64-darwin", ".dylib"),
+)
+"""Every system that binaries are made for."""
+
+# No contraction: a product and a sum that become one rounding would not be what Python computes.
+_FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-Wall", "-Wextra")
+_TAKES_S = 300.0
+
+
+def this_system() -> Target:
+    """The one of `TARGETS` that this program runs on.
+
+    Raises:
+        InputError: It is none of them.
+    """
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(
+        platform.machine().lower(), platform.machine().lower()
+    )
+    name = {"linux": "linux", "win32": "windows", "darwin": "darwin"}.get(sys.platform, "")
+    for target in TARGETS:
+        if target.fmi_3 == f"{machine}-{name}":
+            return target
+    choices = ", ".join(target.fmi_3 for target in TARGETS)
+    raise InputError(f"{machine} {sys.platform}: expected one of {choices}")
+
+
+def compile_for(
+    targets: Iterable[Target],
+    sources: dict[str, str],
+    identifier: str,
+    done: Callable[[Target], None] = lambda _: None,
+) -> dict[Target, bytes]:
+    """Shared libraries of some C files.
+
+    Args:
+        targets: Systems.
+        sources: The files by their names.
+        identifier: Name of the library, without its suffix.
+        done: Called after each.
+
+    Raises:
+        InputError: The package `ziglang` is not installed, or its compiler refuses.
+    """
+    if importlib.util.find_spec("ziglang") is None:
+        raise InputError(
+            "the package ziglang, a C compiler, is not installed, expected `pip install 'rig[fmu]'`"
+        )
+    made: dict[Target, bytes] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for file, text in sources.items():
+            (folder / file).write_text(text, encoding="utf-8")
+        for target in targets:
+            out = folder / target.fmi_3 / f"{identifier}{target.suffix}"
+            out.parent.mkdir()
+            _compile(folder, compiled_files(sources), target, out)
+            made[target] = out.read_bytes()
+            done(target)
+    return made
+
+
+def _compile(folder: Path, files: list[str], target: Target, out: Path) -> None:
+    compiler = [sys.executable, "-m", "ziglang", "cc", "-target", target.triple]
+    linked = ["-s", "-lm"] if target.suffix == ".so" else ["-s"]
+    shared = ["-shared", "-fPIC"] if target.suffix != ".dll" else ["-shared"]
+    command = [*compiler, *_FLAGS, *shared, "-o", str(out), *files, *linked]
+    result = subprocess.run(  # noqa: S603  # a list, no shell
+        command, cwd=folder, capture_output=True, text=True, timeout=_TAKES_S, check=False
+    )
+    if result.returncode != 0:
+        first = next((line for line in result.stderr.splitlines() if "error" in line), "no reason")
+        raise InputError(f"the C compiler for {target.words}: {first}")

@@ -1,0 +1,456 @@
+"""What an FMU of a strut or of a bench has: its variables, and the C that computes them.
+
+A strut is a force element: motion in, force out. A bench of one guided degree of freedom has the
+equation of motion as well, with the mass and the levers that DART has for it.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from dart_model.effects import Effect, effect
+from dart_model.plant import DartPlant
+from dart_model.spec import EffectSpec, ModelSpec, StrutSpec
+from rig.fmu.law_in_c import ARGUMENTS, InC, in_c
+from rig.inputs.errors import InputError
+
+Kind = Literal["time", "input", "parameter", "fixed", "state", "rate", "output", "indicator"]
+KINDS: tuple[Kind, ...] = (
+    "time",
+    "input",
+    "parameter",
+    "fixed",
+    "state",
+    "rate",
+    "output",
+    "indicator",
+)
+"""Of variables, in the order in which they lie in memory; `parameter` may be tuned in a run."""
+
+LONGEST_STEP = "longest_step_s"
+AMBIENT_C = 20.0
+
+_STRUT_STEP_S = 0.5e-3
+"""Longest step of an element's internal states where nobody has said how fast the motion is: that
+of a strut whose motion is prescribed (`dart_model.plant.prescribed`)."""
+
+_SAME = 1e-9
+"""Share by which mass or weight may differ between configurations of one guided degree."""
+
+
+class Variable(NamedTuple):
+    """A value of an FMU.
+
+    Attributes:
+        name: Its name.
+        unit: Its unit; empty if it has none.
+        kind: What it is.
+        meaning: One line.
+        start: Its value at the beginning, if it has one of its own.
+        nominal: Its usual size.
+        is_output: Whether a state is an output as well.
+    """
+
+    name: str
+    unit: str
+    kind: Kind
+    meaning: str
+    start: float | None = None
+    nominal: float = 1.0
+    is_output: bool = False
+
+
+@dataclass(frozen=True)
+class Component:
+    """An FMU without its wrapping.
+
+    Attributes:
+        name: Name of the model.
+        identifier: The same as a C identifier, and as the name of the file.
+        meaning: What it is, in a sentence or two.
+        variables: All variables, in the order of `KINDS`; a value reference is a place in it.
+        laws: C of the laws.
+        evaluation: C of the body of `model_evaluate`.
+    """
+
+    name: str
+    identifier: str
+    meaning: str
+    variables: tuple[Variable, ...]
+    laws: str
+    evaluation: str
+
+    def of(self, kind: Kind) -> list[tuple[int, Variable]]:
+        """Variables of one kind, each behind its value reference."""
+        return [(k, item) for k, item in enumerate(self.variables) if item.kind == kind]
+
+
+def strut_component(spec: ModelSpec, strut: StrutSpec) -> Component:
+    """A strut as a force element.
+
+    Args:
+        spec: The model.
+        strut: Its strut.
+    """
+    made = _Build()
+    made.add("height_m", "m", "input", "height of the strut", strut.free_length_m)
+    made.add("velocity_m_per_s", "m/s", "input", "its derivative; positive is rebound", 0.0)
+    made.add("temperature_c", "degC", "input", "temperature of the damper", AMBIENT_C)
+    laws = made.strut(strut, "", spec.gravity_m_per_s2)
+    if laws.reads_applied_force:
+        made.add("applied_force_n", "N", "input", "force that is applied to the bench", 0.0)
+    made.add(LONGEST_STEP, "s", "fixed", "longest step of co-simulation", _STRUT_STEP_S)
+    carried = [item.effect.words for item in laws.items if item.effect.adds_mass]
+    meaning = (
+        f"Strut {strut.name} of {spec.name}: force over height, velocity and temperature, positive "
+        "when it pushes the two bodies apart."
+    )
+    if carried:
+        meaning += (
+            f" Not in the force: {', '.join(carried)}; add the mass to the body that the strut "
+            "carries."
+        )
+    return made.component(spec.name, f"{spec.name}_{strut.name}", meaning, laws.text)
+
+
+def bench_component(spec: ModelSpec) -> Component:
+    """A bench of one guided degree of freedom, with its struts.
+
+    Raises:
+        InputError: The model has more degrees of freedom, or one that is not guided along a line.
+    """
+    guide = _guide(spec)
+    made = _Build()
+    made.add("applied_force_n", "N", "input", "applied force", 0.0)
+    made.add("temperature_c", "degC", "input", "temperature of the damper", AMBIENT_C)
+    made.add("mass_kg", "kg", "parameter", "mass that moves with the first strut", guide.mass_kg)
+    g = spec.gravity_m_per_s2
+    made.add("gravity_m_per_s2", "m/s2", "parameter", "standard gravity", g)
+    made.add(LONGEST_STEP, "s", "fixed", "longest step of co-simulation", guide.longest_step_s)
+    first = f"{_identifier(spec.struts[0].name)}."
+    height, velocity = first + "height_m", first + "velocity_m_per_s"
+    rest = guide.rest_height_m
+    made.add(height, "m", "state", "height of the strut", rest, is_output=True)
+    made.add(velocity, "m/s", "state", "its derivative; positive is rebound", 0.0, is_output=True)
+    made.add(f"der({height})", "m/s", "rate", "derivative of the height")
+    made.add(f"der({velocity})", "m/s2", "rate", "second derivative of the height")
+    text: list[str] = []
+    forces: list[str] = []
+    masses = [f"[{made.ref('mass_kg')}]"]
+    weights = [f"{guide.weight_n_per_kg!r} * [{made.ref('mass_kg')}]"]
+    for strut, ratio, offset_m in zip(spec.struts, guide.ratios, guide.offsets_m, strict=True):
+        prefix = f"{_identifier(strut.name)}."
+        if prefix != first:
+            made.add(prefix + "height_m", "m", "output", "height of the strut")
+            made.add(prefix + "velocity_m_per_s", "m/s", "output", "positive is rebound")
+            for name, zero_m in (("height_m", offset_m), ("velocity_m_per_s", 0.0)):
+                state = made.ref(first + name)
+                text.append(f"[{made.ref(prefix + name)}] = {zero_m!r} + {ratio!r} * [{state}];")
+        laws = made.strut(strut, prefix, None)
+        text.append(laws.text)
+        forces.append(f"{ratio!r} * [{made.ref(prefix + 'force_n')}]")
+        for item in laws.items:
+            if item.effect.adds_mass:
+                mass = made.ref(item.prefix + item.effect.parameters[0].name)
+                by_mass = guide.added[len(masses) - 1]
+                masses.append(f"{by_mass.inertia!r} * [{mass}]")
+                weights.append(f"{by_mass.weight_n_per_kg!r} * [{mass}]")
+    applied = f"{guide.applied!r} * [{made.ref('applied_force_n')}]"
+    weight = f"[{made.ref('gravity_m_per_s2')}] * ({' + '.join(weights)})"
+    total = " + ".join([applied, *forces, weight])
+    text.append(f"[{made.ref(f'der({height})')}] = [{made.ref(velocity)}];")
+    text.append(f"[{made.ref(f'der({velocity})')}] = ({total}) / ({' + '.join(masses)});")
+    meaning = (
+        f"Bench {spec.name}: one guided degree of freedom under an applied force, which is "
+        "positive upwards. Strut forces are positive when they push the two bodies apart."
+    )
+    return made.component(spec.name, f"{spec.name}_bench", meaning, "\n".join(text))
+
+
+class _Placed(NamedTuple):
+    """An effect of a strut.
+
+    Attributes:
+        effect: The effect.
+        prefix: Before the names of its variables.
+    """
+
+    effect: Effect
+    prefix: str
+
+
+class _Laws(NamedTuple):
+    """A strut's part of an evaluation.
+
+    Attributes:
+        text: The C, with references to variables in brackets.
+        items: The effects.
+        reads_applied_force: Whether one of them depends on the applied force.
+    """
+
+    text: str
+    items: list[_Placed]
+    reads_applied_force: bool
+
+
+class _Build:
+    """Variables and laws as they come together; references are to names until all are known."""
+
+    def __init__(self) -> None:
+        self._variables: dict[str, Variable] = {}
+        self._laws: dict[str, InC] = {}
+        self._indicators = 0
+        self.add("time", "s", "time", "time", None)
+
+    def add(
+        self,
+        name: str,
+        unit: str,
+        kind: Kind,
+        meaning: str,
+        start: float | None = None,
+        nominal: float = 1.0,
+        *,
+        is_output: bool = False,
+    ) -> None:
+        """Add a variable."""
+        if name in self._variables:
+            raise InputError(f"{name}: two variables of this name, expected struts of other names")
+        self._variables[name] = Variable(name, unit, kind, meaning, start, nominal, is_output)
+
+    def ref(self, name: str) -> str:
+        """The reference to a variable, to be put in brackets."""
+        return f"<{name}>"
+
+    def strut(self, spec: StrutSpec, prefix: str, gravity_m_per_s2: float | None) -> _Laws:
+        """Add a strut.
+
+        Args:
+            spec: The strut.
+            prefix: Before the names of its variables.
+            gravity_m_per_s2: Gravity as a parameter of its own; None where the bench has it.
+        """
+        add, ref = self.add, self.ref
+        add(prefix + "free_length_m", "m", "parameter", "height without force", spec.free_length_m)
+        stiffness, damping = spec.stiffness_n_per_m, spec.damping_n_s_per_m
+        add(prefix + "stiffness_n_per_m", "N/m", "parameter", "linear stiffness", stiffness)
+        add(prefix + "damping_n_s_per_m", "N.s/m", "parameter", "linear damping", damping)
+        if gravity_m_per_s2 is not None:
+            g = gravity_m_per_s2
+            add("gravity_m_per_s2", "m/s2", "parameter", "standard gravity", g)
+        add(prefix + "force_n", "N", "output", "force of the strut")
+        add(prefix + "spring.force_n", "N", "output", "part of the linear spring")
+        add(prefix + "damper.force_n", "N", "output", "part of the linear damper")
+        items = [
+            _Placed(effect(item.name), prefix + name)
+            for item, name in zip(spec.effects, _own_names(spec.effects), strict=True)
+        ]
+        lines = [
+            "{",
+            f"    const double height_m = [{ref(prefix + 'height_m')}];",
+            f"    const double velocity_m_per_s = [{ref(prefix + 'velocity_m_per_s')}];",
+            f"    const double strut[4] = {{[{ref(prefix + 'free_length_m')}], "
+            f"[{ref(prefix + 'stiffness_n_per_m')}], [{ref(prefix + 'damping_n_s_per_m')}], "
+            f"[{ref('gravity_m_per_s2')}]}};",
+            "    double force = strut[1] * (strut[0] - height_m) - strut[2] * velocity_m_per_s;",
+            f"    [{ref(prefix + 'spring.force_n')}] = strut[1] * (strut[0] - height_m);",
+            f"    [{ref(prefix + 'damper.force_n')}] = -strut[2] * velocity_m_per_s;",
+        ]
+        reads = False
+        for item, values in zip(items, spec.effects, strict=True):
+            lines += self._effect(item, values)
+            for name in (item.effect.name, f"{item.effect.name}_rate"):
+                reads |= name in self._laws and "applied_force_n" in self._laws[name].reads
+        lines += [f"    [{ref(prefix + 'force_n')}] = force;", "}"]
+        return _Laws("\n".join(lines), items, reads)
+
+    def _effect(self, item: _Placed, values: EffectSpec) -> list[str]:
+        law, prefix = item.effect, item.prefix
+        for parameter, value in zip(law.parameters, values.values(), strict=True):
+            unit = _plain_unit(parameter.unit)
+            self.add(prefix + parameter.name, unit, "parameter", parameter.meaning, value)
+        self.add(prefix + "force_n", "N", "output", f"part of {law.words}")
+        states = [f"{prefix}state_{k + 1}" for k in range(law.state_size)]
+        for name, scale in zip(states, law.state_scales, strict=True):
+            self.add(name, "", "state", f"internal state of {law.words}", 0.0, scale)
+            self.add(f"der({name})", "", "rate", "its derivative")
+        p = f"&[{self.ref(prefix + law.parameters[0].name)}]" if law.parameters else "value"
+        state = f"&[{self.ref(states[0])}]" if states else "value"
+        given = ", ".join(_GIVEN_NAMES)
+        called = f"{self._law(law.name, law)}(&s, {given}, {state}, {p}, strut)"
+        lines = self._switches(self._laws[law.name].switches)
+        lines.append(f"        const double part = {called};")
+        lines.append("        force += part;")
+        lines += [f"        [{self.ref(prefix + 'force_n')}] = part;", "    }"]
+        if law.rate is not None:
+            out = f"&[{self.ref(f'der({states[0]})')}]"
+            name = self._law(f"{law.name}_rate", law)
+            lines += self._switches(self._laws[name].switches)
+            lines.append(f"        {name}(&s, {given}, {state}, {p}, strut, {out});")
+            lines.append("    }")
+        return lines
+
+    def _law(self, name: str, law: Effect) -> str:
+        """Translate a law, once, and give its name in C."""
+        if name not in self._laws:
+            function = law.force if name == law.name or law.rate is None else law.rate
+            self._laws[name] = in_c(function, name)
+        return name
+
+    def _switches(self, count: int) -> list[str]:
+        """The beginning of a block whose law has a number of switches."""
+        first = self._indicators
+        self._indicators += count
+        for k in range(first, self._indicators):
+            meaning = "changes its sign where a law switches"
+            self.add(f"switches.indicator_{k + 1}", "", "indicator", meaning)
+        place = f"{{is_held, answer + {first}, value + FIRST_INDICATOR + {first}}}"
+        return ["    {", f"        const Switches s = {place};"]
+
+    def component(self, name: str, identifier: str, meaning: str, text: str) -> Component:
+        """All of it, with names replaced by places."""
+        variables = tuple(
+            item for kind in KINDS for item in self._variables.values() if item.kind == kind
+        )
+        places = {item.name: k for k, item in enumerate(variables)}
+        force = f"value[{places['applied_force_n']}]" if "applied_force_n" in places else "0.0"
+        head = [
+            "const double t_s = value[0];",
+            f"const double temperature_c = value[{places['temperature_c']}];",
+            f"const double applied_force_n = {force};",
+            "(void)t_s; (void)temperature_c; (void)applied_force_n; (void)is_held;",
+        ]
+
+        def place(found: re.Match[str]) -> str:
+            return f"value[{places[found[1]]}]"
+
+        body = re.sub(r"\[<([^<>]*)>\]", place, "\n".join([*head, text]))
+        laws = "\n".join(law.text for law in self._laws.values())
+        return Component(name, _identifier(identifier), meaning, variables, laws, body)
+
+
+_GIVEN_NAMES = tuple(item.split()[-1].lstrip("*") for item in ARGUMENTS[1:6])
+
+
+class _Added(NamedTuple):
+    """What a kilogram of an effect's mass does to the equation of motion.
+
+    Attributes:
+        inertia: Mass beside the first strut per kilogram.
+        weight_n_per_kg: Force along it per kilogram, for a gravity of one.
+    """
+
+    inertia: float
+    weight_n_per_kg: float
+
+
+class _Guide(NamedTuple):
+    """The equation of motion along the height of the first strut.
+
+    Attributes:
+        mass_kg: Mass, without that of effects.
+        weight_n_per_kg: Weight per mass, for a gravity of one; -1 for a vertical guide.
+        added: The same of each effect with a mass, strut after strut.
+        applied: Force along the height per newton of applied force.
+        ratios: Travel of each strut per travel of the first one.
+        offsets_m: Height of each strut where the first one's is zero.
+        rest_height_m: Height of the first strut at rest.
+        longest_step_s: Longest step of the model's integrator.
+    """
+
+    mass_kg: float
+    weight_n_per_kg: float
+    added: list[_Added]
+    applied: float
+    ratios: list[float]
+    offsets_m: list[float]
+    rest_height_m: float
+    longest_step_s: float
+
+
+def _guide(spec: ModelSpec) -> _Guide:
+    plant = DartPlant(spec)
+    if plant.coordinates != 1 or not plant.is_constant:
+        raise InputError(
+            f"model {spec.name}: {plant.coordinates} joint coordinates, expected one on a straight "
+            "guide for a bench as an FMU (a strut alone can always be exported)"
+        )
+    count = sum(effect(item.name).adds_mass for strut in spec.struts for item in strut.effects)
+    mass_kg, weight = _along_height(spec, [0.0] * count)
+    added: list[_Added] = []
+    for k in range(count):
+        more_kg, more = _along_height(spec, [float(k == other) for other in range(count)])
+        added.append(_Added(more_kg - mass_kg, more - weight))
+    jacobians = plant.jacobians(np.zeros(1))
+    rows, offsets = jacobians.struts[:, 0], jacobians.offsets_m
+    ratios = rows / rows[0]
+    rest = plant.init([float("nan")] * len(spec.struts))
+    return _Guide(
+        mass_kg,
+        weight / mass_kg,
+        added,
+        float(jacobians.applied[0] / rows[0]),
+        ratios.tolist(),
+        (offsets - ratios * offsets[0]).tolist(),
+        rest.struts[0][0],
+        plant.step_s,
+    )
+
+
+def _along_height(spec: ModelSpec, masses_kg: Sequence[float]) -> tuple[float, float]:
+    """Mass, and weight for a gravity of one, along the first strut's height.
+
+    Args:
+        spec: The model.
+        masses_kg: Mass of each effect that has one, strut after strut.
+    """
+    given = iter(masses_kg)
+    struts: list[StrutSpec] = []
+    for strut in spec.struts:
+        effects = [
+            EffectSpec(name=item.name, parameters=_with_mass(item, next(given)))
+            if effect(item.name).adds_mass
+            else item
+            for item in strut.effects
+        ]
+        struts.append(strut.model_copy(update={"effects": tuple(effects)}))
+    update = {"gravity_m_per_s2": 1.0, "struts": tuple(struts)}
+    plant = DartPlant(spec.model_copy(update=update))
+    found: list[tuple[float, float]] = []
+    for q, v in ((0.0, 0.0), (0.11, 0.0), (-0.07, 1.3)):
+        here = plant.mechanics(np.array([q]), np.array([v]))
+        row = float(here.struts[0, 0])
+        found.append((float(here.mass[0, 0]) / row**2, float(here.bias[0]) / row))
+    if not np.allclose(found, found[0], rtol=_SAME, atol=_SAME):
+        raise InputError(
+            f"model {spec.name}: springs or dampers of its joints, expected a guide without them "
+            "for a bench as an FMU (a strut alone can always be exported)"
+        )
+    return found[0]
+
+
+def _with_mass(item: EffectSpec, mass_kg: float) -> dict[str, float]:
+    return {**item.parameters, effect(item.name).parameters[0].name: mass_kg}
+
+
+def _own_names(effects: Iterable[EffectSpec]) -> list[str]:
+    """A prefix for each effect of a strut: its name, numbered where it stands there again."""
+    seen: Counter[str] = Counter()
+    names: list[str] = []
+    for item in effects:
+        seen[item.name] += 1
+        number = seen[item.name]
+        names.append(f"{item.name}." if number == 1 else f"{item.name}_{number}.")
+    return names
+
+
+def _identifier(name: str) -> str:
+    return re.sub(r"\W", "_", name, flags=re.ASCII)
+
+
+def _plain_unit(unit: str) -> str:
+    return unit.replace("·", ".").replace("°C", "degC").replace("²", "2").replace("³", "3")

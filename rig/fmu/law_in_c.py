@@ -1,0 +1,301 @@
+"""A law of the catalogue as C, read from the one place where it is written.
+
+A law is a small Python function in plain scalar arithmetic. Its syntax tree is translated statement
+by statement, so that the C computes what the Python computes, in the same order: the two agree to
+the last bits of the mathematical functions. Whatever a law may not use is refused, with its line.
+
+Where a law switches (a comparison, `min`, `max`, `abs`, `copysign`, a whole part), the C asks a
+switch that has a number of its own. A solver that steps over the laws may hold all switches, so
+that what it integrates is smooth, and look at their indicators for the time at which one turns
+(Cellier and Kofman, "Continuous System Simulation" (2006), chapter 9).
+"""
+
+import ast
+import inspect
+import textwrap
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+ARGUMENTS = (
+    "const Switches *s",
+    "double t_s",
+    "double height_m",
+    "double velocity_m_per_s",
+    "double applied_force_n",
+    "double temperature_c",
+    "const double *state",
+    "const double *p",
+    "const double *strut",
+)
+"""Of every law in C: its switches, then what `Force` is given."""
+
+_GIVEN = len(ARGUMENTS) - 1
+_OUT = "double *out"
+_POINTERS = frozenset({5, 6, 7, 8})
+_INPUTS = ("t_s", "height_m", "velocity_m_per_s", "applied_force_n", "temperature_c")
+
+_FUNCTIONS: Mapping[str, str] = {
+    "math.exp": "exp",
+    "math.tanh": "tanh",
+    "math.sqrt": "root",
+    "math.sin": "sin",
+    "math.cos": "cos",
+    "math.sinh": "sinh",
+    "math.atan": "atan",
+}
+_SWITCHING: Mapping[str, tuple[str, int]] = {
+    "max": ("larger", 2),
+    "min": ("smaller", 2),
+    "abs": ("magnitude", 1),
+    "math.copysign": ("signed_as", 2),
+}
+_CONSTANTS: Mapping[str, str] = {"math.inf": "INFINITY", "math.pi": "3.141592653589793"}
+_COMPARISONS: Mapping[type[ast.AST], str] = {
+    ast.Lt: "is_less",
+    ast.LtE: "is_at_most",
+    ast.Gt: "is_more",
+    ast.GtE: "is_at_least",
+}
+_OPERATORS: Mapping[type[ast.AST], str] = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
+
+
+class NoLawError(ValueError):
+    """A function uses what no law may use."""
+
+
+class InC(NamedTuple):
+    """A law in C.
+
+    Attributes:
+        text: A static function of `ARGUMENTS`; that of a rate writes into one more.
+        switches: Number of its switches.
+        reads: Which of time and inputs it reads, by their names in Python.
+    """
+
+    text: str
+    switches: int
+    reads: frozenset[str]
+
+
+def in_c(law: Callable[..., Any], name: str) -> InC:
+    """A law as a C function.
+
+    Args:
+        law: Its force or its rate.
+        name: What the C function is called.
+
+    Raises:
+        NoLawError: It uses what no law may use.
+    """
+    tree = ast.parse(textwrap.dedent(inspect.getsource(law))).body[0]
+    if not isinstance(tree, ast.FunctionDef):
+        raise NoLawError(f"{name}: expected a function")
+    return _Translation(law, tree, name).made()
+
+
+class _Loop(NamedTuple):
+    """A loop that is being translated.
+
+    Attributes:
+        variable: Its variable.
+        first: Its first switch.
+        each: Switches of each round.
+    """
+
+    variable: str
+    first: int
+    each: int
+
+
+class _Translation:
+    """The translation of one function."""
+
+    def __init__(self, law: Callable[..., Any], tree: ast.FunctionDef, name: str) -> None:
+        self._globals: Mapping[str, Any] = law.__globals__
+        self._tree = tree
+        self._name = name
+        names = [item.arg for item in tree.args.args]
+        self._is_rate = len(names) == _GIVEN + 1
+        self._own = {item: item.lstrip("_") for item in names}
+        self._pointers = {item for place, item in enumerate(names) if place in _POINTERS}
+        self._whole: set[str] = set()
+        self._declared: list[str] = []
+        self._reads: set[str] = set()
+        self._switches = 0
+        self._loop: _Loop | None = None
+
+    def made(self) -> InC:
+        """The function in C."""
+        body = self._block(self._tree.body, 1)
+        arguments = (*ARGUMENTS, _OUT) if self._is_rate else ARGUMENTS
+        declared = [
+            f"    {'long' if name in self._whole else 'double'} {name};" for name in self._declared
+        ]
+        unused = " ".join(f"(void){item.split()[-1].lstrip('*')};" for item in arguments)
+        kind = "void" if self._is_rate else "double"
+        head = f"static {kind} {self._name}({', '.join(arguments)}) {{"
+        lines = [head, *declared, f"    {unused}", *body, "}"]
+        return InC("\n".join(lines) + "\n", self._switches, frozenset(self._reads))
+
+    def _block(self, statements: list[ast.stmt], depth: int) -> list[str]:
+        return [line for item in statements for line in self._statement(item, depth)]
+
+    def _statement(self, node: ast.stmt, depth: int) -> list[str]:
+        before = "    " * depth
+        match node:
+            case ast.Return(value=value) if value is not None:
+                return [f"{before}return {self._real(value)};"]
+            case ast.Assign(targets=[target], value=value):
+                return [f"{before}{self._assigned(target, value)};"]
+            case ast.AugAssign(target=ast.Name(id=name), op=op, value=value):
+                return [f"{before}{name} {self._operator(op, node)}= {self._real(value)};"]
+            case ast.If(test=test, body=body, orelse=orelse):
+                lines = [f"{before}if ({self._expression(test)}) {{", *self._block(body, depth + 1)]
+                if orelse:
+                    lines += [f"{before}}} else {{", *self._block(orelse, depth + 1)]
+                return [*lines, f"{before}}}"]
+            case ast.For(
+                target=ast.Name(id=name),
+                iter=ast.Call(func=ast.Name(id="range"), args=[ast.Name(id=rounds)]),
+                body=body,
+                orelse=[],
+            ) if self._loop is None:
+                return self._for(name, int(self._global(rounds, node)), body, depth)
+            case ast.Expr(value=ast.Constant(value=str())):
+                return []
+            case _:
+                raise self._refused(node)
+
+    def _for(self, name: str, rounds: int, body: list[ast.stmt], depth: int) -> list[str]:
+        before = "    " * depth
+        self._declare(name, whole=True)
+        first = self._switches
+        self._loop = _Loop(name, first, 0)
+        self._block(body, depth)  # counts the switches of a round
+        self._loop = _Loop(name, first, self._switches - first)
+        self._switches = first
+        lines = self._block(body, depth + 1)
+        self._switches = first + rounds * self._loop.each
+        self._loop = None
+        head = f"{before}for ({name} = 0; {name} < {rounds}; ++{name}) {{"
+        return [head, *lines, f"{before}}}"]
+
+    def _assigned(self, target: ast.expr, value: ast.expr) -> str:
+        match target:
+            case ast.Name(id=name):
+                is_whole = self._is_whole(value)
+                self._declare(name, whole=is_whole)
+                text = self._expression(value) if is_whole else self._real(value)
+                return f"{name} = {text}"
+            case ast.Subscript(value=ast.Name(id=name), slice=index) if name in self._pointers:
+                return f"{self._own[name]}[{self._expression(index)}] = {self._real(value)}"
+            case _:
+                raise self._refused(target)
+
+    def _declare(self, name: str, *, whole: bool) -> None:
+        if name in self._own:
+            raise NoLawError(f"{self._name}: {name}: an argument is given another value")
+        if name not in self._declared:
+            self._declared.append(name)
+            if whole:
+                self._whole.add(name)
+        elif whole != (name in self._whole):
+            raise NoLawError(f"{self._name}: {name}: a whole number and a real one")
+
+    def _is_whole(self, node: ast.expr) -> bool:
+        """Whether an expression is a whole number in Python."""
+        match node:
+            case ast.Constant(value=value):
+                return isinstance(value, int)
+            case ast.Name(id=name) if name in self._declared or name in self._own:
+                return name in self._whole
+            case ast.Name(id=name):
+                return isinstance(self._global(name, node), int)
+            case ast.BinOp(left=left, op=ast.Add() | ast.Sub() | ast.Mult(), right=right):
+                return self._is_whole(left) and self._is_whole(right)
+            case ast.UnaryOp(op=ast.USub(), operand=operand):
+                return self._is_whole(operand)
+            case ast.Call(func=ast.Name(id="int")):
+                return True
+            case _:
+                return False
+
+    def _real(self, node: ast.expr) -> str:
+        text = self._expression(node)
+        return f"(double)({text})" if self._is_whole(node) else text
+
+    def _expression(self, node: ast.expr) -> str:
+        match node:
+            case ast.Constant(value=int() | float()) if not isinstance(node.value, bool):
+                return repr(node.value)
+            case ast.Name(id=name):
+                return self._variable(name, node)
+            case ast.Attribute() if ast.unparse(node) in _CONSTANTS:
+                return _CONSTANTS[ast.unparse(node)]
+            case ast.UnaryOp(op=ast.USub(), operand=operand):
+                return f"(-{self._expression(operand)})"
+            case ast.BinOp(left=left, op=op, right=right):
+                return self._arithmetic(left, op, right)
+            case ast.BoolOp(op=op, values=values):
+                sign = " || " if isinstance(op, ast.Or) else " && "
+                return f"({sign.join(self._expression(item) for item in values)})"
+            case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in _COMPARISONS:
+                return self._switch(_COMPARISONS[type(op)], [left, right])
+            case ast.IfExp(test=test, body=body, orelse=orelse):
+                chosen = f"{self._real(body)} : {self._real(orelse)}"
+                return f"({self._expression(test)} ? {chosen})"
+            case ast.Subscript(value=ast.Name(id=name), slice=index) if name in self._pointers:
+                return f"{self._own[name]}[{self._expression(index)}]"
+            case ast.Call(func=function, args=arguments, keywords=[]):
+                return self._call(ast.unparse(function), arguments, node)
+            case _:
+                raise self._refused(node)
+
+    def _arithmetic(self, left: ast.expr, op: ast.operator, right: ast.expr) -> str:
+        if isinstance(op, ast.Pow):
+            return f"power({self._real(left)}, {self._real(right)})"
+        both_whole = self._is_whole(left) and self._is_whole(right) and not isinstance(op, ast.Div)
+        side = self._expression if both_whole else self._real
+        return f"({side(left)} {self._operator(op, left)} {side(right)})"
+
+    def _call(self, called: str, arguments: list[ast.expr], node: ast.expr) -> str:
+        if called == "int" and len(arguments) == 1:
+            return self._switch("whole_part", arguments)
+        if called in _SWITCHING and len(arguments) == _SWITCHING[called][1]:
+            return self._switch(_SWITCHING[called][0], arguments)
+        if called in _FUNCTIONS and len(arguments) == 1:
+            return f"{_FUNCTIONS[called]}({self._real(arguments[0])})"
+        raise self._refused(node)
+
+    def _switch(self, function: str, arguments: list[ast.expr]) -> str:
+        number, loop = self._switches, self._loop
+        self._switches += 1
+        place = str(number)
+        if loop is not None:
+            place = f"{number} + {loop.each} * {loop.variable}"
+        return f"{function}(s, {place}, {', '.join(self._real(item) for item in arguments)})"
+
+    def _variable(self, name: str, node: ast.AST) -> str:
+        if name in self._own:
+            if self._own[name] in _INPUTS:
+                self._reads.add(self._own[name])
+            return self._own[name]
+        if name in self._declared:
+            return name
+        return repr(self._global(name, node))
+
+    def _global(self, name: str, node: ast.AST) -> float:
+        value = self._globals.get(name)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self._refused(node)
+        return value
+
+    def _operator(self, op: ast.AST, node: ast.AST) -> str:
+        sign = _OPERATORS.get(type(op))
+        if sign is None:
+            raise self._refused(node)
+        return sign
+
+    def _refused(self, node: ast.AST) -> NoLawError:
+        line = getattr(node, "lineno", 0)
+        return NoLawError(f"{self._name}: line {line}: {ast.unparse(node)}: no law may use this")
