@@ -243,8 +243,8 @@ class _Build:
             g = gravity_m_per_s2
             add("gravity_m_per_s2", "m/s2", "parameter", "standard gravity", g)
         add(prefix + "force_n", "N", "output", "force of the strut")
-        add(prefix + "spring.force_n", "N", "output", "part of the linear spring")
-        add(prefix + "damper.force_n", "N", "output", "part of the linear damper")
+        add(prefix + "spring.part_n", "N", "output", "part of the linear spring")
+        add(prefix + "damper.part_n", "N", "output", "part of the linear damper")
         items = [
             _Placed(effect(item.name), prefix + name)
             for item, name in zip(spec.effects, _own_names(spec.effects), strict=True)
@@ -257,8 +257,8 @@ class _Build:
             f"[{ref(prefix + 'stiffness_n_per_m')}], [{ref(prefix + 'damping_n_s_per_m')}], "
             f"[{ref('gravity_m_per_s2')}]}};",
             "    double force = strut[1] * (strut[0] - height_m) - strut[2] * velocity_m_per_s;",
-            f"    [{ref(prefix + 'spring.force_n')}] = strut[1] * (strut[0] - height_m);",
-            f"    [{ref(prefix + 'damper.force_n')}] = -strut[2] * velocity_m_per_s;",
+            f"    [{ref(prefix + 'spring.part_n')}] = strut[1] * (strut[0] - height_m);",
+            f"    [{ref(prefix + 'damper.part_n')}] = -strut[2] * velocity_m_per_s;",
         ]
         reads = False
         for item, values in zip(items, spec.effects, strict=True):
@@ -273,7 +273,7 @@ class _Build:
         for parameter, value in zip(law.parameters, values.values(), strict=True):
             unit = _plain_unit(parameter.unit)
             self.add(prefix + parameter.name, unit, "parameter", parameter.meaning, value)
-        self.add(prefix + "force_n", "N", "output", f"part of {law.words}")
+        self.add(prefix + "part_n", "N", "output", f"part of {law.words}")
         states = [f"{prefix}state_{k + 1}" for k in range(law.state_size)]
         for name, scale in zip(states, law.state_scales, strict=True):
             self.add(name, "", "state", f"internal state of {law.words}", 0.0, scale)
@@ -285,7 +285,7 @@ class _Build:
         lines = self._switches(self._laws[law.name].switches)
         lines.append(f"        const double part = {called};")
         lines.append("        force += part;")
-        lines += [f"        [{self.ref(prefix + 'force_n')}] = part;", "    }"]
+        lines += [f"        [{self.ref(prefix + 'part_n')}] = part;", "    }"]
         if law.rate is not None:
             out = f"&[{self.ref(f'der({states[0]})')}]"
             name = self._law(f"{law.name}_rate", law)

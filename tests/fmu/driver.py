@@ -1,5 +1,6 @@
-"""FMUs under FMPy: loaded, and stepped as a master steps them."""
+"""FMUs written for this system alone, and FMPy as their master."""
 
+import itertools
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,7 +13,42 @@ from fmpy.fmi2 import FMU2Slave
 from fmpy.fmi3 import FMU3Slave
 from numpy.typing import NDArray
 
+from dart_model.spec import ModelSpec, dump_model
+from rig.fmu.archive import archive
+from rig.fmu.binaries import this_system
+from rig.fmu.component import Component
+
 Array = NDArray[np.float64]
+
+_NUMBERS = itertools.count()
+
+
+def written(folder: Path, component: Component, version: str, spec: ModelSpec) -> Path:
+    """An FMU with a binary for this system."""
+    path = folder / f"{component.identifier}_{next(_NUMBERS)}.fmu"
+    path.write_bytes(archive(component, version, dump_model(spec), [this_system()]))
+    return path
+
+
+def simulated(
+    path: Path, kind: str, starts: Mapping[str, float], name: str, duration_s: float, step_s: float
+) -> tuple[Array, int]:
+    """A variable at equal steps, and the number of events on the way.
+
+    In Model Exchange FMPy integrates by CVode, to a relative tolerance of 1e-10.
+    """
+    result = fmpy.simulate_fmu(
+        str(path),
+        fmi_type=kind,
+        start_values=dict(starts),
+        stop_time=duration_s,
+        output_interval=step_s,
+        output=[name],
+        relative_tolerance=1e-10,
+    )
+    t_s = np.arange(round(duration_s / step_s) + 1) * step_s
+    # FMPy has a row before and a row after each event.
+    return np.interp(t_s, result["time"], result[name]), (len(result) - len(t_s)) // 2
 
 
 @contextmanager
@@ -23,8 +59,7 @@ def loaded(
     description = fmpy.read_model_description(str(path))
     folder = fmpy.extract(str(path))
     places = {item.name: item.valueReference for item in description.modelVariables}
-    is_3 = description.fmiVersion == "3.0"
-    instance = (FMU3Slave if is_3 else FMU2Slave)(
+    instance = (FMU3Slave if description.fmiVersion == "3.0" else FMU2Slave)(
         guid=description.guid,
         unzipDirectory=folder,
         modelIdentifier=description.coSimulation.modelIdentifier,
@@ -32,29 +67,31 @@ def loaded(
     )
     instance.instantiate()
     try:
-        if not is_3:
+        if not is_3(instance):
             instance.setupExperiment(startTime=0.0)
         put(instance, places, starts or {})
         instance.enterInitializationMode()
         instance.exitInitializationMode()
         yield instance, places
-        instance.terminate()
-        instance.freeInstance()
     finally:
+        instance.freeInstance()
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def is_3(instance: Any) -> bool:
+    """Whether an instance is of FMI 3.0."""
     return isinstance(instance, FMU3Slave)
 
 
 def put(instance: Any, places: Mapping[str, int], values: Mapping[str, float]) -> None:
+    """Set variables."""
     setter = instance.setFloat64 if is_3(instance) else instance.setReal
     if values:
         setter([places[name] for name in values], list(values.values()))
 
 
 def got(instance: Any, places: Mapping[str, int], names: Sequence[str]) -> list[float]:
+    """Read variables."""
     getter = instance.getFloat64 if is_3(instance) else instance.getReal
     return getter([places[name] for name in names])
 
@@ -62,7 +99,7 @@ def got(instance: Any, places: Mapping[str, int], names: Sequence[str]) -> list[
 def stepped(
     path: Path, t_s: Array, inputs: Mapping[str, Array], names: Sequence[str]
 ) -> dict[str, Array]:
-    """Outputs at given times under inputs that are linear in between.
+    """Outputs at given times in Co-Simulation under inputs that are linear in between.
 
     FMI 3.0 knows no slopes of inputs: it is given the mean over each step.
     """
@@ -94,26 +131,3 @@ def _slopes(instance: Any, references: list[int], slopes: list[float]) -> None:
         (fmpy.fmi2.fmi2Integer * count)(*([1] * count)),
         (fmpy.fmi2.fmi2Real * count)(*slopes),
     )
-
-
-def exchanged(
-    path: Path, t_s: Array, inputs: Mapping[str, Array], names: Sequence[str], tolerance: float
-) -> tuple[dict[str, Array], int]:
-    """Outputs at given times in Model Exchange, integrated by CVode; and the number of events."""
-    signals = np.zeros(len(t_s), dtype=[("time", float), *((name, float) for name in inputs)])
-    signals["time"] = t_s
-    for name, values in inputs.items():
-        signals[name] = values
-    result = fmpy.simulate_fmu(
-        str(path),
-        validate=True,
-        fmi_type="ModelExchange",
-        start_time=float(t_s[0]),
-        stop_time=float(t_s[-1]),
-        output_interval=float(t_s[1] - t_s[0]),
-        input=signals,
-        output=list(names),
-        relative_tolerance=tolerance,
-    )
-    events = len(result) - len(t_s)
-    return {name: np.interp(t_s, result["time"], result[name]) for name in names}, events
