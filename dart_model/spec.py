@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 import yaml
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -105,17 +106,21 @@ class InlineSkeleton(_Frozen):
     bodies: Annotated[tuple[BodySpec, ...], Field(min_length=1, max_length=256)]
 
 
+def _file_in_its_folder(file: str) -> str:
+    path = Path(file)
+    if path.is_absolute() or ".." in path.parts:
+        raise ValueError(f"file {file!r}: expected a path inside the model's own folder")
+    return file
+
+
+InFolder = Annotated[str, Field(min_length=1, max_length=255), AfterValidator(_file_in_its_folder)]
+"""A file beside the model file."""
+
+
 class FileSkeleton(_Frozen):
     """Bodies given by a URDF, SDF, SKEL or MJCF file beside the model file."""
 
-    file: Annotated[str, Field(min_length=1, max_length=255)]
-
-    @model_validator(mode="after")
-    def _stays_in_its_folder(self) -> "FileSkeleton":
-        path = Path(self.file)
-        if path.is_absolute() or ".." in path.parts:
-            raise ValueError(f"file {self.file!r}: expected a path inside the model's own folder")
-        return self
+    file: InFolder
 
 
 def _skeleton_kind(skeleton: object) -> str:
@@ -158,6 +163,42 @@ class EffectSpec(_Frozen):
         return [self.parameters[parameter.name] for parameter in effect(self.name).parameters]
 
 
+Variable = Annotated[str, Field(min_length=1, max_length=200)]
+"""A variable of an FMU; with a minus before it, its sign is the other one."""
+
+
+class FmuSpec(_Frozen):
+    """A functional mock-up unit that gives a strut's force, or stands for a whole guided bench.
+
+    Attributes:
+        file: The FMU.
+        height: Variable of the strut's height in m: an input or a state.
+        velocity: Variable of its derivative in m/s, positive in rebound: an input or a state.
+        force: Variable of the strut's force in N, positive where it pushes its bodies apart.
+        acceleration: Instead of it, of a bench: second derivative of the height in m/s².
+        mass_kg: Of a bench: mass that moves along the height.
+        temperature: Input of the damper temperature in °C.
+        applied_force: Input of the applied force in N.
+        parameters: Start values of its parameters.
+    """
+
+    file: InFolder
+    height: Variable
+    velocity: Variable
+    force: Variable | None = None
+    acceleration: Variable | None = None
+    mass_kg: Positive = 1.0
+    temperature: Variable | None = None
+    applied_force: Variable | None = None
+    parameters: dict[str, Finite] = Field(default_factory=dict[str, float])
+
+    @model_validator(mode="after")
+    def _gives_a_force(self) -> "FmuSpec":
+        if (self.force is None) == (self.acceleration is None):
+            raise ValueError("force and acceleration: expected one of them")
+        return self
+
+
 class StrutSpec(_Frozen):
     """Spring-damper: force = -stiffness * (height - free length) - damping * velocity.
 
@@ -169,6 +210,7 @@ class StrutSpec(_Frozen):
         damping_n_s_per_m: Linear damping.
         attachments_m: Where the strut is fixed, in the frame of each body.
         effects: What the law has beyond spring and damper.
+        fmu: A force beside them that a functional mock-up unit computes.
     """
 
     name: Name
@@ -178,6 +220,7 @@ class StrutSpec(_Frozen):
     damping_n_s_per_m: NotNegative
     attachments_m: tuple[Vector, Vector] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     effects: tuple[EffectSpec, ...] = ()
+    fmu: FmuSpec | None = None
 
     @model_validator(mode="after")
     def _has_two_ends(self) -> "StrutSpec":
@@ -329,16 +372,24 @@ def dump_model(spec: ModelSpec) -> str:
     return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
 
 
-def copy_skeleton(spec: ModelSpec, folder: Path) -> None:
-    """Copy a model's skeleton file, if it has one, to where `dump_model`'s text will look for it.
+def files_of(spec: ModelSpec) -> list[str]:
+    """Files that a model names, from its folder on: skeleton and FMUs."""
+    found = [strut.fmu.file for strut in spec.struts if strut.fmu is not None]
+    if isinstance(spec.skeleton, FileSkeleton):
+        found.insert(0, spec.skeleton.file)
+    return list(dict.fromkeys(found))
+
+
+def copy_files(spec: ModelSpec, folder: Path) -> None:
+    """Copy the files that a model names to where `dump_model`'s text will look for them.
 
     Raises:
         OSError: The folder cannot be written.
     """
-    if isinstance(spec.skeleton, FileSkeleton):
-        target = folder / spec.skeleton.file
+    for name in files_of(spec):
+        target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        source = spec.folder / spec.skeleton.file
+        source = spec.folder / name
         if not (target.exists() and target.samefile(source)):
             shutil.copyfile(source, target)
 

@@ -3,6 +3,7 @@
     skeleton      bodies and joints in DART
     geometry      heights and Jacobians of the struts
     strut         spring, damper and effects as one force
+    mockup        a force that a functional mock-up unit computes
     backend       the acceleration, which DART is asked for
     integrator    Kutta's method, and how long its steps may be
     mechanism     struts on joints: the equations of motion
@@ -28,6 +29,7 @@ from dart_model.plant.integrator import (
     stable_step_s,
 )
 from dart_model.plant.mechanism import Mechanism
+from dart_model.plant.mockup import MockUp
 from dart_model.plant.prescribed import PrescribedState, PrescribedStrut
 from dart_model.plant.skeleton import build
 from dart_model.plant.state import Loaded, Mechanics, PlantState
@@ -105,6 +107,11 @@ class DartPlant:
     def internal_states(self) -> int:
         """Number of internal states of all effects."""
         return sum(strut.states for strut in self._struts)
+
+    @property
+    def mockups(self) -> tuple[MockUp | None, ...]:
+        """Of each strut its FMU, if it has one."""
+        return tuple(next(iter(strut.mockups), None) for strut in self._struts)
 
     def init(
         self,

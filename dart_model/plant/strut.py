@@ -1,11 +1,13 @@
 """A strut: its spring, damper and effects as one force, without DART."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from dart_model.effects import Effect, effect
+from dart_model.plant.mockup import MockUp
 from dart_model.spec import ModelSpec, StrutSpec
 from rig.inputs.errors import InputError
 
@@ -14,7 +16,7 @@ _SAMPLED_M, _SAMPLED_M_PER_S = 0.5, 3.0
 
 
 class _Law(NamedTuple):
-    """An effect of a strut.
+    """An effect of a strut, or what an FMU gives beside them.
 
     Attributes:
         effect: The effect.
@@ -23,7 +25,7 @@ class _Law(NamedTuple):
         end: Index after its last one.
     """
 
-    effect: Effect
+    effect: Effect | MockUp
     parameters: list[float]
     first: int
     end: int
@@ -36,9 +38,12 @@ class Strut:
         spec: The strut.
         first_state: Index of its first internal state in the model's.
         gravity_m_per_s2: Standard gravity, for laws that carry a mass.
+        folder: Where an FMU is looked for.
     """
 
-    def __init__(self, spec: StrutSpec, first_state: int, gravity_m_per_s2: float) -> None:
+    def __init__(
+        self, spec: StrutSpec, first_state: int, gravity_m_per_s2: float, folder: Path
+    ) -> None:
         self.name = spec.name
         self._free_length = spec.free_length_m
         self._stiffness = spec.stiffness_n_per_m
@@ -55,9 +60,15 @@ class Strut:
             end = first + effect(item.name).state_size
             laws.append(_Law(effect(item.name), item.values(), first, end))
             first = end
+        if spec.fmu is not None:
+            unit = MockUp(spec.fmu, folder, gravity_m_per_s2)
+            laws.append(_Law(unit, [], first, first + len(unit.state_scales)))
+            first = laws[-1].end
         self._laws = tuple(laws)
         self.states = first - first_state
         """Number of internal states."""
+        self.mockups = tuple(law.effect for law in laws if isinstance(law.effect, MockUp))
+        """FMUs among what gives its force, at most one; its states are the strut's last."""
 
     def force_n(
         self,
@@ -127,7 +138,7 @@ def struts_of(spec: ModelSpec) -> tuple[Strut, ...]:
     struts: list[Strut] = []
     first_state = 0
     for item in spec.struts:
-        strut = Strut(item, first_state, spec.gravity_m_per_s2)
+        strut = Strut(item, first_state, spec.gravity_m_per_s2, spec.folder)
         first_state += strut.states
         struts.append(strut)
     return tuple(struts)

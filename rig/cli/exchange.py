@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 IMPORT_EXAMPLES = (
     "Examples: `rig import bench.txt --mapping bench.yaml --out bench.csv` · "
     "`rig import specimen.dat --rebound positive --out dyno.csv` · "
-    "`rig import bus.blf --config rig.yaml --out runs/9` · `rig import run.mf4 --out runs/10`"
+    "`rig import bus.blf --config rig.yaml --out runs/9` · `rig import run.mf4 --out runs/10` · "
+    "`rig import strut.fmu --fmu --mass-kg 10 --out model`"
 )
 
 
@@ -45,11 +46,24 @@ def import_command(
             "--mapping, whose names and units are then its own.",
         ),
     ] = None,
+    fmu: Annotated[
+        bool,
+        typer.Option(
+            "--fmu",
+            help="SOURCE is an FMU, of which a model is made; --mapping says what its variables "
+            "are, if they are not called as in an FMU of `rig export`.",
+        ),
+    ] = False,
+    mass_kg: Annotated[
+        float | None,
+        typer.Option("--mass-kg", metavar="KG", help="With --fmu: what a strut alone carries."),
+    ] = None,
 ) -> None:
-    """Make a CSV of a foreign table, or a run of a bus log or of an export.
+    """Make a CSV of a foreign table, a run of a bus log or of an export, a model of an FMU.
 
     A table (text, XLSX, TDMS, MF4, MTS) wants --mapping, or --rebound if it is of MTS; a bus log
-    (BLF, ASC, candump, TRC, MF4) wants --config; what `rig export` wrote wants neither.
+    (BLF, ASC, candump, TRC, MF4) wants --config; what `rig export` wrote wants neither. With --fmu,
+    SOURCE is a functional mock-up unit: a program, which from then on may run on this machine.
     """
     from rig.exchange.bus_log import import_log
     from rig.exchange.exported import import_run
@@ -57,6 +71,13 @@ def import_command(
     from rig.exchange.mapping import load_mapping
     from rig.operation.setup import load_setup
 
+    if fmu:
+        if config is not None or rebound is not None:
+            raise InputError("--config and --rebound: expected none of them with --fmu")
+        _import_model(source, mapping, mass_kg, out)
+        return
+    if mass_kg is not None:
+        raise InputError("--mass-kg: expected --fmu with it")
     if sum(given is not None for given in (mapping, config, rebound)) > 1:
         raise InputError("--mapping, --config and --rebound: expected one of them")
     if source.is_dir() and config is None and (mapping is not None or rebound is not None):
@@ -82,6 +103,23 @@ def import_command(
     for line in report.assumptions:
         console.print(f"- {line}", markup=False)
     console.print(f"Written: {report.out}", markup=False)
+
+
+def _import_model(source: Path, mapping: Path | None, mass_kg: float | None, out: Path) -> None:
+    """Make a model of an FMU."""
+    from rig.fmu.imported import MODEL_FILE, import_fmu
+
+    if mass_kg is not None and not 0.0 < mass_kg < float("inf"):
+        raise InputError(f"--mass-kg {mass_kg}: expected a mass")
+    model = import_fmu(source, mapping, mass_kg, out)
+    (strut,) = model.struts
+    given = {} if strut.fmu is None else strut.fmu.model_dump(exclude_none=True, mode="json")
+    for key in ("height", "velocity", "force", "acceleration", "temperature", "applied_force"):
+        if key in given:
+            console.print(f"{key}: {given[key]}", markup=False)
+    if "acceleration" in given:
+        console.print(f"mass: {given['mass_kg']:.6g} kg along the height, from the FMU")
+    console.print(f"Model: {out / MODEL_FILE}", markup=False)
 
 
 def _refuse_without_meaning(source: Path) -> None:

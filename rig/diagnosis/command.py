@@ -6,7 +6,7 @@ from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
-from dart_model.spec import FileSkeleton, ModelSpec, dump_model
+from dart_model.spec import ModelSpec, dump_model, files_of
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.outcome import (
     CORRECTED_FILE,
@@ -49,9 +49,9 @@ def diagnose_runs(
     for name in (DIAGNOSIS_FILE, CORRECTED_FILE, REPORT_FILE, "report.pdf"):
         if (out / name).exists():
             raise InputError(f"{out}: holds {name} already, expected a folder without one")
-    if isinstance(model.skeleton, FileSkeleton):
-        copied = out / model.skeleton.file
-        if copied.exists() and not copied.samefile(model.folder / model.skeleton.file):
+    for name in files_of(model):
+        copied = out / name
+        if copied.exists() and not copied.samefile(model.folder / name):
             raise InputError(f"{copied}: exists already, expected a folder without it")
     standing = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     if not standing.is_dir() or not os.access(standing, os.W_OK):

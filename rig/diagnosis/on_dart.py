@@ -73,7 +73,7 @@ def dart_heights(
     run, start = problem.runs[k], parts.starts[k]
     nodes = len(run.grid.t_s)
     count = min(nodes, max(50, int(_TRIED_S / run.grid.step_s)))
-    states = _states(problem, candidate, start[2 * plant.coordinates :])
+    states = _states(problem, candidate, start[2 * plant.coordinates :], plant)
     steps = 2 if run.substeps == 1 else 2 * run.substeps
     while steps < _MOST_STEPS and 2 * steps * nodes <= _MOST_STEPS_IN_ALL:
         there = _heights(plant, run, states, start, count, steps)
@@ -83,11 +83,21 @@ def dart_heights(
     return _heights(plant, run, states, start, nodes, steps)
 
 
-def _states(problem: Problem, candidate: Candidate, given: Array) -> tuple[float, ...]:
-    """Internal states in the order of DART's model: strut after strut, existing effects first."""
-    index = slots_of(problem, candidate).index
-    order = np.argsort(index[:, 0], kind="stable") if len(index) else []
-    return tuple(float(s) for row in order for s in given[index[row, 3] : index[row, 4]])
+def _states(
+    problem: Problem, candidate: Candidate, given: Array, plant: DartPlant
+) -> tuple[float, ...]:
+    """Internal states in the order of DART's model: strut after strut, existing effects first.
+
+    Those of an FMU, a strut's last, begin at its start.
+    """
+    states: list[float] = []
+    for strut, mockup in enumerate(plant.mockups):
+        for row in slots_of(problem, candidate).index:
+            if row[0] == strut:
+                states += given[row[3] : row[4]].tolist()
+        if mockup is not None:
+            states += [0.0] * len(mockup.state_scales)
+    return tuple(states)
 
 
 def _heights(

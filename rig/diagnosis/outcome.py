@@ -12,7 +12,7 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.spec import ModelSpec, copy_skeleton, dump_model
+from dart_model.spec import ModelSpec, copy_files, dump_model
 
 Array = NDArray[np.float64]
 Verdict = Literal["nothing_missing", "explained", "partly_explained", "ambiguous", "not_explained"]
@@ -322,7 +322,7 @@ def write_results(result: Result, nominal: ModelSpec, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / CORRECTED_FILE, dump_model(result.corrected))
     write_text(folder / DIAGNOSIS_FILE, to_json(result.diagnosis))
-    copy_skeleton(nominal, folder)
+    copy_files(nominal, folder)
 
 
 def write_text(path: Path, text: str) -> None:

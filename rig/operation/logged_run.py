@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from can_dbc.frame import Frame
-from dart_model.spec import copy_skeleton, dump_model
+from dart_model.spec import copy_files, dump_model
 from rig.core.bridge import Bridge, BridgeState, TickResult
 from rig.core.contract import Mode
 from rig.core.record import Record, columns
@@ -115,7 +115,7 @@ def _copy_inputs(ready: Setup, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / MODEL_FILE).write_text(dump_model(ready.model), "utf-8")
         shutil.copyfile(ready.database.path, folder / DBC_FILE)
-        copy_skeleton(ready.model, folder)
+        copy_files(ready.model, folder)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
 

@@ -31,6 +31,7 @@ from rig.diagnosis.problem.grid import (
     with_blocks_kept,
 )
 from rig.diagnosis.problem.mechanism import Mechanism, Readers, constant, readers, tabulated
+from rig.diagnosis.problem.mockup import with_mockups
 from rig.diagnosis.problem.prescribed import Drive, Prescribed, drive_of, noise_of
 from rig.diagnosis.recording import Recording, RecordingError, checked
 
@@ -135,6 +136,11 @@ def _problem(
 ) -> FreeRun | Prescribed:
     spec, *_, read = shared
     if is_prescribed(recordings):
+        if any(strut.fmu is not None for strut in spec.struts):
+            raise RecordingError(
+                f"model {spec.name}: an FMU, and runs whose motion is prescribed: expected runs "
+                "with applied_force_n"
+            )
         drives = tuple(
             drive_of(grid, at, recording, smooth)
             for (grid, at), recording, smooth in zip(pairs, recordings, smoothed, strict=True)
@@ -145,11 +151,11 @@ def _problem(
         return problem
     runs: list[Run] = []
     for (grid, _), recording, (motion, _, _) in zip(pairs, recordings, smoothed, strict=True):
-        mechanism = _mechanism(read, motion)
-        _check_columns(spec, recording, mechanism)
         if recording.applied_force_n is None:
             raise RecordingError(f"{recording.name}: expected a column applied_force_n")
         applied = (recording.t_s, recording.applied_force_n)
+        mechanism = _mechanism(read, motion._replace(applied_n=np.interp(grid.t_s, *applied)))
+        _check_columns(spec, recording, mechanism)
         runs.append(run_of(grid, applied, mechanism, _fastest(spec, mechanism)))
     problem = FreeRun(*shared, tuple(runs), np.full(len(spec.struts), np.inf))
     for run in runs:
@@ -289,8 +295,10 @@ def _motions(
 
 def _mechanism(read: Readers, motion: Track) -> Mechanism:
     if read.plain.is_constant:
-        return constant(read)
-    return tabulated(read, motion.heights_m.T, motion.velocities_m_per_s.T)
+        here = constant(read)
+    else:
+        here = tabulated(read, motion.heights_m.T, motion.velocities_m_per_s.T)
+    return with_mockups(here, read.plain, motion)
 
 
 def _fastest(spec: ModelSpec, m: Mechanism) -> float:

@@ -1,0 +1,260 @@
+"""A model that is an FMU: bench, diagnosis, FMU, and the same bench again."""
+
+import zipfile
+
+import numpy as np
+import pytest
+
+from dart_model.plant import DartPlant
+from dart_model.spec import MODELS, EffectSpec, load_model
+from rig.bench.config import load_bench_config
+from rig.bench.schema import Effect
+from rig.demo.story import draw_effect, tell
+from rig.diagnosis.command import diagnose_runs
+from rig.fmu.component import bench_component, strut_component
+from rig.fmu.imported import MODEL_FILE, import_fmu
+from rig.inputs.errors import InputError
+from rig.io.run_log import read_run
+from rig.operation.check import check
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.replay import replay
+from rig.operation.setup import load_setup
+from tests.fmu.driver import written
+from tests.fmu.specimens import with_effects
+
+SEED = 3
+DURATION_S = 8.0
+DISCRETE = 'causality="output" variability="discrete"'
+SETTLED = 500
+"""Ticks after which the observer follows."""
+
+
+@pytest.fixture(autouse=True)
+def settings(tmp_path_factory, monkeypatch):
+    """Settings of a user who imported nothing."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("settings")))
+
+
+def run_beside(folder, model, effects, excitation=3):
+    """A run of a model in lockstep with the story's bench; and its virtual force (RMS)."""
+    bench = load_bench_config(CONFIGS / "story_bench.yaml")
+    components = [c.model_copy(update={"seed": excitation}) for c in bench.applied_force.components]
+    force = bench.applied_force.model_copy(update={"components": tuple(components)})
+    changed = {"undeclared_effects": effects, "seed": excitation, "applied_force": force}
+    ready = load_setup(CONFIGS / "story.yaml", duration_s=DURATION_S)
+    with_bench(
+        ready.model_copy(update={"model": model}),
+        bench.model_copy(update=changed),
+        folder,
+        lockstep=True,
+        stop=lambda: False,
+        progress=lambda _t, _mode: None,
+    )
+    column = read_run(folder).steps.column("strut.virtual_force_n").to_numpy()
+    return float(np.sqrt(np.mean(np.asarray(column)[SETTLED:] ** 2)))
+
+
+def imported(folder, component, spec, version, mass_kg=None):
+    path = written(folder, component, version, spec)
+    out = folder / f"imported_{path.stem}"
+    import_fmu(path, None, mass_kg, out)
+    return load_model(out / MODEL_FILE)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_a_corrected_model_comes_back_as_an_fmu(tmp_path, version):
+    """A bench with an effect that nobody declared is diagnosed; the corrected model becomes an FMU,
+    and the FMU the model: the virtual force is what noise alone leaves."""
+    story = tell(
+        SEED,
+        tmp_path / "story",
+        duration_s=DURATION_S,
+        lockstep=True,
+        stop=lambda: False,
+        chapter=lambda _: None,
+        watch=lambda *_: None,
+        diagnosis_progress=lambda _what, _share: None,
+    )
+    before_n, after_n = story.virtual_force_rms_n
+    corrected = load_model(tmp_path / "story" / "diagnosis" / "corrected.yaml")
+    nominal = load_model(MODELS / "bench.yaml")
+    floor_n = run_beside(tmp_path / "floor", nominal, ())
+    effect = (draw_effect(SEED)[1],)
+    bench = imported(tmp_path, bench_component(corrected), corrected, version)
+    strut = imported(
+        tmp_path, strut_component(corrected, corrected.struts[0]), corrected, version, 10.0
+    )
+    for name, model in (("bench", bench), ("strut", strut)):
+        there_n = run_beside(tmp_path / name, model, effect)
+        assert there_n == pytest.approx(after_n, rel=1e-6)
+        assert there_n < 1.1 * floor_n
+        assert there_n < 0.2 * before_n
+
+
+@pytest.mark.long
+def test_a_defective_fmu_is_run_replayed_checked_and_diagnosed(tmp_path):
+    """An FMU with a Maxwell element stands for the model; its bench damps by the square as well."""
+    own = {"stiffness_n_per_m": 800.0, "relaxation_time_s": 0.05}
+    lacking = {"damping_n_s2_per_m2": 150.0}
+    nominal = load_model(MODELS / "bench.yaml")
+    spec = nominal.with_effects("strut", [EffectSpec(name="maxwell", parameters=own)])
+    effects = (
+        Effect.model_validate({"name": "maxwell", "strut": "strut", "parameters": own}),
+        Effect.model_validate(
+            {"name": "quadratic_damping", "strut": "strut", "parameters": lacking}
+        ),
+    )
+    model = imported(tmp_path, strut_component(spec, spec.struts[0]), spec, "3.0", 10.0)
+    before_n = run_beside(tmp_path / "run", model, effects, 1)
+    run_beside(tmp_path / "held_out", model, effects, 2)
+    assert replay(tmp_path / "run").different == 0
+    ready = load_setup(CONFIGS / "story.yaml").model_copy(update={"model": model})
+    assert {finding.severity.value for finding in check(ready)} <= {"ok", "note", "warning"}
+    result = diagnose_runs(
+        [tmp_path / "run"], model, [tmp_path / "held_out"], tmp_path / "found", lambda *_: None
+    )
+    found = result.diagnosis
+    assert found.verdict == "explained"
+    assert [item.name for item in found.effects] == ["quadratic_damping"]
+    (value,) = found.effects[0].parameters.values()
+    assert value.value == pytest.approx(150.0, rel=1e-3)
+    # On the FMU itself, in free run.
+    assert found.held_out.height_rmse_m.after < 1.1 * found.noise_floor.height_rmse_m
+    assert found.held_out.height_rmse_m.before > 100.0 * found.noise_floor.height_rmse_m
+    corrected = load_model(tmp_path / "found" / "corrected.yaml")
+    assert run_beside(tmp_path / "after", corrected, effects) < 0.05 * before_n
+
+
+def test_an_fmu_moves_a_body_as_the_law_inside_it_does(tmp_path):
+    """As a bench and as a strut, in both versions: the plant's own figures, to rounding."""
+    spec = with_effects("end_stops", "bouc_wen")
+    plant = DartPlant(spec)
+    models = [
+        imported(tmp_path, made, spec, version, mass_kg)
+        for version in ("2.0", "3.0")
+        for made, mass_kg in (
+            (bench_component(spec), None),
+            (strut_component(spec, spec.struts[0]), 10.0),
+        )
+    ]
+    theirs = moved(plant)
+    for model in models:
+        assert moved(DartPlant(model)) == pytest.approx(theirs, rel=1e-9, abs=1e-12)
+
+
+def moved(plant):
+    state = plant.init([0.38])
+    rows = []
+    for k in range(400):
+        loaded = plant.load(state, (5.0,), 30.0 * np.sin(0.02 * k), 20.0)
+        state = plant.step(loaded, 1e-3, 30.0 * np.sin(0.02 * (k + 1)))
+        rows.append((*state.struts[0], loaded.forces_n[0]))
+    return np.array(rows)
+
+
+def test_the_past_can_be_computed_again(tmp_path):
+    """A plant's answers depend on its arguments alone, also with an FMU that has states."""
+    spec = with_effects("maxwell", "backlash")
+    plant = DartPlant(imported(tmp_path, bench_component(spec), spec, "2.0"))
+    states = [plant.init([0.38])]
+    for _ in range(200):
+        states.append(plant.step(plant.load(states[-1], (0.0,), 0.0, 20.0), 1e-3, 0.0))
+    again = plant.step(plant.load(states[50], (0.0,), 0.0, 20.0), 1e-3, 0.0)
+    assert again == states[51]
+    numbers = plant.numbers(states[120])
+    assert plant.state_of(numbers, states[120].t_s) == states[120]
+
+
+def test_variables_of_other_names_are_mapped_and_signs_turned(tmp_path):
+    spec = with_effects("quadratic_damping")
+    path = written(tmp_path, strut_component(spec, spec.struts[0]), "2.0", spec)
+    names = {'"height_m"': '"x_rel"', '"velocity_m_per_s"': '"v_rel"', '"force_n"': '"F_damper"'}
+    foreign = changed(path, tmp_path / "foreign.fmu", names)
+    with pytest.raises(InputError, match="expected --mapping FILE"):
+        import_fmu(foreign, None, 10.0, tmp_path / "none")
+    mapping = tmp_path / "mapping.yaml"
+    mapping.write_text("{height: x_rel, velocity: v_rel, force: -F_damper}")
+    import_fmu(foreign, mapping, 10.0, tmp_path / "out")
+    (unit,) = DartPlant(load_model(tmp_path / "out" / MODEL_FILE)).mockups
+    (own,) = DartPlant(
+        imported(tmp_path, strut_component(spec, spec.struts[0]), spec, "2.0", 10.0)
+    ).mockups
+    given = (0.0, 0.31, 0.2, 0.0, 20.0, [])
+    assert unit.force(*given) == -own.force(*given)
+    mapping.write_text("{height: x_rel, velocity: v_rel, force: F_spring}")
+    with pytest.raises(InputError, match="force: no variable 'F_spring'"):
+        import_fmu(foreign, mapping, 10.0, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def changed(path, out, changes):
+    """An FMU whose description has other words."""
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(out, "w") as new:
+        for item in old.namelist():
+            text = old.read(item)
+            if item == "modelDescription.xml":
+                for before, after in changes.items():
+                    assert before.encode() in text
+                    text = text.replace(before.encode(), after.encode())
+            new.writestr(item, text)
+    return out
+
+
+def test_a_model_file_alone_makes_no_program_run(tmp_path, monkeypatch):
+    """Another user, or another machine: the FMU has to be imported there, by hand."""
+    spec = with_effects("none")
+    model = imported(tmp_path, bench_component(spec), spec, "3.0")
+    DartPlant(model)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "somebody_else"))
+    with pytest.raises(InputError, match="not imported on this machine"):
+        DartPlant(model)
+
+
+def test_an_fmu_that_was_changed_does_not_run(tmp_path):
+    spec = with_effects("none")
+    model = imported(tmp_path, bench_component(spec), spec, "3.0")
+    path = model.folder / model.struts[0].fmu.file
+    path.write_bytes(path.read_bytes() + b" ")
+    with pytest.raises(InputError, match="not imported on this machine"):
+        DartPlant(model)
+
+
+@pytest.mark.parametrize(
+    ("version", "changes", "line"),
+    [
+        ("2.0", {"<ModelExchange": "<!--", "</ModelExchange>": "-->"}, "Co-Simulation alone"),
+        ("2.0", {"canGetAndSetFMUstate": "canBeInstantiatedOnlyOncePerProcess"}, "only once"),
+        ("2.0", {'causality="output" variability="continuous"': DISCRETE}, "a discrete variable"),
+        ("2.0", {"fmiModelDescription ": "somethingElse "}, "is no FMU"),
+        ("2.0", {"{": "{0"}, "does not start .*name and GUID: expected"),
+        ("3.0", {"{": "{0"}, "does not start .*token: expected"),
+    ],
+)
+def test_what_cannot_be_a_model_is_said(tmp_path, version, changes, line):
+    spec = with_effects("none")
+    path = written(tmp_path, strut_component(spec, spec.struts[0]), version, spec)
+    with pytest.raises(InputError, match=line):
+        import_fmu(changed(path, tmp_path / "it.fmu", changes), None, 10.0, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"no archive at all", bytes(range(256)) * 9])
+def test_what_is_no_archive_is_said(tmp_path, content):
+    path = tmp_path / "it.fmu"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="is no FMU"):
+        import_fmu(path, None, 10.0, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("bench", "mass_kg", "line"),
+    [(True, 10.0, "expected none, a bench has its own"), (False, None, "expected --mass-kg")],
+)
+def test_a_mass_is_given_where_it_is_missing(tmp_path, bench, mass_kg, line):
+    spec = with_effects("none")
+    made = bench_component(spec) if bench else strut_component(spec, spec.struts[0])
+    path = written(tmp_path, made, "2.0", spec)
+    with pytest.raises(InputError, match=line):
+        import_fmu(path, None, mass_kg, tmp_path / "out")
