@@ -17,6 +17,7 @@ from rig.cli import (
     diagnose,
     docs,
     exchange,
+    fleet,
     init,
     replay,
     report,
@@ -33,7 +34,7 @@ from rig.inputs.errors import InputError
 
 __all__ = ["app", "main"]
 
-_GROUPS = ("sensor",)
+_GROUPS = ("sensor", "fleet")
 """Names that stand for several commands."""
 
 app = typer.Typer(
@@ -56,6 +57,7 @@ app.command("compare", epilog=compare.EXAMPLES)(compare.compare_command)
 app.command("timing", epilog=timing.EXAMPLES)(timing.timing)
 app.command("replay", epilog=replay.EXAMPLES)(replay.replay_command)
 app.command("diagnose", epilog=diagnose.EXAMPLES)(diagnose.diagnose)
+app.add_typer(fleet.app, name=_GROUPS[1])
 app.command("import", epilog=exchange.IMPORT_EXAMPLES)(exchange.import_command)
 app.command("export", epilog=exchange.EXPORT_EXAMPLES)(exchange.export_command)
 app.command("docs", epilog=docs.EXAMPLES)(docs.docs)

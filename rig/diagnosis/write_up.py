@@ -51,8 +51,13 @@ _HELD = 0.3
 """Share of half a sampling interval within which a delay is what a zero-order hold looks like."""
 
 
-class _Known(NamedTuple):
-    """A fit and what it does not know."""
+class Known(NamedTuple):
+    """A fit and what it does not know.
+
+    Attributes:
+        fit: The fit.
+        spread: The covariance of what was searched.
+    """
 
     fit: Fit
     spread: Spread
@@ -100,8 +105,8 @@ def written_up(
     chosen = found.chosen.fit
     before = [_forces(problem, k, found.given) for k in range(problem.recordings)]
     after = [_forces(problem, k, chosen) for k in range(problem.recordings)]
-    known = _Known(chosen, spread(chosen))
-    linear = _linear(problem, known)
+    known = Known(chosen, spread(chosen))
+    linear = linear_corrections(problem, known)
     effects = _effects(problem, known, after)
     if not effects:
         effects = _linear_effects(problem, known, after)
@@ -209,7 +214,8 @@ def _forces(problem: Problem, k: int, result: Fit) -> ResidualForces | None:
     return problem.residual_forces(k, result.candidate, result.parts)
 
 
-def _linear(problem: Problem, known: _Known) -> tuple[LinearCorrection, ...]:
+def linear_corrections(problem: Problem, known: Known) -> tuple[LinearCorrection, ...]:
+    """The linear parameters that a fit left free, with their intervals."""
     found: list[LinearCorrection] = []
     for variable, p in enumerate(_free(problem, known.fit)):
         nominal_value = p.nominal + (_existing_preload(problem, p) if p.kind == "preload" else 0.0)
@@ -237,7 +243,7 @@ def _existing_preload(problem: Problem, parameter: LinearParameter) -> float:
 
 
 def _effects(
-    problem: Problem, known: _Known, after: Sequence[ResidualForces | None]
+    problem: Problem, known: Known, after: Sequence[ResidualForces | None]
 ) -> tuple[FoundEffect, ...]:
     model, there = known.fit, [(k, f) for k, f in enumerate(after) if f is not None]
     first = len(model.candidate.kept)
@@ -246,7 +252,7 @@ def _effects(
     found: list[FoundEffect] = []
     for row, (strut, name) in enumerate(model.candidate.new, first):
         left = np.concatenate([f.force_n[strut] for _, f in there])
-        estimates = _estimates(problem, known, row, name)
+        estimates = estimates_of(problem, known, row, name)
         found.append(_found(problem, strut, name, left, forces[row][1], estimates))
     return tuple(sorted(found, key=lambda item: -item.force_rms_n))
 
@@ -269,7 +275,7 @@ def _found(
     )
 
 
-def _estimates(problem: Problem, known: _Known, row: int, name: str) -> dict[str, Estimate]:
+def estimates_of(problem: Problem, known: Known, row: int, name: str) -> dict[str, Estimate]:
     """Parameters of an effect by name; those of a table have no interval."""
     result = known.fit
     variables = effect_variables(problem, result).get(row)
@@ -281,7 +287,7 @@ def _estimates(problem: Problem, known: _Known, row: int, name: str) -> dict[str
 
 
 def _linear_effects(
-    problem: Problem, known: _Known, after: Sequence[ResidualForces | None]
+    problem: Problem, known: Known, after: Sequence[ResidualForces | None]
 ) -> tuple[FoundEffect, ...]:
     """Linear corrections as effects, where they are all that was found."""
     result = known.fit
@@ -308,7 +314,7 @@ def _linear_effects(
     return tuple(sorted(found, key=lambda item: -item.force_rms_n))
 
 
-def _implied_preloads(problem: Problem, known: _Known) -> set[int]:
+def _implied_preloads(problem: Problem, known: Known) -> set[int]:
     """Preloads about mid-stroke that a change of stiffness about the free length brings along."""
     free = _free(problem, known.fit)
     found: set[int] = set()
@@ -331,7 +337,7 @@ def _implied_preloads(problem: Problem, known: _Known) -> set[int]:
     return found
 
 
-def _existing(problem: Problem, found: Found, known: _Known) -> tuple[ExistingEffect, ...]:
+def _existing(problem: Problem, found: Found, known: Known) -> tuple[ExistingEffect, ...]:
     """Existing effects that are superfluous, or whose file values lie outside their intervals."""
     result = known.fit
     variables = effect_variables(problem, result)
@@ -343,7 +349,7 @@ def _existing(problem: Problem, found: Found, known: _Known) -> tuple[ExistingEf
         if kept in found.superfluous:
             listed.append(ExistingEffect(item.name, strut, "superfluous", nominal_values, {}))
         elif row in variables:
-            estimates = _estimates(problem, known, row, item.name)
+            estimates = estimates_of(problem, known, row, item.name)
             if any(_outside(estimates[name], value) for name, value in nominal_values.items()):
                 listed.append(
                     ExistingEffect(item.name, strut, "refitted", nominal_values, estimates)

@@ -1,0 +1,253 @@
+"""`rig fleet`: many runs at once, a store of what was found, and reports over it."""
+
+import csv
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from typer.core import TyperGroup
+
+from rig.cli.output import FAILED, OK, JsonFlag, console, print_json, table
+from rig.inputs.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator
+
+    from rig.fleet.campaign import Progress as State
+    from rig.fleet.overview import Overview
+
+import contextlib
+import time
+
+RUN = "run"
+
+
+class _OrRun(TyperGroup):
+    """`rig fleet SOURCE...` is `rig fleet run SOURCE...`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0] not in self.commands and args[0] != "--help":
+            args = [RUN, *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(
+    cls=_OrRun,
+    help="Many runs of many dampers: diagnose them, keep what was found, report over it. "
+    "`rig fleet SOURCE...` is `rig fleet run SOURCE...`.",
+    no_args_is_help=True,
+)
+
+RUN_EXAMPLES = (
+    "Examples: `rig fleet runs --model damper.yaml --out store` · "
+    "`rig fleet week_30 --path '{bench}/{date}/{damper}' --model damper.yaml --out store` · "
+    "`rig fleet s3://lab/runs --model damper.yaml --out store --dask tcp://head:8786` · "
+    "`rig fleet runs --model damper.yaml --out store --shard $SLURM_ARRAY_TASK_ID/64`"
+)
+QUERY_EXAMPLES = (
+    'Examples: `rig fleet query store "SELECT bench, verdict, count(*) FROM runs GROUP BY ALL"` · '
+    "`rig fleet query store \"SELECT date, value, low, high FROM effects WHERE damper = 'A17' "
+    "AND parameter = 'coulomb_force_n' ORDER BY date\" --csv`"
+)
+REPORT_EXAMPLES = "Examples: `rig fleet report store` · `rig fleet report store --out fleet.html`"
+
+Store = Annotated[Path, typer.Argument(metavar="STORE", help="Folder that `rig fleet` wrote.")]
+
+
+@app.command(RUN, epilog=RUN_EXAMPLES)
+def run_command(
+    sources: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SOURCE...",
+            help="Run folders, CSV files, or folders of them; also as URLs that fsspec knows.",
+        ),
+    ],
+    model: Annotated[
+        str, typer.Option("--model", metavar="MODEL", help="Model file, or a shipped one's name.")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="STORE", help="Store, new or begun.")],
+    path: Annotated[
+        str | None,
+        typer.Option(
+            "--path",
+            metavar="PATTERN",
+            help="Path of a run below its SOURCE with {bench}, {damper}, {date} and *; without it "
+            "the folder above it is the bench, and a date is looked for in the path.",
+        ),
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", min=1, help="Processes; by default one a core.")
+    ] = None,
+    dask: Annotated[
+        str | None,
+        typer.Option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster that runs."),
+    ] = None,
+    shard: Annotated[
+        str | None,
+        typer.Option("--shard", metavar="I/N", help="Only the I-th of N parts, from 1 on."),
+    ] = None,
+    again: Annotated[
+        bool, typer.Option("--again", help="Try runs again that failed before.")
+    ] = False,
+    as_json: JsonFlag = False,
+) -> int:
+    """Diagnose many runs, each by itself, and keep what was found in a store of Parquet files.
+
+    What is in the store is not computed again: a fleet that was ended is gone on with by the same
+    command. A run that fails is a row with its error. Exit code 1 if any failed now.
+    """
+    from dart_model.spec import load_model, model_file
+    from rig.fleet.campaign import Model, campaign
+    from rig.fleet.executors import dask as dask_at
+    from rig.fleet.executors import processes
+    from rig.fleet.sources import find_sources, shard_of
+    from rig.inputs.yaml_file import read_text
+
+    if jobs is not None and dask is not None:
+        raise InputError("--jobs and --dask: expected one of them")
+    part = None if shard is None else _shard(shard)
+    file = model_file(model, Path())
+    load_model(file)  # Refused now, not by every worker.
+    _refuse_other(out)
+    found = find_sources(sources, path)
+    if part is not None:
+        found = shard_of(found, *part)
+    engine = dask_at(dask) if dask is not None else processes(jobs)
+    if not as_json:
+        console.print(f"{len(found)} runs, {engine.words}", markup=False)
+    given = Model(read_text(file), str(file.parent.absolute()))
+    with _shown() as show:
+        end = campaign(found, given, out, engine.make, engine.window, again=again, progress=show)
+    if as_json:
+        print_json(end._asdict())
+    else:
+        console.print(_sentence(end), markup=False)
+        console.print(f"Store: {out}", markup=False)
+    return FAILED if end.failed else OK
+
+
+def _shard(text: str) -> tuple[int, int]:
+    first, _, last = text.partition("/")
+    if not (first.isdigit() and last.isdigit() and 1 <= int(first) <= int(last)):
+        raise InputError(f"--shard {text!r}: expected I/N with I from 1 to N, such as 3/16")
+    return int(first), int(last)
+
+
+def _refuse_other(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file, expected a folder")
+    if out.is_dir() and any(out.iterdir()) and not (out / "runs").is_dir():
+        raise InputError(f"{out}: holds something else, expected a store or a new folder")
+
+
+def _sentence(end: "State") -> str:
+    rate = end.done / end.elapsed_s if end.elapsed_s > 0.0 else 0.0
+    return (
+        f"{end.done} evaluated in {end.elapsed_s:.1f} s ({rate:.2f} a second), "
+        f"{end.failed} of them failed; {end.skipped} were in the store"
+    )
+
+
+@contextlib.contextmanager
+def _shown() -> "Generator[Callable[[State], None]]":
+    """A bar, or a line every ten seconds where there is no terminal."""
+    from rich.console import Console
+
+    shown = Console(stderr=True)
+    if shown.is_terminal:
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=shown, transient=True) as bars:
+            bar = bars.add_task("runs")
+            yield lambda now: bars.update(
+                bar,
+                total=now.todo,
+                completed=now.done,
+                description=f"{now.done}, {now.failed} failed",
+            )
+        return
+    due_s = time.monotonic() + 10.0
+
+    def line(now: "State") -> None:
+        nonlocal due_s
+        if time.monotonic() >= due_s:
+            due_s = time.monotonic() + 10.0
+            sys.stderr.write(f"{now.done} of {now.todo}, {now.failed} failed\n")
+
+    yield line
+
+
+@app.command("query", epilog=QUERY_EXAMPLES)
+def query_command(
+    store: Store,
+    sql: Annotated[
+        str, typer.Argument(metavar="SQL", help="Over the views runs, effects and values.")
+    ],
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Ask a store, in SQL (DuckDB).
+
+    `runs` has a row a run, `effects` a row a parameter of the model (kind `model`) or of an effect
+    that it lacks (`found`), `values` also the figures of `rig characterise` (`figure`).
+    """
+    from rig.fleet.store import query
+
+    names, rows = query(store, sql)
+    if as_json:
+        print_json([dict(zip(names, map(_plain, row), strict=True)) for row in rows])
+    elif as_csv:
+        writer = csv.writer(sys.stdout, lineterminator="\n")
+        writer.writerow(names)
+        writer.writerows(rows)
+    else:
+        shown = table(*names)
+        for row in rows:
+            shown.add_row(*("" if item is None else str(item) for item in row))
+        console.print(shown)
+
+
+def _plain(value: object) -> object:
+    return value if isinstance(value, int | float | str | bool | None) else str(value)
+
+
+@app.command("report", epilog=REPORT_EXAMPLES)
+def report_command(
+    store: Store,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="New HTML file, a page of it.")
+    ] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """What a store says as a whole: verdicts, change-points, wear, outliers, jumps of a bench."""
+    from rig.fleet.overview import overview
+
+    if out is not None and out.exists():
+        raise InputError(f"{out}: exists, expected a new file")
+    found = overview(store)
+    if as_json:
+        print_json(found.as_dict())
+    else:
+        _print(found)
+    if out is not None:
+        from rig.pages.fleet_page import write_fleet_page
+
+        write_fleet_page(found, out)
+        if not as_json:
+            console.print(f"Written: {out}", markup=False)
+
+
+def _print(found: "Overview") -> None:
+    from rig.fleet.words import alarms
+
+    console.print(f"{found.runs} runs of {len(found.verdicts)} benches", markup=False)
+    shown = table("bench", "verdicts")
+    for bench, counts in found.verdicts.items():
+        shown.add_row(bench, ", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+    console.print(shown)
+    for line in alarms(found) or ["Nothing changed, drifts or stands out."]:
+        console.print(f"- {line}", markup=False)
+    for error, count in list(found.failed.items())[:5]:
+        console.print(f"failed, {count}: {error}", markup=False, style="red")

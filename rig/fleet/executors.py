@@ -1,0 +1,79 @@
+"""Where the runs of a fleet are computed: processes of this machine, or a cluster of Dask."""
+
+import importlib
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable
+from concurrent.futures import Executor, ProcessPoolExecutor
+from typing import Any, NamedTuple
+
+from rig.inputs.errors import InputError
+
+_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_AHEAD = 4
+"""Runs that are given to each worker ahead of time, so that none waits for the next one."""
+
+
+class Engine(NamedTuple):
+    """What computes.
+
+    Attributes:
+        words: As it is said.
+        make: Makes an executor.
+        window: Runs that it is given at a time.
+    """
+
+    words: str
+    make: Callable[[], Executor]
+    window: int
+
+
+def processes(jobs: int | None) -> Engine:
+    """Processes of this machine.
+
+    Args:
+        jobs: How many; one a core that this program may use if None.
+    """
+    count = jobs or len(os.sched_getaffinity(0))
+    for name in _THREADS:
+        os.environ.setdefault(
+            name, "1"
+        )  # Workers are as many as cores; theirs would be in the way.
+    context = multiprocessing.get_context("spawn")
+
+    def make() -> Executor:
+        return ProcessPoolExecutor(count, mp_context=context, initializer=_worker)
+
+    return Engine(f"{count} processes", make, _AHEAD * count)
+
+
+def _worker() -> None:
+    """Ctrl-C is the parent's: it ends in order, and with it its workers."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def dask(address: str) -> Engine:
+    """A cluster that runs already, known by its scheduler.
+
+    Raises:
+        InputError: Dask is not installed, or there is no scheduler.
+    """
+    try:
+        library: Any = importlib.import_module("distributed")
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "distributed is not installed, expected `pip install dask[distributed]`"
+        ) from error
+    try:
+        client = library.Client(address, timeout="10s", set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"--dask {address}: no scheduler there ({error})") from error
+    threads = sum(client.nthreads().values())
+    if not threads:
+        raise InputError(f"--dask {address}: a scheduler without workers")
+
+    def make() -> Executor:
+        return client.get_executor(pure=False)
+
+    return Engine(f"Dask at {address}, {threads} threads of workers", make, _AHEAD * threads)

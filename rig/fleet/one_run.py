@@ -1,0 +1,289 @@
+"""One run of a fleet, from its files to a row. It runs in a worker, and never raises."""
+
+import contextlib
+import datetime
+import hashlib
+import math
+import tempfile
+import time
+from collections.abc import Generator
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from fsspec.core import url_to_fs
+
+from dart_model.effects import effect
+from dart_model.spec import ModelSpec, parse_model
+from rig.characteristics.command import characterise
+from rig.diagnosis.diagnose import diagnose
+from rig.diagnosis.outcome import Estimate
+from rig.diagnosis.recording import Recording, read_recording
+from rig.diagnosis.refit import refitted
+from rig.fleet.sources import Source
+from rig.inputs.errors import InputError
+from rig.inputs.yaml_file import parse_mapping, read_text
+from rig.io.run_log import RUN_FILE
+
+_PIECE = 1 << 20
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a worker is given.
+
+    Attributes:
+        source: The run.
+        model: Text of the model file.
+        folder: Where the files that it names lie.
+    """
+
+    source: Source
+    model: str
+    folder: str
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is known of a run; a row of the store, and one for each of its values.
+
+    Attributes:
+        key: Of its content, the model and the version: the same run counts once.
+        identity: Of its place, size and time, the model and the version: what was evaluated is
+            known by it without being read again.
+        source: Where it was.
+        bench: Bench.
+        damper: Damper.
+        date: Day.
+        model: Name of the model.
+        version: Version of rig.
+        verdict: Of the diagnosis; empty where it failed.
+        error: Why it failed; empty where it did not.
+        samples: Number of samples.
+        duration_s: Length.
+        before: Error of the model on held-out blocks: of the height in m, or of the force in N on a
+            prescribed motion.
+        after: The same of the corrected model.
+        floor: What a right model leaves there.
+        took_s: Time of computation.
+        values: Parameters and figures.
+    """
+
+    key: str
+    identity: str
+    source: str
+    bench: str
+    damper: str
+    date: str
+    model: str
+    version: str
+    verdict: str = ""
+    error: str = ""
+    samples: int = 0
+    duration_s: float = math.nan
+    before: float = math.nan
+    after: float = math.nan
+    floor: float = math.nan
+    took_s: float = math.nan
+    values: tuple["Value", ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """As columns, without its values."""
+        return {
+            item.name: getattr(self, item.name) for item in fields(self) if item.name != "values"
+        }
+
+
+@dataclass(frozen=True)
+class Value:
+    """A number that a run gave.
+
+    Attributes:
+        kind: ``model``: a parameter of the model itself, as this run has it; ``found``: of an
+            effect that the model lacks; ``figure``: of the damper, as `rig characterise` has it.
+        strut: Strut.
+        effect: Effect in the catalogue; empty for the linear part and for figures.
+        family: Its family.
+        parameter: Name with its unit.
+        value: Value in SI.
+        low: Lower end of its 95 % interval; NaN where the run does not bound it.
+        high: Upper end.
+    """
+
+    kind: str
+    strut: str
+    effect: str
+    family: str
+    parameter: str
+    value: float
+    low: float
+    high: float
+
+
+def evaluated(task: Task) -> Row:
+    """Diagnose a run by itself; what goes wrong is in the row."""
+    begun = time.perf_counter()
+    source = task.source
+    try:
+        row = _evaluated(task)
+    except InputError as error:
+        row = _failed(task, str(error))
+    except Exception as error:  # one bad run never stops the rest
+        row = _failed(task, f"unexpected: {type(error).__name__}: {error}")
+    took_s = time.perf_counter() - begun
+    return replace(row, took_s=took_s, error=row.error.replace(source.url, "run")[:500])
+
+
+def lost(task: Task, why: str) -> Row:
+    """The row of a run that came back from no worker."""
+    return _failed(task, why)
+
+
+def identity_of(source: Source, model: str) -> str:
+    """What a run is known by without being read."""
+    text = f"{source.url}\0{source.size}\0{source.stamp}\0{model}\0{rig_version()}"
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _failed(task: Task, why: str) -> Row:
+    source, identity = task.source, identity_of(task.source, task.model)
+    return Row(
+        identity,
+        identity,
+        source.url,
+        source.bench,
+        source.damper,
+        source.date or source.changed,
+        _model(task.model, task.folder).name,
+        rig_version(),
+        error=why,
+    )
+
+
+@lru_cache(maxsize=1)
+def rig_version() -> str:
+    """The version whose rows these are."""
+    return version("rig")
+
+
+@lru_cache(maxsize=4)
+def _model(text: str, folder: str) -> ModelSpec:
+    return parse_model(text, "model", Path(folder))
+
+
+def _evaluated(task: Task) -> Row:
+    source, spec = task.source, _model(task.model, task.folder)
+    with _local(source) as path:
+        key = _key(path, task)
+        names = [strut.name for strut in spec.struts]
+        recording = read_recording(path, names)
+        figures = _figures(path, recording)
+        day = source.date or _day_of(path, source) or source.changed
+    found = diagnose(spec, [recording]).diagnosis
+    own = [
+        _value("model", item.strut, item.effect, item.parameter, item.estimate)
+        for item in refitted(spec, [recording])
+    ]
+    new = [
+        _value("found", item.strut, item.name, name, estimate)
+        for item in found.effects
+        for name, estimate in item.parameters.items()
+    ]
+    held_out = found.held_out
+    heights, forces = held_out.height_rmse_m, held_out.residual_force_rmse_n
+    counted, floor = (
+        (heights, found.noise_floor.height_rmse_m)
+        if math.isfinite(heights.after)
+        else (forces, found.noise_floor.residual_force_rmse_n)
+    )
+    return Row(
+        key,
+        identity_of(source, task.model),
+        source.url,
+        source.bench,
+        source.damper,
+        day,
+        spec.name,
+        rig_version(),
+        found.verdict,
+        samples=len(recording.t_s),
+        duration_s=recording.duration_s,
+        before=counted.before,
+        after=counted.after,
+        floor=floor,
+        values=(*own, *new, *figures),
+    )
+
+
+def _value(kind: str, strut: str, name: str, parameter: str, estimate: Estimate) -> Value:
+    low = math.nan if estimate.low is None else estimate.low
+    high = math.nan if estimate.high is None else estimate.high
+    family = effect(name).family if name else ""
+    return Value(kind, strut, name, family, parameter, estimate.value, low, high)
+
+
+def _figures(path: Path, recording: Recording) -> list[Value]:
+    """Figures of a damper that was moved in strokes; none where it was not."""
+    if recording.strut_forces_n is None or recording.heights_m.shape[1] != 1:
+        return []
+    try:
+        damper = characterise(path).damper
+    except InputError:
+        return []
+    named = {
+        "gas_force_n": damper.gas_force,
+        "gas_rate_n_per_m": damper.gas_rate,
+        "friction_n": damper.friction,
+        "asymmetry": damper.asymmetry,
+    }
+    return [
+        Value("figure", "", "", "", name, figure.value, figure.low, figure.high)
+        for name, figure in named.items()
+        if figure is not None
+    ]
+
+
+@contextlib.contextmanager
+def _local(source: Source) -> Generator[Path]:
+    """The run as files of this machine."""
+    if "://" not in source.url:
+        yield Path(source.url)
+        return
+    with tempfile.TemporaryDirectory(prefix="rig-run-") as name:
+        target = Path(name) / Path(source.url).name
+        try:
+            system, root = url_to_fs(source.url)
+            if source.is_folder:
+                system.get(root + "/", str(target) + "/", recursive=True)
+            else:
+                system.get_file(root, str(target))
+        except (OSError, ValueError, ImportError) as error:
+            raise InputError(f"{source.url}: cannot be read ({error})") from error
+        yield target
+
+
+def _key(path: Path, task: Task) -> str:
+    """Of a run's content, the model and the version."""
+    found = hashlib.sha256(f"{task.model}\0{rig_version()}\0".encode())
+    files = sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]
+    for file in files:
+        found.update(f"{file.name}\0".encode() if path.is_dir() else b"")
+        try:
+            with file.open("rb") as opened:
+                while piece := opened.read(_PIECE):
+                    found.update(piece)
+        except OSError as error:
+            raise InputError(f"{file}: cannot be read ({error.strerror})") from error
+    return found.hexdigest()[:32]
+
+
+def _day_of(path: Path, source: Source) -> str:
+    """The day on which a run of the bridge began; empty for other recordings."""
+    if not source.is_folder:
+        return ""
+    epoch_ns = parse_mapping(read_text(path / RUN_FILE), str(path / RUN_FILE)).get("epoch_ns")
+    if not isinstance(epoch_ns, int):
+        return ""
+    return datetime.datetime.fromtimestamp(epoch_ns / 1e9, datetime.UTC).date().isoformat()

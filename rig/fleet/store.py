@@ -1,0 +1,220 @@
+"""Rows of runs as Parquet, partitioned by bench and date, and queries over them.
+
+    STORE/runs/bench=B/date=D/PART.parquet      a row a run
+    STORE/values/bench=B/date=D/PART.parquet    a row a parameter or figure of a run
+
+A part is written whole or not at all, its values first: a run whose row is there is complete. Two
+programs that write into one store (two shards) know nothing of each other, and need not. What was
+written twice all the same is counted once by the views.
+"""
+
+import contextlib
+import hashlib
+import importlib
+import os
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import pyarrow as pa
+from pyarrow import dataset, parquet
+
+from rig.fleet.one_run import Row, Value
+from rig.inputs.errors import InputError
+
+_duckdb: Any = None
+with contextlib.suppress(ModuleNotFoundError):  # It only reads; the store is written without it.
+    _duckdb = importlib.import_module("duckdb")
+_pa: Any = pa
+_dataset: Any = dataset
+_parquet: Any = parquet
+
+_RUN = _pa.schema(
+    [
+        ("key", _pa.string()),
+        ("identity", _pa.string()),
+        ("source", _pa.string()),
+        ("damper", _pa.string()),
+        ("model", _pa.string()),
+        ("version", _pa.string()),
+        ("verdict", _pa.string()),
+        ("error", _pa.string()),
+        ("samples", _pa.int64()),
+        ("duration_s", _pa.float64()),
+        ("before", _pa.float64()),
+        ("after", _pa.float64()),
+        ("floor", _pa.float64()),
+        ("took_s", _pa.float64()),
+        ("part", _pa.string()),
+    ]
+)
+_VALUE = _pa.schema(
+    [
+        ("key", _pa.string()),
+        ("damper", _pa.string()),
+        ("kind", _pa.string()),
+        ("strut", _pa.string()),
+        ("effect", _pa.string()),
+        ("family", _pa.string()),
+        ("parameter", _pa.string()),
+        ("value", _pa.float64()),
+        ("low", _pa.float64()),
+        ("high", _pa.float64()),
+        ("part", _pa.string()),
+    ]
+)
+_VIEWS = """
+CREATE VIEW runs AS SELECT * EXCLUDE (identity) FROM (
+    SELECT * FROM read_parquet({runs}, hive_partitioning = true, hive_types_autocast = false)
+    QUALIFY row_number() OVER (PARTITION BY key ORDER BY part) = 1
+) AS every WHERE error = '' OR source NOT IN (
+    SELECT source FROM read_parquet({runs}, hive_partitioning = true) WHERE error = ''
+);
+CREATE VIEW "values" AS SELECT v.* FROM
+    read_parquet({values}, hive_partitioning = true, hive_types_autocast = false) AS v
+    SEMI JOIN runs ON v.key = runs.key AND v.part = runs.part;
+CREATE VIEW effects AS SELECT * FROM "values" WHERE kind <> 'figure';
+"""
+_ABANDONED_S = 3600.0
+"""Age from which on a part without its runs was left by a program that was killed."""
+
+
+def append(store: Path, rows: Sequence[Row]) -> None:
+    """Write rows, a part for each bench and day.
+
+    Raises:
+        InputError: The store cannot be written.
+    """
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row.bench, row.date), []).append(row)
+    try:
+        for (bench, date), group in groups.items():
+            _write(store, f"bench={quote(bench, safe='')}/date={date}", group)
+    except OSError as error:
+        raise InputError(f"{store}: cannot be written ({error.strerror})") from error
+
+
+def _write(store: Path, partition: str, rows: Sequence[Row]) -> None:
+    part = hashlib.sha256("\0".join(row.key for row in rows).encode()).hexdigest()[:24]
+    runs = [{**row.as_dict(), "part": part} for row in rows]
+    values = [
+        {**_columns(value), "key": row.key, "damper": row.damper, "part": part}
+        for row in rows
+        for value in row.values
+    ]
+    for name, schema, content in (("values", _VALUE, values), ("runs", _RUN, runs)):
+        path = store / name / partition / f"{part}.parquet"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".{path.name}.{os.getpid()}")
+        kept = [{key: item[key] for key in schema.names} for item in content]
+        _parquet.write_table(_pa.Table.from_pylist(kept, schema=schema), temporary)
+        temporary.replace(path)
+
+
+def _columns(value: Value) -> dict[str, Any]:
+    return {name: getattr(value, name) for name in _VALUE.names if hasattr(value, name)}
+
+
+def identities(store: Path, *, with_failed: bool) -> set[str]:
+    """What was evaluated already.
+
+    Args:
+        store: The store; it may not be there yet.
+        with_failed: Whether runs that failed count.
+
+    Raises:
+        InputError: It cannot be read.
+    """
+    found: set[str] = set()
+    for batch in _batches(store, ["identity", "error"]):
+        columns = batch.to_pydict()
+        for identity, error in zip(columns["identity"], columns["error"], strict=True):
+            if with_failed or not error:
+                found.add(identity)
+    return found
+
+
+def keys(store: Path) -> set[str]:
+    """Keys of all runs of a store.
+
+    Raises:
+        InputError: It cannot be read.
+    """
+    return {key for batch in _batches(store, ["key"]) for key in batch.column("key").to_pylist()}
+
+
+def _batches(store: Path, columns: Sequence[str]) -> Iterator[Any]:
+    folder = store / "runs"
+    if not folder.is_dir():
+        return
+    try:
+        there = _dataset.dataset(folder, format="parquet", partitioning="hive")
+        if there.files:
+            yield from there.to_batches(columns=list(columns))
+    except (OSError, _pa.ArrowException, ValueError) as error:
+        raise InputError(f"{folder}: cannot be read ({error})") from error
+
+
+def sweep(store: Path) -> None:
+    """Remove what a killed program left: files without a name, values without their runs."""
+    now = time.time()
+    for path in _files(store, "values", ".*"):
+        runs = store / "runs" / path.relative_to(store / "values")
+        if (path.name.startswith(".") or not runs.exists()) and _age_s(path, now) > _ABANDONED_S:
+            path.unlink(missing_ok=True)
+    for path in _files(store, "runs", ".*"):
+        if path.name.startswith(".") and _age_s(path, now) > _ABANDONED_S:
+            path.unlink(missing_ok=True)
+
+
+def _files(store: Path, name: str, hidden: str) -> Iterable[Path]:
+    folder = store / name
+    return [*folder.rglob("*.parquet"), *folder.rglob(hidden)] if folder.is_dir() else []
+
+
+def _age_s(path: Path, now: float) -> float:
+    try:
+        return now - path.stat().st_mtime
+    except FileNotFoundError:
+        return 0.0
+
+
+def opened(store: Path) -> Any:
+    """A DuckDB connection with the views `runs`, `values` and `effects`.
+
+    Raises:
+        InputError: There is no store, or DuckDB is not installed.
+    """
+    if not any((store / "runs").rglob("*.parquet")):
+        raise InputError(f"{store}: no runs in it, expected what `rig fleet SOURCE` wrote")
+    if _duckdb is None:
+        raise InputError("duckdb is not installed, expected `pip install 'rig[fleet]'`")
+    connection = _duckdb.connect()
+    runs, values = (_quoted(store / name / "**" / "*.parquet") for name in ("runs", "values"))
+    connection.execute(_VIEWS.format(runs=runs, values=values))
+    return connection
+
+
+def _quoted(path: Path) -> str:
+    return "'" + str(path).replace("'", "''") + "'"
+
+
+def query(store: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
+    """Names of columns, and rows, of a query over a store.
+
+    Raises:
+        InputError: There is no store, or DuckDB refuses the query.
+    """
+    connection = opened(store)
+    try:
+        answer = connection.execute(sql)
+        names = [item[0] for item in answer.description or ()]
+        return names, answer.fetchall() if names else []
+    except _duckdb.Error as error:
+        first = str(error).splitlines()[0]
+        raise InputError(f"{store}: {first}") from error
+    finally:
+        connection.close()

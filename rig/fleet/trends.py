@@ -1,0 +1,317 @@
+"""What a value does over time: a change-point beside wear, outliers, and jumps of a whole bench.
+
+A series is a straight line (wear) until it has a change-point: a step, or a bend. Its statistic is
+the largest F over all places of the change (Quandt 1960; Andrews 1993, Econometrica 61), whose
+distribution under a straight line with independent errors depends on the times alone and is drawn
+here; a level for a whole fleet is divided among its series (Bonferroni).
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import f as fisher
+from scipy.stats import t as student
+
+Array = NDArray[np.float64]
+
+LEVEL = 0.01
+"""Chance of one false alarm of a kind in a whole fleet without any change."""
+
+FEWEST = 10
+"""Points of a series from which on a change-point is looked for."""
+
+_EDGE = 3
+"""Points that each side of a change has at least: a line through two of them fits anything."""
+
+_DRAWS = 40_000
+_TAIL = 40
+"""Draws of the statistic without a change, and how many of them its tail is continued from."""
+
+_ALONE = 5
+"""Dampers from which on one is held against the others."""
+
+_MOST_MEMBERS = 400
+"""Of more, the bound of so many is taken at a level that is that much smaller."""
+
+_VALUES_DRAWN, _ROUNDS = 1_000_000, 10
+"""Random numbers a round, and rounds, from which the bound of outliers is read."""
+
+_SHARED = 2
+"""Dampers that have to show a jump together, for it to be the bench's."""
+
+_CLOSE_DAYS = 15.0
+"""Days between a damper's change and one of its bench up to which they are the same."""
+
+_GAUSS = 1.4826
+"""Standard deviation over median absolute deviation of a Gaussian."""
+
+
+class Point(NamedTuple):
+    """A value on a day.
+
+    Attributes:
+        day: Days since any origin.
+        value: The value.
+    """
+
+    day: float
+    value: float
+
+
+class Change(NamedTuple):
+    """A change-point.
+
+    Attributes:
+        day: First day of a step, or the day on which a bend begins.
+        low: Earliest such day of its 95 % interval.
+        high: Latest.
+        kind: ``step`` or ``bend``.
+        before: Value just before, by the line there.
+        after: At the end of the series, by the line there.
+        slope_before: Change per day before.
+        slope_after: Change per day after.
+        p: Chance of a statistic as large without a change, in one series.
+    """
+
+    day: float
+    low: float
+    high: float
+    kind: Literal["step", "bend"]
+    before: float
+    after: float
+    slope_before: float
+    slope_after: float
+    p: float
+
+
+class Drift(NamedTuple):
+    """Slope of the straight line through a series.
+
+    Attributes:
+        per_day: Change per day.
+        low: Lower end of its 95 % interval.
+        high: Upper end.
+        level: Value of the line in the middle.
+        p: Chance of a slope as large without a drift.
+    """
+
+    per_day: float
+    low: float
+    high: float
+    level: float
+    p: float
+
+
+def change_point(points: Sequence[Point]) -> Change | None:
+    """The likeliest change of a series, significant or not; None where it is too short.
+
+    Args:
+        points: The series, by day.
+    """
+    days = np.array([point.day for point in points])
+    if len(points) < FEWEST or np.ptp(days) <= 0.0:
+        return None
+    y = np.array([point.value for point in points])
+    if not _places(days):
+        return None
+    statistic = float(_largest(days, y[:, np.newaxis])[0])
+    return _described(days, y, _chance(tuple(np.round(days - days[0], 6)), statistic))
+
+
+def drift(points: Sequence[Point]) -> Drift | None:
+    """The straight line through a series; None with fewer than three days."""
+    days = np.array([point.day for point in points])
+    if len(np.unique(days)) < 3:
+        return None
+    y = np.array([point.value for point in points])
+    middle = float(days.mean())
+    x = days - middle
+    slope = float(x @ y / (x @ x))
+    left = y - y.mean() - slope * x
+    free = len(y) - 2
+    error = float(np.sqrt(left @ left / free / (x @ x)))
+    half = error * float(student.ppf(0.975, free))
+    p = float(2.0 * student.sf(abs(slope) / max(error, 1e-300), free))
+    return Drift(slope, slope - half, slope + half, float(y.mean()), p)
+
+
+def outliers(values: Mapping[str, float], level: float) -> dict[str, float]:
+    """How many robust standard deviations away from the others members are that stand out.
+
+    Args:
+        values: One value a member; up to a half of them may be bad.
+        level: Chance of any such member among so many alike.
+    """
+    if len(values) < _ALONE:
+        return {}
+    every = np.array(list(values.values()))
+    distance = _distances(every[:, np.newaxis])[:, 0]
+    bound = _farthest(
+        min(len(values), _MOST_MEMBERS), level * min(1.0, _MOST_MEMBERS / len(values))
+    )
+    return {name: float(far) for name, far in zip(values, distance, strict=True) if far > bound}
+
+
+def _distances(values: Array) -> Array:
+    """Distances from the median over the spread, column by column, shape (N, M)."""
+    from_middle = np.abs(values - np.median(values, axis=0))
+    return from_middle / np.maximum(_GAUSS * np.median(from_middle, axis=0), 1e-300)
+
+
+@lru_cache(maxsize=64)
+def _farthest(members: int, level: float) -> float:
+    """Distance that the farthest of so many Gaussian values exceeds with a chance of `level`."""
+    rng = np.random.default_rng(0)
+    draws = max(round(_VALUES_DRAWN / members), 1)
+    farthest = np.concatenate(
+        [_distances(rng.standard_normal((members, draws))).max(axis=0) for _ in range(_ROUNDS)]
+    )
+    return float(np.quantile(farthest, 1.0 - level))
+
+
+def bench_jump(series: Mapping[str, Sequence[Point]]) -> Change | None:
+    """A step that the dampers of one bench have in common: of its calibration, not of theirs.
+
+    Args:
+        series: Of each damper the logarithm of a value that its force scales.
+
+    Returns:
+        The change, if it is significant and at least two dampers share it; ``before`` and
+        ``after`` are logarithms of the common factor.
+    """
+    usable = {name: points for name, points in series.items() if len(points) >= 2 * _EDGE}
+    if len(usable) < _SHARED:
+        return None
+    by_day: dict[float, list[float]] = {}
+    for points in usable.values():
+        middle = float(np.median([point.value for point in points]))
+        for point in points:
+            by_day.setdefault(point.day, []).append(point.value - middle)
+    common = [
+        Point(day, float(np.median(left)))
+        for day, left in sorted(by_day.items())
+        if len(left) >= _SHARED
+    ]
+    change = change_point(common)
+    if change is None or change.kind != "step" or change.p > LEVEL:
+        return None
+    size = change.after - change.before
+    moved = [_step_at(points, change.day) for points in usable.values()]
+    shared = [step for step in moved if step is not None and 0.5 < step / size < 2.0]
+    both = [step for step in moved if step is not None]
+    return change if len(shared) >= max(_SHARED, 0.5 * len(both)) else None
+
+
+def without_jump(points: Sequence[Point], jump: Change) -> list[Point]:
+    """A series of logarithms with a bench's step taken out."""
+    size = jump.after - jump.before
+    return [p._replace(value=p.value - size) if p.day >= jump.day else p for p in points]
+
+
+def _step_at(points: Sequence[Point], day: float) -> float | None:
+    before = [point.value for point in points if point.day < day]
+    after = [point.value for point in points if point.day >= day]
+    if len(before) < _EDGE or len(after) < _EDGE:
+        return None
+    return float(np.median(after) - np.median(before))
+
+
+# --- the statistic --------------------------------------------------------------------------------
+
+
+def _places(days: Array) -> list[int]:
+    """Indices of the first point after a change, each on a day of its own."""
+    return [k for k in range(_EDGE, len(days) - _EDGE + 1) if days[k] > days[k - 1]]
+
+
+def _columns(days: Array, place: int) -> Array:
+    """Line, step and bend, shape (N, 4)."""
+    x = (days - days.mean()) / np.ptp(days)
+    after = np.arange(len(days)) >= place
+    bend = np.where(after, (days - days[place - 1]) / np.ptp(days), 0.0)
+    return np.column_stack([np.ones_like(x), x, after.astype(np.float64), bend])
+
+
+def _largest(days: Array, y: Array) -> Array:
+    """Largest F over all places of each column of y, shape (N, M)."""
+    line, _ = np.linalg.qr(_columns(days, _EDGE)[:, :2])
+    left = y - line @ (line.T @ y)
+    total = np.sum(left**2, axis=0)
+    best = np.zeros(y.shape[1])
+    for place in _places(days):
+        basis, _ = np.linalg.qr(_columns(days, place))
+        explained = np.sum((basis[:, 2:].T @ left) ** 2, axis=0)
+        f = (explained / 2.0) / np.maximum((total - explained) / (len(days) - 4), 1e-300)
+        best = np.maximum(best, f)
+    return best
+
+
+@lru_cache(maxsize=64)
+def _null(days: tuple[float, ...]) -> Array:
+    """Sorted largest F of straight lines with noise."""
+    rng = np.random.default_rng(0)
+    drawn = rng.standard_normal((len(days), _DRAWS))
+    return np.sort(_largest(np.array(days), drawn))
+
+
+def _chance(days: tuple[float, ...], statistic: float) -> float:
+    """Chance of a statistic as large; beyond the draws by the F of one place, times their number.
+
+    The largest of many dependent F has the tail of so many independent ones; how many they are is
+    read where both are known.
+    """
+    drawn = _null(days)
+    above = len(drawn) - int(np.searchsorted(drawn, statistic))
+    if above >= _TAIL:
+        return (above + 1.0) / (len(drawn) + 1.0)
+    free = len(days) - 4
+    known = float(drawn[-_TAIL])
+    independent = (_TAIL / len(drawn)) / max(float(fisher.sf(known, 2, free)), 1e-300)
+    return min(1.0, independent * float(fisher.sf(statistic, 2, free)))
+
+
+_KINDS: tuple[tuple[Literal["step", "bend"], list[int]], ...] = (
+    ("step", [0, 1, 2]),
+    ("bend", [0, 1, 3]),
+)
+
+
+def _described(days: Array, y: Array, p: float) -> Change:
+    """The likelier of a step and a bend, where it likeliest is, and from what to what it leads."""
+    kinds = {
+        kind: {place: _rss(_columns(days, place)[:, own], y) for place in _places(days)}
+        for kind, own in _KINDS
+    }
+    kind, own = min(_KINDS, key=lambda item: min(kinds[item[0]].values()))
+    left = kinds[kind]
+    at = min(left, key=lambda place: left[place])
+    # The profile likelihood of the place, with the variance estimated (Hinkley 1970).
+    bound = left[at] * (1.0 + float(fisher.ppf(0.95, 1, len(days) - 3)) / (len(days) - 3))
+    likely = [place for place, rss in left.items() if rss <= bound]
+    columns = _columns(days, at)[:, own]
+    weights = np.linalg.lstsq(columns, y, rcond=None)[0]
+    span = float(np.ptp(days))
+    slope = float(weights[1]) / span
+    is_bend = kind == "bend"
+    # A bend begins on a day that is still on the line, a step is there on the day.
+    day, low, high = (float(days[k - is_bend]) for k in (at, min(likely), max(likely)))
+    before = float(weights[0]) + slope * (day - float(days.mean()))
+    return Change(
+        day,
+        low,
+        high,
+        kind,
+        before,
+        float(columns[-1] @ weights) if is_bend else before + float(weights[2]),
+        slope,
+        slope + (float(weights[2]) / span if is_bend else 0.0),
+        p,
+    )
+
+
+def _rss(columns: Array, y: Array) -> float:
+    left = y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0]
+    return float(left @ left)

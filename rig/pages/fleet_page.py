@@ -1,0 +1,95 @@
+"""A store of many runs as a page: what changed, with the series that show it."""
+
+import base64
+import io
+from datetime import date
+from pathlib import Path
+from typing import Any, cast
+
+import matplotlib as mpl
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+from matplotlib.figure import Figure as Drawing
+
+from rig.fleet.overview import Overview, Series
+from rig.fleet.words import alarms, name_of
+from rig.pages.report.page import render, write_page
+
+_MOST = 12
+"""Series that are drawn, the surest first."""
+
+_COLOUR, _CHANGED, _OTHERS = "#0072b2", "#d55e00", "#c8ced6"
+
+
+def write_fleet_page(found: Overview, path: Path) -> None:
+    """Write the page.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    verdicts = sorted({verdict for counts in found.verdicts.values() for verdict in counts})
+    drawn = [item for item in found.series if item.is_change and not item.with_bench]
+    drawn.sort(key=lambda item: item.change.p if item.change else 1.0)
+    drawn += [item for item in found.series if item.is_drift]
+    text = render(
+        "fleet.html",
+        headline=_headline(found),
+        alarms=alarms(found),
+        verdicts=[verdict.replace("_", " ") for verdict in verdicts],
+        benches=[
+            (bench, sum(counts.values()), [_share(counts, verdict) for verdict in verdicts])
+            for bench, counts in found.verdicts.items()
+        ],
+        failed=list(found.failed.items())[:10],
+        pictures=[(name_of(item), _picture(found, item)) for item in drawn[:_MOST]],
+        left_out=max(0, len(drawn) - _MOST),
+    )
+    write_page(text, path)
+
+
+def _headline(found: Overview) -> str:
+    dampers = len({item.where for item in found.series})
+    return f"{found.runs} runs of {dampers} dampers on {len(found.verdicts)} benches"
+
+
+def _share(counts: Any, verdict: str) -> str:
+    count = counts.get(verdict, 0)
+    return f"{count} ({100 * count / sum(counts.values()):.0f} %)" if count else "0"
+
+
+def _picture(found: Overview, item: Series) -> str:
+    """A series among those of the other dampers, as an SVG in a data URL."""
+    style = {"axes.grid": True, "grid.alpha": 0.3, "svg.hashsalt": "rig", "font.size": 9}
+    with cast("Any", mpl).rc_context(style):
+        figure = cast("Any", Drawing(figsize=(9.0, 2.8), layout="constrained"))
+        axes = figure.subplots()
+        others = [s for s in found.series if s.quantity == item.quantity and s is not item]
+        for k, other in enumerate(others):
+            label = f"{len(others)} other dampers" if k == 0 else None
+            axes.plot(*_columns(other), color=_OTHERS, linewidth=0.7, zorder=1, label=label)
+        days, values = _columns(item)
+        label = f"damper {item.where.damper}"
+        axes.plot(days, values, "o-", color=_COLOUR, markersize=3, linewidth=1, label=label)
+        change = item.change
+        if item.is_change and change is not None:
+            low, day, high = (
+                date.fromordinal(round(d)) for d in (change.low, change.day, change.high)
+            )
+            axes.axvspan(low, high, color=_CHANGED, alpha=0.15, linewidth=0)
+            axes.axvline(day, color=_CHANGED, label=f"{change.kind}, with its 95 % interval")
+        locator = AutoDateLocator()
+        axes.xaxis.set_major_locator(locator)
+        axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+        axes.set_ylabel(item.quantity.parameter)
+        axes.legend(fontsize="small", frameon=False, loc="upper left")
+        made = io.BytesIO()
+        figure.savefig(made, format="svg", metadata={"Date": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(made.getvalue()).decode("ascii")
+
+
+def _columns(item: Series) -> tuple[list[date], list[float]]:
+    points = item.points
+    return [_date(p.day) for p in points], [p.value for p in points]
+
+
+def _date(day: float) -> date:
+    return date.fromordinal(round(day))
