@@ -115,12 +115,15 @@ def run_command(
     found = find_sources(sources, path)
     if part is not None:
         found = shard_of(found, *part)
-    engine = dask_at(dask) if dask is not None else processes(jobs)
-    if not as_json:
-        console.print(f"{len(found)} runs, {engine.words}", markup=False)
     given = Model(read_text(file), str(file.parent.absolute()))
-    with _shown() as show:
-        end = campaign(found, given, out, engine.make, engine.window, again=again, progress=show)
+    computing = contextlib.nullcontext(processes(jobs)) if dask is None else dask_at(dask)
+    with computing as engine:
+        if not as_json:
+            console.print(f"{len(found)} runs, {engine.words}", markup=False)
+        with _shown() as show:
+            end = campaign(
+                found, given, out, engine.make, engine.window, again=again, progress=show
+            )
     if as_json:
         print_json(end._asdict())
     else:

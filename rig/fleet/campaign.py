@@ -5,7 +5,7 @@ not computed again, so that a campaign that was ended is gone on with by startin
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from pathlib import Path
 from queue import SimpleQueue
@@ -134,8 +134,8 @@ def _rows(
             except (BrokenExecutor, CancelledError):
                 # No worker is left: those that were computed are under suspicion, one by one.
                 suspects = [task, *pending.values()]
+                _end(executor, pending)
                 pending, ready = {}, SimpleQueue()
-                executor.shutdown(wait=False, cancel_futures=True)
                 for suspect in suspects:
                     yield _alone(suspect, make_executor)
                 executor = make_executor()
@@ -144,7 +144,14 @@ def _rows(
                 row = lost(task, f"no worker gave it back: {type(error).__name__}: {error}")
             yield row
     finally:
-        executor.shutdown(wait=False, cancel_futures=True)
+        _end(executor, pending)
+
+
+def _end(executor: Executor, pending: Iterable[Future[Row]]) -> None:
+    """Leave an executor with what it was not yet given a worker for."""
+    for future in pending:
+        future.cancel()
+    executor.shutdown(wait=False)
 
 
 def _submit(
@@ -171,4 +178,4 @@ def _alone(task: Task, make_executor: Callable[[], Executor]) -> Row:
     except (BrokenExecutor, CancelledError):
         return lost(task, "killed its worker, alone as well")
     finally:
-        executor.shutdown(wait=False, cancel_futures=True)
+        _end(executor, ())

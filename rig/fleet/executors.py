@@ -4,8 +4,9 @@ import importlib
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from rig.inputs.errors import InputError
@@ -53,8 +54,9 @@ def _worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def dask(address: str) -> Engine:
-    """A cluster that runs already, known by its scheduler.
+@contextmanager
+def dask(address: str) -> Generator[Engine]:
+    """A cluster that runs already, known by its scheduler; its workers need rig as well.
 
     Raises:
         InputError: Dask is not installed, or there is no scheduler.
@@ -76,4 +78,7 @@ def dask(address: str) -> Engine:
     def make() -> Executor:
         return client.get_executor(pure=False)
 
-    return Engine(f"Dask at {address}, {threads} threads of workers", make, _AHEAD * threads)
+    try:
+        yield Engine(f"Dask at {address}, {threads} threads of workers", make, _AHEAD * threads)
+    finally:
+        client.close()

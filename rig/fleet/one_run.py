@@ -19,7 +19,7 @@ from dart_model.effects import effect
 from dart_model.spec import ModelSpec, parse_model
 from rig.characteristics.command import characterise
 from rig.diagnosis.diagnose import diagnose
-from rig.diagnosis.outcome import Estimate
+from rig.diagnosis.outcome import Estimate, FoundEffect
 from rig.diagnosis.recording import Recording, read_recording
 from rig.diagnosis.refit import refitted
 from rig.fleet.sources import Source
@@ -186,11 +186,7 @@ def _evaluated(task: Task) -> Row:
         _value("model", item.strut, item.effect, item.parameter, item.estimate)
         for item in refitted(spec, [recording])
     ]
-    new = [
-        _value("found", item.strut, item.name, name, estimate)
-        for item in found.effects
-        for name, estimate in item.parameters.items()
-    ]
+    new = [value for item in found.effects for value in _found(item)]
     held_out = found.held_out
     heights, forces = held_out.height_rmse_m, held_out.residual_force_rmse_n
     counted, floor = (
@@ -222,6 +218,16 @@ def _value(kind: str, strut: str, name: str, parameter: str, estimate: Estimate)
     high = math.nan if estimate.high is None else estimate.high
     family = effect(name).family if name else ""
     return Value(kind, strut, name, family, parameter, estimate.value, low, high)
+
+
+def _found(item: FoundEffect) -> list[Value]:
+    """What an effect is worth, and its parameters; of a table without a name the worth alone."""
+    worth = Estimate(item.force_rms_n, None, None)
+    listed = {} if item.name == "restoring_surface" else item.parameters
+    return [
+        _value("found", item.strut, item.name, name, estimate)
+        for name, estimate in {"force_rms_n": worth, **listed}.items()
+    ]
 
 
 def _figures(path: Path, recording: Recording) -> list[Value]:

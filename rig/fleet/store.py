@@ -194,7 +194,10 @@ def opened(store: Path) -> Any:
         raise InputError("duckdb is not installed, expected `pip install 'rig[fleet]'`")
     connection = _duckdb.connect()
     runs, values = (_quoted(store / name / "**" / "*.parquet") for name in ("runs", "values"))
-    connection.execute(_VIEWS.format(runs=runs, values=values))
+    try:
+        connection.execute(_VIEWS.format(runs=runs, values=values))
+    except _duckdb.Error as error:
+        raise InputError(f"{store}: {str(error).splitlines()[0]}") from error
     return connection
 
 

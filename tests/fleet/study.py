@@ -1,0 +1,121 @@
+"""`python -m tests.fleet.study --runs 10000`: one fleet through processes and through Dask.
+
+A worker of the cluster is killed on the way. Printed are what either store holds, the throughput
+per core beside single diagnoses in one process, and the time that distributing takes a run.
+"""
+
+import argparse
+import os
+import resource
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import psutil
+
+from rig.fleet import store
+from rig.fleet.campaign import Model, Progress, campaign
+from rig.fleet.executors import Engine, dask, processes
+from rig.fleet.one_run import Task, evaluated
+from rig.fleet.sources import Source, find_sources
+from tests.fleet.cluster import cluster
+from tests.fleet.population import Piece, write_fleet, write_model
+
+CORES, WORKERS, SINGLE = 2, 4, 300
+BENCHES, DAMPERS = 4, 40
+PATTERN = "{bench}/{date}/{damper}"
+
+
+def scattered(_damper, _week, rng):
+    """A damper as production makes it."""
+    return Piece(
+        friction=1.0 + 0.05 * rng.standard_normal(), damping=1.0 + 0.03 * rng.standard_normal()
+    )
+
+
+def single_rate(sources: Sequence[Source], model: Model) -> float:
+    """Runs a second of one process, after the first one, which imports and compiles."""
+    evaluated(Task(sources[0], model.text, model.folder))
+    begun = time.process_time()
+    for source in sources[:SINGLE]:
+        evaluated(Task(source, model.text, model.folder))
+    return len(sources[:SINGLE]) / (time.process_time() - begun)
+
+
+def through(
+    engine: Engine, sources: Sequence[Source], model: Model, out: Path, kill: psutil.Process | None
+) -> tuple[Progress, float]:
+    """A campaign, and the CPU time of this process a run."""
+
+    def progress(now: Progress) -> None:
+        if kill is not None and now.done == len(sources) // 3 and kill.is_running():
+            kill.kill()
+
+    before = resource.getrusage(resource.RUSAGE_SELF)
+    end = campaign(sources, model, out, engine.make, engine.window, progress=progress)
+    after = resource.getrusage(resource.RUSAGE_SELF)
+    own_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return end, own_s / max(end.done, 1)
+
+
+def content(out: Path) -> list[str]:
+    """Everything of a store but times and parts, by key; as text, since NaN is not itself."""
+    names = "key, source, bench, date, damper, verdict, error, before, after, floor"
+    runs = store.query(out, f"SELECT {names} FROM runs ORDER BY key")[1]
+    values = 'SELECT * EXCLUDE (part) FROM "values" ORDER BY ALL'
+    return list(map(repr, [*runs, *store.query(out, values)[1]]))
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        weeks = -(-given.runs // DAMPERS)
+        write_fleet(folder / "runs", DAMPERS, weeks, scattered, BENCHES, given.seed)
+        path = write_model(folder)
+        model = Model(path.read_text(), str(folder))
+        sources = find_sources([str(folder / "runs")], PATTERN)[: given.runs]
+        os.environ["OPENBLAS_NUM_THREADS"] = "1"
+        alone = single_rate(sources, model)
+        print(f"{len(sources)} runs; one process: {alone:.2f} runs per second of CPU", flush=True)
+        stores: list[Path] = []
+        with cluster(folder, WORKERS) as there:
+            scheduler = psutil.Process(there.scheduler.pid)
+            victim = psutil.Process(there.workers[1].pid)
+            before = sum(scheduler.cpu_times()[:2])
+            out = folder / "by_dask"
+            with dask(there.address) as engine:
+                end, own_s = through(engine, sources, model, out, victim)
+            spent_s = (sum(scheduler.cpu_times()[:2]) - before) / end.done
+            report("Dask", end, alone, own_s, spent_s)
+            print(f"  the killed worker is gone: {not victim.is_running()}", flush=True)
+            stores.append(out)
+        out = folder / "by_processes"
+        end, own_s = through(processes(CORES), sources, model, out, None)
+        report("processes", end, alone, own_s, 0.0)
+        stores.append(out)
+        first, second = (content(out) for out in stores)
+        ((runs, keys),) = store.query(out, "SELECT count(*), count(DISTINCT key) FROM runs")[1]
+        print(f"both stores hold the same: {first == second}; {runs} runs, {keys} different")
+
+
+def report(name: str, end: Progress, alone: float, own_s: float, scheduler_s: float) -> None:
+    """A line of the table."""
+    rate = end.done / end.elapsed_s / CORES
+    shared_ms = 1e3 * (own_s + scheduler_s)
+    print(
+        f"{name}: {end.done} runs, {end.failed} failed, {end.elapsed_s:.0f} s, {rate:.2f} a second "
+        f"and core ({rate / alone:.3f} of one process); distributing: {1e3 * own_s:.2f} ms a run "
+        f"here and {1e3 * scheduler_s:.2f} ms in the scheduler, {shared_ms * 1e6 / 3.6e6:.2f} h of "
+        "a million runs",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""The store: whole parts, no row twice, and what other tools read of it."""
+
+import math
+import os
+
+import duckdb
+import pandas as pd
+import pyarrow.dataset as pad
+import pytest
+
+from rig.fleet import store
+from rig.fleet.one_run import Row, Value
+from rig.inputs.errors import InputError
+
+
+def row(number, *, bench="b", date="2026-01-05", error="", values=1):
+    own = tuple(
+        Value("model", "strut", "coulomb_friction", "friction", f"p{k}", 1.0 * k, k - 1.0, k + 1.0)
+        for k in range(values)
+    )
+    return Row(
+        f"key{number}", f"id{number}", f"runs/{number}", bench, "A1", date, "m", "0.2.0",
+        verdict="" if error else "explained", error=error, samples=10, values=() if error else own,
+    )  # fmt: skip
+
+
+def test_rows_and_values_are_partitioned_by_bench_and_date(tmp_path):
+    store.append(tmp_path, [row(1), row(2, bench="c/d e"), row(3, date="2026-01-06", values=3)])
+    folders = {str(p.parent.relative_to(tmp_path)) for p in tmp_path.rglob("*.parquet")}
+    assert "runs/bench=b/date=2026-01-05" in folders
+    assert "runs/bench=c%2Fd%20e/date=2026-01-05" in folders
+    names, rows = store.query(tmp_path, "SELECT key, bench, date FROM runs ORDER BY key")
+    assert names == ["key", "bench", "date"]
+    assert rows[1] == ("key2", "c/d e", "2026-01-05")
+    assert store.query(tmp_path, 'SELECT count(*) FROM "values"')[1] == [(5,)]
+
+
+def test_what_was_written_twice_counts_once(tmp_path):
+    """Two programs that both computed a run, in parts of different content."""
+    store.append(tmp_path, [row(1), row(2)])
+    store.append(tmp_path, [row(2), row(3)])
+    store.append(tmp_path, [row(1), row(2)])
+    assert store.query(tmp_path, "SELECT count(*) FROM runs")[1] == [(3,)]
+    assert store.query(tmp_path, "SELECT count(*) FROM effects")[1] == [(3,)]
+
+
+def test_a_run_that_failed_is_forgotten_when_it_succeeds(tmp_path):
+    store.append(tmp_path, [row(1, error="unreadable")])
+    assert store.query(tmp_path, "SELECT error FROM runs")[1] == [("unreadable",)]
+    again = row(1)
+    store.append(tmp_path, [Row(**{**again.as_dict(), "key": "other", "values": again.values})])
+    assert store.query(tmp_path, "SELECT key, error FROM runs")[1] == [("other", "")]
+    assert store.identities(tmp_path, with_failed=False) == {"id1"}
+
+
+def test_values_without_their_runs_are_not_seen_and_swept(tmp_path):
+    """A writer that was killed between the two: values come first."""
+    store.append(tmp_path, [row(1)])
+    store.append(tmp_path, [row(2, date="2026-02-02")])
+    (path,) = (tmp_path / "runs" / "bench=b" / "date=2026-02-02").glob("*.parquet")
+    path.unlink()
+    assert store.query(tmp_path, "SELECT count(*) FROM effects")[1] == [(1,)]
+    store.sweep(tmp_path)
+    assert len(list((tmp_path / "values").rglob("*.parquet"))) == 2  # it may be being written
+    for orphan in (tmp_path / "values" / "bench=b" / "date=2026-02-02").glob("*.parquet"):
+        os.utime(orphan, (0, 0))
+    store.sweep(tmp_path)
+    assert len(list((tmp_path / "values").rglob("*.parquet"))) == 1
+
+
+def test_other_tools_read_it(tmp_path):
+    store.append(tmp_path, [row(k) for k in range(5)])
+    frame = pd.read_parquet(tmp_path / "runs")
+    assert sorted(frame["key"]) == [f"key{k}" for k in range(5)]
+    there = pad.dataset(tmp_path / "values", partitioning="hive").to_table()
+    assert there.num_rows == 5
+    found = duckdb.sql(f"SELECT count(*) FROM '{tmp_path}/runs/*/*/*.parquet'").fetchall()
+    assert found == [(5,)]
+
+
+def test_a_number_that_is_missing_stays_missing(tmp_path):
+    store.append(tmp_path, [row(1)])
+    ((before,),) = store.query(tmp_path, "SELECT before FROM runs")[1]
+    assert math.isnan(before)
+
+
+@pytest.mark.parametrize("sql", ["SELEC 1", "SELECT nothing FROM runs", "SELECT * FROM nowhere"])
+def test_a_query_that_is_wrong_is_one_line(tmp_path, sql):
+    store.append(tmp_path, [row(1)])
+    with pytest.raises(InputError) as caught:
+        store.query(tmp_path, sql)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_store_is_said(tmp_path):
+    with pytest.raises(InputError, match="no runs in it"):
+        store.query(tmp_path, "SELECT 1")
+    (tmp_path / "runs" / "bench=b").mkdir(parents=True)
+    (tmp_path / "runs" / "bench=b" / "x.parquet").write_bytes(b"nothing of the kind")
+    with pytest.raises(InputError):
+        store.query(tmp_path, "SELECT * FROM runs")
+    with pytest.raises(InputError):
+        store.identities(tmp_path, with_failed=True)
