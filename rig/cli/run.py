@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from rig.cli.output import FAILED, ConfigFile, JsonFlag, console
+from rig.cli.output import FAILED, JsonFlag, console
 from rig.cli.results import print_ended
+from rig.cli.side_by_side import run_side_by_side
 from rig.cli.watching import status_line, stoppable
 from rig.inputs.errors import InputError
 from rig.inputs.folders import refuse_full
@@ -19,15 +20,25 @@ if TYPE_CHECKING:
     from rig.operation.logged_run import Ended
     from rig.operation.setup import Setup
 
-EXAMPLES = "Examples: `rig run rig.yaml` · `rig run rig.yaml --out runs/7 --listen-only`"
+EXAMPLES = (
+    "Examples: `rig run rig.yaml` · `rig run rig.yaml --out runs/7 --listen-only` · "
+    "`rig run left.yaml right.yaml --out runs/8`, then `rig view runs/8/left runs/8/right`"
+)
 
 
 def run(
-    config: ConfigFile,
+    configs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="CONFIG...", help="YAML file; several are bridges of their own, at once."
+        ),
+    ],
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="DIR", help="Folder of the run; by default runs/ and the time."
+            "--out",
+            metavar="DIR",
+            help="Folder of the run, or of the runs; by default runs/ and the time.",
         ),
     ] = None,
     model: Annotated[
@@ -55,7 +66,32 @@ def run(
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Run the bridge on a bus; Ctrl-C ends it in order."""
+    """Run the bridge on a bus; Ctrl-C ends it in order.
+
+    Several configurations are as many bridges, a process each, each with a folder in `--out` that
+    is called as its configuration; the exit code is the worst of theirs.
+    """
+    folder = out or Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
+    if len(configs) > 1:
+        options: list[str] = [] if model is None else ["--model", model]
+        options += [] if duration_s is None else ["--duration-s", str(duration_s)]
+        flags = {"--listen-only": listen_only, "--force": force, "--trace": trace}
+        options += [name for name, given in flags.items() if given]
+        raise typer.Exit(run_side_by_side(configs, folder, options, as_json=as_json))
+    (config,) = configs
+    _run_one(config, folder, model, duration_s, listen_only, force, trace, as_json)
+
+
+def _run_one(
+    config: Path,
+    folder: Path,
+    model: str | None,
+    duration_s: float | None,
+    listen_only: bool,
+    force: bool,
+    trace: bool,
+    as_json: bool,
+) -> None:
     from rig.operation.check import errors
     from rig.operation.live import live
     from rig.operation.setup import load_setup
@@ -67,7 +103,6 @@ def run(
         raise InputError(
             f"{config}: {wrong[0].what}: {wrong[0].text} (`rig check` shows all; --force runs it)"
         )
-    folder = out or Path("runs") / time.strftime("%Y-%m-%d_%H-%M-%S")
     refuse_full(folder)
     further = [name for name, *_ in ready.config.signals.sensors()]
     shown = status_line(ready.config.duration_s, further, list(ready.config.devices))

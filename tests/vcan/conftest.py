@@ -80,6 +80,13 @@ def _nothing_left_behind(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 @pytest.fixture
+def three_vcans(vcan: str) -> Iterator[tuple[str, str, str]]:
+    """Three of them, for as many benches."""
+    with _interface("vcan2") as second, _interface("vcan3") as third:
+        yield vcan, second, third
+
+
+@pytest.fixture
 def second_vcan(_kernel_with_vcan: None) -> Iterator[str]:
     """Another one, for what a gateway joins."""
     with _interface("vcan1") as name:

@@ -1,0 +1,124 @@
+"""Several bridges on one machine: a process each, since each has a tick to keep."""
+
+import contextlib
+import json
+import signal
+import subprocess
+import sys
+import threading
+from collections import Counter
+from collections.abc import Generator, Sequence
+from pathlib import Path
+from typing import Any
+
+from rig.cli.output import FAILED, OK, WRONG_INPUT, console, print_json, table
+from rig.inputs.errors import InputError
+from rig.inputs.folders import refuse_full
+
+_WORST = (WRONG_INPUT, FAILED)
+"""Exit codes that others give way to, the worst first."""
+
+
+def run_side_by_side(
+    configs: Sequence[Path], folder: Path, options: Sequence[str], *, as_json: bool
+) -> int:
+    """Run as many bridges as there are configurations.
+
+    What each says is shown behind its name. Ctrl-C ends all in order; one that ends, however it
+    does, ends no other.
+
+    Args:
+        configs: Their configurations.
+        folder: Where each gets a folder of its own.
+        options: For each of them.
+        as_json: Whether their summaries are printed as JSON.
+
+    Returns:
+        The worst exit code.
+
+    Raises:
+        InputError: Two of them have one name, or a folder is not empty.
+    """
+    names = [config.stem for config in configs]
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise InputError(f"{twice[0]}: two configurations of this name, expected different ones")
+    for name in names:
+        refuse_full(folder / name)
+    bridges = {
+        name: _started(config, folder / name, options)
+        for name, config in zip(names, configs, strict=True)
+    }
+    readers = [
+        threading.Thread(target=_pass_on, args=(name, bridge), daemon=True)
+        for name, bridge in bridges.items()
+    ]
+    for reader in readers:
+        reader.start()
+    with _forwarded(list(bridges.values())):
+        codes = {name: bridge.wait() for name, bridge in bridges.items()}
+    for reader in readers:
+        reader.join()
+    summaries = {name: _summary(folder / name) for name in names}
+    if as_json:
+        print_json({name: {"exit_code": codes[name], **summaries[name]} for name in names})
+    else:
+        _print(codes, summaries, folder)
+    return next(
+        (code for code in _WORST if code in codes.values()), max(codes.values(), default=OK)
+    )
+
+
+def _started(config: Path, folder: Path, options: Sequence[str]) -> "subprocess.Popen[str]":
+    command = [sys.executable, "-m", "rig", "run", str(config), "--out", str(folder), *options]
+    # A session of its own: the terminal's Ctrl-C comes here, and is passed on once.
+    return subprocess.Popen(  # noqa: S603  # a list, no shell
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def _pass_on(name: str, bridge: "subprocess.Popen[str]") -> None:
+    """What a bridge says, behind its name, on standard error."""
+    for line in bridge.stdout or ():
+        sys.stderr.write(f"{name}: {line}")
+
+
+@contextlib.contextmanager
+def _forwarded(bridges: Sequence["subprocess.Popen[str]"]) -> Generator[None]:
+    """Ctrl-C and an end that is asked for go to every bridge."""
+
+    def forward(_number: int, _frame: Any) -> None:
+        for bridge in bridges:
+            if bridge.poll() is None:
+                bridge.send_signal(signal.SIGINT)
+
+    before = {number: signal.signal(number, forward) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    try:
+        return json.loads((folder / "summary.json").read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def _print(codes: dict[str, int], summaries: dict[str, dict[str, Any]], folder: Path) -> None:
+    shown = table("bridge", "ended", "ticks", "missed", "run")
+    for name, code in codes.items():
+        summary = summaries[name]
+        words = "in order" if code == OK else f"exit code {code}"
+        mode = summary.get("mode", "")
+        missed = summary.get("counts", {}).get("overruns", "")
+        ticks = str(summary.get("ticks", ""))
+        shown.add_row(name, f"{words} {mode}".strip(), ticks, str(missed), str(folder / name))
+    console.print(shown)
