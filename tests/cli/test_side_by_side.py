@@ -33,6 +33,7 @@ def started(*arguments):
     )
 
 
+@pytest.mark.long
 def test_each_has_a_process_and_a_folder_and_the_worst_exit_code_counts(two, tmp_path):
     out = tmp_path / "runs"
     with started(*two, "--out", out, "--duration-s", 0.5, "--json") as process:
@@ -46,6 +47,7 @@ def test_each_has_a_process_and_a_folder_and_the_worst_exit_code_counts(two, tmp
         assert f"{name}: No valid height came" in said
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_all_of_them_in_order(two, tmp_path):
     out = tmp_path / "runs"
     with started(*two, "--out", out) as process:

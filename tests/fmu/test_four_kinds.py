@@ -19,7 +19,7 @@ KINDS = list(itertools.product(("2.0", "3.0"), ("CoSimulation", "ModelExchange")
 DURATION_S, STEP_S, SHORT_S = 1.0, 1e-3, 2e-5
 """The plant's own steps, and those that are short enough where a law switches within one."""
 
-QUICK = {"backlash", "bouc_wen", "delay", "end_stops", "none"}
+QUICK = {"backlash", "bouc_wen"}
 LAWS = [
     pytest.param(name, marks=() if name in QUICK else pytest.mark.long)
     for name in sorted(CATALOGUE)

@@ -115,7 +115,7 @@ struts = st.tuples(st.floats(-1.0, 1.0), st.floats(0.0, 1e5), st.floats(0.0, 1e4
 
 
 @pytest.mark.parametrize("name", LAWS)
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=20)
 @given(motion=motions, at=shares, states=shares, strut=struts)
 def test_a_law_in_c_is_the_plants(compiled, name, motion, at, states, strut):
     law = CATALOGUE[name]
