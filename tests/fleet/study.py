@@ -93,7 +93,8 @@ def main() -> None:
                 end, own_s = through(engine, sources, model, out, victim)
             spent_s = (sum(scheduler.cpu_times()[:2]) - before) / end.done
             report("Dask", end, alone, own_s, spent_s)
-            print(f"  the killed worker is gone: {not victim.is_running()}", flush=True)
+            is_gone = not victim.is_running() or victim.status() == psutil.STATUS_ZOMBIE
+            print(f"  the killed worker is gone: {is_gone}", flush=True)
             stores.append(out)
         out = folder / "by_processes"
         end, own_s = through(processes(CORES), sources, model, out, None)
