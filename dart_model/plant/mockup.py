@@ -7,8 +7,10 @@ its height and velocity are then states, and its force is what accelerates it, l
 Reference: Functional Mock-up Interface Specification 2.0.4 and 3.0.1, "FMI for Model Exchange".
 """
 
+import contextlib
 import ctypes
 import importlib.util
+import io
 import math
 import shutil
 import tempfile
@@ -16,7 +18,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from dart_model.spec import FmuSpec
 from rig.inputs.errors import InputError
@@ -49,8 +51,10 @@ class MockUp:
     """
 
     def __init__(self, spec: FmuSpec, folder: Path, gravity_m_per_s2: float) -> None:
-        require_admitted(folder / spec.file)
-        self._unit = _Unit(folder / spec.file, spec)
+        path = folder / spec.file
+        content = read_program(path)
+        require_admitted(content, path)
+        self._unit = _Unit(content, path, spec)
         self.name = f"FMU {spec.file}"
         self.state_scales = self._unit.nominals
         self._mass_kg, self._gravity = spec.mass_kg, gravity_m_per_s2
@@ -87,8 +91,8 @@ class MockUp:
 class _Unit:
     """An FMU with its variables by what they are to a strut."""
 
-    def __init__(self, path: Path, spec: FmuSpec) -> None:
-        description, folder = _unpacked(path)
+    def __init__(self, content: bytes, path: Path, spec: FmuSpec) -> None:
+        description = described(content, path)
         variables = {item.name: item for item in description.modelVariables}
         states = [item.variable.derivative.name for item in description.derivatives]
         _refuse_unfit(path, description, spec, variables)
@@ -113,7 +117,8 @@ class _Unit:
         self._count = len(states)
         self._x, self._dx = _doubles(self._count), _doubles(self._count)
         self._has_events = bool(description.numberOfEventIndicators)
-        self._calls = _started(path, description, folder, spec.parameters, variables)
+        parameters = {variables[n].valueReference: v for n, v in spec.parameters.items()}
+        self._calls = _started(content, path, description, parameters)
         self._start = self._calls.states(self._count)
         nominals = self._calls.nominals(self._count)
         self.nominals = tuple(nominals[k] for k in self.internal)
@@ -143,6 +148,9 @@ class _Unit:
                 calls.derivatives(self._dx, self._count)
             (value,) = calls.read(self._output)
         except (_Refused, *_errors()):
+            # It may be left anywhere between two calls: anew, so that what is asked next has an
+            # answer of its own.
+            calls.begin_again()
             return math.nan, [math.nan] * len(self.internal)
         return self._sign * value, [self._dx[k] for k in self.internal]
 
@@ -168,14 +176,31 @@ class _Refused(Exception):  # noqa: N818  # an FMU's answer, never seen outside
 class _Calls:
     """The calls of Model Exchange, which differ by the version of the interface in their names."""
 
-    def __init__(self, instance: Any, *, is_3: bool) -> None:
-        self._it = instance
+    def __init__(self, instance: Any, parameters: Mapping[int, float], *, is_3: bool) -> None:
+        self._it, self._is_3, self._parameters = instance, is_3, parameters
         self._update = instance.updateDiscreteStates if is_3 else instance.newDiscreteStates
         self.read = instance.getFloat64 if is_3 else instance.getReal
         self.write = instance.setFloat64 if is_3 else instance.setReal
         self.derivatives = (
             instance.getContinuousStateDerivatives if is_3 else instance.getDerivatives
         )
+
+    def begin(self) -> None:
+        """From an instance to continuous time."""
+        if not self._is_3:
+            self._it.setupExperiment(startTime=0.0)
+        if self._parameters:
+            self.write(list(self._parameters), list(self._parameters.values()))
+        self._it.enterInitializationMode()
+        self._it.exitInitializationMode()
+        self.iterate()
+        self._it.enterContinuousTimeMode()
+
+    def begin_again(self) -> None:
+        """The same after a refusal; what does not come back refuses everything from then on."""
+        with contextlib.suppress(_Refused, *_errors()):
+            self._it.reset()
+            self.begin()
 
     def move(
         self, t_s: float, x: Any, count: int, references: list[int], inputs: list[float]
@@ -191,20 +216,20 @@ class _Calls:
         """Let switches turn where they stand."""
         self._it.enterEventMode()
         if self.iterate():
-            raise _Refused
+            raise _Refused("changes its states by itself")
         self._it.enterContinuousTimeMode()
 
     def iterate(self) -> bool:
         """Handle events until there are none; whether states changed."""
         changed = False
         for _ in range(_MOST_ITERATIONS):
-            again, ends, _, moved, _, _ = self._update()
+            again, ends, _, moved, has_own_times, _ = self._update()
             changed |= bool(moved)
-            if ends:
-                raise _Refused
+            if ends or has_own_times:
+                raise _Refused("ends by itself, or has events at times of its own")
             if not again:
                 return changed
-        raise _Refused
+        raise _Refused("comes to no end of events")
 
     def states(self, count: int) -> list[float]:
         """The continuous states."""
@@ -235,8 +260,24 @@ def _errors() -> tuple[type[Exception], ...]:
     return (FMICallException,)
 
 
-def description_of(path: Path) -> Any:
+def read_program(path: Path) -> bytes:
+    """An FMU's bytes, read once: what is checked is what runs.
+
+    Raises:
+        InputError: It cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def described(content: bytes, path: Path) -> Any:
     """What an FMU says of itself, as FMPy reads it; nothing of it is executed.
+
+    Args:
+        content: The FMU.
+        path: What to call it.
 
     Raises:
         InputError: It is no FMU, or FMPy is not installed.
@@ -247,24 +288,13 @@ def description_of(path: Path) -> Any:
 
     reader: Any = fmpy
     try:
-        return reader.read_model_description(str(path))
+        found = reader.read_model_description(io.BytesIO(content))
     except Exception as error:  # of any library that a hostile archive may upset
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: is no FMU of FMI 2.0 or 3.0 ({reason[:200]})") from error
-
-
-def _unpacked(path: Path) -> tuple[Any, Path]:
-    import fmpy
-
-    reader: Any = fmpy
-    description = description_of(path)
-    folder = tempfile.mkdtemp(prefix="rig-fmu-")
-    try:
-        reader.extract(str(path), folder)
-    except Exception as error:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise InputError(f"{path}: cannot be unpacked ({error})") from error
-    return description, Path(folder)
+    if any(item.variable.derivative is None for item in found.derivatives):
+        raise InputError(f"{path}: a derivative of nothing, expected the state that it is of")
+    return found
 
 
 def _refuse_unfit(
@@ -304,27 +334,38 @@ def _refuse_unfit(
         **{f"parameters {name}": name for name in spec.parameters},
     }
     for key, name in roles.items():
-        if name is not None and _signed(name)[1] not in variables:
+        if name is None:
+            continue
+        plain = name if key.startswith("parameters ") else _signed(name)[1]
+        if plain not in variables:
             there = [n for n, v in variables.items() if v.causality in ("input", "output")]
             raise InputError(
-                f"{path}: {key}: no variable {_signed(name)[1]!r}, expected one such as "
+                f"{path}: {key}: no variable {plain!r}, expected one such as "
                 f"{', '.join(there)[:300]}"
             )
+        if variables[plain].type not in ("Real", "Float64") or variables[plain].dimensions:
+            raise InputError(f"{path}: {key}: {plain}: expected a single real number")
+        if key.startswith("parameters ") and variables[plain].causality != "parameter":
+            raise InputError(f"{path}: {key}: expected a parameter of the FMU")
 
 
 def _started(
-    path: Path, description: Any, folder: Path, parameters: Mapping[str, float], variables: Any
+    content: bytes, path: Path, description: Any, parameters: Mapping[int, float]
 ) -> _Calls:
     """An instance in continuous time, at its start."""
+    import fmpy
     from fmpy.fmi2 import FMU2Model
     from fmpy.fmi3 import FMU3Model
 
     is_3 = description.fmiVersion == "3.0"
     said: deque[str] = deque(maxlen=_MESSAGES)
+    folder = tempfile.mkdtemp(prefix="rig-fmu-")
+    extract: Any = cast("Any", fmpy).extract
     try:
+        extract(io.BytesIO(content), folder)
         instance: Any = (FMU3Model if is_3 else FMU2Model)(
             guid=description.guid,
-            unzipDirectory=str(folder),
+            unzipDirectory=folder,
             modelIdentifier=description.modelExchange.modelIdentifier,
             instanceName="strut",
         )
@@ -332,17 +373,11 @@ def _started(
             instance.instantiate(logMessage=_kept(said))
         else:
             instance.instantiate(callbacks=_callbacks(said), loggingOn=False)
-        calls = _Calls(instance, is_3=is_3)
+        calls = _Calls(instance, parameters, is_3=is_3)
         weakref.finalize(calls, _free, instance, folder)
-        if not is_3:
-            instance.setupExperiment(startTime=0.0)
-        if parameters:
-            calls.write([variables[n].valueReference for n in parameters], [*parameters.values()])
-        instance.enterInitializationMode()
-        instance.exitInitializationMode()
-        calls.iterate()
-        instance.enterContinuousTimeMode()
+        calls.begin()
     except Exception as error:  # FMPy raises its base class
+        shutil.rmtree(folder, ignore_errors=True)
         raise InputError(f"{path}: does not start ({'; '.join([str(error), *said])})") from error
     return calls
 
@@ -365,6 +400,6 @@ def _kept(said: deque[str]) -> Callable[..., None]:
     return log
 
 
-def _free(instance: Any, folder: Path) -> None:
+def _free(instance: Any, folder: str) -> None:
     instance.freeInstance()
     shutil.rmtree(folder, ignore_errors=True)

@@ -128,8 +128,12 @@ class Strut:
             raise InputError(
                 f"strut {self.name}: effects {names}: no force with these parameters ({error})"
             ) from error
-        stiffness = float(np.max(np.abs(np.diff(by_height) / np.diff(heights))))
-        damping = float(np.max(np.abs(np.diff(by_velocity) / np.diff(velocities))))
+        # An FMU may refuse what lies outside its range.
+        slopes = np.abs(np.diff(by_height) / np.diff(heights))
+        rates = np.abs(np.diff(by_velocity) / np.diff(velocities))
+        if not (np.any(np.isfinite(slopes)) and np.any(np.isfinite(rates))):
+            raise InputError(f"strut {self.name}: gives no force about its free length")
+        stiffness, damping = float(np.nanmax(slopes)), float(np.nanmax(rates))
         return max(self._stiffness, stiffness), max(self._damping, damping)
 
 

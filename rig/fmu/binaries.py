@@ -45,7 +45,16 @@ TARGETS = (
 """Every system that binaries are made for."""
 
 # No contraction: a product and a sum that become one rounding would not be what Python computes.
-_FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-Wall", "-Wextra")
+_FLAGS = (
+    "-DFMI2_OVERRIDE_FUNCTION_PREFIX",
+    "-DFMI3_OVERRIDE_FUNCTION_PREFIX",
+    "-std=c99",
+    "-O2",
+    "-ffp-contract=off",
+    "-fvisibility=hidden",
+    "-Wall",
+    "-Wextra",
+)
 _TAKES_S = 300.0
 
 

@@ -39,6 +39,13 @@ def export_fmu(
         raise InputError(f"--fmi {fmi!r}: expected {' or '.join(VERSIONS)}")
     if out.exists():
         raise InputError(f"{out}: exists, expected a new file")
+    meant = spec.struts if bench else [_chosen(spec, strut)]
+    for item in meant:
+        if item.fmu is not None:
+            raise InputError(
+                f"model {spec.name}: strut {item.name} has an FMU, expected one without: its force "
+                "cannot be put into another"
+            )
     component = bench_component(spec) if bench else strut_component(spec, _chosen(spec, strut))
     content = archive(component, fmi, dump_model(spec), done=lambda target: compiled(target.words))
     try:

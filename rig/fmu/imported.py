@@ -2,27 +2,19 @@
 
 import math
 import re
-import shutil
+import tempfile
 from pathlib import Path
 from typing import Any
 
 from dart_model.plant import DartPlant
-from dart_model.plant.mockup import MockUp, description_of
-from dart_model.spec import (
-    BodySpec,
-    FmuSpec,
-    InlineSkeleton,
-    JointSpec,
-    ModelSpec,
-    StrutSpec,
-    dump_model,
-)
+from dart_model.plant.mockup import MockUp, described, read_program
+from dart_model.spec import FmuSpec, ModelSpec, dump_model
 from rig.inputs.errors import InputError
 from rig.inputs.folders import refuse_full
-from rig.inputs.programs import admit
+from rig.inputs.programs import admit, withdraw
 from rig.inputs.yaml_file import parse_mapping, read_text, validated
 
-MODEL_FILE = "model.yaml"
+MODEL_FILE, FMU_FILE = "model.yaml", "strut.fmu"
 
 _FORCES_N = (0.0, 1.0, 1000.0)
 """Applied forces from which the mass of a bench is found."""
@@ -38,7 +30,7 @@ def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: P
         source: The FMU.
         mapping: What its variables are, as in the `fmu` of a model file; without it, they are
             called as in an FMU of `rig export`.
-        mass_kg: Mass that the strut carries; of a bench it is found.
+        mass_kg: Mass that the strut carries; of a bench it is found where it is not given.
         out: New folder for the model file and the FMU.
 
     Returns:
@@ -48,31 +40,48 @@ def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: P
         InputError: The FMU, the mapping or the folder is wrong, or a mass is missing.
     """
     refuse_full(out)
-    description = description_of(source)
-    roles = _mapped(mapping, source) if mapping is not None else _named(description, source)
-    is_bench = roles.acceleration is not None
-    if is_bench and mass_kg is not None:
-        raise InputError("--mass-kg: expected none, a bench has its own")
-    if not is_bench and mass_kg is None:
+    content = read_program(source)
+    description = described(content, source)
+    roles = _named(description, source) if mapping is None else _mapped(mapping)
+    _refuse_contradictions(roles, mapping or source)
+    if roles.force is not None and mass_kg is None:
         raise InputError(f"{source}: a strut alone, expected --mass-kg with what it carries")
-    admit(source)
-    if is_bench:
-        mass_kg = _mass_kg(source, roles)
-        roles = roles.model_copy(update={"mass_kg": mass_kg})
-    spec = _model(description, roles, mass_kg or math.nan, source)
-    DartPlant(spec)
+    is_new = admit(content)
+    try:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            (folder / FMU_FILE).write_bytes(content)
+            spec = _model(description, roles, mass_kg, folder, source)
+            DartPlant(spec)
+    except BaseException:
+        if is_new:
+            withdraw(content)
+        raise
     try:
         out.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(source, out / source.name)
+        (out / FMU_FILE).write_bytes(content)
         (out / MODEL_FILE).write_text(dump_model(spec), "utf-8")
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror})") from error
     return spec.model_copy(update={"folder": out})
 
 
-def _mapped(mapping: Path, source: Path) -> FmuSpec:
+def _mapped(mapping: Path) -> FmuSpec:
     given = parse_mapping(read_text(mapping), str(mapping))
-    return validated(FmuSpec, {**given, "file": source.name}, str(mapping))
+    return validated(FmuSpec, {**given, "file": FMU_FILE}, str(mapping))
+
+
+def _refuse_contradictions(roles: FmuSpec, source: Path) -> None:
+    named = [roles.height, roles.velocity, roles.force, roles.acceleration]
+    named += [roles.temperature, roles.applied_force]
+    plain = [name.removeprefix("-") for name in named if name is not None]
+    if len(set(plain)) < len(plain):
+        raise InputError(f"{source}: one variable stands for two things, expected one for each")
+    motion = [name for name in named[:4] if name is not None and name != roles.force]
+    if len({name.startswith("-") for name in motion}) > 1:
+        raise InputError(
+            f"{source}: height, velocity and acceleration have different signs, expected one"
+        )
 
 
 def _named(description: Any, source: Path) -> FmuSpec:
@@ -85,14 +94,14 @@ def _named(description: Any, source: Path) -> FmuSpec:
     further = {"temperature": there("temperature_c"), "applied_force": there("applied_force_n")}
     if there("height_m") and there("velocity_m_per_s") and causality.get("force_n") == "output":
         own = {"height": "height_m", "velocity": "velocity_m_per_s", "force": "force_n"}
-        return FmuSpec.model_validate({"file": source.name, **own, **further})
+        return validated(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
     rates = {item.variable.derivative.name: item.variable.name for item in description.derivatives}
     found = [name.removesuffix("height_m") for name in rates if name.endswith(".height_m")]
     for prefix in found:
         height, velocity = f"{prefix}height_m", f"{prefix}velocity_m_per_s"
         if velocity in rates and further["applied_force"]:
             own = {"height": height, "velocity": velocity, "acceleration": rates[velocity]}
-            return FmuSpec.model_validate({"file": source.name, **own, **further})
+            return validated(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
     names = ", ".join(n for n, kind in causality.items() if kind in ("input", "output"))
     raise InputError(
         f"{source}: its variables are not named as ours, expected --mapping FILE that says which "
@@ -100,40 +109,70 @@ def _named(description: Any, source: Path) -> FmuSpec:
     )
 
 
-def _mass_kg(source: Path, roles: FmuSpec) -> float:
-    """Mass of a bench along its height: force over acceleration."""
+def _mass_kg(roles: FmuSpec, description: Any, folder: Path, source: Path) -> float:
+    """Mass of a bench along its height: force over acceleration.
+
+    Of an FMU of ours the strut's force belongs to it, which an effect may make of the applied one.
+    """
     if roles.applied_force is None:
-        raise InputError(f"{source}: a bench without applied_force, expected the input that it is")
+        raise InputError(f"{source}: a bench without applied_force, expected it or --mass-kg")
+    own = f"{roles.height.removesuffix('height_m')}force_n"
+    is_ours = roles.height.endswith(".height_m") and own in {
+        item.name for item in description.modelVariables
+    }
     # With a mass of 1 kg and no gravity, what it gives is the acceleration less the applied force.
-    unit = MockUp(roles.model_copy(update={"mass_kg": 1.0}), source.parent, 0.0)
+    unit = MockUp(roles.model_copy(update={"mass_kg": 1.0}), folder, 0.0)
     rest = [0.0] * len(unit.state_scales)
-    given = [unit.force(0.0, 0.0, 0.0, force_n, 20.0, rest) + force_n for force_n in _FORCES_N]
-    slopes = [(a - given[0]) / force_n for a, force_n in zip(given[1:], _FORCES_N[1:], strict=True)]
-    if not (slopes[0] > 0.0 and math.isclose(*slopes, rel_tol=_PROPORTIONAL)):
+    accelerations = [unit.force(0.0, 0.0, 0.0, f, 20.0, rest) + f for f in _FORCES_N]
+    forces = list(_FORCES_N)
+    if is_ours:
+        update = {"force": own, "acceleration": None}
+        strut = MockUp(roles.model_copy(update=update), folder, 0.0)
+        forces = [f + strut.force(0.0, 0.0, 0.0, f, 20.0, rest) for f in _FORCES_N]
+    masses = [
+        (force - forces[0]) / (a - accelerations[0]) if a != accelerations[0] else math.nan
+        for force, a in zip(forces[1:], accelerations[1:], strict=True)
+    ]
+    if not (masses[0] > 0.0 and math.isclose(*masses, rel_tol=_PROPORTIONAL)):
         raise InputError(
-            f"{source}: an applied force of 1 N and of 1000 N accelerates by {slopes[0]:.6g} and "
-            f"{slopes[1]:.6g} m/s² per newton, expected a mass on a straight guide"
+            f"{source}: applied forces of 1 N and of 1000 N tell of masses of {masses[0]:.6g} and "
+            f"{masses[1]:.6g} kg, expected one on a straight guide, or --mass-kg"
         )
-    return float(f"{1.0 / slopes[0]:.12g}")
+    return float(f"{masses[0]:.12g}")
 
 
-def _model(description: Any, roles: FmuSpec, mass_kg: float, source: Path) -> ModelSpec:
+def _model(
+    description: Any, roles: FmuSpec, mass_kg: float | None, folder: Path, source: Path
+) -> ModelSpec:
+    if mass_kg is None:
+        mass_kg = _mass_kg(roles, description, folder, source)
+    if roles.acceleration is not None:
+        roles = roles.model_copy(update={"mass_kg": mass_kg})
     name = re.sub(r"[^A-Za-z0-9_.-]", "_", description.modelName or "fmu")[:60]
+    strut = {
+        "name": "strut",
+        "between": ("world", "body"),
+        "free_length_m": _start_m(description, roles.height),
+        "stiffness_n_per_m": 0.0,
+        "damping_n_s_per_m": 0.0,
+        "fmu": roles.model_dump(exclude_none=True),
+    }
+    body = {"name": "body", "mass_kg": mass_kg, "joint": {"type": "prismatic"}}
+    spec = {
+        "name": name if re.match(r"[A-Za-z_]", name) else f"fmu_{name}"[:60],
+        "skeleton": {"bodies": [body]},
+        "struts": [strut],
+    }
+    return validated(ModelSpec, spec, str(source)).model_copy(update={"folder": folder})
+
+
+def _start_m(description: Any, height: str) -> float:
+    """Height at which the FMU begins; zero if it does not say."""
     starts = {item.name: item.start for item in description.modelVariables}
-    start = starts.get(roles.height.removeprefix("-")) or 0.0
-    sign = -1.0 if roles.height.startswith("-") else 1.0
-    strut = StrutSpec(
-        name="strut",
-        between=("world", "body"),
-        free_length_m=sign * float(start),
-        stiffness_n_per_m=0.0,
-        damping_n_s_per_m=0.0,
-        fmu=roles,
-    )
-    body = BodySpec(name="body", mass_kg=mass_kg, joint=JointSpec(type="prismatic"))
-    return ModelSpec(
-        name=name if re.match(r"[A-Za-z_]", name) else f"fmu_{name}"[:60],
-        skeleton=InlineSkeleton(bodies=(body,)),
-        struts=(strut,),
-        folder=source.parent,
-    )
+    try:
+        start = float(starts.get(height.removeprefix("-")) or 0.0)
+    except (TypeError, ValueError):
+        return 0.0
+    if not math.isfinite(start):
+        return 0.0
+    return -start if height.startswith("-") else start

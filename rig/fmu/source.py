@@ -43,7 +43,7 @@ def sources(component: Component, version: Fmi, token: str) -> dict[str, str]:
         token: What the description calls it, so that no other binary passes for it.
     """
     made = {name: shared(name) for name in (*_SHARED, *VERSIONS[version])}
-    made["model.h"] = _header(component, token)
+    made["model.h"] = _header(component, token, version)
     made["model.c"] = _model(component)
     return made
 
@@ -58,8 +58,9 @@ def compiled_files(names: Iterable[str]) -> list[str]:
     return sorted(name for name in names if name.endswith(".c"))
 
 
-def _header(component: Component, token: str) -> str:
+def _header(component: Component, token: str, version: Fmi) -> str:
     kinds = [item.kind for item in component.variables]
+    fmi = f"FMI{version[0]}"
     first = 0
     lines: list[str] = []
     for kind in KINDS:
@@ -75,6 +76,12 @@ def _header(component: Component, token: str) -> str:
             "   states, their rates, outputs and indicators of switches, one after another. */",
             "#ifndef MODEL_H",
             "#define MODEL_H",
+            "",
+            "/* Linked from their sources, FMUs are told apart by the names of their functions; a",
+            "   shared library has those of the standard. */",
+            f"#ifndef {fmi}_OVERRIDE_FUNCTION_PREFIX",
+            f"#define {fmi}_FUNCTION_PREFIX {component.identifier}_",
+            "#endif",
             "",
             f'#define MODEL_TOKEN "{token}"',
             *lines,

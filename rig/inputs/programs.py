@@ -5,61 +5,80 @@ was imported is known by its content (SHA-256), so that it may lie anywhere.
 """
 
 import hashlib
+import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from rig.inputs.errors import InputError
 
 
-def fingerprint(path: Path) -> str:
-    """SHA-256 of a file.
+def admit(content: bytes) -> bool:
+    """Let a program run from now on, for this user.
+
+    Returns:
+        Whether it could not before.
 
     Raises:
-        InputError: It cannot be read.
+        InputError: The user's settings cannot be read or written.
     """
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    found = _fingerprint(content)
+    admitted = _admitted()
+    if found in admitted:
+        return False
+    _write([*admitted, found])
+    return True
 
 
-def admit(path: Path) -> None:
-    """Let a file run from now on, for this user.
+def withdraw(content: bytes) -> None:
+    """Let a program run no more.
 
     Raises:
-        InputError: It cannot be read, or the user's settings cannot be written.
+        InputError: The user's settings cannot be read or written.
     """
-    found, listed = fingerprint(path), _list()
-    if found in _admitted():
-        return
-    try:
-        listed.parent.mkdir(parents=True, exist_ok=True)
-        with listed.open("a", encoding="utf-8") as file:
-            file.write(f"{found}  {path.name}\n")
-    except OSError as error:
-        raise InputError(f"{listed}: cannot be written ({error.strerror})") from error
+    found = _fingerprint(content)
+    _write([item for item in _admitted() if item != found])
 
 
-def require_admitted(path: Path) -> None:
-    """Refuse a file that this user never let run.
+def require_admitted(content: bytes, path: Path) -> None:
+    """Refuse a program that this user never let run.
+
+    Args:
+        content: The program.
+        path: What to call it.
 
     Raises:
-        InputError: It was not, or cannot be read.
+        InputError: It was not, or the user's settings cannot be read.
     """
-    if fingerprint(path) not in _admitted():
+    if _fingerprint(content) not in _admitted():
         raise InputError(
             f"{path}: a program that was not imported on this machine, expected `rig import "
             f"{path.name} --fmu` first, by someone who trusts it"
         )
 
 
-def _admitted() -> set[str]:
+def _fingerprint(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _write(fingerprints: Sequence[str]) -> None:
+    path = _list()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".{path.name}.{os.getpid()}")
+        temporary.write_text("".join(f"{item}\n" for item in fingerprints), "ascii")
+        temporary.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def _admitted() -> list[str]:
     try:
         text = _list().read_text("utf-8")
     except FileNotFoundError:
-        return set()
+        return []
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{_list()}: cannot be read ({error})") from error
-    return {line.split(maxsplit=1)[0] for line in text.splitlines() if line.strip()}
+    return text.split()
 
 
 def _list() -> Path:

@@ -1,5 +1,6 @@
 """A model that is an FMU: bench, diagnosis, FMU, and the same bench again."""
 
+import tempfile
 import zipfile
 
 import numpy as np
@@ -12,8 +13,10 @@ from rig.bench.schema import Effect
 from rig.demo.story import draw_effect, tell
 from rig.diagnosis.command import diagnose_runs
 from rig.fmu.component import bench_component, strut_component
-from rig.fmu.imported import MODEL_FILE, import_fmu
+from rig.fmu.exported import export_fmu
+from rig.fmu.imported import FMU_FILE, MODEL_FILE, import_fmu
 from rig.inputs.errors import InputError
+from rig.inputs.programs import require_admitted
 from rig.io.run_log import read_run
 from rig.operation.check import check
 from rig.operation.config import CONFIGS
@@ -215,7 +218,7 @@ def test_a_model_file_alone_makes_no_program_run(tmp_path, monkeypatch):
 def test_an_fmu_that_was_changed_does_not_run(tmp_path):
     spec = with_effects("none")
     model = imported(tmp_path, bench_component(spec), spec, "3.0")
-    path = model.folder / model.struts[0].fmu.file
+    path = model.folder / FMU_FILE
     path.write_bytes(path.read_bytes() + b" ")
     with pytest.raises(InputError, match="not imported on this machine"):
         DartPlant(model)
@@ -250,7 +253,7 @@ def test_what_is_no_archive_is_said(tmp_path, content):
 
 @pytest.mark.parametrize(
     ("bench", "mass_kg", "line"),
-    [(True, 10.0, "expected none, a bench has its own"), (False, None, "expected --mass-kg")],
+    [(False, None, "expected --mass-kg")],
 )
 def test_a_mass_is_given_where_it_is_missing(tmp_path, bench, mass_kg, line):
     spec = with_effects("none")
@@ -258,3 +261,103 @@ def test_a_mass_is_given_where_it_is_missing(tmp_path, bench, mass_kg, line):
     path = written(tmp_path, made, "2.0", spec)
     with pytest.raises(InputError, match=line):
         import_fmu(path, None, mass_kg, tmp_path / "out")
+
+
+def test_a_virtual_force_accelerates_the_right_mass(tmp_path):
+    """Also where an effect makes more of the applied force, or adds to the mass."""
+    spec = with_effects("input_gain", "added_mass")
+    model = imported(tmp_path, bench_component(spec), spec, "2.0")
+    assert model.struts[0].fmu.mass_kg == pytest.approx(30.0, rel=1e-9)
+    ours, theirs = DartPlant(model), DartPlant(spec)
+    rows = []
+    for plant in (ours, theirs):
+        state = plant.init([0.3])
+        for _ in range(200):
+            state = plant.step(plant.load(state, (20.0,), 3.0, 20.0), 1e-3, 3.0)
+        rows.append(state.struts[0])
+    assert rows[0] == pytest.approx(rows[1], rel=1e-9)
+
+
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_a_point_that_an_fmu_refuses_spoils_no_other(tmp_path, version):
+    spec = with_effects("end_stops", "maxwell")
+    (unit,) = DartPlant(imported(tmp_path, bench_component(spec), spec, version)).mockups
+    good = (0.1, 0.31, 0.2, 5.0, 20.0, [0.01])
+    first = unit.force(*good)
+    assert np.isnan(unit.force(0.1, 1e308, 1e308, 0.0, 20.0, [1e308]))
+    assert unit.force(*good) == first
+
+
+def test_a_model_with_an_fmu_is_not_exported(tmp_path):
+    spec = with_effects("none")
+    model = imported(tmp_path, bench_component(spec), spec, "3.0")
+    for bench in (True, False):
+        with pytest.raises(InputError, match="has an FMU, expected one without"):
+            export_fmu(model, tmp_path / "it.fmu", "2.0", None, bench)
+
+
+def test_an_import_that_fails_admits_nothing(tmp_path):
+    spec = with_effects("none")
+    path = written(tmp_path, bench_component(spec), "2.0", spec)
+    mapping = tmp_path / "mapping.yaml"
+    mapping.write_text("{height: strut.height_m, velocity: strut.velocity_m_per_s, force: nowhere}")
+    with pytest.raises(InputError):
+        import_fmu(path, mapping, 10.0, tmp_path / "out")
+    with pytest.raises(InputError, match="not imported on this machine"):
+        require_admitted(path.read_bytes(), path)
+
+
+@pytest.mark.parametrize(
+    ("mapping", "line"),
+    [
+        ("{height: height_m, velocity: height_m, force: force_n}", "stands for two things"),
+        ("{height: -height_m, velocity: velocity_m_per_s, force: force_n}", "different signs"),
+        ("{height: height_m, velocity: velocity_m_per_s}", "force and acceleration"),
+        ("{height: height_m, speed: velocity_m_per_s, force: force_n}", "speed"),
+        ("[1, 2]", "mapping.yaml"),
+        (
+            "{height: height_m, velocity: velocity_m_per_s, force: force_n, "
+            "parameters: {force_n: 1}}",
+            "expected a parameter",
+        ),
+    ],
+)
+def test_a_mapping_that_contradicts_itself_is_said(tmp_path, mapping, line):
+    spec = with_effects("none")
+    path = written(tmp_path, strut_component(spec, spec.struts[0]), "2.0", spec)
+    file = tmp_path / "mapping.yaml"
+    file.write_text(mapping)
+    with pytest.raises(InputError, match=line):
+        import_fmu(path, file, 10.0, tmp_path / "out")
+
+
+def test_an_integer_is_no_parameter(tmp_path):
+    """Value references of FMI 2.0 are counted by type: one of an integer is another real's."""
+    spec = with_effects("none")
+    path = written(tmp_path, strut_component(spec, spec.struts[0]), "2.0", spec)
+    own = (
+        '<ScalarVariable name="n" valueReference="6" causality="parameter" variability="tunable">'
+        '<Integer start="1"/></ScalarVariable></ModelVariables>'
+    )
+    foreign = changed(path, tmp_path / "it.fmu", {"</ModelVariables>": own})
+    file = tmp_path / "mapping.yaml"
+    roles = "height: height_m, velocity: velocity_m_per_s, force: force_n"
+    file.write_text(f"{{{roles}, parameters: {{n: 0}}}}")
+    with pytest.raises(InputError, match="single real number"):
+        import_fmu(foreign, file, 10.0, tmp_path / "out")
+
+
+def test_a_height_that_begins_nowhere_begins_at_zero(tmp_path):
+    spec = with_effects("none")
+    path = written(tmp_path, strut_component(spec, spec.struts[0]), "2.0", spec)
+    foreign = changed(
+        path, tmp_path / "it.fmu", {'<Real unit="m" start="0.5"': '<Real unit="m" start="INF"'}
+    )
+    model = import_fmu(foreign, None, 10.0, tmp_path / "out")
+    assert model.struts[0].free_length_m == 0.0
+
+
+def test_nothing_is_left_of_a_refused_fmu(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    test_what_is_no_archive_is_said(tmp_path, b"PK")
+    assert not list(tmp_path.glob("rig-fmu-*"))

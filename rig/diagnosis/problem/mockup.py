@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 _SECANT = 0.02
 """Share of stroke and top speed over which an FMU's slopes are taken: about what a model errs by,
 so that friction has a slope as well."""
+_LEAST_REACH = 1e-9
+"""In m and m/s: of a strut that stands still, which is refused later with a reason."""
 _LONGEST_STATE_STEP_S = 0.5e-3
 """Longest step of an FMU's internal states: that of a strut whose motion is prescribed."""
 
@@ -59,7 +61,8 @@ def forces_along(mockup: MockUp, strut: int, motion: Track) -> tuple[Array, Arra
     Its internal states begin at their start, and go by the midpoint rule.
     """
     z, w = motion.heights_m[strut], motion.velocities_m_per_s[strut]
-    reach_m, reach = _SECANT * float(np.ptp(z)), _SECANT * float(np.max(np.abs(w)))
+    reach_m = max(_SECANT * float(np.ptp(z)), _LEAST_REACH)
+    reach = max(_SECANT * float(np.max(np.abs(w))), _LEAST_REACH)
     found = np.empty((3, len(z)))
     states = np.zeros(len(mockup.state_scales))
     rows = np.column_stack([motion.t_s, z, w, motion.applied_n, motion.temperature_c])

@@ -1,5 +1,7 @@
 /* The functions of FMI 2.0 (Functional Mock-up Interface Specification 2.0.4), for Model Exchange and
    Co-Simulation. */
+#include "model.h"
+
 #include "fmi2.h"
 
 #include <string.h>

@@ -1,6 +1,8 @@
 /* The functions of FMI 3.0 (Functional Mock-up Interface Specification 3.0.2), for Model Exchange and
    Co-Simulation. Of what the description says that there is none of (values that are not Float64,
    clocks, derivatives, partitions) the functions are there and return an error. */
+#include "model.h"
+
 #include "fmi3.h"
 
 #include <stdlib.h>
