@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from typer.core import TyperGroup
 
@@ -99,23 +100,20 @@ def run_command(
     What is in the store is not computed again: a fleet that was ended is gone on with by the same
     command. A run that fails is a row with its error. Exit code 1 if any failed now.
     """
-    from dart_model.spec import load_model, model_file
-    from rig.fleet.campaign import Model, campaign
+    from dart_model.spec import model_file
+    from rig.fleet.campaign import campaign, model_of
     from rig.fleet.executors import dask as dask_at
     from rig.fleet.executors import processes
     from rig.fleet.sources import find_sources, shard_of
-    from rig.inputs.yaml_file import read_text
 
     if jobs is not None and dask is not None:
         raise InputError("--jobs and --dask: expected one of them")
     part = None if shard is None else _shard(shard)
-    file = model_file(model, Path())
-    load_model(file)  # Refused now, not by every worker.
+    given = model_of(model_file(model, Path()))  # Refused now, not by every worker.
     _refuse_other(out)
     found = find_sources(sources, path)
     if part is not None:
         found = shard_of(found, *part)
-    given = Model(read_text(file), str(file.parent.absolute()))
     computing = contextlib.nullcontext(processes(jobs)) if dask is None else dask_at(dask)
     with computing as engine:
         if not as_json:
@@ -134,7 +132,8 @@ def run_command(
 
 def _shard(text: str) -> tuple[int, int]:
     first, _, last = text.partition("/")
-    if not (first.isdigit() and last.isdigit() and 1 <= int(first) <= int(last)):
+    is_number = text.isascii() and first.isdecimal() and last.isdecimal()
+    if not (is_number and 1 <= int(first) <= int(last)):
         raise InputError(f"--shard {text!r}: expected I/N with I from 1 to N, such as 3/16")
     return int(first), int(last)
 
@@ -142,7 +141,7 @@ def _shard(text: str) -> tuple[int, int]:
 def _refuse_other(out: Path) -> None:
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file, expected a folder")
-    if out.is_dir() and any(out.iterdir()) and not (out / "runs").is_dir():
+    if out.is_dir() and any(out.iterdir()) and not (out / "values").is_dir():
         raise InputError(f"{out}: holds something else, expected a store or a new folder")
 
 
@@ -208,7 +207,7 @@ def query_command(
     else:
         shown = table(*names)
         for row in rows:
-            shown.add_row(*("" if item is None else str(item) for item in row))
+            shown.add_row(*("" if item is None else escape(str(item)) for item in row))
         console.print(shown)
 
 
@@ -245,10 +244,11 @@ def report_command(
 def _print(found: "Overview") -> None:
     from rig.fleet.words import alarms
 
-    console.print(f"{found.runs} runs of {len(found.verdicts)} benches", markup=False)
+    console.print(found.words, markup=False)
     shown = table("bench", "verdicts")
     for bench, counts in found.verdicts.items():
-        shown.add_row(bench, ", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+        said = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
+        shown.add_row(escape(bench), said)
     console.print(shown)
     for line in alarms(found) or ["Nothing changed, drifts or stands out."]:
         console.print(f"- {line}", markup=False)

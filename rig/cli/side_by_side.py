@@ -1,19 +1,24 @@
 """Several bridges on one machine: a process each, since each has a tick to keep."""
 
 import contextlib
+import ctypes
 import json
 import signal
 import subprocess
 import sys
 import threading
 from collections import Counter
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from rich.markup import escape
 
 from rig.cli.output import FAILED, OK, WRONG_INPUT, console, print_json, table
 from rig.inputs.errors import InputError
 from rig.inputs.folders import refuse_full
+
+_PR_SET_PDEATHSIG = 1
 
 _WORST = (WRONG_INPUT, FAILED)
 """Exit codes that others give way to, the worst first."""
@@ -45,18 +50,15 @@ def run_side_by_side(
         raise InputError(f"{twice[0]}: two configurations of this name, expected different ones")
     for name in names:
         refuse_full(folder / name)
-    bridges = {
-        name: _started(config, folder / name, options)
-        for name, config in zip(names, configs, strict=True)
-    }
-    readers = [
-        threading.Thread(target=_pass_on, args=(name, bridge), daemon=True)
-        for name, bridge in bridges.items()
-    ]
-    for reader in readers:
-        reader.start()
-    with _forwarded(list(bridges.values())):
-        codes = {name: bridge.wait() for name, bridge in bridges.items()}
+    bridges: dict[str, subprocess.Popen[str]] = {}
+    readers: list[threading.Thread] = []
+    with _ended_together(bridges):
+        for name, config in zip(names, configs, strict=True):
+            bridges[name] = _started(config, folder / name, options)
+        for item in bridges.items():
+            readers.append(threading.Thread(target=_pass_on, args=item, daemon=True))
+            readers[-1].start()
+        codes = {name: _code(bridge.wait()) for name, bridge in bridges.items()}
     for reader in readers:
         reader.join()
     summaries = {name: _summary(folder / name) for name in names}
@@ -79,7 +81,18 @@ def _started(config: Path, folder: Path, options: Sequence[str]) -> "subprocess.
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
+        preexec_fn=_ends_with_its_parent if sys.platform == "linux" else None,  # noqa: PLW1509
     )
+
+
+def _ends_with_its_parent() -> None:
+    """Ctrl-C from the kernel, should the parent die without a word; no thread runs there yet."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+
+
+def _code(code: int) -> int:
+    """An exit code; that of a program which a signal ended is a failure."""
+    return code if code >= 0 else FAILED
 
 
 def _pass_on(name: str, bridge: "subprocess.Popen[str]") -> None:
@@ -89,17 +102,22 @@ def _pass_on(name: str, bridge: "subprocess.Popen[str]") -> None:
 
 
 @contextlib.contextmanager
-def _forwarded(bridges: Sequence["subprocess.Popen[str]"]) -> Generator[None]:
-    """Ctrl-C and an end that is asked for go to every bridge."""
+def _ended_together(bridges: Mapping[str, "subprocess.Popen[str]"]) -> Generator[None]:
+    """Ctrl-C, an end that is asked for and a closed terminal go to every bridge, and an error."""
 
     def forward(_number: int, _frame: Any) -> None:
-        for bridge in bridges:
+        for bridge in list(bridges.values()):
             if bridge.poll() is None:
                 bridge.send_signal(signal.SIGINT)
 
-    before = {number: signal.signal(number, forward) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    numbers += [signal.SIGHUP] if sys.platform != "win32" else []
+    before = {number: signal.signal(number, forward) for number in numbers}
     try:
         yield
+    except BaseException:
+        forward(0, None)
+        raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -120,5 +138,7 @@ def _print(codes: dict[str, int], summaries: dict[str, dict[str, Any]], folder: 
         mode = summary.get("mode", "")
         missed = summary.get("counts", {}).get("overruns", "")
         ticks = str(summary.get("ticks", ""))
-        shown.add_row(name, f"{words} {mode}".strip(), ticks, str(missed), str(folder / name))
+        shown.add_row(
+            escape(name), f"{words} {mode}".strip(), ticks, str(missed), escape(str(folder / name))
+        )
     console.print(shown)

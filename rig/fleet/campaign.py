@@ -4,16 +4,21 @@ Workers give rows back and write nothing; one writer appends them in parts. What
 not computed again, so that a campaign that was ended is gone on with by starting it again.
 """
 
+import hashlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from dataclasses import replace
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import NamedTuple
 
+from dart_model.spec import files_of, load_model
 from rig.fleet import store
 from rig.fleet.one_run import Row, Task, evaluated, identity_of, lost
 from rig.fleet.sources import Source
+from rig.inputs.errors import InputError
+from rig.inputs.yaml_file import read_text
 
 PART_ROWS = 500
 """Rows that are held until they are written, at most."""
@@ -48,10 +53,28 @@ class Model(NamedTuple):
     Attributes:
         text: The model file.
         folder: Folder of the files that it names.
+        sha256: Of all of them.
     """
 
     text: str
     folder: str
+    sha256: str
+
+
+def model_of(file: Path) -> Model:
+    """A model from its file.
+
+    Raises:
+        InputError: It is wrong, or a file that it names cannot be read.
+    """
+    spec, text = load_model(file), read_text(file)
+    found = hashlib.sha256(text.encode())
+    for name in files_of(spec):
+        try:
+            found.update((spec.folder / name).read_bytes())
+        except OSError as error:
+            raise InputError(f"{spec.folder / name}: cannot be read ({error.strerror})") from error
+    return Model(text, str(file.parent.absolute()), found.hexdigest())
 
 
 def campaign(
@@ -84,8 +107,8 @@ def campaign(
     store.sweep(out)
     known = store.identities(out, with_failed=not again)
     keys = store.keys(out)
-    todo = [s for s in sources if identity_of(s, model.text) not in known]
-    tasks = (Task(source, model.text, model.folder) for source in todo)
+    todo = [s for s in sources if identity_of(s, model.sha256) not in known]
+    tasks = (Task(source, *model) for source in todo)
     begun = last_s = time.monotonic()
     held: list[Row] = []
     done = failed = 0
@@ -96,15 +119,17 @@ def campaign(
         return now
     try:
         for row in _rows(tasks, make_executor, window):
+            if time.monotonic() - last_s > PART_S or len(held) >= PART_ROWS:
+                store.append(out, held)
+                held, last_s = [], time.monotonic()
+            if row is None:
+                continue
             done += 1
             failed += bool(row.error)
             worked_s += row.took_s if row.took_s == row.took_s else 0.0
-            if row.key not in keys:
-                keys.add(row.key)
-                held.append(row)
-            if len(held) >= PART_ROWS or time.monotonic() - last_s > PART_S:
-                store.append(out, held)
-                held, last_s = [], time.monotonic()
+            # A copy is known from now on, and counted once: its values are there already.
+            held.append(replace(row, values=()) if row.key in keys else row)
+            keys.add(row.key)
             now = now._replace(
                 done=done, failed=failed, elapsed_s=time.monotonic() - begun, worked_s=worked_s
             )
@@ -116,8 +141,8 @@ def campaign(
 
 def _rows(
     tasks: Iterator[Task], make_executor: Callable[[], Executor], window: int
-) -> Iterator[Row]:
-    """Rows in the order in which they are ready."""
+) -> Iterator[Row | None]:
+    """Rows in the order in which they are ready; None where none was for a while."""
     executor = make_executor()
     pending: dict[Future[Row], Task] = {}
     ready: SimpleQueue[Future[Row]] = SimpleQueue()
@@ -127,7 +152,11 @@ def _rows(
                 _submit(executor, task, pending, ready)
             if not pending:
                 return
-            future = ready.get()
+            try:
+                future = ready.get(timeout=PART_S)
+            except Empty:
+                yield None
+                continue
             task = pending.pop(future)
             try:
                 row = future.result()
@@ -166,6 +195,8 @@ def _submit(
     except BrokenExecutor as error:
         future = Future()
         future.set_exception(error)
+    except Exception as error:  # of an engine elsewhere
+        raise InputError(f"the engine takes no more runs ({error})") from error
     pending[future] = task
     future.add_done_callback(ready.put)
 

@@ -4,6 +4,7 @@ import importlib
 import multiprocessing
 import os
 import signal
+import sys
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -36,7 +37,7 @@ def processes(jobs: int | None) -> Engine:
     Args:
         jobs: How many; one a core that this program may use if None.
     """
-    count = jobs or len(os.sched_getaffinity(0))
+    count = jobs or _cores()
     for name in _THREADS:
         os.environ.setdefault(
             name, "1"
@@ -47,6 +48,13 @@ def processes(jobs: int | None) -> Engine:
         return ProcessPoolExecutor(count, mp_context=context, initializer=_worker)
 
     return Engine(f"{count} processes", make, _AHEAD * count)
+
+
+def _cores() -> int:
+    """Those that this program may use, where the system says so."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _worker() -> None:
@@ -69,7 +77,7 @@ def dask(address: str) -> Generator[Engine]:
         ) from error
     try:
         client = library.Client(address, timeout="10s", set_as_default=False)
-    except (OSError, ValueError) as error:
+    except Exception as error:  # of any of the libraries under it
         raise InputError(f"--dask {address}: no scheduler there ({error})") from error
     threads = sum(client.nthreads().values())
     if not threads:

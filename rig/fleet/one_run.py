@@ -4,6 +4,8 @@ import contextlib
 import datetime
 import hashlib
 import math
+import os
+import re
 import tempfile
 import time
 from collections.abc import Generator
@@ -22,7 +24,7 @@ from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.outcome import Estimate, FoundEffect
 from rig.diagnosis.recording import Recording, read_recording
 from rig.diagnosis.refit import refitted
-from rig.fleet.sources import Source
+from rig.fleet.sources import Source, shown
 from rig.inputs.errors import InputError
 from rig.inputs.yaml_file import parse_mapping, read_text
 from rig.io.run_log import RUN_FILE
@@ -38,11 +40,13 @@ class Task:
         source: The run.
         model: Text of the model file.
         folder: Where the files that it names lie.
+        model_sha256: Of the file and of those.
     """
 
     source: Source
     model: str
     folder: str
+    model_sha256: str
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,7 @@ class Row:
         damper: Damper.
         date: Day.
         model: Name of the model.
+        model_sha256: Of its file and of the files that it names.
         version: Version of rig.
         verdict: Of the diagnosis; empty where it failed.
         error: Why it failed; empty where it did not.
@@ -78,6 +83,7 @@ class Row:
     damper: str
     date: str
     model: str
+    model_sha256: str
     version: str
     verdict: str = ""
     error: str = ""
@@ -133,7 +139,10 @@ def evaluated(task: Task) -> Row:
     except Exception as error:  # one bad run never stops the rest
         row = _failed(task, f"unexpected: {type(error).__name__}: {error}")
     took_s = time.perf_counter() - begun
-    return replace(row, took_s=took_s, error=row.error.replace(source.url, "run")[:500])
+    # Without the run's own name and place: alike errors are counted as one.
+    name = re.escape(source.url.rsplit("/", 1)[-1])
+    error = re.sub(rf"[^\s:]*{name}", "run", row.error.replace(source.url, "run"))
+    return replace(row, took_s=took_s, error=shown(error)[:500])
 
 
 def lost(task: Task, why: str) -> Row:
@@ -141,22 +150,24 @@ def lost(task: Task, why: str) -> Row:
     return _failed(task, why)
 
 
-def identity_of(source: Source, model: str) -> str:
+def identity_of(source: Source, model_sha256: str) -> str:
     """What a run is known by without being read."""
-    text = f"{source.url}\0{source.size}\0{source.stamp}\0{model}\0{rig_version()}"
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
+    parts = [source.url, str(source.size), source.stamp, source.bench, source.damper, source.date]
+    text = "\0".join([*parts, model_sha256, rig_version()])
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
 
 def _failed(task: Task, why: str) -> Row:
-    source, identity = task.source, identity_of(task.source, task.model)
+    source, identity = task.source, identity_of(task.source, task.model_sha256)
     return Row(
         identity,
         identity,
-        source.url,
+        shown(source.url),
         source.bench,
         source.damper,
         source.date or source.changed,
         _model(task.model, task.folder).name,
+        task.model_sha256,
         rig_version(),
         error=why,
     )
@@ -196,12 +207,13 @@ def _evaluated(task: Task) -> Row:
     )
     return Row(
         key,
-        identity_of(source, task.model),
-        source.url,
+        identity_of(source, task.model_sha256),
+        shown(source.url),
         source.bench,
         source.damper,
         day,
         spec.name,
+        task.model_sha256,
         rig_version(),
         found.verdict,
         samples=len(recording.t_s),
@@ -272,10 +284,10 @@ def _local(source: Source) -> Generator[Path]:
 
 def _key(path: Path, task: Task) -> str:
     """Of a run's content, the model and the version."""
-    found = hashlib.sha256(f"{task.model}\0{rig_version()}\0".encode())
+    found = hashlib.sha256(f"{task.model_sha256}\0{rig_version()}\0".encode())
     files = sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]
     for file in files:
-        found.update(f"{file.name}\0".encode() if path.is_dir() else b"")
+        found.update(os.fsencode(f"{file.name}\0") if path.is_dir() else b"")
         try:
             with file.open("rb") as opened:
                 while piece := opened.read(_PIECE):

@@ -2,11 +2,13 @@
 
 import datetime
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rig.fleet.sources import UNKNOWN
 from rig.fleet.store import opened
 from rig.fleet.trends import (
     FEWEST,
@@ -18,11 +20,14 @@ from rig.fleet.trends import (
     change_point,
     drift,
     outliers,
-    without_jump,
+    without_step,
 )
 
 SCALED_BY_FORCE = ("stiffness_n_per_m", "damping_n_s_per_m", "friction_n", "gas_force_n")
 """Values that a load cell's gain multiplies, and the linear model or every damper has."""
+
+_FORCE = re.compile(r"_n(_per_|_s|$)")
+"""Units of what is proportional to a force: N, N/m, N·s/m, ..."""
 
 _RECENT = 5
 """Last points of a series whose median stands for the damper as it is now."""
@@ -65,7 +70,6 @@ class Series(NamedTuple):
         change: Its likeliest change-point; None where it is too short.
         is_change: Whether that is significant in the whole fleet.
         is_drift: Whether the slope is, where there is no change-point.
-        with_bench: Whether the change is that of its bench.
     """
 
     where: Where
@@ -75,7 +79,6 @@ class Series(NamedTuple):
     change: Change | None
     is_change: bool
     is_drift: bool
-    with_bench: bool
 
 
 class Jump(NamedTuple):
@@ -123,6 +126,8 @@ class Overview:
         series: Every quantity of every damper.
         jumps: Of benches.
         outliers: Dampers.
+        model: Model and version of these runs: those that were evaluated last.
+        others: Runs of other models or versions in the store.
     """
 
     runs: int
@@ -131,11 +136,27 @@ class Overview:
     series: tuple[Series, ...]
     jumps: tuple[Jump, ...]
     outliers: tuple[Outlier, ...]
+    model: str
+    others: int
+
+    @property
+    def words(self) -> str:
+        """What it is about, in a sentence."""
+        dampers = len({item.where for item in self.series})
+        left_out = f"; {self.others} runs of other models or versions are left out" * bool(
+            self.others
+        )
+        return (
+            f"{self.runs} runs of {dampers} dampers on {len(self.verdicts)} benches, model "
+            f"{self.model}{left_out}"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON; series without their points."""
         return {
             "runs": self.runs,
+            "model": self.model,
+            "others": self.others,
             "failed": dict(self.failed),
             "verdicts": {bench: dict(counts) for bench, counts in self.verdicts.items()},
             "jumps": [
@@ -148,7 +169,7 @@ class Overview:
                 for jump in self.jumps
             ],
             "changes": [
-                {**_place(item), "with_bench": item.with_bench, **_change_dict(item.change)}
+                {**_place(item), **_change_dict(item.change)}
                 for item in self.series
                 if item.is_change and item.change is not None
             ],
@@ -178,35 +199,61 @@ def overview(store: Path) -> Overview:
     """
     connection = opened(store)
     try:
-        runs = connection.execute("SELECT count(*) FROM runs").fetchone()[0]
+        model, sha256, version = connection.execute(
+            "SELECT model, model_sha256, version FROM runs ORDER BY written DESC LIMIT 1"
+        ).fetchall()[0]
+        connection.execute(
+            "CREATE TEMP TABLE these AS SELECT * FROM runs WHERE model_sha256 = ? AND version = ?",
+            [sha256, version],
+        )
+        ((runs,),) = connection.execute("SELECT count(*) FROM these").fetchall()
+        ((every,),) = connection.execute("SELECT count(*) FROM runs").fetchall()
         failed = dict(
             connection.execute(
-                "SELECT error, count(*) FROM runs WHERE error <> '' "
+                "SELECT error, count(*) FROM these WHERE error <> '' "
                 "GROUP BY error ORDER BY count(*) DESC, error"
             ).fetchall()
         )
         verdicts: dict[str, dict[str, int]] = {}
         for bench, verdict, count in connection.execute(
             "SELECT bench, CASE WHEN error = '' THEN verdict ELSE 'failed' END AS said, count(*) "
-            "FROM runs GROUP BY bench, said ORDER BY bench, count(*) DESC, said"
+            "FROM these GROUP BY bench, said ORDER BY bench, count(*) DESC, said"
         ).fetchall():
             verdicts.setdefault(bench, {})[verdict] = count
         collected = _collected(connection)
     finally:
         connection.close()
     jumps = _jumps(collected)
-    return Overview(runs, failed, verdicts, _series(collected, jumps), jumps, _outliers(collected))
+    stepped_on = _step_days(collected, jumps)
+    cleared = _without(collected, stepped_on)
+    words = f"{model} ({sha256[:8]}), rig {version}"
+    return Overview(
+        runs,
+        failed,
+        verdicts,
+        _series(cleared, stepped_on),
+        jumps,
+        _outliers(cleared),
+        words,
+        every - runs,
+    )
 
 
 _Collected = dict[Quantity, dict[Where, list[Point]]]
 
 
 def _collected(connection: Any) -> _Collected:
-    """Every series by quantity; values that their run does not bound are left out."""
+    """Every series by quantity.
+
+    Values that their run does not bound are left out, and dampers that nobody named: of several,
+    one series would be nobody's.
+    """
     rows = connection.execute(
-        'SELECT v.strut, v.effect, v.parameter, v.bench, v.damper, v.date, v.value FROM "values" v '
-        "WHERE v.kind IN ('model', 'figure') AND isfinite(v.value) AND isfinite(v.low) "
-        "AND isfinite(v.high) ORDER BY v.date, v.key"
+        "SELECT v.strut, v.effect, v.parameter, t.bench, t.damper, t.date, v.value "
+        'FROM "values" v JOIN these t USING (key) '
+        "WHERE t.damper <> ? AND v.kind IN ('model', 'figure') AND isfinite(v.value) "
+        "AND isfinite(v.low) AND isfinite(v.high) ORDER BY t.date, v.key",
+        [UNKNOWN],
     )
     found: _Collected = {}
     while batch := rows.fetchmany(100_000):
@@ -218,28 +265,60 @@ def _collected(connection: Any) -> _Collected:
 
 
 def _jumps(collected: _Collected) -> tuple[Jump, ...]:
-    found: list[Jump] = []
-    for quantity, by_place in collected.items():
-        if quantity.effect or quantity.parameter not in SCALED_BY_FORCE:
-            continue
-        for bench in sorted({where.bench for where in by_place}):
+    """The surest jump of each bench; a load cell's gain shows in several quantities at once."""
+    usable = {
+        quantity: by_place
+        for quantity, by_place in collected.items()
+        if not quantity.effect and quantity.parameter in SCALED_BY_FORCE
+    }
+    benches = sorted({where.bench for by_place in usable.values() for where in by_place})
+    level = LEVEL / max(1, len(benches) * len(usable))
+    found: dict[str, Jump] = {}
+    for bench in benches:
+        for quantity, by_place in usable.items():
             logs = {
                 where.damper: _logarithms(points)
                 for where, points in by_place.items()
                 if where.bench == bench and all(point.value > 0.0 for point in points)
             }
-            change = bench_jump(logs)
-            if change is not None:
+            change = bench_jump(logs, level)
+            if change is not None and (bench not in found or change.p < found[bench].change.p):
                 factor = math.exp(change.after - change.before)
-                found.append(Jump(bench, quantity.parameter, factor, change))
-    return tuple(found)
+                found[bench] = Jump(bench, quantity.parameter, factor, change)
+    return tuple(found.values())
+
+
+def _step_days(collected: _Collected, jumps: Sequence[Jump]) -> dict[tuple[Where, Quantity], float]:
+    """Day of the bench's jump for each series that it is in."""
+    by_bench = {jump.bench: jump.change.day for jump in jumps}
+    return {
+        (where, quantity): by_bench[where.bench]
+        for quantity, by_place in collected.items()
+        for where in by_place
+        if where.bench in by_bench and _FORCE.search(quantity.parameter)
+    }
+
+
+def _without(collected: _Collected, days: Mapping[tuple[Where, Quantity], float]) -> _Collected:
+    """Every series without the jump of its bench, whose size is its own best one."""
+    return {
+        quantity: {
+            where: without_step(points, days[where, quantity])
+            if (where, quantity) in days
+            else points
+            for where, points in by_place.items()
+        }
+        for quantity, by_place in collected.items()
+    }
 
 
 def _logarithms(points: Sequence[Point]) -> list[Point]:
     return [point._replace(value=math.log(point.value)) for point in points]
 
 
-def _series(collected: _Collected, jumps: Sequence[Jump]) -> tuple[Series, ...]:
+def _series(
+    collected: _Collected, stepped_on: Mapping[tuple[Where, Quantity], float]
+) -> tuple[Series, ...]:
     """Every series with what is significant among all of them."""
     every = [
         (where, quantity, points)
@@ -249,26 +328,12 @@ def _series(collected: _Collected, jumps: Sequence[Jump]) -> tuple[Series, ...]:
     level = LEVEL / max(1, sum(len(points) >= FEWEST for _, _, points in every))
     found: list[Series] = []
     for where, quantity, points in every:
-        line, change = drift(points), change_point(points)
+        line = drift(points, stepped_on.get((where, quantity)))
+        change = change_point(points)
         is_change = change is not None and change.p < level
         is_drift = line is not None and len(points) >= FEWEST and line.p < level and not is_change
-        shared = is_change and _goes_with(where, points, jumps, level)
-        found.append(
-            Series(where, quantity, tuple(points), line, change, is_change, is_drift, shared)
-        )
+        found.append(Series(where, quantity, tuple(points), line, change, is_change, is_drift))
     return tuple(found)
-
-
-def _goes_with(where: Where, points: Sequence[Point], jumps: Sequence[Jump], level: float) -> bool:
-    """Whether a change is gone when a jump of its bench is taken out."""
-    if any(point.value <= 0.0 for point in points):
-        return False
-    for jump in jumps:
-        if jump.bench == where.bench:
-            left = change_point(without_jump(_logarithms(points), jump.change))
-            if left is not None and left.p >= level:
-                return True
-    return False
 
 
 def _outliers(collected: _Collected) -> tuple[Outlier, ...]:

@@ -1,11 +1,13 @@
 """What runs there are, here or on object storage, and of which bench, damper and day each is."""
 
+import contextlib
 import datetime
+import os
 import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from fsspec.core import url_to_fs
@@ -18,6 +20,12 @@ FIELDS = ("bench", "damper", "date")
 
 UNKNOWN = "unknown"
 """A bench or a damper that nobody named."""
+
+_CHANGED = ("mtime", "LastModified", "last_modified", "updated", "created")
+"""What file systems call the time of the last change."""
+
+_LONGEST_NAME = 60
+"""Of a bench or a damper: its folder in the store has a name, too."""
 
 _DAY = re.compile(r"(?<!\d)(\d{4})-?(\d{2})-?(\d{2})(?!\d)")
 _FORBIDDEN = re.compile(r"[/\\\x00-\x1f]")
@@ -81,7 +89,7 @@ def shard_of(sources: Sequence[Source], index: int, count: int) -> list[Source]:
         index: Which part, from 1 on.
         count: How many parts.
     """
-    return [item for item in sources if zlib.crc32(item.url.encode()) % count == index - 1]
+    return [item for item in sources if zlib.crc32(os.fsencode(item.url)) % count == index - 1]
 
 
 def _in_place(
@@ -93,7 +101,7 @@ def _in_place(
     stamps: dict[str, str] = {}
     for path, info in files.items():
         run = next((str(up) for up in PurePosixPath(path).parents if str(up) in folders), None)
-        if run is None and not path.endswith(".csv"):
+        if run is None and not path.lower().endswith(".csv"):
             continue
         run = run or path
         sizes[run] = sizes.get(run, 0) + int(info.get("size") or 0)
@@ -103,12 +111,15 @@ def _in_place(
             str(PurePosixPath(run).relative_to(root)) if run != root else PurePosixPath(run).name
         )
         fields = _fields(inside, run, compiled, pattern)
-        day = _day(fields.get("date", "") or ("" if compiled else inside))
+        day = _day(fields.get("date", "" if compiled else inside))
+        if "date" in fields and not day:
+            raise InputError(f"{inside}: {fields['date']!r}: expected a day such as 2026-01-05")
+        _refuse_names(inside, fields)
         yield Source(
             f"{protocol}{run}",
             run in folders,
-            fields.get("bench") or UNKNOWN,
-            fields.get("damper") or UNKNOWN,
+            shown(fields.get("bench") or UNKNOWN),
+            shown(fields.get("damper") or UNKNOWN),
             day,
             stamps[run][:10],
             size,
@@ -118,18 +129,36 @@ def _in_place(
 
 def _listed(place: str) -> tuple[Mapping[str, Any], str, str]:
     """Files at a place with what is known of them, what URLs of it begin with, and its root."""
+    if "://" not in place:
+        return _here(Path(place)), "", str(Path(place).absolute())
     try:
         system, root = url_to_fs(place)
         files = system.find(root, detail=True)
-    except (OSError, ValueError, ImportError) as error:
+    except Exception as error:  # of any library that knows such places
         raise InputError(f"{place}: cannot be read ({error})") from error
-    protocol = "" if "://" not in place else place.split("://", 1)[0] + "://"
-    return files, protocol, root.rstrip("/")
+    return files, place.split("://", 1)[0] + "://", root.rstrip("/")
+
+
+def _here(place: Path) -> dict[str, dict[str, float]]:
+    """Files of this machine at a place, also behind links."""
+    found: dict[str, dict[str, float]] = {}
+    place = place.absolute()
+
+    def refuse(error: OSError) -> None:
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror})") from error
+
+    listed = os.walk(place, followlinks=True, onerror=refuse) if place.is_dir() else []
+    paths = [Path(folder) / name for folder, _, names in listed for name in names]
+    for path in [*paths, *([place] if place.is_file() else [])]:
+        with contextlib.suppress(FileNotFoundError):
+            status = path.stat()
+            found[str(path)] = {"size": status.st_size, "mtime": status.st_mtime}
+    return found
 
 
 def _stamp(info: Mapping[str, Any]) -> str:
     """Time of the last change as text that sorts by time."""
-    changed = info.get("mtime") or info.get("LastModified") or info.get("created") or 0
+    changed = next((info[name] for name in _CHANGED if info.get(name)), 0)
     if isinstance(changed, int | float):
         changed = datetime.datetime.fromtimestamp(float(changed), datetime.UTC)
     if isinstance(changed, datetime.datetime):
@@ -166,6 +195,20 @@ def _fields(
     if found is None:
         raise InputError(f"{inside}: does not fit --path {pattern!r}")
     return found.groupdict()
+
+
+def _refuse_names(inside: str, fields: Mapping[str, str]) -> None:
+    for key in ("bench", "damper"):
+        name = fields.get(key, "")
+        if len(name.encode("utf-8", "replace")) > _LONGEST_NAME or name.startswith("__HIVE"):
+            raise InputError(
+                f"{inside!a}: {key} {name[:80]!a}: expected a name of at most {_LONGEST_NAME} bytes"
+            )
+
+
+def shown(text: str) -> str:
+    """A path as text that can be written, whatever its bytes are."""
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
 
 def _day(text: str) -> str:

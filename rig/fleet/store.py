@@ -9,6 +9,8 @@ written twice all the same is counted once by the views.
 """
 
 import contextlib
+import datetime
+import glob
 import hashlib
 import importlib
 import os
@@ -38,7 +40,9 @@ _RUN = _pa.schema(
         ("source", _pa.string()),
         ("damper", _pa.string()),
         ("model", _pa.string()),
+        ("model_sha256", _pa.string()),
         ("version", _pa.string()),
+        ("written", _pa.string()),
         ("verdict", _pa.string()),
         ("error", _pa.string()),
         ("samples", _pa.int64()),
@@ -66,15 +70,17 @@ _VALUE = _pa.schema(
     ]
 )
 _VIEWS = """
+CREATE VIEW every_run AS
+    SELECT * FROM read_parquet({runs}, hive_partitioning = true, hive_types_autocast = false);
 CREATE VIEW runs AS SELECT * EXCLUDE (identity) FROM (
-    SELECT * FROM read_parquet({runs}, hive_partitioning = true, hive_types_autocast = false)
-    QUALIFY row_number() OVER (PARTITION BY key ORDER BY part) = 1
-) AS every WHERE error = '' OR source NOT IN (
-    SELECT source FROM read_parquet({runs}, hive_partitioning = true) WHERE error = ''
-);
+    SELECT * FROM every_run QUALIFY row_number() OVER (
+        PARTITION BY source, model_sha256, version ORDER BY written DESC, part) = 1
+) QUALIFY row_number() OVER (PARTITION BY key ORDER BY written, part) = 1;
 CREATE VIEW "values" AS SELECT v.* FROM
     read_parquet({values}, hive_partitioning = true, hive_types_autocast = false) AS v
-    SEMI JOIN runs ON v.key = runs.key AND v.part = runs.part;
+    SEMI JOIN every_run ON v.key = every_run.key AND v.part = every_run.part
+    SEMI JOIN runs ON v.key = runs.key
+    QUALIFY dense_rank() OVER (PARTITION BY v.key ORDER BY v.part) = 1;
 CREATE VIEW effects AS SELECT * FROM "values" WHERE kind <> 'figure';
 """
 _ABANDONED_S = 3600.0
@@ -98,8 +104,10 @@ def append(store: Path, rows: Sequence[Row]) -> None:
 
 
 def _write(store: Path, partition: str, rows: Sequence[Row]) -> None:
-    part = hashlib.sha256("\0".join(row.key for row in rows).encode()).hexdigest()[:24]
-    runs = [{**row.as_dict(), "part": part} for row in rows]
+    content = "\0".join([partition, *(row.key for row in rows)])
+    part = hashlib.sha256(content.encode("utf-8", "surrogateescape")).hexdigest()[:24]
+    written = datetime.datetime.now(datetime.UTC).isoformat(timespec="microseconds")
+    runs = [{**row.as_dict(), "written": written, "part": part} for row in rows]
     values = [
         {**_columns(value), "key": row.key, "damper": row.damper, "part": part}
         for row in rows
@@ -202,7 +210,8 @@ def opened(store: Path) -> Any:
 
 
 def _quoted(path: Path) -> str:
-    return "'" + str(path).replace("'", "''") + "'"
+    text = glob.escape(str(path.parents[1])) + f"/{path.parent.name}/{path.name}"
+    return "'" + text.replace("'", "''") + "'"
 
 
 def query(store: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
@@ -214,6 +223,8 @@ def query(store: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
     connection = opened(store)
     try:
         answer = connection.execute(sql)
+        if answer is None or answer.description is None:
+            raise InputError(f"{store}: {sql!r}: expected a query")
         names = [item[0] for item in answer.description or ()]
         return names, answer.fetchall() if names else []
     except _duckdb.Error as error:

@@ -30,6 +30,12 @@ _DRAWS = 40_000
 _TAIL = 40
 """Draws of the statistic without a change, and how many of them its tail is continued from."""
 
+_PIECES = 20
+"""In how many parts they are drawn, so that memory does not grow with the series."""
+
+_MOST_PLACES = 200
+"""Places at which a change is looked for in a series; of more, evenly spread ones."""
+
 _ALONE = 5
 """Dampers from which on one is held against the others."""
 
@@ -41,9 +47,6 @@ _VALUES_DRAWN, _ROUNDS = 1_000_000, 10
 
 _SHARED = 2
 """Dampers that have to show a jump together, for it to be the bench's."""
-
-_CLOSE_DAYS = 15.0
-"""Days between a damper's change and one of its bench up to which they are the same."""
 
 _GAUSS = 1.4826
 """Standard deviation over median absolute deviation of a Gaussian."""
@@ -121,21 +124,46 @@ def change_point(points: Sequence[Point]) -> Change | None:
     return _described(days, y, _chance(tuple(np.round(days - days[0], 6)), statistic))
 
 
-def drift(points: Sequence[Point]) -> Drift | None:
-    """The straight line through a series; None with fewer than three days."""
+def drift(points: Sequence[Point], stepped_on: float | None = None) -> Drift | None:
+    """The straight line through a series; None with too few days for it.
+
+    Args:
+        points: The series, by day.
+        stepped_on: Day of a step of unknown size that is not its own.
+    """
     days = np.array([point.day for point in points])
-    if len(np.unique(days)) < 3:
+    columns = _beside_step(days, stepped_on)
+    free = len(days) - columns.shape[1]
+    if len(np.unique(days)) < 3 or free < 1:
         return None
     y = np.array([point.value for point in points])
-    middle = float(days.mean())
-    x = days - middle
-    slope = float(x @ y / (x @ x))
-    left = y - y.mean() - slope * x
-    free = len(y) - 2
-    error = float(np.sqrt(left @ left / free / (x @ x)))
+    weights = np.linalg.lstsq(columns, y, rcond=None)[0]
+    left = y - columns @ weights
+    span = float(np.ptp(days))
+    slope = float(weights[1]) / span
+    variance = left @ left / free * np.linalg.inv(columns.T @ columns)[1, 1]
+    error = float(np.sqrt(variance)) / span
     half = error * float(student.ppf(0.975, free))
     p = float(2.0 * student.sf(abs(slope) / max(error, 1e-300), free))
     return Drift(slope, slope - half, slope + half, float(y.mean()), p)
+
+
+def without_step(points: Sequence[Point], day: float) -> list[Point]:
+    """A series without the step that it has on a day, beside its straight line."""
+    columns = _beside_step(np.array([point.day for point in points]), day)
+    if columns.shape[1] < 3:
+        return list(points)
+    y = np.array([point.value for point in points])
+    step = float(np.linalg.lstsq(columns, y, rcond=None)[0][2])
+    return [p._replace(value=p.value - step) if p.day >= day else p for p in points]
+
+
+def _beside_step(days: Array, day: float | None) -> Array:
+    """Line, and step where there are points enough on either side, shape (N, 2 or 3)."""
+    place = len(days) if day is None else int(np.searchsorted(days, day))
+    has_step = _EDGE <= place <= len(days) - _EDGE
+    columns = _columns(days, place if has_step else 1)
+    return columns[:, : 3 if has_step else 2]
 
 
 def outliers(values: Mapping[str, float], level: float) -> dict[str, float]:
@@ -172,11 +200,12 @@ def _farthest(members: int, level: float) -> float:
     return float(np.quantile(farthest, 1.0 - level))
 
 
-def bench_jump(series: Mapping[str, Sequence[Point]]) -> Change | None:
+def bench_jump(series: Mapping[str, Sequence[Point]], level: float) -> Change | None:
     """A step that the dampers of one bench have in common: of its calibration, not of theirs.
 
     Args:
         series: Of each damper the logarithm of a value that its force scales.
+        level: Chance of a jump where there is none.
 
     Returns:
         The change, if it is significant and at least two dampers share it; ``before`` and
@@ -196,7 +225,7 @@ def bench_jump(series: Mapping[str, Sequence[Point]]) -> Change | None:
         if len(left) >= _SHARED
     ]
     change = change_point(common)
-    if change is None or change.kind != "step" or change.p > LEVEL:
+    if change is None or change.kind != "step" or change.p > level:
         return None
     size = change.after - change.before
     moved = [_step_at(points, change.day) for points in usable.values()]
@@ -205,18 +234,13 @@ def bench_jump(series: Mapping[str, Sequence[Point]]) -> Change | None:
     return change if len(shared) >= max(_SHARED, 0.5 * len(both)) else None
 
 
-def without_jump(points: Sequence[Point], jump: Change) -> list[Point]:
-    """A series of logarithms with a bench's step taken out."""
-    size = jump.after - jump.before
-    return [p._replace(value=p.value - size) if p.day >= jump.day else p for p in points]
-
-
 def _step_at(points: Sequence[Point], day: float) -> float | None:
-    before = [point.value for point in points if point.day < day]
-    after = [point.value for point in points if point.day >= day]
-    if len(before) < _EDGE or len(after) < _EDGE:
+    """Size of a step on a day beside the line of wear; None where a side has too few points."""
+    columns = _beside_step(np.array([point.day for point in points]), day)
+    if columns.shape[1] < 3:
         return None
-    return float(np.median(after) - np.median(before))
+    values = np.array([point.value for point in points])
+    return float(np.linalg.lstsq(columns, values, rcond=None)[0][2])
 
 
 # --- the statistic --------------------------------------------------------------------------------
@@ -224,7 +248,8 @@ def _step_at(points: Sequence[Point], day: float) -> float | None:
 
 def _places(days: Array) -> list[int]:
     """Indices of the first point after a change, each on a day of its own."""
-    return [k for k in range(_EDGE, len(days) - _EDGE + 1) if days[k] > days[k - 1]]
+    found = [k for k in range(_EDGE, len(days) - _EDGE + 1) if days[k] > days[k - 1]]
+    return found[:: -(-len(found) // _MOST_PLACES)] if found else []
 
 
 def _columns(days: Array, place: int) -> Array:
@@ -253,8 +278,11 @@ def _largest(days: Array, y: Array) -> Array:
 def _null(days: tuple[float, ...]) -> Array:
     """Sorted largest F of straight lines with noise."""
     rng = np.random.default_rng(0)
-    drawn = rng.standard_normal((len(days), _DRAWS))
-    return np.sort(_largest(np.array(days), drawn))
+    found = [
+        _largest(np.array(days), rng.standard_normal((len(days), _DRAWS // _PIECES)))
+        for _ in range(_PIECES)
+    ]
+    return np.sort(np.concatenate(found))
 
 
 def _chance(days: tuple[float, ...], statistic: float) -> float:

@@ -9,10 +9,7 @@ def alarms(found: Overview) -> list[str]:
     changes = [(s.change.p, s, s.change) for s in found.series if s.is_change and s.change]
     drifts = [(s.drift.p, s, s.drift) for s in found.series if s.is_drift and s.drift]
     lines = [_jumped(jump) for jump in found.jumps]
-    lines += [_changed(s, change) for _, s, change in sorted(changes) if not s.with_bench]
-    shared = sum(s.with_bench for _, s, _ in changes)
-    if shared:
-        lines.append(f"{shared} changes of single dampers go with that of their bench")
+    lines += [_changed(s, change) for _, s, change in sorted(changes)]
     lines += [_drifting(s, line) for _, s, line in sorted(drifts)]
     lines += [
         f"Damper {item.where.damper} on {item.where.bench}: {item.quantity.words} is "
@@ -32,7 +29,8 @@ def _jumped(jump: Jump) -> str:
     return (
         f"Bench {jump.bench}: {jump.parameter} of its dampers steps by "
         f"{100 * (jump.factor - 1):+.1f} % on {date_of(change.day)} ({date_of(change.low)} to "
-        f"{date_of(change.high)}): its calibration, not the dampers"
+        f"{date_of(change.high)}): its calibration, not the dampers, whose forces are counted "
+        "without it"
     )
 
 

@@ -17,6 +17,9 @@ from rig.pages.report.page import render, write_page
 _MOST = 12
 """Series that are drawn, the surest first."""
 
+_OTHERS_DRAWN = 60
+"""Other dampers that are drawn beside one."""
+
 _COLOUR, _CHANGED, _OTHERS = "#0072b2", "#d55e00", "#c8ced6"
 
 
@@ -27,12 +30,12 @@ def write_fleet_page(found: Overview, path: Path) -> None:
         InputError: The file cannot be written.
     """
     verdicts = sorted({verdict for counts in found.verdicts.values() for verdict in counts})
-    drawn = [item for item in found.series if item.is_change and not item.with_bench]
+    drawn = [item for item in found.series if item.is_change]
     drawn.sort(key=lambda item: item.change.p if item.change else 1.0)
     drawn += [item for item in found.series if item.is_drift]
     text = render(
         "fleet.html",
-        headline=_headline(found),
+        headline=found.words,
         alarms=alarms(found),
         verdicts=[verdict.replace("_", " ") for verdict in verdicts],
         benches=[
@@ -44,11 +47,6 @@ def write_fleet_page(found: Overview, path: Path) -> None:
         left_out=max(0, len(drawn) - _MOST),
     )
     write_page(text, path)
-
-
-def _headline(found: Overview) -> str:
-    dampers = len({item.where for item in found.series})
-    return f"{found.runs} runs of {dampers} dampers on {len(found.verdicts)} benches"
 
 
 def _share(counts: Any, verdict: str) -> str:
@@ -63,11 +61,12 @@ def _picture(found: Overview, item: Series) -> str:
         figure = cast("Any", Drawing(figsize=(9.0, 2.8), layout="constrained"))
         axes = figure.subplots()
         others = [s for s in found.series if s.quantity == item.quantity and s is not item]
+        others = others[:: -(-len(others) // _OTHERS_DRAWN)] if others else []
         for k, other in enumerate(others):
-            label = f"{len(others)} other dampers" if k == 0 else None
+            label = "others" if k == 0 else None
             axes.plot(*_columns(other), color=_OTHERS, linewidth=0.7, zorder=1, label=label)
         days, values = _columns(item)
-        label = f"damper {item.where.damper}"
+        label = "damper " + item.where.damper.replace("$", r"\$")
         axes.plot(days, values, "o-", color=_COLOUR, markersize=3, linewidth=1, label=label)
         change = item.change
         if item.is_change and change is not None:

@@ -63,6 +63,27 @@ def test_ctrl_c_ends_all_of_them_in_order(two, tmp_path):
         assert path.stem in printed
 
 
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel says there that a parent died")
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
+def test_no_bridge_runs_on_without_its_parent(two, tmp_path, number):
+    """A closed terminal, and a parent that is killed: each ends in order."""
+    out = tmp_path / "runs"
+    with started(*two, "--out", out) as process:
+        until_s = time.monotonic() + 60.0
+        while not all((out / path.stem / "timing.json").exists() for path in two):
+            assert time.monotonic() < until_s
+            time.sleep(0.1)
+        process.send_signal(number)
+        process.communicate(timeout=60)
+    for path in two:
+        file = out / path.stem / "run.yaml"
+        until_s = time.monotonic() + 30.0
+        while "ending" not in yaml.safe_load(file.read_text()):
+            assert time.monotonic() < until_s
+            time.sleep(0.1)
+
+
 def test_one_name_twice_and_a_folder_that_is_full_are_refused(two, tmp_path):
     (tmp_path / "other").mkdir()
     again = tmp_path / "other" / "left.yaml"

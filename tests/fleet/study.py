@@ -17,7 +17,7 @@ from pathlib import Path
 import psutil
 
 from rig.fleet import store
-from rig.fleet.campaign import Model, Progress, campaign
+from rig.fleet.campaign import Model, Progress, campaign, model_of
 from rig.fleet.executors import Engine, dask, processes
 from rig.fleet.one_run import Task, evaluated
 from rig.fleet.sources import Source, find_sources
@@ -50,7 +50,7 @@ def single_rate(sources: Sequence[Source], model: Model) -> float:
 
     A loop on one core while the other one rests is faster on a machine that is shared.
     """
-    tasks = [Task(source, model.text, model.folder) for source in sources]
+    tasks = [Task(source, *model) for source in sources]
     parts = [tasks[k : CORES * SINGLE : CORES] for k in range(CORES)]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(CORES, mp_context=context) as pool:
@@ -91,8 +91,7 @@ def main() -> None:
         folder = Path(name)
         weeks = -(-given.runs // DAMPERS)
         write_fleet(folder / "runs", DAMPERS, weeks, scattered, BENCHES, given.seed)
-        path = write_model(folder)
-        model = Model(path.read_text(), str(folder))
+        model = model_of(write_model(folder))
         sources = find_sources([str(folder / "runs")], PATTERN)[: given.runs]
         os.environ["OPENBLAS_NUM_THREADS"] = "1"
         alone = single_rate(sources, model)

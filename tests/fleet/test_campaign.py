@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import pytest
 
 from rig.fleet import campaign as campaigns
 from rig.fleet import store
-from rig.fleet.campaign import Model, campaign
+from rig.fleet.campaign import campaign, model_of
 from rig.fleet.one_run import Row, Task, evaluated
+from rig.fleet.overview import overview
 from rig.fleet.sources import Source, find_sources, shard_of
 from rig.inputs.errors import InputError
 from tests.fleet.population import Piece, write_fleet, write_model, write_run
@@ -33,7 +35,7 @@ def fleet(tmp_path_factory):
 
 
 def given(folder):
-    return Model((folder / "model.yaml").read_text(), str(folder))
+    return model_of(folder / "model.yaml")
 
 
 def threads():
@@ -98,11 +100,17 @@ def test_shards_are_all_of_it_and_nothing_twice(fleet, tmp_path):
 
 
 def test_another_model_is_another_evaluation(fleet, tmp_path):
-    sources = find_sources([str(fleet / "runs" / "bench_0")], None)
+    sources = find_sources([str(fleet / "runs")], PATTERN)[:4]
     campaign(sources, given(fleet), tmp_path, threads, 4)
-    other = Model((fleet / "model.yaml").read_text().replace("little_dyno", "other"), str(fleet))
+    file = tmp_path / "other.yaml"
+    file.write_text((fleet / "model.yaml").read_text().replace("little_dyno", "other"))
+    other = model_of(file)
     assert campaign(sources, other, tmp_path, threads, 4).done == len(sources)
     assert len(rows(tmp_path)) == 2 * len(sources)
+    found = overview(tmp_path)
+    assert (found.runs, found.others) == (len(sources), len(sources))
+    assert found.model.startswith("other ")
+    assert {len(series.points) for series in found.series} == {len(sources)}
 
 
 def test_a_copy_of_a_run_counts_once(fleet, tmp_path):
@@ -113,6 +121,7 @@ def test_a_copy_of_a_run_counts_once(fleet, tmp_path):
     sources = find_sources([str(tmp_path / "runs")])
     campaign(sources, given(fleet), tmp_path / "store", threads, 4)
     assert len(rows(tmp_path / "store")) == 1
+    assert campaign(sources, given(fleet), tmp_path / "store", threads, 4).done == 0
 
 
 def test_bad_runs_are_rows_and_stop_nothing(fleet, tmp_path):
@@ -144,7 +153,7 @@ def test_what_nobody_foresaw_is_an_error_of_its_run(fleet, monkeypatch):
 
     monkeypatch.setattr("rig.fleet.one_run.diagnose", broken)
     (source, *_) = find_sources([str(fleet / "runs")], PATTERN)
-    row = evaluated(Task(source, given(fleet).text, str(fleet)))
+    row = evaluated(Task(source, *given(fleet)))
     assert row.error == "unexpected: ZeroDivisionError: by nobody"
 
 
@@ -155,7 +164,7 @@ def killed(task):
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return Row(
-        task.source.url, task.source.url, task.source.url, "b", "d", "2026-01-05", "m", "v",
+        task.source.url, task.source.url, task.source.url, "b", "d", "2026-01-05", "m", "h", "v",
         verdict="explained",
     )  # fmt: skip
 
@@ -166,7 +175,7 @@ def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path, monkeypatch):
     monkeypatch.setattr(campaigns, "evaluated", killed)
     names = [f"run_{k}" for k in range(12)] + ["poison", "once"]
     sources = [Source(n, False, "b", "d", "2026-01-05", "2026-01-05", 1, "") for n in names]
-    model = Model((write_model(tmp_path)).read_text(), str(tmp_path / "mark"))
+    model = model_of(write_model(tmp_path))._replace(folder=str(tmp_path / "mark"))
     context = multiprocessing.get_context("spawn")
 
     def make():
@@ -201,6 +210,7 @@ def test_runs_on_object_storage_are_read_through_fsspec(fleet, tmp_path):
         ("{bench}/{bench}/{date}", "each once"),
         ("{rig}/{date}/{damper}", "expected {bench}, {damper}, {date}"),
         ("{bench}/{damper}", "does not fit"),
+        ("{date}/{bench}/{damper}", "expected a day"),
     ],
 )
 def test_a_pattern_that_is_wrong_is_said(fleet, pattern, line):
@@ -224,3 +234,43 @@ def test_a_day_is_looked_for_in_the_path(tmp_path):
         path.write_text("")
     days = {s.url.rsplit("/", 1)[1]: s.date for s in find_sources([str(tmp_path)])}
     assert days == {"a_20260305.csv": "2026-03-05", "b-2026-13-45.csv": "", "c.csv": "2026-04-01"}
+
+
+def test_links_are_followed_and_odd_names_are_runs(fleet, tmp_path):
+    runs = tmp_path / "runs"
+    runs.mkdir()
+    (runs / "linked").symlink_to(fleet / "runs" / "bench_0", target_is_directory=True)
+    content = (fleet / "runs" / "bench_1" / "2026-01-05" / "A01.csv").read_bytes()
+    (runs / os.fsdecode(b"d\xe4mpfer.CSV")).write_bytes(content)
+    sources = find_sources([str(runs)])
+    assert len(sources) == 5
+    end = campaign(shard_of(sources, 1, 1), given(fleet), tmp_path / "store", threads, 2)
+    assert (end.done, end.failed) == (5, 0)
+
+
+def test_a_bench_whose_name_is_too_long_is_said(tmp_path):
+    (tmp_path / ("b" * 61)).mkdir()
+    (tmp_path / ("b" * 61) / "a.csv").write_text("")
+    with pytest.raises(InputError, match="at most 60 bytes"):
+        find_sources([str(tmp_path)])
+
+
+def test_what_is_ready_is_written_though_nothing_follows(fleet, tmp_path, monkeypatch):
+    """A killed writer loses no more than it held for so long."""
+    monkeypatch.setattr(campaigns, "PART_S", 0.05)
+    seen = []
+
+    class Slow(ThreadPoolExecutor):
+        def submit(self, call, task):
+            if "2026-01-26" in task.source.url:
+                return super().submit(lambda: (time.sleep(0.5), call(task))[1])
+            return super().submit(call, task)
+
+    sources = find_sources([str(fleet / "runs" / "bench_0")], None)
+
+    def look(now):
+        if now.done == len(sources):
+            seen.append(len(store.keys(tmp_path)))
+
+    campaign(sources, given(fleet), tmp_path, lambda: Slow(2), 8, progress=look)
+    assert seen[0] >= len(sources) - 1

@@ -3,7 +3,7 @@
 import psutil
 import pytest
 
-from rig.fleet.campaign import Model, campaign
+from rig.fleet.campaign import campaign, model_of
 from rig.fleet.executors import dask, processes
 from rig.fleet.sources import find_sources
 from rig.inputs.errors import InputError
@@ -16,7 +16,7 @@ from tests.fleet.study import PATTERN, content, scattered
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_processes_and_a_cluster_write_the_same_store(tmp_path):
     write_fleet(tmp_path / "runs", 12, 10, scattered)
-    model = Model(write_model(tmp_path).read_text(), str(tmp_path))
+    model = model_of(write_model(tmp_path))
     sources = find_sources([str(tmp_path / "runs")], PATTERN)
     with cluster(tmp_path, 4) as there:
         victim = psutil.Process(there.workers[0].pid)

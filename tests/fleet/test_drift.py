@@ -4,7 +4,7 @@ import datetime
 
 import pytest
 
-from rig.fleet.campaign import Model, campaign
+from rig.fleet.campaign import campaign, model_of
 from rig.fleet.executors import processes
 from rig.fleet.overview import overview
 from rig.fleet.sources import find_sources
@@ -25,7 +25,7 @@ def piece(damper, week, rng):
 @pytest.mark.long
 def test_a_seal_that_fails_in_week_30_is_dated_and_the_others_are_not_accused(tmp_path):
     write_fleet(tmp_path / "runs", DAMPERS, WEEKS, piece, seed=SEED)
-    model = Model(write_model(tmp_path).read_text(), str(tmp_path))
+    model = model_of(write_model(tmp_path))
     sources = find_sources([str(tmp_path / "runs")], "{bench}/{date}/{damper}")
     engine = processes(2)
     end = campaign(sources, model, tmp_path / "store", engine.make, engine.window)

@@ -19,7 +19,7 @@ def row(number, *, bench="b", date="2026-01-05", error="", values=1):
         for k in range(values)
     )
     return Row(
-        f"key{number}", f"id{number}", f"runs/{number}", bench, "A1", date, "m", "0.2.0",
+        f"key{number}", f"id{number}", f"runs/{number}", bench, "A1", date, "m", "hash", "0.2.0",
         verdict="" if error else "explained", error=error, samples=10, values=() if error else own,
     )  # fmt: skip
 
@@ -53,6 +53,29 @@ def test_a_run_that_failed_is_forgotten_when_it_succeeds(tmp_path):
     assert store.identities(tmp_path, with_failed=False) == {"id1"}
 
 
+def test_a_success_of_another_model_hides_no_failure(tmp_path):
+    store.append(tmp_path, [row(1)])
+    failed = row(1, error="unreadable").as_dict() | {"key": "k", "model_sha256": "other"}
+    store.append(tmp_path, [Row(**failed)])
+    found = store.query(tmp_path, "SELECT error FROM runs ORDER BY error")[1]
+    assert found == [("",), ("unreadable",)]
+
+
+def test_a_copy_under_another_bench_counts_once_with_its_values(tmp_path):
+    store.append(tmp_path, [row(1, bench="b")])
+    again = row(1, bench="c")
+    copy = Row(**{**again.as_dict(), "source": "elsewhere", "values": again.values})
+    store.append(tmp_path, [copy])
+    assert store.query(tmp_path, "SELECT count(*) FROM runs")[1] == [(1,)]
+    assert store.query(tmp_path, "SELECT count(*) FROM effects")[1] == [(1,)]
+
+
+def test_a_store_in_a_folder_of_any_name(tmp_path):
+    folder = tmp_path / "a [b] 'c'"
+    store.append(folder, [row(1)])
+    assert store.query(folder, "SELECT count(*) FROM runs")[1] == [(1,)]
+
+
 def test_values_without_their_runs_are_not_seen_and_swept(tmp_path):
     """A writer that was killed between the two: values come first."""
     store.append(tmp_path, [row(1)])
@@ -84,7 +107,9 @@ def test_a_number_that_is_missing_stays_missing(tmp_path):
     assert math.isnan(before)
 
 
-@pytest.mark.parametrize("sql", ["SELEC 1", "SELECT nothing FROM runs", "SELECT * FROM nowhere"])
+@pytest.mark.parametrize(
+    "sql", ["", "SELEC 1", "SELECT nothing FROM runs", "SELECT * FROM nowhere"]
+)
 def test_a_query_that_is_wrong_is_one_line(tmp_path, sql):
     store.append(tmp_path, [row(1)])
     with pytest.raises(InputError) as caught:
