@@ -83,7 +83,7 @@ export NUMBA_CPU_NAME=$NUMBA_CPU_NAME NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR=$NUMBA
 set +e
 echo "vcan: \$(uname -r), up for \$(cut -d ' ' -f 1 /proc/uptime) s"
 "$python" -m pytest -m vcan -o addopts="-ra --import-mode=importlib" \
-    -p no:cacheprovider -p no:hypothesispytest -p no:xdist -p no:benchmark $(printf '%q ' "$@") tests/vcan
+    -p no:cacheprovider -p no:hypothesispytest -p no:xdist -p no:benchmark ${*:+$(printf '%q ' "$@")} tests/vcan
 echo \$? >"$work/out/exit_code"
 GUEST
 }
