@@ -173,6 +173,8 @@ def killed(task):
 def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path, monkeypatch):
     """One run kills its worker always, one only the first time: the others are all there."""
     monkeypatch.setattr(campaigns, "evaluated", killed)
+    # Workers import `killed` from here, and not from a package of the name `tests` elsewhere.
+    monkeypatch.syspath_prepend(Path(__file__).parents[2])
     names = [f"run_{k}" for k in range(12)] + ["poison", "once"]
     sources = [Source(n, False, "b", "d", "2026-01-05", "2026-01-05", 1, "") for n in names]
     model = model_of(write_model(tmp_path))._replace(folder=str(tmp_path / "mark"))
