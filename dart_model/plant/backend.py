@@ -24,7 +24,7 @@ Value = TypeVar("Value", float, Array)
 class Backend(Protocol[Value]):
     """Joint coordinates and their dynamics."""
 
-    def value(self, numbers: Sequence[float]) -> Value:
+    def value(self, numbers: Sequence[float] | Array) -> Value:
         """One number a coordinate, from a sequence."""
         ...
 
@@ -64,8 +64,8 @@ class OneCoordinate:
         self._only_force_matters = False
         self._only_force_matters = self._answers_by_force_alone()
 
-    def value(self, numbers: Sequence[float]) -> float:
-        return numbers[0]
+    def value(self, numbers: Sequence[float] | Array) -> float:
+        return float(numbers[0])
 
     def numbers(self, value: float) -> tuple[float, ...]:
         return (value,)
@@ -113,7 +113,7 @@ class ManyCoordinates:
         self._solve: Callable[[], None] = skeleton.dart.computeForwardDynamics
         self._adds_up = coordinates_add_up(skeleton)
 
-    def value(self, numbers: Sequence[float]) -> Array:
+    def value(self, numbers: Sequence[float] | Array) -> Array:
         return np.array(numbers, dtype=np.float64)
 
     def numbers(self, value: Array) -> tuple[float, ...]:

@@ -21,8 +21,8 @@ _REACHED_M, _OUT_OF_REACH_M = 1e-13, 1e-9
 _DISAGREEMENT_M = 5e-4
 """By which sensors of more struts than coordinates may disagree: more is no noise."""
 
-_RATE_STEP_S = 1e-6
-"""Step of the central difference of a Jacobian in time."""
+_SHORTEST_M = 1e-12
+"""Length of a strut below which its direction is not defined."""
 
 
 class Jacobians(NamedTuple):
@@ -43,6 +43,39 @@ class Jacobians(NamedTuple):
         return self.offsets_m + self.struts @ q
 
 
+class _Ends(NamedTuple):
+    """The lower ends of all struts, then the upper ones.
+
+    Attributes:
+        bodies: Place of each end's body among those that carry ends, the world's last; shape
+            (2, struts).
+        attachments_m: Where they are in their bodies, shape (2, struts, 3).
+    """
+
+    bodies: NDArray[np.intp]
+    attachments_m: Array
+
+
+class _Placed(NamedTuple):
+    """The ends in one configuration, in the world's directions.
+
+    Attributes:
+        arms_m: From the bodies' origins to the ends, shape (2, struts, 3).
+        jacobians: Of the ends' bodies, turning above moving, shape (2, struts, 6, n).
+        gaps_m: From lower to upper ends, shape (struts, 3).
+    """
+
+    arms_m: Array
+    jacobians: Array
+    gaps_m: Array
+
+    def gap_jacobians(self) -> Array:
+        """Derivative of the gaps by the coordinates, shape (struts, 3, n)."""
+        turned = _cross(self.jacobians[..., :3, :].swapaxes(2, 3), self.arms_m[:, :, None])
+        lower, upper = self.jacobians[..., 3:, :] + turned.swapaxes(2, 3)
+        return upper - lower
+
+
 class Geometry:
     """The struts of a model on its skeleton.
 
@@ -52,7 +85,8 @@ class Geometry:
 
     Args:
         spec: The model.
-        skeleton: Its bodies and joints in DART; their positions are overwritten by every call.
+        skeleton: Its bodies and joints in DART; their positions and velocities are overwritten by
+            every call.
 
     Raises:
         InputError: No joint lets the ends of a strut move.
@@ -61,31 +95,82 @@ class Geometry:
     def __init__(self, spec: ModelSpec, skeleton: Skeleton) -> None:
         self._spec = spec
         self._skeleton = skeleton
-        self._guides = tuple(_guide(spec.name, strut, skeleton) for strut in spec.struts)
+        names = sorted({name for strut in spec.struts for name in strut.between} - {WORLD})
+        # DART is asked once for each body: for each end it would take thrice as long.
+        self._carriers = [skeleton.bodies[name] for name in names]
+        places = {name: index for index, name in enumerate([*names, WORLD])}
+        self._ends = _Ends(
+            np.array([[places[strut.between[k]] for strut in spec.struts] for k in (0, 1)]),
+            np.array([[strut.attachments_m[k] for strut in spec.struts] for k in (0, 1)], float),
+        )
+        samples = [self._placed(q) for q in sample_positions(skeleton.coordinates)]
+        columns = np.concatenate([placed.gap_jacobians() for placed in samples], axis=2)
+        self._guides = np.array(
+            [_guide(spec.name, *item) for item in zip(spec.struts, columns, strict=True)]
+        )
+        """Directions of guided struts, shape (struts, 3); NaN where the height is a distance."""
+        self._is_distance = np.isnan(self._guides[:, 0])
         self.constant = self._same_everywhere()
         """The Jacobians, if they are the same in every configuration."""
 
     def at(self, q: Array) -> Jacobians:
         """Jacobians at coordinates `q`, shape (n,)."""
-        skeleton = self._skeleton
-        skeleton.dart.setPositions(q)
-        heights = np.empty(len(self._guides))
-        struts = np.empty((len(self._guides), len(q)))
-        for index, (strut, guide) in enumerate(zip(self._spec.struts, self._guides, strict=True)):
-            gap, by_coordinates = _gap(strut, skeleton)
-            direction = gap / max(float(np.linalg.norm(gap)), 1e-12) if guide is None else guide
-            heights[index] = direction @ gap
-            struts[index] = direction @ by_coordinates
-        applied = np.array(skeleton.dart.getLinearJacobian(skeleton.pushed), dtype=np.float64)[2]
-        return Jacobians(heights - struts @ q, struts, applied)
+        placed = self._placed(q)
+        directions = self._directions(placed.gaps_m)
+        moments = _cross(placed.arms_m, directions)
+        wrenches = np.concatenate([moments, np.broadcast_to(directions, moments.shape)], axis=2)
+        lower, upper = (wrenches[:, :, None] @ placed.jacobians)[:, :, 0]
+        struts = upper - lower
+        heights = np.sum(directions * placed.gaps_m, axis=1)
+        pushed = self._skeleton.dart.getLinearJacobian(self._skeleton.pushed)
+        return Jacobians(heights - struts @ q, struts, np.array(pushed[2], dtype=np.float64))
 
-    def jacobian_rate(self, q: Array, v: Array) -> Array:
-        """Time derivative of the struts' Jacobian at `q` with rates `v`, shape (struts, n)."""
+    def turning(self, q: Array, v: Array) -> Array:
+        """Second derivative of the heights at `q` with constant rates `v`, shape (struts,).
+
+        It is what the struts' Jacobian changes by in time, times the rates: centripetal
+        accelerations, and of a distance what its ends move across it.
+
+        Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008), 2.10 and 3.
+        """
         if self.constant is not None:
-            return np.zeros_like(self.constant.struts)
-        ahead = self.at(moved(self._skeleton, q, v, _RATE_STEP_S))
-        behind = self.at(moved(self._skeleton, q, v, -_RATE_STEP_S))
-        return (ahead.struts - behind.struts) / (2.0 * _RATE_STEP_S)
+            return np.zeros(len(self.constant.struts))
+        dart, bodies = self._skeleton.dart, self._ends.bodies
+        placed = self._placed(q)
+        directions, lengths = self._directions(placed.gaps_m), _lengths(placed.gaps_m)
+        dart.setVelocities(v)
+        still = np.zeros((6, len(q)))
+        changes = np.array([*(dart.getJacobianClassicDeriv(of) for of in self._carriers), still])
+        rates, changed = placed.jacobians @ v, (changes @ v)[bodies]
+        spins, across = rates[..., :3], _cross(rates[..., :3], placed.arms_m)
+        velocities = rates[..., 3:] + across
+        accelerations = (
+            changed[..., 3:] + _cross(changed[..., :3], placed.arms_m) + _cross(spins, across)
+        )
+        velocity, acceleration = np.diff([velocities, accelerations], axis=1)[:, 0]
+        along = np.sum(directions * velocity, axis=1)
+        sideways = velocity - along[:, None] * directions
+        swung = np.where(self._is_distance, np.sum(sideways * sideways, axis=1) / lengths, 0.0)
+        return np.sum(directions * acceleration, axis=1) + swung
+
+    def _directions(self, gaps_m: Array) -> Array:
+        """Along which heights are measured, shape (struts, 3)."""
+        if not self._is_distance.any():
+            return self._guides
+        along = gaps_m / _lengths(gaps_m)[:, None]
+        return np.where(self._is_distance[:, None], along, self._guides)
+
+    def _placed(self, q: Array) -> _Placed:
+        """The ends at coordinates `q`."""
+        dart, (bodies, attachments), carriers = self._skeleton.dart, self._ends, self._carriers
+        dart.setPositions(q)
+        frames = np.array([*(of.getWorldTransform().matrix() for of in carriers), np.eye(4)])
+        still = np.zeros((6, self._skeleton.coordinates))
+        jacobians = np.array([*(dart.getWorldJacobian(of) for of in carriers), still])[bodies]
+        here = frames[bodies]
+        arms = (here[..., :3, :3] @ attachments[..., None])[..., 0]
+        lower, upper = here[..., :3, 3] + arms
+        return _Placed(arms, jacobians, upper - lower)
 
     def reaching(self, heights_m: Array, near: Array) -> Array:
         """Coordinates with given strut heights, found by Newton's method.
@@ -150,37 +235,36 @@ def sample_positions(coordinates: int) -> list[Array]:
     return [0.3 * np.sin(1.0 + (k + 0.7) * np.arange(1, coordinates + 1)) for k in range(4)]
 
 
-def _gap(spec: StrutSpec, skeleton: Skeleton) -> tuple[Array, Array]:
-    """Vector from a strut's lower to its upper end, shape (3,), and its Jacobian, shape (3, n)."""
-    ends: list[Array] = []
-    jacobians: list[Array] = []
-    for name, attachment in zip(spec.between, spec.attachments_m, strict=True):
-        local = np.array(attachment)
-        if name == WORLD:
-            ends.append(local)
-            jacobians.append(np.zeros((3, skeleton.coordinates)))
-        else:
-            body = skeleton.bodies[name]
-            transform = np.array(body.getWorldTransform().matrix())
-            ends.append(transform[:3, :3] @ local + transform[:3, 3])
-            jacobians.append(np.array(skeleton.dart.getLinearJacobian(body, local)))
-    return ends[1] - ends[0], jacobians[1] - jacobians[0]
+def _guide(model: str, strut: StrutSpec, columns: Array) -> Array:
+    """Direction of a strut whose ends move along one straight line, shape (3,), else NaN.
 
-
-def _guide(model: str, strut: StrutSpec, skeleton: Skeleton) -> Array | None:
-    """Direction of a strut whose ends move along one straight line, shape (3,), else None."""
-    columns: list[Array] = []
-    for q in sample_positions(skeleton.coordinates):
-        skeleton.dart.setPositions(q)
-        columns.append(_gap(strut, skeleton)[1])
-    left, singular, _ = np.linalg.svd(np.hstack(columns))
+    Args:
+        model: Name of the model.
+        strut: The strut.
+        columns: Its gap's derivatives by the coordinates, in many configurations, shape (3, m).
+    """
+    left, singular, _ = np.linalg.svd(columns)
     if singular[0] < 1e-9:
         raise InputError(
             f"model {model}: strut {strut.name}: no joint lets {strut.between[0]} and "
             f"{strut.between[1]} move, expected one that does"
         )
     if len(singular) > 1 and singular[1] > 1e-9 * singular[0]:
-        return None
+        return np.full(3, np.nan)
     direction = cast("Array", np.round(left[:, 0], 14))  # exact for guides along an axis
     largest = direction[2] if direction[2] != 0.0 else direction[np.argmax(np.abs(direction))]
     return direction * math.copysign(1.0, largest)
+
+
+def _lengths(vectors: Array) -> Array:
+    """Lengths of vectors of shape (struts, 3), none shorter than what has a direction."""
+    return np.maximum(np.sqrt(np.sum(vectors * vectors, axis=1)), _SHORTEST_M)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Vector products of the last axes; numpy's own takes four times as long."""
+    return a[..., _NEXT] * b[..., _AFTER] - a[..., _AFTER] * b[..., _NEXT]
+
+
+_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]
+"""Of a right-handed triad."""

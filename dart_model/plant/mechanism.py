@@ -60,6 +60,8 @@ class Mechanism(Generic[Value]):
         self._geometry = geometry
         constant = geometry.constant
         self._constant = None if constant is None else self._configuration(constant)
+        # A tick ends where the next force is asked for: its configuration is found once.
+        self._newest: tuple[tuple[float, ...], _Configuration[Value]] | None = None
 
     def state(
         self,
@@ -98,9 +100,8 @@ class Mechanism(Generic[Value]):
         for _, _, row in struts:
             accelerations.append(backend.dot(row, acceleration))
         if self._constant is None:
-            rate = np.array(state.velocities)
-            turned = self._geometry.jacobian_rate(np.array(state.positions), rate) @ rate
-            accelerations = [a + float(b) for a, b in zip(accelerations, turned, strict=True)]
+            turning = self._geometry.turning(np.array(state.positions), np.array(state.velocities))
+            accelerations = [a + b for a, b in zip(accelerations, turning.tolist(), strict=True)]
         return Loaded(
             state,
             tuple(virtual_forces_n),
@@ -157,17 +158,20 @@ class Mechanism(Generic[Value]):
         return PlantState(backend.numbers(q), backend.numbers(v), internal, t_s, motions)
 
     def _at(self, q: Value) -> _Configuration[Value]:
-        return self._configuration(self._geometry.at(np.array(self._backend.numbers(q))))
+        where = self._backend.numbers(q)
+        if self._newest is None or self._newest[0] != where:
+            self._newest = where, self._configuration(self._geometry.at(np.array(where)))
+        return self._newest[1]
 
     def _configuration(self, jacobians: Jacobians) -> _Configuration[Value]:
         value = self._backend.value
         placed = tuple(
             _Placed(strut, offset_m, value(row))
             for strut, offset_m, row in zip(
-                self._struts, jacobians.offsets_m.tolist(), jacobians.struts.tolist(), strict=True
+                self._struts, jacobians.offsets_m.tolist(), jacobians.struts, strict=True
             )
         )
-        return _Configuration(placed, value(jacobians.applied.tolist()))
+        return _Configuration(placed, value(jacobians.applied))
 
 
 def steps_of(dt_s: float, longest_s: float) -> int:
