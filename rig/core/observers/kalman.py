@@ -119,18 +119,16 @@ class KalmanObserver:
         several: Several | None = None,
     ) -> KalmanState:
         """State with the virtual force that a new estimate asks for."""
-        follower = self.filter
-        start = error.start
+        follower, limit_n = self.filter, self.force_limit_n
+        start, mobility_per_kg = error.start, error.start.mobility_per_kg
         mean = follower.predicted(error, t_ns)
-        x, v, a, *_ = mean
-        interval_s = start.interval_ns * 1e-9
-        corner = min(follower.omega, _MOST_PER_INTERVAL / interval_s)
+        x, v, a, _, _ = mean
+        corner = min(error.constants.omega, _MOST_PER_INTERVAL * 1e9 / start.interval_ns)
         wanted = a + corner * corner * x + 2.0 * _DAMPING * corner * v
-        limit_n = self.force_limit_n
-        force_n = min(max(wanted / start.mobility_per_kg, -limit_n), limit_n)
-        std_n = follower.residual_std(error, t_ns) / start.mobility_per_kg
-        error = follower.with_input(error, t_ns, -force_n * start.mobility_per_kg)
-        residual_n = follower.residual(error, mean) / start.mobility_per_kg
+        force_n = min(max(wanted / mobility_per_kg, -limit_n), limit_n)
+        std_n = follower.residual_std(error, t_ns) / mobility_per_kg
+        residual_n = follower.residual(error, mean) / mobility_per_kg
+        error = follower.with_input(error, t_ns, -force_n * mobility_per_kg)
         measured_ns = error.t_ns if several is None else several.measured_ns
         return KalmanState(error, innovation_m, force_n, residual_n, std_n, measured_ns, several)
 

@@ -95,6 +95,35 @@ class Steady(NamedTuple):
     residual: float
 
 
+class Constants(Struct, frozen=True, gc=False):
+    """What a filter asks for at every measurement and is the same all through a run.
+
+    Attributes:
+        steady: What its variances come to.
+        gain: The steady gain in SI: what each of the mean changes by per metre that is new.
+        innovation_m2: Steady variance of what is new in a measurement.
+        residual_std: Steady standard deviation of `ErrorFilter.residual` at a measurement.
+        fading: Share of the newest innovation in the variances' scale.
+        omega: Corner in rad/s.
+        next_ns: Time since the last measurement from which on one is missing.
+        longest_ns: How long after the last measurement the error is predicted.
+        forgotten_ns: Time after which the last measurement says nothing more.
+        own_per_s: How fast the model's own law moves it: the larger one of its damping and the
+            root of its stiffness, over the mass.
+    """
+
+    steady: Steady
+    gain: Mean
+    innovation_m2: float
+    residual_std: float
+    fading: float
+    omega: float
+    next_ns: int
+    longest_ns: int
+    forgotten_ns: int
+    own_per_s: float
+
+
 class ErrorState(Struct, frozen=True, gc=False):
     """What is known of the model's error.
 
@@ -106,7 +135,7 @@ class ErrorState(Struct, frozen=True, gc=False):
         inputs: Accelerations by the virtual force, and from when on; the first one from `t_ns` or
             before.
         start: What the filter was started with.
-        steady: What its variances come to.
+        constants: What does not change from then on.
     """
 
     t_ns: int
@@ -115,7 +144,7 @@ class ErrorState(Struct, frozen=True, gc=False):
     scale: float
     inputs: tuple[tuple[int, float], ...]
     start: Start
-    steady: Steady
+    constants: Constants
 
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
@@ -146,8 +175,8 @@ class ErrorFilter:
 
     def init(self, start: Start) -> ErrorState:
         """State at the model's start, at the first measured height."""
-        steady, inputs = _steady(self.pace(start)), ((start.t_ns, 0.0),)
-        return ErrorState(start.t_ns, _NOTHING, self._prior(), 1.0, inputs, start, steady)
+        inputs, constants = ((start.t_ns, 0.0),), self._constants(start)
+        return ErrorState(start.t_ns, _NOTHING, self._prior(), 1.0, inputs, start, constants)
 
     def settled(self, start: Start) -> ErrorState:
         """State after a long time without an error."""
@@ -162,33 +191,29 @@ class ErrorFilter:
         """
         if innovation.t_ns <= state.t_ns:
             return state
-        interval_ns, steady = state.start.interval_ns, state.steady
-        if forget(self, state, innovation.t_ns):
+        constants, t_ns = state.constants, innovation.t_ns
+        elapsed_ns = t_ns - state.t_ns
+        if elapsed_ns > constants.forgotten_ns:
             return self.anew(state, innovation)
-        mean = moved(state, innovation.t_ns)
-        number = max(1, round((innovation.t_ns - state.t_ns) / interval_ns))
+        mean = moved(state, t_ns)
         covariance, scale = state.covariance, state.scale
         # What is new in a measurement: its distance from the error that was predicted.
         new_m = innovation.value_m - mean[0]
-        if covariance is None and number == 1:
-            gain = steady.gain
-            squared = new_m * new_m / (steady.innovation * self.noise_std_m**2)
-            scale = self.rescaled(scale, squared, interval_ns)
+        if covariance is None and elapsed_ns < constants.next_ns:
+            gain = constants.gain
+            scale = rescaled(constants, scale, new_m * new_m / constants.innovation_m2)
         else:
-            before = steady.covariance if covariance is None else covariance
-            gain, covariance = _gain(spread(before, self.pace(state.start), number))
-            limit = np.diagonal(steady.covariance)
+            steady = constants.steady.covariance
+            before = steady if covariance is None else covariance
+            number = max(1, round(elapsed_ns / state.start.interval_ns))
+            in_units, covariance = _gain(spread(before, self.pace(state.start), number))
+            gain = in_si(in_units, constants.omega)
+            limit = np.diagonal(steady)
             if np.all(np.abs(np.diagonal(covariance) - limit) <= _SETTLED * limit):
                 covariance = None
-        return ErrorState(
-            innovation.t_ns,
-            corrected(mean, gain.tolist(), new_m, self.omega),
-            covariance,
-            scale,
-            since(state.inputs, innovation.t_ns),
-            state.start,
-            steady,
-        )
+        inputs = since(state.inputs, t_ns)
+        mean = corrected(mean, gain, new_m)
+        return ErrorState(t_ns, mean, covariance, scale, inputs, state.start, constants)
 
     def anew(self, state: ErrorState, innovation: Innovation) -> ErrorState:
         """State at a measurement before which nothing is known any more."""
@@ -200,25 +225,13 @@ class ErrorFilter:
             inputs=since(state.inputs, innovation.t_ns),
         )
 
-    def rescaled(self, scale: float, squared: float, interval_ns: int) -> float:
-        """The variances' scale after a measurement whose squared innovation is over its variance.
-
-        Args:
-            scale: The scale before.
-            squared: That ratio, one on average where the variances are right.
-            interval_ns: Time between two measurements.
-        """
-        scale += min(1.0, interval_ns * 1e-9 / _FADING_S) * (squared - scale)
-        return min(max(scale, _SMALLEST_SCALE), _LARGEST_SCALE)
-
     def predicted(self, state: ErrorState, t_ns: int) -> Mean:
         """Mean at a time after the last measurement.
 
         Beyond the time constant of the filter behind the time at which a measurement was due, a
         polynomial would run away: the error is predicted up to there.
         """
-        end_ns = min(t_ns, state.t_ns + self._longest_ns(state))
-        return moved(state, end_ns)
+        return moved(state, min(t_ns, state.t_ns + state.constants.longest_ns))
 
     def residual(self, state: ErrorState, mean: Mean) -> float:
         """Acceleration by the force that the model lacks where it is now, in m/s².
@@ -232,25 +245,36 @@ class ErrorFilter:
 
     def residual_std(self, state: ErrorState, t_ns: int) -> float:
         """Standard deviation of `residual`, at a time, in m/s²."""
-        interval_ns = state.start.interval_ns
-        longest_ns = round(_FORGOTTEN / self.omega * 1e9)
-        number = (min(t_ns - state.t_ns, longest_ns) + interval_ns // 2) // interval_ns
+        constants, interval_ns = state.constants, state.start.interval_ns
+        elapsed_ns = min(t_ns - state.t_ns, constants.forgotten_ns)
+        number = (elapsed_ns + interval_ns // 2) // interval_ns
         if state.covariance is not None:
             variance = _ahead(state.covariance, self.pace(state.start), number)
         elif number < 1:
-            variance = state.steady.residual
+            return math.sqrt(state.scale) * constants.residual_std
         else:
             variance = _steady_ahead(self.pace(state.start), number)
         std = math.sqrt(state.scale * max(variance, 0.0))
-        return std * self.noise_std_m * self.omega**2
+        return std * self.noise_std_m * constants.omega**2
 
     def with_input(self, state: ErrorState, t_ns: int, acceleration: float) -> ErrorState:
         """State after the virtual force has changed."""
+        newest, t_last_ns, inputs = (t_ns, acceleration), state.t_ns, state.inputs
+        if t_ns <= t_last_ns:
+            inputs = (newest,)
         # Without measurements the inputs would grow in number; the prediction ends, and with it
         # what changes the virtual force.
-        if t_ns - state.t_ns > self._longest_ns(state) and acceleration == state.inputs[-1][1]:
-            return state
-        return replace(state, inputs=(*state.inputs, (t_ns, acceleration)))
+        elif t_ns - t_last_ns <= state.constants.longest_ns or acceleration != inputs[-1][1]:
+            inputs = (*inputs, newest)
+        return ErrorState(
+            t_last_ns,
+            state.mean,
+            state.covariance,
+            state.scale,
+            inputs,
+            state.start,
+            state.constants,
+        )
 
     def numbers(self, state: ErrorState) -> tuple[float, ...]:
         """What the next state depends on, all of it in m; covariance and times left out."""
@@ -268,9 +292,21 @@ class ErrorFilter:
         )
         return replace(state, mean=(x, v, a, j, s), inputs=inputs)
 
-    def _longest_ns(self, state: ErrorState) -> int:
-        """How long after the last measurement the error is predicted."""
-        return state.start.delay_ns + 2 * state.start.interval_ns + round(1e9 / self.omega)
+    def _constants(self, start: Start) -> Constants:
+        steady, omega, interval_ns = _steady(self.pace(start)), self.omega, start.interval_ns
+        variance_m2 = self.noise_std_m**2
+        return Constants(
+            steady,
+            in_si(steady.gain, omega),
+            steady.innovation * variance_m2,
+            math.sqrt(max(steady.residual, 0.0) * variance_m2) * omega**2,
+            min(1.0, interval_ns * 1e-9 / _FADING_S),
+            omega,
+            interval_ns + interval_ns // 2,
+            start.delay_ns + 2 * interval_ns + round(1e9 / omega),
+            round(_FORGOTTEN / omega * 1e9),
+            max(abs(start.damping_per_s), math.sqrt(abs(start.stiffness_per_s2))),
+        )
 
     def pace(self, start: Start) -> "Pace":
         """What the variances depend on."""
@@ -303,23 +339,30 @@ class Pace(NamedTuple):
     damping: float = 0.0
 
 
-def forget(follower: ErrorFilter, state: ErrorState, t_ns: int) -> bool:
-    """Whether the last measurement lies so far back that it says nothing of a time."""
-    return (t_ns - state.t_ns) * 1e-9 * follower.omega > _FORGOTTEN
+def rescaled(constants: Constants, scale: float, squared: float) -> float:
+    """The variances' scale after a measurement.
+
+    Args:
+        constants: Of the filter.
+        scale: The scale before.
+        squared: Square of what is new in the measurement over its variance, one on average where
+            the variances are right.
+    """
+    scale += constants.fading * (squared - scale)
+    return min(max(scale, _SMALLEST_SCALE), _LARGEST_SCALE)
 
 
-def corrected(mean: Mean, gain: Sequence[float], new_m: float, omega: float) -> Mean:
-    """The mean after an update; the gain is in units of sigma and 1 / omega."""
+def corrected(mean: Mean, gain: Mean, new: float) -> Mean:
+    """The mean after an update, with a gain in SI."""
     x, v, a, j, s = mean
     of_x, of_v, of_a, of_j, of_s = gain
-    squared = omega * omega
-    return (
-        x + of_x * new_m,
-        v + of_v * new_m * omega,
-        a + of_a * new_m * squared,
-        j + of_j * new_m * squared * omega,
-        s + of_s * new_m * squared * squared,
-    )
+    return x + of_x * new, v + of_v * new, a + of_a * new, j + of_j * new, s + of_s * new
+
+
+def in_si(gain: Array, omega: float) -> Mean:
+    """A gain of units of 1 / omega in SI."""
+    x, v, a, j, s = (gain * omega ** np.arange(ORDER)).tolist()
+    return x, v, a, j, s
 
 
 def since(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tuple[int, float], ...]:
@@ -333,7 +376,9 @@ def since(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tuple[int, 
 def moved(state: ErrorState, to_ns: int) -> Mean:
     """The mean at a later time, under the inputs in between."""
     mean, inputs, from_ns = state.mean, state.inputs, state.t_ns
-    start, last = state.start, len(inputs) - 1
+    start, own_per_s, last = state.start, state.constants.own_per_s, len(inputs) - 1
+    if to_ns <= from_ns:
+        return mean
     for index, (_, by_force) in enumerate(inputs):
         end_ns = to_ns if index == last else min(inputs[index + 1][0], to_ns)
         if end_ns <= from_ns:
@@ -341,7 +386,7 @@ def moved(state: ErrorState, to_ns: int) -> Mean:
         h = (end_ns - from_ns) * 1e-9
         from_ns = end_ns
         # A step in which the model itself hardly moves: what its law does is a Taylor series.
-        quick = h * max(abs(start.damping_per_s), math.sqrt(abs(start.stiffness_per_s2)))
+        quick = h * own_per_s
         if quick <= _STEP_OF_MODEL:
             mean = _stepped(mean, by_force, h, start)
             continue

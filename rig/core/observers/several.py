@@ -31,8 +31,9 @@ from rig.core.observers.model_error import (
     ErrorFilter,
     ErrorState,
     corrected,
-    forget,
+    in_si,
     moved,
+    rescaled,
     since,
     spread,
 )
@@ -182,11 +183,8 @@ def fused(
 def _joined(
     known: tuple[tuple[int, float], ...], latest: tuple[tuple[int, float], ...]
 ) -> tuple[tuple[int, float], ...]:
-    """All inputs: those that are remembered, and what came after the last of them."""
-    for place in range(len(latest) - 1, -1, -1):
-        if latest[place] == known[-1]:
-            return (*known, *latest[place + 1 :])
-    return (*known, *(item for item in latest if item[0] > known[-1][0]))
+    """All inputs: the latest, and those remembered from before them."""
+    return (*(item for item in known if item[0] < latest[0][0]), *latest)
 
 
 def _silent_ns(sensor: Sensor) -> int:
@@ -201,7 +199,8 @@ def _updated(
     follower: ErrorFilter, state: ErrorState, deviation: Deviation, sensor: Sensor | None
 ) -> tuple[ErrorState, bool]:
     """State at a reading, and whether the reading is within its gate."""
-    if forget(follower, state, deviation.t_ns):
+    constants = state.constants
+    if deviation.t_ns - state.t_ns > constants.forgotten_ns:
         if sensor is not None and sensor.measures is not Measures.HEIGHT:
             return state, False
         anew = follower.anew(state, Innovation(deviation.value, deviation.t_ns))
@@ -216,9 +215,8 @@ def _updated(
     new = (deviation.value - expected) / unit
     powers = sigma * omega ** np.arange(3)
     line = np.concatenate([row * powers / unit, np.zeros(2)])
-    interval_ns = state.start.interval_ns
     number = _place(state.start, deviation.t_ns) - _place(state.start, state.t_ns)
-    covariance = state.steady.covariance if state.covariance is None else state.covariance
+    covariance = constants.steady.covariance if state.covariance is None else state.covariance
     if number:
         covariance = spread(covariance, follower.pace(state.start), number / _GRID)
     seen: Array = covariance @ line
@@ -226,17 +224,17 @@ def _updated(
     scale = state.scale
     is_within = abs(new) <= _GATE * math.sqrt(variance * max(scale, 1.0))
     if sensor is None:
-        scale = follower.rescaled(scale, new * new / variance, interval_ns)
+        scale = rescaled(constants, scale, new * new / variance)
     gain = seen / variance
     covariance = covariance - np.outer(gain, seen)
     return ErrorState(
         deviation.t_ns,
-        corrected(mean, gain.tolist(), new * sigma, omega),
+        corrected(mean, in_si(gain, omega), new * sigma),
         0.5 * (covariance + covariance.T),
         scale,
         since(state.inputs, deviation.t_ns),
         state.start,
-        state.steady,
+        constants,
     ), is_within
 
 
