@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.output import WRONG_INPUT, console
-from rig.cli.watching import progress_line
+from rig.cli.watching import progress_bar, progress_line
 from rig.inputs.errors import InputError
 
 if TYPE_CHECKING:
@@ -162,6 +162,7 @@ def _of_mts(source: Path, rebound: str) -> "Mapping":
 EXPORT_EXAMPLES = (
     "Examples: `rig export runs/7 --format mf4 --out run.mf4` · "
     "`rig export runs/7 --format candump --out run.log` · "
+    "`rig export runs/7 --format csv --smoothed --out run.csv` · "
     "`rig export out/corrected.yaml --fmu --out strut.fmu` · "
     "`rig export out/corrected.yaml --fmu --bench --fmi 3.0 --out bench.fmu`"
 )
@@ -177,6 +178,13 @@ def export_command(
     kind: Annotated[
         str | None, typer.Option("--format", help="Of a run: mf4, parquet, csv or candump.")
     ] = None,
+    smoothed: Annotated[
+        bool,
+        typer.Option(
+            "--smoothed",
+            help="With --format csv: also the forces smoothed over the whole run.",
+        ),
+    ] = False,
     fmu: Annotated[
         bool, typer.Option("--fmu", help="A strut of a model as a functional mock-up unit.")
     ] = False,
@@ -197,15 +205,29 @@ def export_command(
     """
     if fmu == (kind is not None):
         raise InputError("--format and --fmu: expected one of them")
+    if smoothed and fmu:
+        raise InputError("--smoothed: expected --format csv with it")
     if fmu:
         _export_model(source, out, fmi, strut, bench)
         return
     if bench or strut is not None:
         raise InputError("--bench and --strut: expected --fmu with them")
+    for path in _export_run(source, kind or "", out, smoothed):
+        console.print(f"Written: {path}", markup=False)
+
+
+def _export_run(source: Path, kind: str, out: Path, smoothed: bool) -> list[Path]:
+    """Write a run in another format."""
     from rig.exchange.exported import export_run
 
-    for path in export_run(source, kind or "", out):
-        console.print(f"Written: {path}", markup=False)
+    if not smoothed:
+        return export_run(source, kind, out)
+    if kind != "csv":
+        raise InputError("--smoothed: expected --format csv: the others are read back as they were")
+    from rig.exchange.smoothed import read_smoothed
+
+    with progress_bar() as bar:
+        return export_run(source, kind, out, lambda folder: read_smoothed(folder, bar))
 
 
 def _export_model(source: Path, out: Path, fmi: str, strut: str | None, bench: bool) -> None:

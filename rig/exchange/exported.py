@@ -38,13 +38,16 @@ _pa = cast("Any", pa)
 _csv = cast("Any", pyarrow.csv)
 
 
-def export_run(folder: Path, kind: str, out: Path) -> list[Path]:
+def export_run(
+    folder: Path, kind: str, out: Path, read: Callable[[Path], RunFolder] = read_run
+) -> list[Path]:
     """Write a run in another format.
 
     Args:
         folder: Folder of the run.
         kind: One of `FORMATS`.
         out: File to write; for Parquet a folder.
+        read: Reads the run; what it adds to the steps is exported too.
 
     Returns:
         The files that were written.
@@ -57,7 +60,7 @@ def export_run(folder: Path, kind: str, out: Path) -> list[Path]:
         raise InputError(f"format {kind!r}: expected one of {', '.join(FORMATS)}")
     if out.exists():
         raise InputError(f"{out}: exists, expected a new file")
-    found = read_run(folder)
+    found = read(folder)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with _all_or_nothing(out):

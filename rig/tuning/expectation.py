@@ -101,7 +101,8 @@ def followed(steps: Any, folder: Path, strut: str, mobility_per_kg: float) -> Fo
     def column(name: str) -> Array:
         return np.asarray(steps.column(name).to_numpy(), dtype=np.float64)
 
-    stretch = _longest(column("mode") == Mode.RUNNING)
+    running = stretches(column("mode") == Mode.RUNNING)
+    stretch = max(running, key=lambda one: one.stop - one.start, default=slice(0, 0))
     tick_s = column("t_ns")[stretch] * 1e-9
     stretch = slice(stretch.start, stretch.start + int(np.sum(tick_s <= tick_s[:1] + _LONGEST_S)))
     tick_s = column("t_ns")[stretch] * 1e-9
@@ -115,7 +116,7 @@ def followed(steps: Any, folder: Path, strut: str, mobility_per_kg: float) -> Fo
             f"of RUNNING without a break, expected {_FEWEST} in {_SHORTEST_S:g} s"
         )
     by_force = -virtual_n * mobility_per_kg
-    moved_m = _twice_integrated(tick_s, by_force, measured_s[fresh])
+    moved_m = twice_integrated(tick_s, by_force, measured_s[fresh])
     free_m = innovation_m[fresh] - moved_m
     t_s = measured_s[fresh]
     line = np.polynomial.Polynomial.fit(t_s, free_m, 1)
@@ -165,18 +166,14 @@ def stated(noise_std_m: float, rms_n: float, up_to_hz: float) -> Expectation:
     return Expectation(noise_std_m, frequency_hz, power_n2, source)
 
 
-def _longest(holds: NDArray[np.bool_]) -> slice:
-    """The longest stretch in which something holds."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], holds.astype(np.int8), [0]])))
-    if not len(edges):
-        return slice(0, 0)
-    begins, ends = edges[::2], edges[1::2]
-    best = int(np.argmax(ends - begins))
-    return slice(int(begins[best]), int(ends[best]))
+def stretches(holds: NDArray[np.bool_]) -> list[slice]:
+    """The stretches in which something holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], holds.astype(np.int8), [0]]))).tolist()
+    return [slice(*pair) for pair in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _twice_integrated(tick_s: Array, acceleration: Array, t_s: Array) -> Array:
-    """An acceleration that is constant from each tick to the next, integrated twice."""
+def twice_integrated(tick_s: Array, acceleration: Array, t_s: Array) -> Array:
+    """An acceleration that is constant from each tick to the next, integrated twice, at times."""
     h = np.diff(tick_s)
     rate = np.concatenate([[0.0], np.cumsum(acceleration[:-1] * h)])
     moved = np.concatenate([[0.0], np.cumsum(rate[:-1] * h + 0.5 * acceleration[:-1] * h * h)])

@@ -1,0 +1,151 @@
+"""Forces smoothed over a whole run, against what the simulated bench had."""
+
+import csv
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from rig.bench.config import load_bench_config
+from rig.bench.trajectory import simulate
+from rig.cli.main import main
+from rig.exchange import smoothed
+from rig.exchange.smoothed import read_smoothed
+from rig.operation.config import CONFIGS
+from rig.operation.live import with_bench
+from rig.operation.setup import load_setup
+from tests.core.full_car import FullCar
+
+NOISE_M, DURATION_S, RATE_HZ = 20e-6, 6.0, 1000
+
+
+def bench_run(folder: Path, case: str):
+    """A run with noisy heights, and the forces of the bench at its ticks, (N, struts)."""
+    content = yaml.safe_load((CONFIGS / f"{case}_bench.yaml").read_text())
+    for transmission in content["transmissions"]:
+        if "height" in transmission:
+            transmission["height"]["noise_std_m"] = NOISE_M
+    (folder / "bench.yaml").write_text(yaml.safe_dump(content))
+    ready = load_setup(CONFIGS / f"{case}.yaml", duration_s=DURATION_S)
+    bench = load_bench_config(folder / "bench.yaml")
+    with_bench(ready, bench, folder / "run", lockstep=True, stop=lambda: False)
+    period_ns = ready.config.period_ns
+    return simulate(bench, int(DURATION_S * 1e9) + period_ns, period_ns).strut_force_n
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("smoothed")
+    return folder / "run", bench_run(folder, "reference")
+
+
+def column(steps, name):
+    return np.asarray(steps.column(name).to_numpy(), float)
+
+
+def errors(run: Path, truth_n, name: str, index: int = 0):
+    """RMS error online and smoothed after half a second, and share of the intervals that hold.
+
+    The deviation that is stated is that of the error, within a factor.
+    """
+    steps = read_smoothed(run, lambda _what, _share: None).steps
+    tick = np.rint(column(steps, "t_ns") * 1e-9 * RATE_HZ).astype(int)
+    online, found, std = (
+        column(steps, f"{name}.{key}")
+        for key in ("force_n", "smoothed_force_n", "smoothed_force_std_n")
+    )
+    missed = found - truth_n[tick, index]
+    later = slice(500, None)
+    assert np.all(np.isfinite(missed[later]) & (std[later] > 0.0))
+    held = np.mean(np.abs(missed[later]) < 1.96 * std[later])
+    online_n = np.sqrt(np.mean((online - truth_n[tick, index])[later] ** 2))
+    smoothed_n = np.sqrt(np.mean(missed[later] ** 2))
+    assert 0.7 * smoothed_n < np.sqrt(np.mean(std[later] ** 2)) < 2.5 * smoothed_n
+    return online_n, smoothed_n, held
+
+
+def test_a_smoothed_force_is_far_nearer_than_the_one_of_the_run(reference):
+    run, truth_n = reference
+    online_n, smoothed_n, held = errors(run, truth_n, "strut")
+    assert smoothed_n < 0.25 * online_n
+    assert smoothed_n < 0.002 * np.max(np.abs(truth_n))
+    assert held > 0.9
+
+
+def test_struts_that_move_each_other_are_smoothed_together(tmp_path):
+    """In a quarter car each virtual force moves both heights."""
+    truth_n = bench_run(tmp_path, "quarter_car")
+    for index, name in enumerate(("tyre", "suspension")):
+        online_n, smoothed_n, held = errors(tmp_path / "run", truth_n, name, index)
+        assert smoothed_n < 0.5 * online_n
+        assert held > 0.85
+
+
+def test_pieces_give_what_the_whole_gives(reference, monkeypatch):
+    run, truth_n = reference
+    _, whole_n, _ = errors(run, truth_n, "strut")
+    monkeypatch.setattr(smoothed, "_LONGEST_S", 1.7)
+    _, pieces_n, held = errors(run, truth_n, "strut")
+    assert pieces_n == pytest.approx(whole_n, rel=0.15)
+    assert held > 0.9
+
+
+def test_every_tick_of_every_stretch_is_in_one_piece():
+    tick_s = np.arange(200_000) / 1000.0
+    pieces = smoothed._pieces(tick_s, slice(1000, 150_000))
+    used = np.concatenate([np.arange(inner.start, inner.stop) for _, inner in pieces])
+    assert np.array_equal(used, np.arange(1000, 150_000))
+    for piece, inner in pieces:
+        assert 1000 <= piece.start <= inner.start < inner.stop <= piece.stop <= 150_000
+
+
+def rig(monkeypatch, *arguments) -> int:
+    monkeypatch.setattr(sys, "argv", ["rig", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+def test_the_command_writes_the_smoothed_forces_beside_the_others(reference, tmp_path, monkeypatch):
+    run, _ = reference
+    out = tmp_path / "run.csv"
+    assert rig(monkeypatch, "export", run, "--format", "csv", "--smoothed", "--out", out) == 0
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == DURATION_S * RATE_HZ
+    last = rows[-1]
+    assert float(last["strut.smoothed_force_n"]) == pytest.approx(
+        float(last["strut.force_n"]), abs=10.0 * float(last["strut.smoothed_force_std_n"])
+    )
+
+
+@pytest.mark.parametrize("kind", ["parquet", "mf4", "candump"])
+def test_what_is_read_back_stays_as_it_was(reference, tmp_path, monkeypatch, capsys, kind):
+    run, _ = reference
+    arguments = ("export", run, "--format", kind, "--smoothed", "--out", tmp_path / "out")
+    assert rig(monkeypatch, *arguments) == 2
+    assert "expected --format csv" in capsys.readouterr().err
+
+
+def test_what_cannot_be_smoothed_is_refused(reference, tmp_path, monkeypatch, capsys):
+    run, _ = reference
+    ready = load_setup(CONFIGS / "dyno.yaml", duration_s=0.2)
+    bench = load_bench_config(CONFIGS / "dyno_bench.yaml")
+    with_bench(ready, bench, tmp_path / "dyno", lockstep=True, stop=lambda: False)
+    out = ("--format", "csv", "--smoothed", "--out", tmp_path / "out.csv")
+    assert rig(monkeypatch, "export", tmp_path / "dyno", *out) == 2
+    assert "prescribed_motion" in capsys.readouterr().err
+    ready = load_setup(CONFIGS / "reference.yaml", duration_s=0.1)
+    bench = load_bench_config(CONFIGS / "reference_bench.yaml")
+    with_bench(ready, bench, tmp_path / "short", lockstep=True, stop=lambda: False)
+    assert rig(monkeypatch, "export", tmp_path / "short", *out) == 2
+    assert "nowhere RUNNING with 200 heights" in capsys.readouterr().err
+    assert not (tmp_path / "out.csv").exists()
+    pitching = FullCar().model(tmp_path)
+    found, ready = smoothed.setup_of_run(run)
+    with pytest.raises(smoothed.InputError, match="straight guides"):
+        smoothed.smoothed_forces(
+            found, ready.model_copy(update={"model": pitching}), lambda _what, _share: None
+        )
