@@ -43,7 +43,7 @@ class Jacobians(NamedTuple):
         return self.offsets_m + self.struts @ q
 
 
-class _Ends(NamedTuple):
+class _Attached(NamedTuple):
     """The lower ends of all struts, then the upper ones.
 
     Attributes:
@@ -56,7 +56,7 @@ class _Ends(NamedTuple):
     attachments_m: Array
 
 
-class _Placed(NamedTuple):
+class _Ends(NamedTuple):
     """The ends in one configuration, in the world's directions.
 
     Attributes:
@@ -99,12 +99,12 @@ class Geometry:
         # DART is asked once for each body: for each end it would take thrice as long.
         self._carriers = [skeleton.bodies[name] for name in names]
         places = {name: index for index, name in enumerate([*names, WORLD])}
-        self._ends = _Ends(
+        self._attached = _Attached(
             np.array([[places[strut.between[k]] for strut in spec.struts] for k in (0, 1)]),
             np.array([[strut.attachments_m[k] for strut in spec.struts] for k in (0, 1)], float),
         )
-        samples = [self._placed(q) for q in sample_positions(skeleton.coordinates)]
-        columns = np.concatenate([placed.gap_jacobians() for placed in samples], axis=2)
+        samples = [self._ends_at(q) for q in sample_positions(skeleton.coordinates)]
+        columns = np.concatenate([ends.gap_jacobians() for ends in samples], axis=2)
         self._guides = np.array(
             [_guide(spec.name, *item) for item in zip(spec.struts, columns, strict=True)]
         )
@@ -115,13 +115,13 @@ class Geometry:
 
     def at(self, q: Array) -> Jacobians:
         """Jacobians at coordinates `q`, shape (n,)."""
-        placed = self._placed(q)
-        directions = self._directions(placed.gaps_m)
-        moments = _cross(placed.arms_m, directions)
+        ends = self._ends_at(q)
+        directions = self._directions(ends.gaps_m)
+        moments = _cross(ends.arms_m, directions)
         wrenches = np.concatenate([moments, np.broadcast_to(directions, moments.shape)], axis=2)
-        lower, upper = (wrenches[:, :, None] @ placed.jacobians)[:, :, 0]
+        lower, upper = (wrenches[:, :, None] @ ends.jacobians)[:, :, 0]
         struts = upper - lower
-        heights = np.sum(directions * placed.gaps_m, axis=1)
+        heights = np.sum(directions * ends.gaps_m, axis=1)
         pushed = self._skeleton.dart.getLinearJacobian(self._skeleton.pushed)
         return Jacobians(heights - struts @ q, struts, np.array(pushed[2], dtype=np.float64))
 
@@ -135,17 +135,17 @@ class Geometry:
         """
         if self.constant is not None:
             return np.zeros(len(self.constant.struts))
-        dart, bodies = self._skeleton.dart, self._ends.bodies
-        placed = self._placed(q)
-        directions, lengths = self._directions(placed.gaps_m), _lengths(placed.gaps_m)
+        dart, bodies = self._skeleton.dart, self._attached.bodies
+        ends = self._ends_at(q)
+        directions, lengths = self._directions(ends.gaps_m), _lengths(ends.gaps_m)
         dart.setVelocities(v)
         still = np.zeros((6, len(q)))
         changes = np.array([*(dart.getJacobianClassicDeriv(of) for of in self._carriers), still])
-        rates, changed = placed.jacobians @ v, (changes @ v)[bodies]
-        spins, across = rates[..., :3], _cross(rates[..., :3], placed.arms_m)
+        rates, changed = ends.jacobians @ v, (changes @ v)[bodies]
+        spins, across = rates[..., :3], _cross(rates[..., :3], ends.arms_m)
         velocities = rates[..., 3:] + across
         accelerations = (
-            changed[..., 3:] + _cross(changed[..., :3], placed.arms_m) + _cross(spins, across)
+            changed[..., 3:] + _cross(changed[..., :3], ends.arms_m) + _cross(spins, across)
         )
         velocity, acceleration = np.diff([velocities, accelerations], axis=1)[:, 0]
         along = np.sum(directions * velocity, axis=1)
@@ -160,9 +160,9 @@ class Geometry:
         along = gaps_m / _lengths(gaps_m)[:, None]
         return np.where(self._is_distance[:, None], along, self._guides)
 
-    def _placed(self, q: Array) -> _Placed:
+    def _ends_at(self, q: Array) -> _Ends:
         """The ends at coordinates `q`."""
-        dart, (bodies, attachments), carriers = self._skeleton.dart, self._ends, self._carriers
+        dart, (bodies, attachments), carriers = self._skeleton.dart, self._attached, self._carriers
         dart.setPositions(q)
         frames = np.array([*(of.getWorldTransform().matrix() for of in carriers), np.eye(4)])
         still = np.zeros((6, self._skeleton.coordinates))
@@ -170,7 +170,7 @@ class Geometry:
         here = frames[bodies]
         arms = (here[..., :3, :3] @ attachments[..., None])[..., 0]
         lower, upper = here[..., :3, 3] + arms
-        return _Placed(arms, jacobians, upper - lower)
+        return _Ends(arms, jacobians, upper - lower)
 
     def reaching(self, heights_m: Array, near: Array) -> Array:
         """Coordinates with given strut heights, found by Newton's method.

@@ -7,7 +7,9 @@ moved; its second derivative is the residual forces times the model's mobility,
     d²(z - z_free)/dt² = W d,    F = F_law + d,
 
 and is smoothed as in a diagnosis, which also finds the sensor's noise and the deviation. That holds
-exactly where W does not depend on where the bench is.
+exactly where W does not depend on where the bench is, and as far as the log has the virtual force
+at all times: a tick that takes several heights changes it in between, so heights that are faster
+than the ticks are refused, and a stretch ends where ticks were missed.
 
 References:
     Rauch, Tung, Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA J. 3 (1965).
@@ -23,14 +25,13 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
 
 from dart_model.plant import DartPlant
 from rig.core.contract import AMBIENT_C, Mode
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
 from rig.inputs.errors import InputError
 from rig.io.run_log import RunFolder
-from rig.operation.assembly import build_plant
+from rig.operation.assembly import arrivals, build_plant
 from rig.operation.replay import setup_of_run
 from rig.operation.setup import Setup
 from rig.tuning.expectation import stretches, twice_integrated
@@ -44,6 +45,9 @@ and by how much two pieces overlap, each used up to the middle: filters settle i
 
 _FEWEST = 200
 """Heights of a piece: a standard deviation of the noise within a tenth."""
+
+_MISSED = 1.5
+"""Periods between two ticks from which on one was missed."""
 
 _SINGULAR = 1e-9
 """Share of the largest mobility below which a combination of forces moves nothing."""
@@ -94,11 +98,12 @@ def smoothed_forces(
         progress: Called with what is being done and the share that is done.
 
     Returns:
-        Two arrays in N of shape (ticks,); NaN where the bridge was not RUNNING, and where it was
-        for too short a time.
+        Two arrays in N of shape (ticks,); NaN where the bridge was not RUNNING, and of all struts
+        where one of them had fewer than 200 heights in the stretch, or in a minute of it.
 
     Raises:
-        InputError: The run's model has no constant mobility, or not every strut is observed.
+        InputError: The run's model has no constant mobility, not every strut is observed, heights
+            come faster than ticks, or there is nothing to smooth.
     """
     names = list(ready.config.observers)
     mobility = _mobility(found, ready, names)
@@ -106,7 +111,11 @@ def smoothed_forces(
     struts = [_strut(found, name) for name in names]
     forces = {name: (np.full(len(tick_s), np.nan), np.full(len(tick_s), np.nan)) for name in names}
     running = found.steps.column("mode").to_numpy() == Mode.RUNNING
-    pieces = [piece for stretch in stretches(running) for piece in _pieces(tick_s, stretch)]
+    missed_s = _MISSED * ready.config.period_ns * 1e-9
+    unbroken = [
+        part for stretch in stretches(running) for part in _unbroken(tick_s, stretch, missed_s)
+    ]
+    pieces = [piece for stretch in unbroken for piece in _pieces(tick_s, stretch)]
     for number, (piece, inner) in enumerate(pieces):
         progress("smoothing", number / len(pieces))
         residual = _residual(tick_s, piece, struts, mobility)
@@ -118,7 +127,8 @@ def smoothed_forces(
             of[1][inner] = deviation[used]
     if all(np.all(np.isnan(force)) for force, _ in forces.values()):
         raise InputError(
-            f"{found.folder}: nowhere RUNNING with {_FEWEST} heights of each strut without a break"
+            f"{found.folder}: nowhere RUNNING with {_FEWEST} heights of each strut within "
+            f"{_LONGEST_S:g} s and no tick missed between them"
         )
     return forces
 
@@ -130,10 +140,17 @@ def _mobility(found: RunFolder, ready: Setup, names: list[str]) -> Array:
         raise InputError(f"{found.folder}: prescribed_motion: its load cell measures the force")
     if len(names) > len(ready.config.signals.height):
         raise InputError(f"{found.folder}: observers: kind none: smoothing wants every height")
+    for name, arrival in zip(names, arrivals(ready), strict=True):
+        if arrival.interval_ns * _MISSED < ready.config.period_ns:
+            raise InputError(
+                f"{found.folder}: height {name}: every {arrival.interval_ns} ns, ticks every "
+                f"{ready.config.period_ns} ns: smoothing wants at most one height a tick"
+            )
     plant = build_plant(ready)
     if not isinstance(plant, DartPlant) or not plant.is_constant:
         raise InputError(f"{found.folder}: model {ready.model.name}: {wanted}")
-    state = plant.init([strut.free_length_m for strut in ready.model.struts])
+    still = [0.0] * plant.coordinates
+    state = plant.state(still, still, (0.0,) * plant.internal_states, 0.0)
 
     def accelerations(virtual_n: Array) -> Array:
         loaded = plant.load(state, tuple(virtual_n.tolist()), 0.0, AMBIENT_C)
@@ -148,6 +165,9 @@ def _mobility(found: RunFolder, ready: Setup, names: list[str]) -> Array:
 
 
 def _strut(found: RunFolder, name: str) -> _Strut:
+    if f"{name}.law_force_n" not in found.steps.schema.names:
+        raise InputError(f"{found.folder}: has no steps of strut {name}, expected a run with some")
+
     def column(key: str) -> Array:
         return np.asarray(found.steps.column(f"{name}.{key}").to_numpy(), dtype=np.float64)
 
@@ -157,6 +177,13 @@ def _strut(found: RunFolder, name: str) -> _Strut:
         column("innovation_m"),
         column("measured_t_ns") * 1e-9,
     )
+
+
+def _unbroken(tick_s: Array, stretch: slice, missed_s: float) -> list[slice]:
+    """The parts of a stretch between which ticks were missed."""
+    breaks = np.flatnonzero(np.diff(tick_s[stretch]) > missed_s) + 1 + stretch.start
+    edges = [stretch.start, *breaks.tolist(), stretch.stop]
+    return [slice(begin, end) for begin, end in itertools.pairwise(edges)]
 
 
 def _pieces(tick_s: Array, stretch: slice) -> list[tuple[slice, slice]]:
@@ -194,14 +221,14 @@ def _residual(
         free_m = strut.innovation_m[piece][fresh][first] - moved_m
         line = np.polynomial.Polynomial.fit(t_s, free_m, 1)
         free_m = free_m - line(t_s)
-        smoothed = smooth(t_s, free_m, estimate_noise(t_s, free_m))
-        _, _, acceleration, jerk = smoothed.states.T
-        between = cast("Any", CubicHermiteSpline)(t_s, acceleration, jerk)
-        longest_s = 2.0 * float(np.median(np.diff(t_s)))
-        known = (times_s >= t_s[0] - longest_s) & (times_s <= t_s[-1] + longest_s)
-        at_s = np.clip(times_s[known], t_s[0], t_s[-1])
-        means[index, known] = between(at_s)
-        variances[index, known] = np.interp(at_s, t_s, smoothed.deviations[:, 2] ** 2)
+        # At ticks without a height the smoother knows what lies between its neighbours.
+        all_s = np.union1d(t_s, times_s)
+        known_m = np.full(len(all_s), np.nan)
+        known_m[np.searchsorted(all_s, t_s)] = free_m
+        smoothed = smooth(all_s, known_m, estimate_noise(t_s, free_m))
+        ticks = np.searchsorted(all_s, times_s)
+        means[index] = smoothed.states[ticks, 2]
+        variances[index] = smoothed.deviations[ticks, 2] ** 2
     forces = np.linalg.solve(mobility, means)
     deviations = np.sqrt(np.linalg.inv(mobility) ** 2 @ variances)
     return list(zip(forces, deviations, strict=True))

@@ -1,6 +1,7 @@
 """Forces smoothed over a whole run, against what the simulated bench had."""
 
 import csv
+import shutil
 import sys
 from pathlib import Path
 
@@ -11,24 +12,32 @@ import yaml
 from rig.bench.config import load_bench_config
 from rig.bench.trajectory import simulate
 from rig.cli.main import main
+from rig.core.contract import Mode
 from rig.exchange import smoothed
 from rig.exchange.smoothed import read_smoothed
+from rig.inputs.errors import InputError
+from rig.io.run_log import read_run
 from rig.operation.config import CONFIGS
 from rig.operation.live import with_bench
 from rig.operation.setup import load_setup
+from tests.core.cores import MS
 from tests.core.full_car import FullCar
 
 NOISE_M, DURATION_S, RATE_HZ = 20e-6, 6.0, 1000
+KALMAN = {"kind": "kalman", "filter": {"bandwidth_hz": 16.0, "noise_std_m": 2e-5}}
 
 
-def bench_run(folder: Path, case: str):
+def bench_run(folder: Path, case: str, changed=None, **sent):
     """A run with noisy heights, and the forces of the bench at its ticks, (N, struts)."""
     content = yaml.safe_load((CONFIGS / f"{case}_bench.yaml").read_text())
     for transmission in content["transmissions"]:
         if "height" in transmission:
             transmission["height"]["noise_std_m"] = NOISE_M
+            transmission.update(sent)
     (folder / "bench.yaml").write_text(yaml.safe_dump(content))
-    ready = load_setup(CONFIGS / f"{case}.yaml", duration_s=DURATION_S)
+    config = yaml.safe_load((CONFIGS / f"{case}.yaml").read_text()) | (changed or {})
+    (folder / "rig.yaml").write_text(yaml.safe_dump(config))
+    ready = load_setup(folder / "rig.yaml", duration_s=DURATION_S)
     bench = load_bench_config(folder / "bench.yaml")
     with_bench(ready, bench, folder / "run", lockstep=True, stop=lambda: False)
     period_ns = ready.config.period_ns
@@ -57,8 +66,10 @@ def errors(run: Path, truth_n, name: str, index: int = 0):
         for key in ("force_n", "smoothed_force_n", "smoothed_force_std_n")
     )
     missed = found - truth_n[tick, index]
-    later = slice(500, None)
-    assert np.all(np.isfinite(missed[later]) & (std[later] > 0.0))
+    running = column(steps, "mode") == Mode.RUNNING
+    assert np.array_equal(np.isfinite(found), running)
+    later = np.flatnonzero(running)[500:]
+    assert np.all(std[later] > 0.0)
     held = np.mean(np.abs(missed[later]) < 1.96 * std[later])
     online_n = np.sqrt(np.mean((online - truth_n[tick, index])[later] ** 2))
     smoothed_n = np.sqrt(np.mean(missed[later] ** 2))
@@ -83,6 +94,51 @@ def test_struts_that_move_each_other_are_smoothed_together(tmp_path):
         assert held > 0.85
 
 
+@pytest.mark.parametrize("observer", [{"kind": "pi"}, KALMAN])
+def test_lost_heights_cost_what_the_deviation_says(tmp_path, observer):
+    """A fifth of the frames is lost: gaps of many ticks, in some of which the bridge holds."""
+    changed = {"observers": {"strut": observer}, "supervision": {"stale_after_s": 0.004}}
+    truth_n = bench_run(tmp_path, "reference", changed, loss_probability=0.2)
+    modes = column(read_run(tmp_path / "run").steps, "mode")
+    assert np.any(modes[500:] == Mode.HOLD)
+    steps = read_smoothed(tmp_path / "run", lambda _what, _share: None).steps
+    found, std = (column(steps, f"strut.smoothed_force_{key}") for key in ("n", "std_n"))
+    known = np.flatnonzero(np.isfinite(found))[500:]
+    tick = np.rint(column(steps, "t_ns") * 1e-9 * RATE_HZ).astype(int)
+    missed = found[known] - truth_n[tick[known], 0]
+    assert np.mean(np.abs(missed) < 1.96 * std[known]) > 0.9
+
+
+def test_an_old_height_is_taken_at_its_own_time(tmp_path):
+    """The model's force is that of its time, with an applied force that is not late."""
+    height = {"message": "BENCH_MEASUREMENT", "signal": "HEIGHT", "delay_s": 0.005}
+    applied = {"message": "BENCH_MEASUREMENT_2", "signal": "APPLIED_FORCE"}
+    changed = {
+        "observers": {"strut": KALMAN},
+        "signals": {"height": {"strut": height}, "applied_force": applied},
+        "supervision": {"stale_after_s": 0.02},
+    }
+    content = yaml.safe_load((CONFIGS / "reference_bench.yaml").read_text())
+    content["transmissions"] = [
+        {
+            "message": "BENCH_MEASUREMENT",
+            "latency_ns": 5_000_000,
+            "height": {"signal": "HEIGHT", "strut": "strut", "noise_std_m": NOISE_M},
+        },
+        {"message": "BENCH_MEASUREMENT_2", "applied_force": {"signal": "APPLIED_FORCE"}},
+    ]
+    (tmp_path / "bench.yaml").write_text(yaml.safe_dump(content))
+    config = yaml.safe_load((CONFIGS / "reference.yaml").read_text()) | changed
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(config))
+    ready = load_setup(tmp_path / "rig.yaml", duration_s=DURATION_S)
+    bench = load_bench_config(tmp_path / "bench.yaml")
+    with_bench(ready, bench, tmp_path / "run", lockstep=True, stop=lambda: False)
+    truth_n = simulate(bench, int(DURATION_S * 1e9) + MS, MS).strut_force_n
+    online_n, smoothed_n, held = errors(tmp_path / "run", truth_n, "strut")
+    assert smoothed_n < 0.3 * online_n
+    assert held > 0.9
+
+
 def test_pieces_give_what_the_whole_gives(reference, monkeypatch):
     run, truth_n = reference
     _, whole_n, _ = errors(run, truth_n, "strut")
@@ -98,7 +154,34 @@ def test_every_tick_of_every_stretch_is_in_one_piece():
     used = np.concatenate([np.arange(inner.start, inner.stop) for _, inner in pieces])
     assert np.array_equal(used, np.arange(1000, 150_000))
     for piece, inner in pieces:
-        assert 1000 <= piece.start <= inner.start < inner.stop <= piece.stop <= 150_000
+        assert piece.start == max(1000, inner.start - 1000)
+        assert min(inner.stop + 995, 150_000) <= piece.stop <= min(inner.stop + 1000, 150_000)
+
+
+def test_a_stretch_ends_where_ticks_were_missed():
+    tick_s = np.concatenate([np.arange(1000), 1005 + np.arange(1000)]) / 1000.0
+    found = smoothed._unbroken(tick_s, slice(100, 1900), 1.5e-3)
+    assert found == [slice(100, 1000), slice(1000, 1900)]
+
+
+def test_heights_that_are_faster_than_the_ticks_are_refused(tmp_path):
+    """The log has the last virtual force of a tick, and not those in between."""
+    bench_run(tmp_path, "reference", {"rate_hz": 200, "observers": {"strut": KALMAN}})
+    with pytest.raises(InputError, match=r"height strut: .* at most one height a tick"):
+        read_smoothed(tmp_path / "run", lambda _what, _share: None)
+
+
+@pytest.mark.parametrize("kept_bytes", [0, 100])
+def test_a_run_that_was_killed_before_its_first_steps_is_one_line(
+    reference, tmp_path, monkeypatch, capsys, kept_bytes
+):
+    cut = tmp_path / "cut"
+    shutil.copytree(reference[0], cut)
+    steps = cut / "steps.arrow"
+    steps.write_bytes(steps.read_bytes()[:kept_bytes])
+    out = ("--format", "csv", "--smoothed", "--out", tmp_path / "out.csv")
+    assert rig(monkeypatch, "export", cut, *out) == 2
+    assert "no steps of strut strut" in capsys.readouterr().err
 
 
 def rig(monkeypatch, *arguments) -> int:
@@ -145,7 +228,7 @@ def test_what_cannot_be_smoothed_is_refused(reference, tmp_path, monkeypatch, ca
     assert not (tmp_path / "out.csv").exists()
     pitching = FullCar().model(tmp_path)
     found, ready = smoothed.setup_of_run(run)
-    with pytest.raises(smoothed.InputError, match="straight guides"):
+    with pytest.raises(InputError, match="straight guides"):
         smoothed.smoothed_forces(
             found, ready.model_copy(update={"model": pitching}), lambda _what, _share: None
         )

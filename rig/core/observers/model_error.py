@@ -302,7 +302,7 @@ class ErrorFilter:
             math.sqrt(max(steady.residual, 0.0) * variance_m2) * omega**2,
             min(1.0, interval_ns * 1e-9 / _FADING_S),
             omega,
-            interval_ns + interval_ns // 2,
+            (3 * interval_ns + 1) // 2,
             start.delay_ns + 2 * interval_ns + round(1e9 / omega),
             round(_FORGOTTEN / omega * 1e9),
             max(abs(start.damping_per_s), math.sqrt(abs(start.stiffness_per_s2))),
