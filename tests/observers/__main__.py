@@ -3,7 +3,7 @@
 The grid: masses, natural frequencies, noises and rates. Each bench is run once with an observer
 that is not tuned, what `rig tune` reads is taken from that run, and the tuned observers follow
 another draw of the noise. The reference case runs through CAN, tuned with another seed than it is
-run with.
+run with; once in real time, joined where it moves.
 """
 
 import argparse
@@ -18,12 +18,15 @@ import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
 from rig.bench.config import load_bench_config
+from rig.bench.simulated import Bench as SimulatedBench
+from rig.bench.trajectory import simulate
 from rig.core.closed_loop import Rhythm
 from rig.core.observers.kalman import KalmanObserver
 from rig.core.observers.model_error import ErrorFilter
 from rig.core.step import strut_answers
 from rig.demo.cases import compared
 from rig.io.run_log import read_run
+from rig.operation import live
 from rig.operation.config import CONFIGS
 from rig.operation.live import with_bench
 from rig.operation.setup import load_setup
@@ -36,6 +39,7 @@ MASSES_KG = (1.0, 10.0, 100.0, 1000.0)
 NATURAL_HZ = (0.5, 2.0, 7.0, 20.0)
 NOISES_M = (1e-6, 20e-6, 200e-6)
 RATES_HZ = (100.0, 500.0, 2000.0)
+AGO_NS, PERIOD_NS = 2_530_000_000, 1_000_000
 
 
 def point(given):
@@ -101,7 +105,14 @@ def grid(jobs):
 
 
 def reference(folder, seed, noise_m, step_m, latency_ns=0, observers=None, delay_s=0.0):
-    """A run of 20 s through CAN; returns its folder and its case."""
+    """A run of 20 s through CAN; returns its case."""
+    ready, bench = prepared(folder, seed, noise_m, step_m, latency_ns, observers, delay_s)
+    ended = with_bench(ready, bench, folder / "run", lockstep=True, stop=lambda: False)
+    return compared(ended, ready, bench).struts[0]
+
+
+def prepared(folder, seed, noise_m, step_m, latency_ns=0, observers=None, delay_s=0.0):
+    """Configuration and bench of the reference case with this noise, in a folder of its own."""
     folder.mkdir(parents=True)
     dbc = DEFAULT_DATABASE.read_text("utf-8")
     fine = "SG_ HEIGHT : 12|20@1- (2E-006,0) [-1.048576|1.048574]"
@@ -130,10 +141,7 @@ def reference(folder, seed, noise_m, step_m, latency_ns=0, observers=None, delay
     if observers is not None:
         config["observers"] = observers
     (folder / "rig.yaml").write_text(yaml.safe_dump(config))
-    ready = load_setup(folder / "rig.yaml")
-    bench = load_bench_config(folder / "bench.yaml")
-    ended = with_bench(ready, bench, folder / "run", lockstep=True, stop=lambda: False)
-    return compared(ended, ready, bench).struts[0]
+    return load_setup(folder / "rig.yaml"), load_bench_config(folder / "bench.yaml")
 
 
 def share(case):
@@ -186,7 +194,6 @@ def latency_table():
     print("height 5 ms old, exact: force error RMS over the peak in %")
     paper_gains = {"kind": "pi", "proportional_n_per_m": 1e5, "integral_n_per_m_s": 1e4}
     follower = {"bandwidth_hz": 40.0, "noise_std_m": 5.8e-7}
-    paper_gains | {"filter": follower}
     cases = (
         ("published gains, no latency", paper_gains, 0, 0.0),
         ("published gains, latency not configured", paper_gains, 5, 0.0),
@@ -207,16 +214,57 @@ def latency_table():
             print(f"  {name}: {100 * share(case):.3g}", flush=True)
 
 
+class LongAgo(SimulatedBench):
+    """A bench that has moved for a while when the bridge comes."""
+
+    def __init__(self, config, database):
+        super().__init__(config, database, -AGO_NS)
+        self.update(-1)
+
+
+def moving_table(seeds):
+    """Real time wants a machine with time to spare; each seed takes ten seconds."""
+    print("a bench that moves since 2.53 s, 20 um noise, 15 um steps: RMS from 0.2 s on, in N")
+    observers = {STRUT: {"kind": "kalman", "filter": {"bandwidth_hz": 20.0, "noise_std_m": 2e-5}}}
+    for seed in range(1, seeds + 1):
+        missed_n = {}
+        for name, bench_class, lockstep in (
+            ("from rest, lockstep", SimulatedBench, True),
+            ("moving, lockstep", LongAgo, True),
+            ("moving, live", LongAgo, False),
+        ):
+            with tempfile.TemporaryDirectory() as temporary:
+                folder = Path(temporary) / "case"
+                _, bench = prepared(folder, seed, 20e-6, 15e-6, observers=observers)
+                ready = load_setup(folder / "rig.yaml", duration_s=8.0)
+                live.Bench = bench_class
+                ended = with_bench(
+                    ready, bench, folder / "run", lockstep=lockstep, stop=lambda: False
+                )
+                steps = open_steps(ended.folder)
+            t_ns, force_n = (steps.column(key).to_numpy() for key in ("t_ns", f"{STRUT}.force_n"))
+            since_ns = AGO_NS if bench_class is LongAgo else 0
+            truth = simulate(bench, int(t_ns[-1]) + since_ns + PERIOD_NS, PERIOD_NS)
+            truth_n = truth.strut_force_n[(t_ns + since_ns) // PERIOD_NS, 0]
+            later = t_ns >= t_ns[np.isfinite(force_n)][0] + 200_000_000
+            missed_n[name] = float(np.sqrt(np.mean((force_n - truth_n)[later] ** 2)))
+        print(
+            "  " + ", ".join(f"{name} {value:.2f}" for name, value in missed_n.items()), flush=True
+        )
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--only", choices=("reference", "latency", "grid"))
+    parser.add_argument("--only", choices=("reference", "latency", "moving", "grid"))
     given = parser.parse_args()
     if given.only in (None, "reference"):
         reference_table(given.seeds)
     if given.only in (None, "latency"):
         latency_table()
+    if given.only in (None, "moving"):
+        moving_table(given.seeds)
     if given.only in (None, "grid"):
         grid(given.jobs)
 
