@@ -40,11 +40,10 @@ def pushed_n(t):
     ("effect", "family", "parameter", "truth"),
     [
         (Friction, "friction", "coulomb_force_n", 6.0),
-        pytest.param(
-            Hardening, "nonlinear_stiffness", "force_at_100_mm_n", 120.0, marks=pytest.mark.long
-        ),
+        (Hardening, "nonlinear_stiffness", "force_at_100_mm_n", 120.0),
     ],
 )
+@pytest.mark.long
 def test_what_pieces_show_is_found_and_fitted_to_all(effect, family, parameter, truth):
     runs = [bench.run(effect(), **LONG), bench.run(effect(), seed=2)]
     found = diagnose(bench.model(stiffness=2300.0), runs[:1], runs[1:]).diagnosis

@@ -356,6 +356,7 @@ def test_kinds_plant_what_they_say():
     assert make_case(len(FAMILIES) + 1, "single").families == (FAMILIES[1],)
 
 
+@pytest.mark.long
 def test_cases_span_visibility_noise_and_rates():
     cases = [short_case(seed, "single") for seed in range(14)]
     ratios = [floor_ratios(c, record(c, c.train))[0] for c in cases]

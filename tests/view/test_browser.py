@@ -195,6 +195,7 @@ def command(run, port):
             assert process.wait(20) == 0
 
 
+@pytest.mark.long
 def test_a_page_goes_on_when_the_server_is_back(made, run):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
@@ -260,6 +261,7 @@ def test_a_live_run_is_followed(made, tmp_path):
             process.wait()
 
 
+@pytest.mark.long
 def test_a_button_diagnoses_a_finished_run(made, tmp_path):
     run = make_run(tmp_path / "bench", 3000)
     with serving(run, token="secret") as one, page(made, one, path="#secret") as opened:

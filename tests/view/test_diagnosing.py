@@ -46,6 +46,7 @@ def ended(server):
     return state(server)
 
 
+@pytest.mark.long
 def test_it_stands_beside_the_run_and_its_report_reads_nothing_of_the_page(run):
     with serving(run, token="secret") as server:
         assert state(server) == {"state": "none"}
