@@ -40,7 +40,7 @@ def pushed_n(t):
     ("effect", "family", "parameter", "truth"),
     [
         (Friction, "friction", "coulomb_force_n", 6.0),
-        (Hardening, "nonlinear_stiffness", "force_at_100_mm_n", 120.0),
+        (Hardening, "nonlinear_stiffness", "stiffness_n_per_m3", 1.2e5),
     ],
 )
 @pytest.mark.long

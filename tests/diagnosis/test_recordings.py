@@ -364,7 +364,7 @@ def test_the_measured_damper_has_memory(tmp_path: Path) -> None:
     stiffness, damping = max(float(stiffness), 1.0), max(float(damping), 1.0)
     model = dyno.model(stiffness=stiffness, damping=damping, free=float(force) / stiffness)
     found = diagnose(model, [first], [second]).diagnosis
-    assert found.effects[0].family in {"hysteresis", "friction"}
+    assert {effect.family for effect in found.effects} & {"hysteresis", "friction"}
     assert len(found.effects) <= 3
     for effect in found.effects:
         for estimate in effect.parameters.values():
