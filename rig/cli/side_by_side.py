@@ -19,6 +19,7 @@ from rig.inputs.errors import InputError
 from rig.inputs.folders import refuse_full
 
 _PR_SET_PDEATHSIG = 1
+"""Of linux/prctl.h: which signal a process is sent when its parent dies; see prctl(2)."""
 
 _WORST = (WRONG_INPUT, FAILED)
 """Exit codes that others give way to, the worst first."""

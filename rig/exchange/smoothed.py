@@ -34,7 +34,7 @@ from rig.io.run_log import RunFolder
 from rig.operation.assembly import arrivals, build_plant
 from rig.operation.replay import setup_of_run
 from rig.operation.setup import Setup
-from rig.tuning.expectation import stretches, twice_integrated
+from rig.tuning.expectation import FEWEST, free_error, stretches
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -42,9 +42,6 @@ Progress = Callable[[str, float], None]
 _LONGEST_S, _OVERLAP_S = 60.0, 2.0
 """Of a piece: a force that the model lacks all the time moves its error by t², and digits with it;
 and by how much two pieces overlap, each used up to the middle: filters settle in less."""
-
-_FEWEST = 200
-"""Heights of a piece: a standard deviation of the noise within a tenth."""
 
 _MISSED = 1.5
 """Periods between two ticks from which on one was missed."""
@@ -127,7 +124,7 @@ def smoothed_forces(
             of[1][inner] = deviation[used]
     if all(np.all(np.isnan(force)) for force, _ in forces.values()):
         raise InputError(
-            f"{found.folder}: nowhere RUNNING with {_FEWEST} heights of each strut within "
+            f"{found.folder}: nowhere RUNNING with {FEWEST} heights of each strut within "
             f"{_LONGEST_S:g} s and no tick missed between them"
         )
     return forces
@@ -215,12 +212,10 @@ def _residual(
         measured_s = strut.measured_s[piece]
         fresh = np.isfinite(measured_s) & (measured_s >= times_s[0])
         t_s, first = np.unique(measured_s[fresh], return_index=True)
-        if len(t_s) < _FEWEST:
+        if len(t_s) < FEWEST:
             return None
-        moved_m = twice_integrated(times_s, -mobility[index] @ virtual_n, t_s)
-        free_m = strut.innovation_m[piece][fresh][first] - moved_m
-        line = np.polynomial.Polynomial.fit(t_s, free_m, 1)
-        free_m = free_m - line(t_s)
+        innovation_m = strut.innovation_m[piece][fresh][first]
+        free_m = free_error(times_s, -mobility[index] @ virtual_n, t_s, innovation_m)
         # At ticks without a height the smoother knows what lies between its neighbours.
         all_s = np.union1d(t_s, times_s)
         known_m = np.full(len(all_s), np.nan)

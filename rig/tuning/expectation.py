@@ -25,7 +25,7 @@ _LONGEST_S = 60.0
 _SHORTEST_S = 1.0
 """Of a run: a spectrum down to some hertz."""
 
-_FEWEST = 200
+FEWEST = 200
 """Measurements: a standard deviation within a tenth."""
 
 _LINES = 120
@@ -110,19 +110,30 @@ def followed(steps: Any, folder: Path, strut: str, mobility_per_kg: float) -> Fo
     measured_s = column(f"{strut}.measured_t_ns")[stretch] * 1e-9
     innovation_m = column(f"{strut}.innovation_m")[stretch]
     fresh = np.isfinite(measured_s) & (measured_s >= tick_s[:1])
-    if np.sum(fresh) < _FEWEST or tick_s[-1] - tick_s[0] < _SHORTEST_S:
+    if np.sum(fresh) < FEWEST or tick_s[-1] - tick_s[0] < _SHORTEST_S:
         raise InputError(
             f"{folder}: {np.sum(fresh)} heights in {np.ptp(tick_s) if len(tick_s) else 0.0:.2g} s "
-            f"of RUNNING without a break, expected {_FEWEST} in {_SHORTEST_S:g} s"
+            f"of RUNNING without a break, expected {FEWEST} in {_SHORTEST_S:g} s"
         )
-    by_force = -virtual_n * mobility_per_kg
-    moved_m = twice_integrated(tick_s, by_force, measured_s[fresh])
-    free_m = innovation_m[fresh] - moved_m
     t_s = measured_s[fresh]
-    line = np.polynomial.Polynomial.fit(t_s, free_m, 1)
+    free_m = free_error(tick_s, -virtual_n * mobility_per_kg, t_s, innovation_m[fresh])
     law = ("law_force_n", "height_m", "velocity_m_per_s")
     law_n, height_m, velocity = (column(f"{strut}.{name}")[stretch] for name in law)
-    return Followed(t_s, free_m - line(t_s), tick_s, law_n, height_m, velocity)
+    return Followed(t_s, free_m, tick_s, law_n, height_m, velocity)
+
+
+def free_error(tick_s: Array, by_force: Array, t_s: Array, innovation_m: Array) -> Array:
+    """Error of the model had there been no virtual force, but for a straight line, shape (N,).
+
+    Args:
+        tick_s: Times of the ticks, shape (M,).
+        by_force: Acceleration of the error by the virtual force from each tick on, shape (M,).
+        t_s: Times at which the measured heights were true, shape (N,).
+        innovation_m: Innovations at them, shape (N,).
+    """
+    free_m = innovation_m - _twice_integrated(tick_s, by_force, t_s)
+    line = np.polynomial.Polynomial.fit(t_s, free_m, 1)
+    return free_m - line(t_s)
 
 
 def residual(given: Followed, mobility_per_kg: float) -> Residual:
@@ -172,8 +183,8 @@ def stretches(holds: NDArray[np.bool_]) -> list[slice]:
     return [slice(*pair) for pair in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def twice_integrated(tick_s: Array, acceleration: Array, t_s: Array) -> Array:
-    """An acceleration that is constant from each tick to the next, integrated twice, at times."""
+def _twice_integrated(tick_s: Array, acceleration: Array, t_s: Array) -> Array:
+    """An acceleration that is constant from each tick to the next, integrated twice."""
     h = np.diff(tick_s)
     rate = np.concatenate([[0.0], np.cumsum(acceleration[:-1] * h)])
     moved = np.concatenate([[0.0], np.cumsum(rate[:-1] * h + 0.5 * acceleration[:-1] * h * h)])

@@ -33,6 +33,14 @@ def started(*arguments):
     )
 
 
+def eventually(holds, within_s):
+    """Wait for what another process does; it tells nobody when it is done."""
+    until_s = time.monotonic() + within_s
+    while not holds():
+        assert time.monotonic() < until_s
+        time.sleep(0.1)
+
+
 @pytest.mark.long
 def test_each_has_a_process_and_a_folder_and_the_worst_exit_code_counts(two, tmp_path):
     out = tmp_path / "runs"
@@ -51,10 +59,7 @@ def test_each_has_a_process_and_a_folder_and_the_worst_exit_code_counts(two, tmp
 def test_ctrl_c_ends_all_of_them_in_order(two, tmp_path):
     out = tmp_path / "runs"
     with started(*two, "--out", out) as process:
-        until_s = time.monotonic() + 60.0
-        while not all((out / path.stem / "timing.json").exists() for path in two):
-            assert time.monotonic() < until_s
-            time.sleep(0.1)
+        eventually(lambda: all((out / path.stem / "timing.json").exists() for path in two), 60.0)
         process.send_signal(signal.SIGINT)
         printed, _ = process.communicate(timeout=60)
     assert process.returncode == 1  # no height ever came
@@ -70,18 +75,12 @@ def test_no_bridge_runs_on_without_its_parent(two, tmp_path, number):
     """A closed terminal, and a parent that is killed: each ends in order."""
     out = tmp_path / "runs"
     with started(*two, "--out", out) as process:
-        until_s = time.monotonic() + 60.0
-        while not all((out / path.stem / "timing.json").exists() for path in two):
-            assert time.monotonic() < until_s
-            time.sleep(0.1)
+        eventually(lambda: all((out / path.stem / "timing.json").exists() for path in two), 60.0)
         process.send_signal(number)
         process.communicate(timeout=60)
     for path in two:
         file = out / path.stem / "run.yaml"
-        until_s = time.monotonic() + 30.0
-        while "ending" not in yaml.safe_load(file.read_text()):
-            assert time.monotonic() < until_s
-            time.sleep(0.1)
+        eventually(lambda file=file: "ending" in yaml.safe_load(file.read_text()), 30.0)
 
 
 def test_one_name_twice_and_a_folder_that_is_full_are_refused(two, tmp_path):
