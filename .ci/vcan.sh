@@ -57,9 +57,9 @@ export NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR="$work/out/num
 fill_caches() {
     (cd "$project" && timeout 600 "$python" -c '
 from can_dbc.database import DEFAULT_DATABASE, load_database
-from rig.bench.config import load_bench_config
-from rig.bench.simulated import Bench
-from rig.operation.config import CONFIGS
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.simulated import Bench
+from rig.plan.config import CONFIGS
 Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), load_database(DEFAULT_DATABASE)).update(10**8)
 '
         timeout 600 "$python" -m tests.sensors.warm)

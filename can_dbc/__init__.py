@@ -1,1 +1,1 @@
-"""What the bytes on the bus mean: database, codecs and end-to-end protection."""
+"""The lowest package: what bytes from outside mean, on a bus (DBC, frames) and in a YAML file."""

@@ -1,7 +1,14 @@
-"""The error of this package."""
+"""Errors of inputs: the base class of the whole project, and that of this package."""
 
-from rig.inputs.errors import InputError
+
+class InputError(ValueError):
+    """An input is wrong; one line names file, key, value and what was expected.
+
+    Every package derives its own error from this one, so that a caller catches all of them at
+    once; the command prints the line and ends with exit code 2. It stands in the lowest package,
+    because every other one raises it.
+    """
 
 
 class DatabaseError(InputError):
-    """A DBC file, or what is asked of it, is wrong; the message is one line naming the place."""
+    """A DBC file, or a signal requested of it, is wrong."""

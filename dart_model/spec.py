@@ -22,9 +22,9 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from can_dbc.errors import InputError
+from can_dbc.yaml_file import Finite, NotNegative, Positive, parse_mapping, read_text, validated
 from dart_model.effects import CATALOGUE, effect
-from rig.inputs.errors import InputError
-from rig.inputs.yaml_file import Finite, NotNegative, Positive, parse_mapping, read_text, validated
 
 MODELS = Path(__file__).parent / "models"
 """Folder of the models that come with the package."""

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from dart_model.spec import ModelSpec
     from rig.diagnosis.recording import Recording
-    from rig.exchange.arrays import Run
-    from rig.pages.found import Found
+    from rig.formats.arrays import Run
+    from rig.pages.notebook import Found
 
 __all__ = ["diagnose", "load_model", "open_run", "read_csv"]
 
@@ -41,7 +41,7 @@ def open_run(folder: Path | str) -> "Run":
     Raises:
         InputError: It is no run, or damaged.
     """
-    from rig.exchange import arrays
+    from rig.formats import arrays
 
     return arrays.open_run(folder)
 
@@ -84,7 +84,7 @@ def diagnose(
     from dart_model.spec import ModelSpec
     from rig.diagnosis import diagnose as diagnosis
     from rig.diagnosis.recording import Recording, read_recording
-    from rig.pages.found import Found
+    from rig.pages.notebook import Found
 
     spec = model if isinstance(model, ModelSpec) else load_model(model)
     struts = [strut.name for strut in spec.struts]

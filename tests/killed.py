@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rig.bench.config import load_bench_config
-from rig.io.run_log import read_run
-from rig.io.run_writer import RunLog
-from rig.operation.config import CONFIGS
-from rig.operation.live import with_bench
-from rig.operation.replay import replay
-from rig.operation.setup import load_setup
+from rig.log.reader import read_run
+from rig.log.writer import RunLog
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from rig.run.live import with_bench
+from rig.run.replay import replay
+from rig.simulated_bench.config import load_bench_config
 
 _COUNTS = struct.Struct("<qq")
 """Frames received, and ticks."""

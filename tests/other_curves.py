@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from rig.bench.config import load_bench_config
-from rig.bench.schema import BenchConfig
 from rig.demo.cases import SETTLED_NS, compared
-from rig.operation.config import CONFIGS
-from rig.operation.live import with_bench
-from rig.operation.setup import load_setup
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from rig.run.live import with_bench
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.schema import BenchConfig
 
 
 def redrawn(

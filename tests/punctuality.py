@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rig.operation.late_ticks import late_ticks
-from rig.operation.replay import setup_of_run
-from rig.operation.trace import read_trace
+from rig.run.late_ticks import late_ticks
+from rig.run.replay import setup_of_run
+from rig.run.trace import read_trace
 
 
 def missed(folder: Path, seconds: float, *, bare: bool, busy: float) -> tuple[int, Counter[str]]:

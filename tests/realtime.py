@@ -21,16 +21,16 @@ from pathlib import Path
 import numpy as np
 
 from can_dbc.database import DEFAULT_DATABASE, load_database
-from rig.bench.config import load_bench_config
-from rig.bench.schema import BenchConfig
-from rig.operation.config import CONFIGS, SignalName
-from rig.operation.live import on_time, with_bench
-from rig.operation.logged_run import Ended
-from rig.operation.loop import regular_ticks
-from rig.operation.setup import Setup, load_setup, put_together
-from rig.operation.timing import Timing
-from rig.operation.trace import Trace
 from rig.pages.timing_picture import draw_run
+from rig.plan.config import CONFIGS, SignalName
+from rig.plan.setup import Setup, load_setup, put_together
+from rig.run.live import on_time, with_bench
+from rig.run.logged_run import Ended
+from rig.run.loop import regular_ticks
+from rig.run.timing import Timing
+from rig.run.trace import Trace
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.schema import BenchConfig
 from tests.soak import force_error_n, load_cell
 
 ESTIMATE = SignalName(message="RIG_ESTIMATE", signal="SPRING_DAMPER_FORCE")

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from can_dbc.codec import decode_log
 from can_dbc.database import load_database
 from can_dbc.units import Dimension
-from rig.bench.config import load_bench_config
-from rig.io.frame_columns import received_frames
-from rig.io.run_log import DBC_FILE, FRAMES_FILE, RUN_FILE, STEPS_FILE, parts
-from rig.operation.config import CONFIGS
-from rig.operation.live import with_bench
-from rig.operation.setup import load_setup
+from rig.log.frame_columns import received_frames
+from rig.log.reader import DBC_FILE, FRAMES_FILE, RUN_FILE, STEPS_FILE, parts
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from rig.run.live import with_bench
+from rig.simulated_bench.config import load_bench_config
 
 PART_S = 600
 S = 1_000_000_000

@@ -4,6 +4,7 @@ import difflib
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from can_dbc.errors import InputError
 from dart_model.effects import (
     backlash,
     damping,
@@ -23,7 +24,7 @@ from dart_model.effects import (
     stop,
     unmodelled_mode,
 )
-from dart_model.effects.contract import (
+from dart_model.effects.law import (
     Bench,
     Bounds,
     Effect,
@@ -35,7 +36,6 @@ from dart_model.effects.contract import (
     Start,
     Writable,
 )
-from rig.inputs.errors import InputError
 
 __all__ = [
     "CATALOGUE",

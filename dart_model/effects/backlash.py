@@ -2,7 +2,7 @@
 
 import math
 
-from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start
+from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start
 from dart_model.effects.ranges import grid, height, moving, within
 
 _BOTH = "heights on both sides of the free play"

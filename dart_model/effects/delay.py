@@ -1,6 +1,6 @@
 """Delay between the channels: the force acts later than it was recorded, or heights come late."""
 
-from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start, Writable
+from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start, Writable
 from dart_model.effects.ranges import moving, within
 
 # Padé approximants of exp(-delay * s). An explicit integrator must follow their poles, so a short

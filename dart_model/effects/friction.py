@@ -6,7 +6,7 @@ that bends by a fraction of a millimetre before it slides, which holds.
 
 import math
 
-from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start, Writable
+from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start, Writable
 from dart_model.effects.ranges import crossing_time_s, grid, moving, of_speed, of_stroke, within
 
 _FAMILY = "friction"

@@ -1,6 +1,6 @@
 """Inertia the model lacks: a mass with its weight, or an inerter, which has none."""
 
-from dart_model.effects.contract import Effect, Floats, Parameter
+from dart_model.effects.law import Effect, Floats, Parameter
 
 
 def _mass(

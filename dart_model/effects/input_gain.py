@@ -1,6 +1,6 @@
 """Input gain: the force that acts is not the force that was recorded."""
 
-from dart_model.effects.contract import Effect, Floats, Parameter
+from dart_model.effects.law import Effect, Floats, Parameter
 
 
 def _force(

@@ -1,6 +1,6 @@
 """No effect: the trivial partner of all others."""
 
-from dart_model.effects.contract import Effect, Floats
+from dart_model.effects.law import Effect, Floats
 
 
 def _force(

@@ -2,7 +2,7 @@
 
 import math
 
-from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start
+from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start
 from dart_model.effects.ranges import always, grid, height, moving, of_stroke, within
 
 _FAMILY = "nonlinear_stiffness"

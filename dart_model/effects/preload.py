@@ -1,6 +1,6 @@
 """Preload: a constant force, such as gas preload, unaccounted weight or a load cell's offset."""
 
-from dart_model.effects.contract import Effect, Floats, Parameter
+from dart_model.effects.law import Effect, Floats, Parameter
 
 
 def _force(

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from types import MappingProxyType
 
-from dart_model.effects.contract import Bounds, Motion, Start
+from dart_model.effects.law import Bounds, Motion, Start
 
 Starts = Callable[[Motion], list[Start]]
 

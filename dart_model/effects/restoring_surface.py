@@ -1,6 +1,6 @@
 """A table of force over height and velocity, for what has no name."""
 
-from dart_model.effects.contract import Effect, Floats, Parameter
+from dart_model.effects.law import Effect, Floats, Parameter
 
 HEIGHTS = 9
 """Rows of the table."""

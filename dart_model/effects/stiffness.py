@@ -1,6 +1,6 @@
 """Linear stiffness beside the strut's own."""
 
-from dart_model.effects.contract import Effect, Floats, Parameter
+from dart_model.effects.law import Effect, Floats, Parameter
 
 
 def _force(

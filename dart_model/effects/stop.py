@@ -1,6 +1,6 @@
 """End stops, which push but never pull."""
 
-from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start
+from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start
 from dart_model.effects.ranges import (
     Starts,
     crossing_time_s,

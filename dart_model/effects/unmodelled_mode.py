@@ -2,7 +2,7 @@
 
 import math
 
-from dart_model.effects.contract import Effect, Floats, Motion, Parameter, Start, Writable
+from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start, Writable
 from dart_model.effects.ranges import geometric, grid, moving, within
 
 

@@ -19,7 +19,9 @@ from typing import Any, cast
 import numpy as np
 from scipy.linalg import null_space  # pyright: ignore[reportUnknownVariableType]
 
+from can_dbc.errors import InputError
 from dart_model.plant.backend import ManyCoordinates, OneCoordinate
+from dart_model.plant.fmu import MockUp
 from dart_model.plant.geometry import Array, Geometry, Jacobians, sample_positions
 from dart_model.plant.integrator import (
     LONGEST_STEP_S,
@@ -29,13 +31,11 @@ from dart_model.plant.integrator import (
     stable_step_s,
 )
 from dart_model.plant.mechanism import Mechanism
-from dart_model.plant.mockup import MockUp
-from dart_model.plant.prescribed import PrescribedState, PrescribedStrut
+from dart_model.plant.prescribed_strut import PrescribedState, PrescribedStrut
 from dart_model.plant.skeleton import build
 from dart_model.plant.state import Loaded, Mechanics, PlantState
 from dart_model.plant.strut import struts_of
 from dart_model.spec import ModelSpec
-from rig.inputs.errors import InputError
 
 __all__ = [
     "LONGEST_STEP_S",

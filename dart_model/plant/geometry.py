@@ -6,9 +6,9 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from can_dbc.errors import InputError
 from dart_model.plant.skeleton import Skeleton
 from dart_model.spec import WORLD, ModelSpec, StrutSpec
-from rig.inputs.errors import InputError
 
 Array = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple, cast
 import dartpy
 import numpy as np
 
+from can_dbc.errors import InputError
 from dart_model.effects import effect
 from dart_model.spec import WORLD, BodySpec, FileSkeleton, InlineSkeleton, ModelSpec
-from rig.inputs.errors import InputError
 
 # dartpy ships no types: it is untyped in this package, and nowhere else.
 _dart = cast("Any", dartpy)

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from can_dbc.errors import InputError
 from dart_model.effects import Effect, effect
-from dart_model.plant.mockup import MockUp
+from dart_model.plant.fmu import MockUp
 from dart_model.spec import ModelSpec, StrutSpec
-from rig.inputs.errors import InputError
 
 _SAMPLED_M, _SAMPLED_M_PER_S = 0.5, 3.0
 """How far from the free length, and how fast, effects are sampled for their steepest slope."""

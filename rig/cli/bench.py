@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.output import ConfigFile, console, write_summary
-from rig.cli.watching import progress_line, stoppable
+from rig.cli.progress import progress_line, stoppable
 
 EXAMPLES = (
     "Examples: `rig bench my_bench.yaml --interface socketcan --channel vcan0` · "
@@ -41,10 +41,10 @@ def bench(
     ] = None,
 ) -> None:
     """Run a simulated bench on a bus, in real time."""
-    from rig.bench.config import load_bench_config
-    from rig.io.bus import BusConfig
-    from rig.operation.live import run_bench
-    from rig.operation.setup import load_authentication, load_setup
+    from rig.bus.bus import BusConfig
+    from rig.plan.setup import load_authentication, load_setup
+    from rig.run.live import run_bench
+    from rig.simulated_bench.config import load_bench_config
 
     bench_config = load_bench_config(config)
     bus, authentication = BusConfig(interface, channel, bitrate), None

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from can_dbc.errors import InputError
 from rig.cli.output import (
     FAILED,
     JsonFlag,
@@ -18,12 +19,11 @@ from rig.cli.output import (
     table,
     write_junit,
 )
-from rig.inputs.errors import InputError
 
 if TYPE_CHECKING:
-    from rig.characteristics.command import Characteristics
-    from rig.characteristics.deviations import Naming
-    from rig.characteristics.tolerance import Judged
+    from rig.dyno.characterise import Characteristics
+    from rig.dyno.faults import Naming
+    from rig.dyno.tolerance import Judged
 
 EXAMPLES = (
     "Examples: `rig characterise dyno.csv` · `rig characterise left.csv right.csv --out found` · "
@@ -84,10 +84,10 @@ def characterise_command(
     tolerance the exit code is 1 unless every point of the band is proven to be kept, with a master
     unless the damper is as good as it.
     """
-    from rig.characteristics.command import characterise
-    from rig.characteristics.deviations import named
-    from rig.characteristics.master import master_of
-    from rig.characteristics.tolerance import judged, load_tolerance
+    from rig.dyno.characterise import characterise
+    from rig.dyno.faults import named
+    from rig.dyno.master import master_of
+    from rig.dyno.tolerance import judged, load_tolerance
 
     _refuse(out, junit, is_judged=tolerance is not None or master is not None)
     band = None if tolerance is None else load_tolerance(tolerance)
@@ -132,7 +132,7 @@ def _content(
     band: str | None,
 ) -> dict[str, object]:
     """All of it, for a file."""
-    from rig.characteristics.command import SCHEMA
+    from rig.dyno.characterise import SCHEMA
 
     return {
         "schema": SCHEMA,

@@ -21,7 +21,7 @@ from rig.cli.output import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rig.operation.check import Finding
+    from rig.plan.check import Finding
 
 EXAMPLES = "Examples: `rig check rig.yaml` · `rig check rig.yaml --junit check.xml`"
 
@@ -35,8 +35,8 @@ def check_command(
     junit: JUnitFile = None,
 ) -> None:
     """Say what is wrong before a bench moves: signals, units, rate, bus load, poles."""
-    from rig.operation.check import Severity, check
-    from rig.operation.setup import load_setup
+    from rig.plan.check import Severity, check
+    from rig.plan.setup import load_setup
 
     findings = check(load_setup(config))
     if as_json:
@@ -54,7 +54,7 @@ def check_command(
 
 
 def _print(config: Path, findings: "Sequence[Finding]") -> None:
-    from rig.operation.check import Severity
+    from rig.plan.check import Severity
 
     shown = table("", "What", "Finding", title=f"Check of {config}")
     styles = {Severity.OK: "green", Severity.WARNING: "yellow", Severity.ERROR: "red"}

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from can_dbc.errors import InputError
 from rig.cli.output import JsonFlag, console, print_json, table
-from rig.inputs.errors import InputError
 
 if TYPE_CHECKING:
-    from rig.characteristics.command import Characteristics
-    from rig.characteristics.comparison import Difference, Trend
-    from rig.characteristics.stroke_force import Figure
+    from rig.dyno.characterise import Characteristics
+    from rig.dyno.comparison import Difference, Trend
+    from rig.dyno.stroke_force import Figure
 
 EXAMPLES = (
     "Examples: `rig compare before.csv after.csv` · "
@@ -41,8 +41,8 @@ def compare_command(
 
     With --dose, once for each state: how each figure changes over the dose.
     """
-    from rig.characteristics.command import characterise
-    from rig.characteristics.comparison import compared, over_dose
+    from rig.dyno.characterise import characterise
+    from rig.dyno.comparison import compared, over_dose
 
     if not dose and len(runs) != 2:
         raise InputError(f"{len(runs)} records, expected two, or --dose once for each")
@@ -64,7 +64,7 @@ def compare_command(
 
 
 def _print_unpaired(found: "list[Characteristics]") -> None:
-    from rig.characteristics.comparison import unpaired
+    from rig.dyno.comparison import unpaired
 
     for text in unpaired(found):
         console.print(f"- not compared: {text}", markup=False)

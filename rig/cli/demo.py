@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
+from can_dbc.errors import InputError
 from rig.cli.output import JsonFlag, console, print_json
+from rig.cli.progress import progress_bar, status_line, stoppable
 from rig.cli.results import print_case, print_diagnosis, print_ended
-from rig.cli.watching import progress_bar, status_line, stoppable
-from rig.inputs.errors import InputError
-from rig.inputs.folders import free_folder, refuse_full
+from rig.files.folders import free_folder, refuse_full
 
 STORY = "story"
 

@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from rig.cli.output import JsonFlag, JUnitFile, console, refuse_existing, write_junit
+from rig.cli.progress import progress_bar
 from rig.cli.results import print_diagnosis, verdict
-from rig.cli.watching import progress_bar
 
 EXAMPLES = "Example: `rig diagnose runs/7 --model bench.yaml --held-out runs/8 --out found`"
 
@@ -33,9 +33,9 @@ def diagnose(
 ) -> None:
     """Trace what the model lacks to named effects, correct it, and judge it on other data."""
     from dart_model.spec import load_model, model_file
-    from rig.diagnosis.command import diagnose_runs
+    from rig.diagnosis.files import diagnose_runs
     from rig.diagnosis.outcome import REPORT_FILE, to_json
-    from rig.pages.paper import browser, print_page
+    from rig.pages.pdf import browser, print_page
     from rig.pages.report import write_report
 
     if pdf:

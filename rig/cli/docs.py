@@ -16,7 +16,7 @@ def docs(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write into.")],
 ) -> None:
     """Write the reference: every effect, every key of a configuration, every command."""
-    from rig.pages.reference import write_reference
+    from rig.guide.reference import write_reference
 
     parent: Any = context.parent
     texts = dict(_texts(parent))

@@ -10,8 +10,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from typer.core import TyperGroup
 
+from can_dbc.errors import InputError
 from rig.cli.output import FAILED, OK, JsonFlag, console, print_json, table
-from rig.inputs.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator
@@ -242,7 +242,7 @@ def report_command(
 
 
 def _print(found: "Overview") -> None:
-    from rig.fleet.words import alarms
+    from rig.fleet.sentences import alarms
 
     console.print(found.words, markup=False)
     shown = table("bench", "verdicts")

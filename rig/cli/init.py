@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
+from can_dbc.errors import InputError
 from rig.cli.output import console
-from rig.inputs.errors import InputError
 
 EXAMPLES = "Example: `rig init --dbc my.dbc --out my.yaml`, then `rig check my.yaml`"
 
@@ -20,7 +20,7 @@ def init(
 ) -> None:
     """Propose a configuration from a DBC: height, forces, temperature, and where to publish."""
     from can_dbc.database import load_database
-    from rig.operation.proposal import propose
+    from rig.plan.proposal import propose
 
     text = propose(load_database(dbc))
     if out is None:

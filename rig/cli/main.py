@@ -8,6 +8,7 @@ from typing import Annotated, cast
 import typer
 from rich.console import Console
 
+from can_dbc.errors import InputError
 from rig.cli import (
     bench,
     characterise,
@@ -16,21 +17,19 @@ from rig.cli import (
     demo,
     diagnose,
     docs,
-    exchange,
+    export_import,
     fleet,
     init,
     replay,
     report,
     run,
-    scoreboard,
     sensor,
-    setting,
     timing,
     tune,
     view,
 )
+from rig.cli import set as set_
 from rig.cli.output import OK, WRONG_INPUT
-from rig.inputs.errors import InputError
 
 __all__ = ["app", "main"]
 
@@ -50,7 +49,7 @@ app.add_typer(sensor.app, name=_GROUPS[0])
 app.command("run", epilog=run.EXAMPLES)(run.run)
 app.command("bench", epilog=bench.EXAMPLES)(bench.bench)
 app.command("view", epilog=view.EXAMPLES)(view.view)
-app.command("set", epilog=setting.EXAMPLES)(setting.set_command)
+app.command("set", epilog=set_.EXAMPLES)(set_.set_command)
 app.command("tune", epilog=tune.EXAMPLES)(tune.tune_command)
 app.command("characterise", epilog=characterise.EXAMPLES)(characterise.characterise_command)
 app.command("compare", epilog=compare.EXAMPLES)(compare.compare_command)
@@ -58,11 +57,10 @@ app.command("timing", epilog=timing.EXAMPLES)(timing.timing)
 app.command("replay", epilog=replay.EXAMPLES)(replay.replay_command)
 app.command("diagnose", epilog=diagnose.EXAMPLES)(diagnose.diagnose)
 app.add_typer(fleet.app, name=_GROUPS[1])
-app.command("import", epilog=exchange.IMPORT_EXAMPLES)(exchange.import_command)
-app.command("export", epilog=exchange.EXPORT_EXAMPLES)(exchange.export_command)
+app.command("import", epilog=export_import.IMPORT_EXAMPLES)(export_import.import_command)
+app.command("export", epilog=export_import.EXPORT_EXAMPLES)(export_import.export_command)
 app.command("docs", epilog=docs.EXAMPLES)(docs.docs)
 app.command("report", epilog=report.EXAMPLES)(report.report)
-app.command("scoreboard", epilog=scoreboard.EXAMPLES)(scoreboard.scoreboard)
 
 
 def _show_version(asked: bool) -> None:

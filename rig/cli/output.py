@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from rig.inputs.errors import InputError
+from can_dbc.errors import InputError
 
 OK, FAILED, WRONG_INPUT = 0, 1, 2
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file.")]

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.output import FAILED, JsonFlag, console, print_json, table, write_summary
-from rig.cli.watching import progress_line
+from rig.cli.progress import progress_line
 
 EXAMPLES = "Example: `rig replay rig-demo/run`"
 
@@ -19,8 +19,8 @@ def replay_command(
     as_json: JsonFlag = False,
 ) -> None:
     """Compute a run again from its frames and compare it with its log, bit for bit."""
-    from rig.io.run_log import changed_files
-    from rig.operation.replay import replay
+    from rig.log.reader import changed_files
+    from rig.run.replay import replay
 
     with progress_line(None) as progress:
         result = replay(folder, progress=progress)

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
+from can_dbc.errors import InputError
 from rig.cli.output import console
-from rig.inputs.errors import InputError
 
 EXAMPLES = "Examples: `rig report runs/7` · `rig report runs/7 --out handed_over.html --pdf`"
 
@@ -22,7 +22,7 @@ def report(
     ] = False,
 ) -> None:
     """Write a page about a run: what ran, how well, timing, faults. One file, no network."""
-    from rig.pages.paper import print_page
+    from rig.pages.pdf import print_page
     from rig.pages.run_report import write_run_report
 
     path = out or run / "report.html"

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from dart_model.spec import ModelSpec
     from rig.demo.cases import Case
     from rig.diagnosis.outcome import Diagnosis
-    from rig.operation.logged_run import Ended
+    from rig.run.logged_run import Ended
 
 _OF_TICKS = ("stale", "overruns", "limited", "bus_faulty", "left_out", "device_faulty")
 """Counts of ticks; the others are of frames."""

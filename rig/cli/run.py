@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from can_dbc.errors import InputError
 from rig.cli.output import FAILED, JsonFlag, console
+from rig.cli.progress import status_line, stoppable
 from rig.cli.results import print_ended
 from rig.cli.side_by_side import run_side_by_side
-from rig.cli.watching import status_line, stoppable
-from rig.inputs.errors import InputError
-from rig.inputs.folders import refuse_full
+from rig.files.folders import refuse_full
 
 if TYPE_CHECKING:
-    from rig.operation.logged_run import Ended
-    from rig.operation.setup import Setup
+    from rig.plan.setup import Setup
+    from rig.run.logged_run import Ended
 
 EXAMPLES = (
     "Examples: `rig run rig.yaml` · `rig run rig.yaml --out runs/7 --listen-only` · "
@@ -92,10 +92,10 @@ def _run_one(
     trace: bool,
     as_json: bool,
 ) -> None:
-    from rig.operation.check import errors
-    from rig.operation.live import live
-    from rig.operation.setup import load_setup
-    from rig.operation.trace import Trace
+    from rig.plan.check import errors
+    from rig.plan.setup import load_setup
+    from rig.run.live import live
+    from rig.run.trace import Trace
 
     ready = load_setup(config, model=model, duration_s=duration_s)
     wrong = errors(ready)
@@ -129,7 +129,7 @@ def _run_one(
 
 
 def _refuse_bad_ends(ready: "Setup", ended: "Ended") -> None:
-    from rig.core.contract import Mode
+    from rig.bridge.contract import Mode
 
     said = Console(stderr=True)
     if ended.state.core.mode is Mode.WAITING:

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
+from can_dbc.errors import InputError
 from rig.cli.output import JsonFlag, console, print_json, table
-from rig.cli.watching import progress_bar
-from rig.inputs.errors import InputError
+from rig.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rig.io.bus import BusConfig
-    from rig.io.canopen_network import CanOpenNetwork
-    from rig.sensors.described import Device
+    from rig.bus.bus import BusConfig
+    from rig.bus.canopen_network import CanOpenNetwork
+    from rig.sensors.canopen_description import Device
     from rig.sensors.proposal import Origin
     from rig.sensors.scan import Found
 
@@ -83,7 +83,7 @@ def scan_command(
     bus is asked for addresses; nothing is changed. On a bus with devices of another kind, whose
     frames may mean something else under these ids, use --listen-only.
     """
-    from rig.io.bus import BusConfig
+    from rig.bus.bus import BusConfig
 
     if out is not None and out.exists():
         raise InputError(f"--out {out}: exists, expected a new folder")
@@ -153,8 +153,8 @@ def set_command(
     What is changed holds until the device is switched off: nothing is stored in it. A device that
     is put back is left pre-operational, as it is after it was switched on.
     """
-    from rig.io.bus import BusConfig
-    from rig.sensors.setting import Setting, restore, set_to_work
+    from rig.bus.bus import BusConfig
+    from rig.sensors.set_up import Setting, restore, set_to_work
     from rig.sensors.undo import begin_undo, read_undo, write_undo
 
     config = BusConfig(interface, channel, bitrate)
@@ -195,7 +195,7 @@ def set_command(
 
 @contextlib.contextmanager
 def _network(config: "BusConfig", *, listen_only: bool = False) -> Generator["CanOpenNetwork"]:
-    from rig.io.canopen_network import CanOpenNetwork
+    from rig.bus.canopen_network import CanOpenNetwork
 
     network = CanOpenNetwork(config, listen_only=listen_only)
     try:
@@ -238,7 +238,7 @@ def _origin(
 
 
 def _from_files(given: "Sequence[str]") -> "Found":
-    from rig.sensors.described import described
+    from rig.sensors.canopen_description import described
     from rig.sensors.eds import EdsObjects
     from rig.sensors.scan import Found
 

@@ -14,9 +14,9 @@ from typing import Any
 
 from rich.markup import escape
 
+from can_dbc.errors import InputError
 from rig.cli.output import FAILED, OK, WRONG_INPUT, console, print_json, table
-from rig.inputs.errors import InputError
-from rig.inputs.folders import refuse_full
+from rig.files.folders import refuse_full
 
 _PR_SET_PDEATHSIG = 1
 """Of linux/prctl.h: which signal a process is sent when its parent dies; see prctl(2)."""

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from can_dbc.errors import InputError
 from rig.cli.output import ConfigFile, JsonFlag, console, print_json, table
-from rig.cli.watching import progress_bar
-from rig.inputs.errors import InputError
+from rig.cli.progress import progress_bar
 
 if TYPE_CHECKING:
-    from rig.tuning.command import Stated, TunedStrut
+    from rig.tuning.tune import Stated, TunedStrut
 
 EXAMPLES = (
     "Examples: `rig tune rig.yaml --run runs/7 --out tuned.yaml` · "
@@ -73,10 +73,10 @@ def tune_command(
     as_json: JsonFlag = False,
 ) -> None:
     """Find the gains of the observers with the smallest expected error of the force."""
-    from rig.operation.setup import load_setup
     from rig.pages.tuning_picture import draw_tuning
-    from rig.tuning.command import tune, write_config
+    from rig.plan.setup import load_setup
     from rig.tuning.gains import KINDS, Aim
+    from rig.tuning.tune import tune, write_config
 
     if observer not in KINDS:
         raise InputError(f"--observer {observer!r}: expected one of {', '.join(KINDS)}")
@@ -103,7 +103,7 @@ def tune_command(
 
 
 def _source(run: Path | None, stated: tuple[float | None, ...]) -> "Path | Stated":
-    from rig.tuning.command import Stated
+    from rig.tuning.tune import Stated
 
     residual_n, up_to_hz, noise_std_m = stated
     if run is not None:
@@ -116,7 +116,7 @@ def _source(run: Path | None, stated: tuple[float | None, ...]) -> "Path | State
 
 
 def _as_dict(strut: "TunedStrut") -> dict[str, object]:
-    from rig.tuning.command import plain
+    from rig.tuning.tune import plain
 
     chosen, published = strut.found, strut.paper
     return {
@@ -141,8 +141,8 @@ def _as_dict(strut: "TunedStrut") -> dict[str, object]:
 
 
 def _print(strut: "TunedStrut", damping_ratio: float, least_margin: float) -> None:
-    from rig.tuning.command import plain
     from rig.tuning.gains import PAPER_HZ
+    from rig.tuning.tune import plain
 
     chosen, published = strut.found, strut.paper
     shown = table(

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
+from can_dbc.errors import InputError
 from rig.cli.output import console
-from rig.cli.watching import stoppable
-from rig.inputs.errors import InputError
+from rig.cli.progress import stoppable
 
 EXAMPLES = (
     "Examples: `rig view runs/7` while it runs · `rig view before after --model corrected.yaml`"

@@ -11,17 +11,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from rig.bench.config import load_bench_config
-from rig.bench.schema import BenchConfig
-from rig.bench.trajectory import simulate
-from rig.core.observers.pi import PiObserver
-from rig.io.run_log import read_run
-from rig.operation.config import CONFIGS
-from rig.operation.live import with_bench
-from rig.operation.logged_run import Ended
-from rig.operation.loop import Watch
-from rig.operation.replay import replay
-from rig.operation.setup import Setup, load_setup
+from rig.log.reader import read_run
+from rig.observers.pi import PiObserver
+from rig.plan.config import CONFIGS
+from rig.plan.setup import Setup, load_setup
+from rig.run.live import with_bench
+from rig.run.logged_run import Ended
+from rig.run.loop import Watch
+from rig.run.replay import replay
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.schema import BenchConfig
+from rig.simulated_bench.trajectory import simulate
 
 SETTLED_NS = 500_000_000
 """Figures are taken after this time."""

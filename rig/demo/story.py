@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 
 from dart_model.spec import load_model
-from rig.bench.config import load_bench_config
-from rig.bench.schema import BenchConfig, Effect
 from rig.demo.cases import SETTLED_NS
-from rig.diagnosis.command import diagnose_runs
+from rig.diagnosis.files import diagnose_runs
 from rig.diagnosis.outcome import CORRECTED_FILE, REPORT_FILE, Diagnosis, to_json
-from rig.io.run_log import read_run
-from rig.operation.config import CONFIGS
-from rig.operation.live import with_bench
-from rig.operation.logged_run import Ended
-from rig.operation.loop import Watch
-from rig.operation.setup import Setup, load_setup
+from rig.log.reader import read_run
 from rig.pages.report import write_report
+from rig.plan.config import CONFIGS
+from rig.plan.setup import Setup, load_setup
+from rig.run.live import with_bench
+from rig.run.logged_run import Ended
+from rig.run.loop import Watch
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.schema import BenchConfig, Effect
 
 _STRUT = "strut"
 _RANGES: Mapping[str, tuple[str, Mapping[str, tuple[float, float]]]] = {

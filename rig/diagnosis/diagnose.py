@@ -17,9 +17,9 @@ from rig.diagnosis.problem.build import (
     with_noise,
     with_tones,
 )
-from rig.diagnosis.problem.contract import Parts, Problem, existing_values, free_beside, nominal
 from rig.diagnosis.problem.free_run import FreeRun
-from rig.diagnosis.problem.prescribed import Prescribed
+from rig.diagnosis.problem.prescribed_motion import Prescribed
+from rig.diagnosis.problem.problem import Parts, Problem, existing_values, free_beside, nominal
 from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.recording import Recording, RecordingError
 from rig.diagnosis.search.conclude import Found, conclude

@@ -13,15 +13,15 @@ from rig.diagnosis.numerics.smoother import estimate_noise, smooth
 from rig.diagnosis.on_dart import dart_heights
 from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem import track
-from rig.diagnosis.problem.contract import (
+from rig.diagnosis.problem.free_run import FreeRun, Trajectory, track_of
+from rig.diagnosis.problem.prescribed_motion import Drive, Prescribed
+from rig.diagnosis.problem.problem import (
     Candidate,
     Parts,
     Problem,
     existing_values,
     nominal,
 )
-from rig.diagnosis.problem.free_run import FreeRun, Trajectory, track_of
-from rig.diagnosis.problem.prescribed import Drive, Prescribed
 from rig.diagnosis.recording import Recording, RecordingError
 from rig.diagnosis.search.fit import Fit, fit
 

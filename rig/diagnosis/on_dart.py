@@ -7,9 +7,9 @@ from scipy.interpolate import CubicSpline
 from dart_model.effects import effect
 from dart_model.plant import DartPlant
 from dart_model.spec import EffectSpec, ModelSpec
-from rig.diagnosis.problem.contract import Candidate, Parts, Problem, slots_of
 from rig.diagnosis.problem.free_run import FreeRun, Run
 from rig.diagnosis.problem.linear_part import corrected_spec, rounded
+from rig.diagnosis.problem.problem import Candidate, Parts, Problem, slots_of
 
 Array = NDArray[np.float64]
 

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from can_dbc.addressing import Directory
 from can_dbc.codec import decode_log
 from can_dbc.database import Message
+from can_dbc.errors import InputError
 from can_dbc.protection import check_crc_log
-from rig.core.quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, TEMPERATURE, Quantity
-from rig.inputs.errors import InputError
-from rig.io.run_log import RunFolder
-from rig.operation.config import SignalName
-from rig.operation.replay import setup_of_run
-from rig.operation.setup import Setup
+from rig.log.reader import RunFolder
+from rig.plan.config import SignalName
+from rig.plan.quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, TEMPERATURE, Quantity
+from rig.plan.setup import Setup
+from rig.run.replay import setup_of_run
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -24,16 +24,16 @@ from rig.diagnosis.outcome import (
     Verdict,
     White,
 )
-from rig.diagnosis.problem.contract import (
+from rig.diagnosis.problem.free_run import FreeRun
+from rig.diagnosis.problem.linear_part import EFFECTS, PARAMETERS
+from rig.diagnosis.problem.prescribed_motion import Prescribed
+from rig.diagnosis.problem.problem import (
     LinearParameter,
     Problem,
     ResidualForces,
     middle_m,
     slots_of,
 )
-from rig.diagnosis.problem.free_run import FreeRun
-from rig.diagnosis.problem.linear_part import EFFECTS, PARAMETERS
-from rig.diagnosis.problem.prescribed import Prescribed
 from rig.diagnosis.problem.track import forces_along
 from rig.diagnosis.recording import Recording
 from rig.diagnosis.search.conclude import Found

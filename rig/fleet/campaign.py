@@ -13,12 +13,12 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import NamedTuple
 
+from can_dbc.errors import InputError
+from can_dbc.yaml_file import read_text
 from dart_model.spec import files_of, load_model
 from rig.fleet import store
 from rig.fleet.one_run import Row, Task, evaluated, identity_of, lost
 from rig.fleet.sources import Source
-from rig.inputs.errors import InputError
-from rig.inputs.yaml_file import read_text
 
 PART_ROWS = 500
 """Rows that are held until they are written, at most."""

@@ -17,17 +17,17 @@ from typing import Any
 
 from fsspec.core import url_to_fs
 
+from can_dbc.errors import InputError
+from can_dbc.yaml_file import parse_mapping, read_text
 from dart_model.effects import effect
 from dart_model.spec import ModelSpec, parse_model
-from rig.characteristics.command import characterise
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.outcome import Estimate, FoundEffect
 from rig.diagnosis.recording import Recording, read_recording
 from rig.diagnosis.refit import refitted
+from rig.dyno.characterise import characterise
 from rig.fleet.sources import Source, shown
-from rig.inputs.errors import InputError
-from rig.inputs.yaml_file import parse_mapping, read_text
-from rig.io.run_log import RUN_FILE
+from rig.log.reader import RUN_FILE
 
 _PIECE = 1 << 20
 

@@ -12,8 +12,8 @@ from typing import Any
 
 from fsspec.core import url_to_fs
 
-from rig.inputs.errors import InputError
-from rig.io.run_log import RUN_FILE
+from can_dbc.errors import InputError
+from rig.log.reader import RUN_FILE
 
 FIELDS = ("bench", "damper", "date")
 """What a pattern may name."""

@@ -23,8 +23,8 @@ from urllib.parse import quote
 import pyarrow as pa
 from pyarrow import dataset, parquet
 
+from can_dbc.errors import InputError
 from rig.fleet.one_run import Row, Value
-from rig.inputs.errors import InputError
 
 _duckdb: Any = None
 with contextlib.suppress(ModuleNotFoundError):  # It only reads; the store is written without it.

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
+from can_dbc.errors import InputError
 from rig.fmu.source import compiled_files
-from rig.inputs.errors import InputError
 
 
 class Target(NamedTuple):

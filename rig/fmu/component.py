@@ -12,11 +12,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from can_dbc.errors import InputError
 from dart_model.effects import Effect, effect
 from dart_model.plant import DartPlant
 from dart_model.spec import EffectSpec, ModelSpec, StrutSpec
 from rig.fmu.law_in_c import ARGUMENTS, InC, in_c
-from rig.inputs.errors import InputError
 
 Kind = Literal["time", "input", "parameter", "fixed", "state", "rate", "output", "indicator"]
 KINDS: tuple[Kind, ...] = (
@@ -36,7 +36,7 @@ AMBIENT_C = 20.0
 
 _STRUT_STEP_S = 0.5e-3
 """Longest step of an element's internal states where nobody has said how fast the motion is: that
-of a strut whose motion is prescribed (`dart_model.plant.prescribed`)."""
+of a strut whose motion is prescribed (`dart_model.plant.prescribed_strut`)."""
 
 _SAME = 1e-9
 """Share by which mass or weight may differ between configurations of one guided degree."""

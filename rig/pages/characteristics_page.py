@@ -10,11 +10,11 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure as Drawing
 
-from rig.characteristics.command import AtRest, Characteristics
-from rig.characteristics.deviations import Naming
-from rig.characteristics.figures import SIDES, Step
-from rig.characteristics.stroke_force import ANGLES, Figure
-from rig.characteristics.tolerance import Judged
+from rig.dyno.characterise import AtRest, Characteristics
+from rig.dyno.faults import Naming
+from rig.dyno.figures import SIDES, Step
+from rig.dyno.stroke_force import ANGLES, Figure
+from rig.dyno.tolerance import Judged
 from rig.pages.report.page import render, write_page
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers and in grey print.

@@ -11,7 +11,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure as Drawing
 
 from rig.fleet.overview import Overview, Series
-from rig.fleet.words import alarms, name_of
+from rig.fleet.sentences import alarms, name_of
 from rig.pages.report.page import render, write_page
 
 _MOST = 12

@@ -6,13 +6,13 @@ from typing import Any, cast
 
 import numpy as np
 
-from rig.inputs.errors import InputError
-from rig.io.run_follower import RunFollower, Window
-from rig.io.run_log import read_header
-from rig.operation.changes import logged_changes
-from rig.operation.timing import read_histograms
+from can_dbc.errors import InputError
+from rig.log.follower import RunFollower, Window
+from rig.log.reader import read_header
 from rig.pages.report.figures import Curve, Panel, Plot, plot
 from rig.pages.report.page import render, write_page
+from rig.run.changes import logged_changes
+from rig.run.timing import read_histograms
 
 _POINTS = 1500
 """Buckets of a curve: two for each pixel of the page's width are not seen."""

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from rig.operation.logged_run import Ended
+from rig.run.logged_run import Ended
 
 TIMING_PICTURE = "timing.png"
 """Its name in the folder of a run."""

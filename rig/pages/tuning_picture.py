@@ -8,9 +8,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from rig.inputs.errors import InputError
-from rig.tuning.command import TunedStrut
+from can_dbc.errors import InputError
 from rig.tuning.gains import PAPER_HZ
+from rig.tuning.tune import TunedStrut
 
 _TOTAL, _NOISE, _LAG, _PAPER = "#1b1f24", "#0072b2", "#d55e00", "#a3458f"
 

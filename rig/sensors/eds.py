@@ -10,8 +10,8 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from rig.inputs.errors import InputError
-from rig.io.canopen_network import package
+from can_dbc.errors import InputError
+from rig.bus.canopen_network import package
 
 SIZE_MAX_BYTES = 4 * 1024 * 1024
 _SIGNED = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)

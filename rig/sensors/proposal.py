@@ -10,10 +10,10 @@ from cantools.database.can import Database, Message, Node, Signal
 from cantools.database.conversion import BaseConversion
 
 from can_dbc.database import DEFAULT_DATABASE
+from can_dbc.errors import InputError
 from can_dbc.units import Dimension, si_conversion
-from rig.inputs.errors import InputError
-from rig.io.bus import BusConfig
-from rig.sensors.described import Device, Mapped, Pdo
+from rig.bus.bus import BusConfig
+from rig.sensors.canopen_description import Device, Mapped, Pdo
 from rig.sensors.j1939 import LARGEST_VALUE, Claim, Spoken
 
 DBC_NAME, CONFIG_NAME = "sensors.dbc", "rig.yaml"

@@ -9,9 +9,9 @@ from itertools import pairwise
 from statistics import median
 
 from can_dbc.frame import Frame
-from rig.io.bus import BusError
-from rig.io.canopen_network import CanOpenNetwork
-from rig.sensors.described import Device, described
+from rig.bus.bus import BusError
+from rig.bus.canopen_network import CanOpenNetwork
+from rig.sensors.canopen_description import Device, described
 from rig.sensors.j1939 import Claim, Spoken, claims, spoken
 
 _ANSWERS, _HEARTBEATS = range(0x581, 0x600), range(0x701, 0x780)

@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from rig.inputs.errors import InputError
-from rig.inputs.yaml_file import load_validated
-from rig.sensors.setting import SETTABLE, Changed
+from can_dbc.errors import InputError
+from can_dbc.yaml_file import load_validated
+from rig.sensors.set_up import SETTABLE, Changed
 
 _SCHEMA = 1
 _HEX = r"^([0-9a-f]{2}){1,8}$"

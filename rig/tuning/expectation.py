@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.core.contract import Mode
+from can_dbc.errors import InputError
+from rig.bridge.contract import Mode
 from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise, smooth
-from rig.inputs.errors import InputError
-from rig.io.run_log import read_run
+from rig.log.reader import read_run
 
 Array = NDArray[np.float64]
 

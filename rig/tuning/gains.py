@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from rig.core.closed_loop import LinearLoop, Loop, Rhythm
-from rig.core.contract import Observer, Plant
-from rig.core.observers.kalman import KalmanObserver
-from rig.core.observers.model_error import ErrorFilter
-from rig.core.observers.pi import PiObserver
-from rig.core.stability import Pole, poles_of
-from rig.core.step import Answer
+from rig.bridge.contract import Observer, Plant
+from rig.bridge.free_model import Answer
+from rig.closed_loop.loop import LinearLoop, Loop, Rhythm
+from rig.closed_loop.poles import Pole, poles_of
+from rig.observers.error_filter import ErrorFilter
+from rig.observers.kalman import KalmanObserver
+from rig.observers.pi import PiObserver
 from rig.tuning.expectation import Expectation
 
 MARGINS = {"kalman": 1.1, "pi": 2.0}

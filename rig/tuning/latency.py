@@ -20,9 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.core.observers.kalman import KalmanObserver
-from rig.operation.replay import replay
-from rig.operation.setup import Setup
+from rig.observers.kalman import KalmanObserver
+from rig.plan.setup import Setup
+from rig.run.replay import replay
 from rig.tuning.expectation import followed, residual
 
 Array = NDArray[np.float64]

@@ -18,13 +18,13 @@ from can_dbc.codec import compile_encoder
 from can_dbc.frame import Frame
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
-from rig.core.bridge import Bridge, BridgeState
-from rig.core.contract import Mode
-from rig.operation import assembly
-from rig.operation.setup import load_setup
+from rig.bridge.bridge import Bridge, BridgeState
+from rig.bridge.contract import Mode
+from rig.plan import assembly
+from rig.plan.setup import load_setup
 from tests.bench.test_tick_speed import TICKS, Subject, compared
-from tests.core.cores import MS
-from tests.core.full_car import FullCar
+from tests.bridge.cores import MS
+from tests.bridge.full_car import FullCar
 
 pytestmark = pytest.mark.long
 

@@ -21,18 +21,18 @@ import pytest
 from can_dbc.frame import Frame
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model
-from rig.core.bridge import Bridge, BridgeState
-from rig.core.contract import Innovation, Measurement, Start, StepInput
-from rig.core.observers.pi import PiState
-from rig.core.step import RigCore, RigState
-from rig.core.supervisor import Supervision
-from rig.io.bus import Bus, BusConfig
-from rig.operation.assembly import build_bridge
-from rig.operation.config import CONFIGS
-from rig.operation.replay import replay
-from rig.operation.setup import load_setup
-from tests.core.cores import GAINS, core, measured
-from tests.loop.listed import MS, ListPort, bench_frames, live
+from rig.bridge.bridge import Bridge, BridgeState
+from rig.bridge.contract import Innovation, Measurement, Start, StepInput
+from rig.bridge.free_model import RigCore, RigState
+from rig.bridge.supervisor import Supervision
+from rig.bus.bus import Bus, BusConfig
+from rig.observers.pi import PiState
+from rig.plan.assembly import build_bridge
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from rig.run.replay import replay
+from tests.bridge.cores import GAINS, core, measured
+from tests.run.listed import MS, ListPort, bench_frames, live
 
 TICKS = 300
 ROUNDS = 50

@@ -4,9 +4,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from can_dbc.bulk_check import in_sequence
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.protection import INITIAL, Verdict, compile_checker, compile_protector
-from can_dbc.protection_log import in_sequence
 
 MESSAGE = load_database(DEFAULT_DATABASE).message("BENCH_MEASUREMENT")
 

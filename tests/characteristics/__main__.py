@@ -5,7 +5,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from rig.characteristics.command import of_arrays
+from rig.dyno.characterise import of_arrays
 from tests.characteristics.dynos import drawn, found
 
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rig.characteristics.command import of_arrays
-from rig.characteristics.deviations import named
-from rig.characteristics.master import master_of
+from rig.dyno.characterise import of_arrays
+from rig.dyno.faults import named
+from rig.dyno.master import master_of
 
 RATE_HZ, AMPLITUDE_M, MIDDLE_M = 250.0, 0.025, 0.35
 STEPS = ((0.004, 2.6), (0.05, 6.0), (0.1, 6.0), (0.2, 6.0), (0.4, 8.0), (0.8, 10.0))

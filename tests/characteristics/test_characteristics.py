@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from rig.characteristics.command import characterise, of_arrays
-from rig.characteristics.strokes import blocks_of, holds_of, strokes_of
+from can_dbc.errors import InputError
 from rig.cli.main import app
-from rig.inputs.errors import InputError
+from rig.dyno.characterise import characterise, of_arrays
+from rig.dyno.strokes import blocks_of, holds_of, strokes_of
 from tests.characteristics.__main__ import coverage, study
 from tests.characteristics.dynos import Dyno, drawn
 

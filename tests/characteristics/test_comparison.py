@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from rig.characteristics.command import of_arrays
-from rig.characteristics.comparison import compared, over_dose
-from rig.characteristics.tolerance import judged, load_tolerance
+from can_dbc.errors import InputError
 from rig.cli.main import app
-from rig.inputs.errors import InputError
+from rig.dyno.characterise import of_arrays
+from rig.dyno.comparison import compared, over_dose
+from rig.dyno.tolerance import judged, load_tolerance
 from tests.characteristics.test_characteristics import written
 
 HEADER = "velocity_m_per_s,compression_low_n,compression_high_n,rebound_low_n,rebound_high_n"

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from rig.characteristics.command import of_arrays
-from rig.characteristics.deviations import named
-from rig.characteristics.master import cycle_of, master_of, with_compliance, with_play
+from can_dbc.errors import InputError
 from rig.cli.main import app
-from rig.inputs.errors import InputError
+from rig.dyno.characterise import of_arrays
+from rig.dyno.faults import named
+from rig.dyno.master import cycle_of, master_of, with_compliance, with_play
 from tests.characteristics.population import (
     FAULTS,
     SCATTER,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rig.cli.main import main
-from rig.operation.config import CONFIGS
+from rig.plan.config import CONFIGS
 
 EXAMPLE = CONFIGS / "reference.yaml"
 

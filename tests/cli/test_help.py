@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from rig.cli.main import app
 from rig.demo.cases import CASES
-from rig.exchange.exported import FORMATS
+from rig.formats.export import FORMATS
 
 SLOW = ("asammdf", "can", "dartpy", "matplotlib", "numba", "numpy", "pyarrow", "scipy")
 """What takes long to import; together seconds."""

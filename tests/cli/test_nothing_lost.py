@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from rig.cli.main import main
-from rig.exchange import exported
-from rig.io.run_log import changed_files, read_run
-from rig.operation.config import CONFIGS
-from rig.operation.setup import load_setup
-from tests.loop.listed import ListPort, bench_frames, live
+from rig.formats import export as exported
+from rig.log.reader import changed_files, read_run
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from tests.run.listed import ListPort, bench_frames, live
 
 
 def rig(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:

@@ -9,7 +9,7 @@ import time
 import pytest
 import yaml
 
-from rig.operation.config import CONFIGS
+from rig.plan.config import CONFIGS
 
 
 @pytest.fixture

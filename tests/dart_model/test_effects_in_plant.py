@@ -4,10 +4,10 @@ import math
 
 import pytest
 
+from can_dbc.errors import InputError
 from dart_model.effects import CATALOGUE, Effect
 from dart_model.plant import LONGEST_STEP_S, DartPlant, PlantState
 from dart_model.spec import MODELS, EffectSpec, ModelSpec, load_model, parse_model
-from rig.inputs.errors import InputError
 
 AMBIENT_C = 20.0
 SEED = load_model(MODELS / "reference.yaml")

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
+from can_dbc.errors import InputError
 from dart_model.plant import DartPlant, PlantState
 from dart_model.spec import MODELS, ModelSpec, load_model, parse_model
-from rig.inputs.errors import InputError
 
 GRAVITY = 9.81
 AMBIENT_C = 20.0

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from can_dbc.errors import InputError
 from dart_model.plant import DartPlant
 from dart_model.spec import ModelSpec, load_model
-from rig.inputs.errors import InputError
 
 INERTIA = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
 

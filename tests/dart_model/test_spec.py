@@ -10,6 +10,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from can_dbc.errors import InputError
+from can_dbc.yaml_file import parse_mapping, read_text
 from dart_model.effects import CATALOGUE
 from dart_model.spec import (
     MODELS,
@@ -24,8 +26,6 @@ from dart_model.spec import (
     load_model,
     parse_model,
 )
-from rig.inputs.errors import InputError
-from rig.inputs.yaml_file import parse_mapping, read_text
 
 TEXT = """
 name: reference

@@ -8,7 +8,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from dart_model.effects import Motion
 from rig.diagnosis.problem.build import build, part_of, with_tones
-from rig.diagnosis.problem.contract import Parts, nominal
+from rig.diagnosis.problem.problem import Parts, nominal
 from rig.diagnosis.problem.track import most_thinned, pieces
 from rig.diagnosis.search.fit import fit
 from tests.diagnosis import little_bench, little_dyno

@@ -13,9 +13,9 @@ from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.problem.build import build
 from rig.diagnosis.recording import Recording, RecordingError, read_csv
 from rig.diagnosis.search.criteria import CRITERIA
-from rig.exchange.foreign_table import import_table
-from rig.exchange.mapping import load_mapping
-from rig.operation.config import CONFIGS
+from rig.formats.foreign_table import import_table
+from rig.formats.mapping import load_mapping
+from rig.plan.config import CONFIGS
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis import little_dyno as dyno
 from tests.diagnosis.answers import is_at_the_floor

@@ -6,11 +6,11 @@ import pytest
 from dart_model.effects import effect
 from rig.diagnosis.diagnose import first_fits
 from rig.diagnosis.problem.build import build
-from rig.diagnosis.problem.contract import nominal
+from rig.diagnosis.problem.problem import nominal
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.fit import law_values, parts_for
 from rig.diagnosis.search.pool import FULL, Pool
-from rig.diagnosis.search.score import changes
+from rig.diagnosis.search.score_test import changes
 from tests.diagnosis import little_bench, little_dyno
 from tests.diagnosis.test_planted_effects import FrictionAndHardening
 from tests.diagnosis.test_prescribed import Orifice

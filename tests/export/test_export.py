@@ -9,15 +9,15 @@ import pyarrow.parquet
 import pytest
 from msgspec.structs import astuple
 
+from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.bench.config import load_bench_config
-from rig.exchange.exported import FORMATS, export_run, import_run
-from rig.inputs.errors import InputError
-from rig.io.run_log import parse_frame, read_run
-from rig.operation.config import CONFIGS
-from rig.operation.live import with_bench
-from rig.operation.replay import replay
-from rig.operation.setup import load_setup
+from rig.formats.export import FORMATS, export_run, import_run
+from rig.log.reader import parse_frame, read_run
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from rig.run.live import with_bench
+from rig.run.replay import replay
+from rig.simulated_bench.config import load_bench_config
 
 
 @pytest.fixture(scope="module")

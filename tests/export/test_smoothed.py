@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 import yaml
 
-from rig.bench.config import load_bench_config
-from rig.bench.trajectory import simulate
+from can_dbc.errors import InputError
+from rig.bridge.contract import Mode
 from rig.cli.main import main
-from rig.core.contract import Mode
-from rig.exchange import smoothed
-from rig.exchange.smoothed import read_smoothed
-from rig.inputs.errors import InputError
-from rig.io.run_log import read_run
-from rig.operation.config import CONFIGS
-from rig.operation.live import with_bench
-from rig.operation.setup import load_setup
-from tests.core.cores import MS
-from tests.core.full_car import FullCar
+from rig.formats import smoothed
+from rig.formats.smoothed import read_smoothed
+from rig.log.reader import read_run
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from rig.run.live import with_bench
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.trajectory import simulate
+from tests.bridge.cores import MS
+from tests.bridge.full_car import FullCar
 
 NOISE_M, DURATION_S, RATE_HZ = 20e-6, 6.0, 1000
 KALMAN = {"kind": "kalman", "filter": {"bandwidth_hz": 16.0, "noise_std_m": 2e-5}}

@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from rig.bench.config import load_bench_config
-from rig.core.contract import Mode
-from rig.core.messages import Conditions
-from rig.io.run_log import read_run
-from rig.io.whole_file import WholeFile
-from rig.operation.config import CONFIGS
-from rig.operation.live import with_bench
-from rig.operation.replay import replay
-from rig.operation.setup import load_setup
+from rig.bridge.contract import Mode
+from rig.bridge.messages import Conditions
+from rig.log.reader import read_run
+from rig.log.whole_file import WholeFile
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from rig.run.live import with_bench
+from rig.run.replay import replay
+from rig.simulated_bench.config import load_bench_config
 from tests.faults.trial import MS, Trial
 
 

@@ -4,12 +4,12 @@ import json
 
 import pytest
 
+from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.core.contract import Mode
-from rig.core.devices import Device, after_alarm, after_frame, trouble, well
-from rig.inputs.errors import InputError
-from rig.operation.assembly import build_bridge
-from rig.operation.setup import load_setup
+from rig.bridge.contract import Mode
+from rig.bridge.devices import Device, after_alarm, after_frame, trouble, well
+from rig.plan.assembly import build_bridge
+from rig.plan.setup import load_setup
 from tests.faults.trial import BEGIN_NS, MEASUREMENT, MS, Trial, after, first_ms
 
 NODE = 5

@@ -8,8 +8,8 @@ from msgspec.structs import replace
 from can_dbc.codec import compile_decoder
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
-from rig.core.bridge import RIVAL_FRAMES
-from rig.core.contract import Mode
+from rig.bridge.bridge import RIVAL_FRAMES
+from rig.bridge.contract import Mode
 from tests.faults.trial import (
     BEGIN_NS,
     MEASUREMENT,

@@ -10,18 +10,17 @@ from math import isfinite, sin
 import pytest
 import yaml
 
-import rig.io.run_log
-import rig.operation.setup
-from can_dbc.errors import DatabaseError
-from rig.bench.config import load_bench_config
-from rig.bench.schema import BenchConfigError
+import rig.log.reader
+import rig.plan.setup
+from can_dbc.errors import DatabaseError, InputError
 from rig.diagnosis.recording import RecordingError, read_csv
-from rig.exchange.mapping import load_mapping
-from rig.inputs.errors import InputError
-from rig.io.run_log import DBC_FILE, FRAMES_FILE, MODEL_FILE, RUN_FILE, STEPS_FILE
-from rig.operation.config import CONFIGS
-from rig.operation.replay import replay
-from rig.operation.setup import load_setup
+from rig.formats.mapping import load_mapping
+from rig.log.reader import DBC_FILE, FRAMES_FILE, MODEL_FILE, RUN_FILE, STEPS_FILE
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from rig.run.replay import replay
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.schema import BenchConfigError
 from tests.faults.test_machine import lockstep
 
 REFUSED = (InputError, DatabaseError, BenchConfigError, RecordingError)
@@ -108,11 +107,11 @@ def run(tmp_path_factory):
 def known(monkeypatch):
     """Reads what stays the same once."""
     for module, name in (
-        (rig.operation.setup, "load_database"),
-        (rig.operation.setup, "load_model"),
+        (rig.plan.setup, "load_database"),
+        (rig.plan.setup, "load_model"),
     ):
         monkeypatch.setattr(module, name, once_for_each_content(getattr(module, name)))
-    parse, texts = rig.io.run_log.parse_mapping, {}
+    parse, texts = rig.log.reader.parse_mapping, {}
 
     def parse_once(text, source):
         if text not in texts:
@@ -120,7 +119,7 @@ def known(monkeypatch):
             texts[text] = parse(text, source)
         return texts[text]
 
-    monkeypatch.setattr(rig.io.run_log, "parse_mapping", parse_once)
+    monkeypatch.setattr(rig.log.reader, "parse_mapping", parse_once)
 
 
 def replay_is_sound(folder):

@@ -13,20 +13,20 @@ import yaml
 from msgspec.structs import replace
 
 from can_dbc.frame import Frame
-from rig.bench.config import load_bench_config
-from rig.core.contract import Mode
-from rig.core.messages import Conditions
-from rig.io.bus import BusError
-from rig.io.link import Link
-from rig.io.run_log import read_run
-from rig.io.steps import LOG_FAULT
-from rig.io.whole_file import WholeFile
-from rig.operation.config import CONFIGS
-from rig.operation.live import with_bench
-from rig.operation.replay import replay
-from rig.operation.setup import load_setup
+from rig.bridge.contract import Mode
+from rig.bridge.messages import Conditions
+from rig.bus.bus import BusError
+from rig.bus.link import Link
+from rig.log.reader import read_run
+from rig.log.steps import LOG_FAULT
+from rig.log.whole_file import WholeFile
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from rig.run.live import with_bench
+from rig.run.replay import replay
+from rig.simulated_bench.config import load_bench_config
+from tests.bus_and_log.at_once import AtOnce
 from tests.faults.trial import BEGIN_NS, MS, Trial, first_ms, force_error_n
-from tests.io.at_once import AtOnce
 
 BUS_OFF = Frame(0, 0x040, bytes(8), is_error=True)
 RESTARTED = Frame(0, 0x100, bytes(8), is_error=True)

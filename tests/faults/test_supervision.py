@@ -4,14 +4,14 @@ import pytest
 from msgspec.structs import replace
 
 from can_dbc.codec import compile_decoder
+from can_dbc.errors import InputError
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
-from rig.core.contract import Measurement, Mode
-from rig.core.messages import Conditions
-from rig.core.supervisor import TRANSITIONS, Action, Event, Limit, Watched, judged
-from rig.inputs.errors import InputError
-from rig.inputs.yaml_file import load_validated
-from rig.operation.config import CONFIGS, LimitConfig, RunConfig
+from can_dbc.yaml_file import load_validated
+from rig.bridge.contract import Measurement, Mode
+from rig.bridge.messages import Conditions
+from rig.bridge.supervisor import TRANSITIONS, Action, Event, Limit, Watched, judged
+from rig.plan.config import CONFIGS, LimitConfig, RunConfig
 from tests.faults.trial import BEGIN_NS, MS, Trial, after, measurements_only
 
 STATUS = 0x300

@@ -6,14 +6,14 @@ from typing import NamedTuple
 import numpy as np
 
 from can_dbc.frame import Frame
-from rig.bench.config import load_bench_config
-from rig.bench.simulated import Bench
-from rig.core.bridge import Bridge, BridgeState, TickResult
-from rig.core.contract import Mode
-from rig.core.messages import Conditions, Counts
-from rig.operation.assembly import build_bridge
-from rig.operation.config import CONFIGS
-from rig.operation.setup import load_setup
+from rig.bridge.bridge import Bridge, BridgeState, TickResult
+from rig.bridge.contract import Mode
+from rig.bridge.messages import Conditions, Counts
+from rig.plan.assembly import build_bridge
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.simulated import Bench
 
 MS = 1_000_000
 BEGIN_NS = 300 * MS

@@ -10,13 +10,13 @@ from pathlib import Path
 import fsspec
 import pytest
 
+from can_dbc.errors import InputError
 from rig.fleet import campaign as campaigns
 from rig.fleet import store
 from rig.fleet.campaign import campaign, model_of
 from rig.fleet.one_run import Row, Task, evaluated
 from rig.fleet.overview import overview
 from rig.fleet.sources import Source, find_sources, shard_of
-from rig.inputs.errors import InputError
 from tests.fleet.population import Piece, write_fleet, write_model, write_run
 
 PATTERN = "{bench}/{date}/{damper}"

@@ -3,10 +3,10 @@
 import psutil
 import pytest
 
+from can_dbc.errors import InputError
 from rig.fleet.campaign import campaign, model_of
 from rig.fleet.executors import dask, processes
 from rig.fleet.sources import find_sources
-from rig.inputs.errors import InputError
 from tests.fleet.cluster import cluster
 from tests.fleet.population import write_fleet, write_model
 from tests.fleet.study import PATTERN, content, scattered

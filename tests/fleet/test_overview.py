@@ -8,7 +8,7 @@ import pytest
 from rig.fleet import store
 from rig.fleet.one_run import Row, Value
 from rig.fleet.overview import date_of, overview
-from rig.fleet.words import alarms
+from rig.fleet.sentences import alarms
 from rig.pages.fleet_page import write_fleet_page
 from tests.fleet.population import FIRST
 

@@ -8,9 +8,9 @@ import pandas as pd
 import pyarrow.dataset as pad
 import pytest
 
+from can_dbc.errors import InputError
 from rig.fleet import store
 from rig.fleet.one_run import Row, Value
-from rig.inputs.errors import InputError
 
 
 def row(number, *, bench="b", date="2026-01-05", error="", values=1):

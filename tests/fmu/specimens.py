@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 from dart_model.effects import CATALOGUE, Effect
-from dart_model.effects.contract import Motion
+from dart_model.effects.law import Motion
 from dart_model.spec import MODELS, EffectSpec, ModelSpec, load_model
 
 FORCE_N = 40.0

@@ -6,23 +6,23 @@ import zipfile
 import numpy as np
 import pytest
 
+from can_dbc.errors import InputError
 from dart_model.plant import DartPlant
+from dart_model.plant.admitted_programs import require_admitted
 from dart_model.spec import MODELS, EffectSpec, load_model
-from rig.bench.config import load_bench_config
-from rig.bench.schema import Effect
 from rig.demo.story import draw_effect, tell
-from rig.diagnosis.command import diagnose_runs
+from rig.diagnosis.files import diagnose_runs
 from rig.fmu.component import bench_component, strut_component
-from rig.fmu.exported import export_fmu
-from rig.fmu.imported import FMU_FILE, MODEL_FILE, import_fmu
-from rig.inputs.errors import InputError
-from rig.inputs.programs import require_admitted
-from rig.io.run_log import read_run
-from rig.operation.check import check
-from rig.operation.config import CONFIGS
-from rig.operation.live import with_bench
-from rig.operation.replay import replay
-from rig.operation.setup import load_setup
+from rig.fmu.export import export_fmu
+from rig.fmu.import_fmu import FMU_FILE, MODEL_FILE, import_fmu
+from rig.log.reader import read_run
+from rig.plan.check import check
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from rig.run.live import with_bench
+from rig.run.replay import replay
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.schema import Effect
 from tests.fmu.driver import written
 from tests.fmu.specimens import with_effects
 

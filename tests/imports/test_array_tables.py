@@ -9,9 +9,9 @@ import numpy as np
 import openpyxl
 import pytest
 
-from rig.exchange.foreign_table import import_table
-from rig.exchange.mapping import load_mapping
-from rig.inputs.errors import InputError
+from can_dbc.errors import InputError
+from rig.formats.foreign_table import import_table
+from rig.formats.mapping import load_mapping
 from tests.faults.test_fuzz_files import mangled
 from tests.imports.test_tables import rows
 
@@ -102,7 +102,7 @@ def test_columns_of_other_lengths_and_texts_are_refused(tmp_path):
 
 
 def test_a_worksheet_that_unpacks_to_more_than_memory_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("rig.exchange.array_tables._MAX_BYTES", 100_000)
+    monkeypatch.setattr("rig.formats.array_tables._MAX_BYTES", 100_000)
     made = io.BytesIO()
     with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("xl/worksheets/sheet1.xml", bytes(1_000_000))

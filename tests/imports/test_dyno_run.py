@@ -6,18 +6,18 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from can_dbc.errors import InputError
 from dart_model.spec import load_model
-from rig.bench.config import load_bench_config
-from rig.bench.trajectory import simulate
 from rig.demo.cases import run_case
-from rig.diagnosis.command import diagnose_runs
+from rig.diagnosis.files import diagnose_runs
 from rig.diagnosis.recording import read_recording
-from rig.inputs.errors import InputError
-from rig.operation.check import check
-from rig.operation.config import CONFIGS
-from rig.operation.live import with_bench
-from rig.operation.replay import replay
-from rig.operation.setup import load_setup
+from rig.plan.check import check
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from rig.run.live import with_bench
+from rig.run.replay import replay
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.trajectory import simulate
 
 DURATION_S = 3.0
 

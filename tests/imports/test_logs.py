@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.bench.config import load_bench_config
-from rig.bench.simulated import Bench
-from rig.exchange.bus_log import import_log
-from rig.exchange.foreign_table import import_table
-from rig.exchange.mapping import load_mapping
-from rig.inputs.errors import InputError
-from rig.io.log_files import read_log
-from rig.io.run_log import read_run
-from rig.operation.config import CONFIGS
-from rig.operation.replay import replay
-from rig.operation.setup import Setup, load_setup
+from rig.bus.log_files import read_log
+from rig.formats.bus_log import import_log
+from rig.formats.foreign_table import import_table
+from rig.formats.mapping import load_mapping
+from rig.log.reader import read_run
+from rig.plan.config import CONFIGS
+from rig.plan.setup import Setup, load_setup
+from rig.run.replay import replay
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.simulated import Bench
 
 EPOCH_S = 1_700_000_000.0
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from can_dbc.errors import InputError
 from rig.cli.main import app
-from rig.exchange.foreign_table import import_table
-from rig.exchange.mapping import load_mapping
-from rig.exchange.mts import mts_columns, mts_mapping
-from rig.inputs.errors import InputError
+from rig.formats.foreign_table import import_table
+from rig.formats.mapping import load_mapping
+from rig.formats.mts import mts_columns, mts_mapping
 from tests.faults.test_fuzz_files import mangled
 from tests.imports.test_tables import rows
 

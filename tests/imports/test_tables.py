@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig.exchange.foreign_table import import_table
-from rig.exchange.mapping import load_mapping
-from rig.inputs.errors import InputError
+from can_dbc.errors import InputError
+from rig.formats.foreign_table import import_table
+from rig.formats.mapping import load_mapping
 
 Written = Callable[[str, str], Path]
 

@@ -17,22 +17,22 @@ import numpy as np
 import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
-from rig.bench.config import load_bench_config
-from rig.bench.simulated import Bench as SimulatedBench
-from rig.bench.trajectory import simulate
-from rig.core.closed_loop import Rhythm
-from rig.core.observers.kalman import KalmanObserver
-from rig.core.observers.model_error import ErrorFilter
-from rig.core.step import strut_answers
+from rig.bridge.free_model import strut_answers
+from rig.closed_loop.loop import Rhythm
 from rig.demo.cases import compared
-from rig.io.run_log import read_run
-from rig.operation import live
-from rig.operation.config import CONFIGS
-from rig.operation.live import with_bench
-from rig.operation.setup import load_setup
-from rig.tuning.command import plain, tune
+from rig.log.reader import read_run
+from rig.observers.error_filter import ErrorFilter
+from rig.observers.kalman import KalmanObserver
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from rig.run import live
+from rig.run.live import with_bench
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.simulated import Bench as SimulatedBench
+from rig.simulated_bench.trajectory import simulate
 from rig.tuning.expectation import Expectation, followed, residual, spectrum
 from rig.tuning.gains import Aim, Bench, expected, gain_margin, paper, tuned
+from rig.tuning.tune import plain, tune
 from tests.observers.benches import STRUT, Truth, follow, judged
 
 MASSES_KG = (1.0, 10.0, 100.0, 1000.0)

@@ -6,14 +6,14 @@ import yaml
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, parse_model
-from rig.bench.schema import BenchConfig
-from rig.bench.trajectory import simulate
-from rig.core.contract import Measurement, Mode, StepInput
-from rig.core.quantities import APPLIED_FORCE, OTHERS
-from rig.core.record import Record, columns
-from rig.core.step import Arrival, RigCore
-from rig.core.supervisor import Supervision
-from rig.operation.config import CONFIGS
+from rig.bridge.contract import Measurement, Mode, StepInput
+from rig.bridge.free_model import Arrival, RigCore
+from rig.bridge.log_columns import Record, columns
+from rig.bridge.supervisor import Supervision
+from rig.plan.config import CONFIGS
+from rig.plan.quantities import APPLIED_FORCE, OTHERS
+from rig.simulated_bench.schema import BenchConfig
+from rig.simulated_bench.trajectory import simulate
 
 STRUT = "strut"
 REST_M = 0.4

@@ -14,11 +14,11 @@ import numpy as np
 
 from dart_model.plant import DartPlant
 from dart_model.spec import parse_model
-from rig.core.closed_loop import Rhythm
-from rig.core.observers.kalman import KalmanObserver
-from rig.core.observers.model_error import ErrorFilter
-from rig.core.step import strut_answers
+from rig.bridge.free_model import strut_answers
+from rig.closed_loop.loop import Rhythm
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
+from rig.observers.error_filter import ErrorFilter
+from rig.observers.kalman import KalmanObserver
 from rig.tuning.expectation import Expectation, followed, residual, spectrum
 from rig.tuning.gains import Aim, Bench, paper, tuned
 from tests.observers.benches import STRUT, follow

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from can_dbc.errors import InputError
 from dart_model.effects import CATALOGUE, FAMILY_WORDS
 from dart_model.spec import ModelSpec
 from rig.diagnosis.outcome import (
@@ -29,9 +30,8 @@ from rig.diagnosis.outcome import (
     Verdict,
     White,
 )
-from rig.inputs.errors import InputError
 from rig.pages.report import page, sentence, write_report
-from rig.pages.report.quantities import label, quantity, value_and_interval
+from rig.pages.report.number_formats import label, quantity, value_and_interval
 from rig.pages.report.series import cloud, envelope, spectrum, surface
 from rig.pages.report.words import BLOCKS
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
-from rig.exchange.arrays import open_run
-from rig.inputs.errors import InputError
-from rig.operation.changes import change_line
-from rig.pages import paper
+from can_dbc.errors import InputError
+from rig.formats.arrays import open_run
+from rig.pages import pdf as paper
 from rig.pages.run_report import write_run_report
+from rig.run.changes import change_line
 from tests.view.serving import make_run
 
 

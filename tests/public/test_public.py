@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import rig
+from can_dbc.errors import InputError
 from dart_model.effects import CATALOGUE, FAMILY_WORDS
-from rig.inputs.errors import InputError
-from rig.operation.config import CONFIGS
-from rig.operation.setup import load_setup
-from rig.pages.reference import write_reference
-from tests.loop.listed import ListPort, bench_frames, live
+from rig.guide.reference import write_reference
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
 from tests.public.bench import heights
+from tests.run.listed import ListPort, bench_frames, live
 
 
 def test_importing_it_loads_nothing_slow():

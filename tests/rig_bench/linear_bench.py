@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from rig.bench.schema import BenchConfig
+from rig.simulated_bench.schema import BenchConfig
 
 MASS_KG = 2.0
 STIFFNESS_N_PER_M = 800.0

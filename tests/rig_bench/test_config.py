@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from rig.bench.config import BenchConfigError, load_bench_config
-from rig.bench.effects import EFFECT_KINDS
-from rig.inputs.errors import InputError
+from can_dbc.errors import InputError
+from rig.simulated_bench.config import BenchConfigError, load_bench_config
+from rig.simulated_bench.effects import EFFECT_KINDS
 
 GOOD = """
 name: small

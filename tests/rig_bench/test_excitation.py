@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from rig.bench.trajectory import simulate
+from rig.simulated_bench.trajectory import simulate
 from tests.rig_bench.linear_bench import linear_bench
 
 SECOND_NS = 1_000_000_000

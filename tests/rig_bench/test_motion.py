@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from rig.bench.assembly import assemble
-from rig.bench.mechanics import curve_force
-from rig.bench.schema import BenchConfig, BenchConfigError
-from rig.bench.trajectory import BenchDivergedError, simulate
+from rig.simulated_bench.assembly import assemble
+from rig.simulated_bench.equations_of_motion import curve_force
+from rig.simulated_bench.schema import BenchConfig, BenchConfigError
+from rig.simulated_bench.trajectory import BenchDivergedError, simulate
 from tests.rig_bench.linear_bench import (
     DAMPING_N_S_PER_M,
     FREE_LENGTH_M,

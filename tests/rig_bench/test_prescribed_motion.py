@@ -8,13 +8,13 @@ import pytest
 
 from can_dbc.codec import compile_decoder
 from can_dbc.database import DEFAULT_DATABASE, load_database
+from can_dbc.errors import InputError
 from can_dbc.units import Dimension
-from rig.bench.config import load_bench_config
-from rig.bench.schema import BenchConfig
-from rig.bench.simulated import Bench
-from rig.bench.trajectory import simulate
-from rig.inputs.errors import InputError
-from rig.operation.config import CONFIGS
+from rig.plan.config import CONFIGS
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.schema import BenchConfig
+from rig.simulated_bench.simulated import Bench
+from rig.simulated_bench.trajectory import simulate
 from tests.rig_bench.linear_bench import linear_strut
 
 STIFFNESS_N_PER_M, DAMPING_N_S_PER_M, LENGTH_M = 5000.0, 200.0, 0.5

@@ -13,9 +13,9 @@ from scipy.linalg import expm
 
 import rig
 from can_dbc.database import DEFAULT_DATABASE, load_database
-from rig.bench.config import load_bench_config
-from rig.bench.simulated import Bench
-from rig.bench.trajectory import Trajectory, simulate
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.simulated import Bench
+from rig.simulated_bench.trajectory import Trajectory, simulate
 
 CONFIGS = Path(rig.__file__).parent / "configs"
 PERIOD_S = 1e-3

@@ -10,9 +10,9 @@ from can_dbc.codec import compile_decoder
 from can_dbc.database import DEFAULT_DATABASE, DatabaseError, load_database
 from can_dbc.protection import INITIAL, Verdict, check_crc, compile_checker, read_counter
 from can_dbc.units import Dimension
-from rig.bench.schema import BenchConfigError
-from rig.bench.simulated import RECORDS_KEPT, Bench
-from rig.bench.trajectory import simulate
+from rig.simulated_bench.schema import BenchConfigError
+from rig.simulated_bench.simulated import RECORDS_KEPT, Bench
+from rig.simulated_bench.trajectory import simulate
 from tests.rig_bench.linear_bench import linear_bench
 
 SECOND_NS = 1_000_000_000

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.signal import find_peaks
 
-from rig.bench.effects import EFFECT_KINDS
-from rig.bench.trajectory import Trajectory, simulate
+from rig.simulated_bench.effects import EFFECT_KINDS
+from rig.simulated_bench.trajectory import Trajectory, simulate
 from tests.rig_bench.linear_bench import (
     DAMPING_N_S_PER_M,
     FREE_LENGTH_M,

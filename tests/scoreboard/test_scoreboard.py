@@ -7,17 +7,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from can_dbc.errors import InputError
 from rig.diagnosis.recording import Recording
-from rig.exchange.foreign_table import import_table
-from rig.exchange.mapping import load_mapping
-from rig.inputs.errors import InputError
-from rig.operation.config import CONFIGS
-from rig.scoreboard import silverbox
-from rig.scoreboard.run import run_scoreboard
-from rig.scoreboard.silverbox import PUBLISHED, TESTS, TRAINING, open_loop_rmse_m
-from rig.scoreboard.starts import driven_start, dyno_start
-from rig.scoreboard.table import PAGE_FILE, TABLE_FILE, Row, page, write_scoreboard
+from rig.formats.foreign_table import import_table
+from rig.formats.mapping import load_mapping
+from rig.plan.config import CONFIGS
 from tests.diagnosis import little_dyno as dyno
+from tests.scoreboard import silverbox
+from tests.scoreboard.run import run_scoreboard
+from tests.scoreboard.silverbox import PUBLISHED, TESTS, TRAINING, open_loop_rmse_m
+from tests.scoreboard.starts import driven_start, dyno_start
+from tests.scoreboard.table import PAGE_FILE, TABLE_FILE, Row, page, write_scoreboard
 
 # Measured data lie beside the checkout, never in it.
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"

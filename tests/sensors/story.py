@@ -11,13 +11,13 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from rig.bridge.contract import Mode
 from rig.cli.main import app
-from rig.core.contract import Mode
-from rig.io.run_log import read_run
-from rig.operation.live import live
-from rig.operation.logged_run import Ended
-from rig.operation.replay import replay
-from rig.operation.setup import load_setup
+from rig.log.reader import read_run
+from rig.plan.setup import load_setup
+from rig.run.live import live
+from rig.run.logged_run import Ended
+from rig.run.replay import replay
 from tests.sensors.dyno import (
     AMPLIFIER,
     DAMPING_N_S_PER_M,

@@ -6,9 +6,9 @@ import pytest
 from typer.testing import CliRunner
 
 from can_dbc.database import load_database
+from can_dbc.errors import InputError
 from rig.cli.main import app
-from rig.inputs.errors import InputError
-from rig.sensors.described import described
+from rig.sensors.canopen_description import described
 from rig.sensors.eds import EdsObjects
 from rig.sensors.undo import read_undo
 

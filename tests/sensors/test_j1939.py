@@ -10,10 +10,10 @@ from can_dbc.codec import compile_decoder, si_range
 from can_dbc.database import load_database
 from can_dbc.frame import Frame
 from can_dbc.units import Dimension
-from rig.core.contract import Mode
-from rig.io.bus import BusConfig
-from rig.operation.assembly import build_bridge
-from rig.operation.setup import load_setup
+from rig.bridge.contract import Mode
+from rig.bus.bus import BusConfig
+from rig.plan.assembly import build_bridge
+from rig.plan.setup import load_setup
 from rig.sensors.j1939 import Claim, claims, group_number, spoken
 from rig.sensors.proposal import configuration_text, dbc_text
 

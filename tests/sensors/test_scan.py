@@ -13,15 +13,15 @@ from typer.testing import CliRunner
 from can_dbc.codec import compile_decoder
 from can_dbc.database import load_database
 from can_dbc.units import Dimension, si_conversion
+from rig.bus.bus import BusConfig
+from rig.bus.canopen_network import CanOpenNetwork
 from rig.cli.main import app
-from rig.io.bus import BusConfig
-from rig.io.canopen_network import CanOpenNetwork
-from rig.operation.check import check
-from rig.operation.setup import load_setup
-from rig.sensors.described import described
+from rig.plan.check import check
+from rig.plan.setup import load_setup
+from rig.sensors.canopen_description import described
 from rig.sensors.proposal import Origin, dbc_text
 from rig.sensors.scan import scan
-from rig.sensors.setting import Setting, restore, set_to_work
+from rig.sensors.set_up import Setting, restore, set_to_work
 from rig.sensors.undo import read_undo, write_undo
 from tests.sensors.peer import KILONEWTON, amplifier, encoder, with_timer
 

@@ -8,15 +8,15 @@ import pytest
 import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
-from rig.bench.config import load_bench_config
+from can_dbc.errors import InputError
 from rig.cli.main import main
-from rig.inputs.errors import InputError
-from rig.operation.config import CONFIGS
-from rig.operation.live import with_bench
-from rig.operation.replay import replay
-from rig.operation.setup import load_setup, setup_of_folder
-from rig.tuning.command import Stated, tune, write_config
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup, setup_of_folder
+from rig.run.live import with_bench
+from rig.run.replay import replay
+from rig.simulated_bench.config import load_bench_config
 from rig.tuning.gains import MARGINS, Aim
+from rig.tuning.tune import Stated, tune, write_config
 
 STEP_M = 15e-6
 NOISE_M = 20e-6

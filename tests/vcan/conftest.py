@@ -15,13 +15,13 @@ import pytest
 import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
-from rig.bench.config import load_bench_config
-from rig.io.bus import BusConfig
-from rig.operation.config import CONFIGS
-from rig.operation.live import live, run_bench
-from rig.operation.logged_run import Ended
-from rig.operation.loop import Progress
-from rig.operation.setup import Setup, load_setup
+from rig.bus.bus import BusConfig
+from rig.plan.config import CONFIGS
+from rig.plan.setup import Setup, load_setup
+from rig.run.live import live, run_bench
+from rig.run.logged_run import Ended
+from rig.run.loop import Progress
+from rig.simulated_bench.config import load_bench_config
 
 TOOLS = ("ip", "candump", "canplayer", "cangen", "cangw", "cansend")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from rig.io.run_log import read_run
+from rig.log.reader import read_run
 from tests.vcan.conftest import RATE_HZ, Files, in_process, run_for, run_until_terminated
 
 pytestmark = pytest.mark.vcan

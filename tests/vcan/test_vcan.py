@@ -15,14 +15,14 @@ from can_dbc.addressing import Filter
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.frame import Frame
 from can_dbc.protection import check_crc
-from rig.bench.config import load_bench_config
-from rig.bench.simulated import Bench
-from rig.core.contract import Mode
-from rig.io.bus import Bus, BusConfig
-from rig.io.run_log import RunFolder, parse_frame, read_run
-from rig.operation.assembly import build_bridge
-from rig.operation.replay import replay
-from rig.operation.setup import load_setup
+from rig.bridge.contract import Mode
+from rig.bus.bus import Bus, BusConfig
+from rig.log.reader import RunFolder, parse_frame, read_run
+from rig.plan.assembly import build_bridge
+from rig.plan.setup import load_setup
+from rig.run.replay import replay
+from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.simulated import Bench
 from tests.vcan.conftest import BENCH_IDS, RATE_HZ, Files, in_process, run_for, running
 
 pytestmark = pytest.mark.vcan

@@ -17,8 +17,8 @@ import numpy as np
 import pyarrow as pa
 import yaml
 
-from rig.io.run_log import END_OF_STREAM
-from rig.io.steps import step_schema
+from rig.log.reader import END_OF_STREAM
+from rig.log.steps import step_schema
 from tests.view.browser import browser, drawn, until
 from tests.view.serving import make_run
 

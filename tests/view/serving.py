@@ -8,10 +8,10 @@ from urllib.parse import urlencode
 
 import numpy as np
 
-from rig.operation.config import CONFIGS
-from rig.operation.setup import load_setup
 from rig.pages.view.server import ViewServer
-from tests.loop.listed import ListPort, bench_frames, live
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from tests.run.listed import ListPort, bench_frames, live
 
 COUNT = 800
 

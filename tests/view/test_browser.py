@@ -13,10 +13,10 @@ import time
 import pytest
 import yaml
 
-from rig.operation.changes import logged_changes
-from rig.operation.replay import replay
 from rig.pages.report import page as page_of
 from rig.pages.run_report import write_run_report
+from rig.run.changes import logged_changes
+from rig.run.replay import replay
 from tests.pages.test_report import report
 from tests.view.browser import browser, drawn, frames, in_sight, needs_chromium, page, until
 from tests.view.serving import COUNT, make_run, serving

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import yaml
 
-from rig.exchange.arrays import open_run
-from rig.inputs.errors import InputError
-from rig.operation.changes import CHANGES_FILE, change_line
+from can_dbc.errors import InputError
+from rig.formats.arrays import open_run
 from rig.pages.view import foxglove
 from rig.pages.view.foxglove import FoxgloveView, Playback
+from rig.run.changes import CHANGES_FILE, change_line
 from tests.view.browser import browser, needs_chromium, until
 from tests.view.serving import COUNT, make_run
 

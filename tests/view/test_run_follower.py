@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.io.run_follower import BUCKET, FLAGS, RunFollower
-from rig.io.run_log import END_OF_STREAM, part_name
-from rig.io.steps import Step, StepRows
+from rig.log.follower import BUCKET, FLAGS, RunFollower
+from rig.log.reader import END_OF_STREAM, part_name
+from rig.log.steps import Step, StepRows
 
 MS = 1_000_000
 NAMES = ("force_n", "sparse_m")

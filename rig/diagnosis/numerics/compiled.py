@@ -24,7 +24,7 @@ from numba.typed import List
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
-from dart_model.effects.contract import Floats, Writable
+from dart_model.effects.law import Floats, Writable
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -10,17 +10,7 @@ from dart_model.effects import Motion, effect
 from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.smoother import estimate_noise
 from rig.diagnosis.problem import linear_part, track
-from rig.diagnosis.problem.contract import (
-    Candidate,
-    Existing,
-    LinearParameter,
-    Parts,
-    Problem,
-    ResidualForces,
-    Track,
-    existing_values,
-    nominal,
-)
+from rig.diagnosis.problem.fmu_force import with_mockups
 from rig.diagnosis.problem.free_run import FreeRun, Run, run_of, system
 from rig.diagnosis.problem.grid import (
     NO_TEMPERATURE_C,
@@ -31,8 +21,18 @@ from rig.diagnosis.problem.grid import (
     with_blocks_kept,
 )
 from rig.diagnosis.problem.mechanism import Mechanism, Readers, constant, readers, tabulated
-from rig.diagnosis.problem.mockup import with_mockups
-from rig.diagnosis.problem.prescribed import Drive, Prescribed, drive_of, noise_of
+from rig.diagnosis.problem.prescribed_motion import Drive, Prescribed, drive_of, noise_of
+from rig.diagnosis.problem.problem import (
+    Candidate,
+    Existing,
+    LinearParameter,
+    Parts,
+    Problem,
+    ResidualForces,
+    Track,
+    existing_values,
+    nominal,
+)
 from rig.diagnosis.recording import Recording, RecordingError, checked
 
 Array = NDArray[np.float64]

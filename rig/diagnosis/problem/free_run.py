@@ -21,7 +21,9 @@ from dart_model.effects import Bench, Motion
 from rig.diagnosis.numerics.compiled import respond, simulate
 from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise
 from rig.diagnosis.problem import linear_part, track
-from rig.diagnosis.problem.contract import (
+from rig.diagnosis.problem.grid import Grid, fine_times, smoothed
+from rig.diagnosis.problem.mechanism import Mechanism
+from rig.diagnosis.problem.problem import (
     Candidate,
     Flags,
     Integers,
@@ -37,8 +39,6 @@ from rig.diagnosis.problem.contract import (
     state_scales,
     strut_constants,
 )
-from rig.diagnosis.problem.grid import Grid, fine_times, smoothed
-from rig.diagnosis.problem.mechanism import Mechanism
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.diagnosis.numerics.smoother import Noise, Smoothed, estimate_noise, smooth
-from rig.diagnosis.problem.contract import Track, block_numbers
+from rig.diagnosis.problem.problem import Track, block_numbers
 from rig.diagnosis.recording import Recording
 
 Array = NDArray[np.float64]

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from dart_model.effects import Bench, Motion
 from dart_model.spec import WORLD, EffectSpec, InlineSkeleton, ModelSpec
-from rig.diagnosis.problem.contract import Kind, LinearParameter, middle_m
 from rig.diagnosis.problem.mechanism import Mechanism
+from rig.diagnosis.problem.problem import Kind, LinearParameter, middle_m
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import Motion
 from rig.diagnosis.numerics.compiled import along, law
-from rig.diagnosis.problem.contract import (
+from rig.diagnosis.problem.problem import (
     Candidate,
     Parts,
     Problem,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import effect
 from rig.diagnosis.outcome import RejectedEffect
-from rig.diagnosis.problem.contract import (
+from rig.diagnosis.problem.problem import (
     Candidate,
     Placed,
     Problem,

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
 from dart_model.effects import effect
-from rig.diagnosis.problem.contract import Candidate, Placed, nominal
+from rig.diagnosis.problem.problem import Candidate, Placed, nominal
 from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.search.fit import parts_for
 from rig.diagnosis.search.pool import Pool, Scored
-from rig.diagnosis.search.score import Change
+from rig.diagnosis.search.score_test import Change
 from rig.diagnosis.search.screen import (
     Screening,
     Stage,

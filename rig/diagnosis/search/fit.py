@@ -23,7 +23,7 @@ from scipy.stats import t as student
 
 from dart_model.effects import Effect, Motion, effect
 from rig.diagnosis.numerics.least_squares import Prior, Rows, Solution, Space, joined, solve
-from rig.diagnosis.problem.contract import (
+from rig.diagnosis.problem.problem import (
     Candidate,
     Integers,
     Parts,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
-from rig.diagnosis.problem.contract import (
+from rig.diagnosis.problem.problem import (
     Candidate,
     Parts,
     Problem,
@@ -23,7 +23,7 @@ from rig.diagnosis.problem.contract import (
 )
 from rig.diagnosis.search.criteria import DISSIPATING, STORING, SelectionCriteria
 from rig.diagnosis.search.fit import Fit, block_scores, fit
-from rig.diagnosis.search.score import Change, changes
+from rig.diagnosis.search.score_test import Change, changes
 from rig.diagnosis.search.screen import (
     Screening,
     Stage,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from dart_model.effects import CATALOGUE, effect
 from rig.diagnosis.numerics.compiled import law
 from rig.diagnosis.numerics.least_squares import Prior, Space, joined, solve
-from rig.diagnosis.problem.contract import (
+from rig.diagnosis.problem.problem import (
     Candidate,
     Integers,
     Parts,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
-from rig.diagnosis.problem.contract import Problem, Track, placed, slots_of, strut_constants
+from rig.diagnosis.problem.problem import Problem, Track, placed, slots_of, strut_constants
 from rig.diagnosis.problem.track import forces_along, law_force, linear_forces
 from rig.diagnosis.search.criteria import SelectionCriteria
 from rig.diagnosis.search.fit import UNBOUND, Fit, effect_variables, spread, start_variables

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects.restoring_surface import FIRST_FORCE, HEIGHTS, VELOCITIES
-from rig.diagnosis.problem.contract import Parts, Problem, existing_values, nominal
+from rig.diagnosis.problem.problem import Parts, Problem, existing_values, nominal
 from rig.diagnosis.search.fit import Fit, fit, left_out
 from rig.diagnosis.search.screen import Stage, response, stage_of
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from can_dbc.errors import InputError
 from dart_model.effects import FAMILY_WORDS, effect
 from rig.diagnosis.outcome import Diagnosis, Result, write_text
-from rig.inputs.errors import InputError
 from rig.pages import charts
 from rig.pages.report import tables
 from rig.pages.report.figures import (
@@ -21,7 +21,7 @@ from rig.pages.report.figures import (
     residual_plot,
     surface_plot,
 )
-from rig.pages.report.quantities import percent
+from rig.pages.report.number_formats import percent
 from rig.pages.report.series import check_series
 from rig.pages.report.words import BLOCKS, is_prescribed, sentence
 

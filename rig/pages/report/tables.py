@@ -6,7 +6,14 @@ from typing import NamedTuple
 from dart_model.effects import CATALOGUE, Effect, effect
 from dart_model.effects.restoring_surface import FIRST_FORCE, RESTORING_SURFACE
 from rig.diagnosis.outcome import BeforeAfter, Diagnosis, Estimate, RunFigures
-from rig.pages.report.quantities import change, label, percent, quantity, ratio, value_and_interval
+from rig.pages.report.number_formats import (
+    change,
+    label,
+    percent,
+    quantity,
+    ratio,
+    value_and_interval,
+)
 from rig.pages.report.words import LINEAR, difference, is_prescribed, linear_label, missing
 
 Row = tuple[str, ...]

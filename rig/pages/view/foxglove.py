@@ -16,9 +16,9 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.inputs.errors import InputError
-from rig.operation.changes import logged_changes
-from rig.pages.view.watched import WatchedRun
+from can_dbc.errors import InputError
+from rig.pages.view.run_status import WatchedRun
+from rig.run.changes import logged_changes
 
 HOST = "127.0.0.1"
 

@@ -17,16 +17,16 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
+from can_dbc.errors import InputError
 from dart_model.spec import ModelSpec
 from rig.diagnosis.outcome import REPORT_FILE
-from rig.inputs.errors import InputError
-from rig.io.run_log import MODEL_FILE
-from rig.operation.requests import ask
-from rig.operation.timing import read_histograms
+from rig.log.reader import MODEL_FILE
 from rig.pages import charts
-from rig.pages.view import closely
-from rig.pages.view.diagnosing import Diagnosing
-from rig.pages.view.watched import WatchedRun
+from rig.pages.view import visible_stretch as closely
+from rig.pages.view.diagnosis_job import Diagnosing
+from rig.pages.view.run_status import WatchedRun
+from rig.run.requests import ask
+from rig.run.timing import read_histograms
 
 HOST = "127.0.0.1"
 

@@ -1,0 +1,224 @@
+"""YAML from outside, read as data: bounded, without aliases or repeated keys, then validated."""
+
+import re
+from collections.abc import Hashable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, cast
+
+import yaml
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
+from pydantic_core import PydanticCustomError
+
+from can_dbc.errors import InputError
+
+_MAX_BYTES = 4 * 1024 * 1024
+"""Largest file; a model with a thousand struts has a tenth of it."""
+
+_Model = TypeVar("_Model", bound=BaseModel)
+
+
+def _no_truth_value(value: object) -> object:
+    """Refuse `true`, which would otherwise be read as 1."""
+    if isinstance(value, bool):
+        raise PydanticCustomError("number", "expected a number")
+    return value
+
+
+Finite = Annotated[float, BeforeValidator(_no_truth_value), Field(allow_inf_nan=False)]
+Positive = Annotated[Finite, Field(gt=0)]
+NotNegative = Annotated[Finite, Field(ge=0)]
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """`SafeLoader` that refuses what a configuration never needs and a mistake or an attack has."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        events = cast("Any", self)  # untyped in the stubs
+        if events.check_event(yaml.AliasEvent):
+            raise yaml.MarkedYAMLError(
+                problem="aliases are not accepted", problem_mark=events.peek_event().start_mark
+            )
+        return super().compose_node(parent, index)
+
+    def construct_mapping(
+        self, node: yaml.MappingNode, deep: bool = False
+    ) -> dict[Hashable, object]:
+        seen: set[object] = set()
+        for key_node, _ in node.value:
+            key = cast("object", cast("Any", self).construct_object(key_node, deep=True))
+            if isinstance(key, Hashable) and key in seen:
+                raise yaml.MarkedYAMLError(
+                    problem=f"key {key!r} stands here twice", problem_mark=key_node.start_mark
+                )
+            if isinstance(key, Hashable):
+                seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+# YAML 1.1 reads 1e5, without a point, as text.
+cast("Any", _PlainLoader).add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?[0-9]+([.][0-9]*)?[eE][-+]?[0-9]+$"),
+    "-+0123456789",
+)
+
+_NO_YAML = (yaml.YAMLError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError)
+"""What PyYAML raises for a text that is none, or for a tag whose value does not fit it."""
+
+
+def read_text(path: Path, max_bytes: int = _MAX_BYTES) -> str:
+    """Text of a file.
+
+    Args:
+        path: The file.
+        max_bytes: Largest size that is read.
+
+    Raises:
+        InputError: The file is missing, unreadable, too large or not UTF-8.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(max_bytes + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    if len(data) > max_bytes:
+        raise InputError(f"{path}: larger than {max_bytes} bytes, expected a smaller file")
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: byte {error.start} is not UTF-8, expected text") from error
+
+
+def parse_mapping(text: str, source: str) -> dict[str, object]:
+    """The mapping a YAML text holds.
+
+    Args:
+        text: YAML.
+        source: What to call the text in an error, usually its path.
+
+    Raises:
+        InputError: The text is no YAML, or no mapping.
+    """
+    try:
+        data = cast("object", yaml.load(text, _PlainLoader))  # noqa: S506 - it is a SafeLoader
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        where = f" line {mark.line + 1}" if mark else ""
+        raise InputError(f"{source}:{where} is no valid YAML: {error.problem}") from error
+    except (*_NO_YAML, RecursionError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{source}: is no valid YAML: {reason}") from error
+    if not isinstance(data, dict):
+        found = "nothing" if data is None else type(data).__name__
+        raise InputError(f"{source}: expected keys and values at the top level, found {found}")
+    mapping = cast("dict[object, object]", data)
+    for key in mapping:
+        if not isinstance(key, str):
+            raise InputError(f"{source}: key {key!r}: expected a name")
+    return cast("dict[str, object]", mapping)
+
+
+def validated(model: type[_Model], data: object, source: str, context: object = None) -> _Model:
+    """`data` as a frozen `model`.
+
+    Args:
+        model: What the data are to be.
+        data: Keys and values.
+        source: What to call them in an error, usually the path of their file.
+        context: What the model's own checks are given.
+
+    Raises:
+        InputError: With the first error's key, value and expectation, and how many more there are.
+    """
+    try:
+        return model.model_validate(data, context=context)
+    except ValidationError as error:
+        raise InputError(_one_line(error, model, source)) from error
+
+
+def load_validated(model: type[_Model], path: Path, context: object = None) -> _Model:
+    """The file at `path` as a frozen `model`; `context` as of `validated`.
+
+    Raises:
+        InputError: One line that names file, key, value and what was expected.
+    """
+    return validated(model, parse_mapping(read_text(path), str(path)), str(path), context)
+
+
+_NO_MAPPING = ("dict_type", "model_type", "model_attributes_type", "dataclass_type")
+"""pydantic's names for a value where keys and values are wanted."""
+
+
+def _one_line(error: ValidationError, model: type[BaseModel], source: str) -> str:
+    errors = error.errors(include_url=False)
+    # A list whose items are wrong is also called too short: that says nothing more.
+    deepest = max(len(item["loc"]) for item in errors)
+    errors = [item for item in errors if item["type"] != "too_short" or len(item["loc"]) == deepest]
+    first = max(errors, key=lambda item: (len(item["loc"]), item["type"] == "extra_forbidden"))
+    # Parts in angle brackets are not keys: they tell apart what may stand under one.
+    parts = [part for part in first["loc"] if part != "" and not str(part).startswith("<")]
+    key = ".".join(str(part) for part in parts) or "top level"
+    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    cause = cast("dict[str, object]", first.get("ctx", {})).get("error")
+    if cause is not None:
+        where = f"{source}: {key}" if parts else source
+        return f"{where}: {cause}{more}"
+    kind = first["type"]
+    if kind == "missing":
+        return f"{source}: {key}: is missing, expected a value{more}"
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+        known = ", ".join(_keys(model.model_json_schema(), parts[:-1]))
+        expected = f", expected one of {known}" if known else ""
+        return f"{source}: {key}: unknown key{expected}{more}"
+    if kind == "union_tag_invalid":
+        context = cast("dict[str, str]", first.get("ctx", {}))
+        tag, choices = (context[name].strip("'<>") for name in ("tag", "expected_tags"))
+        expected = choices.replace("'", "").replace("<", "").replace(">", "")
+        return f"{source}: {key}: {tag!r}: expected one of {expected}{more}"
+    if kind in _NO_MAPPING:
+        shown = repr(cast("object", first["input"]))[:60]
+        return f"{source}: {key}: {shown}: expected keys and values{more}"
+    value = repr(cast("object", first["input"]))
+    shown = value if len(value) <= 60 else value[:57] + "..."
+    return f"{source}: {key}: {shown}: {first['msg'][0].lower()}{first['msg'][1:]}{more}"
+
+
+_Schema = dict[str, Any]
+
+
+def _keys(schema: _Schema, path: Sequence[int | str]) -> list[str]:
+    """Keys that a JSON schema has at a path of keys and indices."""
+    nodes = [schema]
+    for part in path:
+        below: list[_Schema | None] = []
+        for node in _alternatives(schema, nodes):
+            below += [node.get("properties", {}).get(part), node.get("items")]
+            below += node.get("prefixItems", [])
+            values = node.get("additionalProperties")
+            below.append(None if isinstance(values, bool) else values)
+        # A part that is no key is the tag of one of several choices.
+        nodes = [node for node in below if node] or _tagged(schema, nodes, part)
+    found: list[str] = []
+    for node in _alternatives(schema, nodes):
+        found += node.get("properties", {})
+    return list(dict.fromkeys(found))
+
+
+def _tagged(schema: _Schema, nodes: Iterable[_Schema], tag: int | str) -> list[_Schema]:
+    """Choices among nodes that have a key whose only value is `tag`."""
+    return [
+        node
+        for node in _alternatives(schema, nodes)
+        if any(value.get("const") == tag for value in node.get("properties", {}).values())
+    ]
+
+
+def _alternatives(schema: _Schema, nodes: Iterable[_Schema]) -> Iterator[_Schema]:
+    """Nodes with references followed and choices laid out."""
+    for node in nodes:
+        reference = str(node.get("$ref", "")).rpartition("/")[2]
+        if reference:
+            yield from _alternatives(schema, [schema["$defs"][reference]])
+        choices = [*node.get("anyOf", []), *node.get("oneOf", []), *node.get("allOf", [])]
+        yield from _alternatives(schema, choices)
+        yield node

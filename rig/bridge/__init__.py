@@ -1,0 +1,1 @@
+"""One tick of the bridge: values in, values out; no bus, clock, file or logging."""

@@ -1,0 +1,1 @@
+"""The bus: python-can, SecOC, CANopen, and bus logs that other programs wrote."""

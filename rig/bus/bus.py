@@ -1,0 +1,243 @@
+"""CAN through python-can, whatever the interface: frames as values, faults as errors of our own."""
+
+import contextlib
+import errno
+import socket
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import can
+
+from can_dbc.addressing import Filter
+from can_dbc.errors import InputError
+from can_dbc.frame import Frame
+
+FRAMES_A_MS = 64
+"""Bound on the frames read per ms since the last tick, so that a flood holds no tick up. No bus
+reaches it (CAN FD at 1 and 8 Mbit/s carries a third); what is beyond waits."""
+
+_QUEUE_BYTES, _SO_RCVBUFFORCE = 4_000_000, 33
+"""Some 5 000 frames wait for a tick that is late; more than usual is granted to root alone."""
+
+_MOST_KNOWN = 10_000
+"""Identifiers that are remembered as let in or not; a flood of others must fill no memory."""
+
+_LISTEN_ONLY_OPTIONS: dict[str, dict[str, Any]] = {
+    "pcan": {"state": can.BusState.PASSIVE},
+    "slcan": {"listen_only": True},
+    "vector": {"listen_only": True},
+    "kvaser": {"driver_mode": False},
+}
+"""What keeps a controller from acknowledging frames too. SocketCAN leaves this to `ip link`."""
+
+
+class BusError(InputError):
+    """The bus cannot be opened, or a frame cannot be sent or received."""
+
+
+class BusFullError(BusError):
+    """A frame cannot be sent now, because the interface's queue is full; it may be later."""
+
+
+@dataclass(frozen=True)
+class BusConfig:
+    """How to open a bus.
+
+    Attributes:
+        interface: python-can's name: ``virtual``, ``socketcan``, ``pcan``, ``slcan``, ...
+        channel: Channel of the interface.
+        bitrate: Bit rate in bit/s.
+        data_bitrate: Bit rate of CAN FD payloads in bit/s; None on classic CAN.
+        options: Further arguments of the interface.
+    """
+
+    interface: str
+    channel: str
+    bitrate: int
+    data_bitrate: int | None = None
+    options: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+
+class Bus:
+    """An open bus.
+
+    Args:
+        config: How to open it.
+        filters: The only frames that are let in, beside error frames; None lets all in.
+        listen_only: Send nothing. Most interfaces swallow such a request silently, so it is kept
+            here: the interface's way of sending is not even looked up.
+        epoch_ns: Unix time of the run's start; time stamps are given relative to it.
+
+    Raises:
+        BusError: The interface cannot be opened.
+    """
+
+    def __init__(
+        self,
+        config: BusConfig,
+        filters: Iterable[Filter] | None = None,
+        *,
+        listen_only: bool = False,
+        epoch_ns: int = 0,
+    ) -> None:
+        self._filters = None if filters is None else frozenset(filters)
+        self._known: dict[tuple[int, bool], bool] = {}
+        self.epoch_ns = epoch_ns
+        """Unix time that stamps are relative to; to be set anew when the system's clock was."""
+        self._bus = opened(config, self._filters, listen_only=listen_only)
+        self._receive = self._bus.recv
+        self._send = None if listen_only else self._bus.send
+
+    def receive(self, elapsed_ns: int = 1_000_000_000) -> list[Frame]:
+        """The frames that have arrived, in order, without waiting; error frames among them.
+
+        Args:
+            elapsed_ns: Time since the last poll, for which the number of frames is bounded.
+
+        Raises:
+            BusError: The interface is gone.
+        """
+        frames: list[Frame] = []
+        receive = self._receive
+        try:
+            for _ in range(FRAMES_A_MS * (elapsed_ns // 1_000_000 + 1)):
+                message = receive(0)
+                if message is None:
+                    break
+                if message.is_error_frame or self._lets_in(message):
+                    frames.append(self._frame(message))
+        except (can.CanError, OSError, ValueError) as error:
+            raise BusError(f"receiving failed: {error}") from error
+        return frames
+
+    def _lets_in(self, message: can.Message) -> bool:
+        if self._filters is None:
+            return True
+        key = (message.arbitration_id, message.is_extended_id)
+        known = self._known.get(key)
+        if known is None:
+            known = self._known[key] = any(
+                item.is_extended == message.is_extended_id
+                and message.arbitration_id & item.mask == item.arbitration_id & item.mask
+                for item in self._filters
+            )
+            if len(self._known) > _MOST_KNOWN:
+                self._known.clear()
+        return known
+
+    def _frame(self, message: can.Message) -> Frame:
+        return Frame(
+            round(message.timestamp * 1e9) - self.epoch_ns,
+            message.arbitration_id,
+            bytes(message.data),
+            message.is_extended_id,
+            message.is_fd,
+            message.bitrate_switch,
+            message.is_error_frame,
+        )
+
+    @property
+    def listens_only(self) -> bool:
+        """Whether nothing is ever sent."""
+        return self._send is None
+
+    def send(self, frame: Frame) -> None:
+        """Send one frame; nothing if the bus only listens.
+
+        Raises:
+            BusFullError: The interface's queue is full.
+            BusError: The frame cannot be sent.
+        """
+        if self._send is None:
+            return
+        message = can.Message(
+            timestamp=(frame.t_ns + self.epoch_ns) * 1e-9,
+            arbitration_id=frame.arbitration_id,
+            is_extended_id=frame.is_extended,
+            data=frame.data,
+            is_fd=frame.is_fd,
+            bitrate_switch=frame.bitrate_switch,
+        )
+        try:
+            self._send(message)
+        except (can.CanError, OSError, ValueError) as error:
+            raise _sending_failed(error) from error
+
+    def close(self) -> None:
+        """Close the interface; an interface that is gone already is closed."""
+        with contextlib.suppress(can.CanError, OSError):
+            self._bus.shutdown()
+
+
+_OPENING_ERRORS = (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError)
+
+
+def _widen(connection: socket.socket) -> None:
+    """Let the kernel keep more frames than its usual 250 or so, as many as it allows for."""
+    with contextlib.suppress(OSError):
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _QUEUE_BYTES)
+        connection.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _QUEUE_BYTES)
+
+
+def _sending_failed(error: Exception) -> BusError:
+    code = getattr(error, "error_code", None) or getattr(error, "errno", None)
+    text = " ".join(str(error).split())
+    full = code == errno.ENOBUFS or "buffer full" in text.lower()
+    return (BusFullError if full else BusError)(f"sending failed: {text}")
+
+
+def opened(
+    config: BusConfig, wanted: frozenset[Filter] | None = None, *, listen_only: bool = False
+) -> can.BusABC:
+    """python-can's bus, for what needs more of it than `Bus` gives.
+
+    Args:
+        config: How to open it.
+        wanted: The only frames that are let in, where the interface can choose; None: all.
+        listen_only: Whether the controller is to keep silent, where it can.
+
+    Raises:
+        BusError: The interface cannot be opened.
+    """
+    options: dict[str, Any] = dict(config.options)
+    if listen_only:
+        options |= _LISTEN_ONLY_OPTIONS.get(config.interface, {})
+    if config.interface == "virtual":
+        # Simulated time would otherwise be overwritten by the time of sending.
+        options.setdefault("preserve_timestamps", True)
+    if config.data_bitrate is not None:
+        options.setdefault("fd", True)
+        options.setdefault("data_bitrate", config.data_bitrate)
+    filters = None
+    if wanted is not None and config.interface == "socketcan":
+        # The kernel's filters let error frames pass. python-can's own, which stand in for them at
+        # other interfaces, do not, and end a poll at the first foreign frame.
+        filters = [
+            {"can_id": item.arbitration_id, "can_mask": item.mask, "extended": item.is_extended}
+            for item in sorted(wanted, key=lambda item: item.arbitration_id)
+        ]
+    try:
+        bus: can.BusABC = cast("Any", can.Bus)(
+            interface=config.interface,
+            channel=config.channel,
+            bitrate=config.bitrate,
+            can_filters=filters,
+            **options,
+        )
+        if config.interface == "socketcan":
+            _widen(cast("Any", bus).socket)
+    except (
+        can.CanError,
+        OSError,
+        ValueError,
+        TypeError,
+        ImportError,
+        NotImplementedError,
+    ) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise BusError(
+            f"bus.interface {config.interface!r}, bus.channel {config.channel!r}: "
+            f"cannot be opened: {reason}"
+        ) from error
+    return bus

@@ -1,0 +1,108 @@
+"""Bus logs that other programs wrote (BLF, ASC, candump, TRC, MF4), read through python-can."""
+
+import importlib
+import struct
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, cast
+
+import can
+from can.io.blf import BLFParseError
+
+from can_dbc.errors import InputError
+from can_dbc.frame import Frame
+
+_TEXT = MappingProxyType(
+    {".asc": can.ASCReader, ".log": can.CanutilsLogReader, ".trc": can.TRCReader}
+)
+_BINARY = MappingProxyType({".blf": can.BLFReader, ".mf4": can.MF4Reader})
+
+LOG_SUFFIXES = (*_TEXT, *_BINARY)
+"""Kinds of logs that are read."""
+
+# What the readers raise on a damaged file depends on the format and is documented nowhere.
+_DAMAGED: tuple[type[Exception], ...] = (
+    can.CanError,
+    BLFParseError,
+    OSError,
+    ValueError,
+    TypeError,
+    LookupError,
+    ArithmeticError,
+    AttributeError,
+    AssertionError,
+    NotImplementedError,
+    EOFError,
+    struct.error,
+    zlib.error,
+)
+
+
+def read_log(path: Path) -> Iterator[tuple[int, Frame]]:
+    """Data frames of a bus log, in the order of the file, one at a time.
+
+    Args:
+        path: File with one of `LOG_SUFFIXES`.
+
+    Yields:
+        Unix time of each frame in ns, as exactly as the file and python-can have it (a float in s,
+        to 0.24 us in our days), and the frame, stamped with the time since the first one.
+
+    Raises:
+        InputError: The file is of no such kind, cannot be read, is damaged, or wants a package that
+            is not installed.
+    """
+    if path.suffix.lower() not in LOG_SUFFIXES:
+        raise InputError(
+            f"{path}: expected a log with one of the endings {', '.join(LOG_SUFFIXES)}"
+        )
+    if not path.is_file():
+        raise InputError(f"{path}: cannot be read: no such file")
+    damaged, first_ns = _damaged(path), None
+    try:
+        # Opened here and not by the reader, which leaves a damaged file open.
+        with _opened(path) as file:
+            for message in _messages(path, file):
+                if message.is_error_frame or message.is_remote_frame:
+                    continue
+                at_ns = round(message.timestamp * 1e9)
+                first_ns = at_ns if first_ns is None else first_ns
+                yield at_ns, _frame(message, at_ns - first_ns)
+    except damaged as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(f"{path}: is no such log, or is damaged: {reason}") from error
+
+
+def _opened(path: Path) -> Any:
+    if path.suffix.lower() in _TEXT:
+        return path.open(encoding="utf-8", errors="replace")
+    return path.open("rb")
+
+
+def _messages(path: Path, file: Any) -> Iterable[can.Message]:
+    reader = cast("Callable[[Any], Any]", {**_TEXT, **_BINARY}[path.suffix.lower()])
+    return cast("Iterable[can.Message]", reader(file))
+
+
+def _damaged(path: Path) -> tuple[type[Exception], ...]:
+    """What the reader of a file may raise when it is damaged."""
+    if path.suffix.lower() != ".mf4":
+        return _DAMAGED
+    try:
+        errors = cast("Any", importlib.import_module("asammdf.blocks.utils"))
+    except ImportError as error:
+        raise InputError(f"{path}: wants the package asammdf: pip install 'rig[mf4]'") from error
+    return (*_DAMAGED, cast("type[Exception]", errors.MdfException))
+
+
+def _frame(message: can.Message, t_ns: int) -> Frame:
+    return Frame(
+        t_ns,
+        message.arbitration_id,
+        bytes(message.data),
+        message.is_extended_id,
+        message.is_fd,
+        message.bitrate_switch,
+    )

@@ -1,0 +1,196 @@
+"""Authentication of frames after AUTOSAR SecOC, on CAN FD.
+
+Behind the payload stand the low bits of a freshness value and the high bits of a CMAC (AES-128)
+over data id, payload and whole freshness value. The freshness value is the sender's Unix time in
+units of 0.1 ms, and more than the last one in any case: it needs no memory across restarts, and a
+frame that was sent before is refused. What was refused does not get any further.
+
+References: AUTOSAR, "Specification of Secure Onboard Communication" (profile 1, 24Bit-CMAC-8Bit-FV,
+is the default); RFC 4493, "The AES-CMAC Algorithm".
+"""
+
+import hmac
+import importlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+from msgspec.structs import replace
+
+from can_dbc.errors import InputError
+from can_dbc.frame import Frame
+from can_dbc.yaml_file import read_text
+
+FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
+"""Lengths that a CAN FD frame can have, in bytes."""
+
+_FRESHNESS_UNIT_NS = 100_000
+_FRESHNESS_BYTES = 8
+_KEY_BYTES = 16
+_LARGEST_KEY_FILE = 1000
+
+
+@dataclass(frozen=True)
+class Authentication:
+    """How frames are authenticated.
+
+    Attributes:
+        key: 16 bytes; it stands in no log and no error.
+        freshness_bytes: Length of the freshness value's part in a frame.
+        mac_bytes: Length of the CMAC's part.
+        tolerance_ns: How far the clocks of two senders may be apart.
+    """
+
+    key: bytes = field(repr=False)
+    freshness_bytes: int
+    mac_bytes: int
+    tolerance_ns: int
+
+    @property
+    def trailer_bytes(self) -> int:
+        """How much longer a frame becomes."""
+        return self.freshness_bytes + self.mac_bytes
+
+
+def read_key(path: Path) -> bytes:
+    """Key of a file that holds 32 hexadecimal digits.
+
+    Raises:
+        InputError: The file cannot be read, or holds no such key; what it holds is not said.
+    """
+    try:
+        key = bytes.fromhex(read_text(path, _LARGEST_KEY_FILE))
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        key = b""
+    if len(key) != _KEY_BYTES:
+        raise InputError(f"{path}: expected a key of {2 * _KEY_BYTES} hexadecimal digits")
+    return key
+
+
+def cmac(key: bytes) -> Callable[[bytes], bytes]:
+    """AES-CMAC under a key: message -> 16 bytes.
+
+    Raises:
+        InputError: The package that computes it is not installed.
+    """
+    try:
+        module = cast("Any", importlib.import_module("cryptography.hazmat.primitives.cmac"))
+        ciphers = cast("Any", importlib.import_module("cryptography.hazmat.primitives.ciphers"))
+    except ImportError as error:
+        raise InputError(
+            "authentication: wants the package cryptography: pip install 'rig[secoc]'"
+        ) from error
+    keyed = module.CMAC(ciphers.algorithms.AES(key))
+
+    def compute(message: bytes) -> bytes:
+        state = keyed.copy()
+        state.update(message)
+        return cast("bytes", state.finalize())
+
+    return compute
+
+
+class _Heard(NamedTuple):
+    """Freshness value of the last frame that was accepted under an id, and when it came."""
+
+    freshness: int
+    t_ns: int
+
+
+class Authenticator:
+    """Secures what one side of a bus sends, and accepts what is authentic and new.
+
+    Args:
+        how: Key and lengths.
+        epoch_ns: Unix time of the run's start, to which the frames' times are relative.
+
+    Raises:
+        InputError: The package that computes the CMAC is not installed.
+    """
+
+    def __init__(self, how: Authentication, epoch_ns: int) -> None:
+        self.unauthentic = 0
+        """Frames refused because no fresh value fits their CMAC."""
+        self.replayed = 0
+        """Frames refused because one as new had come already."""
+        self._how = how
+        self._epoch_ns = epoch_ns
+        self._cmac = cmac(how.key)
+        self._sent: dict[int, int] = {}
+        self._heard: dict[int, _Heard] = {}
+
+    def secured(self, frame: Frame) -> Frame:
+        """The frame with freshness value and CMAC behind its payload."""
+        identifier = frame.arbitration_id
+        freshness = max(self._time(frame.t_ns), self._sent.get(identifier, -1) + 1)
+        self._sent[identifier] = freshness
+        trailer = self._low(freshness) + self._authenticator(frame, frame.data, freshness)
+        return replace(frame, data=frame.data + trailer, is_fd=True, bitrate_switch=True)
+
+    def accepted(self, frames: Sequence[Frame]) -> list[Frame]:
+        """The frames that are authentic and new, without what secured them; error frames pass."""
+        found: list[Frame] = []
+        for frame in frames:
+            if frame.is_error:
+                found.append(frame)
+                continue
+            payload = self._authentic(frame)
+            if payload is not None:
+                found.append(replace(frame, data=payload))
+        return found
+
+    @property
+    def refused(self) -> int:
+        """Frames refused."""
+        return self.unauthentic + self.replayed
+
+    def _authentic(self, frame: Frame) -> bytes | None:
+        """Payload of a frame that is accepted."""
+        how = self._how
+        end = len(frame.data) - how.trailer_bytes
+        payload, trailer = frame.data[: max(end, 0)], frame.data[max(end, 0) :]
+        low, received = trailer[: how.freshness_bytes], trailer[how.freshness_bytes :]
+        last = self._heard.get(frame.arbitration_id)
+        for freshness in self._possible(last, frame.t_ns, low) if end >= 0 else ():
+            if hmac.compare_digest(self._authenticator(frame, payload, freshness), received):
+                if last is not None and freshness <= last.freshness:
+                    self.replayed += 1
+                    return None
+                self._heard[frame.arbitration_id] = _Heard(freshness, frame.t_ns)
+                return payload
+        self.unauthentic += 1
+        return None
+
+    def _possible(self, last: _Heard | None, t_ns: int, low: bytes) -> Iterator[int]:
+        """Whole freshness values that a frame may have, the likeliest first.
+
+        Before the first frame the own clock says which; then the sender's, which goes on from the
+        last frame.
+        """
+        modulus = 1 << 8 * self._how.freshness_bytes
+        if last is None:
+            expected = self._time(t_ns)
+        else:
+            expected = last.freshness + (t_ns - last.t_ns) // _FRESHNESS_UNIT_NS
+        tolerance = self._how.tolerance_ns // _FRESHNESS_UNIT_NS
+        ahead = (int.from_bytes(low, "big") - expected + modulus // 2) % modulus - modulus // 2
+        nearest = expected + ahead
+        for distance in range(0, tolerance + modulus, modulus):
+            for freshness in {nearest + distance, nearest - distance}:
+                if freshness >= 0 and abs(freshness - expected) <= tolerance:
+                    yield freshness
+
+    def _time(self, t_ns: int) -> int:
+        return max(self._epoch_ns + t_ns, 0) // _FRESHNESS_UNIT_NS
+
+    def _low(self, freshness: int) -> bytes:
+        count = self._how.freshness_bytes
+        return freshness.to_bytes(_FRESHNESS_BYTES, "big")[_FRESHNESS_BYTES - count :]
+
+    def _authenticator(self, frame: Frame, payload: bytes, freshness: int) -> bytes:
+        data_id = frame.arbitration_id.to_bytes(2, "big")
+        whole = data_id + payload + freshness.to_bytes(_FRESHNESS_BYTES, "big")
+        return self._cmac(whole)[: self._how.mac_bytes]

@@ -1,0 +1,1 @@
+"""Model and observers in closed loop: its linear map, its poles, and what is observable."""

@@ -1,0 +1,233 @@
+"""Model and observers in closed loop, made linear by differences on the step itself.
+
+Nothing is known of the model but what it does: the map from one measurement to the next is
+differenced about a bench at rest.
+
+Reference: Åström and Wittenmark, "Computer-Controlled Systems" (1997), chapter 3.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.bridge.contract import AMBIENT_C, Innovation, Observer, Plant, Start
+from rig.bridge.free_model import Answer, strut_answers
+from rig.closed_loop.derivatives import slopes
+
+Array = NDArray[np.float64]
+
+_STEP = 1e-8
+"""Step of the central differences, in units of the state: so small that no observer comes near its
+limit."""
+
+_ACCELERATION_STEP_M_PER_S2 = 1e-2
+"""Step of the residual force, over the effective mass."""
+
+
+class Rhythm(NamedTuple):
+    """When a loop is closed.
+
+    Attributes:
+        period_ns: Time between two ticks.
+        measured_every: Ticks between two measurements.
+        delay: Age of a measurement when it is used, in measurement periods.
+    """
+
+    period_ns: int
+    measured_every: int = 1
+    delay: int = 0
+
+    @classmethod
+    def of(cls, period_ns: int, interval_ns: int, delay_ns: int) -> "Rhythm":
+        """The rhythm of a tick and of its measurements, in whole ticks and measurement periods."""
+        every = max(1, round(interval_ns / period_ns))
+        return cls(period_ns, every, round(delay_ns / (every * period_ns)))
+
+    @property
+    def interval_ns(self) -> int:
+        """Time between two measurements."""
+        return self.period_ns * self.measured_every
+
+
+class LinearLoop(NamedTuple):
+    """The error of a model that follows its bench: ``x+ = a x + b u``, ``y = c x + d u``.
+
+    A step goes from one measurement to the next.
+
+    Attributes:
+        a: Shape (n, n).
+        b: By noise of a strut's measurement (m) and by its residual force (N), shape (n, 2).
+        c: Error of that strut's published force (N), shape (n,).
+        d: The same by noise and residual force, shape (2,).
+        interval_s: Time between two measurements.
+    """
+
+    a: Array
+    b: Array
+    c: Array
+    d: Array
+    interval_s: float
+
+    def noise_gain_n_per_m(self) -> float:
+        """Standard deviation of the force's error over that of a white sensor noise."""
+        # Sum over all past samples: the discrete Lyapunov equation, by doubling.
+        power, covariance = self.a, np.outer(self.b[:, 0], self.b[:, 0])
+        for _ in range(60):
+            added = power @ covariance @ power.T
+            covariance = covariance + added
+            power = power @ power
+            if np.abs(added).max(initial=0.0) <= 1e-14 * np.abs(covariance).max(initial=0.0):
+                break
+        variance = float(self.c @ covariance @ self.c) + float(self.d[0]) ** 2
+        return variance**0.5 if np.isfinite(variance) and variance >= 0.0 else float("inf")
+
+    def lag_gain(self, frequency_hz: Array) -> Array:
+        """Error of the published force over the residual force, at frequencies; shape (N,)."""
+        return np.abs(self._response(frequency_hz, 1))
+
+    def _response(self, frequency_hz: Array, column: int) -> NDArray[np.complex128]:
+        eye = np.eye(len(self.a))
+        found = np.empty(len(frequency_hz), np.complex128)
+        for index, frequency in enumerate(frequency_hz):
+            z = np.exp(2j * np.pi * frequency * self.interval_s)
+            before = cast("Any", np.linalg.solve(z * eye - self.a, self.b[:, column]))
+            found[index] = self.c @ before + self.d[column]
+        return found
+
+
+class Loop:
+    """The map from one measurement to the next, of numbers to numbers.
+
+    Args:
+        plant: The model.
+        observers: One for each of its struts.
+        heights_m: Strut heights at which the bench is assumed to rest.
+        rhythm: When the loop is closed.
+        answers: What the observers take the model to answer; by differences on it if absent.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        observers: Sequence[Observer],
+        heights_m: Sequence[float],
+        rhythm: Rhythm,
+        answers: Sequence[Answer] | None = None,
+    ) -> None:
+        self._plant, self._observers, self._rhythm = plant, tuple(observers), rhythm
+        self._heights_m = list(heights_m)
+        start = plant.init(heights_m)
+        self._law_n = plant.load(start, [0.0] * plant.struts, 0.0, AMBIENT_C).forces_n
+        self._answers = answers or strut_answers(plant, heights_m)
+        self._states = [
+            self._settled(observer, answer)
+            for observer, answer in zip(self._observers, self._answers, strict=True)
+        ]
+        parts = [
+            list(plant.numbers(start)),
+            *(
+                list(observer.numbers(state))
+                for observer, state in zip(self._observers, self._states, strict=True)
+            ),
+            self._heights_m * rhythm.delay,
+        ]
+        # Where the numbers of the model, of each observer and of the past heights end.
+        self._ends = [0, *itertools.accumulate(len(part) for part in parts)]
+        self.at_rest: Array = np.array([*itertools.chain(*parts)])
+        """Numbers of model, observers and the model's past heights (the newest first), at rest."""
+
+    def after(
+        self, x: Array, strut: int = 0, noise_m: float = 0.0, residual_n: float = 0.0
+    ) -> tuple[Array, float]:
+        """Numbers after the next measurement, and the error of a strut's published force.
+
+        Args:
+            x: Numbers after the last one.
+            strut: Index of the strut that noise and residual force are of.
+            noise_m: Noise of the measurement.
+            residual_n: Force that the bench's strut has and the model's lacks, over the interval;
+                the bench's motion is taken as given, and the model gets the force's opposite.
+        """
+        parts = [x[first:end].tolist() for first, end in itertools.pairwise(self._ends)]
+        model = self._plant.state_of(parts[0])
+        states = [
+            observer.with_numbers(state, numbers)
+            for observer, state, numbers in zip(
+                self._observers, self._states, parts[1:-1], strict=True
+            )
+        ]
+        rhythm, seen = self._rhythm, parts[-1]
+        count = len(self._observers)
+        for tick in range(1, rhythm.measured_every + 1):
+            acting = [state.virtual_force_n for state in states]
+            acting[strut] -= residual_n
+            loaded = self._plant.load(model, acting, 0.0, AMBIENT_C)
+            model = self._plant.step(loaded, rhythm.period_ns * 1e-9, 0.0)
+            now = [height_m for height_m, _ in model.struts]
+            if tick < rhythm.measured_every:
+                innovations: list[float | None] = [None] * count
+            else:
+                compared = seen[-count:] if rhythm.delay else now
+                innovations = [
+                    bench_m - model_m + (noise_m if index == strut else 0.0)
+                    for index, (bench_m, model_m) in enumerate(
+                        zip(self._heights_m, compared, strict=True)
+                    )
+                ]
+                seen = (now + seen)[: count * rhythm.delay]
+            states = [
+                self._stepped(observer, state, tick, innovation)
+                for observer, state, innovation in zip(
+                    self._observers, states, innovations, strict=True
+                )
+            ]
+        law_n = self._plant.load(model, [0.0] * count, 0.0, AMBIENT_C).forces_n[strut]
+        error_n = law_n - self._law_n[strut] + states[strut].residual_force_n - residual_n
+        numbers = [
+            observer.numbers(state) for observer, state in zip(self._observers, states, strict=True)
+        ]
+        return np.array([*self._plant.numbers(model), *itertools.chain(*numbers), *seen]), error_n
+
+    def linear(self, strut: int = 0) -> LinearLoop:
+        """The loop about rest, as one strut's noise and residual force drive it."""
+        size = len(self.at_rest)
+        widths = [_STEP * max(1.0, abs(value)) for value in self.at_rest.tolist()]
+        step_n = _ACCELERATION_STEP_M_PER_S2 / self._answers[strut].mobility_per_kg
+
+        def after(u: Array) -> Array:
+            noise_m, residual_n = u[size:].tolist()
+            return np.append(*self.after(self.at_rest + u[:size], strut, noise_m, residual_n))
+
+        found = slopes(after, [*widths, _STEP, step_n])
+        a, b, c, d = found[:-1, :size], found[:-1, size:], found[-1, :size], found[-1, size:]
+        return LinearLoop(a, b, c, d, self._rhythm.interval_ns * 1e-9)
+
+    def _settled(self, observer: Observer, answer: Answer) -> Any:
+        """An observer that has followed a bench at rest for long, its last tick at time zero."""
+        rhythm = self._rhythm
+        delay_ns, ticks = rhythm.delay * rhythm.interval_ns, rhythm.delay + 2
+        begin_ns = -ticks * rhythm.interval_ns
+        start = Start(
+            begin_ns - delay_ns, answer[0], rhythm.interval_ns, delay_ns, answer[1], answer[2]
+        )
+        state = observer.settled(start)
+        for number in range(1 - ticks, 1):
+            for tick in range(1 - rhythm.measured_every, 1):
+                t_ns = number * rhythm.interval_ns + tick * rhythm.period_ns
+                innovation = Innovation(0.0, t_ns - delay_ns) if tick == 0 else None
+                state = observer.step(state, t_ns, innovation)
+        return state
+
+    def _stepped(
+        self, observer: Observer, state: Any, tick: int, innovation_m: float | None
+    ) -> Any:
+        """State of an observer at a tick after time zero."""
+        rhythm = self._rhythm
+        t_ns = tick * rhythm.period_ns
+        if innovation_m is None:
+            return observer.step(state, t_ns, None)
+        measured_ns = t_ns - rhythm.delay * rhythm.interval_ns
+        return observer.step(state, t_ns, Innovation(innovation_m, measured_ns))

@@ -1,0 +1,143 @@
+"""Which unknown forces and offsets can be observed from measured heights.
+
+An unknown that is constant, or changes without a law, is one more state that stays where it is. It
+is observable if no motion of the model explains it away: if the matrix
+
+    [ A - 1   B ]
+    [   C     D ]
+
+has independent columns, A and C the model's map over a time and its heights, B and D what the
+unknowns do to them; A, B and C by differences on the model itself.
+
+Reference: Hautus, Controllability and observability conditions of linear autonomous systems (1969);
+Francis and Wonham, The internal model principle of control theory, Automatica 12 (1976).
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.bridge.contract import AMBIENT_C, Plant
+from rig.closed_loop.derivatives import slopes
+
+Array = NDArray[np.float64]
+
+_TIME_S = 0.02
+"""Time of the map: long enough that it differs from one, short for a bench."""
+
+_STEP = 1e-6
+"""Of the model's numbers (m or rad, and per second): a third of the digits of a double."""
+
+_FORCE_STEP_N = 1e-2
+"""Of the forces, whose effect is linear."""
+
+_INDEPENDENT = 1e-6
+"""Least singular value of columns of unit length: a hundred times what the differences leave."""
+
+
+class Unknown(NamedTuple):
+    """Something that is not known.
+
+    Attributes:
+        name: What it is, as a phrase.
+        strut: Index of the strut that it is of.
+        is_offset: Whether it adds to the strut's measured height, and not to its force.
+    """
+
+    name: str
+    strut: int
+    is_offset: bool = False
+
+
+class Verdict(NamedTuple):
+    """What is observable from measured heights.
+
+    Attributes:
+        hidden: Unknowns that are not observable at all.
+        confused: Pairs of unknowns, each observable if the other is known, that cannot be
+            distinguished.
+        together: Whether all that is not hidden is observable at once.
+    """
+
+    hidden: tuple[Unknown, ...]
+    confused: tuple[tuple[Unknown, Unknown], ...]
+    together: bool
+
+
+class Linear(NamedTuple):
+    """A model about rest, from one time to another.
+
+    Attributes:
+        model: The model's numbers by those before, shape (n, n).
+        by_force: The same by forces in its struts, shape (n, struts).
+        heights: Heights by the model's numbers, shape (struts, n).
+    """
+
+    model: Array
+    by_force: Array
+    heights: Array
+
+
+def linear_model(plant: Plant, heights_m: Sequence[float]) -> Linear:
+    """A model about rest at some heights of all its struts."""
+    start = np.array(plant.numbers(plant.init(heights_m)))
+    nothing = np.zeros(plant.struts)
+
+    def after(x: Array, forces_n: Array) -> Array:
+        state = plant.state_of(x.tolist())
+        loaded = plant.load(state, forces_n.tolist(), 0.0, AMBIENT_C)
+        return np.array(plant.numbers(plant.step(loaded, _TIME_S, 0.0)))
+
+    def heights(x: Array) -> Array:
+        return np.array([height_m for height_m, _ in plant.state_of(x.tolist()).struts])
+
+    steps = [_STEP] * len(start)
+    return Linear(
+        slopes(lambda d: after(start + d, nothing), steps),
+        slopes(lambda d: after(start, d), [_FORCE_STEP_N] * plant.struts),
+        slopes(lambda d: heights(start + d), steps),
+    )
+
+
+def observability(linear: Linear, measured: Sequence[int], unknowns: Sequence[Unknown]) -> Verdict:
+    """Which unknowns can be observed from the heights of some struts.
+
+    Args:
+        linear: The model about rest.
+        measured: Indices of the struts whose heights are measured.
+        unknowns: What is asked.
+    """
+    model, by_force = linear.model, linear.by_force
+    seen = linear.heights[list(measured)]
+    columns = [_column(unknown, by_force, measured, len(seen)) for unknown in unknowns]
+    base = np.vstack([model - np.eye(len(model)), seen])
+    scaled = base / np.maximum(np.linalg.norm(base, axis=0), 1e-300)
+
+    def is_observable(*which: int) -> bool:
+        # The model's own motion must not explain it: only what it leaves of the columns counts.
+        rest: Any = np.column_stack([columns[i] / np.linalg.norm(columns[i]) for i in which])
+        explained: Any = cast("Any", np.linalg.lstsq)(scaled, rest, rcond=1e-10)[0]
+        rest = rest - scaled @ explained
+        least = cast("Any", np.linalg.svd)(rest, compute_uv=False)[-1]
+        return bool(least > _INDEPENDENT)
+
+    alone = [bool(columns[i].any()) and is_observable(i) for i in range(len(unknowns))]
+    pairs = [
+        (unknowns[i], unknowns[j])
+        for i, j in itertools.combinations(range(len(unknowns)), 2)
+        if alone[i] and alone[j] and not is_observable(i, j)
+    ]
+    hidden = [item for item, observed in zip(unknowns, alone, strict=True) if not observed]
+    shown = [i for i, observed in enumerate(alone) if observed]
+    return Verdict(tuple(hidden), tuple(pairs), not shown or is_observable(*shown))
+
+
+def _column(unknown: Unknown, by_force: Array, measured: Sequence[int], outputs: int) -> Array:
+    """What an unknown does to the model's numbers and to the measured heights."""
+    if not unknown.is_offset:
+        return np.concatenate([by_force[:, unknown.strut], np.zeros(outputs)])
+    to_heights = np.array([float(strut == unknown.strut) for strut in measured])
+    return np.concatenate([np.zeros(len(by_force)), to_heights])

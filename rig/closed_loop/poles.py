@@ -1,0 +1,65 @@
+"""Poles of model and observer in closed loop.
+
+Reference: Åström and Wittenmark, "Computer-Controlled Systems" (1997), chapter 3.
+"""
+
+import cmath
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.bridge.contract import Observer, Plant
+from rig.closed_loop.loop import Loop, Rhythm
+
+
+class Pole(NamedTuple):
+    """A discrete pole, with what it means in continuous time.
+
+    Attributes:
+        magnitude: Distance from zero; 1 or more is unstable.
+        frequency_hz: Undamped natural frequency.
+        damping_ratio: 1 is aperiodic, 0 rings for ever, negative grows.
+    """
+
+    magnitude: float
+    frequency_hz: float
+    damping_ratio: float
+
+
+def closed_loop_poles(
+    plant: Plant, observers: Sequence[Observer], heights_m: Sequence[float], rhythm: Rhythm
+) -> list[Pole]:
+    """Poles of model and observers.
+
+    Args:
+        plant: The model.
+        observers: One for each of its struts.
+        heights_m: Strut heights at which the bench is assumed to rest.
+        rhythm: When the loop is closed.
+
+    Returns:
+        Poles, the slowest to decay first.
+    """
+    loop = Loop(plant, observers, heights_m, rhythm)
+    return poles_of(loop.linear().a, rhythm.interval_ns * 1e-9)
+
+
+def poles_of(a: NDArray[np.float64], interval_s: float) -> list[Pole]:
+    """Poles of a discrete map, the slowest to decay first.
+
+    Args:
+        a: The map, shape (n, n).
+        interval_s: Time that it takes.
+    """
+    poles = [_pole(complex(value), interval_s) for value in np.linalg.eigvals(a)]
+    return sorted((pole for pole in poles if pole.magnitude > 1e-6), reverse=True)
+
+
+def _pole(z: complex, interval_s: float) -> Pole:
+    if abs(z) < 1e-12:
+        return Pole(0.0, 0.0, 1.0)
+    s = cmath.log(z) / interval_s
+    natural = abs(s)
+    return Pole(abs(z), natural / (2.0 * cmath.pi), -s.real / natural if natural > 0.0 else 1.0)

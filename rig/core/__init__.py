@@ -1,1 +1,0 @@
-"""Observer, step and supervisor: values in, values out; no bus, clock, file or logging."""

@@ -1,0 +1,239 @@
+"""The figures of a damper over all steps: peak curve, gas, friction, knee, temperature."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.dyno.figures import QUASI_STATIC_M_PER_S, Step
+from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, student
+
+Array = NDArray[np.float64]
+
+_ALIKE_SPEED = 0.05
+"""Relative difference of speed and amplitude up to which steps are the same, another time."""
+
+_LEAST_WARMING_K = 2.0
+"""Span of temperatures from which on a change per kelvin is told: sensors agree within one."""
+
+_WARM_UP = 2.0
+"""Times the cycles of the other steps that the first one has where it is a warm-up."""
+
+_DRAWS = 300
+"""Of the curve, for the interval of a knee: its ends are known to a tenth of themselves."""
+
+_STRAIGHT = 1.25
+"""Ratio of the slopes below a knee and above it that is none."""
+
+_KNEE_POINTS = 60
+_LOWEST_OF_KNEE, _HIGHEST_OF_KNEE = 0.05, 0.9
+"""Shares of the peak speed between which a knee is looked for."""
+
+_FEWEST_STROKES = 6
+"""Of a change per kelvin."""
+
+
+class Damper(NamedTuple):
+    """Figures over all steps; None where the test does not tell them.
+
+    Attributes:
+        kinds: Of each step `warm_up`, `quasi_static` or `velocity_step`.
+        gas_force: At mid-stroke of the slowest step, in N.
+        gas_rate: Its rise per compression there, in N/m.
+        friction: Half the difference of both directions there, in N.
+        knee: By direction the speed in m/s at which the curve bends.
+        asymmetry: Rebound over compression at peak velocity of the fastest step, without gas.
+        per_kelvin: By direction the change of force per kelvin, in N/K.
+        notes: Why a figure is missing, and what was assumed.
+    """
+
+    kinds: tuple[str, ...]
+    gas_force: Figure | None
+    gas_rate: Figure | None
+    friction: Figure | None
+    knee: dict[str, Figure | None]
+    asymmetry: Figure | None
+    per_kelvin: dict[str, Figure | None]
+    notes: tuple[str, ...]
+
+
+def damper_of(steps: Sequence[Step]) -> Damper:
+    """Figures of a damper.
+
+    Args:
+        steps: Its steps, in time; one at least.
+    """
+    notes: list[str] = []
+    kinds = _kinds(steps)
+    slow = [step for step, kind in zip(steps, kinds, strict=True) if kind == "quasi_static"]
+    gas_force = gas_rate = friction = None
+    if slow:
+        slowest = min(slow, key=lambda step: step.peak_speed_m_per_s)
+        speed = 1e3 * slowest.peak_speed_m_per_s
+        gas_force, gas_rate, friction = (
+            figure._replace(method=f"{figure.method}, at {speed:.2g} mm/s")
+            for figure in (slowest.mean_force, slowest.spring_rate, slowest.half_difference)
+        )
+        notes.append(
+            f"friction and gas force are forces at {speed:.2g} mm/s: what bleeds there is in them, "
+            "and their intervals are of the measurement alone"
+        )
+    else:
+        notes.append(
+            "no step of 5 mm/s or less: friction, gas force and its rate are not told, and "
+            "asymmetry is that of whole forces"
+        )
+    fastest = max(steps, key=lambda step: step.peak_speed_m_per_s)
+    knee = {
+        name: _knee(stroke)
+        for name, stroke in zip(("compression", "rebound"), fastest.strokes, strict=True)
+    }
+    if any(stroke.is_constant for stroke in fastest.strokes):
+        notes.append("no knee: the fastest step has one speed, which tells no curve")
+    elif not any(knee.values()):
+        notes.append("no knee: the curve of the fastest step is straight within its noise")
+    per_kelvin = {name: _per_kelvin(steps, index) for index, name in enumerate(knee)}
+    if not any(per_kelvin.values()):
+        notes.append(f"no change per kelvin: no speed was run over {_LEAST_WARMING_K:g} K or more")
+    return Damper(
+        kinds,
+        gas_force,
+        gas_rate,
+        friction,
+        knee,
+        _asymmetry(fastest, gas_force),
+        per_kelvin,
+        tuple(notes),
+    )
+
+
+def _kinds(steps: Sequence[Step]) -> tuple[str, ...]:
+    kinds = [
+        "quasi_static" if step.peak_speed_m_per_s <= QUASI_STATIC_M_PER_S else "velocity_step"
+        for step in steps
+    ]
+    others = [step.cycles for step in steps[1:]]
+    is_longer = len(others) >= 2 and steps[0].cycles >= _WARM_UP * float(np.median(others))
+    if kinds[0] == "velocity_step" and is_longer:
+        kinds[0] = "warm_up"
+    return tuple(kinds)
+
+
+def _asymmetry(step: Step, gas: Figure | None) -> Figure | None:
+    """Ratio of the forces, by the delta method."""
+    up, down = step.rebound.force_at_peak_velocity, step.compression.force_at_peak_velocity
+    offset = 0.0 if gas is None else gas.value
+    rebound, compression = -(up.value - offset), down.value - offset
+    if compression <= 0.0 or rebound <= 0.0:
+        return None
+    ratio = rebound / compression
+    own = 0.0 if gas is None else 0.5 * (gas.high - gas.low)
+    parts = (
+        0.5 * (up.high - up.low) / rebound,
+        0.5 * (down.high - down.low) / compression,
+        own * (1.0 / rebound + 1.0 / compression),
+    )
+    half = ratio * float(np.linalg.norm(parts))
+    of = "whole force" if gas is None else "force less gas force"
+    return Figure(ratio, ratio - half, ratio + half, f"{of} at peak velocity, fastest step")
+
+
+def _knee(stroke: MeanStroke) -> Figure | None:
+    """Where two straight lines through the curve meet, with the percentiles of redrawn curves."""
+    if stroke.is_constant:
+        return None  # one speed tells no curve
+    speed = np.abs(stroke.velocity_m_per_s)
+    peak = float(speed.max())
+    grid = np.linspace(0.03, 0.99, _KNEE_POINTS) * peak
+    top = int(np.argmax(speed))
+    if not 0 < top < len(speed) - 1:
+        return None
+    # Both halves of the stroke: lag and spring, which turn their sign, drop out.
+    rows = np.array([0.5 * (_at(speed[: top + 1], v, 0) + _at(speed[top:], v, top)) for v in grid])
+    tried = np.linspace(_LOWEST_OF_KNEE, _HIGHEST_OF_KNEE, 2 * _KNEE_POINTS) * peak
+    bases = [np.column_stack([np.ones_like(grid), grid, np.maximum(grid - v, 0.0)]) for v in tried]
+    solvers = [np.linalg.pinv(base) for base in bases]
+
+    def found(force_n: Array) -> tuple[float, float]:
+        curve = rows @ force_n
+        left = [
+            float(np.sum((curve - base @ (solver @ curve)) ** 2))
+            for base, solver in zip(bases, solvers, strict=True)
+        ]
+        best = int(np.argmin(left))
+        _, below, bend = solvers[best] @ curve
+        above = below + bend
+        steep, flat = max(abs(below), abs(above)), min(abs(below), abs(above))
+        return float(tried[best]), steep / max(flat, 1e-12)
+
+    value, ratio = found(stroke.force_n)
+    if ratio < _STRAIGHT:
+        return None
+    rng = np.random.default_rng(0)
+    values, vectors = np.linalg.eigh(stroke.covariance)
+    spread = vectors * np.sqrt(np.clip(values, 0.0, None))
+    drawn = [
+        found(stroke.force_n + spread @ rng.standard_normal(len(values))) for _ in range(_DRAWS)
+    ]
+    if np.mean([item[1] < _STRAIGHT for item in drawn]) > 0.05:
+        return None
+    step = float(tried[1] - tried[0])
+    low, high = np.percentile([item[0] for item in drawn], (2.5, 97.5))
+    low, high = min(float(low), value) - step, max(float(high), value) + step
+    return Figure(value, low, high, "two straight lines through force over speed, fastest step")
+
+
+def _at(speed: Array, value: float, offset: int) -> Array:
+    """Row over the angles that gives the force where a half stroke has a speed."""
+    order = np.argsort(speed)
+    place = float(np.interp(value, speed[order], order.astype(np.float64)))
+    before = min(int(place), len(speed) - 2)
+    row = np.zeros(len(ANGLES))
+    row[offset + before] = 1.0 - (place - before)
+    row[offset + before + 1] = place - before
+    return row
+
+
+def _per_kelvin(steps: Sequence[Step], index: int) -> Figure | None:
+    """Change of the force at peak velocity per kelvin over steps of one speed and amplitude."""
+    groups: list[list[Step]] = []
+    for step in steps:
+        if step.temperature_c is None:
+            return None
+        for group in groups:
+            if _same(group[0], step):
+                group.append(step)
+                break
+        else:
+            groups.append([step])
+    best: Figure | None = None
+    for group in groups:
+        figure = _slope(group, index)
+        if figure is not None and (best is None or figure.high - figure.low < best.high - best.low):
+            best = figure
+    return best
+
+
+def _same(a: Step, b: Step) -> bool:
+    return all(
+        abs(x - y) <= _ALIKE_SPEED * x
+        for x, y in ((a.peak_speed_m_per_s, b.peak_speed_m_per_s), (a.amplitude_m, b.amplitude_m))
+    )
+
+
+def _slope(group: Sequence[Step], index: int) -> Figure | None:
+    """Least squares through the strokes of like steps."""
+    temperatures = np.concatenate([step.warmth[index][0] for step in group])
+    forces = np.concatenate([step.warmth[index][1] for step in group])
+    if len(forces) < _FEWEST_STROKES or np.ptp(temperatures) < _LEAST_WARMING_K:
+        return None
+    about = temperatures - temperatures.mean()
+    slope = float(about @ forces) / float(about @ about)
+    left = forces - forces.mean() - slope * about
+    freedom = len(forces) - 2
+    std = float(np.sqrt(left @ left / freedom / (about @ about)))
+    half = student(freedom) * std
+    speed = group[0].peak_speed_m_per_s
+    text = f"line through the strokes at {speed:.3g} m/s over {np.ptp(temperatures):.1f} K"
+    return Figure(slope, slope - half, slope + half, text)

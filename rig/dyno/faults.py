@@ -1,0 +1,502 @@
+"""What is wrong with a damper that is not as its master: named, with its size.
+
+Every fault that is known is run in the master, step by step; what it changes there is held against
+what the damper's mean strokes differ by from the master's. Good dampers differ too: by their
+measurement, and by what manufacturing scatters in gas force, friction, damping below and above the
+knee, and the knee's place. A fault is named where it explains far more than both.
+
+The comparison is that of Gaussian likelihoods: differences are normal about what a fault of some
+size makes of them, with a covariance of measurement, scatter and the model's own coarseness; the
+best size of each fault is found, and what it lowers the chi-squared by is held against
+`_NAMED` (Wilks, Ann. Math. Stat. 9, 1938).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve  # pyright: ignore[reportUnknownVariableType]
+
+from can_dbc.errors import InputError
+from rig.dyno.characterise import Characteristics
+from rig.dyno.comparison import paired
+from rig.dyno.figures import Step
+from rig.dyno.master import (
+    Curve,
+    Cycle,
+    Master,
+    cycle_of,
+    refuse_unlike,
+    with_compliance,
+    with_play,
+)
+from rig.dyno.stroke_force import FINE, Figure, MeanStroke
+
+Array = NDArray[np.float64]
+
+_NAMED = 32.0
+"""Fall of chi-squared from which on a fault is named. Of differences that are normal one in a
+million reaches 25 by chance; the model describes dampers but roughly. With this value and the
+shares below none of 420 good dampers was named (`python -m tests.characteristics.population`, seeds
+4 and 5), with a first choice of them seven of 720 were (seeds 2 to 4)."""
+
+_BINS = 24
+"""Parts of a stroke whose samples' means are held against the master."""
+
+_OWN_SHARE = 0.004
+"""Of the largest force of a step: what the model leaves out at each angle by itself."""
+
+_DAMPING_SHARE = 0.02
+"""Of the damping at each angle: the same."""
+
+_EXPLAINED = 0.5
+"""Share of what differs that faults have to explain to be named."""
+
+_MODEL_SHARE = 0.1
+"""Of what a fault changes: how well the run of it in the master is known."""
+
+_SIZE_SHARE = 0.15
+"""Of a size: how well the run of a fault in the master tells it."""
+
+_MOST_FAULTS = 2
+_SIZES = 401
+"""Sizes of a fault that are tried."""
+
+_FALL = 3.84
+"""Rise of chi-squared at the ends of a 95 % interval of one size."""
+
+
+class Fault(NamedTuple):
+    """Something that can be wrong.
+
+    Attributes:
+        name: What it is called.
+        quantity: What its size is.
+        unit: Unit of the size.
+        sizes: Sizes that are tried, rising, shape (K,).
+        changes: What each changes of the stacked forces, shape (K, N).
+        least: Smallest that can be.
+        most: Largest.
+    """
+
+    name: str
+    quantity: str
+    unit: str
+    sizes: Array
+    changes: Array
+    least: float = -np.inf
+    most: float = np.inf
+
+
+class Named(NamedTuple):
+    """A fault that was found.
+
+    Attributes:
+        name: What it is called.
+        quantity: What its size is.
+        unit: Unit of the size.
+        size: Its size, with a 95 % interval.
+        evidence: By how much it lowers chi-squared.
+    """
+
+    name: str
+    quantity: str
+    unit: str
+    size: Figure
+    evidence: float
+
+    def as_dict(self) -> dict[str, object]:
+        """For a file."""
+        return {**self._asdict(), "size": self.size.as_dict()}
+
+    def words(self) -> str:
+        """The same in a line."""
+        size, unit = self.size, f" {self.unit}" if self.unit else ""
+        least = "at least " if np.isinf(size.high) else "at most " if np.isinf(size.low) else ""
+        interval = f"({size.low:.3g} to {size.high:.3g})"
+        return (
+            f"{self.name}: {self.quantity} {least}{size.value:.3g}{unit} "
+            f"{'' if least else interval}".rstrip()
+        )
+
+
+class Naming(NamedTuple):
+    """What a damper is against its master.
+
+    Attributes:
+        named: Faults, the one that explains most first; empty of a good damper.
+        is_good: Whether it differs by no more than good dampers do.
+        explained: Share of the chi-squared beyond a good damper's that the faults explain; 1 of a
+            good damper.
+        not_compared: Steps of the master that the damper's record has not.
+    """
+
+    named: tuple[Named, ...]
+    is_good: bool
+    explained: float
+    not_compared: tuple[str, ...] = ()
+
+    @property
+    def passes(self) -> bool:
+        """Whether it is proven to be as its master: in all of the master's steps."""
+        return self.is_good and not self.not_compared
+
+    def words(self) -> str:
+        """The same in a sentence."""
+        if self.not_compared:
+            said = self._replace(not_compared=()).words()
+            return f"{said}; not compared: {', '.join(self.not_compared)}"
+        if self.is_good:
+            return "as its master, within what manufacturing scatters"
+        if not self.named:
+            return "not as its master, and no fault that is known explains it"
+        found = "; ".join(item.words() for item in self.named)
+        return f"{found}: explains {100 * self.explained:.0f} % of what differs"
+
+    def as_dict(self) -> dict[str, object]:
+        """For a file."""
+        return {**self._asdict(), "named": [item.as_dict() for item in self.named]}
+
+
+class _Stack(NamedTuple):
+    """The forces of a damper less the master's, part by part of every stroke.
+
+    Attributes:
+        strokes: The master's strokes, in their order.
+        gathers: Of each stroke the means over its parts as rows over `FINE`, shape (parts, 361).
+        less_n: Differences, shape (N,).
+        noise_n: Standard deviation of each by the noise of its samples, shape (N,).
+    """
+
+    strokes: tuple[MeanStroke, ...]
+    gathers: tuple[Array, ...]
+    less_n: Array
+    noise_n: Array
+
+    def gathered(self, fine: Sequence[Array]) -> Array:
+        """Curves over `FINE` of every stroke, shape (..., 361), as means over its parts."""
+        parts = [curve @ rows.T for curve, rows in zip(fine, self.gathers, strict=True)]
+        return np.concatenate(parts, axis=-1)
+
+
+def _stack(steps: Sequence[tuple[Step, Step]]) -> _Stack:
+    strokes: list[MeanStroke] = []
+    gathers: list[Array] = []
+    less: list[Array] = []
+    noise: list[Array] = []
+    for theirs, mine in steps:
+        for own, good in zip(mine.strokes, theirs.strokes, strict=True):
+            part = np.arange(len(FINE)) * _BINS // len(FINE)
+            counts = np.bincount(part, weights=own.samples, minlength=_BINS)
+            filled = np.flatnonzero(counts)
+            rows = (part == filled[:, None]) * own.samples / counts[filled, None]
+            means = np.bincount(part, weights=own.sums_n, minlength=_BINS)[filled] / counts[filled]
+            strokes.append(good)
+            gathers.append(rows)
+            less.append(means - rows @ _fine(good))
+            noise.append(good.noise_n / np.sqrt(counts[filled]))
+    return _Stack(tuple(strokes), tuple(gathers), np.concatenate(less), np.concatenate(noise))
+
+
+def _fine(stroke: MeanStroke) -> Array:
+    return stroke.row(FINE) @ stroke.force_n
+
+
+def named(found: Characteristics, master: Master, scatter: float) -> Naming:
+    """What is wrong with a damper.
+
+    Args:
+        found: The damper.
+        master: The good one, of the same test.
+        scatter: Relative standard deviation that manufacturing leaves of each property.
+
+    Raises:
+        InputError: No step of one has a partner in the other.
+    """
+    refuse_unlike(found)
+    steps = paired(master.characteristics, found)
+    if not steps:
+        raise InputError(
+            f"{found.name}, {master.characteristics.name}: no step of one speed and amplitude in "
+            "common, expected the same test as the master's"
+        )
+    stack = _stack(steps)
+    faults = [
+        fault._replace(changes=stack.gathered(np.split(fault.changes, len(stack.strokes), axis=1)))
+        for fault in faults_of(master, [theirs for theirs, _ in steps])
+    ]
+    covariance, left = _covariance(stack, master, scatter), stack.less_n
+    count = len(left)
+    before = _chi_squared(left, covariance)
+    beyond = max(before - count, 1.0)
+    kept: list[Named] = []
+    for _ in range(_MOST_FAULTS):
+        rest = [item for item in faults if item.name not in [one.name for one in kept]]
+        best = min((_tried(item, left, covariance) for item in rest), key=lambda item: item.misfit)
+        if before - best.misfit < _NAMED:
+            break
+        fault = best.fault
+        kept.append(Named(fault.name, fault.quantity, fault.unit, best.size, before - best.misfit))
+        # What a fault makes is known but so well, and the less the more it makes.
+        left = left - best.explained_n
+        covariance = covariance + np.diag((_MODEL_SHARE * best.explained_n) ** 2)
+        before = _chi_squared(left, covariance)
+    remains = max(before - count, 0.0)
+    is_good = not kept and remains <= (_WORST_MISFIT - 1.0) * count
+    compared = [theirs for theirs, _ in steps]
+    lacking = tuple(
+        f"±{1e3 * step.amplitude_m:.3g} mm at {step.peak_speed_m_per_s:.3g} m/s"
+        for step in master.characteristics.steps
+        if not any(step is one for one in compared)
+    )
+    if kept and remains > (1.0 - _EXPLAINED) * beyond:
+        kept = []  # the nearest fault is no name
+    explained = 1.0 if is_good else max(1.0 - remains / beyond, 0.0)
+    return Naming(tuple(kept), is_good, explained, lacking)
+
+
+_WORST_MISFIT = 1.5
+"""Chi-squared over the number of forces up to which a damper with no fault that has a name is good;
+the good ones of the study have 0.6 to 1.2."""
+
+
+class _Tried(NamedTuple):
+    """A fault at its best size.
+
+    Attributes:
+        fault: The fault.
+        size: Its best size, with its interval.
+        misfit: Chi-squared there.
+        explained_n: What it makes of the differences.
+    """
+
+    fault: Fault
+    size: Figure
+    misfit: float
+    explained_n: Array
+
+
+def _tried(fault: Fault, left: Array, covariance: Array) -> _Tried:
+    """A fault at its best size."""
+    nodes: Array = np.arange(len(fault.sizes), dtype=np.float64)
+    tried: Array = np.linspace(0.0, float(nodes[-1]), _SIZES)
+    sizes: Array = np.interp(tried, nodes, fault.sizes).astype(np.float64)
+    columns: list[Array] = [
+        np.interp(sizes, fault.sizes, fault.changes[:, place]).astype(np.float64)
+        for place in range(fault.changes.shape[1])
+    ]
+    changes: Array = np.array(columns).T
+    apart = left - changes
+    factor = cast("Any", cho_factor)(covariance, lower=True)
+    solved = cast("Any", cho_solve)(factor, apart.T).T
+    chi: Array = np.einsum("ij,ij->i", apart, solved)
+    best = int(np.argmin(chi))
+    within = sizes[chi <= float(chi[best]) + _FALL]
+    value = float(sizes[best])
+    step = float(sizes[min(best + 1, len(sizes) - 1)] - sizes[max(best - 1, 0)])
+    more = _SIZE_SHARE * abs(value)
+    low = value - float(np.hypot(value - float(within[0]) + step, more))
+    high = value + float(np.hypot(float(within[-1]) - value + step, more))
+    # A size at the end of those that were tried is that at least, or at most.
+    low = -np.inf if within[0] == sizes[0] and sizes[0] != 0.0 else low
+    high = np.inf if within[-1] == sizes[-1] else high
+    size = Figure(
+        value,
+        float(max(low, fault.least)),
+        float(min(high, fault.most)),
+        "profile of the likelihood, and what the run in the master is known by",
+    )
+    return _Tried(fault, size, float(chi[best]), changes[best])
+
+
+def _chi_squared(left: Array, covariance: Array) -> float:
+    factor = cast("Any", cho_factor)(covariance, lower=True)
+    return float(left @ cast("Any", cho_solve)(factor, left))
+
+
+def _covariance(stack: _Stack, master: Master, scatter: float) -> Array:
+    """Of the differences between two good dampers."""
+    whole = np.diag(stack.noise_n**2)
+    parts: dict[str, list[Array]] = {}
+    begin = 0
+    for stroke, rows in zip(stack.strokes, stack.gathers, strict=True):
+        here = slice(begin, begin + len(rows))
+        begin += len(rows)
+        columns = _properties(stroke, master)
+        damping = rows @ (columns["compression"] + columns["rebound"])
+        largest = float(np.abs(stroke.force_n).max())
+        extra = (_OWN_SHARE * largest) ** 2 + (_DAMPING_SHARE * damping) ** 2
+        of_master = rows @ stroke.row(FINE)
+        whole[here, here] += of_master @ stroke.covariance @ of_master.T + np.diag(extra)
+        for name, column in columns.items():
+            parts.setdefault(name, []).append(column)
+    for curves in parts.values():
+        column = stack.gathered(curves)
+        # The master is one of them too.
+        whole += 2.0 * scatter**2 * np.outer(column, column)
+    return whole
+
+
+def _velocity(stroke: MeanStroke) -> Array:
+    return stroke.row(FINE) @ stroke.velocity_m_per_s
+
+
+def _properties(stroke: MeanStroke, master: Master) -> Mapping[str, Array]:
+    """What each property that scatters makes of a stroke's force at `FINE`, whole."""
+    height = stroke.middle_m + stroke.sign * stroke.amplitude_m * np.sin(FINE)
+    velocity = _velocity(stroke)
+    speed = np.abs(velocity)
+    damping = master.damping(velocity)
+    columns = {
+        "gas": master.gas(height),
+        "friction": np.full_like(FINE, -stroke.sign * master.friction_n),
+    }
+    for side, sign, curve in (
+        ("compression", -1, master.compression),
+        ("rebound", 1, master.rebound),
+    ):
+        is_it = stroke.sign == sign
+        at_zero, upper = curve.upper_line()
+        opens = max(at_zero, 0.0) / max(curve.lower_slope() - upper, 1.0)
+        columns[side] = damping * is_it
+        columns[f"{side} above"] = -sign * upper * np.maximum(speed - opens, 0.0) * is_it
+        less = _less_by_opening(curve, speed, np.array([_SMALL]))[0]
+        columns[f"{side} knee"] = -sign * less / _SMALL * is_it
+    return columns
+
+
+_SMALL = 0.05
+"""Share by which a knee is moved to see what its scatter makes."""
+
+
+def _less_by_opening(curve: Curve, speed: Array, shares: Array) -> Array:
+    """By how much a valve lowers the force that opens at a speed lower by shares, shape (K, N).
+
+    Above the knee a curve is a line, and a knee at a lower speed is the same line lower down.
+    """
+    at_zero, upper = curve.upper_line()
+    good, lines = curve.force(speed), at_zero * (1.0 - shares[:, None]) + upper * speed
+    # A knee is no corner: that the curve is below its own line there is no fault.
+    return np.minimum(good, lines) - np.minimum(good, at_zero + upper * speed)
+
+
+def faults_of(master: Master, steps: Sequence[Step]) -> list[Fault]:
+    """All faults that are known, run in the master.
+
+    Args:
+        master: The good damper.
+        steps: Steps of its record.
+
+    Returns:
+        Faults whose changes are those at `FINE` of all strokes of the steps, one after the other.
+    """
+    strokes = [stroke for step in steps for stroke in step.strokes]
+    gas = np.concatenate([_properties(stroke, master)["gas"] for stroke in strokes])
+    against = np.repeat([-float(stroke.sign) for stroke in strokes], len(FINE))
+    lost = np.concatenate([[-4.0, -2.0], np.linspace(-1.0, 1.0, 41)])
+    usual_n = max(master.friction_n, 5.0)
+    more_n = np.concatenate(
+        [np.linspace(-master.friction_n, 10.0 * usual_n, 61), usual_n * np.array([20.0, 60.0])]
+    )
+    gives = _gives(master)
+    plays = np.concatenate([[0.0], np.geomspace(2e-5, 8e-3, 32)])
+    rates = 1e6 / np.maximum(gives, 1e-3 * gives[1])
+    return [
+        Fault("gas pressure", "share of it lost", "", lost, -lost[:, None] * gas, most=1.0),
+        Fault(
+            "seal friction",
+            "more by",
+            "N",
+            more_n,
+            more_n[:, None] * against,
+            least=-master.friction_n,
+        ),
+        Fault(
+            "air in the oil",
+            "the oil gives by",
+            "mm/kN",
+            gives,
+            _run(steps, lambda cycle: with_compliance(master, cycle, rates)),
+            least=0.0,
+        ),
+        Fault(
+            "play",
+            "of",
+            "mm",
+            1e3 * plays,
+            _run(steps, lambda cycle: with_play(master, cycle, plays)),
+            least=0.0,
+        ),
+        *[_early(master, strokes, sides) for sides in _SIDES if _bend(master, sides)],
+        *[_weaker(master, strokes, sides) for sides in _SIDES],
+    ]
+
+
+_SIDES = (("compression",), ("rebound",), ("compression", "rebound"))
+
+
+def _bend(master: Master, sides: Sequence[str]) -> bool:
+    """Whether the curves of some sides bend at a knee: what a valve that opens makes."""
+    curves = [getattr(master, side) for side in sides]
+    return all(curve.upper_line()[0] > _BEND * curve.force_n[-2] for curve in curves)
+
+
+_BEND = 0.1
+"""Force at no speed of the upper line, over the largest force, from which on a curve has a knee."""
+
+
+def _early(master: Master, strokes: Sequence[MeanStroke], sides: Sequence[str]) -> Fault:
+    """A valve that blows off at a lower speed, and from there on has the slope it has above."""
+    shares = np.linspace(0.0, 0.9, 31)
+    rows: list[Array] = []
+    for stroke in strokes:
+        side, curve = (
+            ("compression", master.compression) if stroke.sign < 0 else ("rebound", master.rebound)
+        )
+        if side not in sides:
+            rows.append(np.zeros((len(shares), len(FINE))))
+            continue
+        less = _less_by_opening(curve, np.abs(_velocity(stroke)), shares)
+        rows.append(-stroke.sign * less)
+    name = f"blow-off early in {' and '.join(sides)}"
+    changes = np.concatenate(rows, axis=1)
+    quantity = "speed of opening lower by the share"
+    return Fault(name, quantity, "", shares, changes, least=0.0, most=1.0)
+
+
+def _weaker(master: Master, strokes: Sequence[MeanStroke], sides: Sequence[str]) -> Fault:
+    """Another damping at all speeds alike: a valve or an oil of another kind."""
+    shares = np.concatenate([np.linspace(-1.0, 1.0, 41), [2.0, 4.0]])
+    rows = [sum(_properties(stroke, master)[side] for side in sides) for stroke in strokes]
+    name = f"another damping in {' and '.join(sides)}"
+    changes = shares[:, None] * np.concatenate(rows)
+    return Fault(name, "at all speeds more by the share", "", shares, changes, least=-1.0)
+
+
+def _gives(master: Master) -> Array:
+    """How far the oil gives way, in mm/kN, up to half the amplitude at the largest force."""
+    largest = max(float(master.compression.force_n[-2]), float(master.rebound.force_n[-2]))
+    amplitude = max(step.amplitude_m for step in master.characteristics.steps)
+    most = 0.5 * amplitude / largest * 1e6
+    return np.concatenate([[0.0], np.geomspace(1e-3 * most, most, 24)])
+
+
+def _run(steps: Sequence[Step], run: Callable[[Cycle], Array]) -> Array:
+    """What a fault's sizes change of a cycle of each step, along its strokes; first size: none."""
+    parts: list[Array] = []
+    for step in steps:
+        made = run(cycle_of(step))
+        changes = made - made[0]
+        parts += [_along(stroke, changes) for stroke in step.strokes]
+    return np.concatenate(parts, axis=1)
+
+
+def _along(stroke: MeanStroke, changes: Array) -> Array:
+    """Changes over a cycle at the angles of a stroke; a cycle begins in the middle of rebound."""
+    turn = FINE if stroke.sign > 0 else np.pi + FINE
+    times = changes.shape[1]
+    place = turn / (2.0 * np.pi) * times % times
+    grid: Array = np.arange(times + 1, dtype=np.float64)
+    closed = np.concatenate([changes, changes[:, :1]], axis=1)
+    return np.array([np.interp(place, grid, row) for row in closed], dtype=np.float64)

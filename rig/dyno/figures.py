@@ -1,0 +1,280 @@
+"""The figures of a block, each a functional of its two mean strokes.
+
+Signs are those of the project: a force is positive when the strut pushes, so that damping is
+positive in compression and negative in rebound. What a figure is:
+
+    force at peak velocity    the mean stroke where the speed is largest
+    window                    its mean over the tenth of the stroke to either side of the middle
+    zero crossing             its value at mid-stroke
+    peak                      its largest magnitude against the motion
+    energy per cycle          what the loop of force over height encloses
+    equivalent damping        the linear damping that takes the same energy from the same motion
+    spring rate               fall of the mean of both strokes per height: gas, springs, and what of
+                              a lag looks like one
+    hysteresis at zero speed  compression less rebound stroke at the turning points: what friction
+                              jumps by there, nothing where it builds up over a travel
+                              (presliding); by speed: speeding up less slowing down, without the
+                              spring
+
+Reference: Dixon, The Shock Absorber Handbook (2007), 10; Lion and Loose, A thermomechanically
+coupled model for automotive shock absorbers, Vehicle System Dynamics 37 (2002).
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, combined, mean_stroke
+from rig.dyno.strokes import Block, Motion, motion_of, repeats
+
+Array = NDArray[np.float64]
+
+QUASI_STATIC_M_PER_S = 5e-3
+"""Peak speed up to which a step tells friction and gas force: seals and bleed alone damp there."""
+
+_WINDOW = 0.1
+"""Of half the stroke, to either side of the middle."""
+
+_CENTRAL = 0.2
+"""Share of half the stroke in which strokes are compared with each other: the speed is within two
+per cent of its peak there."""
+
+_SPEEDS = (0.25, 0.5, 0.75)
+"""Shares of the peak speed at which hysteresis is told."""
+
+_RULE: tuple[Array, Array] = np.polynomial.legendre.leggauss(400)
+_PLACE, _WEIGHT = 0.5 * np.pi * _RULE[0], 0.5 * np.pi * _RULE[1]
+"""Angles and weights of an integral over a stroke."""
+
+SIDES = ("compression", "rebound")
+
+
+class Side(NamedTuple):
+    """Figures of one direction.
+
+    Attributes:
+        peak_velocity: Largest speed, in m/s, positive.
+        force_at_peak_velocity: Force there, in N.
+        force_window: Mean about mid-stroke, in N.
+        force_zero_crossing: Force at mid-stroke, in N.
+        peak_force: Largest force against the motion, in N.
+        hysteresis: By share of the peak speed: force speeding up less force slowing down, in N.
+    """
+
+    peak_velocity: Figure
+    force_at_peak_velocity: Figure
+    force_window: Figure
+    force_zero_crossing: Figure
+    peak_force: Figure
+    hysteresis: Mapping[str, Figure]
+
+
+class Step(NamedTuple):
+    """Figures of a block: one step of a test.
+
+    Attributes:
+        begin_s: Its beginning.
+        end_s: Its end.
+        cycles: Cycles that were used.
+        frequency_hz: Cycles a second; None where the motion is not periodic.
+        amplitude_m: Half the stroke.
+        middle_m: Height at mid-stroke.
+        temperature_c: Mean temperature; None where none was measured.
+        compression: Figures of the compression strokes.
+        rebound: Figures of the rebound strokes.
+        energy_per_cycle: In J.
+        equivalent_damping: In N·s/m.
+        spring_rate: In N/m.
+        mean_force: Mean of both strokes at mid-stroke, in N: the gas force where it is slow.
+        half_difference: Half of compression less rebound at mid-stroke, in N: the friction where it
+            is slow.
+        hysteresis_at_zero: In N.
+        strokes: The mean strokes, compression and rebound.
+        warmth: Of both directions the temperature of each stroke and its force about mid-stroke.
+    """
+
+    begin_s: float
+    end_s: float
+    cycles: float
+    frequency_hz: float | None
+    amplitude_m: float
+    middle_m: float
+    temperature_c: float | None
+    compression: Side
+    rebound: Side
+    energy_per_cycle: Figure
+    equivalent_damping: Figure
+    spring_rate: Figure
+    mean_force: Figure
+    half_difference: Figure
+    hysteresis_at_zero: Figure
+    strokes: tuple[MeanStroke, MeanStroke]
+    warmth: tuple[tuple[Array, Array], tuple[Array, Array]]
+
+    @property
+    def peak_speed_m_per_s(self) -> float:
+        """Larger of both sides' peak velocities."""
+        return max(self.compression.peak_velocity.value, self.rebound.peak_velocity.value)
+
+
+def step_of(
+    t_s: Array, height_m: Array, force_n: Array, temperature_c: Array | None, block: Block
+) -> Step | None:
+    """Figures of a block; None where it has too few samples for any, or does not repeat.
+
+    Args:
+        t_s: Times of the record, shape (N,).
+        height_m: Heights, shape (N,).
+        force_n: Strut forces, shape (N,).
+        temperature_c: Temperatures, shape (N,), or None.
+        block: The block.
+    """
+    here = slice(block.begin, block.end)
+    motion = motion_of(t_s[here], height_m[here], len(block.strokes))
+    if np.isnan(motion.period_s) and not repeats(t_s, height_m, block):
+        return None
+    velocity = motion.velocity_m_per_s
+    # A stroke ends where the velocity turns, which the samples hardly ever hit.
+    turned = np.concatenate([[0], np.cumsum(np.diff(np.sign(velocity)) != 0)])
+    found: list[MeanStroke] = []
+    for sign in (-1, 1):
+        stroke = mean_stroke(motion, force_n[here], turned, sign)
+        if stroke is None:
+            return None
+        found.append(stroke)
+    down, up = found
+    speed_std = motion.velocity_std_m_per_s
+    warm = None if temperature_c is None else float(np.mean(temperature_c[here]))
+    return Step(
+        float(t_s[block.begin]),
+        float(t_s[block.end - 1]),
+        0.5 * len(block.strokes),
+        None if np.isnan(motion.period_s) else 1.0 / motion.period_s,
+        0.5 * (down.amplitude_m + up.amplitude_m),
+        0.5 * (down.middle_m + up.middle_m),
+        warm,
+        _side(down, down, up, speed_std),
+        _side(up, down, up, speed_std),
+        *_of_both(down, up, speed_std / float(np.abs(velocity).max())),
+        (down, up),
+        (
+            _warmth(down, motion, force_n[here], turned, temperature_c, here),
+            _warmth(up, motion, force_n[here], turned, temperature_c, here),
+        ),
+    )
+
+
+def _warmth(
+    stroke: MeanStroke,
+    motion: Motion,
+    force_n: Array,
+    number: NDArray[np.int64],
+    temperature_c: Array | None,
+    here: slice,
+) -> tuple[Array, Array]:
+    """Temperature of each stroke, and its force about mid-stroke as the mean stroke's and more."""
+    if temperature_c is None:
+        return np.empty(0), np.empty(0)
+    place = stroke.sign * (motion.height_m - stroke.middle_m) / stroke.amplitude_m
+    central = (np.abs(place) < _CENTRAL) & (stroke.sign * motion.velocity_m_per_s > 0.0)
+    if not central.any():
+        return np.empty(0), np.empty(0)
+    theta = np.arcsin(place[central])
+    more_n = force_n[central] - stroke.row(theta) @ stroke.force_n
+    middle_n = float((stroke.row(0.0) @ stroke.force_n)[0])
+    numbers = number[central]
+    of_stroke = [numbers == n for n in np.unique(numbers)]
+    warm = temperature_c[here][central]
+    return (
+        np.array([warm[mine].mean() for mine in of_stroke]),
+        np.array([middle_n + more_n[mine].mean() for mine in of_stroke]),
+    )
+
+
+def _side(stroke: MeanStroke, down: MeanStroke, up: MeanStroke, speed_std: float) -> Side:
+    speed = np.abs(stroke.velocity_m_per_s)
+    peak = float(speed.max())
+    row, what = np.eye(len(ANGLES))[int(np.argmax(speed))], "mean stroke at the largest speed"
+    method = "largest slope of the fitted motion"
+    if stroke.is_constant:
+        # What a smoothed motion has beside its turning points is no larger speed.
+        plateau = speed[np.abs(np.sin(ANGLES)) <= _WINDOW]
+        peak, speed_std = float(plateau.mean()), float(np.hypot(speed_std, plateau.std()))
+        row, what = stroke.row(0.0)[0], "mean stroke at mid-stroke: the speed is constant"
+        method = "speed about mid-stroke, where it is constant"
+    middle = np.arcsin(np.linspace(-_WINDOW, _WINDOW, 21))
+    against = int(np.argmax(-stroke.sign * stroke.force_n))
+    one = np.eye(len(ANGLES))
+    half = 1.96 * speed_std
+    return Side(
+        Figure(peak, peak - half, peak + half, method),
+        stroke.figure(row, what),
+        stroke.figure(
+            stroke.row(middle).mean(axis=0), f"window of {100 * _WINDOW:.0f} % about mid-stroke"
+        ),
+        stroke.figure(stroke.row(0.0)[0], "zero crossing of the height"),
+        stroke.figure(one[against], "largest force of the mean stroke"),
+        {f"{share:g}": _hysteresis(stroke, down, up, share * peak) for share in _SPEEDS},
+    )
+
+
+def _hysteresis(stroke: MeanStroke, down: MeanStroke, up: MeanStroke, speed: float) -> Figure:
+    """Speeding up less slowing down at a speed, without the spring."""
+    fast = np.flatnonzero(np.abs(stroke.velocity_m_per_s) >= speed)
+    first, last = ANGLES[fast[0]], ANGLES[fast[-1]]
+    rows = {id(item): np.zeros(len(ANGLES)) for item in (down, up)}
+    rows[id(stroke)] += (stroke.row(first) - stroke.row(last))[0]
+    # The spring's share: its rate times the heights between, towards lower forces upwards.
+    apart_m = stroke.sign * stroke.amplitude_m * float(np.sin(last) - np.sin(first))
+    for item, row in _spring(down, up):
+        rows[id(item)] -= apart_m * row
+    parts = [(rows[id(item)], item) for item in (down, up)]
+    return combined(parts, "same speed, speeding up less slowing down, spring removed")
+
+
+def _spring(down: MeanStroke, up: MeanStroke) -> list[tuple[MeanStroke, Array]]:
+    """The spring rate as rows: the least-squares slope of both strokes' mean, with its sign."""
+    place = _PLACE
+    inside = np.abs(place) <= np.arcsin(0.9)
+    u, w = np.sin(place[inside]), (_WEIGHT * np.cos(place))[inside]
+    slope = w * u / float(np.sum(w * u * u))
+    return [
+        (item, -0.5 * item.sign / item.amplitude_m * (slope @ item.row(place[inside])))
+        for item in (down, up)
+    ]
+
+
+def _of_both(
+    down: MeanStroke, up: MeanStroke, relative_std: float
+) -> tuple[Figure, Figure, Figure, Figure, Figure, Figure]:
+    place = _PLACE
+    along = _WEIGHT * np.cos(place)
+    work = [
+        (-item.sign * item.amplitude_m * (along @ item.row(place)), item) for item in (down, up)
+    ]
+    squared = sum(
+        item.amplitude_m * float(along @ np.abs(item.row(place) @ item.velocity_m_per_s))
+        for item in (down, up)
+    )
+    spring = [(row, item) for item, row in _spring(down, up)]
+    mid_down, mid_up = down.row(0.0)[0], up.row(0.0)[0]
+    last, first = 0.5 * np.pi, -0.5 * np.pi
+    # The upper turning point ends the rebound and begins the compression, the lower one the other.
+    turning_down = (down.row(first) + down.row(last))[0]
+    turning_up = (up.row(first) + up.row(last))[0]
+    return (
+        combined(work, "area of the loop", 1.0, relative_std),
+        combined(
+            work, "energy over that of a linear damper of 1 N·s/m", 1.0 / squared, relative_std
+        ),
+        combined(spring, "slope of the mean of both strokes, inner 90 %", 1.0, relative_std),
+        combined([(mid_down, down), (mid_up, up)], "mean of both strokes at mid-stroke", 0.5),
+        combined(
+            [(mid_down, down), (-mid_up, up)], "half the difference of both at mid-stroke", 0.5
+        ),
+        combined(
+            [(turning_down, down), (-turning_up, up)], "difference at the turning points", 0.5
+        ),
+    )

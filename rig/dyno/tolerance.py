@@ -1,0 +1,205 @@
+"""A band of tolerance about a master curve, and where a damper stands in it.
+
+A point passes when its interval lies inside the band, fails when it lies outside, and is open when
+the interval crosses a limit: the measurement then proves neither (ISO 14253-1, 2017).
+"""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from can_dbc.errors import InputError
+from can_dbc.yaml_file import load_validated, read_text, validated
+from rig.dyno.figures import Step
+from rig.dyno.stroke_force import Figure
+
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Verdict = Literal["pass", "fail", "open", "not measured"]
+
+_COLUMNS = ("velocity_m_per_s", "compression_low_n", "compression_high_n", "rebound_low_n",
+            "rebound_high_n")  # fmt: skip
+
+
+class Point(BaseModel):
+    """Limits at one peak velocity.
+
+    Attributes:
+        velocity_m_per_s: The velocity.
+        compression_low_n: Smallest force in compression.
+        compression_high_n: Largest.
+        rebound_low_n: Smallest force in rebound, where damping is negative.
+        rebound_high_n: Largest.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    velocity_m_per_s: Annotated[float, Field(gt=0.0, le=100.0, strict=True)]
+    compression_low_n: Finite
+    compression_high_n: Finite
+    rebound_low_n: Finite
+    rebound_high_n: Finite
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "Point":
+        for side in ("compression", "rebound"):
+            low, high = getattr(self, f"{side}_low_n"), getattr(self, f"{side}_high_n")
+            if low >= high:
+                raise ValueError(f"{side}_low_n {low}: expected less than {side}_high_n ({high})")
+        return self
+
+
+class Tolerance(BaseModel):
+    """A band about a master curve.
+
+    Attributes:
+        name: What it is for.
+        points: Limits by peak velocity, increasing.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: Annotated[str, Field(min_length=1, max_length=200)]
+    points: Annotated[tuple[Point, ...], Field(min_length=1, max_length=1000)]
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "Tolerance":
+        speeds = [point.velocity_m_per_s for point in self.points]
+        if sorted(set(speeds)) != speeds:
+            raise ValueError("points: expected velocities that increase")
+        return self
+
+
+class Judged(NamedTuple):
+    """A point of a damper.
+
+    Attributes:
+        velocity_m_per_s: Peak velocity.
+        side: `compression` or `rebound`.
+        force: Its force there; None where no step is near.
+        low_n: Smallest that is allowed.
+        high_n: Largest.
+        verdict: How it stands.
+    """
+
+    velocity_m_per_s: float
+    side: str
+    force: Figure | None
+    low_n: float
+    high_n: float
+    verdict: Verdict
+
+    def as_dict(self) -> dict[str, object]:
+        """For a file."""
+        force = None if self.force is None else self.force.as_dict()
+        return {**self._asdict(), "force": force}
+
+    def words(self) -> str:
+        """The same in a line."""
+        band = f"{self.low_n:g} to {self.high_n:g} N"
+        if self.force is None:
+            return f"no step at {self.velocity_m_per_s:g} m/s, expected {band}"
+        low, high = self.force.low, self.force.high
+        return (
+            f"{self.force.value:.1f} N ({low:.1f} to {high:.1f}), {self.force.method}, "
+            f"expected {band}"
+        )
+
+
+def load_tolerance(path: Path) -> Tolerance:
+    """A band from YAML, or from CSV with the columns of `Point`.
+
+    Raises:
+        InputError: One line that names file, key, value and what was expected.
+    """
+    if path.suffix.lower() != ".csv":
+        return load_validated(Tolerance, path)
+    text = read_text(path).removeprefix("\ufeff")  # as spreadsheets begin a file
+    rows = list(csv.reader(text.splitlines()))
+    while rows and not any(cell.strip() for cell in rows[-1]):
+        rows.pop()
+    if not rows or tuple(cell.strip() for cell in rows[0]) != _COLUMNS:
+        raise InputError(f"{path}: line 1: expected the header {','.join(_COLUMNS)}")
+    points: list[dict[str, float]] = []
+    for number, row in enumerate(rows[1:], start=2):
+        if len(row) != len(_COLUMNS):
+            raise InputError(f"{path}: line {number}: {len(row)} cells, expected {len(_COLUMNS)}")
+        points.append(dict(zip(_COLUMNS, _numbers(path, number, row), strict=True)))
+    if not points:
+        raise InputError(f"{path}: holds no point, expected rows under the header")
+    return validated(Tolerance, {"name": path.stem, "points": points}, str(path))
+
+
+def _numbers(path: Path, line: int, row: Sequence[str]) -> list[float]:
+    try:
+        return [float(cell) for cell in row]
+    except ValueError:
+        raise InputError(f"{path}: line {line}: {','.join(row)}: expected numbers") from None
+
+
+def judged(steps: Sequence[Step], kinds: Sequence[str], tolerance: Tolerance) -> list[Judged]:
+    """Every point of a band, compression and rebound.
+
+    A point belongs to the velocity step nearest to its speed within 1 %; the force is then less
+    certain by what it may change over the difference. Between two steps the force of a damper lies
+    between theirs, since it rises with speed: that is its interval. Beyond all steps it is not
+    measured. A warm-up is no step.
+
+    Args:
+        steps: The steps of a damper.
+        kinds: What each of them is, as `damper_of` says.
+        tolerance: The band.
+    """
+    used = [step for step, kind in zip(steps, kinds, strict=True) if kind != "warm_up"]
+    ordered = sorted(used, key=lambda step: step.peak_speed_m_per_s)
+    found: list[Judged] = []
+    for point in tolerance.points:
+        for side, low, high in (
+            ("compression", point.compression_low_n, point.compression_high_n),
+            ("rebound", point.rebound_low_n, point.rebound_high_n),
+        ):
+            force = _force_at(ordered, side, point.velocity_m_per_s)
+            verdict = _verdict(force, low, high)
+            found.append(Judged(point.velocity_m_per_s, side, force, low, high, verdict))
+    return found
+
+
+_SAME = 0.01
+"""Relative distance of a step's speed from a point's up to which it is the point's."""
+
+_STEEPEST = 2.0
+"""Power of the speed with which the force of an orifice rises: no damper's rises faster."""
+
+
+def _force_at(ordered: Sequence[Step], side: str, speed: float) -> Figure | None:
+    sides = [step.compression if side == "compression" else step.rebound for step in ordered]
+    speeds = [one.peak_velocity.value for one in sides]
+    figures = [one.force_at_peak_velocity for one in sides]
+    if not speeds:
+        return None
+    nearest = min(range(len(speeds)), key=lambda place: abs(speeds[place] / speed - 1.0))
+    apart = abs(speeds[nearest] / speed - 1.0)
+    if apart <= _SAME:
+        found = figures[nearest]
+        more = _STEEPEST * apart * abs(found.value)
+        method = f"step at {speeds[nearest]:.4g} m/s"
+        return Figure(found.value, found.low - more, found.high + more, method)
+    for place in range(len(speeds) - 1):
+        if speeds[place] <= speed <= speeds[place + 1]:
+            share = (speed - speeds[place]) / (speeds[place + 1] - speeds[place])
+            below, above = figures[place], figures[place + 1]
+            value = (1.0 - share) * below.value + share * above.value
+            low, high = min(below.low, above.low), max(below.high, above.high)
+            method = f"between steps at {speeds[place]:.3g} and {speeds[place + 1]:.3g} m/s"
+            return Figure(value, low, high, method)
+    return None
+
+
+def _verdict(force: Figure | None, low: float, high: float) -> Verdict:
+    if force is None:
+        return "not measured"
+    if low <= force.low and force.high <= high:
+        return "pass"
+    return "fail" if force.high < low or force.low > high else "open"

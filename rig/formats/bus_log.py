@@ -1,0 +1,129 @@
+"""A bus log of another program becomes a run, as if the bridge had received it live."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from can_dbc.addressing import Directory
+from can_dbc.errors import InputError
+from can_dbc.frame import Frame
+from rig.bridge.messages import Conditions
+from rig.bus.link import LinkFigures
+from rig.bus.log_files import read_log
+from rig.formats.import_report import ImportReport
+from rig.machine.clock import VirtualClock
+from rig.plan.assembly import build_bridge
+from rig.plan.setup import Setup
+from rig.run.logged_run import logged
+from rig.run.loop import Progress
+
+_LONGEST_GAP_NS = 3_600_000_000_000
+"""Time between two frames of one recording, an hour; more is another day's, or a wrong clock."""
+
+
+class _LogPort:
+    """Frames of a foreign log, tick by tick. What the bridge sends goes nowhere."""
+
+    def __init__(self, source: Path, directory: Directory, first_due_ns: int) -> None:
+        self._source = source
+        self._frames = read_log(source)
+        self._directory = directory
+        self.taken = 0
+        self.others = 0
+        self.last_ns = 0
+        self._waiting = self._next()
+        self.first_ns = 0 if self._waiting is None else self._waiting.t_ns
+        self._shift_ns = first_due_ns - self.first_ns
+
+    @property
+    def ended(self) -> bool:
+        """Whether all frames were read."""
+        return self._waiting is None
+
+    def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
+        """Frames up to a tick."""
+        frames: list[Frame] = []
+        while (frame := self._waiting) is not None and frame.t_ns + self._shift_ns <= t_ns:
+            # A log that several channels were written to may be out of order by a little.
+            self.last_ns = max(frame.t_ns, self.last_ns)
+            frames.append(replace(frame, t_ns=self.last_ns + self._shift_ns))
+            self.taken += 1
+            self._waiting = self._next()
+        return frames, Conditions()
+
+    def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
+        """Log nothing as sent."""
+        return frames[:0]
+
+    def _next(self) -> Frame | None:
+        for _, frame in self._frames:
+            if self._directory.place(frame.arbitration_id, frame.is_extended) is not None:
+                if self.taken and frame.t_ns - self.last_ns > _LONGEST_GAP_NS:
+                    gap_s = (frame.t_ns - self.last_ns) * 1e-9
+                    raise InputError(
+                        f"{self._source}: {gap_s:.0f} s without a frame of the bench, "
+                        "expected a log of one run: cut it there"
+                    )
+                return frame
+            self.others += 1
+        return None
+
+
+def import_log(
+    source: Path, ready: Setup, out: Path, progress: Progress = lambda _t, _mode: None
+) -> ImportReport:
+    """Turn a bus log of another program into a run, as if the bridge had received it live.
+
+    Args:
+        source: BLF, ASC, candump, TRC or MF4 log of a bus.
+        ready: Configuration that says which signals are read, with model and DBC.
+        out: Folder of the run to write; absent or empty.
+        progress: Called with time and mode of every tick.
+
+    Returns:
+        What was made and what was assumed.
+
+    Raises:
+        InputError: The log cannot be read, holds no frame that the bridge hears, or the folder
+            cannot be written.
+    """
+    bridge = build_bridge(ready)
+    # Half a tick after a tick, so that the jitter of a bench as fast as the bridge gives each tick
+    # one frame, and not two to one and none to the next.
+    port = _LogPort(source, bridge.directory, ready.config.period_ns // 2)
+    wanted = tuple(item.message.name for item in bridge.incoming)
+    if port.ended:
+        raise InputError(
+            f"{source}: none of its {port.others} frames is one of {', '.join(wanted)}, "
+            "expected a log of the bench that the configuration describes"
+        )
+    endless = ready.model_copy(
+        update={"config": ready.config.model_copy(update={"duration_s": None})}
+    )
+    ended = logged(
+        endless,
+        bridge,
+        port,
+        VirtualClock(),
+        out,
+        figures=LinkFigures(),
+        stop=lambda: port.ended,
+        progress=progress,
+    )
+    duration_s = (port.last_ns - port.first_ns) * 1e-9
+    counts = ended.state.counts
+    return ImportReport(
+        out,
+        port.taken,
+        duration_s,
+        port.taken / duration_s if duration_s > 0.0 else 0.0,
+        wanted,
+        (
+            f"meaning of the frames from {ready.database.path.name}; "
+            f"{port.others} frames of other ids left out",
+            "all frames taken as received, error frames left out; the first one is at half a tick",
+            f"estimates computed with model {ready.model.name} at {ready.config.rate_hz:g} Hz",
+            f"{counts.lost} frames lost and {counts.refused} refused by counter and checksum",
+        ),
+    )

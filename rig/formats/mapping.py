@@ -1,0 +1,228 @@
+"""What a foreign table means: its layout, its times, and the unit and sign of each column.
+
+Nothing is guessed: what the mapping leaves open is assumed as documented.
+"""
+
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from can_dbc.errors import DatabaseError, InputError
+from can_dbc.units import Dimension, SiConversion, si_conversion
+from can_dbc.yaml_file import load_validated
+
+Text = Annotated[str, Field(min_length=1, max_length=200)]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Unit = Annotated[str, Field(min_length=1, max_length=40)]
+Place = Text | Annotated[int, Field(ge=1, le=10_000)]
+"""A column by its name, or by its number, the first one being 1."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+
+class Table(_Section):
+    """How the text is laid out.
+
+    Attributes:
+        separator: Between cells: one character, ``tab``, or ``whitespace`` for any run of blanks.
+        decimal: Decimal point or comma.
+        encoding: Of the text, as Python calls it.
+        skip_lines: Lines before the column names, or before the data where there are no names.
+        column_names: Whether a line with the column names stands before the data.
+        skip_after_names: Lines between the names and the data, e.g. one with units.
+        first_row: First row of data that is taken, counted from 0.
+        rows: Number of rows that are taken; all if absent.
+    """
+
+    separator: Annotated[str, Field(pattern=r"^(.|tab|whitespace)$")] = ","
+    decimal: Literal[".", ","] = "."
+    encoding: Text = "utf-8-sig"
+    skip_lines: Annotated[int, Field(ge=0, le=100_000)] = 0
+    column_names: bool = True
+    skip_after_names: Annotated[int, Field(ge=0, le=1000)] = 0
+    first_row: Annotated[int, Field(ge=0, le=10**12)] = 0
+    rows: Annotated[int, Field(ge=1, le=10**12)] | None = None
+
+    @model_validator(mode="after")
+    def _one_meaning_a_character(self) -> "Table":
+        if self.separator == self.decimal:
+            raise ValueError(
+                f"separator {self.separator!r} is also the decimal sign, expected another"
+            )
+        return self
+
+
+class Time(_Section):
+    """When a row was measured: a column of numbers, a column of dates, or a sampling rate.
+
+    Attributes:
+        column: Column of the time.
+        unit: Unit of a column of numbers, e.g. ``s`` or ``ms``.
+        date_format: How a column of dates is written, in the letters of C's ``strptime``; ``iso``
+            for ISO 8601.
+        sampling_rate_hz: Rows a second, where there is no column.
+    """
+
+    column: Place | None = None
+    unit: Unit | None = None
+    date_format: Text | None = None
+    sampling_rate_hz: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "Time":
+        if (self.column is None) == (self.sampling_rate_hz is None):
+            raise ValueError("expected one of column and sampling_rate_hz")
+        if self.column is None and (self.unit or self.date_format):
+            raise ValueError("unit and date_format go with a column, expected none of them")
+        if self.column is not None and (self.unit is None) == (self.date_format is None):
+            raise ValueError("expected one of unit and date_format with the column")
+        return self
+
+
+class _Channel(_Section):
+    """A measured quantity: `si = sign * gain * reading` in `unit`, converted to SI, plus an offset.
+
+    Attributes:
+        column: Its column.
+        unit: Unit of gain times reading, e.g. ``mm``, ``kN``, ``lbf``.
+        gain: Units a reading, e.g. of a sensor whose volts were recorded.
+        sign: -1 where the foreign table counts the other way.
+    """
+
+    column: Place
+    unit: Unit
+    gain: Number = 1.0
+    sign: Literal[1, -1] = 1
+
+    @model_validator(mode="after")
+    def _says_something(self) -> "_Channel":
+        if self.gain == 0.0:
+            raise ValueError("gain 0: expected another number")
+        return self
+
+
+class HeightChannel(_Channel):
+    """A height; `offset_m` is added, e.g. the strut's length where the sensor reads zero."""
+
+    offset_m: Number = 0.0
+
+
+class ForceChannel(_Channel):
+    """A force; `offset_n` is added, e.g. minus the reading of an unloaded cell."""
+
+    offset_n: Number = 0.0
+
+
+class TemperatureChannel(_Channel):
+    """A temperature; `offset_k` is added."""
+
+    offset_k: Number = 0.0
+
+
+class Mapping(_Section):
+    """What a foreign table means.
+
+    Attributes:
+        table: How the text is laid out; not read for MF4 files.
+        time: When a row was measured; not read for MF4 files, whose channels have times.
+        height: Strut height, positive apart.
+        applied_force: Force on the body, positive upwards (force-driven bench).
+        strut_force: Load cell, positive when the strut pushes its bodies apart.
+        temperature: Damper temperature.
+    """
+
+    table: Table = Table()
+    time: Time | None = None
+    height: HeightChannel
+    applied_force: ForceChannel | None = None
+    strut_force: ForceChannel | None = None
+    temperature: TemperatureChannel | None = None
+
+    @model_validator(mode="after")
+    def _has_a_force(self) -> "Mapping":
+        if self.applied_force is None and self.strut_force is None:
+            raise ValueError("expected applied_force or strut_force beside height")
+        return self
+
+
+def load_mapping(path: Path) -> Mapping:
+    """Read a mapping.
+
+    Raises:
+        InputError: One line that names file, key, value and what was expected.
+    """
+    mapping = load_validated(Mapping, path)
+    try:
+        outputs_of(mapping)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return mapping
+
+
+class Output(NamedTuple):
+    """A column of the CSV that is written, and how it comes from a reading: `a * reading + b`."""
+
+    name: str
+    key: str
+    place: Place
+    unit: str
+    factor: float
+    offset: float
+    words: str
+
+
+def outputs_of(mapping: Mapping) -> list[Output]:
+    """The columns of the CSV that a mapping gives.
+
+    Raises:
+        InputError: A unit is unknown or of another dimension.
+    """
+    made: list[Output] = []
+    height, temperature = mapping.height, mapping.temperature
+    made.append(_output("height_m", "height", height, Dimension.LENGTH, height.offset_m))
+    for name, key, force in (
+        ("applied_force_n", "applied_force", mapping.applied_force),
+        ("strut_force_n", "strut_force", mapping.strut_force),
+    ):
+        if force is not None:
+            made.append(_output(name, key, force, Dimension.FORCE, force.offset_n))
+    if temperature is not None:
+        made.append(
+            _output(
+                "temperature_c",
+                "temperature",
+                temperature,
+                Dimension.TEMPERATURE,
+                temperature.offset_k,
+            )
+        )
+    return made
+
+
+def _output(name: str, key: str, channel: _Channel, dimension: Dimension, add: float) -> Output:
+    conversion = unit_conversion(channel.unit, dimension, key)
+    factor = conversion.factor * channel.gain * channel.sign
+    words = f"{name} = {factor:.9g} * column {channel.column!r}"
+    offset = conversion.offset + add
+    if offset:
+        words += f" {'+' if offset > 0 else '-'} {abs(offset):.9g}"
+    gain = "" if channel.gain == 1.0 else f", {channel.gain:g} {channel.unit} a reading"
+    turned = ", sign turned" if channel.sign < 0 else ""
+    words += f" (read in {channel.unit}{gain}{turned})"
+    return Output(name, key, channel.column, channel.unit, factor, offset, words)
+
+
+def unit_conversion(unit: str, dimension: Dimension, key: str) -> SiConversion:
+    """How readings become SI; `key` names the channel in an error.
+
+    Raises:
+        InputError: The unit is unknown or of another dimension.
+    """
+    try:
+        return si_conversion(unit, dimension)
+    except DatabaseError as error:
+        raise InputError(f"{key}.unit: {error}") from error

@@ -1,0 +1,207 @@
+"""A run as ASAM MDF 4: a bus log with its DBC, decoded signals, and every step."""
+
+import hashlib
+import importlib
+from collections.abc import Iterable
+from contextlib import closing
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from can_dbc.errors import InputError
+from can_dbc.frame import Frame
+from rig.formats.content import Content, content_of
+from rig.log.reader import (
+    DBC_FILE,
+    MODEL_FILE,
+    RUN_FILE,
+    RunFolder,
+)
+
+_pa = cast("Any", pa)
+_CAN, _STEPS = "CAN_DataFrame", "steps"
+
+
+def _bus_dtype(name: str) -> np.dtype[np.void]:
+    fields: list[Any] = [
+        (f"{name}.BusChannel", "<u1"),
+        (f"{name}.ID", "<u4"),
+        (f"{name}.IDE", "<u1"),
+        (f"{name}.DLC", "<u1"),
+        (f"{name}.DataLength", "<u1"),
+        (f"{name}.DataBytes", "(64,)u1"),
+        (f"{name}.Dir", "<u1"),
+        (f"{name}.EDL", "<u1"),
+        (f"{name}.BRS", "<u1"),
+        (f"{name}.ESI", "<u1"),
+    ]
+    return np.dtype(fields)
+
+
+_FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
+"""Payload lengths by data length code."""
+
+
+def _records(frames: list[tuple[Frame, str]], name: str) -> NDArray[np.void]:
+    """Frames as the MDF standard's bus logging lays them out."""
+    records = np.zeros(len(frames), dtype=_bus_dtype(name))
+    padded = b"".join(frame.data.ljust(64, b"\0") for frame, _ in frames)
+    records[f"{name}.BusChannel"] = 1
+    records[f"{name}.ID"] = [frame.arbitration_id for frame, _ in frames]
+    records[f"{name}.IDE"] = [frame.is_extended for frame, _ in frames]
+    lengths = np.array([len(frame.data) for frame, _ in frames], dtype=np.int64)
+    records[f"{name}.DLC"] = np.searchsorted(_FD_LENGTHS, lengths)
+    records[f"{name}.DataLength"] = lengths
+    records[f"{name}.DataBytes"] = np.frombuffer(padded, dtype=np.uint8).reshape(-1, 64)
+    records[f"{name}.Dir"] = [direction == "T" for _, direction in frames]
+    records[f"{name}.EDL"] = [frame.is_fd for frame, _ in frames]
+    records[f"{name}.BRS"] = [frame.bitrate_switch for frame, _ in frames]
+    return records
+
+
+def _asammdf() -> Any:
+    try:
+        return importlib.import_module("asammdf")
+    except ImportError as error:
+        raise InputError(
+            "format mf4: the package asammdf is missing, expected `pip install rig[mf4]`"
+        ) from error
+
+
+def to_mf4(found: RunFolder, out: Path) -> list[Path]:
+    """Write a run as an MF4 file; returns it.
+
+    Raises:
+        InputError: The package asammdf is missing.
+    """
+    asammdf = _asammdf()
+    content = content_of(found)
+    source = asammdf.Source("CAN", "CAN", "", source_type=2, bus_type=2)
+    dbc = content.files.get(DBC_FILE, b"")
+    with closing(asammdf.MDF(version="4.10")) as mdf:
+        epoch = datetime.fromtimestamp(0, UTC) + timedelta(microseconds=found.epoch_ns // 1000)
+        mdf.header.start_time = epoch
+        for name, is_error in ((_CAN, False), ("CAN_ErrorFrame", True)):
+            frames = [pair for pair in content.frames if pair[0].is_error is is_error]
+            if not frames:
+                continue
+            mdf.append(
+                asammdf.Signal(
+                    _records(frames, name),
+                    np.array([frame.t_ns for frame, _ in frames], dtype=np.int64) * 1e-9,
+                    name=name,
+                    source=source,
+                    attachment=(dbc, DBC_FILE, hashlib.md5(dbc, usedforsecurity=False).digest()),
+                ),
+                comment="frames of the bus",
+            )
+        _append_decoded(mdf, found.folder / DBC_FILE, content)
+        _append_steps(asammdf, mdf, content.steps)
+        for name, data in content.files.items():
+            if name != DBC_FILE:
+                mdf.attach(data, name, hash_sum=hashlib.md5(data, usedforsecurity=False).digest())
+        mdf.save(str(out), compression=2)
+    return [out]
+
+
+def _append_decoded(mdf: Any, dbc: Path, content: Content) -> None:
+    """The signals of the frames, decoded by asammdf with the DBC."""
+    if not any(not frame.is_error for frame, _ in content.frames):
+        return
+    with closing(mdf.extract_bus_logging({"CAN": [(str(dbc), 0)]})) as decoded:
+        for number in range(len(decoded.groups)):
+            channels = [
+                _as_decoded(signal)
+                for signal in decoded.iter_channels(skip_master=True)
+                if signal.group_index == number
+            ]
+            if channels:
+                mdf.append(channels, comment="decoded with the DBC")
+
+
+def _as_decoded(signal: Any) -> Any:
+    """A signal under a name of its own: readers that decode the frames themselves use the plain."""
+    names = [name for name in signal.display_names if name.endswith(f".{signal.name}")]
+    signal.name = f"decoded.{min(names, key=len, default=signal.name)}"
+    signal.display_names = {}
+    return signal
+
+
+def _append_steps(asammdf: Any, mdf: Any, steps: Any) -> None:
+    if steps.num_rows == 0:
+        return
+    t_s = steps.column("t_ns").to_numpy() * 1e-9
+    mdf.append(
+        [
+            asammdf.Signal(steps.column(name).to_numpy(), t_s, name=f"{_STEPS}.{name}")
+            for name in steps.schema.names
+        ],
+        comment=_STEPS,
+    )
+
+
+def from_mf4(source: Path) -> Content:
+    """Read what `to_mf4` wrote.
+
+    Raises:
+        InputError: It is something else, or the package asammdf is missing.
+    """
+    asammdf = _asammdf()
+    try:
+        mdf = asammdf.MDF(str(source))
+    except (OSError, ValueError, LookupError, asammdf.blocks.utils.MdfException) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{source}: is no MF4 file: {reason}") from error
+    with closing(mdf):
+        files = {
+            str(block.file_name): cast("bytes", mdf.extract_attachment(number)[0])
+            for number, block in enumerate(mdf.attachments)
+        }
+        if RUN_FILE not in files or MODEL_FILE not in files:
+            raise InputError(f"{source}: holds no {RUN_FILE}, expected an exported run")
+        frames = [*_frames_of(mdf, _CAN), *_frames_of(mdf, "CAN_ErrorFrame")]
+        frames.sort(key=lambda pair: pair[0].t_ns)
+        return Content(files, frames, _steps_of(mdf))
+
+
+def _frames_of(mdf: Any, name: str) -> Iterable[tuple[Frame, str]]:
+    if name not in mdf:
+        return
+    signal = mdf.get(name)
+    records: Any = signal.samples
+    t_s: NDArray[np.float64] = signal.timestamps
+    t_ns = np.rint(t_s * 1e9).astype(np.int64).tolist()
+    columns = [
+        records[f"{name}.{field}"].tolist()
+        for field in ("ID", "DataLength", "IDE", "EDL", "BRS", "Dir")
+    ]
+    payloads: Any = records[f"{name}.DataBytes"]
+    for row, (t, number, length, extended, fd, switched, sent) in enumerate(
+        zip(t_ns, *columns, strict=True)
+    ):
+        data = payloads[row, :length].tobytes()
+        frame = Frame(t, number, data, bool(extended), bool(fd), bool(switched), name != _CAN)
+        yield frame, "T" if sent else "R"
+
+
+def _steps_of(mdf: Any) -> Any:
+    prefix = f"{_STEPS}."
+    group = next(
+        (
+            number
+            for number, group in enumerate(mdf.groups)
+            if group.channel_group.comment == _STEPS
+        ),
+        None,
+    )
+    if group is None:
+        return _pa.table({})
+    names = [
+        channel.name for channel in mdf.groups[group].channels if channel.name.startswith(prefix)
+    ]
+    arrays = [_pa.array(mdf.get(name, group=group).samples) for name in names]
+    return _pa.Table.from_arrays(arrays, names=[name.removeprefix(prefix) for name in names])

@@ -1,1 +1,0 @@
-"""What comes from outside and may be wrong: the error that says so, and how YAML is read."""

@@ -1,1 +1,0 @@
-"""The outside world: bus, clock and run log."""

@@ -1,0 +1,119 @@
+"""Windows of a run around its faults, each kept apart as a run folder of its own."""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from can_dbc.frame import Frame
+from rig.log.steps import BUS_FAULT, LOG_FAULT, Step
+
+
+class Entry(NamedTuple):
+    """What a tick received, sent and computed."""
+
+    received: Sequence[Frame]
+    sent: Sequence[Frame]
+    step: Step
+
+
+@dataclass(frozen=True)
+class Window:
+    """What is captured around a trigger.
+
+    Attributes:
+        before_ns: Time before it.
+        after_ns: Time after it.
+        most: Captures of one run; later triggers are passed over.
+    """
+
+    before_ns: int
+    after_ns: int
+    most: int
+
+
+class Capture(NamedTuple):
+    """A finished window.
+
+    Attributes:
+        number: 1 for the run's first.
+        why: Trigger, one word.
+        t_ns: Time of the trigger.
+        entries: All of its ticks.
+    """
+
+    number: int
+    why: str
+    t_ns: int
+    entries: list[Entry]
+
+
+class Captures:
+    """Watches a run tick by tick for triggers.
+
+    A trigger is a change to HOLD or SAFE, a fault of the bus or of the log that was not there the
+    tick before, or one given with `trigger`. A trigger within a window does not lengthen it.
+
+    Args:
+        window: What is captured.
+        capture_name: Whether a change from one mode to another is a trigger, and its name if so.
+        finished: Called with every finished window.
+    """
+
+    def __init__(
+        self,
+        window: Window,
+        capture_name: Callable[[int, int], str | None],
+        finished: Callable[[Capture], None],
+    ) -> None:
+        self._window = window
+        self._capture_name = capture_name
+        self._finished = finished
+        self._before: deque[Entry] = deque()
+        self._open: Capture | None = None
+        self._count = 0
+        self._asked: str | None = None
+        self._mode = 0
+        self._flags = 0
+
+    def trigger(self, why: str) -> None:
+        """Capture at the next tick; may be called from any thread.
+
+        Args:
+            why: One word, for the folder's name.
+        """
+        self._asked = why
+
+    def take(self, entry: Entry) -> None:
+        """Look at a tick."""
+        step = entry.step
+        why = self._why(step)
+        self._mode, self._flags = step.mode, step.flags
+        oldest_ns = step.t_ns - self._window.before_ns
+        while self._before and self._before[0].step.t_ns < oldest_ns:
+            self._before.popleft()
+        if self._open is None and why is not None and self._count < self._window.most:
+            self._count += 1
+            self._open = Capture(self._count, why, step.t_ns, list(self._before))
+        if self._open is not None:
+            self._open.entries.append(entry)
+            if step.t_ns - self._open.t_ns >= self._window.after_ns:
+                self.finish()
+        self._before.append(entry)
+
+    def finish(self) -> None:
+        """End an open window now."""
+        if self._open is not None:
+            capture, self._open = self._open, None
+            self._finished(capture)
+
+    def _why(self, step: Step) -> str | None:
+        asked, self._asked = self._asked, None
+        began = step.flags & ~self._flags
+        if asked is not None:
+            return asked
+        if began & BUS_FAULT:
+            return "bus"
+        if began & LOG_FAULT:
+            return "log"
+        return self._capture_name(self._mode, step.mode)

@@ -1,0 +1,298 @@
+"""Reads a run's steps while they are being written, in memory that hardly grows.
+
+Of all steps only the least and the largest value of each 64 are kept; the newest are kept whole,
+and older ones are read again where somebody looks closely. A window is thinned by minimum and
+maximum, never by skipping, so that no peak is lost at any zoom.
+"""
+
+import bisect
+import contextlib
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from rig.log.reader import END_OF_STREAM, STEPS_FILE, part_name
+from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, step_schema
+
+Array = NDArray[np.float64]
+_pa = cast("Any", pa)
+
+BUCKET = 64
+"""Steps of which the extremes are kept: a screen's width of them is a minute at 1 kHz."""
+
+FLAGS = {"acknowledged": ACKNOWLEDGED, "bus_fault": BUS_FAULT, "log_fault": LOG_FAULT}
+"""Columns that the bits of `flags` become: of a sum of bits the largest says little."""
+
+_NEWEST = 131_072
+"""Steps that are kept whole: two minutes at 1 kHz, in some ten megabytes."""
+
+_PIECE = 4096
+"""Steps of a piece that is not added to any more."""
+
+_AT_ONCE = 1024
+"""Batches that are turned into numbers in one go, which bounds the memory for it."""
+
+
+class Window(NamedTuple):
+    """A stretch of a run.
+
+    Attributes:
+        t_s: Times, shape (N,).
+        values: Columns in the order asked for, shape (columns, N); NaN where there is nothing.
+            Where steps were thinned, two neighbours are a bucket's least and largest value.
+        steps: Number of steps in it.
+    """
+
+    t_s: Array
+    values: Array
+    steps: int
+
+
+class RunFollower:
+    """The steps of a run's folder, which may still be written.
+
+    Args:
+        folder: The folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._part, self._offset = 0, 0
+        self._schema: Any = None
+        self.columns: tuple[str, ...] = ()
+        """Names of the columns, `t_ns` first; none before the stream has begun."""
+        self.steps = 0
+        """Steps that have been read."""
+        self._begins: list[int] = []
+        self._places: list[tuple[int, int]] = []
+        self._least, self._largest = _Growing(), _Growing()
+        self._newest: deque[Array] = deque()
+        self._following = 0
+        self._open = np.zeros((0, 0))
+
+    @property
+    def unread_bytes(self) -> int:
+        """Bytes of the present file that have not been read."""
+        with contextlib.suppress(OSError):
+            return max(0, self._path.stat().st_size - self._offset)
+        return 0
+
+    @property
+    def is_another(self) -> bool:
+        """Whether the file is shorter than what was read of it: another run's."""
+        with contextlib.suppress(OSError):
+            return self._path.stat().st_size < self._offset
+        return False
+
+    @property
+    def share_read(self) -> float:
+        """Share of the present file that has been read, 0 to 1."""
+        return self._offset / max(1, self._offset + self.unread_bytes)
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """Times of the first and the last step; zeros before there is one."""
+        if not self.steps:
+            return 0.0, 0.0
+        first = self._least.rows[0, 0] if len(self._least.rows) else self._open[0, 0]
+        return float(first) * 1e-9, float(self._newest[-1][-1, 0]) * 1e-9
+
+    def update(self, most_steps: int) -> None:
+        """Take what has been written since the last time.
+
+        Args:
+            most_steps: About how many steps are taken; the rest is for the next call.
+        """
+        end = self.steps + most_steps
+        while self.steps < end and (batches := self._written()):
+            self._add(_matrix(_pa.Table.from_batches(batches)))
+
+    def window(self, names: Sequence[str], begin_s: float, end_s: float, points: int) -> Window:
+        """A stretch of the run.
+
+        Args:
+            names: Columns; one that the run does not have is NaN.
+            begin_s: Time from which on.
+            end_s: Time up to which.
+            points: Most buckets into which it is thinned.
+        """
+        columns = [self.columns.index(name) if name in self.columns else -1 for name in names]
+        begin_ns, end_ns = begin_s * 1e9 - 0.5, end_s * 1e9 + 0.5
+        begin, end = self.between(begin_s, end_s)
+        first, last = begin // BUCKET, -(-end // BUCKET)
+        if end - begin <= max(_NEWEST // 2, 2 * points):
+            rows = self.rows(begin, end)
+            rows = rows[(rows[:, 0] >= begin_ns) & (rows[:, 0] <= end_ns)]
+            if len(rows) <= 2 * points:
+                return Window(rows[:, 0] * 1e-9, _chosen(rows, columns), len(rows))
+            values = _chosen(rows, columns)
+            return _thinned(rows[:, 0], values, values, points, len(rows))
+        least, largest = self._least.rows[first:last], self._largest.rows[first:last]
+        if last > len(self._least.rows) and len(self._open):
+            least = np.vstack([least, np.fmin.reduce(self._open)])
+            largest = np.vstack([largest, np.fmax.reduce(self._open)])
+        low, high = _chosen(least, columns), _chosen(largest, columns)
+        return _thinned(least[:, 0], low, high, points, end - begin)
+
+    def between(self, begin_s: float, end_s: float) -> tuple[int, int]:
+        """Numbers of steps between which all of a stretch are, with some before and after it."""
+        last = self._bucket(end_s * 1e9 + 0.5) + 1
+        # Behind the last whole bucket are the steps of the next one.
+        end = last * BUCKET if last < len(self._least.rows) else self.steps
+        return self._bucket(begin_s * 1e9 - 0.5) * BUCKET, end
+
+    def rows(self, begin: int, end: int) -> Array:
+        """Steps by their numbers, shape (N, columns), times in ns in the first column.
+
+        Args:
+            begin: Number of the first.
+            end: Number after the last.
+        """
+        begin, end = max(begin, 0), min(end, self.steps)
+        if begin >= end:
+            return np.zeros((0, max(len(self.columns), 1)))
+        kept_from = self.steps - sum(map(len, self._newest))
+        if begin >= kept_from:
+            return self._kept(begin - kept_from, end - kept_from)
+        first = bisect.bisect_right(self._begins, begin) - 1
+        last = bisect.bisect_left(self._begins, end)
+        batches = [self._read_again(*self._places[i]) for i in range(first, last)]
+        offset = self._begins[first]
+        return _matrix(_pa.Table.from_batches(batches))[begin - offset : end - offset]
+
+    @property
+    def _path(self) -> Path:
+        return self._folder / part_name(STEPS_FILE, self._part)
+
+    def _written(self) -> list[Any]:
+        """The next batches that are whole; none where nothing more has been written."""
+        self._go_on()
+        if not self.unread_bytes:
+            return []
+        batches: list[Any] = []
+        # Behind the last whole batch may stand one that is still on its way to the disk.
+        with (
+            contextlib.suppress(_pa.ArrowException, EOFError, OSError),
+            # No mapping: a piece that the disk did not take is cut off again under it.
+            _pa.OSFile(str(self._path)) as source,
+        ):
+            if self._offset == 0:
+                schema = _pa.ipc.open_stream(source).schema
+                common = step_schema()
+                if schema.names[: len(common)] != common.names:
+                    return []  # not a run's steps
+                self._schema, self._offset = schema, source.tell()
+            source.seek(self._offset)
+            while len(batches) < _AT_ONCE:
+                message = _pa.ipc.read_message(source)
+                batch = _pa.ipc.read_record_batch(message, self._schema)
+                self._begins.append(self._following)
+                self._places.append((self._part, self._offset))
+                self._following += batch.num_rows
+                self._offset = source.tell()
+                batches.append(batch)
+        return batches
+
+    def _go_on(self) -> None:
+        """Go on to the next part, where this one has ended and there is one."""
+        following = self._folder / part_name(STEPS_FILE, self._part + 1)
+        # A full disk may have kept the end from this one.
+        with contextlib.suppress(OSError):
+            if following.stat().st_size and self.unread_bytes <= len(END_OF_STREAM):
+                self._part, self._offset = self._part + 1, 0
+
+    def _read_again(self, part: int, offset: int) -> Any:
+        with _pa.OSFile(str(self._folder / part_name(STEPS_FILE, part))) as source:
+            source.seek(offset)
+            return _pa.ipc.read_record_batch(_pa.ipc.read_message(source), self._schema)
+
+    def _add(self, rows: Array) -> None:
+        if not self.columns:
+            self.columns = (*self._schema.names, *FLAGS)
+            self._open = rows[:0]
+        self.steps += len(rows)
+        if self._newest and len(self._newest[-1]) < _PIECE:
+            self._newest[-1] = np.concatenate([self._newest[-1], rows])
+        else:
+            self._newest.append(rows)
+        while sum(map(len, self._newest)) - len(self._newest[0]) >= _NEWEST:
+            self._newest.popleft()
+        rows = np.concatenate([self._open, rows])
+        whole = len(rows) // BUCKET * BUCKET
+        if whole:
+            buckets = rows[:whole].reshape(-1, BUCKET, rows.shape[1])
+            self._least.add(np.fmin.reduce(buckets, axis=1))
+            self._largest.add(np.fmax.reduce(buckets, axis=1))
+        self._open = rows[whole:].copy()
+
+    def _kept(self, begin: int, end: int) -> Array:
+        """Of the newest steps."""
+        found: list[Array] = []
+        first = 0
+        for piece in self._newest:
+            if first < end and first + len(piece) > begin:
+                found.append(piece[max(begin - first, 0) : end - first])
+            first += len(piece)
+        return np.concatenate(found)
+
+    def _bucket(self, t_ns: float) -> int:
+        """Number of the bucket that a time is in."""
+        return max(0, int(np.searchsorted(self._least.rows[:, 0], t_ns, side="right")) - 1)
+
+
+class _Growing:
+    """Rows that are added to; twice the room is taken where there is no more."""
+
+    def __init__(self) -> None:
+        self._room = np.zeros((0, 1))
+        self._count = 0
+
+    @property
+    def rows(self) -> Array:
+        """All rows, shape (N, columns)."""
+        return self._room[: self._count]
+
+    def add(self, rows: Array) -> None:
+        """Add rows."""
+        count = self._count + len(rows)
+        if count > len(self._room):
+            room = np.zeros((max(2 * len(self._room), count, 1024), rows.shape[1]))
+            room[: self._count] = self.rows
+            self._room = room
+        self._room[self._count : count] = rows
+        self._count = count
+
+
+def _matrix(table: Any) -> Array:
+    columns = [np.asarray(column.to_numpy(), np.float64) for column in table.columns]
+    flags = table.column("flags").to_numpy()
+    return np.column_stack([*columns, *((flags & bit > 0) for bit in FLAGS.values())])
+
+
+def _chosen(rows: Array, columns: Sequence[int]) -> Array:
+    """Columns of rows, shape (columns, N); NaN where there is none."""
+    found = np.full((len(columns), len(rows)), np.nan)
+    for place, column in enumerate(columns):
+        if column >= 0:
+            found[place] = rows[:, column]
+    return found
+
+
+def _thinned(t_ns: Array, least: Array, largest: Array, points: int, steps: int) -> Window:
+    """Least and largest values of some buckets, one after the other."""
+    edges = np.linspace(0, len(t_ns), min(points, len(t_ns)) + 1).astype(np.intp)[:-1]
+    low = np.fmin.reduceat(least, edges, axis=1)
+    high = np.fmax.reduceat(largest, edges, axis=1)
+    begin_s = t_ns[edges] * 1e-9
+    middle_s = 0.5 * (begin_s + np.append(begin_s[1:], t_ns[-1] * 1e-9))
+    t_s = np.column_stack([begin_s, middle_s]).ravel()
+    # In the order in which the curve passes them, so that a slope is no staircase.
+    falls = np.diff(low + high, axis=1, append=np.nan) < 0.0
+    low, high = np.where(falls, high, low), np.where(falls, low, high)
+    values = np.stack([low, high], axis=2).reshape(len(low), -1)
+    return Window(t_s, values, steps)

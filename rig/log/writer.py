@@ -1,0 +1,403 @@
+"""Writes the folder of a run while it runs, so that it can be read after a kill.
+
+A thread of its own writes, so that a slow disk does not delay a tick. Frames are written
+unbuffered, at most 10 ms after they came (20 ms while no tick comes); steps are flushed in batches.
+While the disk takes nothing, ticks wait in memory, and what does not fit there is counted.
+"""
+
+import contextlib
+import re
+import shutil
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import pyarrow as pa
+import yaml
+
+from can_dbc.errors import InputError
+from can_dbc.frame import Frame
+from rig.log.captures import Capture, Captures, Entry, Window
+from rig.log.reader import (
+    DBC_FILE,
+    END_OF_STREAM,
+    FRAMES_FILE,
+    MODEL_FILE,
+    RUN_FILE,
+    STEPS_FILE,
+    format_frame,
+    part_name,
+)
+from rig.log.steps import Step, StepRows
+from rig.log.whole_file import WholeFile
+from rig.machine.realtime import follow
+
+FLUSH_NS = 190_000_000
+"""Time of the run that a batch of steps spans; with `WAKE_NS` at most 0.2 s are lost to a kill."""
+
+_MOST_STEPS = 200
+"""Steps in a batch: while a larger one is put together a fast loop waits for the interpreter."""
+
+_MOST_AT_ONCE = 40
+"""Ticks taken over in one go, for the same reason."""
+
+_GIVEN_WAY_S = 5e-5
+"""Pause after each go. Less would not do: a thread that lets go of the interpreter and wants it
+back at once has it again before the one that waits is awake."""
+
+WAKE_NS = 10_000_000
+"""Time of the run after which the writing thread is woken for what was handed over."""
+
+_LONGEST_PAUSE_S = 0.02
+"""After which the writing thread looks by itself, while no tick wakes it."""
+
+MOST_WAITING = 120_000
+"""Ticks that may wait for the disk before they are dropped, and counted: two minutes at 1 kHz."""
+
+MANY_WAITING = 2_000
+"""Ticks waiting that are a fault."""
+
+_ASIDE_EVERY_S = 1.0
+"""Time between two writings of the file beside the log."""
+
+_CLOSING_S = 30.0
+"""How long the end of a run waits for a slow disk."""
+
+_RESERVE_FILE, _RESERVE_BYTES = "reserve.tmp", 65_536
+"""Space kept back, so that a full disk still takes how the run ended."""
+
+_pa = cast("Any", pa)
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """When a run is continued in further files; None for never.
+
+    Attributes:
+        size_bytes: Size of frames and steps together.
+        time_ns: Time of the run that they span.
+    """
+
+    size_bytes: int | None = None
+    time_ns: int | None = None
+
+
+class _Part:
+    """The two files that are written now."""
+
+    def __init__(self, folder: Path, number: int, schema: Any, begin_ns: int) -> None:
+        self.number = number
+        self.begin_ns = begin_ns
+        self.frames = WholeFile(folder / part_name(FRAMES_FILE, number))
+        try:
+            self.steps = WholeFile(folder / part_name(STEPS_FILE, number))
+            try:
+                self.steps.append(schema.serialize().to_pybytes())
+            except OSError:
+                self.steps.close()
+                raise
+        except OSError:
+            self.frames.close()
+            raise
+
+    @property
+    def size(self) -> int:
+        return self.frames.size + self.steps.size
+
+    def close(self) -> None:
+        try:
+            self.steps.append(END_OF_STREAM)
+        finally:
+            self.steps.close()
+            self.frames.close()
+
+
+class RunLog:
+    """Writer of a run's folder.
+
+    Args:
+        folder: Folder to create; it must be empty or absent.
+        header: What is known before the first tick, for `run.yaml`.
+        columns: Names of the numbers of each step.
+        epoch_ns: Unix time of the run's start.
+        channel: Name of the bus in `frames.log`.
+        paced: The run waits for a clock, so a thread of its own writes; otherwise the run waits for
+            the disk.
+        priority: Real-time priority of the loop, which the thread follows; 0 for none.
+        rotation: When the files are continued in others.
+        window: What is captured around faults; None captures nothing.
+        capture_name: Whether a change of mode is a trigger of a capture, and its name if so.
+        aside: Name and content of a file that is written anew once a second, if any.
+
+    Raises:
+        InputError: The folder cannot be created, or holds another run.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        header: dict[str, object],
+        columns: Sequence[str],
+        epoch_ns: int,
+        channel: str,
+        *,
+        paced: bool,
+        priority: int = 0,
+        rotation: Rotation = Rotation(),
+        window: Window | None = None,
+        capture_name: Callable[[int, int], str | None] = lambda _before, _now: None,
+        aside: tuple[str, Callable[[], bytes]] | None = None,
+    ) -> None:
+        self.folder = folder
+        self.fault: str | None = None
+        """What is wrong with the disk now, if anything; the run goes on."""
+        self.trouble: str | None = None
+        """What was wrong with it first, if ever anything was."""
+        self.dropped = 0
+        """Ticks that the disk did not take."""
+        self.is_busy = False
+        """Whether ticks are being written now."""
+        self._header = header
+        self._epoch_ns = epoch_ns
+        # A line of the log has no place for blanks or anything beyond ASCII.
+        self._channel = re.sub(r"[^!-~]", "_", channel)
+        self._columns = tuple(columns)
+        self._aside = aside
+        self._rows = StepRows(columns)
+        self._rotation = rotation
+        self._captures = (
+            None if window is None else Captures(window, capture_name, self._write_capture)
+        )
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if (folder / RUN_FILE).exists():
+                raise InputError(f"{folder}: holds a run already, expected an empty folder")
+            _write_yaml(folder / RUN_FILE, header)
+            (folder / _RESERVE_FILE).write_bytes(bytes(_RESERVE_BYTES))
+            self._part = _Part(folder, 0, self._rows.schema, 0)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
+        self._waiting: deque[Entry] = deque()
+        self._notes: deque[tuple[str, str]] = deque()
+        self._noted: dict[str, WholeFile] = {}
+        self._lines = b""
+        self._priority = priority
+        self._closing = threading.Event()
+        self._wake = threading.Event()
+        self._woken_ns = 0
+        self._thread = threading.Thread(target=self._write_until_closed, name="run-log")
+        self._paced = paced
+        if paced:
+            self._thread.start()
+
+    def add(self, received: Sequence[Frame], sent: Sequence[Frame], step: Step) -> None:
+        """Hand over what a tick received, sent and computed."""
+        waiting = len(self._waiting)
+        if waiting >= MANY_WAITING:
+            self._failed("the disk is too slow")
+            if waiting >= MOST_WAITING:
+                self.dropped += 1
+                return
+        self._waiting.append(Entry(received, sent, step))
+        if not self._paced:
+            self._write_waiting()
+        elif step.t_ns - self._woken_ns >= WAKE_NS:
+            # Woken by the end of a tick's work, and not by a timer, which would as often go off in
+            # the middle of it and take the interpreter from the loop.
+            self._woken_ns = step.t_ns
+            self._wake.set()
+
+    def note(self, name: str, line: str) -> None:
+        """Add a line to another file of the run, before what is logged of the next tick."""
+        self._notes.append((name, line))
+        self._wake.set()
+
+    def trigger(self, why: str) -> None:
+        """Capture a window around the next tick, if windows are captured at all.
+
+        Args:
+            why: One word, for the name of the window's folder.
+        """
+        if self._captures is not None:
+            self._captures.trigger(why)
+
+    def close(self, ending: Callable[[], dict[str, object]]) -> None:
+        """Write what is waiting, and how the run ended.
+
+        Args:
+            ending: Gives what is added to `run.yaml`, when all else is written.
+        """
+        self._closing.set()
+        self._wake.set()
+        if self._paced:
+            self._thread.join(_CLOSING_S)
+        if self._thread.is_alive():
+            self._failed("the disk is too slow")
+        else:
+            self._finish()
+        self.dropped += len(self._waiting) + self._rows.count
+        with contextlib.suppress(OSError):
+            (self.folder / _RESERVE_FILE).unlink()
+        try:
+            _write_yaml(self.folder / RUN_FILE, {**self._header, **ending()})
+        except OSError as error:
+            self._failed(str(error.strerror))
+
+    def _finish(self) -> None:
+        self._write_waiting()
+        self._write_aside()
+        if self._captures is not None:
+            self._captures.finish()
+        try:
+            try:
+                self._flush()
+            finally:
+                self._part.close()
+                for file in self._noted.values():
+                    file.close()
+        except OSError as error:
+            self._failed(str(error.strerror))
+
+    def _failed(self, why: str) -> None:
+        self.fault = why
+        if self.trouble is None:
+            self.trouble = why
+
+    def _write_until_closed(self) -> None:
+        follow(self._priority)
+        due_s = time.monotonic() + _ASIDE_EVERY_S
+        while not self._closing.is_set():
+            self._wake.wait(_LONGEST_PAUSE_S)
+            self._wake.clear()
+            self._write_waiting()
+            if time.monotonic() >= due_s:
+                due_s += _ASIDE_EVERY_S
+                self._write_aside()
+
+    def _write_aside(self) -> None:
+        """Write the file beside the log; where it fails, the next one takes its place."""
+        if self._aside is not None:
+            name, content = self._aside
+            with contextlib.suppress(OSError):
+                _write_whole(self.folder / name, content())
+
+    def _write_waiting(self) -> None:
+        """Write what waits; what the disk does not take is kept, and tried again the next time."""
+        self.is_busy = True
+        try:
+            self._write_notes()
+            self._write_lines()
+            self._flush_if_due()
+            while self._waiting:
+                room = _MOST_STEPS - self._rows.count
+                count = min(_MOST_AT_ONCE, room, len(self._waiting))
+                self._write_notes()  # after the count, so that a note precedes its tick
+                self._take(count)
+                self._write_lines()
+                self._give_way()
+                self._flush_if_due()
+        except OSError as error:
+            self._failed(str(error.strerror))
+        else:
+            self.fault = None
+        finally:
+            self.is_busy = False
+
+    def _write_notes(self) -> None:
+        while self._notes:
+            name, line = self._notes[0]
+            if name not in self._noted:
+                self._noted[name] = WholeFile(self.folder / name)
+            self._noted[name].append(line.encode())
+            self._notes.popleft()
+
+    def _give_way(self) -> None:
+        """Let the loop have the interpreter, if it waits for it."""
+        if self._paced:
+            time.sleep(_GIVEN_WAY_S)
+
+    def _take(self, count: int) -> None:
+        lines: list[str] = []
+        for _ in range(count):
+            entry = self._waiting.popleft()
+            lines += self._lines_of(entry)
+            self._rows.append(entry.step)
+            if self._captures is not None:
+                self._captures.take(entry)
+        self._lines = "".join(lines).encode("ascii")
+
+    def _lines_of(self, entry: Entry) -> list[str]:
+        lines = [self._line(frame, "R") for frame in entry.received]
+        return lines + [self._line(frame, "T") for frame in entry.sent]
+
+    def _line(self, frame: Frame, direction: str) -> str:
+        return format_frame(frame, self._epoch_ns, self._channel, direction)
+
+    def _write_lines(self) -> None:
+        self._part.frames.append(self._lines)
+        self._lines = b""
+
+    def _flush_if_due(self) -> None:
+        if self._rows.span_ns >= FLUSH_NS or self._rows.count >= _MOST_STEPS:
+            last_ns = self._rows.last_ns
+            self._flush()
+            self._rotate(last_ns)
+            self._give_way()
+
+    def _flush(self) -> None:
+        if self._rows.count:
+            self._part.steps.append(_serialized(self._rows))
+            self._rows.clear()
+
+    def _rotate(self, now_ns: int) -> None:
+        """Continue in new files, if it is time; frames and steps then end with the same tick."""
+        limit, part = self._rotation, self._part
+        is_full = limit.size_bytes is not None and part.size >= limit.size_bytes
+        is_long = limit.time_ns is not None and now_ns - part.begin_ns >= limit.time_ns
+        if is_full or is_long:
+            self._part = _Part(self.folder, part.number + 1, self._rows.schema, now_ns)
+            part.close()
+
+    def _write_capture(self, capture: Capture) -> None:
+        folder = self.folder / "captures" / f"{capture.number:03d}_{capture.why}"
+        header = {**self._header, "capture": {"why": capture.why, "t_s": capture.t_ns * 1e-9}}
+        rows = StepRows(self._columns)
+        try:
+            folder.mkdir(parents=True)
+            part = _Part(folder, 0, rows.schema, 0)
+            for first in range(0, len(capture.entries), _MOST_AT_ONCE):
+                lines: list[str] = []
+                for entry in capture.entries[first : first + _MOST_AT_ONCE]:
+                    rows.append(entry.step)
+                    lines += self._lines_of(entry)
+                part.frames.append("".join(lines).encode("ascii"))
+                part.steps.append(_serialized(rows))
+                rows.clear()
+                self._give_way()
+            part.close()
+            for name in (MODEL_FILE, DBC_FILE):
+                if (self.folder / name).exists():
+                    shutil.copyfile(self.folder / name, folder / name)
+            _write_yaml(folder / RUN_FILE, header)
+        except OSError as error:
+            self._failed(f"capture {folder.name}: {error.strerror}")
+
+
+def _serialized(rows: StepRows) -> bytes:
+    return bytes(rows.batch().serialize())
+
+
+def _write_yaml(path: Path, content: dict[str, object]) -> None:
+    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    _write_whole(path, text.encode())
+
+
+def _write_whole(path: Path, content: bytes) -> None:
+    # Written beside and moved, so that a kill leaves the old or the new file, never half of one.
+    beside = path.with_suffix(".tmp")
+    beside.write_bytes(content)
+    beside.replace(path)

@@ -1,0 +1,17 @@
+"""Observers, one file each. A further one is a file here and a line in the table below."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from rig.observers.kalman import KalmanObserver
+from rig.observers.none import NoObserver
+from rig.observers.pi import PiObserver
+
+OBSERVERS: Mapping[str, type[Any]] = MappingProxyType(
+    {"pi": PiObserver, "kalman": KalmanObserver, "none": NoObserver}
+)
+"""`kind` in a configuration -> a frozen pydantic dataclass that is an `Observer`."""
+
+DEFAULT_KIND = "pi"
+"""What an observer without `kind` is."""

@@ -1,0 +1,486 @@
+"""A Kalman filter for the error of the model of one strut: what the observers predict with.
+
+Bench and model carry the same loads but for the residual force d and the virtual force F_v, so that
+the error of the model's height, x = z - z_model, obeys
+
+    m d²x/dt² = d - F_v - k x - c dx/dt,
+
+m the effective mass that the strut's force moves, k and c the slopes of the model's own law, which
+is not where the bench is. The residual force is an integrated random walk of third order (the
+third derivative of d is white noise): a smooth force that nothing else is known of. State: x, its
+rate, and the acceleration d / m with its first two derivatives. The virtual force is a known input,
+so that the filter also tells where the error stands now, when the newest measurement is some
+milliseconds old.
+
+The intensity of the noise is given as a bandwidth: of a sensor with standard deviation sigma every
+h seconds, the steady filter is a Butterworth filter with the corner (q / (sigma² h))^(1/10).
+Variances are in units of sigma², and sigma² itself follows the innovations.
+
+References:
+    Jazwinski, Stochastic Processes and Filtering Theory (1970), 7.
+    Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), 6.
+    Johnson, Optimal control of the linear regulator with constant disturbances, IEEE TAC 13 (1968),
+    for the disturbance as a state.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Annotated, Any, NamedTuple, cast
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+from scipy.linalg import expm  # pyright: ignore[reportUnknownVariableType]
+
+from rig.bridge.contract import Innovation, Start
+
+Array = NDArray[np.float64]
+Mean = tuple[float, float, float, float, float]
+
+ORDER = 5
+"""States: error, rate, acceleration by the residual force and two derivatives of it. With three or
+four the reference case's force error is 2.7 or 1.05 % of the peak at its best bandwidth, with five
+0.85 %, under 20 um of noise."""
+
+_SETTLED = 1e-6
+"""Relative distance of the variances from their limit below which the gains are constant."""
+
+_MOST_DOUBLINGS = 60
+"""Of the recursion for the limit: more updates than any run has."""
+
+_ACCELERATION_STD_M_PER_S2 = 30.0
+"""Of the residual force over the mass, before anything was measured: three times gravity."""
+
+_RATE_STD_M_PER_S = 1.0
+"""Of the model's velocity at its start: dampers move at up to two metres a second."""
+
+_LOWEST_HZ, _HIGHEST_HZ = 0.01, 1e4
+_LEAST_STD_M, _LARGEST_STD_M = 1e-12, 1.0
+"""Bounds of what a filter can be asked for."""
+
+_NOTHING: Mean = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+_FORGOTTEN = 20.0
+"""Time without a measurement, in units of 1 / omega, after which what was known is worth nothing: a
+polynomial of third order is 20³ times as uncertain as at one."""
+
+_STEP_OF_MODEL = 0.5
+"""Of a step of the mean, in radians or time constants of the model's own law: a ten-thousandth of
+its change is left out."""
+
+_FADING_S = 1.0
+"""Time constant with which the innovations' variance is followed."""
+
+_SMALLEST_SCALE, _LARGEST_SCALE = 1e-4, 1e4
+"""Bounds of a variance that follows the innovations, over the configured one."""
+
+
+class Steady(NamedTuple):
+    """A filter that has run for long, at one interval; in units of sigma and 1 / omega.
+
+    Attributes:
+        gain: Gain, shape (5,).
+        innovation: Variance of the innovation.
+        covariance: Of the estimate after an update, shape (5, 5).
+        residual: Variance of the residual force's acceleration after an update.
+    """
+
+    gain: Array
+    innovation: float
+    covariance: Array
+    residual: float
+
+
+class Constants(Struct, frozen=True, gc=False):
+    """What a filter asks for at every measurement and is the same all through a run.
+
+    Attributes:
+        steady: What its variances come to.
+        gain: The steady gain in SI: what each of the mean changes by per metre that is new.
+        innovation_m2: Steady variance of what is new in a measurement.
+        residual_std: Steady standard deviation of `ErrorFilter.residual` at a measurement.
+        fading: Share of the newest innovation in the variances' scale.
+        omega: Corner in rad/s.
+        next_ns: Time since the last measurement from which on one is missing.
+        longest_ns: How long after the last measurement the error is predicted.
+        forgotten_ns: Time after which the last measurement says nothing more.
+        own_per_s: How fast the model's own law moves it: the larger one of its damping and the
+            root of its stiffness, over the mass.
+    """
+
+    steady: Steady
+    gain: Mean
+    innovation_m2: float
+    residual_std: float
+    fading: float
+    omega: float
+    next_ns: int
+    longest_ns: int
+    forgotten_ns: int
+    own_per_s: float
+
+
+class ErrorState(Struct, frozen=True, gc=False):
+    """What is known of the model's error.
+
+    Attributes:
+        t_ns: Time of the estimate: that of the last measurement.
+        mean: Error in m, its rate, acceleration of the residual force and its two derivatives, SI.
+        covariance: In units of sigma and 1 / omega; None once it is steady.
+        scale: Variance of the sensor over the configured one, as the innovations show it.
+        inputs: Accelerations by the virtual force, and from when on; the first one from `t_ns` or
+            before.
+        start: What the filter was started with.
+        constants: What does not change from then on.
+    """
+
+    t_ns: int
+    mean: Mean
+    covariance: Array | None
+    scale: float
+    inputs: tuple[tuple[int, float], ...]
+    start: Start
+    constants: Constants
+
+
+@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
+class ErrorFilter:
+    """The filter of one strut.
+
+    Attributes:
+        bandwidth_hz: Corner up to which the residual force is followed.
+        noise_std_m: Standard deviation of the height measurement, quantisation included
+            (a step over the square root of 12).
+    """
+
+    bandwidth_hz: Annotated[float, Field(ge=_LOWEST_HZ, le=_HIGHEST_HZ)]
+    noise_std_m: Annotated[float, Field(ge=_LEAST_STD_M, le=_LARGEST_STD_M)]
+
+    @classmethod
+    def within(cls, bandwidth_hz: float, noise_std_m: float) -> "ErrorFilter":
+        """The filter whose values are the nearest within their bounds."""
+        return cls(
+            bandwidth_hz=min(max(bandwidth_hz, _LOWEST_HZ), _HIGHEST_HZ),
+            noise_std_m=min(max(noise_std_m, _LEAST_STD_M), _LARGEST_STD_M),
+        )
+
+    @property
+    def omega(self) -> float:
+        """Corner in rad/s."""
+        return 2.0 * math.pi * self.bandwidth_hz
+
+    def init(self, start: Start) -> ErrorState:
+        """State at the model's start, at the first measured height."""
+        inputs, constants = ((start.t_ns, 0.0),), self._constants(start)
+        return ErrorState(start.t_ns, _NOTHING, self._prior(), 1.0, inputs, start, constants)
+
+    def settled(self, start: Start) -> ErrorState:
+        """State after a long time without an error."""
+        return replace(self.init(start), covariance=None)
+
+    def updated(self, state: ErrorState, innovation: Innovation) -> ErrorState:
+        """State at a new measurement; one that is not newer than the last changes nothing.
+
+        Args:
+            state: State at the last measurement.
+            innovation: Measured less model height, at the time of the measurement.
+        """
+        if innovation.t_ns <= state.t_ns:
+            return state
+        constants, t_ns = state.constants, innovation.t_ns
+        elapsed_ns = t_ns - state.t_ns
+        if elapsed_ns > constants.forgotten_ns:
+            return self.anew(state, innovation)
+        mean = moved(state, t_ns)
+        covariance, scale = state.covariance, state.scale
+        # What is new in a measurement: its distance from the error that was predicted.
+        new_m = innovation.value_m - mean[0]
+        if covariance is None and elapsed_ns < constants.next_ns:
+            gain = constants.gain
+            scale = rescaled(constants, scale, new_m * new_m / constants.innovation_m2)
+        else:
+            steady = constants.steady.covariance
+            before = steady if covariance is None else covariance
+            number = max(1, round(elapsed_ns / state.start.interval_ns))
+            in_units, covariance = _gain(spread(before, self.pace(state.start), number))
+            gain = in_si(in_units, constants.omega)
+            limit = np.diagonal(steady)
+            if np.all(np.abs(np.diagonal(covariance) - limit) <= _SETTLED * limit):
+                covariance = None
+        inputs = since(state.inputs, t_ns)
+        mean = corrected(mean, gain, new_m)
+        return ErrorState(t_ns, mean, covariance, scale, inputs, state.start, constants)
+
+    def anew(self, state: ErrorState, innovation: Innovation) -> ErrorState:
+        """State at a measurement before which nothing is known any more."""
+        return replace(
+            state,
+            t_ns=innovation.t_ns,
+            mean=(innovation.value_m, 0.0, 0.0, 0.0, 0.0),
+            covariance=self._prior(),
+            inputs=since(state.inputs, innovation.t_ns),
+        )
+
+    def predicted(self, state: ErrorState, t_ns: int) -> Mean:
+        """Mean at a time after the last measurement.
+
+        Beyond the time constant of the filter behind the time at which a measurement was due, a
+        polynomial would run away: the error is predicted up to there.
+        """
+        return moved(state, min(t_ns, state.t_ns + state.constants.longest_ns))
+
+    def residual(self, state: ErrorState, mean: Mean) -> float:
+        """Acceleration by the force that the model lacks where it is now, in m/s².
+
+        Args:
+            state: The state.
+            mean: Of now, from `predicted`.
+        """
+        x, v, a, *_ = mean
+        return a - state.start.stiffness_per_s2 * x - state.start.damping_per_s * v
+
+    def residual_std(self, state: ErrorState, t_ns: int) -> float:
+        """Standard deviation of `residual`, at a time, in m/s²."""
+        constants, interval_ns = state.constants, state.start.interval_ns
+        elapsed_ns = min(t_ns - state.t_ns, constants.forgotten_ns)
+        number = (elapsed_ns + interval_ns // 2) // interval_ns
+        if state.covariance is not None:
+            variance = _ahead(state.covariance, self.pace(state.start), number)
+        elif number < 1:
+            return math.sqrt(state.scale) * constants.residual_std
+        else:
+            variance = _steady_ahead(self.pace(state.start), number)
+        std = math.sqrt(state.scale * max(variance, 0.0))
+        return std * self.noise_std_m * constants.omega**2
+
+    def with_input(self, state: ErrorState, t_ns: int, acceleration: float) -> ErrorState:
+        """State after the virtual force has changed."""
+        newest, t_last_ns, inputs = (t_ns, acceleration), state.t_ns, state.inputs
+        if t_ns <= t_last_ns:
+            inputs = (newest,)
+        # Without measurements the inputs would grow in number; the prediction ends, and with it
+        # what changes the virtual force.
+        elif t_ns - t_last_ns <= state.constants.longest_ns or acceleration != inputs[-1][1]:
+            inputs = (*inputs, newest)
+        return ErrorState(
+            t_last_ns,
+            state.mean,
+            state.covariance,
+            state.scale,
+            inputs,
+            state.start,
+            state.constants,
+        )
+
+    def numbers(self, state: ErrorState) -> tuple[float, ...]:
+        """What the next state depends on, all of it in m; covariance and times left out."""
+        omega = self.omega
+        means = [value / omega**power for power, value in enumerate(state.mean)]
+        return (*means, *[acceleration / omega**2 for _, acceleration in state.inputs])
+
+    def with_numbers(self, state: ErrorState, numbers: Sequence[float]) -> ErrorState:
+        """The state with other numbers than its own, as `numbers` gives them."""
+        omega = self.omega
+        x, v, a, j, s = (value * omega**power for power, value in enumerate(numbers[:ORDER]))
+        inputs = tuple(
+            (since_ns, value * omega**2)
+            for (since_ns, _), value in zip(state.inputs, numbers[ORDER:], strict=True)
+        )
+        return replace(state, mean=(x, v, a, j, s), inputs=inputs)
+
+    def _constants(self, start: Start) -> Constants:
+        steady, omega, interval_ns = _steady(self.pace(start)), self.omega, start.interval_ns
+        variance_m2 = self.noise_std_m**2
+        return Constants(
+            steady,
+            in_si(steady.gain, omega),
+            steady.innovation * variance_m2,
+            math.sqrt(max(steady.residual, 0.0) * variance_m2) * omega**2,
+            min(1.0, interval_ns * 1e-9 / _FADING_S),
+            omega,
+            (3 * interval_ns + 1) // 2,
+            start.delay_ns + 2 * interval_ns + round(1e9 / omega),
+            round(_FORGOTTEN / omega * 1e9),
+            max(abs(start.damping_per_s), math.sqrt(abs(start.stiffness_per_s2))),
+        )
+
+    def pace(self, start: Start) -> "Pace":
+        """What the variances depend on."""
+        omega = self.omega
+        return Pace(
+            omega * start.interval_ns * 1e-9,
+            start.stiffness_per_s2 / omega**2,
+            start.damping_per_s / omega,
+        )
+
+    def _prior(self) -> Array:
+        """Covariance before anything was measured."""
+        omega, sigma = self.omega, self.noise_std_m
+        rate = _RATE_STD_M_PER_S / (sigma * omega)
+        acceleration = _ACCELERATION_STD_M_PER_S2 / (sigma * omega**2)
+        return np.diag(np.array([1.0, rate, acceleration, acceleration, acceleration]) ** 2)
+
+
+class Pace(NamedTuple):
+    """What the variances depend on, in units of 1 / omega.
+
+    Attributes:
+        interval: Time between two measurements.
+        stiffness: Of the model's law over the mass.
+        damping: Of the model's law over the mass.
+    """
+
+    interval: float
+    stiffness: float = 0.0
+    damping: float = 0.0
+
+
+def rescaled(constants: Constants, scale: float, squared: float) -> float:
+    """The variances' scale after a measurement.
+
+    Args:
+        constants: Of the filter.
+        scale: The scale before.
+        squared: Square of what is new in the measurement over its variance, one on average where
+            the variances are right.
+    """
+    scale += constants.fading * (squared - scale)
+    return min(max(scale, _SMALLEST_SCALE), _LARGEST_SCALE)
+
+
+def corrected(mean: Mean, gain: Mean, new: float) -> Mean:
+    """The mean after an update, with a gain in SI."""
+    x, v, a, j, s = mean
+    of_x, of_v, of_a, of_j, of_s = gain
+    return x + of_x * new, v + of_v * new, a + of_a * new, j + of_j * new, s + of_s * new
+
+
+def in_si(gain: Array, omega: float) -> Mean:
+    """A gain of units of 1 / omega in SI."""
+    x, v, a, j, s = (gain * omega ** np.arange(ORDER)).tolist()
+    return x, v, a, j, s
+
+
+def since(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tuple[int, float], ...]:
+    """Those inputs that still act at a time or begin after it."""
+    first = 0
+    while first + 1 < len(inputs) and inputs[first + 1][0] <= t_ns:
+        first += 1
+    return inputs[first:]
+
+
+def moved(state: ErrorState, to_ns: int) -> Mean:
+    """The mean at a later time, under the inputs in between."""
+    mean, inputs, from_ns = state.mean, state.inputs, state.t_ns
+    start, own_per_s, last = state.start, state.constants.own_per_s, len(inputs) - 1
+    if to_ns <= from_ns:
+        return mean
+    for index, (_, by_force) in enumerate(inputs):
+        end_ns = to_ns if index == last else min(inputs[index + 1][0], to_ns)
+        if end_ns <= from_ns:
+            continue
+        h = (end_ns - from_ns) * 1e-9
+        from_ns = end_ns
+        # A step in which the model itself hardly moves: what its law does is a Taylor series.
+        quick = h * own_per_s
+        if quick <= _STEP_OF_MODEL:
+            mean = _stepped(mean, by_force, h, start)
+            continue
+        count = math.ceil(quick / _STEP_OF_MODEL)
+        for _ in range(count):
+            mean = _stepped(mean, by_force, h / count, start)
+    return mean
+
+
+def _stepped(mean: Mean, by_force: float, h: float, start: Start) -> Mean:
+    """The mean after a step, to the fifth order of the error's Taylor series."""
+    x, v, a, j, s = mean
+    stiffness, damping = start.stiffness_per_s2, start.damping_per_s
+    x2 = a + by_force - stiffness * x - damping * v
+    x3 = j - stiffness * v - damping * x2
+    x4 = s - stiffness * x2 - damping * x3
+    x5 = -stiffness * x3 - damping * x4
+    return (
+        x + h * (v + h * (x2 / 2.0 + h * (x3 / 6.0 + h * (x4 / 24.0 + h * x5 / 120.0)))),
+        v + h * (x2 + h * (x3 / 2.0 + h * (x4 / 6.0 + h * x5 / 24.0))),
+        a + h * (j + h * s / 2.0),
+        j + h * s,
+        s,
+    )
+
+
+def _gain(ahead: Array) -> tuple[Array, Array]:
+    """Gain, and covariance after an update, from the covariance before it."""
+    gain = ahead[:, 0] / (ahead[0, 0] + 1.0)
+    after = ahead - np.outer(gain, ahead[0])
+    return gain, 0.5 * (after + after.T)
+
+
+def spread(covariance: Array, pace: Pace, number: float) -> Array:
+    """Covariance some intervals later; a sensor's noise is a density of one an interval."""
+    transition, noise = _transition(pace.interval * number, pace.stiffness, pace.damping)
+    return transition @ covariance @ transition.T + pace.interval * noise
+
+
+def _ahead(covariance: Array, pace: Pace, number: int) -> float:
+    """Variance of the residual force's acceleration some intervals later."""
+    if number >= 1:
+        covariance = spread(covariance, pace, number)
+    row = np.array([-pace.stiffness, -pace.damping, 1.0, 0.0, 0.0])
+    return float(row @ covariance @ row)
+
+
+@lru_cache(maxsize=1024)
+def _transition(time: float, stiffness: float, damping: float) -> tuple[Array, Array]:
+    """Transition over a time, and covariance of what unit white noise adds meanwhile.
+
+    Reference: Van Loan, Computing integrals involving the matrix exponential, IEEE TAC 23 (1978).
+    """
+    # Van Loan's matrix grows where the model's own motion decays: a short time, doubled.
+    doublings = max(0, math.ceil(math.log2(max(time * (damping + math.sqrt(abs(stiffness))), 1.0))))
+    short = time / 2**doublings
+    rates = np.diag(np.ones(ORDER - 1), 1)
+    rates[1, :2] = -stiffness, -damping
+    driven = np.zeros((ORDER, ORDER))
+    driven[-1, -1] = 1.0
+    both = cast("Any", expm)(short * np.block([[-rates, driven], [np.zeros((5, 5)), rates.T]]))
+    transition = np.ascontiguousarray(both[ORDER:, ORDER:].T)
+    noise = transition @ both[:ORDER, ORDER:]
+    for _ in range(doublings):
+        noise = noise + transition @ noise @ transition.T
+        transition = transition @ transition
+    return transition, 0.5 * (noise + noise.T)
+
+
+@lru_cache(maxsize=256)
+def _steady(pace: Pace) -> Steady:
+    """The limit of the filter's recursion, by doubling its length in each iteration.
+
+    Reference: Chu, Fan, Lin, Wang, Structure-preserving algorithms for periodic discrete-time
+    algebraic Riccati equations, Int. J. Control 77 (2004).
+    """
+    transition, noise = _transition(pace.interval, pace.stiffness, pace.damping)
+    a, g, ahead = transition.T, np.zeros((ORDER, ORDER)), pace.interval * noise
+    g[0, 0] = 1.0
+    for _ in range(_MOST_DOUBLINGS):
+        between = np.linalg.inv(np.eye(ORDER) + g @ ahead)
+        before = ahead
+        ahead = ahead + a.T @ ahead @ between @ a
+        ahead = 0.5 * (ahead + ahead.T)
+        g = g + a @ between @ g @ a.T
+        g = 0.5 * (g + g.T)
+        a = a @ between @ a
+        change = np.abs(np.diagonal(ahead) - np.diagonal(before))
+        if np.all(change <= 1e-12 * np.diagonal(ahead)):
+            break
+    gain, after = _gain(ahead)
+    return Steady(gain, float(ahead[0, 0]) + 1.0, after, _ahead(after, pace, 0))
+
+
+@lru_cache(maxsize=1024)
+def _steady_ahead(pace: Pace, number: int) -> float:
+    return _ahead(_steady(pace).covariance, pace, number)

@@ -1,1 +1,0 @@
-"""A run put together: configuration, bus, clock, bridge and log."""

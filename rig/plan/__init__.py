@@ -1,0 +1,1 @@
+"""A configuration with its model and DBC: read, resolved, checked, proposed."""

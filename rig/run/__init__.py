@@ -1,0 +1,1 @@
+"""A run: live, in lockstep, replayed, and changed while it is running."""

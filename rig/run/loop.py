@@ -1,0 +1,169 @@
+"""The one loop: live, simulated and replayed runs differ only in ticks, source and sink."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple, Protocol
+
+from msgspec import Struct
+
+from can_dbc.frame import Frame
+from rig.bridge.bridge import Bridge, BridgeState, TickResult
+from rig.bridge.contract import Mode, StepOutput
+from rig.bridge.log_columns import Record
+from rig.bridge.messages import Conditions, Counts
+from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step
+from rig.machine.clock import Clock
+from rig.run.changes import Changes, unchanged
+from rig.run.timing import BINS, Timing
+
+
+class Tick(Struct, frozen=True, gc=False):
+    """A tick that is due.
+
+    Attributes:
+        t_ns: Its time.
+        overruns: Ticks missed before it.
+    """
+
+    t_ns: int
+    overruns: int
+
+
+class Port(Protocol):
+    """Where frames come from and go to."""
+
+    def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
+        """Frames that have come up to a tick, and what is known of the bus."""
+        ...
+
+    def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
+        """Send the frames of a tick; returns those that were sent."""
+        ...
+
+
+Sink = Callable[[Sequence[Frame], Sequence[Frame], TickResult, Step], None]
+"""What a tick received and sent, what it did, and the record of it."""
+
+Progress = Callable[[int, Mode], None]
+"""Called with time and mode of a tick."""
+
+SHOWN_EVERY_NS = 200_000_000
+"""Time between two looks at a run: five a second, as fast as a person reads."""
+
+
+class Look(NamedTuple):
+    """A look at a run.
+
+    Attributes:
+        t_ns: Time of the tick.
+        ticks: How many there have been with it.
+        output: What it published.
+        counts: What has been counted since the start.
+        late_ns: Largest lateness so far; None where nothing waits for a clock.
+        troubles: Devices with something wrong, by their places, and what it is.
+    """
+
+    t_ns: int
+    ticks: int
+    output: StepOutput
+    counts: Counts
+    late_ns: int | None
+    troubles: tuple[tuple[int, str], ...] = ()
+
+
+Watch = Callable[[Look], None]
+"""Given a look now and then; the loop itself calls it, so it must be quick."""
+
+
+def unnoted(_t_ns: int, _mode: Mode) -> None:
+    """Nobody counts the ticks."""
+
+
+def unwatched(_look: Look) -> None:
+    """Nobody looks."""
+
+
+def regular_ticks(
+    clock: Clock, period_ns: int, count: int | None, stop: Callable[[], bool], timing: Timing
+) -> Iterator[Tick]:
+    """Ticks on a grid of absolute deadlines; missed ones are skipped and counted.
+
+    The first one is the next after now: what had to be set up before it makes no tick late.
+
+    Args:
+        clock: The clock.
+        period_ns: Time between two ticks.
+        count: Number of ticks of the grid from the first one on; without end if None.
+        stop: Asked before each tick whether to end.
+        timing: Where lateness and work are written.
+    """
+    # A number is written through a view of the memory in half the time it takes in the array.
+    lateness, work = timing.lateness.data, timing.work.data
+    extremes = timing.extremes_ns.data
+    last = BINS - 1
+    woke_ns = clock.now_ns()
+    index, overruns = -(-woke_ns // period_ns), 0
+    end = None if count is None else index + count
+    while (end is None or index < end) and not stop():
+        deadline_ns = index * period_ns
+        before_ns, woke_ns = woke_ns, clock.wait_until(deadline_ns)
+        late_ns = woke_ns - deadline_ns
+        missed = late_ns // period_ns
+        if missed > 0:
+            index += missed
+            overruns += missed
+            if end is not None and index >= end:
+                return
+        lateness[min(late_ns // 1000, last)] += 1
+        extremes[0] = max(extremes[0], late_ns)
+        extremes[2] = max(extremes[2], woke_ns - before_ns)
+        yield Tick(index * period_ns, overruns)
+        overruns = 0
+        work_ns = clock.now_ns() - woke_ns
+        work[min(work_ns // 1000, last)] += 1
+        extremes[1] = max(extremes[1], work_ns)
+        index += 1
+
+
+def run(
+    bridge: Bridge,
+    state: BridgeState,
+    ticks: Iterator[Tick],
+    port: Port,
+    sink: Sink,
+    record: Record,
+    changes: Changes = unchanged,
+) -> BridgeState:
+    """Run the bridge over ticks.
+
+    Args:
+        bridge: The bridge.
+        state: Where it starts.
+        ticks: When.
+        port: Where frames come from and go to.
+        sink: Where the record of every tick goes.
+        record: What is kept of a tick.
+        changes: Asked at every tick for another bridge from there on.
+
+    Returns:
+        The state at the end.
+    """
+    for tick in ticks:
+        bridge = changes(tick.t_ns) or bridge
+        frames, conditions = port.receive(tick.t_ns)
+        if tick.overruns:
+            conditions = conditions._replace(overruns=tick.overruns)
+        state, result = bridge.tick(state, tick.t_ns, frames, conditions)
+        sent = port.send(result.frames)
+        numbers = record.numbers(result.step_input, result.output)
+        flags, mode = _flags(conditions), result.output.mode
+        step = Step(tick.t_ns, tick.overruns, len(frames), mode, flags, numbers)
+        sink(frames, sent, result, step)
+    return state
+
+
+def _flags(conditions: Conditions) -> int:
+    return (
+        ACKNOWLEDGED * conditions.acknowledged
+        + BUS_FAULT * conditions.bus_fault
+        + LOG_FAULT * conditions.log_fault
+    )

@@ -1,0 +1,229 @@
+"""A run computed again from its log, through the loop that ran live, and compared bit for bit.
+
+The ticks, the frames of each and what the loop knew come from the log; nothing is sent.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from can_dbc.errors import InputError
+from can_dbc.frame import Frame
+from rig.bridge.bridge import TickResult
+from rig.bridge.log_columns import Record, columns
+from rig.bridge.messages import Conditions
+from rig.log.frame_columns import FrameColumns, received_frames
+from rig.log.reader import RunFolder, last_frame_ns, read_run
+from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step, StepRows
+from rig.plan.assembly import build_bridge, sensors
+from rig.plan.setup import Setup, setup_of_folder
+from rig.run.changes import replayed_changes, unchanged
+from rig.run.loop import Progress, Tick, run
+
+_TICKS_AT_ONCE = 4096
+"""Ticks whose frames and steps are objects in memory at once."""
+
+_MOST_LOST_A_FRAME = 1000
+"""Ticks without a step for each frame after the last step, beyond which times cannot be right."""
+
+_NO_CONDITIONS = Conditions()
+
+_pa = cast("Any", pa)
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """A run computed again from its log.
+
+    Attributes:
+        steps: Every step, as an Arrow table like that of the log.
+        logged: How many steps the log holds.
+        different: How many of them differ from the steps computed here in any bit.
+        first_different_ns: Time of the first that differs.
+        refused_frames: Frames refused in the replay.
+    """
+
+    steps: Any
+    logged: int
+    different: int
+    first_different_ns: int | None
+    refused_frames: int
+
+
+@dataclass(frozen=True)
+class LoggedTicks:
+    """Ticks of a run, with what the loop knew at each; all of shape (ticks,).
+
+    Attributes:
+        t_ns: Time.
+        overruns: Ticks missed before it.
+        received: Frames received.
+        flags: Conditions, as in the log.
+    """
+
+    t_ns: NDArray[np.int64]
+    overruns: NDArray[np.int64]
+    received: NDArray[np.int64]
+    flags: NDArray[np.int64]
+
+
+def setup_of_run(folder: Path) -> tuple[RunFolder, Setup]:
+    """A logged run and the configuration it ran with.
+
+    Raises:
+        InputError: A file of the run is missing or damaged.
+        DatabaseError: Its DBC is.
+    """
+    return read_run(folder), setup_of_folder(folder)
+
+
+def replay(
+    folder: Path, *, ready: Setup | None = None, progress: Progress = lambda _t, _mode: None
+) -> Replayed:
+    """Compute a run again from its frames, and compare it with its steps.
+
+    Ticks whose steps a kill took are those of the rate, up to the last frame.
+
+    Args:
+        folder: Folder of the run.
+        ready: Another configuration to replay with, e.g. with a corrected model or other gains.
+        progress: Called with the time and mode of every tick.
+
+    Raises:
+        InputError: The run is damaged.
+    """
+    found, own = setup_of_run(folder)
+    ready = ready or own
+    bridge = build_bridge(ready, sending=False)
+    frames = received_frames(found.frame_files, found.epoch_ns)
+    ticks = _ticks(found, frames, ready.config.period_ns)
+    config = ready.config
+    further = sensors(ready)
+    rows = StepRows(columns(list(config.observers), config.signals.measured, further))
+    batches: list[Any] = []
+
+    def keep(
+        _received: Sequence[Frame], _sent: Sequence[Frame], result: TickResult, step: Step
+    ) -> None:
+        rows.append(step)
+        if rows.count == _TICKS_AT_ONCE:
+            batches.append(rows.batch())
+            rows.clear()
+        progress(step.t_ns, result.output.mode)
+
+    port = _LogPort(frames, ticks)
+    # With another configuration the run's own changes would undo what is tried.
+    changes = replayed_changes(folder, own, bridge) if ready is own else unchanged
+    record = Record(config.signals.measured, len(further))
+    state = run(bridge, bridge.init(0), port.ticks(), port, keep, record, changes)
+    batches.append(rows.batch())
+    steps = _pa.Table.from_batches(batches, schema=rows.schema)
+    different = _different(found.steps, steps)
+    return Replayed(
+        steps,
+        found.steps.num_rows,
+        len(different),
+        int(ticks.t_ns[different[0]]) if len(different) else None,
+        state.counts.refused,
+    )
+
+
+class _LogPort:
+    """The frames of a log, tick by tick, with what the loop knew."""
+
+    def __init__(self, frames: FrameColumns, ticks: LoggedTicks) -> None:
+        self._frames = frames
+        self._ticks = ticks
+        self._waiting: Iterator[tuple[Sequence[Frame], Conditions]] = iter(())
+
+    def ticks(self) -> Iterator[Tick]:
+        """The ticks; frames and conditions of some are made ready at a time."""
+        ticks, begin = self._ticks, 0
+        for first in range(0, len(ticks.t_ns), _TICKS_AT_ONCE):
+            part = slice(first, first + _TICKS_AT_ONCE)
+            received = ticks.received[part].tolist()
+            frames = list(self._frames.between(begin, begin + sum(received)))
+            begin += sum(received)
+            self._waiting = _by_tick(frames, received, ticks.flags[part].tolist())
+            yield from map(Tick, ticks.t_ns[part].tolist(), ticks.overruns[part].tolist())
+
+    def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
+        """Frames that the tick received, and what the loop knew."""
+        _ = t_ns  # the ticks come in their order
+        return next(self._waiting)
+
+    def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
+        """Nothing is sent."""
+        return frames
+
+
+def _by_tick(
+    frames: list[Frame], received: list[int], flags: list[int]
+) -> Iterator[tuple[Sequence[Frame], Conditions]]:
+    begin = 0
+    for count, known in zip(received, flags, strict=True):
+        conditions = _NO_CONDITIONS
+        if known:
+            conditions = Conditions(
+                acknowledged=bool(known & ACKNOWLEDGED),
+                bus_fault=bool(known & BUS_FAULT),
+                log_fault=bool(known & LOG_FAULT),
+            )
+        yield frames[begin : begin + count], conditions
+        begin += count
+
+
+def _ticks(found: RunFolder, frames: FrameColumns, period_ns: int) -> LoggedTicks:
+    """Logged ticks whose frames are there, then those of the rate up to the last frame."""
+    t_ns, overruns, received, flags = (
+        np.asarray(found.steps.column(name).to_numpy(), dtype=np.int64)
+        for name in ("t_ns", "overruns", "received", "flags")
+    )
+    if (received < 0).any() or (np.diff(t_ns) <= 0).any():
+        raise InputError(
+            f"{found.folder}: steps.arrow: expected times that rise and numbers of frames received"
+        )
+    there = int(np.searchsorted(np.cumsum(received), len(frames.t_ns), side="right"))
+    t_ns, overruns, received, flags = (
+        column[:there] for column in (t_ns, overruns, received, flags)
+    )
+    used = int(received.sum())
+    begin_ns = int(t_ns[-1]) + period_ns if there else 0
+    end_ns = last_frame_ns(found.folder, found.epoch_ns) + 1
+    if there < found.steps.num_rows:
+        end_ns = begin_ns  # the next tick's frames are not all there
+    if (end_ns - begin_ns) // period_ns > _MOST_LOST_A_FRAME * (len(frames.t_ns) - used + 10):
+        raise InputError(
+            f"{found.folder}: the last frame is {(end_ns - begin_ns) * 1e-9:.0f} s after the last "
+            "step, expected a log whose times belong together"
+        )
+    lost_ns = np.arange(begin_ns, end_ns, period_ns, dtype=np.int64)
+    # A frame comes with the first tick after it, and after the frames before it.
+    came_ns = np.maximum.accumulate(frames.t_ns[used:])
+    came = np.searchsorted(came_ns, lost_ns, side="right")
+    nothing = np.zeros(len(lost_ns), dtype=np.int64)
+    return LoggedTicks(
+        np.concatenate([t_ns, lost_ns]),
+        np.concatenate([overruns, nothing]),
+        np.concatenate([received, np.diff(came, prepend=0)]),
+        np.concatenate([flags, nothing]),
+    )
+
+
+def _different(logged: Any, again: Any) -> NDArray[np.intp]:
+    """Indices of logged steps that are not the same bit for bit."""
+    count = min(logged.num_rows, again.num_rows)
+    unequal = np.zeros(count, dtype=np.bool_)
+    if count == 0:
+        return np.flatnonzero(unequal)
+    if logged.schema != again.schema:
+        raise InputError("steps.arrow: its columns are not those of the run's struts and signals")
+    for name in logged.schema.names:
+        a, b = (table.column(name).to_numpy()[:count] for table in (logged, again))
+        unequal |= a.view(f"V{a.itemsize}") != b.view(f"V{b.itemsize}")
+    return np.flatnonzero(unequal)

@@ -1,0 +1,300 @@
+"""From the bench's configuration to its equations of motion and its state at the start."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from scipy import interpolate, optimize
+
+from rig.simulated_bench.effects import EFFECT_KINDS, PARAMETER_COUNT, parameter_values
+from rig.simulated_bench.equations_of_motion import (
+    GIVEN,
+    SINE_COLUMNS,
+    SWEEP_COLUMNS,
+    Applied,
+    Curves,
+    Drive,
+    Effects,
+    Floats,
+    Law,
+    Mechanics,
+    Prescribed,
+    Thermal,
+    derivatives,
+    give,
+)
+from rig.simulated_bench.schema import (
+    WORLD,
+    AppliedForce,
+    BenchConfig,
+    BenchConfigError,
+    Effect,
+    ForceFile,
+    HeightFile,
+    HeightMultisine,
+    HeightSine,
+    HeightSweep,
+    Multisine,
+    PrescribedMotion,
+    Sine,
+    Sweep,
+)
+
+EQUILIBRIUM_TOLERANCE_M_PER_S2 = 1e-9
+"""Largest acceleration that counts as rest."""
+
+
+class Assembly(NamedTuple):
+    """A bench ready to run.
+
+    Attributes:
+        mechanics: Its equations of motion.
+        drive: What drives it.
+        start: State at time zero, shape (states,).
+    """
+
+    mechanics: Mechanics
+    drive: Drive
+    start: Floats
+
+
+def assemble(config: BenchConfig) -> Assembly:
+    """Build the equations of motion and the state at the start.
+
+    Args:
+        config: The bench.
+
+    Returns:
+        The bench ready to run.
+
+    Raises:
+        BenchConfigError: It has no static equilibrium to start from, or a body has no mass left.
+    """
+    mechanics = _mechanics(config)
+    drive = Drive(
+        _applied(config.applied_force, config.undeclared_effects),
+        _prescribed(config.prescribed_motion),
+    )
+    return Assembly(mechanics, drive, _start(config, mechanics, drive))
+
+
+def _mechanics(config: BenchConfig) -> Mechanics:
+    uppers = [strut.between[1] for strut in config.struts]
+    lowers = [strut.between[0] for strut in config.struts]
+    thermal = config.temperature
+    return Mechanics(
+        gravity_m_per_s2=config.gravity_m_per_s2,
+        mass_kg=_masses(config, uppers),
+        lower=np.array([-1 if name == WORLD else uppers.index(name) for name in lowers]),
+        driven=uppers.index(config.applied_force.body or uppers[0]),
+        prescribed=_prescribed_strut(config),
+        free_length_m=np.array([strut.free_length_m for strut in config.struts]),
+        springs=_curves([(s.spring.height_m, s.spring.force_n) for s in config.struts]),
+        dampers=_curves([(s.damper.velocity_m_per_s, s.damper.force_n) for s in config.struts]),
+        effects=_effects(config),
+        thermal=Thermal(
+            warming_k_per_j=1.0 / (thermal.heat_capacity_j_per_k or math.inf),
+            cooling_per_s=1.0 / (thermal.cooling_time_s or math.inf),
+            ambient_c=thermal.ambient_c,
+        ),
+    )
+
+
+def _prescribed_strut(config: BenchConfig) -> int:
+    if config.prescribed_motion is None:
+        return -1
+    return [strut.name for strut in config.struts].index(config.prescribed_motion.strut)
+
+
+def _masses(config: BenchConfig, uppers: list[str]) -> Floats:
+    by_name = {mass.name: mass.mass_kg for mass in config.masses}
+    mass_kg = np.array([by_name[name] for name in uppers], dtype=np.float64)
+    for index, effect in enumerate(config.undeclared_effects):
+        if EFFECT_KINDS[effect.name].law == Law.ADDED_MASS:
+            body = _strut_index(config, effect)
+            mass_kg[body] += parameter_values(effect.name, effect.parameters)[0]
+            if mass_kg[body] <= 0.0:
+                raise BenchConfigError(
+                    f"undeclared_effects.{index}.parameters.mass_kg leaves {uppers[body]} "
+                    f"{mass_kg[body]:g} kg, expected more than 0"
+                )
+    return mass_kg
+
+
+def _strut_index(config: BenchConfig, effect: Effect) -> int:
+    return [strut.name for strut in config.struts].index(effect.strut)
+
+
+def _curves(points: Sequence[tuple[Sequence[float], Sequence[float]]]) -> Curves:
+    segments = [_segments(np.array(at), np.array(force_n)) for at, force_n in points]
+    return Curves(
+        first=np.cumsum([0, *(len(part) for part in segments)]), segments=np.concatenate(segments)
+    )
+
+
+def _segments(at: Floats, force_n: Floats) -> Floats:
+    """Segments of a curve through points without overshoot, shape (segments, 6)."""
+    pchip = cast("Any", interpolate).PchipInterpolator(at, force_n)
+    cubic = np.asarray(pchip.c, dtype=np.float64).T
+    return np.column_stack([at[:-1], np.diff(at), cubic])
+
+
+def _applied(force: AppliedForce, effects: tuple[Effect, ...]) -> Applied:
+    sines: list[tuple[float, ...]] = []
+    sweeps: list[tuple[float, ...]] = []
+    files = [part.samples for part in force.components if isinstance(part, ForceFile)]
+    for part in force.components:
+        if isinstance(part, Sine):
+            sines.append((part.amplitude_n, part.rate_rad_per_s, part.phase_rad))
+        elif isinstance(part, Multisine):
+            sines.extend(_multisine(part, part.rms_n))
+        elif isinstance(part, Sweep):
+            sweeps.append(_sweep(part, part.amplitude_n))
+    return Applied(
+        gain=math.prod(_values(effects, Law.INPUT_GAIN)),
+        delay_s=math.fsum(_values(effects, Law.DELAY)),
+        sines=_rows(sines, SINE_COLUMNS),
+        sweeps=_rows(sweeps, SWEEP_COLUMNS),
+        file_first=np.cumsum([0, *(len(samples.t_s) for samples in files)]),
+        file_t_s=np.concatenate([np.empty(0), *(samples.t_s for samples in files)]),
+        file_force_n=np.concatenate([np.empty(0), *(samples.values for samples in files)]),
+    )
+
+
+def _prescribed(motion: PrescribedMotion | None) -> Prescribed:
+    sines: list[tuple[float, ...]] = []
+    sweeps: list[tuple[float, ...]] = []
+    files: list[Floats] = []
+    for part in motion.components if motion is not None else ():
+        if isinstance(part, HeightSine):
+            sines.append((part.amplitude_m, part.rate_rad_per_s, part.phase_rad))
+        elif isinstance(part, HeightMultisine):
+            sines.extend(_multisine(part, part.rms_m))
+        elif isinstance(part, HeightSweep):
+            sweeps.append(_sweep(part, part.amplitude_m))
+        else:
+            files.append(_spline(part))
+    return Prescribed(
+        mean_height_m=0.0 if motion is None else motion.mean_height_m,
+        sines=_rows(sines, SINE_COLUMNS),
+        sweeps=_rows(sweeps, SWEEP_COLUMNS),
+        files=Curves(
+            first=np.cumsum([0, *(len(part) for part in files)]),
+            segments=np.concatenate([np.empty((0, 6)), *files]),
+        ),
+    )
+
+
+def _spline(part: HeightFile) -> Floats:
+    """Segments of the cubic spline through the samples, shape (segments, 6)."""
+    t_s, height_m = part.samples
+    cubic = cast("Any", interpolate).CubicSpline(t_s, height_m)
+    return np.column_stack([t_s[:-1], np.diff(t_s), np.asarray(cubic.c, dtype=np.float64).T])
+
+
+def _rows(rows: list[tuple[float, ...]], columns: int) -> Floats:
+    return np.array(rows, dtype=np.float64).reshape(-1, columns)
+
+
+def _sweep(part: Sweep | HeightSweep, amplitude: float) -> tuple[float, ...]:
+    logarithmic = float(part.spacing == "logarithmic")
+    return amplitude, part.start_hz, part.end_hz, part.duration_s, logarithmic
+
+
+def _multisine(part: Multisine | HeightMultisine, rms: float) -> list[tuple[float, ...]]:
+    rates = 2.0 * math.pi * np.linspace(part.low_hz, part.high_hz, part.lines)
+    phases = np.random.default_rng(part.seed).uniform(0.0, 2.0 * math.pi, part.lines)
+    amplitude = rms * math.sqrt(2.0 / part.lines)
+    return [
+        (amplitude, float(rate), float(phase)) for rate, phase in zip(rates, phases, strict=True)
+    ]
+
+
+def _values(effects: tuple[Effect, ...], law: Law) -> list[float]:
+    return [
+        parameter_values(effect.name, effect.parameters)[0]
+        for effect in effects
+        if EFFECT_KINDS[effect.name].law == law
+    ]
+
+
+def _effects(config: BenchConfig) -> Effects:
+    acting = config.undeclared_effects
+    kinds = [EFFECT_KINDS[effect.name] for effect in acting]
+    parameters = np.zeros((len(acting), PARAMETER_COUNT))
+    for row, effect in zip(parameters, acting, strict=True):
+        values = parameter_values(effect.name, effect.parameters)
+        row[: len(values)] = values
+    first_state = 2 * len(config.struts) + 1
+    states = np.cumsum([first_state, *(kind.states for kind in kinds)])
+    struts = [_strut_index(config, effect) for effect in acting]
+    places = [[int(kind.law) for kind in kinds], struts, states[:-1]]
+    return Effects(np.array(places, dtype=np.int64).T.copy(), parameters)
+
+
+def _start(config: BenchConfig, mechanics: Mechanics, drive: Drive) -> Floats:
+    n = len(config.struts)
+    states = 2 * n + 1 + sum(EFFECT_KINDS[e.name].states for e in config.undeclared_effects)
+    y = np.zeros(states)
+    y[2 * n] = config.temperature.initial_c
+    for (law, _, state), values in zip(*mechanics.effects, strict=True):
+        if law == Law.HIDDEN_MASS:
+            mass_kg, stiffness_n_per_m = values[0], values[1]
+            y[state] = -mass_kg * mechanics.gravity_m_per_s2 / stiffness_n_per_m
+    heights_m = [strut.initial_height_m for strut in config.struts]
+    at_start = np.zeros(GIVEN)
+    if mechanics.prescribed >= 0:
+        give(mechanics, drive, 0.0, at_start)
+        heights_m[mechanics.prescribed] = float(at_start[1])
+    at_start[[0, 2]] = 0.0  # the others rest before it starts
+    y[:n] = _positions(mechanics, _heights(mechanics, y, heights_m, at_start))
+    return y
+
+
+def _positions(mechanics: Mechanics, heights_m: Floats) -> Floats:
+    positions_m = np.array(heights_m, dtype=np.float64)
+    for i, lower in enumerate(mechanics.lower):
+        if lower >= 0:
+            positions_m[i] += positions_m[lower]
+    return positions_m
+
+
+def _heights(
+    mechanics: Mechanics, y: Floats, given: Sequence[float | None], at_start: Floats
+) -> Floats:
+    """Heights at the start: those given, and those at which the other bodies rest, shape (n,)."""
+    n = len(given)
+    free = [i for i in range(n) if given[i] is None]
+    heights_m = np.array(
+        [
+            length if h is None else h
+            for h, length in zip(given, mechanics.free_length_m, strict=True)
+        ]
+    )
+    if not free:
+        return heights_m
+    rates = np.zeros_like(y)
+
+    def accelerations(unknown: Floats) -> Floats:
+        heights_m[free] = unknown
+        state = y.copy()
+        state[:n] = _positions(mechanics, heights_m)
+        derivatives(mechanics, 0.0, at_start, state, rates)
+        return rates[n : 2 * n][free]
+
+    found = _root(accelerations, heights_m[free])
+    left = float(np.max(np.abs(accelerations(found))))
+    if not left <= EQUILIBRIUM_TOLERANCE_M_PER_S2:
+        raise BenchConfigError(
+            f"struts.{free[0]}.initial_height_m is missing and there is no static equilibrium "
+            "to start from, expected a height"
+        )
+    heights_m[free] = found
+    return heights_m
+
+
+def _root(function: Callable[[Floats], Floats], start: Floats) -> Floats:
+    """Solve `function(x) = 0` near `start`, shape as `start`."""
+    solution = cast("Any", optimize).root(function, start.copy(), tol=1e-13)
+    return np.asarray(solution.x, dtype=np.float64)

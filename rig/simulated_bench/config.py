@@ -1,0 +1,30 @@
+"""The bench's configuration: from YAML to validated values, or one line that says what is wrong."""
+
+from pathlib import Path
+
+from can_dbc.yaml_file import load_validated
+from rig.simulated_bench.assembly import assemble
+from rig.simulated_bench.schema import BenchConfig, BenchConfigError
+
+__all__ = ["BenchConfig", "BenchConfigError", "load_bench_config"]
+
+
+def load_bench_config(path: Path) -> BenchConfig:
+    """Read a bench from its YAML file.
+
+    Args:
+        path: The file. Files that it names lie in its folder or below.
+
+    Returns:
+        The bench.
+
+    Raises:
+        InputError: The file cannot be read or does not describe a bench; one line naming file,
+            key, value and expectation.
+    """
+    config = load_validated(BenchConfig, path, context=path.parent)
+    try:
+        assemble(config)
+    except BenchConfigError as error:
+        raise BenchConfigError(f"{path}: {error}") from error
+    return config

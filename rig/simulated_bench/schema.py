@@ -1,0 +1,473 @@
+"""What a bench's configuration may say: frozen, validated values.
+
+Lengths are in m, forces in N, positive as in the rest of the project: a strut force pushes its two
+bodies apart, an applied force points upwards, a height is the length of a strut.
+"""
+
+import math
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationInfo,
+    model_validator,
+)
+
+from can_dbc.errors import InputError
+from rig.simulated_bench.effects import EFFECT_KINDS, parameter_error
+from rig.simulated_bench.samples import Samples, read_samples
+
+WORLD = "world"
+"""Name of the ground."""
+
+
+class BenchConfigError(InputError):
+    """A bench configuration that cannot be used; one line: file, key, value, expectation."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}$")]
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+Nanoseconds = Annotated[int, Field(ge=0, le=10**10)]
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Points = Annotated[tuple[float, ...], Field(strict=False, min_length=2, max_length=1000)]
+
+
+class Mass(_Section):
+    """A body that moves along the vertical axis."""
+
+    name: Name
+    mass_kg: Positive
+
+
+class SpringCurve(_Section):
+    """Spring force over height, by points; monotone cubic between, straight beyond.
+
+    Attributes:
+        height_m: Heights, increasing, in m.
+        force_n: Force at each height in N, positive when the spring pushes its bodies apart.
+    """
+
+    height_m: Points
+    force_n: Points
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _check_curve("height_m", self.height_m, self.force_n)
+        return self
+
+
+class DamperCurve(_Section):
+    """Damper force over velocity, by points; monotone cubic between, straight beyond.
+
+    Attributes:
+        velocity_m_per_s: Rates of height, increasing, in m/s.
+        force_n: Force at each rate in N, positive when the damper pushes its bodies apart.
+    """
+
+    velocity_m_per_s: Points
+    force_n: Points
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _check_curve("velocity_m_per_s", self.velocity_m_per_s, self.force_n)
+        return self
+
+
+class Strut(_Section):
+    """A spring and a damper between two bodies, or between the world and a body.
+
+    Attributes:
+        name: Name of the strut.
+        between: Lower and upper body. Every body is the upper body of exactly one strut.
+        free_length_m: Height at which the laws of undeclared effects see no deflection, in m.
+        spring: Spring curve.
+        damper: Damper curve.
+        initial_height_m: Height at the start in m; the static equilibrium if none is given.
+    """
+
+    name: Name
+    between: Annotated[tuple[Name, Name], Field(strict=False)]
+    free_length_m: Positive
+    spring: SpringCurve
+    damper: DamperCurve
+    initial_height_m: Positive | None = None
+
+
+class _Sine(_Section):
+    """A sine: amplitude * sin(angular frequency * t + phase_rad)."""
+
+    kind: Literal["sine"]
+    frequency_hz: Positive | None = None
+    angular_frequency_rad_per_s: Positive | None = None
+    phase_rad: float = 0.0
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.frequency_hz is None) == (self.angular_frequency_rad_per_s is None):
+            raise ValueError("expected one of frequency_hz and angular_frequency_rad_per_s")
+        return self
+
+    @property
+    def rate_rad_per_s(self) -> float:
+        """Angular frequency in rad/s, whichever way it was given."""
+        if self.angular_frequency_rad_per_s is not None:
+            return self.angular_frequency_rad_per_s
+        return 2.0 * math.pi * (self.frequency_hz or 0.0)
+
+
+class Sine(_Sine):
+    """A sine force."""
+
+    amplitude_n: float
+
+
+class HeightSine(_Sine):
+    """A sine motion."""
+
+    amplitude_m: float
+
+
+class _Multisine(_Section):
+    """Sines of equal amplitude and random phase on equally spaced frequencies of a band.
+
+    Attributes:
+        kind: Tag of this component.
+        low_hz: Lowest frequency in Hz.
+        high_hz: Highest frequency in Hz.
+        lines: Number of frequencies.
+        seed: Seed of the phases.
+    """
+
+    kind: Literal["multisine"]
+    low_hz: Positive
+    high_hz: Positive
+    lines: Annotated[int, Field(ge=2, le=400)] = 40
+    seed: Seed
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.high_hz <= self.low_hz:
+            raise ValueError(f"high_hz = {self.high_hz:g}, expected more than low_hz")
+        return self
+
+
+class Multisine(_Multisine):
+    """A multisine force; `rms_n` is the root mean square of the sum."""
+
+    rms_n: Positive
+
+
+class HeightMultisine(_Multisine):
+    """A multisine motion; `rms_m` is the root mean square of the sum."""
+
+    rms_m: Positive
+
+
+class _Sweep(_Section):
+    """A sine whose frequency runs from one value to another within `duration_s`."""
+
+    kind: Literal["sweep"]
+    start_hz: Positive
+    end_hz: Positive
+    duration_s: Positive
+    spacing: Literal["linear", "logarithmic"] = "linear"
+
+
+class Sweep(_Sweep):
+    """A swept force; zero after `duration_s`."""
+
+    amplitude_n: float
+
+
+class HeightSweep(_Sweep):
+    """A swept motion; it stays where it ends."""
+
+    amplitude_m: float
+
+
+class _File(_Section):
+    """A column of a CSV file over its column `t_s`.
+
+    Attributes:
+        kind: Tag of this component.
+        path: File, relative to the configuration, within its folder.
+    """
+
+    column: ClassVar[str]
+    kind: Literal["file"]
+    path: Annotated[str, Field(min_length=1, max_length=1000)]
+    _samples: Samples = PrivateAttr()
+
+    @property
+    def samples(self) -> Samples:
+        """The samples of the file, read once when the configuration is validated."""
+        return self._samples
+
+    @model_validator(mode="after")
+    def _read(self, info: ValidationInfo) -> Self:
+        folder = info.context if isinstance(info.context, Path) else Path()
+        self._samples = read_samples(folder, self.path, self.column)
+        return self
+
+
+class ForceFile(_File):
+    """A force from column `applied_force_n`, straight between samples, zero outside them."""
+
+    column = "applied_force_n"
+
+
+class HeightFile(_File):
+    """A motion from column `height_m`, a cubic spline between samples, still outside them."""
+
+    column = "height_m"
+
+
+Component = Annotated[Sine | Multisine | Sweep | ForceFile, Field(discriminator="kind")]
+
+
+class AppliedForce(_Section):
+    """The force that drives the bench.
+
+    Attributes:
+        body: Body on which it acts; None where the bench applies no force.
+        components: Forces that add up.
+    """
+
+    body: Name | None = None
+    components: Annotated[tuple[Component, ...], Field(strict=False, max_length=50)] = ()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.components and self.body is None:
+            raise ValueError("body is missing, expected the body on which the components act")
+        return self
+
+
+HeightComponent = Annotated[
+    HeightSine | HeightMultisine | HeightSweep | HeightFile, Field(discriminator="kind")
+]
+
+
+class PrescribedMotion(_Section):
+    """A motion that a strut is forced through, whatever force it takes: a damper dyno.
+
+    Attributes:
+        strut: Strut whose height is prescribed.
+        mean_height_m: Height about which the components move, in m.
+        components: Motions that add up.
+    """
+
+    strut: Name
+    mean_height_m: float = 0.0
+    components: Annotated[tuple[HeightComponent, ...], Field(strict=False, max_length=50)]
+
+
+class Temperature(_Section):
+    """The damper's temperature: heated by what the damper curves dissipate, cooled by the air.
+
+    Attributes:
+        initial_c: Temperature at the start in degrees Celsius.
+        ambient_c: Temperature of the air in degrees Celsius.
+        heat_capacity_j_per_k: Heat capacity; None keeps the damper from warming up.
+        cooling_time_s: Time constant of cooling; None keeps the heat in.
+    """
+
+    initial_c: float = 20.0
+    ambient_c: float = 20.0
+    heat_capacity_j_per_k: Positive | None = None
+    cooling_time_s: Positive | None = None
+
+
+class Effect(_Section):
+    """An effect that the bench has and no model declares.
+
+    Attributes:
+        name: One of `rig.simulated_bench.effects.EFFECT_KINDS`.
+        strut: Strut in which it acts, or whose upper body it changes.
+        parameters: Values by parameter name.
+    """
+
+    name: str
+    strut: Name
+    parameters: dict[str, float] = {}
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.name not in EFFECT_KINDS:
+            raise ValueError(f"name = {self.name!r}, expected one of {', '.join(EFFECT_KINDS)}")
+        wrong = parameter_error(self.name, self.parameters)
+        if wrong is not None:
+            raise ValueError(f"parameters: {wrong}")
+        return self
+
+
+class HeightSensor(_Section):
+    """A sensor of a strut's height; `noise_std_m` is the standard deviation of white noise."""
+
+    signal: str
+    strut: Name
+    noise_std_m: NotNegative = 0.0
+
+
+class AppliedForceSensor(_Section):
+    """A sensor of the applied force; `noise_std_n` is the standard deviation of white noise."""
+
+    signal: str
+    noise_std_n: NotNegative = 0.0
+
+
+class LoadCell(_Section):
+    """A sensor of a strut's force; `noise_std_n` is the standard deviation of white noise."""
+
+    signal: str
+    strut: Name
+    noise_std_n: NotNegative = 0.0
+
+
+class Thermometer(_Section):
+    """A sensor of the damper's temperature; `noise_std_k` is that of white noise."""
+
+    signal: str
+    noise_std_k: NotNegative = 0.0
+
+
+class Transmission(_Section):
+    """One message of the bench: what it carries and how it travels.
+
+    Attributes:
+        message: Name of the message in the bus's database.
+        period_ns: Time between samples; the database's cycle time if none is given.
+        latency_ns: Time from sample to transmission.
+        jitter_ns: Largest further time, drawn evenly from zero up.
+        loss_probability: Share of frames that never arrive; their counters are missing.
+        height: Height sensor, if the message carries one.
+        applied_force: Sensor of the applied force, if the message carries one.
+        strut_force: Load cell, if the message carries one.
+        temperature: Thermometer, if the message carries one.
+    """
+
+    message: str
+    period_ns: Annotated[int, Field(ge=1_000, le=10**10)] | None = None
+    latency_ns: Nanoseconds = 0
+    jitter_ns: Nanoseconds = 0
+    loss_probability: Probability = 0.0
+    height: HeightSensor | None = None
+    applied_force: AppliedForceSensor | None = None
+    strut_force: LoadCell | None = None
+    temperature: Thermometer | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not (self.height or self.applied_force or self.strut_force or self.temperature):
+            raise ValueError(
+                "expected one or more of height, applied_force, strut_force, temperature"
+            )
+        return self
+
+
+class BenchConfig(_Section):
+    """A simulated bench, complete.
+
+    Attributes:
+        name: Name of the bench.
+        gravity_m_per_s2: Acceleration of free fall.
+        masses: Bodies.
+        struts: Struts; each carries one body, the lower ends are the world or other bodies.
+        applied_force: The force that drives the bench, if any.
+        prescribed_motion: The motion that drives a strut, if any.
+        temperature: The damper's temperature.
+        undeclared_effects: What the bench has and no model declares.
+        transmissions: Messages that the bench sends.
+        seed: Seed of noise, jitter and loss.
+        step_ns: Longest step of the integrator.
+    """
+
+    name: Name
+    gravity_m_per_s2: NotNegative = 9.81
+    masses: Annotated[tuple[Mass, ...], Field(strict=False, min_length=1, max_length=20)]
+    struts: Annotated[tuple[Strut, ...], Field(strict=False, min_length=1, max_length=20)]
+    applied_force: AppliedForce = AppliedForce()
+    prescribed_motion: PrescribedMotion | None = None
+    temperature: Temperature = Temperature()
+    undeclared_effects: Annotated[tuple[Effect, ...], Field(strict=False, max_length=50)] = ()
+    transmissions: Annotated[tuple[Transmission, ...], Field(strict=False, max_length=50)] = ()
+    seed: Seed = 0
+    step_ns: Annotated[int, Field(ge=1_000, le=10_000_000)] = 100_000
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        masses = _unique("masses", [mass.name for mass in self.masses])
+        struts = _unique("struts", [strut.name for strut in self.struts])
+        _check_tree(self.struts, masses)
+        if self.applied_force.body is not None:
+            _check_known("applied_force.body", self.applied_force.body, masses)
+        if self.prescribed_motion is not None:
+            _check_known("prescribed_motion.strut", self.prescribed_motion.strut, struts)
+            _check_prescribed(self.prescribed_motion.strut, self.struts, self.undeclared_effects)
+        for index, effect in enumerate(self.undeclared_effects):
+            _check_known(f"undeclared_effects.{index}.strut", effect.strut, struts)
+        for index, sent in enumerate(self.transmissions):
+            for key, sensor in (("height", sent.height), ("strut_force", sent.strut_force)):
+                if sensor is not None:
+                    _check_known(f"transmissions.{index}.{key}.strut", sensor.strut, struts)
+        return self
+
+
+def _check_curve(key: str, at: tuple[float, ...], force_n: tuple[float, ...]) -> None:
+    if len(at) != len(force_n):
+        raise ValueError(f"force_n has {len(force_n)} points, expected {len(at)} as {key}")
+    for before, after in pairwise(at):
+        if after <= before:
+            raise ValueError(f"{key} has {after:g} after {before:g}, expected increasing values")
+
+
+def _unique(key: str, names: list[str]) -> list[str]:
+    for name in names:
+        if name == WORLD or names.count(name) > 1:
+            raise ValueError(f"{key}: name {name} is taken, expected another")
+    return names
+
+
+def _check_known(key: str, name: str, known: list[str]) -> None:
+    if name not in known:
+        raise ValueError(f"{key} = {name!r}, expected one of {', '.join(known)}")
+
+
+_UNSEEN_IN_PRESCRIBED_MOTION = ("added_mass", "hidden_mass")
+
+
+def _check_prescribed(name: str, struts: tuple[Strut, ...], effects: tuple[Effect, ...]) -> None:
+    strut = next(strut for strut in struts if strut.name == name)
+    if strut.initial_height_m is not None:
+        raise ValueError(
+            f"struts: {name} has an initial_height_m, expected none: its motion is prescribed"
+        )
+    for index, effect in enumerate(effects):
+        if effect.strut == name and effect.name in _UNSEEN_IN_PRESCRIBED_MOTION:
+            raise ValueError(
+                f"undeclared_effects.{index}: {effect.name} does not change the force of strut "
+                f"{name}, whose motion is prescribed, expected another effect"
+            )
+
+
+def _check_tree(struts: tuple[Strut, ...], masses: list[str]) -> None:
+    carried: list[str] = []
+    for index, strut in enumerate(struts):
+        lower, upper = strut.between
+        _check_known(f"struts.{index}.between.0", lower, [WORLD, *carried])
+        _check_known(f"struts.{index}.between.1", upper, [m for m in masses if m not in carried])
+        carried.append(upper)
+    if len(carried) < len(masses):
+        left = next(mass for mass in masses if mass not in carried)
+        raise ValueError(f"struts: expected one that carries {left}")

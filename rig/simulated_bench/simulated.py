@@ -1,0 +1,301 @@
+"""The simulated bench on the bus: its sensors, and the frames that it sends.
+
+`Bench.update(now_ns)` gives the frames that are due and the time to come back, so the one who calls
+owns the clock: a virtual one in lockstep, the real one otherwise. The bench listens to nothing, so
+its motion is the same whatever the bridge does.
+"""
+
+import heapq
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from can_dbc.codec import Encoder, compile_encoder
+from can_dbc.database import Database, Message
+from can_dbc.frame import Frame
+from can_dbc.protection import compile_protector
+from can_dbc.units import Dimension
+from rig.simulated_bench.assembly import assemble
+from rig.simulated_bench.equations_of_motion import RECORD_COLUMNS, RECORD_EXTRA
+from rig.simulated_bench.schema import BenchConfig, BenchConfigError, Transmission
+from rig.simulated_bench.trajectory import Motion, advanced, regular_grid
+
+RECORDS_AHEAD = 4
+"""Records computed in one go: few enough not to delay a loop, enough to share the overhead."""
+
+RECORDS_KEPT = 4096
+"""Records kept for `Bench.truth`."""
+
+SHORTEST_GRID_NS = 10_000
+"""Smallest common divisor of all periods that is accepted."""
+
+
+class StrutTruth(NamedTuple):
+    """What a strut really does.
+
+    Attributes:
+        height_m: Height in m.
+        velocity_m_per_s: Rate of height in m/s.
+        strut_force_n: Total force in N, undeclared effects in the strut included.
+    """
+
+    height_m: float
+    velocity_m_per_s: float
+    strut_force_n: float
+
+
+class BenchTruth(NamedTuple):
+    """What the bench really does at one time.
+
+    Attributes:
+        t_ns: Time on the caller's clock.
+        struts: One entry a strut, in the order of the configuration.
+        applied_force_n: Force that the force sensor sees, without noise, in N.
+        acting_force_n: Force that reaches the driven body in N.
+        temperature_c: Temperature of the damper in degrees Celsius.
+    """
+
+    t_ns: int
+    struts: tuple[StrutTruth, ...]
+    applied_force_n: float
+    acting_force_n: float
+    temperature_c: float
+
+
+class _Channel(NamedTuple):
+    """One measured quantity: where it stands in a record, its noise and the noise's source."""
+
+    signal: str
+    dimension: Dimension
+    column: int
+    noise_std: float
+    noise: np.random.Generator
+
+    def measure(self, record: list[float]) -> float:
+        """Read the quantity, with noise."""
+        value = record[self.column]
+        if self.noise_std > 0.0:
+            value += self.noise_std * self.noise.standard_normal()
+        return value
+
+
+class _Sender:
+    """One message: its sensors, its counter, and how its frames travel."""
+
+    def __init__(self, config: BenchConfig, index: int, database: Database) -> None:
+        self.transmission = config.transmissions[index]
+        self.message = database.message(self.transmission.message)
+        self.period_ns = self.transmission.period_ns or _cycle_time_ns(self.message, index)
+        self.next_sample_ns = 0
+        self.saturated_frames = 0
+        sources = np.random.SeedSequence([config.seed, index]).spawn(6)
+        self._jitter, self._loss, *noises = [np.random.default_rng(source) for source in sources]
+        self._channels = _channels(config, self.transmission, noises)
+        self._encode: Encoder = compile_encoder(
+            self.message,
+            tuple(channel.signal for channel in self._channels),
+            tuple(channel.dimension for channel in self._channels),
+        )
+        protection = self.message.protection
+        self._protect = None if protection is None else compile_protector(protection)
+        self._counter = 0
+        self._last_sent_ns = 0
+
+    def send(self, record: list[float], start_ns: int) -> Frame | None:
+        """Build the frame of one sample; None if it is lost on the way."""
+        values = [channel.measure(record) for channel in self._channels]
+        data, saturated = self._encode(values)
+        self.saturated_frames += bool(saturated)
+        if self._protect is not None:
+            data = self._protect(data, self._counter)
+        self._counter += 1
+        late_ns = self.transmission.latency_ns
+        late_ns += round(self._jitter.random() * self.transmission.jitter_ns)
+        # One sender's frames leave in the order in which they were queued.
+        self._last_sent_ns = max(self.next_sample_ns + late_ns, self._last_sent_ns)
+        self.next_sample_ns += self.period_ns
+        if self._loss.random() < self.transmission.loss_probability:
+            return None
+        return Frame(
+            start_ns + self._last_sent_ns,
+            self.message.arbitration_id,
+            bytes(data),
+            is_extended=self.message.is_extended,
+            is_fd=self.message.is_fd,
+        )
+
+
+class Bench:
+    """A bench that moves by its own laws and reports on the bus.
+
+    Args:
+        config: The bench.
+        database: What its messages mean.
+        start_ns: Time of its start on the caller's clock.
+
+    Raises:
+        BenchConfigError: The bench sends nothing, or its periods have no useful common divisor.
+        ValueError: The database lacks a message or signal that the configuration names.
+    """
+
+    def __init__(self, config: BenchConfig, database: Database, start_ns: int = 0) -> None:
+        if not config.transmissions:
+            raise BenchConfigError("transmissions is empty, expected one or more messages")
+        self.config = config
+        self._start_ns = start_ns
+        self._senders = [_Sender(config, i, database) for i in range(len(config.transmissions))]
+        period_ns = math.gcd(*(sender.period_ns for sender in self._senders))
+        if period_ns < SHORTEST_GRID_NS:
+            raise BenchConfigError(
+                f"transmissions: the periods' common divisor is {period_ns} ns, "
+                f"expected at least {SHORTEST_GRID_NS} ns"
+            )
+        self._period_ns = period_ns
+        self._grid = regular_grid(config, period_ns)
+        self._assembly = assemble(config)
+        self._motion = Motion(0, self._assembly.start)
+        columns = RECORD_COLUMNS * len(config.struts) + RECORD_EXTRA
+        self._records = np.empty((RECORDS_KEPT, columns))
+        self._queue: list[tuple[int, int, int, Frame]] = []
+        self._queued = 0
+        self._advance()
+
+    @property
+    def saturated_frames(self) -> int:
+        """Number of frames with a value outside its signal's range."""
+        return sum(sender.saturated_frames for sender in self._senders)
+
+    def update(self, now_ns: int) -> tuple[list[Frame], int]:
+        """Give the frames that were sent up to a time.
+
+        Args:
+            now_ns: Time on the caller's clock.
+
+        Returns:
+            The frames in the order of their transmission, each stamped with its time, and the
+            earliest time at which another can be due.
+        """
+        elapsed_ns = now_ns - self._start_ns
+        while (sender := self._next_sender()).next_sample_ns <= elapsed_ns:
+            frame = sender.send(self._record(sender.next_sample_ns), self._start_ns)
+            if frame is not None:
+                self._queued += 1
+                entry = (frame.t_ns, frame.arbitration_id, self._queued, frame)
+                heapq.heappush(self._queue, entry)
+        frames: list[Frame] = []
+        while self._queue and self._queue[0][0] <= now_ns:
+            frames.append(heapq.heappop(self._queue)[3])
+        return frames, self._next_due_ns()
+
+    def truth(self, t_ns: int) -> BenchTruth:
+        """What the bench really does at a time.
+
+        At the sensors' sample times the values are those that were sampled. Between, heights follow
+        a cubic and the rest a straight line.
+
+        Args:
+            t_ns: Time on the caller's clock, not before the start and not more than
+                `RECORDS_KEPT - RECORDS_AHEAD` records before the latest.
+
+        Returns:
+            The truth at that time.
+
+        Raises:
+            ValueError: The time is before the start, or its record was dropped.
+        """
+        period_ns = self._period_ns
+        index, rest_ns = divmod(t_ns - self._start_ns, period_ns)
+        oldest = max(self._motion.records - RECORDS_KEPT, 0)
+        if index < oldest:
+            raise ValueError(
+                f"t_ns = {t_ns}, expected at least {self._start_ns + oldest * period_ns}"
+            )
+        before = self._record(index * period_ns)
+        if rest_ns == 0:
+            return self._as_truth(t_ns, before)
+        after = self._record((index + 1) * period_ns)
+        return self._as_truth(t_ns, _between(before, after, rest_ns / period_ns, period_ns * 1e-9))
+
+    def _as_truth(self, t_ns: int, record: list[float]) -> BenchTruth:
+        extra = RECORD_COLUMNS * len(self.config.struts)
+        struts = tuple(
+            StrutTruth(*record[first : first + RECORD_COLUMNS])
+            for first in range(0, extra, RECORD_COLUMNS)
+        )
+        return BenchTruth(t_ns, struts, *record[extra:])
+
+    def _record(self, elapsed_ns: int) -> list[float]:
+        index = elapsed_ns // self._period_ns
+        while index >= self._motion.records:
+            self._advance()
+        record: list[float] = self._records[index % RECORDS_KEPT].tolist()
+        return record
+
+    def _advance(self) -> None:
+        first = self._motion.records % RECORDS_KEPT
+        self._motion, records = advanced(self._assembly, self._grid, self._motion, RECORDS_AHEAD)
+        self._records[first : first + RECORDS_AHEAD] = records
+
+    def _next_sender(self) -> _Sender:
+        return min(self._senders, key=lambda sender: sender.next_sample_ns)
+
+    def _next_due_ns(self) -> int:
+        due_ns = self._start_ns + min(
+            sender.next_sample_ns + sender.transmission.latency_ns for sender in self._senders
+        )
+        return min(due_ns, self._queue[0][0]) if self._queue else due_ns
+
+
+def _cycle_time_ns(message: Message, index: int) -> int:
+    if not message.cycle_time_ns:
+        raise BenchConfigError(
+            f"transmissions.{index}.period_ns is missing and the database gives {message.name} "
+            "no cycle time, expected a period"
+        )
+    return message.cycle_time_ns
+
+
+def _channels(
+    config: BenchConfig, sent: Transmission, noises: list[np.random.Generator]
+) -> list[_Channel]:
+    struts = [strut.name for strut in config.struts]
+    extra = RECORD_COLUMNS * len(struts)
+    channels: list[_Channel] = []
+    # Each quantity has its own source, so that one sensor's noise does not depend on another's.
+    if sent.height is not None:
+        column = RECORD_COLUMNS * struts.index(sent.height.strut)
+        noise_std = sent.height.noise_std_m
+        channels.append(
+            _Channel(sent.height.signal, Dimension.LENGTH, column, noise_std, noises[0])
+        )
+    if sent.applied_force is not None:
+        noise_std = sent.applied_force.noise_std_n
+        channels.append(
+            _Channel(sent.applied_force.signal, Dimension.FORCE, extra, noise_std, noises[1])
+        )
+    if sent.strut_force is not None:
+        column = RECORD_COLUMNS * struts.index(sent.strut_force.strut) + 2
+        noise_std = sent.strut_force.noise_std_n
+        channels.append(
+            _Channel(sent.strut_force.signal, Dimension.FORCE, column, noise_std, noises[2])
+        )
+    if sent.temperature is not None:
+        noise_std = sent.temperature.noise_std_k
+        channels.append(
+            _Channel(
+                sent.temperature.signal, Dimension.TEMPERATURE, extra + 2, noise_std, noises[3]
+            )
+        )
+    return channels
+
+
+def _between(before: list[float], after: list[float], share: float, period_s: float) -> list[float]:
+    """Record at a share of the way: heights by their rates (Hermite), the rest straight."""
+    record = [a + share * (b - a) for a, b in zip(before, after, strict=True)]
+    left = 1.0 - share
+    for i in range(0, len(record) - RECORD_EXTRA, RECORD_COLUMNS):
+        chord = after[i] - before[i]
+        bend = left * (before[i + 1] * period_s - chord) - share * (after[i + 1] * period_s - chord)
+        record[i] += share * left * bend
+    return record

@@ -1,0 +1,140 @@
+"""The bench's motion over time, as records on a regular grid."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rig.simulated_bench.assembly import Assembly, assemble
+from rig.simulated_bench.equations_of_motion import (
+    RECORD_COLUMNS,
+    RECORD_EXTRA,
+    Floats,
+    Integers,
+    Span,
+    advance,
+)
+from rig.simulated_bench.schema import BenchConfig, BenchConfigError
+
+NANOSECONDS = 1e-9
+"""Length of a nanosecond in s."""
+
+
+class BenchDivergedError(BenchConfigError):
+    """The equations of motion left the finite numbers: the step is too long for this bench."""
+
+
+class Motion(NamedTuple):
+    """Where the bench is.
+
+    Attributes:
+        records: Number of records so far; the state is at the time of the next one.
+        y: State, shape (states,).
+    """
+
+    records: int
+    y: Floats
+
+
+class Trajectory(NamedTuple):
+    """The motion of a bench on a regular grid of times; row k is at `t_ns[k]`.
+
+    Attributes:
+        t_ns: Times from the start, shape (records,).
+        height_m: Height of each strut, shape (records, struts).
+        velocity_m_per_s: Rate of height of each strut, shape (records, struts).
+        strut_force_n: Total force of each strut, undeclared effects in it included, shape
+            (records, struts).
+        applied_force_n: Force that the force sensor sees, shape (records,).
+        acting_force_n: Force that reaches the driven body, shape (records,).
+        temperature_c: Temperature of the damper, shape (records,).
+    """
+
+    t_ns: Integers
+    height_m: Floats
+    velocity_m_per_s: Floats
+    strut_force_n: Floats
+    applied_force_n: Floats
+    acting_force_n: Floats
+    temperature_c: Floats
+
+
+class Grid(NamedTuple):
+    """Times of the records.
+
+    Attributes:
+        substeps: Steps of the integrator between records.
+        step_s: Length of a step in s.
+    """
+
+    substeps: int
+    step_s: float
+
+
+def regular_grid(config: BenchConfig, period_ns: int) -> Grid:
+    """Divide a period into steps no longer than the configured one."""
+    substeps = -(-period_ns // config.step_ns)
+    return Grid(substeps, period_ns * NANOSECONDS / substeps)
+
+
+def advanced(assembly: Assembly, grid: Grid, motion: Motion, count: int) -> tuple[Motion, Floats]:
+    """Advance the bench.
+
+    Args:
+        assembly: The bench.
+        grid: Times of the records.
+        motion: Where the bench is.
+        count: Number of records to make.
+
+    Returns:
+        Where the bench is then, and the records, shape (count, columns); see
+        `rig.simulated_bench.equations_of_motion.observe`.
+
+    Raises:
+        BenchDivergedError: The motion is no longer finite.
+    """
+    struts = len(assembly.mechanics.mass_kg)
+    records = np.empty((count, RECORD_COLUMNS * struts + RECORD_EXTRA))
+    y = motion.y.copy()
+    span = Span(motion.records, grid.substeps, grid.step_s)
+    advance(assembly.mechanics, assembly.drive, span, y, records)
+    if not np.isfinite(records).all():
+        raise BenchDivergedError(
+            f"the motion is not finite after {motion.records * grid.substeps * grid.step_s:g} s, "
+            "expected a shorter step_ns or curves that do not drive the bench"
+        )
+    return Motion(motion.records + count, y), records
+
+
+def simulate(config: BenchConfig, duration_ns: int, period_ns: int = 1_000_000) -> Trajectory:
+    """Run a bench from its start, without sensors and bus.
+
+    The motion at a time does not depend on how it is asked for: a `Bench` with the same grid goes
+    through the same values bit for bit.
+
+    Args:
+        config: The bench.
+        duration_ns: Time of the last record; rounded down to a multiple of `period_ns`.
+        period_ns: Time between records.
+
+    Returns:
+        The motion.
+
+    Raises:
+        BenchConfigError: The bench has no state to start from.
+        BenchDivergedError: The motion is no longer finite.
+    """
+    assembly = assemble(config)
+    count = duration_ns // period_ns + 1
+    _, records = advanced(
+        assembly, regular_grid(config, period_ns), Motion(0, assembly.start), count
+    )
+    extra = RECORD_COLUMNS * len(config.struts)
+    return Trajectory(
+        t_ns=np.arange(count, dtype=np.int64) * period_ns,
+        height_m=records[:, 0:extra:RECORD_COLUMNS],
+        velocity_m_per_s=records[:, 1:extra:RECORD_COLUMNS],
+        strut_force_n=records[:, 2:extra:RECORD_COLUMNS],
+        applied_force_n=records[:, extra],
+        acting_force_n=records[:, extra + 1],
+        temperature_c=records[:, extra + 2],
+    )

@@ -1,0 +1,125 @@
+"""Observers of struts on a trailing arm and in a quarter car.
+
+Each bench has equations of its own, those of the diagnosis' tests.
+"""
+
+import numpy as np
+
+from dart_model.plant import DartPlant
+from dart_model.spec import MODELS, load_model
+from rig.bridge.contract import Measurement, StepInput
+from rig.bridge.free_model import Arrival, RigCore
+from rig.bridge.supervisor import Supervision
+from rig.observers.error_filter import ErrorFilter
+from rig.observers.kalman import KalmanObserver
+from rig.observers.none import NoObserver
+from tests.bridge.cores import MS, others
+from tests.diagnosis.mechanisms import QuarterCar, TrailingArm
+
+SUPERVISION = Supervision(30 * MS, 500 * MS, safe_holds_last=False)
+OBSERVER = KalmanObserver(
+    "kalman", ErrorFilter(bandwidth_hz=25.0, noise_std_m=1e-5), force_limit_n=20_000.0
+)
+RATE_HZ = 1000
+
+
+def follow(plant, heights_m, applied_n, observers=None):
+    """Published forces, shape (N, struts), NaN before the model started."""
+    count = heights_m.shape[1]
+    period_ns = round(1e9 / RATE_HZ)
+    core = RigCore(
+        plant, observers or (OBSERVER,) * count, SUPERVISION, (Arrival(period_ns),) * count
+    )
+    state = core.init(0)
+    found = np.full(heights_m.shape, np.nan)
+    for tick, (heights, force) in enumerate(zip(heights_m, applied_n, strict=True)):
+        measured = tuple(
+            None if np.isnan(h) else Measurement(float(h), tick * period_ns) for h in heights
+        )
+        given = StepInput(tick * period_ns, measured, others(applied_force=float(force)))
+        state, output = core.step(state, given)
+        for index, strut in enumerate(output.struts):
+            found[tick, index] = strut.force_n
+    return found
+
+
+def noisy(heights_m, seed=1):
+    return heights_m + 1e-5 * np.random.default_rng(seed).standard_normal(heights_m.shape)
+
+
+def error(found, truth):
+    """RMS error of each strut's force over the deviation of that force, after half a second."""
+    return np.sqrt(np.mean((found - truth)[500:] ** 2, axis=0)) / np.std(truth[500:], axis=0)
+
+
+def wrong(model, share=0.7, names=None):
+    """The same model with springs and dampers too weak."""
+    struts = tuple(
+        strut.model_copy(
+            update={
+                "stiffness_n_per_m": share * strut.stiffness_n_per_m,
+                "damping_n_s_per_m": share * strut.damping_n_s_per_m,
+            }
+        )
+        if names is None or strut.name in names
+        else strut
+        for strut in model.struts
+    )
+    return DartPlant(model.model_copy(update={"struts": struts}))
+
+
+def test_a_strut_on_a_trailing_arm(tmp_path):
+    arm = TrailingArm()
+    t_s, heights_m = arm.heights(duration_s=4.0, rate_hz=RATE_HZ)
+    applied_n = np.array([arm.load_n(t) for t in t_s])
+    velocity = np.gradient(heights_m[:, 0], t_s)
+    truth = -arm.stiffness * (heights_m[:, 0] - arm.free_m) - arm.damping * velocity
+    found = follow(wrong(arm.model(tmp_path)), noisy(heights_m), applied_n)
+    assert error(found, truth[:, None])[0] < 0.06
+
+
+def quarter_car(duration_s=4.0):
+    """The shipped quarter car; heights, applied force and strut forces of its bench."""
+    model, car = load_model(MODELS / "quarter_car.yaml"), QuarterCar()
+    t_s, heights_m = car.heights(duration_s=duration_s, rate_hz=RATE_HZ)
+    applied_n = np.array([car.load_n(t) for t in t_s])
+    rates = np.gradient(heights_m, t_s, axis=0)
+    rest = np.array([car.tyre_free_m, car.free_m])
+    stiffness = np.array([car.tyre, car.stiffness])
+    damping = np.array([car.tyre_damping, car.damping])
+    return model, heights_m, applied_n, -stiffness * (heights_m - rest) - damping * rates
+
+
+def test_errors_of_two_struts_are_corrected_at_once():
+    model, heights_m, applied_n, truth = quarter_car()
+    both = error(follow(wrong(model), noisy(heights_m), applied_n), truth)
+    for index, name in enumerate(("tyre", "suspension")):
+        alone = error(follow(wrong(model, names=[name]), noisy(heights_m), applied_n), truth)
+        assert both[index] < 1.1 * alone[index]
+
+
+def test_a_corrected_strut_lacks_nothing_in_the_car_either():
+    """The suspension's law, right by itself, in a car whose tyre is wrong: no force is missing."""
+    model, heights_m, applied_n, forces_n = quarter_car()
+    truth = forces_n[:, 1]
+    missed = []
+    for names in (["tyre"], ["tyre", "suspension"]):
+        plant = wrong(model, names=names)
+        found = follow(plant, noisy(heights_m), applied_n)[:, 1]
+        missed.append(np.sqrt(np.mean((found - truth)[500:] ** 2)))
+    corrected, rough = missed
+    right = follow(DartPlant(model), noisy(heights_m), applied_n)[:, 1]
+    assert corrected < 1.1 * np.sqrt(np.mean((right - truth)[500:] ** 2))
+    assert corrected < rough
+
+
+def test_a_tyre_that_nobody_measures_is_what_its_law_says():
+    model, heights_m, applied_n, forces_n = quarter_car(duration_s=6.0)
+    truth = forces_n[:, 1]
+    seen = noisy(heights_m)
+    seen[:, 0] = np.nan
+    plant = wrong(model, names=["suspension"])
+    found = follow(plant, seen, applied_n, (NoObserver("none"), OBSERVER))
+    # Its height at the start is not known, the model begins at rest on it.
+    missed = (found[:, 1] - truth)[1000:]
+    assert np.sqrt(np.mean(missed**2)) < 0.1 * np.std(truth)

@@ -1,0 +1,36 @@
+"""A bench's frames whose signals take turns."""
+
+from can_dbc.database import load_database
+from can_dbc.frame import Frame
+from can_dbc.protection import SequenceState, Verdict
+from rig.bridge.messages import HeightTarget, Wanted, incoming
+from rig.plan.quantities import HEIGHT
+
+DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: BENCH RIG
+BO_ 256 M: 8 BENCH
+ SG_ PAGE M : 0|8@1+ (1,0) [0|0] "" RIG
+ SG_ LEVEL m1 : 8|16@1+ (0.001,0) [0|0] "m" RIG
+ SG_ OTHER m2 : 8|16@1+ (1,0) [0|0] "" RIG
+"""
+
+
+def verdicts(tmp_path, *payloads):
+    path = tmp_path / "paged.dbc"
+    path.write_text(DBC)
+    made = incoming(load_database(path).message("M"), [Wanted("LEVEL", HEIGHT)])
+    assert made.heights == (HeightTarget(0, 0),)
+    return [made.read(SequenceState(), Frame(0, 256, data))[1:] for data in payloads]
+
+
+def test_a_frame_of_another_page_is_no_fault_and_a_short_one_is(tmp_path):
+    with_height = bytes([1]) + (421).to_bytes(2, "little") + bytes(5)
+    without = bytes([2, 7, 0]) + bytes(5)
+    found = verdicts(tmp_path, with_height, without, with_height[:2])
+    assert found == [
+        (Verdict.OK, (0.421,)),
+        (Verdict.OK, None),
+        (Verdict.WRONG_LENGTH, None),
+    ]

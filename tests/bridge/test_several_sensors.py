@@ -1,0 +1,238 @@
+"""Several sensors of one strut in one filter: against theory, late ones, and ones that fail."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from rig.bridge.contract import (
+    Deviation,
+    Innovation,
+    Measurement,
+    Measures,
+    Mode,
+    Reading,
+    Sensor,
+    Start,
+    StepInput,
+)
+from rig.bridge.free_model import Arrival, RigCore
+from rig.bridge.supervisor import Supervision
+from rig.observers.error_filter import ErrorFilter
+from rig.observers.kalman import KalmanObserver
+from tests.bridge.cores import MS, others
+from tests.observers.benches import Truth
+
+NOISE_M, BANDWIDTH_HZ = 2e-5, 20.0
+HEIGHT = Sensor("strut.wire", 0, Measures.HEIGHT, NOISE_M, MS)
+
+
+def kalman(bandwidth_hz=BANDWIDTH_HZ, noise_std_m=NOISE_M):
+    return KalmanObserver("kalman", ErrorFilter(bandwidth_hz, noise_std_m))
+
+
+def start(*sensors):
+    return Start(0, 0.1, MS, 0, 40.0, 2.0, tuple(enumerate(sensors)))
+
+
+def undriven(state, t_ns):
+    """The state without the virtual force, which no model answers to here."""
+    return replace(state, error=replace(state.error, inputs=((t_ns, 0.0),)))
+
+
+def test_two_equal_sensors_are_one_of_half_the_variance():
+    # The intensity of the force's noise is omega^10 sigma^2 h: the same with both.
+    both, one = kalman(), kalman(BANDWIDTH_HZ * 2.0**0.1, NOISE_M / np.sqrt(2.0))
+    fusing, alone = both.init(start(HEIGHT)), one.init(start())
+    rng = np.random.default_rng(1)
+    for tick in range(1, 2001):
+        t_ns, (a, b) = tick * MS, NOISE_M * rng.standard_normal(2)
+        fusing = both.fuse(fusing, t_ns, Innovation(a, t_ns), [Deviation(0, b, t_ns)])
+        alone = one.step(alone, t_ns, Innovation((a + b) / 2.0, t_ns))
+        fusing, alone = undriven(fusing, t_ns), undriven(alone, t_ns)
+        if tick > 1000:  # the scales of the variances follow other innovations
+            assert fusing.residual_force_n == pytest.approx(alone.residual_force_n, abs=2e-3)
+    ratio = fusing.force_std_n / alone.force_std_n
+    scales = np.sqrt(fusing.error.scale / alone.error.scale)
+    assert ratio == pytest.approx(scales, rel=1e-3)
+
+
+@settings(max_examples=30)
+@given(
+    late=st.lists(st.sampled_from([0, 2, 5]), min_size=30, max_size=30),
+    seed=st.integers(0, 1000),
+)
+def test_a_late_reading_is_used_at_its_time(late, seed):
+    """Whatever comes late: in the end the filter is the one that had all in order."""
+    observer, rng = kalman(), np.random.default_rng(seed)
+    delayed = Sensor("strut.wire", 0, Measures.VELOCITY, 1e-3, MS, 5 * MS)
+    readings = [(tick * MS + MS // 2, 1e-4 * rng.standard_normal()) for tick in range(30)]
+    heights = NOISE_M * rng.standard_normal(40)
+    found = []
+    for delays in ([0] * 30, late):
+        state = observer.init(start(delayed))
+        for tick in range(1, 40):
+            t_ns = tick * MS
+            here = [
+                Deviation(0, value, at_ns)
+                for (at_ns, value), delay in zip(readings, delays, strict=True)
+                if t_ns - MS < at_ns + delay * MS <= t_ns
+            ]
+            state = observer.fuse(state, t_ns, Innovation(heights[tick], t_ns), here)
+            state = undriven(state, t_ns)
+        found.append(state.error)
+    assert np.allclose(found[0].mean, found[1].mean, rtol=1e-9, atol=1e-15)
+    assert np.allclose(found[0].covariance, found[1].covariance, rtol=1e-9)
+
+
+TRUTH = Truth(10.0, 2.0, 1000, 4.0)
+SUPERVISION = Supervision(30 * MS, 500 * MS, safe_holds_last=False)
+
+
+def velocity():
+    return np.gradient(TRUTH.height_m, 1e-3)
+
+
+def follow(sensors, readings, *, heights=None, observer=None):
+    """Outputs of the bench of 10 kg; `readings` of a tick: place and value, now."""
+    seen = TRUTH.height_m if heights is None else heights
+    core = RigCore(
+        TRUTH.plant, (observer or kalman(25.0, NOISE_M),), SUPERVISION, (Arrival(MS),), sensors
+    )
+    state, outputs = core.init(0), []
+    for tick, (height_m, applied_n) in enumerate(zip(seen, TRUTH.applied_n, strict=True)):
+        t_ns = tick * MS
+        measured = None if np.isnan(height_m) else Measurement(float(height_m), t_ns)
+        came = tuple(
+            Reading(place, value, t_ns - sensors[place].delay_ns)
+            for place, value in readings(tick)
+            if value is not None
+        )
+        given_now = others(applied_force=float(applied_n))
+        state, output = core.step(state, StepInput(t_ns, (measured,), given_now, readings=came))
+        outputs.append(output)
+    return outputs
+
+
+def noisy(values, std, seed):
+    return values + std * np.random.default_rng(seed).standard_normal(len(values))
+
+
+def errors(outputs, first=500):
+    found = np.array(
+        [
+            [item.force_n, item.force_std_n]
+            for (item,) in (output.struts for output in outputs[first:])
+        ]
+    )
+    return found[:, 0] - TRUTH.force_n[first : first + len(found)], found[:, 1]
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+CELL = Sensor("strut.cell", 0, Measures.FORCE, 0.5, MS)
+TACHO = Sensor("strut.tacho", 0, Measures.VELOCITY, 1e-3, MS)
+WIRE = Sensor("strut.wire", 0, Measures.HEIGHT, 1e-5, 5 * MS)
+
+
+@pytest.mark.parametrize(("sensor", "share"), [(CELL, 0.4), (TACHO, 0.85), (WIRE, 1.0)])
+def test_a_further_sensor_makes_the_force_better_and_its_interval_honest(sensor, share):
+    heights = noisy(TRUTH.height_m, NOISE_M, 1)
+    values = {
+        Measures.FORCE: TRUTH.force_n,
+        Measures.VELOCITY: velocity(),
+        Measures.HEIGHT: TRUTH.height_m,
+    }[sensor.measures]
+    read = noisy(values, sensor.noise_std, 2)
+    every = sensor.interval_ns // MS
+    alone, _ = errors(follow((), lambda _tick: [], heights=heights))
+    outputs = follow(
+        (sensor,), lambda tick: [(0, read[tick])] if tick % every == 0 else [], heights=heights
+    )
+    missed, std_n = errors(outputs)
+    assert rms(missed) < share * rms(alone)
+    assert 0.93 <= np.mean(np.abs(missed) < 1.96 * std_n) <= 0.995
+    assert not any(output.left_out for output in outputs)
+
+
+@pytest.mark.parametrize("sensor", [CELL, TACHO])
+def test_a_late_sensor_is_held_against_the_model_of_its_time(sensor):
+    late = Sensor(sensor.name, 0, sensor.measures, sensor.noise_std, MS, 5 * MS)
+    values = TRUTH.force_n if sensor is CELL else velocity()
+    heights, read = noisy(TRUTH.height_m, NOISE_M, 1), noisy(values, sensor.noise_std, 2)
+    at_once, _ = errors(follow((sensor,), lambda tick: [(0, read[tick])], heights=heights))
+    delayed, _ = errors(
+        follow((late,), lambda tick: [(0, read[tick - 5])] if tick >= 5 else [], heights=heights)
+    )
+    ignored, _ = errors(
+        follow((sensor,), lambda tick: [(0, read[tick - 5])] if tick >= 5 else [], heights=heights)
+    )
+    alone, _ = errors(follow((), lambda _tick: [], heights=heights))
+    assert rms(at_once) <= rms(delayed) < 0.7 * rms(alone)
+    assert rms(delayed) < 0.9 * rms(ignored)
+
+
+def test_a_sensor_that_jumps_is_left_out_and_comes_back():
+    heights, read = noisy(TRUTH.height_m, NOISE_M, 1), noisy(TRUTH.force_n, 0.5, 2)
+    read[1500:2500] += 200.0
+    outputs = follow((CELL,), lambda tick: [(0, read[tick])], heights=heights)
+    out = [tick for tick, output in enumerate(outputs) if output.left_out]
+    assert out == list(range(1504, 2549))  # five beyond the gate; fifty within it
+    missed, _ = errors(outputs)
+    alone, _ = errors(follow((), lambda _tick: [], heights=heights))
+    assert rms(missed[1100:1900]) < 1.1 * rms(alone[1100:1900])
+
+
+def test_a_silent_sensor_is_left_out_and_said():
+    heights, read = noisy(TRUTH.height_m, NOISE_M, 1), noisy(TRUTH.force_n, 0.5, 2)
+    outputs = follow(
+        (CELL,), lambda tick: [] if 1500 <= tick < 1600 else [(0, read[tick])], heights=heights
+    )
+    out = [tick for tick, output in enumerate(outputs) if output.left_out]
+    assert out == list(range(1505, 1600))
+
+
+def test_another_height_carries_on_where_the_struts_own_is_lost():
+    heights = noisy(TRUTH.height_m, NOISE_M, 1)
+    heights[1500:2500] = np.nan
+    read = noisy(TRUTH.height_m, 1e-5, 2)
+    outputs = follow(
+        (WIRE,), lambda tick: [(0, read[tick])] if tick % 5 == 0 else [], heights=heights
+    )
+    assert {output.mode for output in outputs[20:]} == {Mode.RUNNING}
+    missed, std_n = errors(outputs)
+    assert np.mean(np.abs(missed[1100:1900]) < 1.96 * std_n[1100:1900]) > 0.9
+    without = follow((), lambda _tick: [], heights=heights)
+    assert {output.mode for output in without[1700:1900]} == {Mode.HOLD}
+    # A force or a velocity alone does not keep the model where the bench is.
+    cell = follow((CELL,), lambda tick: [(0, TRUTH.force_n[tick])], heights=heights)
+    assert {output.mode for output in cell[1700:1900]} == {Mode.HOLD}
+
+
+def test_a_sensor_that_is_out_does_not_come_back_without_the_reference():
+    heights, read = noisy(TRUTH.height_m, NOISE_M, 1), TRUTH.height_m.copy()
+    read[900:] += 5e-3
+    heights[1000:1400] = np.nan
+    wire = Sensor("strut.wire", 0, Measures.HEIGHT, 1e-5, MS)
+    outputs = follow((wire,), lambda tick: [(0, read[tick])], heights=heights)
+    assert all(output.left_out for output in outputs[910:])
+    assert not any(output.struts[0].valid for output in outputs[1100:1390])
+    missed, _ = errors(outputs)
+    assert rms(missed[1000:]) < 20.0
+
+
+def test_two_steps_at_one_time_keep_the_input_of_both():
+    core = RigCore(TRUTH.plant, (kalman(),), SUPERVISION, (Arrival(MS),), (WIRE,))
+    state = core.init(0)
+    for tick in range(100):
+        given_now = StepInput(tick * MS, (Measurement(0.4 + 1e-5 * tick, tick * MS),))
+        state, _ = core.step(state, given_now)
+    for height_m in (0.40, 0.41):
+        state, output = core.step(state, StepInput(100 * MS, (Measurement(height_m, 100 * MS),)))
+    driven = -output.struts[0].virtual_force_n * state.observers[0].error.start.mobility_per_kg
+    state, _ = core.step(state, StepInput(101 * MS, (Measurement(0.4, 101 * MS),)))
+    inputs = dict(state.observers[0].several.inputs)
+    assert inputs[100 * MS] == driven

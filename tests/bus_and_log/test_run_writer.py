@@ -1,0 +1,240 @@
+"""A run's log on disks that fail, are slow, or are long in use."""
+
+import math
+import resource
+import threading
+
+import pytest
+import yaml
+
+from can_dbc.errors import InputError
+from can_dbc.frame import Frame
+from rig.log.captures import Window
+from rig.log.frame_columns import received_frames
+from rig.log.reader import RUN_FILE, RUN_SCHEMA, read_run
+from rig.log.steps import BUS_FAULT, Step
+from rig.log.whole_file import WholeFile
+from rig.log.writer import MANY_WAITING, Rotation, RunLog
+
+MS = 1_000_000
+EPOCH_NS = 1_700_000_000_000_000_000
+RUNNING, HOLD = 2, 3
+COLUMNS = [f"strut.number_{k}" for k in range(11)]
+
+
+def step(index, mode=RUNNING, flags=0):
+    return Step(index * MS, 0, 1, mode, flags, (0.5 + index, float(index), *(math.nan,) * 9))
+
+
+def tick(index, **options):
+    """What is handed over for one tick."""
+    t_ns = index * MS
+    data = index.to_bytes(8, "big")
+    return [Frame(t_ns, 0x100, data)], [Frame(t_ns, 0x110, data)], step(index, **options)
+
+
+def open_log(folder, *, paced=False, **options):
+    header = {"schema": RUN_SCHEMA, "epoch_ns": EPOCH_NS}
+    return RunLog(folder, header, COLUMNS, EPOCH_NS, "can0", paced=paced, **options)
+
+
+def ending():
+    return {"ending": {"status": "done"}}
+
+
+def assert_holds(folder, first, last):
+    """The run holds the frames and the steps of these ticks, and no others."""
+    found = read_run(folder)
+    expected = [
+        (item, way) for i in range(first, last) for item, way in zip(*_frames(i), strict=True)
+    ]
+    assert list(found.frames()) == expected
+    assert found.steps.column("t_ns").to_pylist() == [i * MS for i in range(first, last)]
+    columns = received_frames(found.frame_files, found.epoch_ns)
+    assert columns.t_ns.tolist() == [i * MS for i in range(first, last)]
+
+
+def _frames(index):
+    received, sent, _ = tick(index)
+    return (*received, *sent), ("R", "T")
+
+
+@pytest.fixture
+def file_size_limit():
+    """Sets the size at which the kernel lets no file grow: a disk that is full, but for real."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def limit(size_bytes):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, before[1]))
+
+    yield limit
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_piece_that_does_not_fit_leaves_no_trace_and_fits_later(tmp_path, file_size_limit):
+    file = WholeFile(tmp_path / "x")
+    file.append(b"a" * 700)
+    file_size_limit(1000)
+    with pytest.raises(OSError, match="large"):
+        file.append(b"b" * 700)
+    assert (tmp_path / "x").read_bytes() == b"a" * 700
+    file_size_limit(resource.RLIM_INFINITY)
+    file.append(b"b" * 700)
+    file.close()
+    assert (tmp_path / "x").read_bytes() == b"a" * 700 + b"b" * 700
+
+
+def test_a_disk_that_is_full_for_a_while_costs_nothing(tmp_path, file_size_limit):
+    log = open_log(tmp_path / "run")
+    file_size_limit(70_000)
+    for index in range(2000):
+        log.add(*tick(index))
+    assert log.fault is not None
+    file_size_limit(resource.RLIM_INFINITY)
+    for index in range(2000, 2500):
+        log.add(*tick(index))
+    assert log.fault is None
+    log.close(ending)
+    assert "large" in log.trouble
+    assert log.dropped == 0
+    assert_holds(tmp_path / "run", 0, 2500)
+
+
+def test_what_was_written_before_the_disk_was_full_stays_readable_and_the_rest_is_counted(
+    tmp_path, file_size_limit
+):
+    log = open_log(tmp_path / "run")
+    for index in range(1000):
+        log.add(*tick(index))
+    file_size_limit(100_000)
+    for index in range(1000, 3000):
+        log.add(*tick(index))
+    log.close(ending)
+    found = read_run(tmp_path / "run")
+    count = found.steps.num_rows
+    assert count >= 800
+    assert log.dropped >= 1000
+    lines = list(found.frames())
+    assert lines == [
+        (item, way) for i in range(len(lines) // 2) for item, way in zip(*_frames(i), strict=True)
+    ]
+    assert found.header["ending"] == {"status": "done"}
+
+
+def test_how_the_run_ended_is_written_to_a_full_disk_out_of_what_was_kept_back(tmp_path):
+    log = open_log(tmp_path / "run")
+    assert (tmp_path / "run" / "reserve.tmp").stat().st_size >= 50_000
+    log.close(ending)
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [
+        "frames.log",
+        "run.yaml",
+        "steps.arrow",
+    ]
+
+
+def test_a_slow_disk_holds_nothing_up_and_is_told(tmp_path, monkeypatch):
+    released = threading.Event()
+    append = WholeFile.append
+
+    def slow(self, piece):
+        released.wait(30.0)
+        append(self, piece)
+
+    log = open_log(tmp_path / "run", paced=True)
+    monkeypatch.setattr(WholeFile, "append", slow)
+    for index in range(2 * MANY_WAITING + 1000):
+        log.add(*tick(index))
+    assert log.fault == "the disk is too slow"
+    released.set()
+    log.close(ending)
+    assert log.dropped == 0
+    assert_holds(tmp_path / "run", 0, 2 * MANY_WAITING + 1000)
+
+
+def test_what_was_handed_over_is_written_while_the_run_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr("rig.log.writer._LONGEST_PAUSE_S", None)  # nothing but a tick wakes it
+    written = threading.Event()
+    append = WholeFile.append
+
+    def told(self, piece):
+        append(self, piece)
+        if b"R\n" in piece:
+            written.set()
+
+    monkeypatch.setattr(WholeFile, "append", told)
+    log = open_log(tmp_path / "run", paced=True)
+    for index in range(20):
+        log.add(*tick(index))
+    try:
+        assert written.wait(30.0)
+    finally:
+        log.close(ending)
+    assert_holds(tmp_path / "run", 0, 20)
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_moves(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"file/run: cannot be written"):
+        open_log(tmp_path / "file" / "run")
+
+
+@pytest.mark.parametrize(
+    "rotation", [Rotation(size_bytes=100_000), Rotation(time_ns=500 * MS), Rotation(1, 1)]
+)
+def test_a_rotated_run_reads_like_one_that_is_not(tmp_path, rotation):
+    log = open_log(tmp_path / "run", rotation=rotation)
+    for index in range(3000):
+        log.add(*tick(index))
+    log.close(ending)
+    assert len(read_run(tmp_path / "run").frame_files) > 4
+    assert_holds(tmp_path / "run", 0, 3000)
+
+
+def test_parts_end_with_the_same_tick(tmp_path):
+    log = open_log(tmp_path / "run", rotation=Rotation(time_ns=500 * MS))
+    for index in range(1200):
+        log.add(*tick(index))
+    log.close(ending)
+    text = (tmp_path / "run" / "frames.log").read_text()
+    assert text.count("\n") % 2 == 0
+    later = (tmp_path / "run" / "frames.0001.log").read_text()
+    assert later.splitlines()[0].endswith("R")
+
+
+def captured(folder):
+    return sorted(path.name for path in (folder / "captures").glob("*"))
+
+
+def test_a_window_around_a_fault_is_a_run_of_its_own(tmp_path):
+    log = open_log(
+        tmp_path / "run",
+        window=Window(100 * MS, 50 * MS, 10),
+        capture_name=lambda before, now: "hold" if now == HOLD != before else None,
+    )
+    for index in range(1000):
+        log.add(*tick(index, mode=HOLD if index in (500, 501, 502) else RUNNING))
+    log.close(ending)
+    assert captured(tmp_path / "run") == ["001_hold"]
+    assert_holds(tmp_path / "run" / "captures" / "001_hold", 400, 551)
+    header = yaml.safe_load((tmp_path / "run" / "captures" / "001_hold" / RUN_FILE).read_text())
+    assert header["capture"] == {"why": "hold", "t_s": 0.5}
+
+
+def test_a_users_trigger_a_bus_fault_and_no_more_windows_than_asked_for(tmp_path):
+    log = open_log(tmp_path / "run", window=Window(10 * MS, 10 * MS, 2))
+    for index in range(500):
+        if index == 100:
+            log.trigger("user")
+        log.add(*tick(index, flags=BUS_FAULT if 200 <= index < 250 or index == 400 else 0))
+    log.close(ending)
+    assert captured(tmp_path / "run") == ["001_user", "002_bus"]
+    assert_holds(tmp_path / "run" / "captures" / "002_bus", 190, 211)
+
+
+def test_a_run_that_ends_within_a_window_keeps_what_there_is(tmp_path):
+    log = open_log(tmp_path / "run", window=Window(10 * MS, 1000 * MS, 2))
+    log.add(*tick(0))
+    log.trigger("user")
+    log.add(*tick(1))
+    log.close(ending)
+    assert_holds(tmp_path / "run" / "captures" / "001_user", 0, 2)

@@ -1,0 +1,152 @@
+"""A foreign bus: one message in and one out, big-endian, without protection, in seven lines."""
+
+from pathlib import Path
+
+import can
+import cantools
+import pytest
+import yaml
+
+from can_dbc.database import DEFAULT_DATABASE, load_database
+from can_dbc.errors import InputError
+from rig.bus.bus import Bus
+from rig.bus.link import Link, LinkFigures
+from rig.machine.clock import VirtualClock
+from rig.plan.assembly import build_bridge
+from rig.plan.config import CONFIGS
+from rig.plan.proposal import propose
+from rig.plan.setup import load_setup
+from rig.run.logged_run import logged
+from rig.run.ports import BusPort
+from rig.run.replay import replay
+from tests.bus_and_log.at_once import AtOnce
+
+DBC = """VERSION ""
+
+NS_ :
+
+BS_:
+
+BU_: SENSOR CONTROL
+
+BO_ 288 SENSOR_1: 8 SENSOR
+ SG_ Travel : 7|16@0- (0.05,0) [-1600|1600] "mm" CONTROL
+ SG_ OilTemp : 23|8@0+ (1,-40) [-40|215] "degC" CONTROL
+
+BO_ 400 CONTROL_1: 8 CONTROL
+ SG_ EstimatedForce : 7|16@0- (0.001,0) [-32|32] "kN" SENSOR
+ SG_ Setpoint : 23|16@0- (0.1,0) [-3000|3000] "N" SENSOR
+
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_ "GenMsgCycleTime" BO_ 288 1;
+"""
+
+
+@pytest.fixture
+def dbc(tmp_path: Path) -> Path:
+    path = tmp_path / "my.dbc"
+    path.write_text(DBC)
+    return path
+
+
+def test_a_proposal_finds_height_temperature_and_where_to_publish(dbc):
+    text = propose(load_database(dbc))
+    assert yaml.safe_load(text) == {
+        "model": "reference",
+        "dbc": "my.dbc",
+        "bus": {"interface": "socketcan", "channel": "can0", "bitrate": 500000},
+        "signals": {
+            "height": {"message": "SENSOR_1", "signal": "Travel"},
+            "temperature": {"message": "SENSOR_1", "signal": "OilTemp"},
+        },
+        "publish": {"force": {"message": "CONTROL_1", "signal": "EstimatedForce"}},
+    }
+    assert "or CONTROL_1.Setpoint" in text
+
+
+def test_a_dbc_without_a_length_gives_no_proposal(dbc):
+    dbc.write_text(DBC.replace('"mm"', '""'))
+    with pytest.raises(InputError, match=r"my\.dbc: no signal has a unit of length"):
+        propose(load_database(dbc))
+
+
+def test_what_was_proposed_runs_over_a_bus_and_replays(dbc, tmp_path):
+    config = tmp_path / "my.yaml"
+    text = propose(load_database(dbc)).replace("interface: socketcan", "interface: virtual")
+    text = text.replace("channel: can0", "channel: own-dbc")
+    lines = [line for line in text.splitlines() if "temperature" not in line]
+    assert len(lines) == 7
+    config.write_text("\n".join(lines))
+    ready = load_setup(config, duration_s=0.3)
+    bridge = build_bridge(ready)
+    clock = VirtualClock()
+    bus = ready.config.bus.config()
+    link = Link(lambda: Bus(bus, bridge.filters), clock.epoch_now_ns, executor=AtOnce())
+    peer = Bus(bus)
+    other = cantools.database.load_file(dbc)
+
+    class Bench:
+        """Sends a height with another program's codec before each tick."""
+
+        def __init__(self) -> None:
+            self.forces: list[float] = []
+
+        def receive(self, t_ns):
+            payload = other.encode_message("SENSOR_1", {"Travel": 300.0, "OilTemp": 25})
+            message = can.Message(timestamp=t_ns * 1e-9, arbitration_id=288, data=payload)
+            message.is_extended_id = False
+            peer._bus.send(message)
+            return port.receive(t_ns)
+
+        def send(self, frames):
+            sent = port.send(frames)
+            for frame in peer.receive():
+                decoded = other.decode_message(frame.arbitration_id, frame.data)
+                self.forces.append(decoded["EstimatedForce"])
+            return sent
+
+    port, bench = BusPort(link), Bench()
+    try:
+        ended = logged(
+            ready,
+            bridge,
+            bench,
+            clock,
+            tmp_path / "run",
+            figures=LinkFigures(),
+            stop=lambda: False,
+            progress=lambda _t, _mode: None,
+        )
+    finally:
+        link.close()
+        peer.close()
+    assert (ended.ticks, ended.state.counts.refused) == (300, 0)
+    # The body's weight of 98.1 N, carried by the strut at rest, in steps of a newton.
+    assert bench.forces[-1] * 1000.0 == pytest.approx(98.0, abs=25.0)
+    assert len(bench.forces) == 300
+    found = replay(tmp_path / "run")
+    assert (found.logged, found.different) == (300, 0)
+
+
+def test_several_messages_of_the_bench_leave_the_estimate_to_another_node(dbc):
+    text = DBC.replace(
+        "BO_ 400",
+        "BO_ 300 SENSOR_2: 8 SENSOR\n"
+        ' SG_ SetForce : 7|16@0- (0.1,0) [-3000|3000] "N" CONTROL\n\nBO_ 400',
+    )
+    dbc.write_text(text)
+    published = yaml.safe_load(propose(load_database(dbc)))["publish"]
+    assert published == {"force": {"message": "CONTROL_1", "signal": "EstimatedForce"}}
+
+
+def test_the_packages_own_dbc_gives_its_own_estimate():
+    published = yaml.safe_load(propose(load_database(DEFAULT_DATABASE)))["publish"]
+    assert published["force"]["signal"] == "SPRING_DAMPER_FORCE"
+
+
+def test_an_engine_that_is_not_there_is_one_line(tmp_path):
+    text = (CONFIGS / "reference.yaml").read_text() + "\nengine: magic\n"
+    (tmp_path / "my.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"my\.yaml: engine 'magic': expected one of dart"):
+        build_bridge(load_setup(tmp_path / "my.yaml"))

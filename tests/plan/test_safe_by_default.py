@@ -1,0 +1,101 @@
+"""What is refused before a bench moves, and what is said of a model that runs away."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from rig.cli.main import main
+from rig.log.reader import read_run
+from rig.plan.config import CONFIGS
+from rig.plan.setup import load_setup
+from rig.run.live import with_bench
+from rig.simulated_bench.config import load_bench_config
+
+
+def rig(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["rig", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+def config(folder: Path, **changes: object) -> Path:
+    data = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
+    data["realtime"] = {"fifo_priority": 0, "lock_memory": False, "freeze_garbage": False}
+    path = folder / "my.yaml"
+    path.write_text(yaml.safe_dump({**data, **changes}))
+    return path
+
+
+UNSTABLE = {"observers": {"strut": {"proportional_n_per_m": 1e8}}}
+
+
+def test_what_the_check_calls_an_error_does_not_start(tmp_path, monkeypatch, capsys):
+    path = config(tmp_path, **UNSTABLE)
+    assert rig(monkeypatch, "run", path, "--out", tmp_path / "run") == 2
+    assert "unstable" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_forced_run_says_so(tmp_path, monkeypatch):
+    path = config(tmp_path, **UNSTABLE)
+    out = tmp_path / "run"
+    assert rig(monkeypatch, "run", path, "--out", out, "--force", "--duration-s", 0.05) == 1
+    (forced,) = read_run(out).header["forced"]
+    assert forced["what"] == "poles"
+    assert "unstable" in forced["text"]
+
+
+def test_a_folder_that_holds_something_is_not_written_into(tmp_path, monkeypatch, capsys):
+    path = config(tmp_path)
+    for name in ("frames.log", "model.yaml"):
+        (tmp_path / name).write_text("mine")
+    assert rig(monkeypatch, "run", path, "--out", tmp_path) == 2
+    assert "is not empty" in capsys.readouterr().err
+    assert (tmp_path / "frames.log").read_text() == "mine"
+
+
+@pytest.mark.parametrize(("mode", "code"), [(0o600, 1), (0o640, 2), (0o604, 2)])
+def test_a_key_that_others_can_read_is_refused(tmp_path, monkeypatch, capsys, mode, code):
+    pytest.importorskip("cryptography")
+    key = tmp_path / "bench.key"
+    key.write_text("00112233445566778899aabbccddeeff\n")
+    key.chmod(mode)
+    path = config(
+        tmp_path,
+        bus={
+            "interface": "virtual",
+            "channel": f"key-{mode}-{os.getpid()}",
+            "data_bitrate": 8_000_000,
+        },
+        authentication={"key_file": "bench.key"},
+    )
+    # No bench is there: a run that may start ends without a height.
+    assert rig(monkeypatch, "run", path, "--out", tmp_path / "run", "--duration-s", 0.05) == code
+    assert ("can be read by others" in capsys.readouterr().err) is (code == 2)
+
+
+def test_a_model_that_diverges_is_told_with_its_strut_and_time(tmp_path):
+    data = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
+    data["observers"] = {"strut": {"proportional_n_per_m": 1e9, "force_limit_n": 1e300}}
+    path = tmp_path / "my.yaml"
+    path.write_text(yaml.safe_dump(data))
+    ended = with_bench(
+        load_setup(path, duration_s=1.0),
+        load_bench_config(CONFIGS / "reference_bench.yaml"),
+        tmp_path / "run",
+        lockstep=True,
+        stop=lambda: False,
+        progress=lambda _t, _mode: None,
+    )
+    assert ended.diverged is not None
+    assert ended.diverged["strut"] == "strut"
+    ending = read_run(tmp_path / "run").header["ending"]
+    assert ending["diverged"] == ended.diverged
+    steps = read_run(tmp_path / "run").steps
+    t_ns = round(ended.diverged["t_s"] * 1e9)
+    at = steps.column("t_ns").to_pylist().index(t_ns)
+    assert steps.column("mode").to_pylist()[at - 1 : at + 1] == [2, 4]

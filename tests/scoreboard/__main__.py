@@ -1,0 +1,45 @@
+"""`python -m tests.scoreboard`: published measured sets, our figures beside the published ones."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.output import JsonFlag, console, print_json, table
+from rig.cli.progress import progress_bar
+from tests.scoreboard.run import run_scoreboard
+
+
+def scoreboard(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            "--data",
+            metavar="DIR",
+            help="Folder with folders silverbox, emps, brfd, mr_damper, any of them.",
+        ),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME", help="Only this set; may be given several times."),
+    ] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Diagnose published measured sets and print our figures beside the published ones."""
+    with progress_bar() as bar:
+        rows = run_scoreboard(data, out, bar, only or ())
+    if as_json:
+        print_json([asdict(row) for row in rows])
+        return
+    shown = table("set", "test", "model", "figure", "source", title="Measured sets")
+    for row in rows:
+        figure = "-" if row.value is None else f"{row.value:.4g} {row.unit}"
+        shown.add_row(row.dataset, row.test, row.model, figure, row.source)
+    console.print(shown)
+    console.print(f"Written: {out}/scoreboard.csv, {out}/scoreboard.md", markup=False)
+
+
+if __name__ == "__main__":
+    typer.run(scoreboard)
