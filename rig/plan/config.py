@@ -496,7 +496,8 @@ class RunConfig(_Frozen):
             RIG_KINEMATICS for the first strut, and the same with _2, _3, ... for the next ones.
         status: What is published of the bridge, by the keys of `rig.bridge.messages.STATUS`; or a
             message that has a signal of each name. By default RIG_STATUS, where the DBC has it.
-        timing: How well the rate is kept, by the keys of `rig.bridge.messages.TIMING`, or a message;
+        timing: How well the rate is kept, by the keys of `rig.bridge.messages.TIMING`, or a
+            message;
             nothing by default.
         supervision: Ages and safe state.
         realtime: What is asked of the machine.
