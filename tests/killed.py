@@ -18,7 +18,7 @@ import numpy as np
 from rig.log.reader import read_run
 from rig.log.writer import RunLog
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
@@ -39,12 +39,10 @@ def run(folder: Path, counts: mmap.mmap) -> None:
 
     RunLog.add = counted
     with_bench(
-        load_setup(CONFIGS / "reference.yaml", duration_s=60.0),
+        load_plan(CONFIGS / "reference.yaml", duration_s=60.0),
         load_bench_config(CONFIGS / "reference_bench.yaml"),
         folder,
         lockstep=False,
-        stop=lambda: False,
-        progress=lambda _t, _mode: None,
     )
 
 

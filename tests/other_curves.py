@@ -14,7 +14,7 @@ from scipy.interpolate import PchipInterpolator
 
 from rig.demo.cases import SETTLED_NS, compared
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.live import with_bench
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.schema import BenchConfig
@@ -58,7 +58,7 @@ def main() -> None:
     asked = parser.parse_args()
     rng = np.random.default_rng(asked.seed)
     shipped = load_bench_config(CONFIGS / "reference_bench.yaml")
-    ready = load_setup(CONFIGS / "reference.yaml")
+    ready = load_plan(CONFIGS / "reference.yaml")
     rows: list[tuple[float, float, float, float]] = []
     for number in range(asked.benches):
         bench = other(shipped, rng)
@@ -68,8 +68,6 @@ def main() -> None:
                 bench,
                 Path(folder) / "run",
                 lockstep=True,
-                stop=lambda: False,
-                progress=lambda _t, _mode: None,
             )
             (strut,) = compared(ended, ready, bench).struts
         figures = strut.figures(strut.observed)

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rig.plan.load import plan_of_run
 from rig.run.late_ticks import late_ticks
-from rig.run.replay import setup_of_run
 from rig.run.trace import read_trace
 
 
@@ -34,7 +34,7 @@ def missed(folder: Path, seconds: float, *, bare: bool, busy: float) -> tuple[in
 
 
 def _period_ns(folder: Path) -> int:
-    return setup_of_run(folder)[1].config.period_ns
+    return plan_of_run(folder).period_ns
 
 
 def main() -> None:

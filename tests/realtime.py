@@ -21,12 +21,14 @@ from pathlib import Path
 import numpy as np
 
 from can_dbc.database import DEFAULT_DATABASE, load_database
+from rig.channels.channel import SignalName
 from rig.pages.timing_picture import draw_run
-from rig.plan.config import CONFIGS, SignalName
-from rig.plan.setup import Setup, load_setup, put_together
-from rig.run.live import on_time, with_bench
+from rig.plan.config import CONFIGS
+from rig.plan.load import load_plan
+from rig.plan.plan import Plan, resolve
+from rig.run.live import real_time, with_bench
 from rig.run.logged_run import Ended
-from rig.run.loop import regular_ticks
+from rig.run.loop import RunControl, regular_ticks
 from rig.run.timing import Timing
 from rig.run.trace import Trace
 from rig.simulated_bench.config import load_bench_config
@@ -72,9 +74,9 @@ def busy_cores(share: float) -> Iterator[None]:
 
 def at_rate(
     rate_hz: float, seconds: float, *, fifo: bool, folder: Path
-) -> tuple[Setup, BenchConfig]:
+) -> tuple[Plan, BenchConfig]:
     """The reference case with one frame in and one out a tick."""
-    ready = load_setup(CONFIGS / "reference.yaml", duration_s=seconds)
+    ready = load_plan(CONFIGS / "reference.yaml", duration_s=seconds)
     folder.mkdir(parents=True)
     dbc = folder / "every_tick.dbc"
     # Without a cycle time a message is sent at every tick.
@@ -95,17 +97,17 @@ def at_rate(
         measurement.model_copy(update={"period_ns": period_ns}),
         auxiliary.model_copy(update={"period_ns": 10 * period_ns}),
     )
-    ready = put_together(config, ready.source, ready.model, load_database(dbc))
+    ready = resolve(config, ready.source, ready.model, load_database(dbc))
     return ready, bench.model_copy(update={"transmissions": every})
 
 
-def bare(ready: Setup, folder: Path, *, traced: bool) -> None:
+def bare(ready: Plan, folder: Path, *, traced: bool) -> None:
     """Let ticks come with nothing to do, and print how well the rate was kept."""
     config, timing = ready.config, Timing.empty()
     count = round((config.duration_s or 0.0) * config.rate_hz)
     trace = Trace(config.period_ns)
     overruns: list[int] = []
-    with on_time(config) as (granted, real):
+    with real_time(config) as (granted, real):
         clock = trace.clock(real) if traced else real
         for tick in regular_ticks(clock, config.period_ns, count, lambda: False, timing):
             overruns.append(tick.overruns)
@@ -166,8 +168,7 @@ def main() -> int:
             asked.out / "run",
             lockstep=False,
             trace=Trace(ready.config.period_ns) if asked.trace else None,
-            stop=lambda: False,
-            progress=lambda _t_ns, _mode: None,
+            control=RunControl(progress=lambda _t_ns, _mode: None),
         )
     peak_n = float(np.abs(load_cell(ended.folder, 0)[1]).max())
     error = force_error_n(ended.folder, 0) / peak_n

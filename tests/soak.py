@@ -22,8 +22,9 @@ from can_dbc.units import Dimension
 from rig.log.frame_columns import received_frames
 from rig.log.reader import DBC_FILE, FRAMES_FILE, RUN_FILE, STEPS_FILE, parts
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.live import with_bench
+from rig.run.loop import RunControl
 from rig.simulated_bench.config import load_bench_config
 
 PART_S = 600
@@ -60,7 +61,7 @@ def main() -> int:
     parser.add_argument("--hours", type=float, default=4.0)
     parser.add_argument("--out", type=Path, required=True)
     asked = parser.parse_args()
-    ready = load_setup(CONFIGS / "reference.yaml", duration_s=asked.hours * 3600.0)
+    ready = load_plan(CONFIGS / "reference.yaml", duration_s=asked.hours * 3600.0)
     log = ready.config.log.model_copy(update={"rotate_s": float(PART_S)})
     memory_mib: list[float] = []
 
@@ -70,19 +71,18 @@ def main() -> int:
             print(f"{t_ns // S:>6} s  {memory_mib[-1]:.1f} MiB", flush=True)
 
     ended = with_bench(
-        ready.model_copy(update={"config": ready.config.model_copy(update={"log": log})}),
+        ready.with_config(ready.config.model_copy(update={"log": log})),
         load_bench_config(CONFIGS / "reference_bench.yaml"),
         asked.out,
         lockstep=True,
-        stop=lambda: False,
-        progress=progress,
+        control=RunControl(progress=progress),
     )
     files = parts(asked.out, STEPS_FILE)
     # The last part may be short; the one before it is whole.
     first_n, last_n = force_error_n(asked.out, 0), force_error_n(asked.out, len(files) - 2)
     growth_mib = memory_mib[-1] - memory_mib[0]
     expected = round(asked.hours * 3600.0 * ready.config.rate_hz)
-    drift_ns = ended.state.core.t_ns - (expected - 1) * ready.config.period_ns
+    drift_ns = ended.state.supervised.t_ns - (expected - 1) * ready.config.period_ns
     print(f"memory: {growth_mib:.1f} MiB more than after ten minutes")
     print(f"ticks: {ended.ticks} of {expected}, last one {drift_ns} ns off; {len(files)} parts")
     print(f"force error: {first_n:.3f} N in the first ten minutes, {last_n:.3f} N in the last")

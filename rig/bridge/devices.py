@@ -1,26 +1,28 @@
-"""What devices on the bus say of themselves while a run goes on.
+"""Health of the devices on the bus while a run is going on: settings, state, and what is a fault.
 
-A CANopen device that reports an error, falls silent or leaves the operational state sends nothing
-to be believed: its frames are refused until it is well again. A J1939 device is known by its NAME:
-its frames are those from the address that it claimed last.
+The frames of a CANopen device that reports an error, falls silent or leaves the operational state
+are refused until it is healthy again. A J1939 device is identified by its NAME: its frames are
+those from the address that it claimed last.
 
 References: CiA 301, "CANopen application layer and communication profile", 7.2.7 (emergency) and
 7.2.8.3.2 (heartbeat, boot-up); SAE J1939-81, "Network management" (address claim).
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from msgspec import Struct
 from msgspec.structs import replace
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.frame import Frame
+from rig.channels.channel import SignalName
 
-HEARTBEAT_ID, LARGEST_NODE_ID = 0x700, 127
+EMERGENCY_ID, HEARTBEAT_ID, LARGEST_NODE_ID = 0x080, 0x700, 127
 _BOOT_UP, _STOPPED, OPERATIONAL, _PRE_OPERATIONAL = 0, 4, 5, 127
 _STATES = {_BOOT_UP: "restarted", _STOPPED: "stopped", _PRE_OPERATIONAL: "pre-operational"}
 _TOGGLE = 0x80
-"""Bit of an answer to node guarding that is not of the state."""
+"""Bit of an answer to node guarding that is not part of the state."""
 
 CLAIM, CLAIM_MASK = 0x18EEFF00, 0x03FFFF00
 """Identifier of an address claim, and which of its bits say that it is one."""
@@ -30,8 +32,62 @@ _NO_ERROR = 0x00
 """High byte of the error codes that report the end of an error."""
 
 
+class DeviceSettings(BaseModel):
+    """A device that reports its state; its frames are refused while it is at fault.
+
+    Attributes:
+        node_id: CANopen node id; a device has this or a NAME.
+        emergency_id: Arbitration id of its emergency frames; 128 and the node id if absent.
+        heartbeat_s: Longest time between two heartbeats; they are not watched if absent.
+        alarms: Signals that are other than zero while the device is at fault.
+        j1939_name: NAME of a J1939 device: 64 bits, as it claims its address with.
+        source_address: Address of a J1939 device at the start; a claim later on changes it.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    node_id: Annotated[int, Field(ge=1, le=LARGEST_NODE_ID, strict=True)] | None = None
+    emergency_id: Annotated[int, Field(ge=1, le=0x7FF, strict=True)] | None = None
+    heartbeat_s: Annotated[float, Field(ge=0.001, le=165.0, allow_inf_nan=False)] | None = None
+    alarms: Annotated[tuple[SignalName, ...], Field(max_length=16)] = ()
+    j1939_name: Annotated[int, Field(ge=0, lt=2**64, strict=True)] | None = None
+    source_address: Annotated[int, Field(ge=0, le=253, strict=True)] | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "DeviceSettings":
+        of_canopen = (self.node_id, self.emergency_id, self.heartbeat_s)
+        of_j1939 = (self.j1939_name, self.source_address)
+        is_canopen = self.node_id is not None and of_j1939 == (None, None)
+        if not is_canopen and (of_canopen != (None, None, None) or None in of_j1939):
+            raise ValueError(
+                "expected node_id, optionally with emergency_id and heartbeat_s, or j1939_name and "
+                "source_address"
+            )
+        return self
+
+    def device(self, name: str, *, is_vital: bool) -> "Device":
+        """The device of these settings.
+
+        Args:
+            name: Name of the node in the DBC.
+            is_vital: Whether the estimate rests on it.
+        """
+        node_id = self.node_id or 0
+        device = Device(
+            name,
+            node_id,
+            self.emergency_id or EMERGENCY_ID + node_id,
+            round((self.heartbeat_s or 0.0) * 1e9),
+            len(self.alarms),
+            is_vital,
+        )
+        if self.j1939_name is None or self.source_address is None:
+            return device
+        return device._replace(j1939_name=self.j1939_name, address=self.source_address)
+
+
 class Device(NamedTuple):
-    """A device as the bridge knows it.
+    """A device as the bridge watches it.
 
     Attributes:
         name: Name of the node in the DBC.
@@ -59,12 +115,12 @@ class Device(NamedTuple):
         return (self.emergency_id, HEARTBEAT_ID + self.node_id) if self.node_id else ()
 
 
-class Health(Struct, frozen=True, gc=False):
-    """What is known of a device.
+class DeviceHealth(Struct, frozen=True, gc=False):
+    """Health of a device.
 
     Attributes:
         since_ns: Time of its last heartbeat, or of the start.
-        state: What the last heartbeat said; operational before the first.
+        state: State in the last heartbeat; operational before the first.
         error_code: Error code of the emergency that is not over, else 0.
         alarms: Raw value of each of its alarms.
         address: Source address that it claimed last.
@@ -77,13 +133,13 @@ class Health(Struct, frozen=True, gc=False):
     address: int = _NO_ADDRESS
 
 
-def well(device: Device, t_ns: int) -> Health:
-    """What is known of a device at the start."""
-    return Health(t_ns, alarms=(0,) * device.alarms, address=device.address)
+def initial_health(device: Device, t_ns: int) -> DeviceHealth:
+    """Health of a device at the start."""
+    return DeviceHealth(t_ns, alarms=(0,) * device.alarms, address=device.address)
 
 
-def after_frame(device: Device, health: Health, frame: Frame) -> Health:
-    """Health after an emergency or a heartbeat; one of another length says nothing.
+def update_by_frame(device: Device, health: DeviceHealth, frame: Frame) -> DeviceHealth:
+    """Health after an emergency or a heartbeat; one of another length is ignored.
 
     Args:
         device: The device.
@@ -102,12 +158,12 @@ def after_frame(device: Device, health: Health, frame: Frame) -> Health:
         return health
     state = data[0] & ~_TOGGLE
     if state == _BOOT_UP:
-        return replace(well(device, frame.t_ns), state=state)
+        return replace(initial_health(device, frame.t_ns), state=state)
     return replace(health, since_ns=frame.t_ns, state=state)
 
 
-def after_claim(device: Device, health: Health, frame: Frame) -> Health:
-    """Health after somebody claimed an address on a J1939 bus.
+def update_by_claim(device: Device, health: DeviceHealth, frame: Frame) -> DeviceHealth:
+    """Health after an address claim on a J1939 bus.
 
     Args:
         device: The device.
@@ -119,42 +175,42 @@ def after_claim(device: Device, health: Health, frame: Frame) -> Health:
     address = frame.arbitration_id & 0xFF
     if int.from_bytes(frame.data, "little") == device.j1939_name:
         return replace(health, address=address)
-    # Somebody else took it: what comes from there is not the device's until it claims again.
+    # Another device took it: what it sends is not this device's until that claims again.
     return replace(health, address=_NO_ADDRESS) if address == health.address else health
 
 
-def is_from(device: Device, health: Health, frame: Frame) -> bool:
+def is_from(device: Device, health: DeviceHealth, frame: Frame) -> bool:
     """Whether a frame of a device's messages is from the device itself."""
     return device.j1939_name is None or frame.arbitration_id & 0xFF == health.address
 
 
-def after_data(device: Device, health: Health) -> Health:
+def update_by_data(device: Device, health: DeviceHealth) -> DeviceHealth:
     """Health after a frame with its data.
 
-    A device that restarted sends such when it is operational, which tells what a heartbeat would
-    where none are watched.
+    A device that restarted sends data when it is operational, which replaces a heartbeat where none
+    is watched.
     """
     if device.heartbeat_ns or health.state != _BOOT_UP:
         return health
     return replace(health, state=OPERATIONAL)
 
 
-def after_alarm(health: Health, place: int, raw: int) -> Health:
+def update_by_alarm(health: DeviceHealth, index: int, raw: int) -> DeviceHealth:
     """Health after a frame with an alarm in it.
 
     Args:
         health: Health before.
-        place: Which of its alarms.
+        index: Index of the alarm among the device's.
         raw: Its raw value; 0 for none.
     """
     alarms = health.alarms
-    if alarms[place] == raw:
+    if alarms[index] == raw:
         return health
-    return replace(health, alarms=(*alarms[:place], raw, *alarms[place + 1 :]))
+    return replace(health, alarms=(*alarms[:index], raw, *alarms[index + 1 :]))
 
 
-def trouble(device: Device, health: Health, t_ns: int) -> str | None:
-    """What is wrong with a device at a time, in words; None if nothing is."""
+def fault(device: Device, health: DeviceHealth, t_ns: int) -> str | None:
+    """Fault of a device at a time, as a phrase; None if it is healthy."""
     if health.error_code:
         return f"emergency {health.error_code:#06x}"
     if any(health.alarms):
@@ -168,13 +224,12 @@ def trouble(device: Device, health: Health, t_ns: int) -> str | None:
     return None
 
 
-def troubles(
-    devices: Sequence[Device], healths: Sequence[Health], t_ns: int
+def faults(
+    devices: Sequence[Device], healths: Sequence[DeviceHealth], t_ns: int
 ) -> tuple[tuple[int, str], ...]:
-    """Places of the devices with something wrong at a time, and what it is."""
-    found = [
-        (place, why)
-        for place, (device, health) in enumerate(zip(devices, healths, strict=True))
-        if (why := trouble(device, health, t_ns)) is not None
+    """Indices of the devices that are at fault at a time, and their faults."""
+    every = [
+        (index, fault(device, health, t_ns))
+        for index, (device, health) in enumerate(zip(devices, healths, strict=True))
     ]
-    return tuple(found)
+    return tuple((index, why) for index, why in every if why is not None)

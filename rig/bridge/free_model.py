@@ -1,115 +1,83 @@
-"""One tick: advance the model, compare it with the bench, correct it, publish."""
+"""A model under the applied force that observers make follow its bench."""
 
-import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
-from rig.bridge.contract import (
-    AMBIENT_C,
-    CoreState,
-    Deviation,
-    Divergence,
-    FusingObserver,
-    Innovation,
-    LoadedModel,
-    Measurement,
-    Measures,
-    Mode,
-    Observer,
-    Plant,
-    Reading,
-    Sensor,
-    Start,
-    StepInput,
-    StepOutput,
-    StrutOutput,
-    is_sensible,
-)
-from rig.bridge.supervisor import Event, Supervision, age_event, mode_at_age, next_mode
-from rig.closed_loop.derivatives import slopes
+from dart_model.protocol import AMBIENT_C, AnyPlant, LoadedModel
+from rig.bridge.estimator import Estimate, first_diverged, is_sensible
+from rig.bridge.values import StepInput, StrutOutput
+from rig.channels.channel import Channel, Role, Sample
+from rig.channels.quantities import APPLIED_FORCE, TEMPERATURE
+from rig.closed_loop.strut_response import strut_responses
+from rig.observers.protocol import AnyObserver, Innovation, ObserverState, Start
+from rig.observers.strut_sensors import Instant, model_height_m, model_reading
+
+_APPLIED, _TEMPERATURE, _READING, _UNUSED = -1, -2, -3, -4
+"""Routes of samples other than heights; a load cell of the bench is logged and not used here."""
 
 
-class Instant(NamedTuple):
-    """The model at a time.
+class FreeModelState(Struct, frozen=True, gc=False):
+    """State of a model that follows its bench.
 
     Attributes:
-        t_ns: The time.
-        struts: Height (m) and velocity (m/s) of each strut.
-        forces_n: Force of each strut's law; empty where nobody asks for it.
+        t_ns: Time of the last step.
+        temperature_c: Last damper temperature.
+        first: Of each strut the measurements that arrived before the model started, the oldest
+            first.
+        observers: State of each strut's observer; empty while the model waits.
+        model: The model under its forces; None while it waits for measurements.
+        past: The model at the ticks before the last, the newest first, as far back as a measurement
+            may be old; empty where none is late.
     """
 
     t_ns: int
-    struts: Sequence[tuple[float, float]]
-    forces_n: Sequence[float]
-
-
-class RigState(CoreState, frozen=True, gc=False, kw_only=True):
-    """State of a bridge whose model runs by itself.
-
-    Attributes:
-        observers: State of each strut's observer; empty before the first measurements.
-        first: Of each strut the measurements that came before the model started, the oldest first.
-        model: The model under its forces; None before the first measurements.
-        past: The model at the ticks before the last, the newest first, as far back as a measurement
-            may be old; empty where none comes late.
-    """
-
-    observers: tuple[Any, ...] = ()
-    first: tuple[tuple[Measurement, ...], ...]
-    model: Any = None
+    temperature_c: float
+    first: tuple[tuple[Sample, ...], ...]
+    observers: tuple[ObserverState, ...] = ()
+    model: LoadedModel[Any] | None = None
     past: tuple[Instant, ...] = ()
 
 
-_SECANT_M, _SECANT_M_PER_S = 2e-3, 0.1
-"""Of the law's secants: a share of a usual stroke and speed, so that friction, which is infinitely
-steep at rest, counts as what it is on the way."""
-
-_SECANT_N = 1.0
-"""Of the force, whose answer is linear."""
-
-
-class Arrival(NamedTuple):
-    """How the measurements of a strut come.
+class _Received(Struct, gc=False):
+    """Samples of a step, by what they are used for.
 
     Attributes:
-        interval_ns: Time between two.
-        delay_ns: How much later one comes than it is true.
+        heights: New height of each strut, None where none arrived.
+        readings: Samples of further sensors, in the order of their arrival.
+        applied_n: New applied force, None where none arrived.
+        temperature_c: New damper temperature, None where none arrived.
     """
 
-    interval_ns: int = 1_000_000
-    delay_ns: int = 0
+    heights: list[Sample | None]
+    readings: list[Sample]
+    applied_n: float | None = None
+    temperature_c: float | None = None
 
 
-class RigCore:
-    """The bridge's arithmetic where the force is given and the model runs by itself.
-
-    At a tick the model is first advanced to the tick's time under the forces of the last one, so
-    that the applied force may be linear between its two samples; then the new measurement, if there
-    is one, is compared with it. Nothing waits for the next tick.
+class FreeModelEstimator:
+    """An estimator whose model moves under the applied force.
 
     Args:
         plant: The model.
-        observers: One for each of the model's struts, in their order.
-        supervision: Ages and safe output.
-        arrivals: How each strut's measurements come; one a millisecond, at once, if absent.
-        sensors: Sensors beside the heights.
+        observers: One per strut, in the model's order.
+        channels: Channels of the bench; their indices are their positions.
+        stale_after_ns: Age up to which a measurement can start the model.
 
     Raises:
-        ValueError: There are more or fewer observers than struts.
+        ValueError: There is not one observer per strut.
     """
 
     def __init__(
         self,
-        plant: Plant,
-        observers: Sequence[Observer],
-        supervision: Supervision,
-        arrivals: Sequence[Arrival] | None = None,
-        sensors: Sequence[Sensor] = (),
+        plant: AnyPlant,
+        observers: Sequence[AnyObserver],
+        channels: Sequence[Channel],
+        stale_after_ns: int,
     ) -> None:
         if len(observers) != plant.struts:
             raise ValueError(
@@ -117,11 +85,18 @@ class RigCore:
             )
         self._plant = plant
         self._observers = tuple(observers)
-        self._supervision = supervision
-        self._arrivals = tuple(arrivals or [Arrival()] * len(observers))
-        self._sensors = tuple(sensors)
-        self._is_fusing = tuple(bool(self._at(strut)) for strut in range(plant.struts))
-        latest = max([item.delay_ns for item in (*self._arrivals, *self._sensors)])
+        self._channels = tuple(channels)
+        self._stale_after_ns = stale_after_ns
+        self._routes = [_route(channel) for channel in channels]
+        self._heights = {
+            channel.strut: channel for channel in channels if channel.role is Role.HEIGHT
+        }
+        sensors = [channel for channel in channels if channel.role is Role.SENSOR]
+        self._sensors = tuple(
+            tuple(channel for channel in sensors if channel.strut == strut)
+            for strut in range(plant.struts)
+        )
+        latest = max([item.delay_ns for item in (*self._heights.values(), *sensors)], default=0)
         # A reading lies between two ticks: both are kept for it.
         self._oldest_ns = latest + 1 if sensors else latest
 
@@ -130,132 +105,163 @@ class RigCore:
         """Number of struts, each with an observer."""
         return len(self._observers)
 
-    def changed(self, observers: Sequence[Observer], supervision: Supervision) -> "RigCore":
-        """The same model with other observers and supervision."""
-        return RigCore(self._plant, observers, supervision, self._arrivals, self._sensors)
+    def with_settings(
+        self, observers: Sequence[AnyObserver], stale_after_ns: int
+    ) -> "FreeModelEstimator":
+        """The same model with other observers."""
+        return FreeModelEstimator(self._plant, observers, self._channels, stale_after_ns)
 
-    def init(self, t_ns: int) -> RigState:
-        """State before the first tick."""
-        return RigState(t_ns, Mode.WAITING, AMBIENT_C, first=((),) * self.struts)
+    def init(self, t_ns: int) -> FreeModelState:
+        """State before the first step."""
+        return FreeModelState(t_ns, AMBIENT_C, ((),) * self.struts)
 
-    def step(self, state: RigState, step_input: StepInput) -> tuple[RigState, StepOutput]:
-        """Advance by one tick.
+    def restart(self, state: FreeModelState, t_ns: int) -> FreeModelState:
+        """State that waits for measurements again; the temperature is kept."""
+        return FreeModelState(t_ns, state.temperature_c, ((),) * self.struts)
+
+    def discard(self, before: FreeModelState, after: FreeModelState) -> FreeModelState:
+        """State before a step whose motion is not to be used, at the time of that step."""
+        return replace(before, t_ns=after.t_ns)
+
+    def heights_m(self, state: FreeModelState) -> Sequence[float]:
+        """Height of each strut where the model stands; empty while it waits."""
+        if state.model is None:
+            return ()
+        return [height_m for height_m, _ in state.model.state.struts]
+
+    def step(
+        self, state: FreeModelState, step_input: StepInput
+    ) -> tuple[FreeModelState, Estimate | None]:
+        """Advance the model to a time and correct it with what was measured.
 
         Args:
-            state: State after the last tick.
-            step_input: What came since then.
+            state: State after the last step.
+            step_input: What arrived since then.
 
         Returns:
-            State after this tick, and what it publishes.
+            State after this step, and its estimate; None while the model waits for measurements.
         """
-        if state.mode is Mode.RUNNING:
-            return self._observe(state, state.model, step_input)
-        if state.mode is Mode.SAFE and step_input.acknowledged:
-            mode = next_mode(state.mode, Event.ACKNOWLEDGED)
-            state = replace(state, mode=mode, first=((),) * self.struts)
-        if state.mode is Mode.WAITING:
-            return self._try_to_start(state, step_input)
-        if state.model is None or state.mode is Mode.SAFE:
-            state = replace(state, t_ns=step_input.t_ns)
-            return state, self._safe_output(state)
-        return self._observe(state, state.model, step_input)
+        received = self._sort(step_input.samples)
+        if state.model is None:
+            return self._try_to_start(state, step_input.t_ns, received)
+        return self._observe(state, state.model, step_input.t_ns, received)
 
-    def _try_to_start(self, state: RigState, step_input: StepInput) -> tuple[RigState, StepOutput]:
+    def _sort(self, samples: Sequence[Sample]) -> _Received:
+        """Samples by what they are used for; of a quantity of the bench the newest."""
+        received = _Received([None] * len(self._observers), [])
+        routes = self._routes
+        for sample in samples:
+            route = routes[sample.channel]
+            if route >= 0:
+                received.heights[route] = sample
+            elif route == _APPLIED:
+                received.applied_n = sample.value
+            elif route == _TEMPERATURE:
+                received.temperature_c = sample.value
+            elif route == _READING:
+                received.readings.append(sample)
+        return received
+
+    def _try_to_start(
+        self, state: FreeModelState, t_ns: int, received: _Received
+    ) -> tuple[FreeModelState, Estimate | None]:
         """Start the model at the measured heights, once every strut has enough of them."""
-        t_ns = step_input.t_ns
-        wanted = [observer.first_measurements for observer in self._observers]
+        required = [observer.measurements_to_start for observer in self._observers]
         first = tuple(
             (*old, new)[-count:] if new is not None and count else old
-            for new, old, count in zip(step_input.heights, state.first, wanted, strict=True)
+            for new, old, count in zip(received.heights, state.first, required, strict=True)
         )
-        temperature_c = _latest(step_input.temperature_c, state.temperature_c)
-        state = replace(state, t_ns=t_ns, first=first, temperature_c=temperature_c)
-        if not self._belong_together(first):
-            return state, StepOutput(state.mode, ())
-        is_enough = all(len(given) == count for given, count in zip(first, wanted, strict=True))
-        newest = [given[-1] for given in first if given]
-        if not is_enough or not self._fresh(newest, t_ns):
-            return state, StepOutput(state.mode, ())
-        started = [started_at(given, t_ns) for given in first]
-        heights, velocities = [[item[i] for item in started] for i in (0, 1)]
+        temperature_c = _latest(received.temperature_c, state.temperature_c)
+        state = FreeModelState(t_ns, temperature_c, first)
+        if not self._can_start(first, required, t_ns):
+            return state, None
+        starts = [start_of_motion(samples, t_ns) for samples in first]
+        heights, velocities = [[item[i] for item in starts] for i in (0, 1)]
         model = self._plant.init(heights, velocities, t_s=t_ns * 1e-9)
-        applied_n = _latest(step_input.applied_force_n, 0.0)
-        without = (0.0,) * len(first)
-        loaded = self._plant.load(model, without, applied_n, temperature_c)
-        answers = strut_answers(self._plant, heights)
-        starts_ns = [given[-1].t_ns if given else t_ns for given in first]
-        observers = tuple(
-            observer.init(
-                Start(starts_ns[i], answers[i][0], *arrival, *answers[i][1:], self._at(i))
+        applied_n = _latest(received.applied_n, 0.0)
+        loaded = self._plant.load(model, (0.0,) * len(first), applied_n, temperature_c)
+        responses = strut_responses(self._plant, heights)
+        observers: list[ObserverState] = []
+        for strut, observer in enumerate(self._observers):
+            measured_ns = first[strut][-1].t_ns if first[strut] else t_ns
+            mobility_per_kg, stiffness_per_s2, damping_per_s = responses[strut]
+            start = Start(
+                measured_ns,
+                mobility_per_kg,
+                *self._rhythm(strut),
+                stiffness_per_s2,
+                damping_per_s,
+                self._sensors[strut],
             )
-            for i, (observer, arrival) in enumerate(
-                zip(self._observers, self._arrivals, strict=True)
-            )
-        )
-        mode = next_mode(state.mode, Event.FRESH)
-        return self._published(state, t_ns, mode, observers, loaded)
+            observers.append(observer.init(start))
+        newest_ns = min(samples[-1].t_ns for samples in first if samples)
+        return self._estimate(t_ns, tuple(observers), loaded, newest_ns, ())
 
-    def _at(self, strut: int) -> tuple[tuple[int, Sensor], ...]:
-        """Further sensors of a strut, by their places."""
-        return tuple(item for item in enumerate(self._sensors) if item[1].strut == strut)
+    def _rhythm(self, strut: int) -> tuple[int, int]:
+        """Interval and delay of a strut's heights in ns; zero where none is measured."""
+        channel = self._heights.get(strut)
+        return (0, 0) if channel is None else (channel.interval_ns, channel.delay_ns)
 
-    def _belong_together(self, first: Sequence[tuple[Measurement, ...]]) -> bool:
-        """Whether no strut's measurements have a break: a velocity is taken from them."""
-        return all(
-            given[-1].t_ns - given[0].t_ns <= 2 * len(given) * arrival.interval_ns
-            for given, arrival in zip(first, self._arrivals, strict=True)
-            if given
-        )
+    def _can_start(
+        self, first: Sequence[tuple[Sample, ...]], required: Sequence[int], t_ns: int
+    ) -> bool:
+        """Whether every strut has enough measurements, fresh and without a gap.
 
-    def _fresh(self, measurements: list[Measurement], t_ns: int) -> bool:
-        oldest_ns = min(item.t_ns for item in measurements)
-        return age_event(self._supervision, t_ns - oldest_ns) is Event.FRESH
+        A velocity is computed from several: they must belong together.
+        """
+        for strut, samples in enumerate(first):
+            if len(samples) != required[strut]:
+                return False
+            if samples and samples[-1].t_ns - samples[0].t_ns > (
+                2 * len(samples) * self._rhythm(strut)[0]
+            ):
+                return False
+        newest_ns = min(samples[-1].t_ns for samples in first if samples)
+        return t_ns - newest_ns <= self._stale_after_ns
 
     def _observe(
-        self, state: RigState, loaded: LoadedModel, step_input: StepInput
-    ) -> tuple[RigState, StepOutput]:
+        self, state: FreeModelState, loaded: LoadedModel[Any], t_ns: int, received: _Received
+    ) -> tuple[FreeModelState, Estimate]:
         """Advance the model to the tick and correct it with what was measured."""
-        t_ns = step_input.t_ns
-        applied_n = _latest(step_input.applied_force_n, loaded.applied_force_n)
-        temperature_c = _latest(step_input.temperature_c, loaded.temperature_c)
+        applied_n = _latest(received.applied_n, loaded.applied_force_n)
+        temperature_c = _latest(received.temperature_c, loaded.temperature_c)
         model = self._plant.step(loaded, (t_ns - state.t_ns) * 1e-9, applied_n)
-        observers: list[Any] = []
-        virtual_n: list[float] = []
-        oldest_ns = t_ns
         instants: tuple[Instant, ...] = ()
-        deviations: list[tuple[Deviation, ...]] | None = None
+        further: Sequence[tuple[Innovation, ...]] = ()
         if self._oldest_ns:
             forces_n: Sequence[float] = ()
-            if step_input.readings:
-                nothing = (0.0,) * self.struts
-                forces_n = self._plant.load(model, nothing, applied_n, temperature_c).forces_n
-            instants = self._remembered(state, Instant(t_ns, model.struts, forces_n))
-            deviations = self._deviations(step_input.readings, instants)
-        for index, observer in enumerate(self._observers):
-            measured = step_input.heights[index]
+            if received.readings:
+                no_forces = (0.0,) * self.struts
+                forces_n = self._plant.load(model, no_forces, applied_n, temperature_c).forces_n
+            instants = self._recent_instants(state, loaded, Instant(t_ns, model.struts, forces_n))
+            further = self._compare(received.readings, instants)
+        observers: list[ObserverState] = []
+        virtual_n: list[float] = []
+        oldest_ns = t_ns
+        for strut, observer in enumerate(self._observers):
+            measured = received.heights[strut]
             innovation = None
             if measured is not None:
-                model_m = _height_at(measured.t_ns, index, t_ns, model.struts, instants)
-                innovation = Innovation(measured.height_m - model_m, measured.t_ns)
-            before = state.observers[index]
-            if self._is_fusing[index]:
-                given = deviations[index] if deviations else ()
-                observed = cast("FusingObserver", observer).fuse(before, t_ns, innovation, given)
+                measured_ns = measured.t_ns
+                model_m = model_height_m(measured_ns, strut, t_ns, model.struts, instants)
+                innovation = Innovation(measured.value - model_m, measured_ns)
+            before = state.observers[strut]
+            if further:
+                observed = observer.step(before, t_ns, innovation, further[strut])
             else:
                 observed = observer.step(before, t_ns, innovation)
             observers.append(observed)
             virtual_n.append(observed.virtual_force_n)
             oldest_ns = min(oldest_ns, observed.measured_ns)
         loaded = self._plant.load(model, virtual_n, applied_n, temperature_c)
-        mode = mode_at_age(self._supervision, state.mode, t_ns - oldest_ns)
-        if instants:
-            state = replace(state, past=instants[1:])
-        return self._published(state, t_ns, mode, tuple(observers), loaded)
+        past = instants[1:] if instants else state.past
+        return self._estimate(t_ns, tuple(observers), loaded, oldest_ns, past)
 
-    def _remembered(self, state: RigState, now: Instant) -> tuple[Instant, ...]:
+    def _recent_instants(
+        self, state: FreeModelState, before: LoadedModel[Any], now: Instant
+    ) -> tuple[Instant, ...]:
         """The model now and before, as far back as a measurement may be old."""
         oldest_ns = now.t_ns - self._oldest_ns
-        before = state.model
         kept = [now]
         for instant in (Instant(state.t_ns, before.state.struts, before.forces_n), *state.past):
             if kept[-1].t_ns <= oldest_ns:
@@ -263,185 +269,86 @@ class RigCore:
             kept.append(instant)
         return tuple(kept)
 
-    def _deviations(
-        self, readings: Sequence[Reading], instants: Sequence[Instant]
-    ) -> list[tuple[Deviation, ...]] | None:
-        """Readings held against the model, by strut; None where there are none."""
+    def _compare(
+        self, readings: Sequence[Sample], instants: Sequence[Instant]
+    ) -> Sequence[tuple[Innovation, ...]]:
+        """Innovations of further sensors, by strut; empty where none were read."""
         if not readings:
-            return None
-        found: list[tuple[Deviation, ...]] = [()] * self.struts
-        for reading in readings:
-            sensor = self._sensors[reading.sensor]
-            value = reading.value - _model_at(reading.t_ns, sensor, instants)
-            found[sensor.strut] += (Deviation(reading.sensor, value, reading.t_ns),)
-        return found
+            return ()
+        innovations: list[tuple[Innovation, ...]] = [()] * self.struts
+        for sample in readings:
+            channel = self._channels[sample.channel]
+            value = sample.value - model_reading(sample.t_ns, channel, instants)
+            innovation = Innovation(value, sample.t_ns, sample.channel)
+            innovations[channel.strut] += (innovation,)
+        return innovations
 
-    def _published(
+    def _estimate(
         self,
-        before: RigState,
         t_ns: int,
-        mode: Mode,
-        observers: tuple[Any, ...],
-        loaded: LoadedModel,
-    ) -> tuple[RigState, StepOutput]:
-        """State and output at the end of a tick."""
-        valid = mode is Mode.RUNNING
+        observers: tuple[ObserverState, ...],
+        loaded: LoadedModel[Any],
+        measured_ns: int,
+        past: tuple[Instant, ...],
+    ) -> tuple[FreeModelState, Estimate]:
+        """State and estimate at the end of a step."""
         struts: list[StrutOutput] = []
+        left_out: tuple[int, ...] = ()
         size = loaded.applied_force_n
-        for index, observer in enumerate(observers):
-            height_m, velocity_m_per_s = loaded.state.struts[index]
-            law_force_n = loaded.forces_n[index]
+        for strut, observer in enumerate(observers):
+            height_m, velocity_m_per_s = loaded.state.struts[strut]
+            law_force_n = loaded.forces_n[strut]
             force_n = law_force_n + observer.residual_force_n
-            strut = StrutOutput(
+            output = StrutOutput(
                 force_n,
                 observer.virtual_force_n,
-                valid,
+                True,
                 height_m,
                 velocity_m_per_s,
-                loaded.accelerations_m_per_s2[index],
+                loaded.accelerations_m_per_s2[strut],
                 observer.innovation_m,
                 observer.force_std_n,
                 law_force_n,
             )
-            struts.append(strut)
+            struts.append(output)
             size += force_n + height_m + velocity_m_per_s
-        # A model that has diverged says nothing of use, and would not come back by itself. DART
-        # hides it: what is not finite has an acceleration of zero there.
-        if not is_sensible(size):
-            before = replace(before, diverged=Divergence(_first_diverged(struts), t_ns))
-        if mode is Mode.SAFE or not is_sensible(size):
-            state = replace(before, t_ns=t_ns, mode=Mode.SAFE)
-            return state, self._safe_output(state)
-        published = tuple(struts)
-        state = RigState(
-            t_ns,
-            mode,
-            loaded.temperature_c,
-            published if valid else before.last_valid,
-            before.diverged,
-            observers=observers,
-            first=before.first,
-            model=loaded,
-            past=before.past,
-        )
-        left_out: tuple[int, ...] = ()
-        if self._sensors:
-            fusing = itertools.compress(observers, self._is_fusing)
-            left_out = tuple(place for observer in fusing for place in observer.left_out)
-        return state, StepOutput(mode, published, left_out)
-
-    def _safe_output(self, state: RigState) -> StepOutput:
-        """The defined output of the safe state: the model stands still where it was left."""
-        if state.model is None:
-            return StepOutput(state.mode, ())
-        forces = [0.0] * self.struts
-        if self._supervision.safe_holds_last and state.last_valid:
-            forces = [strut.force_n for strut in state.last_valid]
-        struts = tuple(
-            StrutOutput(force_n, 0.0, False, height_m, 0.0, 0.0, 0.0)
-            for force_n, (height_m, _) in zip(forces, state.model.state.struts, strict=True)
-        )
-        return StepOutput(state.mode, struts)
+            if self._sensors[strut]:
+                left_out += observer.left_out
+        # A model that has diverged is of no use, and would not come back by itself. DART hides it:
+        # what is not finite has an acceleration of zero there.
+        diverged = -1 if is_sensible(size) else first_diverged(struts)
+        state = FreeModelState(t_ns, loaded.temperature_c, (), observers, loaded, past)
+        return state, Estimate(tuple(struts), measured_ns, diverged, left_out)
 
 
-def started_at(measurements: Sequence[Measurement], t_ns: int) -> tuple[float, float]:
-    """Height and velocity at a time, from the measurements before it.
+def start_of_motion(samples: Sequence[Sample], t_ns: int) -> tuple[float, float]:
+    """Height (m) and velocity (m/s) at a time, from the measurements before it.
 
     Args:
-        measurements: One: the model starts at rest there. Three or more: a parabola through them.
-            None: NaN, the strut starts where the others leave it.
+        samples: One: the model starts at rest there. Three or more: a parabola through them. None:
+            NaN, the strut starts where the others put it.
         t_ns: The time.
     """
-    if not measurements:
+    if not samples:
         return math.nan, 0.0
-    if len(measurements) == 1:
-        return measurements[0].height_m, 0.0
-    since_s = [(item.t_ns - t_ns) * 1e-9 for item in measurements]
+    if len(samples) == 1:
+        return samples[0].value, 0.0
+    since_s = [(item.t_ns - t_ns) * 1e-9 for item in samples]
     longest_s = max(map(abs, since_s))
     share = np.array(since_s) / longest_s
-    heights = np.array([item.height_m for item in measurements])
+    heights = np.array([item.value for item in samples])
     powers = np.column_stack([np.ones_like(share), share, share * share])
     height, slope, _ = np.linalg.lstsq(powers, heights, rcond=None)[0]
     return float(height), float(slope) / longest_s
 
 
-class Answer(NamedTuple):
-    """How the acceleration of a strut's height answers to that strut alone.
-
-    Attributes:
-        mobility_per_kg: To a newton in the strut.
-        stiffness_per_s2: To a metre of height, with the other sign.
-        damping_per_s: To a metre per second, with the other sign.
-    """
-
-    mobility_per_kg: float
-    stiffness_per_s2: float
-    damping_per_s: float
-
-
-def strut_answers(plant: Plant, heights_m: Sequence[float]) -> list[Answer]:
-    """How a model answers at rest at some heights, by secants of its accelerations."""
-    return [_strut_answer(plant, np.asarray(heights_m), index) for index in range(plant.struts)]
-
-
-def _strut_answer(plant: Plant, heights_m: NDArray[np.float64], index: int) -> Answer:
-    alone = np.eye(plant.struts)[index]
-
-    def acceleration(u: NDArray[np.float64]) -> NDArray[np.float64]:
-        force_n, height_m, velocity_m_per_s = u.tolist()
-        heights, velocities = heights_m + height_m * alone, velocity_m_per_s * alone
-        state = plant.init(heights.tolist(), velocities.tolist())
-        loaded = plant.load(state, (force_n * alone).tolist(), 0.0, AMBIENT_C)
-        return np.array([loaded.accelerations_m_per_s2[index]])
-
-    ((mobility, stiffness, damping),) = slopes(
-        acceleration, (_SECANT_N, _SECANT_M, _SECANT_M_PER_S)
-    ).tolist()
-    return Answer(mobility, -stiffness, -damping)
-
-
-def _height_at(
-    measured_ns: int,
-    index: int,
-    t_ns: int,
-    struts: Sequence[tuple[float, float]],
-    instants: Sequence[Instant],
-) -> float:
-    """Height of the model when a measurement was true, to first order from the tick behind it."""
-    for earlier in instants:
-        if earlier.t_ns < measured_ns:
-            break
-        t_ns, struts = earlier.t_ns, earlier.struts
-    height_m, velocity_m_per_s = struts[index]
-    return height_m - velocity_m_per_s * (t_ns - measured_ns) * 1e-9
-
-
-def _model_at(t_ns: int, sensor: Sensor, instants: Sequence[Instant]) -> float:
-    """What a sensor of the model would have read: velocity and force between two ticks."""
-    now, strut = instants[0], sensor.strut
-    if sensor.measures is Measures.HEIGHT:
-        return _height_at(t_ns, strut, now.t_ns, now.struts, instants)
-    before = after = now
-    for before in instants[1:]:
-        if before.t_ns <= t_ns:
-            break
-        after = before
-    values = [
-        at.forces_n[strut] if sensor.measures is Measures.FORCE else at.struts[strut][1]
-        for at in (before, after)
-    ]
-    if after.t_ns == before.t_ns:
-        return values[1]
-    share = min(max((t_ns - before.t_ns) / (after.t_ns - before.t_ns), 0.0), 1.0)
-    return values[0] + share * (values[1] - values[0])
-
-
-def _first_diverged(struts: Sequence[StrutOutput]) -> int:
-    """Index of the first strut whose numbers no bench has; the first one if it is none of them."""
-    for index, strut in enumerate(struts):
-        if not is_sensible(strut.force_n + strut.height_m + strut.velocity_m_per_s):
-            return index
-    return 0
+def _route(channel: Channel) -> int:
+    """Route of a channel's samples: the index of the strut of a height, else one of the above."""
+    if channel.role is Role.HEIGHT:
+        return channel.strut
+    if channel.role is Role.SENSOR:
+        return _READING
+    return {APPLIED_FORCE: _APPLIED, TEMPERATURE: _TEMPERATURE}.get(channel.quantity, _UNUSED)
 
 
 def _latest(new: float | None, old: float) -> float:

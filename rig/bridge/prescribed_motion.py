@@ -1,8 +1,8 @@
-"""One tick at a dyno: the motion is prescribed, and the load cell measures the force it takes.
+"""A dyno: the motion is prescribed, and the load cell measures the force it requires.
 
-The model does not run by itself: its strut is moved along the measured motion, and the virtual
-force is what the load cell shows beyond the model's own law. The motion between and at measurements
-is followed by a filter with fading memory, which has no lag for a constant acceleration.
+The model is not free: its strut is moved along the measured motion, and the virtual force is the
+load cell's less that of the model's own law. The motion between and at measurements is followed by
+a filter with fading memory, which has no lag for a constant acceleration.
 
 Reference: Morrison, "Introduction to Sequential Smoothing and Prediction" (1969), chapter 13: the
 fading-memory polynomial filter of second degree.
@@ -11,51 +11,46 @@ fading-memory polynomial filter of second degree.
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from msgspec import Struct
-from msgspec.structs import replace
 
-from rig.bridge.contract import (
-    AMBIENT_C,
-    CoreState,
-    Divergence,
-    Measurement,
-    Mode,
-    StepInput,
-    StepOutput,
-    StrutOutput,
-    is_sensible,
-)
-from rig.bridge.supervisor import Event, Supervision, age_event, next_mode
+from dart_model.protocol import AMBIENT_C
+from rig.bridge.estimator import Estimate, is_sensible
+from rig.bridge.values import StepInput, StrutOutput
+from rig.channels.channel import Channel, Role, Sample
+from rig.channels.quantities import LOAD_CELL_FORCE, TEMPERATURE
+from rig.observers.protocol import AnyObserver
+
+ModelT = TypeVar("ModelT")
 
 
-class PrescribedModel(Protocol):
+class PrescribedModel(Protocol[ModelT]):
     """A strut of a model that is moved from outside. Its states are frozen."""
 
-    def init(self, t_s: float) -> Any:
+    def init(self, t_s: float) -> ModelT:
         """State at the beginning."""
         ...
 
     def step(
         self,
-        state: Any,
+        state: ModelT,
         t_s: float,
         motion: Callable[[float], tuple[float, float]],
         temperature_c: float,
-    ) -> Any:
+    ) -> ModelT:
         """State at `t_s`, after a motion: time in s -> height (m) and velocity (m/s)."""
         ...
 
     def force_n(
-        self, state: Any, height_m: float, velocity_m_per_s: float, temperature_c: float
+        self, state: ModelT, height_m: float, velocity_m_per_s: float, temperature_c: float
     ) -> float:
-        """What a load cell would show."""
+        """Force that a load cell would show, in N."""
         ...
 
 
-class Tracked(Struct, frozen=True, gc=False):
-    """The motion as far as it is known.
+class Motion(Struct, frozen=True, gc=False):
+    """The motion as it is known.
 
     Attributes:
         height_m: Height at the last measurement.
@@ -72,168 +67,177 @@ class Tracked(Struct, frozen=True, gc=False):
     measured_ns: int
 
 
-class PrescribedCoreState(CoreState, frozen=True, gc=False, kw_only=True):
-    """State between two ticks at a dyno.
+class PrescribedMotionState(Struct, frozen=True, gc=False):
+    """State between two steps at a dyno.
 
     Attributes:
-        tracked: The motion; None before the first measurement.
+        t_ns: Time of the last step.
+        temperature_c: Last damper temperature.
+        motion: The motion as it is known; None before the first measurement.
         model: State of the model; None before the first measurement.
         cell_n: Last force of the load cell; None before the first one.
-        cell_ns: When it came.
+        cell_ns: Time at which it arrived.
+        is_moving: Whether the model has begun to move along the motion.
     """
 
-    tracked: Tracked | None = None
+    t_ns: int
+    temperature_c: float
+    motion: Motion | None = None
     model: Any = None
     cell_n: float | None = None
     cell_ns: int = 0
+    is_moving: bool = False
 
 
-def followed(tracked: Tracked, measured: Measurement, settling_s: float) -> Tracked:
+def update_motion(motion: Motion, sample: Sample, settling_s: float) -> Motion:
     """The motion after a new measurement.
 
     Args:
-        tracked: The motion before it.
-        measured: The measurement.
+        motion: The motion before it.
+        sample: The measured height.
         settling_s: Time constant with which older measurements fade.
     """
-    age_s = (measured.t_ns - tracked.measured_ns) * 1e-9
+    age_s = (sample.t_ns - motion.measured_ns) * 1e-9
     if age_s <= 0.0:
-        return tracked
-    height_m, velocity, acceleration = predicted(tracked, measured.t_ns)
-    innovation_m = measured.height_m - height_m
+        return motion
+    height_m, velocity, acceleration = predict_motion(motion, sample.t_ns)
+    innovation_m = sample.value - height_m
     kept = math.exp(-age_s / settling_s)
     fresh = 1.0 - kept
-    return Tracked(
+    return Motion(
         height_m + (1.0 - kept**3) * innovation_m,
         velocity + 1.5 * fresh * fresh * (1.0 + kept) * innovation_m / age_s,
         acceleration + fresh**3 * innovation_m / (age_s * age_s),
         innovation_m,
-        measured.t_ns,
+        sample.t_ns,
     )
 
 
-def predicted(tracked: Tracked, t_ns: int) -> tuple[float, float, float]:
+def predict_motion(motion: Motion, t_ns: int) -> tuple[float, float, float]:
     """Height (m), velocity (m/s) and acceleration (m/s²) at a time after the last measurement."""
-    h = (t_ns - tracked.measured_ns) * 1e-9
-    acceleration = tracked.acceleration_m_per_s2
-    velocity = tracked.velocity_m_per_s + h * acceleration
+    h = (t_ns - motion.measured_ns) * 1e-9
+    acceleration = motion.acceleration_m_per_s2
+    velocity = motion.velocity_m_per_s + h * acceleration
     return (
-        tracked.height_m + h * (tracked.velocity_m_per_s + 0.5 * h * acceleration),
+        motion.height_m + h * (motion.velocity_m_per_s + 0.5 * h * acceleration),
         velocity,
         acceleration,
     )
 
 
-def _motion(tracked: Tracked, t_s: float) -> tuple[float, float]:
+def _motion_at(motion: Motion, t_s: float) -> tuple[float, float]:
     """Height and velocity at a time of the run."""
-    height_m, velocity_m_per_s, _ = predicted(tracked, round(t_s * 1e9))
+    height_m, velocity_m_per_s, _ = predict_motion(motion, round(t_s * 1e9))
     return height_m, velocity_m_per_s
 
 
-class PrescribedCore:
-    """The bridge's arithmetic where the motion is given and the force is measured.
+class PrescribedMotionEstimator:
+    """An estimator whose motion is prescribed and whose force is measured.
 
     Args:
         model: The strut.
         settling_s: Time constant with which older measurements of the motion fade.
-        supervision: Ages and safe output.
+        channels: Channels of the bench; their indices are their positions.
+        stale_after_ns: Age up to which a measurement can start the model.
     """
 
-    def __init__(self, model: PrescribedModel, settling_s: float, supervision: Supervision) -> None:
+    def __init__(
+        self,
+        model: PrescribedModel[Any],
+        settling_s: float,
+        channels: Sequence[Channel],
+        stale_after_ns: int,
+    ) -> None:
         self._model = model
         self._settling_s = settling_s
-        self._supervision = supervision
+        self._channels = tuple(channels)
+        self._stale_after_ns = stale_after_ns
 
     @property
     def struts(self) -> int:
         """Number of struts."""
         return 1
 
-    def changed(self, observers: Sequence[object], supervision: Supervision) -> "PrescribedCore":
-        """The same with another supervision; it has no use for an observer."""
+    def with_settings(
+        self, observers: Sequence[AnyObserver], stale_after_ns: int
+    ) -> "PrescribedMotionEstimator":
+        """The same with another age; no observer is used."""
         del observers
-        return PrescribedCore(self._model, self._settling_s, supervision)
+        return PrescribedMotionEstimator(
+            self._model, self._settling_s, self._channels, stale_after_ns
+        )
 
-    def init(self, t_ns: int) -> PrescribedCoreState:
-        """State before the first tick."""
-        return PrescribedCoreState(t_ns, Mode.WAITING, AMBIENT_C)
+    def init(self, t_ns: int) -> PrescribedMotionState:
+        """State before the first step."""
+        return PrescribedMotionState(t_ns, AMBIENT_C)
+
+    def restart(self, state: PrescribedMotionState, t_ns: int) -> PrescribedMotionState:
+        """State that waits for measurements again; the temperature is kept."""
+        return PrescribedMotionState(t_ns, state.temperature_c)
+
+    def discard(
+        self, before: PrescribedMotionState, after: PrescribedMotionState
+    ) -> PrescribedMotionState:
+        """State after the step: the motion is the bench's, whatever becomes of the model."""
+        del before
+        return after
+
+    def heights_m(self, state: PrescribedMotionState) -> Sequence[float]:
+        """Last measured height as it is filtered; empty before the first one."""
+        return () if state.motion is None else (state.motion.height_m,)
 
     def step(
-        self, state: PrescribedCoreState, step_input: StepInput
-    ) -> tuple[PrescribedCoreState, StepOutput]:
-        """Advance by one tick.
+        self, state: PrescribedMotionState, step_input: StepInput
+    ) -> tuple[PrescribedMotionState, Estimate | None]:
+        """Move the model to a time, and compare it with the load cell.
 
         Args:
-            state: State after the last tick, which `init` or `step` gave.
-            step_input: What came since then.
+            state: State after the last step.
+            step_input: What arrived since then.
 
         Returns:
-            State after this tick, and what it publishes.
+            State after this step, and its estimate; None while measurements are awaited.
         """
-        if state.mode is Mode.SAFE and step_input.acknowledged:
-            mode = next_mode(state.mode, Event.ACKNOWLEDGED)
-            state = replace(state, mode=mode, tracked=None, cell_n=None)
-        if state.mode is Mode.SAFE:
-            state = replace(state, t_ns=step_input.t_ns)
-            return state, self._safe_output(state)
-        received = self._received(state, step_input)
-        tracked, cell_n, t_ns = received.tracked, received.cell_n, step_input.t_ns
-        if tracked is not None and cell_n is not None:
-            age_ns = t_ns - min(tracked.measured_ns, received.cell_ns)
-            mode = next_mode(received.mode, age_event(self._supervision, age_ns))
-            if mode is not Mode.WAITING:
-                return self._moved(received, tracked, cell_n, mode, t_ns)
-        return replace(received, t_ns=t_ns), StepOutput(received.mode, ())
-
-    def _received(self, state: PrescribedCoreState, step_input: StepInput) -> PrescribedCoreState:
-        """State with what came; the model begins at the first measurement."""
-        tracked, model, (measured,) = state.tracked, state.model, step_input.heights
-        if measured is not None and tracked is None:
-            tracked = Tracked(measured.height_m, 0.0, 0.0, 0.0, measured.t_ns)
-            model = self._model.init(state.t_ns * 1e-9)
-        elif measured is not None and tracked is not None:
-            tracked = followed(tracked, measured, self._settling_s)
-        cell_n, cell_ns = state.cell_n, state.cell_ns
-        if step_input.load_cell_force_n is not None:
-            cell_n, cell_ns = step_input.load_cell_force_n, step_input.t_ns
-        warm = step_input.temperature_c
-        return replace(
-            state,
-            tracked=tracked,
-            model=model,
-            cell_n=cell_n,
-            cell_ns=cell_ns,
-            temperature_c=state.temperature_c if warm is None else warm,
-        )
-
-    def _moved(
-        self, state: PrescribedCoreState, tracked: Tracked, cell_n: float, mode: Mode, t_ns: int
-    ) -> tuple[PrescribedCoreState, StepOutput]:
-        """Move the model to the tick, and compare it with the load cell."""
+        t_ns = step_input.t_ns
+        state = self._receive(state, step_input)
+        motion, cell_n = state.motion, state.cell_n
+        if motion is None or cell_n is None:
+            return state, None
+        measured_ns = min(motion.measured_ns, state.cell_ns)
+        if not state.is_moving and t_ns - measured_ns > self._stale_after_ns:
+            return state, None
         temperature_c = state.temperature_c
-        model = self._model.step(state.model, t_ns * 1e-9, partial(_motion, tracked), temperature_c)
-        height_m, velocity, acceleration = predicted(tracked, t_ns)
-        model_n = self._model.force_n(model, height_m, velocity, temperature_c)
-        valid = mode is Mode.RUNNING
-        strut = StrutOutput(
-            cell_n, cell_n - model_n, valid, height_m, velocity, acceleration, tracked.innovation_m
+        model = self._model.step(
+            state.model, t_ns * 1e-9, partial(_motion_at, motion), temperature_c
         )
-        diverged = not is_sensible(cell_n + model_n + height_m + velocity)
-        if diverged:
-            state = replace(state, diverged=Divergence(0, t_ns))
-        if diverged or mode is Mode.SAFE:
-            state = replace(state, t_ns=t_ns, mode=Mode.SAFE)
-            return state, self._safe_output(state)
-        last_valid = (strut,) if valid else state.last_valid
-        state = replace(state, t_ns=t_ns, mode=mode, model=model, last_valid=last_valid)
-        return state, StepOutput(mode, (strut,))
+        height_m, velocity, acceleration = predict_motion(motion, t_ns)
+        model_n = self._model.force_n(model, height_m, velocity, temperature_c)
+        innovation_m, virtual_n = motion.innovation_m, cell_n - model_n
+        strut = StrutOutput(cell_n, virtual_n, True, height_m, velocity, acceleration, innovation_m)
+        diverged = -1 if is_sensible(cell_n + model_n + height_m + velocity) else 0
+        after = PrescribedMotionState(
+            t_ns, temperature_c, motion, model, cell_n, state.cell_ns, is_moving=True
+        )
+        return after, Estimate((strut,), measured_ns, diverged)
 
-    def _safe_output(self, state: PrescribedCoreState) -> StepOutput:
-        """The defined output of the safe state."""
-        if state.tracked is None:
-            return StepOutput(state.mode, ())
-        force_n = 0.0
-        if self._supervision.safe_holds_last and state.last_valid:
-            force_n = state.last_valid[0].force_n
-        strut = StrutOutput(force_n, 0.0, False, state.tracked.height_m, 0.0, 0.0, 0.0)
-        return StepOutput(state.mode, (strut,))
+    def _receive(
+        self, state: PrescribedMotionState, step_input: StepInput
+    ) -> PrescribedMotionState:
+        """State with the samples of a step; the model begins at the first measured height."""
+        motion, model, temperature_c = state.motion, state.model, state.temperature_c
+        cell_n, cell_ns = state.cell_n, state.cell_ns
+        for sample in step_input.samples:
+            channel = self._channels[sample.channel]
+            if channel.role is Role.HEIGHT:
+                if motion is None:
+                    motion = Motion(sample.value, 0.0, 0.0, 0.0, sample.t_ns)
+                    model = self._model.init(state.t_ns * 1e-9)
+                else:
+                    motion = update_motion(motion, sample, self._settling_s)
+            elif channel.quantity is LOAD_CELL_FORCE:
+                cell_n, cell_ns = sample.value, step_input.t_ns
+            elif channel.quantity is TEMPERATURE:
+                temperature_c = sample.value
+        return PrescribedMotionState(
+            step_input.t_ns, temperature_c, motion, model, cell_n, cell_ns, state.is_moving
+        )

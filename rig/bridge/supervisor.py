@@ -1,176 +1,48 @@
-"""Which mode follows which, and what is done beyond a limit: the tables of the bridge's states."""
+"""The state machine that owns the mode: the only place where it changes.
+
+What may change it is an event: the age of the measurements, a model that diverged, a limit, a
+device, the user. What is published follows from the mode.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import Enum, IntEnum, auto
-from typing import NamedTuple
+from enum import IntEnum, auto
+from typing import Annotated, Literal
 
-from rig.bridge.contract import Measurement, Mode, StrutOutput
+from msgspec import Struct
+from msgspec.structs import replace
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from can_dbc.yaml_file import Positive
+from rig.bridge.estimator import AnyEstimator, Estimate
+from rig.bridge.limits import Action, Limit, worst_action
+from rig.bridge.values import Divergence, Mode, StepInput, StepOutput, StrutOutput
 
 
 class Event(IntEnum):
-    """What a tick finds, the severest first."""
+    """What a tick shows, the severest first."""
 
     BEYOND_SAFE = auto()
+    DIVERGED = auto()
     TIMEOUT = auto()
     BEYOND_HOLD = auto()
+    DEVICE_FAULT = auto()
     STALE = auto()
     ACKNOWLEDGED = auto()
     FRESH = auto()
-
-
-class Action(IntEnum):
-    """What is done beyond a limit, the severest last.
-
-    WARN reports it in the status. REFUSE also drops the measurement, with all of its frame. HOLD
-    also marks the estimate invalid as long as it lasts. SAFE enters the safe state. HOLD and SAFE
-    for a measurement drop it too.
-    """
-
-    WARN = 1
-    REFUSE = 2
-    HOLD = 3
-    SAFE = 4
-
-
-class Watched(Enum):
-    """What a limit is set on: the first three of the measurement, the others of the estimate."""
-
-    MEASURED_HEIGHT_M = "measured_height_m"
-    MEASURED_RATE_M_PER_S = "measured_rate_m_per_s"
-    UNCHANGED_S = "unchanged_s"
-    HEIGHT_M = "height_m"
-    FORCE_N = "force_n"
-    VIRTUAL_FORCE_N = "virtual_force_n"
-    INNOVATION_M = "innovation_m"
-
-    @property
-    def is_measured(self) -> bool:
-        """Whether it is of the measurement."""
-        return self in _MEASURED
-
-
-_MEASURED = (Watched.MEASURED_HEIGHT_M, Watched.MEASURED_RATE_M_PER_S, Watched.UNCHANGED_S)
-
-
-@dataclass(frozen=True)
-class Limit:
-    """One row of the table of limits.
-
-    Attributes:
-        watched: What it is set on, of every strut.
-        low: Smallest value within, in the unit of `watched`.
-        high: Largest value within.
-        action: What is done beyond.
-    """
-
-    watched: Watched
-    low: float
-    high: float
-    action: Action
-
-
-class Seen(NamedTuple):
-    """What plausibility remembers of one strut's measurements.
-
-    Attributes:
-        height_m: Last measured height that was used.
-        t_ns: Its time.
-        since_ns: Since when the height is exactly that.
-    """
-
-    height_m: float
-    t_ns: int
-    since_ns: int
-
-
-def judged(limits: Sequence[Limit], seen: Seen | None, measured: Measurement) -> tuple[Seen, int]:
-    """What the limits say of a new measurement.
-
-    Args:
-        limits: Limits on measured quantities; others are passed over.
-        seen: What is remembered of the strut; None before its first measurement.
-        measured: The new measurement.
-
-    Returns:
-        What is to be remembered, and the severest action asked for, 0 if none.
-    """
-    height_m, t_ns = measured.height_m, measured.t_ns
-    last = seen or Seen(height_m, t_ns, t_ns)
-    age_s = (t_ns - last.t_ns) * 1e-9
-    values = {
-        Watched.MEASURED_HEIGHT_M: height_m,
-        Watched.MEASURED_RATE_M_PER_S: (height_m - last.height_m) / age_s if age_s > 0.0 else 0.0,
-        Watched.UNCHANGED_S: (t_ns - last.since_ns) * 1e-9 if height_m == last.height_m else 0.0,
-    }
-    action = max(
-        (
-            limit.action
-            for limit in limits
-            if limit.watched in values and not limit.low <= values[limit.watched] <= limit.high
-        ),
-        default=0,
-    )
-    if action >= Action.REFUSE:
-        # What was used last stays the reference, but only for as long as the rate allows for.
-        return last, action
-    since_ns = last.since_ns if height_m == last.height_m else t_ns
-    return Seen(height_m, t_ns, since_ns), action
-
-
-def beyond(limits: Sequence[Limit], strut: StrutOutput) -> int:
-    """The severest action that the limits ask for at an estimate, 0 if it is within all of them.
-
-    Args:
-        limits: Limits on estimated quantities; others are passed over.
-        strut: What a tick publishes of one strut.
-    """
-    values = {
-        Watched.HEIGHT_M: strut.height_m,
-        Watched.FORCE_N: strut.force_n,
-        Watched.VIRTUAL_FORCE_N: strut.virtual_force_n,
-        Watched.INNOVATION_M: strut.innovation_m,
-    }
-    return max(
-        (
-            limit.action
-            for limit in limits
-            if limit.watched in values and not limit.low <= values[limit.watched] <= limit.high
-        ),
-        default=0,
-    )
-
-
-EVENTS_BEYOND = {Action.HOLD: Event.BEYOND_HOLD, Action.SAFE: Event.BEYOND_SAFE}
-"""Action -> event; the others change no mode."""
-
-
-@dataclass(frozen=True)
-class Supervision:
-    """When a measurement is too old, what the safe state publishes, and the limits.
-
-    Attributes:
-        stale_after_ns: Age at which the estimate is marked invalid.
-        safe_after_ns: Age at which the safe state is entered.
-        safe_holds_last: The safe state publishes the last valid force; otherwise zero.
-        limits: What is done beyond which values.
-    """
-
-    stale_after_ns: int
-    safe_after_ns: int
-    safe_holds_last: bool
-    limits: tuple[Limit, ...] = ()
 
 
 TRANSITIONS: dict[tuple[Mode, Event], Mode] = {
     (Mode.WAITING, Event.FRESH): Mode.RUNNING,
     (Mode.RUNNING, Event.STALE): Mode.HOLD,
     (Mode.RUNNING, Event.TIMEOUT): Mode.SAFE,
+    (Mode.RUNNING, Event.DIVERGED): Mode.SAFE,
     (Mode.RUNNING, Event.BEYOND_HOLD): Mode.HOLD,
     (Mode.RUNNING, Event.BEYOND_SAFE): Mode.SAFE,
-    (Mode.HOLD, Event.BEYOND_SAFE): Mode.SAFE,
+    (Mode.RUNNING, Event.DEVICE_FAULT): Mode.HOLD,
     (Mode.HOLD, Event.FRESH): Mode.RUNNING,
     (Mode.HOLD, Event.TIMEOUT): Mode.SAFE,
+    (Mode.HOLD, Event.DIVERGED): Mode.SAFE,
+    (Mode.HOLD, Event.BEYOND_SAFE): Mode.SAFE,
     (Mode.SAFE, Event.ACKNOWLEDGED): Mode.WAITING,
 }
 """Mode and event -> next mode; a pair that is not listed changes nothing."""
@@ -181,15 +53,186 @@ def next_mode(mode: Mode, event: Event) -> Mode:
     return TRANSITIONS.get((mode, event), mode)
 
 
-def mode_at_age(supervision: Supervision, mode: Mode, age_ns: int) -> Mode:
-    """Mode after a tick at which the oldest measurement is of some age."""
-    if mode is Mode.RUNNING and age_ns <= supervision.stale_after_ns:
-        return mode
-    return next_mode(mode, age_event(supervision, age_ns))
+class Supervision(BaseModel):
+    """Ages of the measurement, the output of the safe state, and the table of limits.
+
+    Attributes:
+        stale_after_s: Age of a height from which the estimate is marked invalid.
+        safe_after_s: Age from which the safe state is entered.
+        safe_output: Force that the safe state publishes: `zero`, or the `last` valid one.
+        limits: What is done beyond which values, row by row.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    stale_after_s: Positive = 0.01
+    safe_after_s: Positive = 0.5
+    safe_output: Literal["zero", "last"] = "zero"
+    limits: Annotated[tuple[Limit, ...], Field(max_length=100)] = ()
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "Supervision":
+        if self.safe_after_s < self.stale_after_s:
+            raise ValueError(
+                f"safe_after_s {self.safe_after_s}: expected at least stale_after_s "
+                f"({self.stale_after_s})"
+            )
+        return self
+
+    @property
+    def stale_after_ns(self) -> int:
+        """Age from which the estimate is marked invalid, in ns."""
+        return round(self.stale_after_s * 1e9)
+
+    @property
+    def safe_after_ns(self) -> int:
+        """Age from which the safe state is entered, in ns."""
+        return round(self.safe_after_s * 1e9)
 
 
-def age_event(supervision: Supervision, age_ns: int) -> Event:
-    """What the age of the oldest measurement means."""
-    if age_ns <= supervision.stale_after_ns:
-        return Event.FRESH
-    return Event.STALE if age_ns <= supervision.safe_after_ns else Event.TIMEOUT
+class SupervisedState(Struct, frozen=True, gc=False):
+    """State of an estimator and of its supervisor between two steps; a run can restart from any.
+
+    Attributes:
+        t_ns: Time of the last step.
+        mode: State of the bridge.
+        estimator: State of the estimator.
+        last_valid: What was last published as valid; empty before.
+        stopped_m: Heights at which the struts of a stopped model stand, in the safe state.
+        diverged: The last divergence of the model, if there ever was one.
+    """
+
+    t_ns: int
+    mode: Mode
+    estimator: object
+    last_valid: tuple[StrutOutput, ...] = ()
+    stopped_m: Sequence[float] = ()
+    diverged: Divergence | None = None
+
+
+class Reports(Struct, frozen=True, gc=False):
+    """What the gates and the devices report to the supervisor at a tick.
+
+    Attributes:
+        action: Severest action that the limits on measurements require, 0 if none.
+        is_device_faulty: Whether a device that the estimate rests on is at fault.
+    """
+
+    action: int = 0
+    is_device_faulty: bool = False
+
+
+_NO_REPORTS = Reports()
+_EVENT_OF_ACTION = {Action.HOLD: Event.BEYOND_HOLD, Action.SAFE: Event.BEYOND_SAFE}
+"""Action -> event; the others change no mode."""
+
+
+def _mode_by_reports(mode: Mode, action: int, reports: Reports) -> Mode:
+    """Mode after the limits' action and the devices' state."""
+    if action in _EVENT_OF_ACTION:
+        mode = next_mode(mode, _EVENT_OF_ACTION[Action(action)])
+    return next_mode(mode, Event.DEVICE_FAULT) if reports.is_device_faulty else mode
+
+
+class Supervisor:
+    """Steps an estimator and decides what is published of it.
+
+    Args:
+        estimator: The estimator.
+        settings: Ages, safe output and limits.
+    """
+
+    def __init__(self, estimator: AnyEstimator, settings: Supervision) -> None:
+        self.estimator = estimator
+        self._settings = settings
+        self._stale_after_ns = settings.stale_after_ns
+        self._safe_after_ns = settings.safe_after_ns
+        self._limits = tuple(limit for limit in settings.limits if not limit.value.is_measured)
+
+    def init(self, t_ns: int) -> SupervisedState:
+        """State before the first step."""
+        return SupervisedState(t_ns, Mode.WAITING, self.estimator.init(t_ns))
+
+    def step(
+        self, state: SupervisedState, step_input: StepInput, reports: Reports = _NO_REPORTS
+    ) -> tuple[SupervisedState, StepOutput, int]:
+        """One step.
+
+        Args:
+            state: State after the last step.
+            step_input: What arrived since then.
+            reports: What gates and devices report.
+
+        Returns:
+            State after the step, what it publishes, and the severest action that a limit requires.
+        """
+        t_ns, mode, before = step_input.t_ns, state.mode, state.estimator
+        if mode is Mode.SAFE:
+            if not step_input.acknowledged:
+                state = replace(state, t_ns=t_ns)
+                return state, self._safe_output(state), reports.action
+            mode = next_mode(mode, Event.ACKNOWLEDGED)
+            before = self.estimator.restart(before, state.t_ns)
+        after, estimate = self.estimator.step(before, step_input)
+        if estimate is None:
+            state = SupervisedState(t_ns, mode, after, state.last_valid, (), state.diverged)
+            return state, StepOutput(mode, ()), reports.action
+        mode = self._mode_by_age(mode, t_ns - estimate.measured_ns)
+        if estimate.diverged >= 0:
+            mode = next_mode(mode, Event.DIVERGED)
+            state = replace(state, diverged=Divergence(estimate.diverged, t_ns))
+        if mode is Mode.SAFE:
+            # The model stops where it was before a motion that no measurement supports.
+            after = self.estimator.discard(before, after)
+            return *self._stop(state, t_ns, after), reports.action
+        action = reports.action
+        if self._limits:
+            action = max([action, *[worst_action(self._limits, item) for item in estimate.struts]])
+        mode = _mode_by_reports(mode, action, reports)
+        if mode is Mode.SAFE:
+            return *self._stop(state, t_ns, after), action
+        return *self._publish(state, t_ns, mode, after, estimate), action
+
+    def _mode_by_age(self, mode: Mode, age_ns: int) -> Mode:
+        """Mode after a step at which the oldest measurement is of some age."""
+        if mode is Mode.RUNNING and age_ns <= self._stale_after_ns:
+            return mode
+        return next_mode(mode, self.age_event(age_ns))
+
+    def age_event(self, age_ns: int) -> Event:
+        """What the age of the oldest measurement means."""
+        if age_ns <= self._stale_after_ns:
+            return Event.FRESH
+        return Event.STALE if age_ns <= self._safe_after_ns else Event.TIMEOUT
+
+    def _publish(
+        self, state: SupervisedState, t_ns: int, mode: Mode, after: object, estimate: Estimate
+    ) -> tuple[SupervisedState, StepOutput]:
+        """State and output while the model moves: valid in RUNNING alone."""
+        struts = last_valid = estimate.struts
+        if mode is not Mode.RUNNING:
+            struts = tuple([replace(strut, valid=False) for strut in struts])
+            last_valid = state.last_valid
+        state = SupervisedState(t_ns, mode, after, last_valid, (), state.diverged)
+        return state, StepOutput(mode, struts, estimate.left_out)
+
+    def _stop(
+        self, state: SupervisedState, t_ns: int, estimator: object
+    ) -> tuple[SupervisedState, StepOutput]:
+        """State and output at the entry of the safe state."""
+        heights_m = self.estimator.heights_m(estimator)
+        state = SupervisedState(
+            t_ns, Mode.SAFE, estimator, state.last_valid, heights_m, state.diverged
+        )
+        return state, self._safe_output(state)
+
+    def _safe_output(self, state: SupervisedState) -> StepOutput:
+        """The defined output of the safe state: the model stands still."""
+        forces = [0.0] * len(state.stopped_m)
+        if self._settings.safe_output == "last" and state.last_valid and forces:
+            forces = [strut.force_n for strut in state.last_valid]
+        struts = tuple(
+            StrutOutput(force_n, 0.0, False, height_m, 0.0, 0.0, 0.0)
+            for force_n, height_m in zip(forces, state.stopped_m, strict=True)
+        )
+        return StepOutput(state.mode, struts)

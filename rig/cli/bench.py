@@ -42,25 +42,25 @@ def bench(
 ) -> None:
     """Run a simulated bench on a bus, in real time."""
     from rig.bus.bus import BusConfig
-    from rig.plan.setup import load_authentication, load_setup
+    from rig.plan.load import load_authentication, load_plan
     from rig.run.live import run_bench
+    from rig.run.loop import RunControl
     from rig.simulated_bench.config import load_bench_config
 
     bench_config = load_bench_config(config)
     bus, authentication = BusConfig(interface, channel, bitrate), None
     if bridge is not None:
-        ready = load_setup(bridge)
-        bus, dbc = ready.config.bus.config(), ready.database.path
-        authentication = load_authentication(ready)
+        plan = load_plan(bridge)
+        bus, dbc = plan.config.bus.config(), plan.database.path
+        authentication = load_authentication(plan)
     with stoppable() as stop, progress_line(duration_s) as progress:
         sent = run_bench(
             bench_config,
             bus,
             dbc,
+            RunControl(stop=stop, progress=progress),
             authentication=authentication,
             duration_s=duration_s,
-            stop=stop,
-            progress=progress,
         )
     console.print(f"Sent {sent} frames.")
     if out is not None:

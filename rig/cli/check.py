@@ -36,9 +36,9 @@ def check_command(
 ) -> None:
     """Say what is wrong before a bench moves: signals, units, rate, bus load, poles."""
     from rig.plan.check import Severity, check
-    from rig.plan.setup import load_setup
+    from rig.plan.load import load_plan
 
-    findings = check(load_setup(config))
+    findings = check(load_plan(config))
     if as_json:
         print_json([finding.as_dict() for finding in findings])
     else:

@@ -69,7 +69,7 @@ def import_command(
     from rig.formats.export import import_run
     from rig.formats.foreign_table import import_table
     from rig.formats.mapping import load_mapping
-    from rig.plan.setup import load_setup
+    from rig.plan.load import load_plan
 
     if fmu:
         if config is not None or rebound is not None:
@@ -90,7 +90,7 @@ def import_command(
         report = import_table(source, load_mapping(mapping), out)
     elif config is not None:
         with progress_line(None) as progress:
-            report = import_log(source, load_setup(config), out, progress)
+            report = import_log(source, load_plan(config), out, progress)
     else:
         _refuse_without_meaning(source)
         import_run(source, out)

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 if TYPE_CHECKING:
-    from rig.bridge.contract import Mode
+    from rig.bridge.values import Mode
     from rig.run.loop import Look
 
 
@@ -86,7 +86,7 @@ def _plain_progress() -> Callable[[str, float], None]:
 
 @contextlib.contextmanager
 def status_line(
-    duration_s: float | None, sensors: Sequence[str] = (), devices: Sequence[str] = ()
+    duration_s: float | None, channels: Sequence[str] = (), devices: Sequence[str] = ()
 ) -> Generator[Callable[["Look"], None]]:
     """State, rate, lateness, force and losses of a run, in place, or lines where that cannot be.
 
@@ -94,7 +94,7 @@ def status_line(
 
     Args:
         duration_s: Length of the run; None if it has none.
-        sensors: Names of the further sensors.
+        channels: Names of the channels.
         devices: Names of the devices.
     """
     is_terminal = sys.stderr.isatty()
@@ -119,7 +119,7 @@ def status_line(
         text += f"  lost {look.counts.lost}"
         if look.counts.refused:
             text += f"  refused {look.counts.refused}"
-        text += _of_sensors(look, sensors, devices)
+        text += _unused(look, channels, devices)
         if look.late_ns is not None:
             text += f"  missed {look.counts.overruns}  late ≤ {look.late_ns * 1e-6:.2f} ms"
         # The largest force stands for all struts: a line is no table.
@@ -140,11 +140,11 @@ def status_line(
             _say(b"\r\x1b[K")
 
 
-def _of_sensors(look: "Look", sensors: Sequence[str], devices: Sequence[str]) -> str:
-    """What is not used now, and why."""
-    text = "".join(f"  {devices[place]}: {why}" for place, why in look.troubles)
+def _unused(look: "Look", channels: Sequence[str], devices: Sequence[str]) -> str:
+    """Devices and sensors that are not used now, and why."""
+    text = "".join(f"  {devices[index]}: {why}" for index, why in look.device_faults)
     if look.output.left_out:
-        text += f"  left out {', '.join(sensors[place] for place in look.output.left_out)}"
+        text += f"  left out {', '.join(channels[index] for index in look.output.left_out)}"
     return text
 
 

@@ -102,7 +102,7 @@ def _share(force_n: float, peak_n: float) -> str:
 
 def print_ended(ended: "Ended", *, with_timing: bool) -> None:
     """Print how a run ended."""
-    shown = table("Run", f"{ended.ticks} ticks, ended {ended.state.core.mode.name}")
+    shown = table("Run", f"{ended.ticks} ticks, ended {ended.state.mode.name}")
     for name, value in ended.state.counts._asdict().items():
         if value or name in ("lost", "refused", "overruns"):
             what = "ticks" if name in _OF_TICKS else "frames"

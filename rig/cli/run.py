@@ -17,7 +17,7 @@ from rig.cli.side_by_side import run_side_by_side
 from rig.files.folders import refuse_full
 
 if TYPE_CHECKING:
-    from rig.plan.setup import Setup
+    from rig.plan.plan import Plan
     from rig.run.logged_run import Ended
 
 EXAMPLES = (
@@ -93,28 +93,28 @@ def _run_one(
     as_json: bool,
 ) -> None:
     from rig.plan.check import errors
-    from rig.plan.setup import load_setup
+    from rig.plan.load import load_plan
     from rig.run.live import live
+    from rig.run.loop import RunControl
     from rig.run.trace import Trace
 
-    ready = load_setup(config, model=model, duration_s=duration_s)
-    wrong = errors(ready)
+    plan = load_plan(config, model=model, duration_s=duration_s)
+    wrong = errors(plan)
     if wrong and not force:
         raise InputError(
             f"{config}: {wrong[0].what}: {wrong[0].text} (`rig check` shows all; --force runs it)"
         )
     refuse_full(folder)
-    further = [name for name, *_ in ready.config.signals.sensors()]
-    shown = status_line(ready.config.duration_s, further, list(ready.config.devices))
+    channels = [channel.name for channel in plan.channels]
+    shown = status_line(plan.config.duration_s, channels, list(plan.config.devices))
     with stoppable() as stop, shown as watch:
+        forced = [finding.as_dict() for finding in wrong]
         ended = live(
-            ready,
+            plan,
             folder,
+            RunControl(stop=stop, watch=watch, forced=forced),
             listen_only=listen_only,
-            trace=Trace(ready.config.period_ns) if trace else None,
-            forced=[finding.as_dict() for finding in wrong],
-            stop=stop,
-            watch=watch,
+            trace=Trace(plan.period_ns) if trace else None,
         )
         # Inside: a second Ctrl-C must not lose it.
         text = json.dumps(ended.summary(), indent=2) + "\n"
@@ -125,17 +125,19 @@ def _run_one(
     else:
         print_ended(ended, with_timing=True)
         console.print(f"Run: {folder}", markup=False)
-    _refuse_bad_ends(ready, ended)
+    _refuse_bad_ends(plan, ended)
 
 
-def _refuse_bad_ends(ready: "Setup", ended: "Ended") -> None:
-    from rig.bridge.contract import Mode
+def _refuse_bad_ends(plan: "Plan", ended: "Ended") -> None:
+    from rig.bridge.values import Mode
 
-    said = Console(stderr=True)
-    if ended.state.core.mode is Mode.WAITING:
-        wanted = sorted({entry.message for entry in ready.config.signals.height.values()})
-        said.print(f"No valid height came: expected frames of {', '.join(wanted)}.", style="red")
+    stderr = Console(stderr=True)
+    if ended.state.mode is Mode.WAITING:
+        messages = sorted({entry.message for entry in plan.config.signals.height.values()})
+        stderr.print(
+            f"No valid height arrived: expected frames of {', '.join(messages)}.", style="red"
+        )
         raise typer.Exit(FAILED)
-    if ended.state.core.mode is Mode.SAFE:
-        said.print("The run ended in its safe state.", style="red")
+    if ended.state.mode is Mode.SAFE:
+        stderr.print("The run ended in its safe state.", style="red")
         raise typer.Exit(FAILED)

@@ -10,7 +10,8 @@ from rig.cli.output import ConfigFile, JsonFlag, console, print_json, table
 from rig.cli.progress import progress_bar
 
 if TYPE_CHECKING:
-    from rig.tuning.tune import Stated, TunedStrut
+    from rig.tuning.gains import Aim
+    from rig.tuning.tune import StatedExpectation, TunedStrut
 
 EXAMPLES = (
     "Examples: `rig tune rig.yaml --run runs/7 --out tuned.yaml` · "
@@ -58,7 +59,7 @@ def tune_command(
             "--gain-margin",
             min=1.0,
             max=20.0,
-            help="Factor by which the model may answer more, or less, and stay stable; 1.1 for "
+            help="Factor by which the model may respond more, or less, and stay stable; 1.1 for "
             "kalman and 2 for pi by default.",
         ),
     ] = None,
@@ -74,7 +75,7 @@ def tune_command(
 ) -> None:
     """Find the gains of the observers with the smallest expected error of the force."""
     from rig.pages.tuning_picture import draw_tuning
-    from rig.plan.setup import load_setup
+    from rig.plan.load import load_plan
     from rig.tuning.gains import KINDS, Aim
     from rig.tuning.tune import tune, write_config
 
@@ -85,43 +86,46 @@ def tune_command(
             raise InputError(f"{path}: exists, expected a new file")
     stated = (residual_n, up_to_hz, noise_std_m)
     source = _source(run, stated)
-    ready, aim = load_setup(config), Aim(damping_ratio, gain_margin)
+    plan, aim = load_plan(config), Aim(damping_ratio, gain_margin)
     with progress_bar() as bar:
-        found = tune(ready, source, observer, aim, bar)
+        struts = tune(plan, source, observer, aim, bar)
     if out is not None:
-        write_config(ready, found, out)
+        write_config(plan, struts, out)
     if plot is not None:
-        draw_tuning(found, plot)
+        draw_tuning(struts, plot)
     if as_json:
-        print_json([_as_dict(strut) for strut in found])
+        print_json([_as_dict(strut) for strut in struts])
         return
-    for strut in found:
-        _print(strut, damping_ratio, aim.margin(observer))
+    for strut in struts:
+        _print(strut, Aim(damping_ratio, gain_margin))
     for path in (out, plot):
         if path is not None:
             console.print(f"Written: {path}", markup=False)
 
 
-def _source(run: Path | None, stated: tuple[float | None, ...]) -> "Path | Stated":
-    from rig.tuning.tune import Stated
+def _source(run: Path | None, stated: tuple[float | None, ...]) -> "Path | StatedExpectation":
+    from rig.tuning.tune import StatedExpectation
 
     residual_n, up_to_hz, noise_std_m = stated
     if run is not None:
         if stated != (None, None, None):
-            raise InputError("--run: says what is to be expected, expected nothing stated beside")
+            raise InputError(
+                "--run: contains what is to be expected, expected none of --residual-n, "
+                "--up-to-hz and --noise-std-m"
+            )
         return run
     if not residual_n or not up_to_hz:
         raise InputError("rig tune: expected --run RUN, or --residual-n and --up-to-hz above zero")
-    return Stated(residual_n, up_to_hz, noise_std_m)
+    return StatedExpectation(residual_n, up_to_hz, noise_std_m)
 
 
 def _as_dict(strut: "TunedStrut") -> dict[str, object]:
-    from rig.tuning.tune import plain
+    from rig.tuning.tune import settings_of
 
-    chosen, published = strut.found, strut.paper
+    chosen, published = strut.tuned, strut.published
     return {
         "strut": strut.name,
-        "observer": plain(chosen.observer),
+        "observer": settings_of(chosen.observer),
         "noise_std_m": strut.expectation.noise_std_m,
         "delay_s": strut.delay_s,
         "latency": None
@@ -140,11 +144,11 @@ def _as_dict(strut: "TunedStrut") -> dict[str, object]:
     }
 
 
-def _print(strut: "TunedStrut", damping_ratio: float, least_margin: float) -> None:
+def _print(strut: "TunedStrut", aim: "Aim") -> None:
     from rig.tuning.gains import PAPER_HZ
-    from rig.tuning.tune import plain
+    from rig.tuning.tune import settings_of
 
-    chosen, published = strut.found, strut.paper
+    chosen, published = strut.tuned, strut.published
     shown = table(
         "expected error of the force",
         "tuned",
@@ -171,10 +175,13 @@ def _print(strut: "TunedStrut", damping_ratio: float, least_margin: float) -> No
         markup=False,
     )
     if strut.latency is not None and strut.latency.std_s == float("inf"):
-        console.print("Latency of the height: this run does not tell it (one frequency alone?).")
+        console.print(
+            "Height latency: cannot be determined from this run, probably because it contains a "
+            "single frequency. Record a sweep or a multisine."
+        )
     elif strut.latency is not None:
         low_ms, high_ms = 1e3 * max(strut.latency.low_s, 0.0), 1e3 * strut.latency.high_s
-        verdict = "" if strut.delay_s else "; not distinguished from none, so none is set"
+        verdict = "" if strut.delay_s else "; indistinguishable from zero, so none is set"
         console.print(
             f"Latency of the height: {1e3 * strut.latency.delay_s:.3g} ms (95 %: {low_ms:.3g} to "
             f"{high_ms:.3g} ms){verdict}.",
@@ -185,16 +192,16 @@ def _print(strut: "TunedStrut", damping_ratio: float, least_margin: float) -> No
         for pole in chosen.expected.poles[:6]
     )
     console.print(f"Poles, the slowest first: {slowest}.", markup=False)
-    console.print(f"observers.{strut.name}: {plain(chosen.observer)}", markup=False)
-    if chosen.expected.damping_ratio < 0.99 * damping_ratio:
+    console.print(f"observers.{strut.name}: {settings_of(chosen.observer)}", markup=False)
+    if chosen.expected.damping_ratio < 0.99 * aim.damping_ratio:
         console.print(
-            f"No gains keep a damping ratio of {damping_ratio:g}; the best that were found "
+            f"No gains keep a damping ratio of {aim.damping_ratio:g}; the best "
             f"keep {chosen.expected.damping_ratio:.3f}.",
             style="yellow",
         )
-    if margin < 0.97 * least_margin:
+    if margin < 0.97 * chosen.required_margin:
         console.print(
-            f"No gains keep a gain margin of {least_margin:g}; the best that were found keep "
+            f"No gains keep a gain margin of {chosen.required_margin:g}; the best keep "
             f"{margin:.3g}.",
             style="yellow",
         )

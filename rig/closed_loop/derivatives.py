@@ -1,4 +1,4 @@
-"""Derivatives by central differences: nothing is known of a model but what it answers."""
+"""Derivatives by central differences: a model is known by its responses alone."""
 
 from collections.abc import Callable, Sequence
 
@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def slopes(function: Callable[[Array], Array], widths: Sequence[float]) -> Array:
-    """Derivatives of a function about zero, a column an argument.
+def central_differences(function: Callable[[Array], Array], widths: Sequence[float]) -> Array:
+    """Derivatives of a function about zero, one column per argument.
 
     Args:
         function: Takes arguments of shape (n,), gives values of shape (m,).

@@ -1,7 +1,7 @@
 """Model and observers in closed loop, made linear by differences on the step itself.
 
-Nothing is known of the model but what it does: the map from one measurement to the next is
-differenced about a bench at rest.
+The map from one measurement to the next is differenced about a bench at rest; the model is known by
+its responses alone.
 
 Reference: Åström and Wittenmark, "Computer-Controlled Systems" (1997), chapter 3.
 """
@@ -13,9 +13,10 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.bridge.contract import AMBIENT_C, Innovation, Observer, Plant, Start
-from rig.bridge.free_model import Answer, strut_answers
-from rig.closed_loop.derivatives import slopes
+from dart_model.protocol import AMBIENT_C, AnyPlant
+from rig.closed_loop.derivatives import central_differences
+from rig.closed_loop.strut_response import StrutResponse, strut_responses
+from rig.observers.protocol import AnyObserver, Innovation, Start
 
 Array = NDArray[np.float64]
 
@@ -90,12 +91,12 @@ class LinearLoop(NamedTuple):
 
     def _response(self, frequency_hz: Array, column: int) -> NDArray[np.complex128]:
         eye = np.eye(len(self.a))
-        found = np.empty(len(frequency_hz), np.complex128)
+        response = np.empty(len(frequency_hz), np.complex128)
         for index, frequency in enumerate(frequency_hz):
             z = np.exp(2j * np.pi * frequency * self.interval_s)
             before = cast("Any", np.linalg.solve(z * eye - self.a, self.b[:, column]))
-            found[index] = self.c @ before + self.d[column]
-        return found
+            response[index] = self.c @ before + self.d[column]
+        return response
 
 
 class Loop:
@@ -106,25 +107,26 @@ class Loop:
         observers: One for each of its struts.
         heights_m: Strut heights at which the bench is assumed to rest.
         rhythm: When the loop is closed.
-        answers: What the observers take the model to answer; by differences on it if absent.
+        responses: Responses that the observers take the model to have; by differences on it if
+            absent.
     """
 
     def __init__(
         self,
-        plant: Plant,
-        observers: Sequence[Observer],
+        plant: AnyPlant,
+        observers: Sequence[AnyObserver],
         heights_m: Sequence[float],
         rhythm: Rhythm,
-        answers: Sequence[Answer] | None = None,
+        responses: Sequence[StrutResponse] | None = None,
     ) -> None:
         self._plant, self._observers, self._rhythm = plant, tuple(observers), rhythm
         self._heights_m = list(heights_m)
         start = plant.init(heights_m)
         self._law_n = plant.load(start, [0.0] * plant.struts, 0.0, AMBIENT_C).forces_n
-        self._answers = answers or strut_answers(plant, heights_m)
+        self._responses = responses or strut_responses(plant, heights_m)
         self._states = [
-            self._settled(observer, answer)
-            for observer, answer in zip(self._observers, self._answers, strict=True)
+            self._steady_state(observer, response)
+            for observer, response in zip(self._observers, self._responses, strict=True)
         ]
         parts = [
             list(plant.numbers(start)),
@@ -179,7 +181,7 @@ class Loop:
                 ]
                 seen = (now + seen)[: count * rhythm.delay]
             states = [
-                self._stepped(observer, state, tick, innovation)
+                self._step_observer(observer, state, tick, innovation)
                 for observer, state, innovation in zip(
                     self._observers, states, innovations, strict=True
                 )
@@ -195,25 +197,26 @@ class Loop:
         """The loop about rest, as one strut's noise and residual force drive it."""
         size = len(self.at_rest)
         widths = [_STEP * max(1.0, abs(value)) for value in self.at_rest.tolist()]
-        step_n = _ACCELERATION_STEP_M_PER_S2 / self._answers[strut].mobility_per_kg
+        step_n = _ACCELERATION_STEP_M_PER_S2 / self._responses[strut].mobility_per_kg
 
         def after(u: Array) -> Array:
             noise_m, residual_n = u[size:].tolist()
             return np.append(*self.after(self.at_rest + u[:size], strut, noise_m, residual_n))
 
-        found = slopes(after, [*widths, _STEP, step_n])
-        a, b, c, d = found[:-1, :size], found[:-1, size:], found[-1, :size], found[-1, size:]
+        slopes = central_differences(after, [*widths, _STEP, step_n])
+        a, b, c, d = slopes[:-1, :size], slopes[:-1, size:], slopes[-1, :size], slopes[-1, size:]
         return LinearLoop(a, b, c, d, self._rhythm.interval_ns * 1e-9)
 
-    def _settled(self, observer: Observer, answer: Answer) -> Any:
+    def _steady_state(self, observer: AnyObserver, response: StrutResponse) -> Any:
         """An observer that has followed a bench at rest for long, its last tick at time zero."""
         rhythm = self._rhythm
         delay_ns, ticks = rhythm.delay * rhythm.interval_ns, rhythm.delay + 2
         begin_ns = -ticks * rhythm.interval_ns
+        mobility, stiffness, damping = response
         start = Start(
-            begin_ns - delay_ns, answer[0], rhythm.interval_ns, delay_ns, answer[1], answer[2]
+            begin_ns - delay_ns, mobility, rhythm.interval_ns, delay_ns, stiffness, damping
         )
-        state = observer.settled(start)
+        state = observer.steady_state(start)
         for number in range(1 - ticks, 1):
             for tick in range(1 - rhythm.measured_every, 1):
                 t_ns = number * rhythm.interval_ns + tick * rhythm.period_ns
@@ -221,8 +224,8 @@ class Loop:
                 state = observer.step(state, t_ns, innovation)
         return state
 
-    def _stepped(
-        self, observer: Observer, state: Any, tick: int, innovation_m: float | None
+    def _step_observer(
+        self, observer: AnyObserver, state: Any, tick: int, innovation_m: float | None
     ) -> Any:
         """State of an observer at a tick after time zero."""
         rhythm = self._rhythm

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.bridge.contract import AMBIENT_C, Plant
-from rig.closed_loop.derivatives import slopes
+from dart_model.protocol import AMBIENT_C, AnyPlant
+from rig.closed_loop.derivatives import central_differences
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ _INDEPENDENT = 1e-6
 
 
 class Unknown(NamedTuple):
-    """Something that is not known.
+    """An unknown force or offset.
 
     Attributes:
         name: What it is, as a phrase.
@@ -52,14 +52,14 @@ class Unknown(NamedTuple):
     is_offset: bool = False
 
 
-class Verdict(NamedTuple):
+class Observability(NamedTuple):
     """What is observable from measured heights.
 
     Attributes:
         hidden: Unknowns that are not observable at all.
         confused: Pairs of unknowns, each observable if the other is known, that cannot be
             distinguished.
-        together: Whether all that is not hidden is observable at once.
+        together: Whether all that are not hidden are observable at once.
     """
 
     hidden: tuple[Unknown, ...]
@@ -67,7 +67,7 @@ class Verdict(NamedTuple):
     together: bool
 
 
-class Linear(NamedTuple):
+class LinearModel(NamedTuple):
     """A model about rest, from one time to another.
 
     Attributes:
@@ -81,7 +81,7 @@ class Linear(NamedTuple):
     heights: Array
 
 
-def linear_model(plant: Plant, heights_m: Sequence[float]) -> Linear:
+def linear_model(plant: AnyPlant, heights_m: Sequence[float]) -> LinearModel:
     """A model about rest at some heights of all its struts."""
     start = np.array(plant.numbers(plant.init(heights_m)))
     nothing = np.zeros(plant.struts)
@@ -95,20 +95,22 @@ def linear_model(plant: Plant, heights_m: Sequence[float]) -> Linear:
         return np.array([height_m for height_m, _ in plant.state_of(x.tolist()).struts])
 
     steps = [_STEP] * len(start)
-    return Linear(
-        slopes(lambda d: after(start + d, nothing), steps),
-        slopes(lambda d: after(start, d), [_FORCE_STEP_N] * plant.struts),
-        slopes(lambda d: heights(start + d), steps),
+    return LinearModel(
+        central_differences(lambda d: after(start + d, nothing), steps),
+        central_differences(lambda d: after(start, d), [_FORCE_STEP_N] * plant.struts),
+        central_differences(lambda d: heights(start + d), steps),
     )
 
 
-def observability(linear: Linear, measured: Sequence[int], unknowns: Sequence[Unknown]) -> Verdict:
+def observability(
+    linear: LinearModel, measured: Sequence[int], unknowns: Sequence[Unknown]
+) -> Observability:
     """Which unknowns can be observed from the heights of some struts.
 
     Args:
         linear: The model about rest.
         measured: Indices of the struts whose heights are measured.
-        unknowns: What is asked.
+        unknowns: The unknowns.
     """
     model, by_force = linear.model, linear.by_force
     seen = linear.heights[list(measured)]
@@ -132,7 +134,7 @@ def observability(linear: Linear, measured: Sequence[int], unknowns: Sequence[Un
     ]
     hidden = [item for item, observed in zip(unknowns, alone, strict=True) if not observed]
     shown = [i for i, observed in enumerate(alone) if observed]
-    return Verdict(tuple(hidden), tuple(pairs), not shown or is_observable(*shown))
+    return Observability(tuple(hidden), tuple(pairs), not shown or is_observable(*shown))
 
 
 def _column(unknown: Unknown, by_force: Array, measured: Sequence[int], outputs: int) -> Array:

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.bridge.contract import Observer, Plant
+from dart_model.protocol import AnyPlant
 from rig.closed_loop.loop import Loop, Rhythm
+from rig.observers.protocol import AnyObserver
 
 
 class Pole(NamedTuple):
@@ -29,7 +30,7 @@ class Pole(NamedTuple):
 
 
 def closed_loop_poles(
-    plant: Plant, observers: Sequence[Observer], heights_m: Sequence[float], rhythm: Rhythm
+    plant: AnyPlant, observers: Sequence[AnyObserver], heights_m: Sequence[float], rhythm: Rhythm
 ) -> list[Pole]:
     """Poles of model and observers.
 

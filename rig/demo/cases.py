@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from rig.log.reader import read_run
 from rig.observers.pi import PiObserver
 from rig.plan.config import CONFIGS
-from rig.plan.setup import Setup, load_setup
+from rig.plan.load import load_plan
+from rig.plan.plan import Plan
 from rig.run.live import with_bench
 from rig.run.logged_run import Ended
-from rig.run.loop import Watch
+from rig.run.loop import RunControl, Watch
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.schema import BenchConfig
@@ -131,23 +132,25 @@ def run_case(
     Raises:
         InputError: The folder cannot be written.
     """
-    ready = load_setup(CONFIGS / f"{name}.yaml", duration_s=duration_s)
+    plan = load_plan(CONFIGS / f"{name}.yaml", duration_s=duration_s)
     bench = load_bench_config(CONFIGS / f"{name}_bench.yaml")
-    ended = with_bench(ready, bench, folder / "run", lockstep=lockstep, stop=stop, watch=watch)
-    case = compared(ended, ready, bench)
+    ended = with_bench(
+        plan, bench, folder / "run", lockstep=lockstep, control=RunControl(stop=stop, watch=watch)
+    )
+    case = compared(ended, plan, bench)
     (folder / "summary.json").write_text(json.dumps(case.summary(), indent=2) + "\n", "utf-8")
     for strut in case.struts:
         draw(strut, folder / f"{strut.name}.png")
     return case
 
 
-def compared(ended: Ended, ready: Setup, bench: BenchConfig) -> Case:
+def compared(ended: Ended, plan: Plan, bench: BenchConfig) -> Case:
     """A run with a simulated bench beside the bench's truth and the model alone."""
     observed = read_run(ended.folder).steps
     t_ns = np.asarray(observed.column("t_ns").to_numpy(), dtype=np.int64)
-    period_ns = ready.config.period_ns
+    period_ns = plan.period_ns
     truth = simulate(bench, int(t_ns[-1]) + period_ns, period_ns)
-    model_alone = _alone(ended, ready, observed)
+    model_alone = _alone(ended, plan, observed)
     at = t_ns // period_ns
     struts = tuple(
         StrutCase(
@@ -162,23 +165,23 @@ def compared(ended: Ended, ready: Setup, bench: BenchConfig) -> Case:
             model_alone[name],
             _height_and_force(observed, name),
         )
-        for index, name in enumerate(ready.config.observers)
+        for index, name in enumerate(plan.config.observers)
     )
     return Case(ended, struts)
 
 
-def _alone(ended: Ended, ready: Setup, observed: Any) -> dict[str, NDArray[np.float64]]:
+def _alone(ended: Ended, plan: Plan, observed: Any) -> dict[str, NDArray[np.float64]]:
     """Height and force of every strut of the model without virtual force."""
-    names = list(ready.config.observers)
-    if ready.config.prescribed_motion is not None:
+    names = plan.strut_names
+    if plan.is_prescribed:
         # The motion is what it is; the model's own force is what the virtual force comes on top of.
         virtual_n = {n: observed.column(f"{n}.virtual_force_n").to_numpy() for n in names}
         return {
             n: _height_and_force(observed, n) - np.outer(virtual_n[n], [0.0, 1.0]) for n in names
         }
     without = {name: PiObserver(proportional_n_per_m=0.0, integral_n_per_m_s=0.0) for name in names}
-    config = ready.config.model_copy(update={"observers": without})
-    steps = replay(ended.folder, ready=ready.model_copy(update={"config": config})).steps
+    config = plan.config.model_copy(update={"observers": without})
+    steps = replay(ended.folder, plan=plan.with_config(config)).steps
     return {name: _height_and_force(steps, name) for name in names}
 
 

@@ -15,10 +15,11 @@ from rig.diagnosis.outcome import CORRECTED_FILE, REPORT_FILE, Diagnosis, to_jso
 from rig.log.reader import read_run
 from rig.pages.report import write_report
 from rig.plan.config import CONFIGS
-from rig.plan.setup import Setup, load_setup
+from rig.plan.load import load_plan
+from rig.plan.plan import Plan
 from rig.run.live import with_bench
 from rig.run.logged_run import Ended
-from rig.run.loop import Watch
+from rig.run.loop import RunControl, Watch
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.schema import BenchConfig, Effect
 
@@ -115,31 +116,30 @@ def tell(
         InputError: The folder cannot be written.
     """
     family, effect = draw_effect(seed)
-    ready = load_setup(CONFIGS / "story.yaml", duration_s=duration_s)
+    plan = load_plan(CONFIGS / "story.yaml", duration_s=duration_s)
     benches = [_bench(effect, excitation) for excitation in (1, 2, 3)]
 
-    def run(number: int, name: str, with_ready: Setup, in_lockstep: bool) -> Ended:
+    def run(number: int, name: str, with_ready: Plan, in_lockstep: bool) -> Ended:
         return with_bench(
             with_ready,
             benches[number],
             folder / name,
             lockstep=in_lockstep,
-            stop=stop,
-            watch=watch,
+            control=RunControl(stop=stop, watch=watch),
         )
 
     chapter("The bridge runs with a bench that carries an undeclared effect")
-    first = run(0, "run", ready, lockstep)
+    first = run(0, "run", plan, lockstep)
     chapter("A second run, with another excitation, is held out")
-    held_out = run(1, "held_out", ready, in_lockstep=True)
+    held_out = run(1, "held_out", plan, in_lockstep=True)
     chapter("The first run is diagnosed")
     out = folder / "diagnosis"
-    result = diagnose_runs([first.folder], ready.model, [held_out.folder], out, diagnosis_progress)
+    result = diagnose_runs([first.folder], plan.model, [held_out.folder], out, diagnosis_progress)
     write_report(result, out / REPORT_FILE)
     chapter("A fresh run, with the model as it was and with the corrected one")
-    before = run(2, "fresh_before", ready, in_lockstep=True)
+    before = run(2, "fresh_before", plan, in_lockstep=True)
     corrected = load_model(out / CORRECTED_FILE)
-    after = run(2, "fresh_after", ready.model_copy(update={"model": corrected}), in_lockstep=True)
+    after = run(2, "fresh_after", plan.with_model(corrected), in_lockstep=True)
     story = Story(
         family,
         effect,

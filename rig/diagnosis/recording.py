@@ -18,11 +18,12 @@ from can_dbc.codec import decode_log
 from can_dbc.database import Message
 from can_dbc.errors import InputError
 from can_dbc.protection import check_crc_log
+from rig.channels.channel import Channel
+from rig.channels.quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE, Quantity
 from rig.log.reader import RunFolder
-from rig.plan.config import SignalName
-from rig.plan.quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, TEMPERATURE, Quantity
-from rig.plan.setup import Setup
-from rig.run.replay import setup_of_run
+from rig.log.reader import read_run as read_run_folder
+from rig.plan.load import plan_of_run
+from rig.plan.plan import Plan
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -267,38 +268,39 @@ def read_run(folder: Path) -> Recording:
         InputError: The run is damaged, or holds no height.
         RecordingError: It holds nothing that can be diagnosed.
     """
-    found, ready = setup_of_run(folder)
-    payloads = _payloads(found, ready)
-    signals = ready.config.signals
-    heights = [_channel(ready, payloads, entry, HEIGHT) for entry in signals.height.values()]
-    for (name, entry), (t_s, _) in zip(signals.height.items(), heights, strict=True):
+    plan = plan_of_run(folder)
+    payloads = _payloads(read_run_folder(folder), plan)
+    heights = [_samples(payloads, channel) for channel in plan.heights]
+    for channel, (t_s, _) in zip(plan.heights, heights, strict=True):
         if len(t_s) < 2:
-            raise InputError(f"{folder}: no {entry.message} with the height of strut {name}")
+            raise InputError(
+                f"{folder}: no {_message(channel).name} with the height of strut {channel.name}"
+            )
     t_s = heights[0][0]
     half_s = 0.5 * float(np.median(np.diff(t_s)))
 
-    def other(quantity: Quantity) -> Array | None:
-        entry = signals.others.get(quantity)
-        if entry is None:
+    def bench(quantity: Quantity) -> Array | None:
+        channel = plan.bench_channel(quantity)
+        if channel is None:
             return None
-        own_t_s, values = _channel(ready, payloads, entry, quantity)
+        own_t_s, values = _samples(payloads, channel)
         return np.interp(t_s, own_t_s, values) if len(own_t_s) else None
 
-    cell = other(LOAD_CELL_FORCE)
-    if cell is None and other(APPLIED_FORCE) is None:
+    cell = bench(LOAD_CELL_FORCE)
+    if cell is None and bench(APPLIED_FORCE) is None:
         raise RecordingError(
             f"{folder}: has heights alone, expected signals.applied_force or "
             "signals.load_cell_force in its configuration, and frames of it"
         )
-    # The bus carries one load cell; with several struts nothing says whose it is.
+    # The bus carries one load cell; with several struts it is not known whose it is.
     return checked(
         Recording(
             folder.name,
             t_s,
             np.column_stack([_nearest(t_s, *height, half_s) for height in heights]),
-            other(APPLIED_FORCE),
+            bench(APPLIED_FORCE),
             None if cell is None or len(heights) > 1 else cell[:, np.newaxis],
-            other(TEMPERATURE),
+            bench(TEMPERATURE),
         )
     )
 
@@ -306,39 +308,46 @@ def read_run(folder: Path) -> Recording:
 _Payloads = dict[str, tuple[NDArray[np.int64], NDArray[np.uint8]]]
 
 
-def _payloads(found: RunFolder, ready: Setup) -> _Payloads:
+def _message(channel: Channel) -> Message:
+    if channel.message is None:
+        raise ValueError(f"{channel.key}: expected a channel on a bus")
+    return channel.message
+
+
+def _payloads(run: RunFolder, plan: Plan) -> _Payloads:
     """Times and payloads of every received message, wrong lengths left out."""
-    names = sorted({entry.message for entry in ready.config.signals.named().values()})
-    messages = [ready.database.message(name) for name in names]
+    messages = sorted(
+        {item.name: item for item in map(_message, plan.channels)}.values(),
+        key=lambda item: item.name,
+    )
     directory = Directory(messages)
     times: list[list[int]] = [[] for _ in messages]
     data: list[list[bytes]] = [[] for _ in messages]
-    for frame, direction in found.frames():
-        place = directory.place(frame.arbitration_id, frame.is_extended)
-        if place is None or direction != "R" or frame.is_error:
+    for frame, direction in run.frames():
+        index = directory.place(frame.arbitration_id, frame.is_extended)
+        if index is None or direction != "R" or frame.is_error:
             continue
-        if len(frame.data) == messages[place].length_bytes:
-            times[place].append(frame.t_ns)
-            data[place].append(frame.data)
+        if len(frame.data) == messages[index].length_bytes:
+            times[index].append(frame.t_ns)
+            data[index].append(frame.data)
     return {
         message.name: (
-            np.array(times[place], dtype=np.int64),
-            np.frombuffer(b"".join(data[place]), dtype=np.uint8).reshape(-1, message.length_bytes),
+            np.array(times[index], dtype=np.int64),
+            np.frombuffer(b"".join(data[index]), dtype=np.uint8).reshape(-1, message.length_bytes),
         )
-        for place, message in enumerate(messages)
+        for index, message in enumerate(messages)
     }
 
 
-def _channel(
-    ready: Setup, payloads: _Payloads, entry: SignalName, quantity: Quantity
-) -> tuple[Array, Array]:
-    """Sample times in s and values of one signal."""
-    message = ready.database.message(entry.message)
+def _samples(payloads: _Payloads, channel: Channel) -> tuple[Array, Array]:
+    """Sample times in s and values of one channel."""
+    message = _message(channel)
     t_ns, data = payloads[message.name]
     good = np.ones(len(data), dtype=bool)
     if message.protection is not None:
         good = check_crc_log(data, message.protection)
-    values = decode_log(message, [entry.signal], [quantity.dimension], data)[entry.signal]
+    signal = channel.signal
+    values = decode_log(message, [signal], [channel.quantity.dimension], data)[signal]
     good &= np.isfinite(values)
     t_s, first = np.unique(_sample_times_s(t_ns[good], message), return_index=True)
     return t_s, values[good][first]

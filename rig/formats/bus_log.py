@@ -8,15 +8,15 @@ from msgspec.structs import replace
 from can_dbc.addressing import Directory
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.bridge.messages import Conditions
+from rig.bridge.report import Conditions
 from rig.bus.link import LinkFigures
 from rig.bus.log_files import read_log
 from rig.formats.import_report import ImportReport
 from rig.machine.clock import VirtualClock
-from rig.plan.assembly import build_bridge
-from rig.plan.setup import Setup
-from rig.run.logged_run import logged
-from rig.run.loop import Progress
+from rig.plan.build import build_bridge
+from rig.plan.plan import Plan
+from rig.run.logged_run import Endpoint, run_logged
+from rig.run.loop import Progress, RunControl
 
 _LONGEST_GAP_NS = 3_600_000_000_000
 """Time between two frames of one recording, an hour; more is another day's, or a wrong clock."""
@@ -71,13 +71,13 @@ class _LogPort:
 
 
 def import_log(
-    source: Path, ready: Setup, out: Path, progress: Progress = lambda _t, _mode: None
+    source: Path, plan: Plan, out: Path, progress: Progress = lambda _t, _mode: None
 ) -> ImportReport:
     """Turn a bus log of another program into a run, as if the bridge had received it live.
 
     Args:
         source: BLF, ASC, candump, TRC or MF4 log of a bus.
-        ready: Configuration that says which signals are read, with model and DBC.
+        plan: Configuration that says which signals are read, with model and DBC.
         out: Folder of the run to write; absent or empty.
         progress: Called with time and mode of every tick.
 
@@ -88,29 +88,20 @@ def import_log(
         InputError: The log cannot be read, holds no frame that the bridge hears, or the folder
             cannot be written.
     """
-    bridge = build_bridge(ready)
+    bridge = build_bridge(plan)
     # Half a tick after a tick, so that the jitter of a bench as fast as the bridge gives each tick
     # one frame, and not two to one and none to the next.
-    port = _LogPort(source, bridge.directory, ready.config.period_ns // 2)
+    port = _LogPort(source, bridge.directory, plan.period_ns // 2)
     wanted = tuple(item.message.name for item in bridge.incoming)
     if port.ended:
         raise InputError(
             f"{source}: none of its {port.others} frames is one of {', '.join(wanted)}, "
             "expected a log of the bench that the configuration describes"
         )
-    endless = ready.model_copy(
-        update={"config": ready.config.model_copy(update={"duration_s": None})}
-    )
-    ended = logged(
-        endless,
-        bridge,
-        port,
-        VirtualClock(),
-        out,
-        figures=LinkFigures(),
-        stop=lambda: port.ended,
-        progress=progress,
-    )
+    endless = plan.with_config(plan.config.model_copy(update={"duration_s": None}))
+    endpoint = Endpoint(port, VirtualClock(), LinkFigures())
+    control = RunControl(stop=lambda: port.ended, progress=progress)
+    ended = run_logged(endless, bridge, endpoint, out, control)
     duration_s = (port.last_ns - port.first_ns) * 1e-9
     counts = ended.state.counts
     return ImportReport(
@@ -120,10 +111,10 @@ def import_log(
         port.taken / duration_s if duration_s > 0.0 else 0.0,
         wanted,
         (
-            f"meaning of the frames from {ready.database.path.name}; "
+            f"meaning of the frames from {plan.database.path.name}; "
             f"{port.others} frames of other ids left out",
             "all frames taken as received, error frames left out; the first one is at half a tick",
-            f"estimates computed with model {ready.model.name} at {ready.config.rate_hz:g} Hz",
+            f"estimates computed with model {plan.model.name} at {plan.config.rate_hz:g} Hz",
             f"{counts.lost} frames lost and {counts.refused} refused by counter and checksum",
         ),
     )

@@ -27,13 +27,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
-from dart_model.plant import DartPlant
-from rig.bridge.contract import AMBIENT_C, Mode
+from dart_model.protocol import AMBIENT_C
+from rig.bridge.values import Mode
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
-from rig.log.reader import RunFolder
-from rig.plan.assembly import arrivals, build_plant
-from rig.plan.setup import Setup
-from rig.run.replay import setup_of_run
+from rig.log.reader import RunFolder, read_run
+from rig.plan.build import build_plant
+from rig.plan.load import plan_of_run
+from rig.plan.plan import Plan
 from rig.tuning.expectation import FEWEST, free_error, stretches
 
 Array = NDArray[np.float64]
@@ -76,22 +76,22 @@ def read_smoothed(folder: Path, progress: Progress) -> RunFolder:
     Raises:
         InputError: The run is damaged, or its forces cannot be smoothed.
     """
-    found, ready = setup_of_run(folder)
+    found, plan = read_run(folder), plan_of_run(folder)
     steps = found.steps
-    for name, (force_n, std_n) in smoothed_forces(found, ready, progress).items():
+    for name, (force_n, std_n) in smoothed_forces(found, plan, progress).items():
         for key, values in (("smoothed_force_n", force_n), ("smoothed_force_std_n", std_n)):
             steps = steps.append_column(f"{name}.{key}", cast("Any", pa).array(values))
     return replace(found, steps=steps)
 
 
 def smoothed_forces(
-    found: RunFolder, ready: Setup, progress: Progress
+    found: RunFolder, plan: Plan, progress: Progress
 ) -> dict[str, tuple[Array, Array]]:
     """Force of each strut at each tick, and its standard deviation, by the strut's name.
 
     Args:
         found: The run.
-        ready: The configuration it ran with.
+        plan: The configuration it ran with.
         progress: Called with what is being done and the share that is done.
 
     Returns:
@@ -102,13 +102,13 @@ def smoothed_forces(
         InputError: The run's model has no constant mobility, not every strut is observed, heights
             come faster than ticks, or there is nothing to smooth.
     """
-    names = list(ready.config.observers)
-    mobility = _mobility(found, ready, names)
+    names = plan.strut_names
+    mobility = _mobility(found, plan, names)
     tick_s = found.steps.column("t_ns").to_numpy() * 1e-9
     struts = [_strut(found, name) for name in names]
     forces = {name: (np.full(len(tick_s), np.nan), np.full(len(tick_s), np.nan)) for name in names}
     running = found.steps.column("mode").to_numpy() == Mode.RUNNING
-    missed_s = _MISSED * ready.config.period_ns * 1e-9
+    missed_s = _MISSED * plan.period_ns * 1e-9
     unbroken = [
         part for stretch in stretches(running) for part in _unbroken(tick_s, stretch, missed_s)
     ]
@@ -130,24 +130,24 @@ def smoothed_forces(
     return forces
 
 
-def _mobility(found: RunFolder, ready: Setup, names: list[str]) -> Array:
+def _mobility(found: RunFolder, plan: Plan, names: list[str]) -> Array:
     """Second derivative of each height per newton in each strut, in 1/kg."""
     wanted = "smoothing wants a model whose masses move along straight guides"
-    if ready.config.prescribed_motion is not None:
+    if plan.is_prescribed:
         raise InputError(f"{found.folder}: prescribed_motion: its load cell measures the force")
-    if len(names) > len(ready.config.signals.height):
+    if len(plan.struts) > len(plan.heights):
         raise InputError(f"{found.folder}: observers: kind none: smoothing wants every height")
-    for name, arrival in zip(names, arrivals(ready), strict=True):
-        if arrival.interval_ns * _MISSED < ready.config.period_ns:
+    for strut in plan.struts:
+        if strut.interval_ns * _MISSED < plan.period_ns:
             raise InputError(
-                f"{found.folder}: height {name}: every {arrival.interval_ns} ns, ticks every "
-                f"{ready.config.period_ns} ns: smoothing wants at most one height a tick"
+                f"{found.folder}: height {strut.name}: every {strut.interval_ns} ns, ticks every "
+                f"{plan.period_ns} ns: smoothing wants at most one height a tick"
             )
-    plant = build_plant(ready)
-    if not isinstance(plant, DartPlant) or not plant.is_constant:
-        raise InputError(f"{found.folder}: model {ready.model.name}: {wanted}")
-    still = [0.0] * plant.coordinates
-    state = plant.state(still, still, (0.0,) * plant.internal_states, 0.0)
+    plant = build_plant(plan)
+    if not plant.is_constant:
+        raise InputError(f"{found.folder}: model {plan.model.name}: {wanted}")
+    rest = plant.numbers(plant.init([strut.free_length_m for strut in plan.struts]))
+    state = plant.state_of([0.0] * len(rest))
 
     def accelerations(virtual_n: Array) -> Array:
         loaded = plant.load(state, tuple(virtual_n.tolist()), 0.0, AMBIENT_C)
@@ -157,7 +157,7 @@ def _mobility(found: RunFolder, ready: Setup, names: list[str]) -> Array:
     mobility = np.column_stack([accelerations(one) - without for one in np.eye(len(names))])
     singular = np.linalg.svd(mobility, compute_uv=False)
     if singular[-1] < _SINGULAR * singular[0]:
-        raise InputError(f"{found.folder}: model {ready.model.name}: more struts than coordinates")
+        raise InputError(f"{found.folder}: model {plan.model.name}: more struts than coordinates")
     return mobility
 
 

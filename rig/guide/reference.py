@@ -18,10 +18,10 @@ from pydantic_core import PydanticUndefined
 from can_dbc.errors import InputError
 from dart_model.effects import CATALOGUE, FAMILY_WORDS, Effect, Motion
 from dart_model.spec import ModelSpec
-from rig.bridge.messages import STATUS, STRUT, TIMING
+from rig.bridge.publications import STATUS, STRUT, TIMING
+from rig.channels.quantities import BENCH_QUANTITIES, HEIGHT
 from rig.observers import OBSERVERS
 from rig.plan.config import RunConfig
-from rig.plan.quantities import HEIGHT, OTHERS
 from rig.simulated_bench.effects import EFFECT_KINDS
 from rig.simulated_bench.schema import BenchConfig
 
@@ -190,7 +190,7 @@ def _loop(
 
 
 def _bus() -> str:
-    measured = [(q.key, q.dimension.value, q.column, q.words) for q in (HEIGHT, *OTHERS)]
+    measured = [(q.key, q.dimension.value, q.column, q.words) for q in (HEIGHT, *BENCH_QUANTITIES)]
     published = [
         (group, item.key, item.dimension.value, item.signal)
         for group, items in (("publish", STRUT), ("status", STATUS), ("timing", TIMING))

@@ -36,7 +36,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from scipy.linalg import expm  # pyright: ignore[reportUnknownVariableType]
 
-from rig.bridge.contract import Innovation, Start
+from rig.observers.protocol import Innovation, Remark, Start, TuningTask
 
 Array = NDArray[np.float64]
 Mean = tuple[float, float, float, float, float]
@@ -62,7 +62,7 @@ _LOWEST_HZ, _HIGHEST_HZ = 0.01, 1e4
 _LEAST_STD_M, _LARGEST_STD_M = 1e-12, 1.0
 """Bounds of what a filter can be asked for."""
 
-_NOTHING: Mean = (0.0, 0.0, 0.0, 0.0, 0.0)
+_NO_ERROR: Mean = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 _FORGOTTEN = 20.0
 """Time without a measurement, in units of 1 / omega, after which what was known is worth nothing: a
@@ -77,6 +77,14 @@ _FADING_S = 1.0
 
 _SMALLEST_SCALE, _LARGEST_SCALE = 1e-4, 1e4
 """Bounds of a variance that follows the innovations, over the configured one."""
+
+
+_WIDEST_PER_INTERVAL, _NARROWEST_PER_INTERVAL = 2.0, 0.004
+"""Bounds of a corner in rad/s times the time between two measurements: wider ones follow single
+samples, narrower ones nothing."""
+
+_WIDEST_OF_RATE = 1.0 / 3.0
+"""Corner of a filter over the rate of its measurements beyond which it smooths nothing."""
 
 
 class Steady(NamedTuple):
@@ -168,6 +176,36 @@ class ErrorFilter:
             noise_std_m=min(max(noise_std_m, _LEAST_STD_M), _LARGEST_STD_M),
         )
 
+    @classmethod
+    def corners(cls, interval_s: float) -> tuple[float, float]:
+        """Bounds of a sensible corner in rad/s, for measurements at an interval."""
+        return _NARROWEST_PER_INTERVAL / interval_s, _WIDEST_PER_INTERVAL / interval_s
+
+    @classmethod
+    def with_corner(cls, corner: float, task: TuningTask) -> "ErrorFilter":
+        """The filter for a strut, with the sensible corner (rad/s) that is nearest."""
+        low, high = cls.corners(task.interval_s)
+        return cls.within(min(max(corner, low), high) / (2.0 * math.pi), task.noise_std_m)
+
+    def with_bandwidth(self, factor: float) -> "ErrorFilter":
+        """The filter with its bandwidth multiplied by a factor, within its bounds."""
+        return self.within(factor * self.bandwidth_hz, self.noise_std_m)
+
+    def rounded(self) -> "ErrorFilter":
+        """The filter with values of four digits."""
+        bandwidth_hz, noise_std_m = self.bandwidth_hz, self.noise_std_m
+        return ErrorFilter(
+            bandwidth_hz=float(f"{bandwidth_hz:.4g}"), noise_std_m=float(f"{noise_std_m:.4g}")
+        )
+
+    def remark_on_rate(self, rate_hz: float) -> Remark:
+        """Whether it smooths at a rate of measurements, or follows single ones."""
+        text = f"{self.bandwidth_hz:g} Hz of {rate_hz:g} measurements a second"
+        if self.bandwidth_hz <= _WIDEST_OF_RATE * rate_hz:
+            return Remark(text, is_warning=False)
+        text += ": follows single measurements, expected a third of them at most; see rig tune"
+        return Remark(text, is_warning=True)
+
     @property
     def omega(self) -> float:
         """Corner in rad/s."""
@@ -176,13 +214,13 @@ class ErrorFilter:
     def init(self, start: Start) -> ErrorState:
         """State at the model's start, at the first measured height."""
         inputs, constants = ((start.t_ns, 0.0),), self._constants(start)
-        return ErrorState(start.t_ns, _NOTHING, self._prior(), 1.0, inputs, start, constants)
+        return ErrorState(start.t_ns, _NO_ERROR, self._prior(), 1.0, inputs, start, constants)
 
-    def settled(self, start: Start) -> ErrorState:
+    def steady_state(self, start: Start) -> ErrorState:
         """State after a long time without an error."""
         return replace(self.init(start), covariance=None)
 
-    def updated(self, state: ErrorState, innovation: Innovation) -> ErrorState:
+    def update(self, state: ErrorState, innovation: Innovation) -> ErrorState:
         """State at a new measurement; one that is not newer than the last changes nothing.
 
         Args:
@@ -194,44 +232,44 @@ class ErrorFilter:
         constants, t_ns = state.constants, innovation.t_ns
         elapsed_ns = t_ns - state.t_ns
         if elapsed_ns > constants.forgotten_ns:
-            return self.anew(state, innovation)
-        mean = moved(state, t_ns)
+            return self.restart(state, innovation)
+        mean = mean_at(state, t_ns)
         covariance, scale = state.covariance, state.scale
         # What is new in a measurement: its distance from the error that was predicted.
-        new_m = innovation.value_m - mean[0]
+        new_m = innovation.value - mean[0]
         if covariance is None and elapsed_ns < constants.next_ns:
             gain = constants.gain
-            scale = rescaled(constants, scale, new_m * new_m / constants.innovation_m2)
+            scale = update_scale(constants, scale, new_m * new_m / constants.innovation_m2)
         else:
             steady = constants.steady.covariance
             before = steady if covariance is None else covariance
             number = max(1, round(elapsed_ns / state.start.interval_ns))
-            in_units, covariance = _gain(spread(before, self.pace(state.start), number))
+            in_units, covariance = _gain(predict_covariance(before, self.pace(state.start), number))
             gain = in_si(in_units, constants.omega)
             limit = np.diagonal(steady)
             if np.all(np.abs(np.diagonal(covariance) - limit) <= _SETTLED * limit):
                 covariance = None
-        inputs = since(state.inputs, t_ns)
-        mean = corrected(mean, gain, new_m)
+        inputs = inputs_since(state.inputs, t_ns)
+        mean = correct(mean, gain, new_m)
         return ErrorState(t_ns, mean, covariance, scale, inputs, state.start, constants)
 
-    def anew(self, state: ErrorState, innovation: Innovation) -> ErrorState:
-        """State at a measurement before which nothing is known any more."""
+    def restart(self, state: ErrorState, innovation: Innovation) -> ErrorState:
+        """State at a measurement before which everything known has become worthless."""
         return replace(
             state,
             t_ns=innovation.t_ns,
-            mean=(innovation.value_m, 0.0, 0.0, 0.0, 0.0),
+            mean=(innovation.value, 0.0, 0.0, 0.0, 0.0),
             covariance=self._prior(),
-            inputs=since(state.inputs, innovation.t_ns),
+            inputs=inputs_since(state.inputs, innovation.t_ns),
         )
 
-    def predicted(self, state: ErrorState, t_ns: int) -> Mean:
+    def predict(self, state: ErrorState, t_ns: int) -> Mean:
         """Mean at a time after the last measurement.
 
         Beyond the time constant of the filter behind the time at which a measurement was due, a
         polynomial would run away: the error is predicted up to there.
         """
-        return moved(state, min(t_ns, state.t_ns + state.constants.longest_ns))
+        return mean_at(state, min(t_ns, state.t_ns + state.constants.longest_ns))
 
     def residual(self, state: ErrorState, mean: Mean) -> float:
         """Acceleration by the force that the model lacks where it is now, in m/s².
@@ -339,7 +377,7 @@ class Pace(NamedTuple):
     damping: float = 0.0
 
 
-def rescaled(constants: Constants, scale: float, squared: float) -> float:
+def update_scale(constants: Constants, scale: float, squared: float) -> float:
     """The variances' scale after a measurement.
 
     Args:
@@ -352,7 +390,7 @@ def rescaled(constants: Constants, scale: float, squared: float) -> float:
     return min(max(scale, _SMALLEST_SCALE), _LARGEST_SCALE)
 
 
-def corrected(mean: Mean, gain: Mean, new: float) -> Mean:
+def correct(mean: Mean, gain: Mean, new: float) -> Mean:
     """The mean after an update, with a gain in SI."""
     x, v, a, j, s = mean
     of_x, of_v, of_a, of_j, of_s = gain
@@ -365,7 +403,7 @@ def in_si(gain: Array, omega: float) -> Mean:
     return x, v, a, j, s
 
 
-def since(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tuple[int, float], ...]:
+def inputs_since(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tuple[int, float], ...]:
     """Those inputs that still act at a time or begin after it."""
     first = 0
     while first + 1 < len(inputs) and inputs[first + 1][0] <= t_ns:
@@ -373,7 +411,7 @@ def since(inputs: tuple[tuple[int, float], ...], t_ns: int) -> tuple[tuple[int, 
     return inputs[first:]
 
 
-def moved(state: ErrorState, to_ns: int) -> Mean:
+def mean_at(state: ErrorState, to_ns: int) -> Mean:
     """The mean at a later time, under the inputs in between."""
     mean, inputs, from_ns = state.mean, state.inputs, state.t_ns
     start, own_per_s, last = state.start, state.constants.own_per_s, len(inputs) - 1
@@ -388,15 +426,15 @@ def moved(state: ErrorState, to_ns: int) -> Mean:
         # A step in which the model itself hardly moves: what its law does is a Taylor series.
         quick = h * own_per_s
         if quick <= _STEP_OF_MODEL:
-            mean = _stepped(mean, by_force, h, start)
+            mean = _taylor_step(mean, by_force, h, start)
             continue
         count = math.ceil(quick / _STEP_OF_MODEL)
         for _ in range(count):
-            mean = _stepped(mean, by_force, h / count, start)
+            mean = _taylor_step(mean, by_force, h / count, start)
     return mean
 
 
-def _stepped(mean: Mean, by_force: float, h: float, start: Start) -> Mean:
+def _taylor_step(mean: Mean, by_force: float, h: float, start: Start) -> Mean:
     """The mean after a step, to the fifth order of the error's Taylor series."""
     x, v, a, j, s = mean
     stiffness, damping = start.stiffness_per_s2, start.damping_per_s
@@ -420,7 +458,7 @@ def _gain(ahead: Array) -> tuple[Array, Array]:
     return gain, 0.5 * (after + after.T)
 
 
-def spread(covariance: Array, pace: Pace, number: float) -> Array:
+def predict_covariance(covariance: Array, pace: Pace, number: float) -> Array:
     """Covariance some intervals later; a sensor's noise is a density of one an interval."""
     transition, noise = _transition(pace.interval * number, pace.stiffness, pace.damping)
     return transition @ covariance @ transition.T + pace.interval * noise
@@ -429,7 +467,7 @@ def spread(covariance: Array, pace: Pace, number: float) -> Array:
 def _ahead(covariance: Array, pace: Pace, number: int) -> float:
     """Variance of the residual force's acceleration some intervals later."""
     if number >= 1:
-        covariance = spread(covariance, pace, number)
+        covariance = predict_covariance(covariance, pace, number)
     row = np.array([-pace.stiffness, -pace.damping, 1.0, 0.0, 0.0])
     return float(row @ covariance @ row)
 

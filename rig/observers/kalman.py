@@ -1,29 +1,41 @@
 """The noise-aware observer: a filter of the model's error, which the virtual force takes away.
 
-The filter tells error, rate and residual force d. The virtual force is the residual force and a
+The filter estimates error, rate and residual force d. The virtual force is the residual force and a
 feedback of error and rate,
 
     F_v = d + m omega_c² x + 2 m zeta omega_c dx/dt,
 
-so that the model follows the filtered height through a force alone: its height and velocity stay
-what the integrator makes of them. What is published is the force that the model's law
-lacks where the model is, d - k x - c dx/dt, not the feedback beside it.
+so that the model follows the filtered height through a force alone: its height and velocity remain
+those of the integrator. What is published is the force that the model's law
+lacks at the model's own state, d - k x - c dx/dt, without the feedback.
 
 Reference: Åström and Wittenmark, "Computer-Controlled Systems" (1997), 9.5, for the disturbance
 that is estimated and cancelled.
 """
 
+import math
 from collections.abc import Sequence
-from typing import Literal
+from dataclasses import replace
+from math import sqrt
+from typing import ClassVar, Literal
 
+import numpy as np
 from msgspec import Struct
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from can_dbc.yaml_file import Positive
-from rig.bridge.contract import Deviation, Innovation, Start
 from rig.observers.error_filter import ErrorFilter, ErrorState
-from rig.observers.sensor_fusion import Several, begun, fused
+from rig.observers.protocol import (
+    AnyObserver,
+    Innovation,
+    Remark,
+    Search,
+    SensorStep,
+    Start,
+    TuningTask,
+)
+from rig.observers.sensor_fusion import FusionMemory, fuse_samples, initial_memory
 
 _DAMPING = 0.8
 """Damping ratio of the feedback: settles fast, hardly overshoots."""
@@ -32,18 +44,29 @@ _MOST_PER_INTERVAL = 0.3
 """Largest product of the feedback's corner and the time between two measurements: the hold of the
 virtual force takes half an interval of phase."""
 
+_GAIN_MARGIN = 1.1
+"""The residual force is cancelled with the effective mass that the model itself gives, which is
+known: the observer tolerates a tenth or a fifth."""
+
+_BANDWIDTHS = 30
+"""Tried before the local search, in steps of a fifth: the error has several minima over the
+bandwidth where the force has spectral lines."""
+
+_UNTUNED_CORNER_PER_INTERVAL = 0.1
+"""Corner in rad/s times the interval, of an observer that is not tuned yet: quick and tame."""
+
 
 class KalmanState(Struct, frozen=True, gc=False):
     """State of a noise-aware observer.
 
     Attributes:
-        error: What is known of the model's error.
+        error: Estimate of the model's error.
         innovation_m: Last innovation.
         virtual_force_n: Virtual force, constant until the next tick.
         residual_force_n: Estimated residual force.
         force_std_n: Its standard deviation.
         measured_ns: Time of the last measurement of the height.
-        several: What is remembered of further sensors; None without any.
+        fusion: Memory of further sensors; None without any.
     """
 
     error: ErrorState
@@ -52,12 +75,12 @@ class KalmanState(Struct, frozen=True, gc=False):
     residual_force_n: float
     force_std_n: float
     measured_ns: int
-    several: Several | None = None
+    fusion: FusionMemory | None = None
 
     @property
     def left_out(self) -> tuple[int, ...]:
-        """Places of further sensors that are not used now."""
-        return () if self.several is None else self.several.left_out
+        """Channels of further sensors that are not used now."""
+        return () if self.fusion is None else self.fusion.left_out
 
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
@@ -66,71 +89,72 @@ class KalmanObserver:
 
     Attributes:
         kind: Tag of this observer in a configuration.
-        filter: The filter; `rig tune` finds its bandwidth.
+        filter: The filter; `rig tune` chooses its bandwidth.
         force_limit_n: Largest magnitude of the virtual force.
     """
+
+    requires_height: ClassVar[bool] = True
+    fuses_sensors: ClassVar[bool] = True
+    knows_std: ClassVar[bool] = True
 
     kind: Literal["kalman"]
     filter: ErrorFilter
     force_limit_n: Positive = 1.0e4
 
     @property
-    def first_measurements(self) -> int:
+    def measurements_to_start(self) -> int:
         """Enough for height and velocity: a parabola through twelve of them."""
         return 12
 
     def init(self, start: Start) -> KalmanState:
         """State at the model's start."""
-        return self._at(self.filter.init(start), start)
+        return self._initial(self.filter.init(start), start)
 
-    def settled(self, start: Start) -> KalmanState:
+    def steady_state(self, start: Start) -> KalmanState:
         """State after a long time at rest."""
-        return self._at(self.filter.settled(start), start)
+        return self._initial(self.filter.steady_state(start), start)
 
-    def _at(self, error: ErrorState, start: Start) -> KalmanState:
+    def _initial(self, error: ErrorState, start: Start) -> KalmanState:
         std_n = self.filter.residual_std(error, start.t_ns) / start.mobility_per_kg
         return KalmanState(error, 0.0, 0.0, 0.0, std_n, start.t_ns)
 
-    def step(self, state: KalmanState, t_ns: int, innovation: Innovation | None) -> KalmanState:
-        """State after a tick; arguments as of `Observer.step`."""
-        if innovation is None:
-            return self._driven(t_ns, state.error, state.innovation_m)
-        error = self.filter.updated(state.error, innovation)
-        return self._driven(t_ns, error, innovation.value_m)
-
-    def fuse(
+    def step(
         self,
         state: KalmanState,
         t_ns: int,
         innovation: Innovation | None,
-        deviations: Sequence[Deviation],
+        further: Sequence[Innovation] = (),
     ) -> KalmanState:
-        """State after a tick; arguments as of `FusingObserver.fuse`."""
-        several = state.several or begun(state.error.start)
-        error, several = fused(self.filter, state.error, several, t_ns, innovation, deviations)
-        innovation_m = state.innovation_m if innovation is None else innovation.value_m
-        return self._driven(t_ns, error, innovation_m, several)
+        """State after a tick; arguments as of `Observer.step`."""
+        error, fusion = state.error, state.fusion
+        if error.start.sensors:
+            memory = fusion or initial_memory(error.start)
+            error, fusion = fuse_samples(self.filter, error, memory, t_ns, innovation, further)
+        elif innovation is not None:
+            error = self.filter.update(error, innovation)
+        innovation_m = state.innovation_m if innovation is None else innovation.value
+        return self._drive(t_ns, error, innovation_m, fusion)
 
-    def _driven(
+    def _drive(
         self,
         t_ns: int,
         error: ErrorState,
         innovation_m: float,
-        several: Several | None = None,
+        fusion: FusionMemory | None = None,
     ) -> KalmanState:
-        """State with the virtual force that a new estimate asks for."""
+        """State with the virtual force that a new estimate requires."""
         follower, limit_n = self.filter, self.force_limit_n
         start, mobility_per_kg = error.start, error.start.mobility_per_kg
-        mean = follower.predicted(error, t_ns)
+        mean = follower.predict(error, t_ns)
         x, v, a, _, _ = mean
         corner = min(error.constants.omega, _MOST_PER_INTERVAL * 1e9 / start.interval_ns)
-        wanted = a + corner * corner * x + 2.0 * _DAMPING * corner * v
-        force_n = min(max(wanted / mobility_per_kg, -limit_n), limit_n)
+        required = a + corner * corner * x + 2.0 * _DAMPING * corner * v
+        force_n = min(max(required / mobility_per_kg, -limit_n), limit_n)
         std_n = follower.residual_std(error, t_ns) / mobility_per_kg
         residual_n = follower.residual(error, mean) / mobility_per_kg
         error = follower.with_input(error, t_ns, -force_n * mobility_per_kg)
-        measured_ns = error.t_ns if several is None else several.measured_ns
-        return KalmanState(error, innovation_m, force_n, residual_n, std_n, measured_ns, several)
+        measured_ns = error.t_ns if fusion is None else fusion.measured_ns
+        return KalmanState(error, innovation_m, force_n, residual_n, std_n, measured_ns, fusion)
 
     def numbers(self, state: KalmanState) -> tuple[float, ...]:
         """What the next state depends on: all of it is in the filter's inputs."""
@@ -147,5 +171,51 @@ class KalmanObserver:
             state.residual_force_n,
             state.force_std_n,
             state.measured_ns,
-            state.several,
+            state.fusion,
         )
+
+    def can_continue(self, other: AnyObserver) -> bool:
+        """Whether the other one has the same filter, whose state it continues."""
+        return isinstance(other, KalmanObserver) and other.filter == self.filter
+
+    def remark_on_step(self, step: SensorStep) -> Remark:
+        """Whether the rounding of the height sensor is within the filter's noise."""
+        if step.step_m / sqrt(12.0) <= self.filter.noise_std_m:
+            return Remark("", is_warning=False)
+        text = "their rounding alone is more than filter.noise_std_m; see rig tune"
+        return Remark(text, is_warning=True)
+
+    def remark_on_rate(self, rate_hz: float) -> Remark | None:
+        """Whether the filter smooths, at a rate of measurements."""
+        return self.filter.remark_on_rate(rate_hz)
+
+    @classmethod
+    def untuned(cls, noise_std_m: float, interval_ns: int) -> "KalmanObserver":
+        """An observer for a strut whose noise alone is known."""
+        corner = _UNTUNED_CORNER_PER_INTERVAL / (interval_ns * 1e-9)
+        return cls("kalman", ErrorFilter.within(corner / (2.0 * math.pi), noise_std_m))
+
+    @classmethod
+    def search(cls, task: TuningTask) -> Search:
+        """Search over the logarithm of the filter's corner in rad/s."""
+        low, high = ErrorFilter.corners(task.interval_s)
+
+        def observer(x: Sequence[float]) -> KalmanObserver:
+            corner = math.exp(float(x[0]))
+            return cls("kalman", ErrorFilter.with_corner(corner, task), task.force_limit_n)
+
+        grid = np.linspace(math.log(low), math.log(high), _BANDWIDTHS).tolist()
+        return Search(observer, [[value] for value in grid], 1, _GAIN_MARGIN)
+
+    def bandwidth_hz(self, mobility_per_kg: float) -> float:
+        """Corner of the filter."""
+        del mobility_per_kg
+        return self.filter.bandwidth_hz
+
+    def with_bandwidth(self, factor: float) -> "KalmanObserver":
+        """The observer with its filter's corner multiplied."""
+        return replace(self, filter=self.filter.with_bandwidth(factor))
+
+    def rounded(self) -> "KalmanObserver":
+        """The observer with parameters of four digits."""
+        return replace(self, filter=self.filter.rounded())

@@ -5,21 +5,53 @@
 Reference: Cuesta, Luque, Mantaras, "A methodology to improve simulation of multibody systems using
 estimation techniques" (2021), equations (6) and (7). Anti-windup by conditional integration:
 Åström and Hägglund, "Advanced PID Control" (2006), section 3.5. With a `filter` the innovation is
-that of now, predicted from one that is some milliseconds old; and with a derivative gain its rate
-damps the loop, which the published method leaves to the model.
+predicted for the present from one that is some milliseconds old; and with a derivative gain its
+rate damps the loop, which the published method leaves to the model.
 """
 
+import itertools
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from math import nan
-from typing import Literal
+from typing import ClassVar, Literal
 
+import numpy as np
 from msgspec import Struct
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from can_dbc.yaml_file import NotNegative, Positive
-from rig.bridge.contract import Innovation, Start
 from rig.observers.error_filter import ErrorFilter, ErrorState
+from rig.observers.protocol import (
+    AnyObserver,
+    Innovation,
+    Remark,
+    Search,
+    SensorStep,
+    Start,
+    TuningTask,
+)
+
+_COARSE_OF_WEIGHT = 0.01
+"""Force of one step of the height sensor over the model's weight from which it is warned of: the
+published method errs by 1.1 % of the strut's peak force in all."""
+
+_GAIN_MARGIN = 2.0
+"""Usual for a PI loop."""
+
+_NATURAL_FREQUENCIES = 8
+"""That a search may begin at, its bounds among them: an octave and more apart. The fast ones keep
+their margin with strong damping and a filter well above them only."""
+
+_SEARCH_STARTS = 2
+"""Local searches among them."""
+
+_INTEGRAL_SHARE_PER_S = 0.1
+"""K_I over K_P, as in the reference case: slow, it takes what is constant."""
+
+PUBLISHED_PER_S2, PUBLISHED_PER_S3 = 1.0e4, 1.0e3
+"""Gains of the reference case over its mass of 10 kg."""
 
 
 class PiState(Struct, frozen=True, gc=False):
@@ -48,8 +80,13 @@ class PiState(Struct, frozen=True, gc=False):
 
     @property
     def force_std_n(self) -> float:
-        """Not known."""
+        """NaN: not known."""
         return nan
+
+    @property
+    def left_out(self) -> tuple[int, ...]:
+        """Empty: no further sensor is used."""
+        return ()
 
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
@@ -60,10 +97,14 @@ class PiObserver:
         kind: Tag of this observer in a configuration.
         proportional_n_per_m: K_P.
         integral_n_per_m_s: K_I.
-        derivative_n_s_per_m: Gain of the innovation's rate; wants `filter`.
+        derivative_n_s_per_m: Gain of the innovation's rate; requires `filter`.
         force_limit_n: Largest magnitude of the virtual force.
-        filter: Tells the innovation of now; without one the last is taken as it is.
+        filter: Predicts the present innovation; without one the last is used as it is.
     """
+
+    requires_height: ClassVar[bool] = True
+    fuses_sensors: ClassVar[bool] = False
+    knows_std: ClassVar[bool] = False
 
     kind: Literal["pi"] = "pi"
     proportional_n_per_m: NotNegative = 1.0e5
@@ -75,12 +116,10 @@ class PiObserver:
     def __post_init__(self) -> None:
         """Refuse a derivative of the raw innovation: that is noise."""
         if self.derivative_n_s_per_m and self.filter is None:
-            raise ValueError(
-                f"derivative_n_s_per_m {self.derivative_n_s_per_m:g}: expected filter beside it"
-            )
+            raise ValueError(f"derivative_n_s_per_m {self.derivative_n_s_per_m:g}: requires filter")
 
     @property
-    def first_measurements(self) -> int:
+    def measurements_to_start(self) -> int:
         """The model starts at rest, at the first measured height."""
         return 1
 
@@ -89,23 +128,30 @@ class PiObserver:
         error = None if self.filter is None else self.filter.init(start)
         return PiState(0.0, 0.0, 0.0, start.t_ns, start, error)
 
-    def settled(self, start: Start) -> PiState:
+    def steady_state(self, start: Start) -> PiState:
         """State after a long time at rest."""
-        error = None if self.filter is None else self.filter.settled(start)
+        error = None if self.filter is None else self.filter.steady_state(start)
         return PiState(0.0, 0.0, 0.0, start.t_ns, start, error)
 
-    def step(self, state: PiState, t_ns: int, innovation: Innovation | None) -> PiState:
+    def step(
+        self,
+        state: PiState,
+        t_ns: int,
+        innovation: Innovation | None,
+        further: Sequence[Innovation] = (),
+    ) -> PiState:
         """State after a tick; arguments as of `Observer.step`.
 
         Between measurements the virtual force is constant. At the limit the integral grows no
         further.
         """
+        del further
         if innovation is None:
             return state
-        error, innovation_m, rate_m_per_s = state.error, innovation.value_m, 0.0
+        error, innovation_m, rate_m_per_s = state.error, innovation.value, 0.0
         if self.filter is not None and error is not None:
-            error = self.filter.updated(error, innovation)
-            innovation_m, rate_m_per_s, *_ = self.filter.predicted(error, t_ns)
+            error = self.filter.update(error, innovation)
+            innovation_m, rate_m_per_s, *_ = self.filter.predict(error, t_ns)
         elapsed_s = (innovation.t_ns - state.measured_ns) * 1e-9
         integral_m_s = state.integral_m_s + innovation_m * elapsed_s
         proportional_n = self.proportional_n_per_m * innovation_m
@@ -122,7 +168,7 @@ class PiObserver:
             acceleration = -force_n * error.start.mobility_per_kg
             error = self.filter.with_input(error, t_ns, acceleration)
         measured_ns = innovation.t_ns
-        return PiState(integral_m_s, innovation.value_m, force_n, measured_ns, state.start, error)
+        return PiState(integral_m_s, innovation.value, force_n, measured_ns, state.start, error)
 
     def numbers(self, state: PiState) -> tuple[float, ...]:
         """Integral, virtual force and filter, all in m: what the next state depends on."""
@@ -147,6 +193,78 @@ class PiObserver:
             state.start,
             error,
         )
+
+    def can_continue(self, other: AnyObserver) -> bool:
+        """Whether the other one has the same filter, whose state it continues."""
+        return isinstance(other, PiObserver) and other.filter == self.filter
+
+    def remark_on_step(self, step: SensorStep) -> Remark:
+        """Force that one step of the height sensor makes."""
+        force_n = step.step_m * self.proportional_n_per_m
+        text = f"each {force_n:.3g} N at K_P"
+        if step.weight_n is None or force_n <= _COARSE_OF_WEIGHT * step.weight_n:
+            return Remark(text, is_warning=False)
+        return Remark(f"{text}: more than 1 % of the model's weight; see rig tune", is_warning=True)
+
+    def remark_on_rate(self, rate_hz: float) -> Remark | None:
+        """Whether the filter smooths, at a rate of measurements."""
+        return None if self.filter is None else self.filter.remark_on_rate(rate_hz)
+
+    @classmethod
+    def search(cls, task: TuningTask) -> Search:
+        """Search over the logarithms of natural frequency, damping ratio and filter corner."""
+        low, high = ErrorFilter.corners(task.interval_s)
+
+        def observer(x: Sequence[float]) -> PiObserver:
+            natural, damping, corner = (float(value) for value in x)
+            proportional = task.mass_kg * math.exp(2.0 * natural)
+            return PiObserver(
+                proportional_n_per_m=proportional,
+                integral_n_per_m_s=_INTEGRAL_SHARE_PER_S * proportional,
+                derivative_n_s_per_m=2.0 * task.mass_kg * math.exp(natural + damping),
+                force_limit_n=task.force_limit_n,
+                filter=ErrorFilter.with_corner(math.exp(corner), task),
+            )
+
+        naturals = np.linspace(math.log(low), math.log(high), _NATURAL_FREQUENCIES)[1:-1].tolist()
+        candidates = [
+            [natural, math.log(damping), natural + above]
+            for natural, damping, above in itertools.product(naturals, (0.3, 1.0), (0.3, 1.5))
+        ]
+        return Search(observer, candidates, _SEARCH_STARTS, _GAIN_MARGIN)
+
+    def bandwidth_hz(self, mobility_per_kg: float) -> float:
+        """Natural frequency of the loop."""
+        return math.sqrt(self.proportional_n_per_m * mobility_per_kg) / (2.0 * math.pi)
+
+    def with_bandwidth(self, factor: float) -> "PiObserver":
+        """The observer with its natural frequency and its filter's corner multiplied."""
+        return replace(
+            self,
+            proportional_n_per_m=factor**2 * self.proportional_n_per_m,
+            integral_n_per_m_s=factor**2 * self.integral_n_per_m_s,
+            derivative_n_s_per_m=factor * self.derivative_n_s_per_m,
+            filter=None if self.filter is None else self.filter.with_bandwidth(factor),
+        )
+
+    def rounded(self) -> "PiObserver":
+        """The observer with parameters of four digits."""
+        return replace(
+            self,
+            proportional_n_per_m=float(f"{self.proportional_n_per_m:.4g}"),
+            integral_n_per_m_s=float(f"{self.integral_n_per_m_s:.4g}"),
+            derivative_n_s_per_m=float(f"{self.derivative_n_s_per_m:.4g}"),
+            filter=None if self.filter is None else self.filter.rounded(),
+        )
+
+
+def published_observer(mobility_per_kg: float, force_limit_n: float) -> PiObserver:
+    """The published gains, scaled by the effective mass."""
+    return PiObserver(
+        proportional_n_per_m=PUBLISHED_PER_S2 / mobility_per_kg,
+        integral_n_per_m_s=PUBLISHED_PER_S3 / mobility_per_kg,
+        force_limit_n=force_limit_n,
+    )
 
 
 def _scales(start: Start) -> tuple[float, float]:

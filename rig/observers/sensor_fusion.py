@@ -7,9 +7,9 @@ true: where a reading is older than what was used already, the filter goes back 
 takes the later ones once more.
 
 The strut's own height is the reference: it is always used, and without it no sensor that is left
-out comes back. A further sensor is gated. A reading
-beyond the gate is not used; some in a row leave the sensor out until as many are within again.
-What drifts within the gate is not found, and a reference that jumps is a case for the limits.
+out is used again. A further sensor is gated. A reading beyond the gate is not used; some in a row
+leave the sensor out until as many are within again. A drift within the gate is not detected, and a
+reference that jumps is a case for the limits.
 
 References:
     Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation (2001),
@@ -25,18 +25,21 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from rig.bridge.contract import Deviation, Innovation, Measures, Sensor, Start
+from rig.channels.channel import Channel
+from rig.channels.quantities import HEIGHT
 from rig.observers.error_filter import (
     Array,
     ErrorFilter,
     ErrorState,
-    corrected,
+    correct,
     in_si,
-    moved,
-    rescaled,
-    since,
-    spread,
+    inputs_since,
+    mean_at,
+    predict_covariance,
+    update_scale,
 )
+from rig.observers.protocol import REFERENCE_HEIGHT, Innovation, Start
+from rig.observers.strut_sensors import STRUT_SENSORS
 
 _GATE = 6.0
 """Of a reading, in its standard deviations: two in a thousand million are beyond it by chance."""
@@ -53,8 +56,8 @@ _GRID = 16
 thirtieth of what is unknown is added too early or too late, and never twice."""
 
 
-class Health(NamedTuple):
-    """What is known of a further sensor.
+class SensorHealth(NamedTuple):
+    """Health of a further sensor.
 
     Attributes:
         t_ns: Time of its last reading.
@@ -68,8 +71,8 @@ class Health(NamedTuple):
     within: int = 0
     is_out: bool = False
 
-    def after(self, t_ns: int, *, is_within: bool, counts: bool) -> "Health":
-        """After another reading.
+    def update(self, t_ns: int, *, is_within: bool, counts: bool) -> "SensorHealth":
+        """Health after another reading.
 
         Args:
             t_ns: Its time.
@@ -80,179 +83,168 @@ class Health(NamedTuple):
             return self._replace(t_ns=t_ns)
         beyond, within = (0, self.within + 1) if is_within else (self.beyond + 1, 0)
         is_out = within < _WITHIN if self.is_out else beyond >= _BEYOND
-        return Health(t_ns, beyond, within, is_out)
+        return SensorHealth(t_ns, beyond, within, is_out)
 
 
-class Several(Struct, frozen=True, gc=False):
-    """What is remembered of several sensors.
+class FusionMemory(Struct, frozen=True, gc=False):
+    """Memory of several sensors.
 
     Attributes:
-        used: What was used of late, the oldest first, with the state before each.
+        used: Innovations used lately, the oldest first, with the state before each.
         inputs: Accelerations by the virtual force and their times, as far back as `used`.
-        health: Of each further sensor, by its place.
+        health: Of each further sensor, by its channel.
         measured_ns: Time of the last reading of a height that was used.
-        own_ns: Time of the last of the strut's own height.
-        left_out: Places of sensors that are left out, or silent.
+        own_ns: Time of the last reading of the strut's own height.
+        left_out: Channels of sensors that are left out, or silent.
     """
 
-    used: tuple[tuple[ErrorState, Deviation], ...]
+    used: tuple[tuple[ErrorState, Innovation], ...]
     inputs: tuple[tuple[int, float], ...]
-    health: dict[int, Health]
+    health: dict[int, SensorHealth]
     measured_ns: int
     own_ns: int
     left_out: tuple[int, ...] = ()
 
 
-_OWN = -1
-"""Place of the strut's own height."""
+def initial_memory(start: Start) -> FusionMemory:
+    """Memory before any reading of a further sensor."""
+    health = {channel.index: SensorHealth(start.t_ns) for channel in start.sensors}
+    return FusionMemory((), ((start.t_ns, 0.0),), health, start.t_ns, start.t_ns)
 
 
-def begun(start: Start) -> Several:
-    """Before any reading of a further sensor."""
-    health = {place: Health(start.t_ns) for place, _ in start.sensors}
-    return Several((), ((start.t_ns, 0.0),), health, start.t_ns, start.t_ns)
-
-
-def fused(
+def fuse_samples(
     follower: ErrorFilter,
     error: ErrorState,
-    several: Several,
+    memory: FusionMemory,
     t_ns: int,
     innovation: Innovation | None,
-    deviations: Sequence[Deviation],
-) -> tuple[ErrorState, Several]:
+    further: Sequence[Innovation],
+) -> tuple[ErrorState, FusionMemory]:
     """Filter and memory after a tick.
 
     Args:
         follower: The filter.
         error: Its state, with all inputs up to now.
-        several: What is remembered.
+        memory: Memory of the sensors.
         t_ns: Time of the tick.
-        innovation: Of a new height of the strut; None where none came.
-        deviations: Of new readings of the further sensors.
+        innovation: Of a new height of the strut; None where none arrived.
+        further: Of new samples of the further sensors.
     """
-    sensors = dict(error.start.sensors)
-    new = [*deviations]
+    sensors = {channel.index: channel for channel in error.start.sensors}
+    new = [*further]
     if innovation is not None:
-        new.append(Deviation(_OWN, innovation.value_m, innovation.t_ns))
-    inputs = _joined(several.inputs, error.inputs)
-    used, health, measured_ns = list(several.used), dict(several.health), several.measured_ns
-    own_ns = several.own_ns
-    for deviation in sorted(new, key=lambda item: item.t_ns):
+        new.append(innovation)
+    inputs = _join_inputs(memory.inputs, error.inputs)
+    used, health, measured_ns = list(memory.used), dict(memory.health), memory.measured_ns
+    own_ns = memory.own_ns
+    for item in sorted(new, key=lambda entry: entry.t_ns):
         at = len(used)
-        while at and used[at - 1][1].t_ns > deviation.t_ns:
+        while at and used[at - 1][1].t_ns > item.t_ns:
             at -= 1
         before = used[at][0] if at < len(used) else error
         before = replace(before, inputs=inputs)
-        if deviation.t_ns < before.t_ns:  # older than all that is remembered
+        if item.t_ns < before.t_ns:  # older than all of the memory
             continue
-        sensor = sensors.get(deviation.sensor)
-        after, is_within = _updated(follower, before, deviation, sensor)
+        sensor = None if item.channel == REFERENCE_HEIGHT else sensors[item.channel]
+        after, is_within = _update(follower, before, item, sensor)
         if sensor is None:
-            own_ns = max(own_ns, deviation.t_ns)
+            own_ns = max(own_ns, item.t_ns)
         else:
-            # Without the reference the gate grows wide, and proves nothing to one that is out.
-            has_reference = deviation.t_ns - own_ns <= _SILENT * error.start.interval_ns
-            known = health[deviation.sensor].after(
-                deviation.t_ns, is_within=is_within, counts=has_reference
+            # Without the reference the gate grows wide, and does not show that a sensor is right.
+            has_reference = item.t_ns - own_ns <= _SILENT * error.start.interval_ns
+            state = health[item.channel].update(
+                item.t_ns, is_within=is_within, counts=has_reference
             )
-            health[deviation.sensor] = known
-            if known.is_out or not is_within:
+            health[item.channel] = state
+            if state.is_out or not is_within:
                 continue
-        if sensor is None or sensor.measures is Measures.HEIGHT:
-            measured_ns = max(measured_ns, deviation.t_ns)
-        later = [item for _, item in used[at:]]
-        used[at:] = [(before, deviation)]
-        for item in later:
-            used.append((replace(after, inputs=inputs), item))
-            after, _ = _updated(follower, used[-1][0], item, sensors.get(item.sensor))
+        if sensor is None or sensor.quantity is HEIGHT:
+            measured_ns = max(measured_ns, item.t_ns)
+        later = [entry for _, entry in used[at:]]
+        used[at:] = [(before, item)]
+        for entry in later:
+            used.append((replace(after, inputs=inputs), entry))
+            after, _ = _update(follower, used[-1][0], entry, sensors.get(entry.channel))
         error = after
     oldest_ns = t_ns - _longest_delay_ns(error.start)
     while used and used[0][1].t_ns < oldest_ns:
         used.pop(0)
     from_ns = used[0][0].t_ns if used else error.t_ns
     left_out = tuple(
-        place
-        for place, known in health.items()
-        if known.is_out or t_ns - known.t_ns > _silent_ns(sensors[place])
+        channel
+        for channel, state in health.items()
+        if state.is_out or t_ns - state.t_ns > _silent_ns(sensors[channel])
     )
-    memory = Several(tuple(used), since(inputs, from_ns), health, measured_ns, own_ns, left_out)
-    return replace(error, inputs=since(inputs, error.t_ns)), memory
+    inputs = inputs_since(inputs, from_ns)
+    after_tick = FusionMemory(tuple(used), inputs, health, measured_ns, own_ns, left_out)
+    return replace(error, inputs=inputs_since(inputs, error.t_ns)), after_tick
 
 
-def _joined(
+def _join_inputs(
     known: tuple[tuple[int, float], ...], latest: tuple[tuple[int, float], ...]
 ) -> tuple[tuple[int, float], ...]:
     """All inputs: the latest, and those remembered from before them."""
     return (*(item for item in known if item[0] < latest[0][0]), *latest)
 
 
-def _silent_ns(sensor: Sensor) -> int:
+def _silent_ns(sensor: Channel) -> int:
     return sensor.delay_ns + _SILENT * sensor.interval_ns
 
 
 def _longest_delay_ns(start: Start) -> int:
-    return max([start.delay_ns, *(sensor.delay_ns for _, sensor in start.sensors)])
+    return max([start.delay_ns, *(sensor.delay_ns for sensor in start.sensors)])
 
 
-def _updated(
-    follower: ErrorFilter, state: ErrorState, deviation: Deviation, sensor: Sensor | None
+def _update(
+    follower: ErrorFilter, state: ErrorState, innovation: Innovation, sensor: Channel | None
 ) -> tuple[ErrorState, bool]:
     """State at a reading, and whether the reading is within its gate."""
     constants = state.constants
-    if deviation.t_ns - state.t_ns > constants.forgotten_ns:
-        if sensor is not None and sensor.measures is not Measures.HEIGHT:
+    if innovation.t_ns - state.t_ns > constants.forgotten_ns:
+        if sensor is not None and sensor.quantity is not HEIGHT:
             return state, False
-        anew = follower.anew(state, Innovation(deviation.value, deviation.t_ns))
-        if sensor is None or anew.covariance is None:
-            return anew, True
+        restarted = follower.restart(state, innovation)
+        if sensor is None or restarted.covariance is None:
+            return restarted, True
         of_sensor = np.diag([(sensor.noise_std / follower.noise_std_m) ** 2 - 1.0, 0, 0, 0, 0])
-        return replace(anew, covariance=anew.covariance + of_sensor), True
-    mean = moved(state, deviation.t_ns)
+        return replace(restarted, covariance=restarted.covariance + of_sensor), True
+    mean = mean_at(state, innovation.t_ns)
     omega, sigma = follower.omega, follower.noise_std_m
     row, unit = _row(state.start, sensor, sigma)
     expected = float(row @ np.array(mean[:3]))
-    new = (deviation.value - expected) / unit
+    new = (innovation.value - expected) / unit
     powers = sigma * omega ** np.arange(3)
     line = np.concatenate([row * powers / unit, np.zeros(2)])
-    number = _place(state.start, deviation.t_ns) - _place(state.start, state.t_ns)
+    number = _grid_index(state.start, innovation.t_ns) - _grid_index(state.start, state.t_ns)
     covariance = constants.steady.covariance if state.covariance is None else state.covariance
     if number:
-        covariance = spread(covariance, follower.pace(state.start), number / _GRID)
+        covariance = predict_covariance(covariance, follower.pace(state.start), number / _GRID)
     seen: Array = covariance @ line
     variance = float(line @ seen) + 1.0
     scale = state.scale
     is_within = abs(new) <= _GATE * math.sqrt(variance * max(scale, 1.0))
     if sensor is None:
-        scale = rescaled(constants, scale, new * new / variance)
+        scale = update_scale(constants, scale, new * new / variance)
     gain = seen / variance
     covariance = covariance - np.outer(gain, seen)
     return ErrorState(
-        deviation.t_ns,
-        corrected(mean, in_si(gain, omega), new * sigma),
+        innovation.t_ns,
+        correct(mean, in_si(gain, omega), new * sigma),
         0.5 * (covariance + covariance.T),
         scale,
-        since(state.inputs, deviation.t_ns),
+        inputs_since(state.inputs, innovation.t_ns),
         state.start,
         constants,
     ), is_within
 
 
-def _place(start: Start, t_ns: int) -> int:
-    """Place of a time on the grid of the variances."""
+def _grid_index(start: Start, t_ns: int) -> int:
+    """Index of a time on the grid of the variances."""
     return round((t_ns - start.t_ns) * _GRID / start.interval_ns)
 
 
-def _row(start: Start, sensor: Sensor | None, noise_std_m: float) -> tuple[Array, float]:
-    """A sensor's value per error, rate and residual acceleration in SI, and its deviation."""
+def _row(start: Start, sensor: Channel | None, noise_std_m: float) -> tuple[Array, float]:
+    """A sensor's reading per error, rate and residual acceleration in SI, and its deviation."""
     if sensor is None:
         return np.array([1.0, 0.0, 0.0]), noise_std_m
-    match sensor.measures:
-        case Measures.HEIGHT:
-            row = [1.0, 0.0, 0.0]
-        case Measures.VELOCITY:
-            row = [0.0, 1.0, 0.0]
-        case Measures.FORCE:
-            mass_kg = 1.0 / start.mobility_per_kg
-            row = [-start.stiffness_per_s2 * mass_kg, -start.damping_per_s * mass_kg, mass_kg]
-    return np.array(row), sensor.noise_std
+    return np.array(STRUT_SENSORS[sensor.quantity].row(start)), sensor.noise_std

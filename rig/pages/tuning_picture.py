@@ -47,9 +47,9 @@ def _draw(axes: Any, strut: TunedStrut) -> None:
     ):
         values = [getattr(item, name) for _, item in stable]
         axes.loglog(frequency, values, color=colour, linewidth=width, label=label)
-    chosen = strut.found.expected.force_n
+    chosen = strut.tuned.expected.force_n
     axes.plot(strut.bandwidth_hz, chosen, "o", color=_TOTAL, markersize=9, label="chosen")
-    published = strut.paper
+    published = strut.published
     if np.isfinite(published.force_n):
         label = "published gains, by mass"
         axes.plot(PAPER_HZ, published.force_n, "X", color=_PAPER, markersize=9, label=label)

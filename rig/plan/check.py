@@ -3,38 +3,31 @@
 import stat
 from dataclasses import dataclass, replace
 from enum import Enum
-from math import sqrt
 
 from can_dbc.bus_load import frame_time_s
 from can_dbc.codec import si_step
 from can_dbc.database import Message
-from can_dbc.units import Dimension
+from dart_model.protocol import AnyPlant
 from dart_model.spec import InlineSkeleton
-from rig.bridge.contract import Plant
+from rig.channels.channel import Channel
+from rig.channels.quantities import LOAD_CELL_FORCE
 from rig.closed_loop.loop import Rhythm
 from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import Pole, closed_loop_poles
-from rig.observers.pi import PiObserver
-from rig.plan.assembly import arrivals, build_bridge, build_plant
-from rig.plan.quantities import LOAD_CELL_FORCE
-from rig.plan.setup import Setup, load_authentication
+from rig.observers.protocol import SensorStep
+from rig.plan.build import build_bridge, build_plant
+from rig.plan.load import load_authentication
+from rig.plan.plan import Plan
 
 LITTLE_DAMPING = 0.02
 """Damping ratio below which a pole is warned of: it rings for some 8 periods to a third."""
-
-_WIDEST_OF_RATE = 1.0 / 3.0
-"""Corner of a filter over the rate of its measurements beyond which it smooths nothing."""
-
-_COARSE_OF_WEIGHT = 0.01
-"""Force of one step of the height sensor over the model's weight from which it is warned of: the
-published method is off by 1.1 % of the strut's peak force in all."""
 
 _OTHERS_MAY_READ = stat.S_IRGRP | stat.S_IROTH
 FULL_LOAD, HIGH_LOAD = 1.0, 0.7
 
 
 class Severity(Enum):
-    """Severity of a finding; an error keeps the run from starting."""
+    """Severity of a finding; an error prevents the run from starting."""
 
     OK = "ok"
     WARNING = "warning"
@@ -47,8 +40,8 @@ class Finding:
 
     Attributes:
         severity: Its severity.
-        what: What was looked at.
-        text: What was found, with figures.
+        what: Subject of the check.
+        text: Result, with figures.
     """
 
     severity: Severity
@@ -60,11 +53,11 @@ class Finding:
         return {"severity": self.severity.value, "what": self.what, "text": self.text}
 
 
-def check(ready: Setup) -> list[Finding]:
-    """Check a configuration: signals and units, rate, bus load, stability.
+def check(plan: Plan) -> list[Finding]:
+    """Check a plan: signals and units, rate, bus load, stability.
 
     Args:
-        ready: Configuration, model and DBC.
+        plan: The plan.
 
     Returns:
         All findings, good ones too.
@@ -73,47 +66,52 @@ def check(ready: Setup) -> list[Finding]:
         InputError: The model cannot be built, or a key cannot be read.
         DatabaseError: A signal or its unit is wrong.
     """
-    build_bridge(ready)
-    config = ready.config
-    heights = [ready.database.message(entry.message) for entry in config.signals.height.values()]
-    further = {entry.message for _, _, entry in config.signals.sensors()}
-    read = {message.name: message for message in heights}
-    read |= {name: ready.database.message(name) for name in sorted(further)}
+    build_bridge(plan)
+    heights = [_message(channel) for channel in plan.heights]
+    sensors = {message.name: message for message in map(_message, plan.sensors)}
+    further = dict(sorted(sensors.items()))
+    read = {message.name: message for message in heights} | further
     findings = [
         Finding(
             Severity.OK,
             "signals",
-            f"all in {ready.database.path.name}, units converted to SI",
+            f"all in {plan.database.path.name}, units converted to SI",
         ),
-        *[_protected(message) for message in read.values()],
-        *[_rate(message, config.period_ns) for message in heights],
-        *_resolution(ready),
+        *[_protection(message) for message in read.values()],
+        *[_rate(message, plan.period_ns) for message in heights],
+        *_resolution(plan),
         *[
             Finding(
                 Severity.WARNING,
                 f"rate of {name}",
                 "the DBC gives no cycle time: its sensors count as silent after five ticks",
             )
-            for name in sorted(further)
-            if read[name].cycle_time_ns is None
+            for name, message in further.items()
+            if message.cycle_time_ns is None
         ],
-        _staleness(ready, heights),
-        _load(ready),
-        *_authenticated(ready),
+        _staleness(plan, heights),
+        _load(plan),
+        *_authentication(plan),
     ]
-    if config.prescribed_motion is not None:
+    if plan.is_prescribed:
         text = "the motion is prescribed: no loop is closed that could become unstable"
         return [*findings, Finding(Severity.OK, "poles", text)]
-    plant = build_plant(ready)
-    return [*findings, *_stability(ready, plant), *_observability(ready, plant)]
+    plant = build_plant(plan)
+    return [*findings, *_stability(plan, plant), *_observability(plan, plant)]
 
 
-def errors(ready: Setup) -> list[Finding]:
-    """What keeps a run from starting; arguments and errors as of `check`."""
-    return [finding for finding in check(ready) if finding.severity is Severity.ERROR]
+def errors(plan: Plan) -> list[Finding]:
+    """Findings that prevent a run from starting; arguments and errors as of `check`."""
+    return [finding for finding in check(plan) if finding.severity is Severity.ERROR]
 
 
-def _protected(message: Message) -> Finding:
+def _message(channel: Channel) -> Message:
+    if channel.message is None:
+        raise ValueError(f"{channel.key}: expected a channel on a bus")
+    return channel.message
+
+
+def _protection(message: Message) -> Finding:
     if message.protection is None:
         return Finding(
             Severity.WARNING,
@@ -143,54 +141,40 @@ def _rate(message: Message, period_ns: int) -> Finding:
     return Finding(Severity.OK, what, text)
 
 
-def _resolution(ready: Setup) -> list[Finding]:
-    """What one step of each height sensor is to the observer."""
+def _resolution(plan: Plan) -> list[Finding]:
+    """What one step of each height sensor means to its observer."""
     findings: list[Finding] = []
-    config = ready.config
-    for name, entry in config.signals.height.items():
-        step_m = si_step(ready.database.message(entry.message), entry.signal, Dimension.LENGTH)
-        if step_m == 0.0 or config.prescribed_motion is not None:
+    for channel in plan.heights:
+        step_m = si_step(_message(channel), channel.signal, channel.quantity.dimension)
+        if step_m == 0.0 or plan.is_prescribed:
             continue
-        observer = config.observers[name]
-        what, text = f"resolution of {name}", f"steps of {step_m * 1e6:.3g} µm"
-        is_coarse = False
-        if isinstance(observer, PiObserver):
-            force_n = step_m * observer.proportional_n_per_m
-            text += f", each {force_n:.3g} N at K_P"
-            weight_n = _weight_n(ready)
-            is_coarse = weight_n is not None and force_n > _COARSE_OF_WEIGHT * weight_n
-            hint = ": more than 1 % of the model's weight; see rig tune"
-        else:
-            follower = getattr(observer, "filter", None)
-            noise_m = None if follower is None else follower.noise_std_m
-            is_coarse = noise_m is not None and step_m / sqrt(12.0) > noise_m
-            hint = ": their rounding alone is more than filter.noise_std_m; see rig tune"
-        severity = Severity.WARNING if is_coarse else Severity.OK
-        findings.append(Finding(severity, what, text + hint * is_coarse))
+        observer = plan.struts[channel.strut].observer
+        remark = observer.remark_on_step(SensorStep(step_m, _weight_n(plan)))
+        text = ", ".join(filter(None, (f"steps of {step_m * 1e6:.3g} µm", remark.text)))
+        severity = Severity.WARNING if remark.is_warning else Severity.OK
+        findings.append(Finding(severity, f"resolution of {channel.name}", text))
     return findings
 
 
-def _weight_n(ready: Setup) -> float | None:
+def _weight_n(plan: Plan) -> float | None:
     """Weight of the model's bodies; None where they stand in a file of their own."""
-    skeleton = ready.model.skeleton
+    skeleton = plan.model.skeleton
     if not isinstance(skeleton, InlineSkeleton):
         return None
     mass_kg = sum(body.mass_kg for body in skeleton.bodies)
-    return mass_kg * abs(ready.model.gravity_m_per_s2) or None
+    return mass_kg * abs(plan.model.gravity_m_per_s2) or None
 
 
-def _staleness(ready: Setup, heights: list[Message]) -> Finding:
-    stale_ns = round(ready.config.supervision.stale_after_s * 1e9)
-    messages = list(heights)
-    if ready.config.prescribed_motion is not None:
-        cell = ready.config.signals.others[LOAD_CELL_FORCE]
-        messages.append(ready.database.message(cell.message))
+def _staleness(plan: Plan, heights: list[Message]) -> Finding:
+    stale_ns = plan.config.supervision.stale_after_ns
+    cell = plan.bench_channel(LOAD_CELL_FORCE)
+    messages = [*heights, _message(cell)] if plan.is_prescribed and cell is not None else heights
     slowest_ns = max(message.cycle_time_ns or 0 for message in messages)
-    delay_ns = max(entry.delay_ns for entry in ready.config.signals.height.values())
+    delay_ns = max(channel.delay_ns for channel in plan.heights)
     text = f"stale after {stale_ns * 1e-6:g} ms, slowest measurement every {slowest_ns * 1e-6:g} ms"
     if delay_ns:
-        text += f", {delay_ns * 1e-6:g} ms old when it comes"
-    if stale_ns < slowest_ns + delay_ns + ready.config.period_ns:
+        text += f", {delay_ns * 1e-6:g} ms old when it arrives"
+    if stale_ns < slowest_ns + delay_ns + plan.period_ns:
         return Finding(
             Severity.ERROR,
             "supervision.stale_after_s",
@@ -200,41 +184,33 @@ def _staleness(ready: Setup, heights: list[Message]) -> Finding:
     return Finding(Severity.OK, "supervision.stale_after_s", text)
 
 
-def _authenticated(ready: Setup) -> list[Finding]:
-    asked = ready.config.authentication
-    if asked is None:
+def _authentication(plan: Plan) -> list[Finding]:
+    settings = plan.config.authentication
+    if settings is None:
         return []
-    load_authentication(ready)
+    load_authentication(plan)
     text = (
-        f"AES-128 CMAC, {asked.mac_bits} bits, freshness {asked.freshness_bits} bits, "
-        f"clocks within {asked.clock_tolerance_s:g} s"
+        f"AES-128 CMAC, {settings.mac_bits} bits, freshness {settings.freshness_bits} bits, "
+        f"clocks within {settings.clock_tolerance_s:g} s"
     )
-    path = ready.source.parent / asked.key_file
+    path = plan.source.parent / settings.key_file
     if path.stat().st_mode & _OTHERS_MAY_READ:
-        return [
-            Finding(
-                Severity.ERROR,
-                "authentication",
-                f"{text}; {path} can be read by others, expected mode 0600",
-            )
-        ]
+        text += f"; {path} can be read by others, expected mode 0600"
+        return [Finding(Severity.ERROR, "authentication", text)]
     return [Finding(Severity.OK, "authentication", text)]
 
 
-def _load(ready: Setup) -> Finding:
-    config, database = ready.config, ready.database
-    sent = config.published_messages()
-    names = {entry.message for entry in config.subscribed().values()}.union(sent)
-    period_ns = config.period_ns
+def _load(plan: Plan) -> Finding:
+    config = plan.config
+    sent = {message.name for message in plan.sent_messages()}
     load = 0.0
-    for name in sorted(names):
-        message = database.message(name)
-        cycle_ns = message.cycle_time_ns or period_ns
-        if name in sent:
-            cycle_ns = max(cycle_ns, period_ns)
+    for message in sorted(plan.messages(), key=lambda item: item.name):
+        cycle_ns = message.cycle_time_ns or plan.period_ns
+        if message.name in sent:
+            cycle_ns = max(cycle_ns, plan.period_ns)
         if config.authentication is not None:
             length = message.length_bytes + config.authentication.trailer_bytes
-            message = replace(message, length_bytes=length, is_fd=True)
+            message = replace(message, length_bytes=length, is_fd=True)  # noqa: PLW2901
         time_s = frame_time_s(message, config.bus.bitrate, config.bus.data_bitrate)
         load += time_s / (cycle_ns * 1e-9)
     rate = f"{config.bus.bitrate / 1e6:g} Mbit/s"
@@ -244,18 +220,16 @@ def _load(ready: Setup) -> Finding:
     return Finding(Severity.WARNING if load > HIGH_LOAD else Severity.OK, "bus load", text)
 
 
-def _stability(ready: Setup, plant: Plant) -> list[Finding]:
-    observers = tuple(ready.config.observers.values())
-    rest = tuple(strut.free_length_m for strut in ready.model.struts)
-    every = arrivals(ready)
+def _stability(plan: Plan, plant: AnyPlant) -> list[Finding]:
+    rest = tuple(strut.free_length_m for strut in plan.struts)
     rhythm = Rhythm.of(
-        ready.config.period_ns,
-        max(arrival.interval_ns for arrival in every),
-        max(arrival.delay_ns for arrival in every),
+        plan.period_ns,
+        max(strut.interval_ns for strut in plan.struts),
+        max(strut.delay_ns for strut in plan.struts),
     )
-    poles = closed_loop_poles(plant, observers, rest, rhythm)
-    findings = [_worst(poles), *_bandwidths(ready)]
-    late = closed_loop_poles(plant, observers, rest, rhythm._replace(delay=rhythm.delay + 1))
+    poles = closed_loop_poles(plant, plan.observers, rest, rhythm)
+    findings = [_worst(poles), *_bandwidths(plan)]
+    late = closed_loop_poles(plant, plan.observers, rest, rhythm._replace(delay=rhythm.delay + 1))
     worst = max(pole.magnitude for pole in late)
     text = f"largest |z| {worst:.5f} with measurements one cycle late"
     if worst < 1.0:
@@ -266,43 +240,37 @@ def _stability(ready: Setup, plant: Plant) -> list[Finding]:
     return findings
 
 
-def _bandwidths(ready: Setup) -> list[Finding]:
-    """Filters that follow single measurements, because their corner is near the rate's."""
+def _bandwidths(plan: Plan) -> list[Finding]:
+    """Whether filters smooth, or follow single measurements: their corner is near the rate."""
     findings: list[Finding] = []
-    for (name, observer), arrival in zip(
-        ready.config.observers.items(), arrivals(ready), strict=True
-    ):
-        follower = getattr(observer, "filter", None)
-        if follower is None:
-            continue
-        rate_hz = 1e9 / arrival.interval_ns
-        text = f"{follower.bandwidth_hz:g} Hz of {rate_hz:g} measurements a second"
-        if follower.bandwidth_hz > _WIDEST_OF_RATE * rate_hz:
-            text += ": follows single measurements, expected a third of them at most; see rig tune"
-            findings.append(Finding(Severity.WARNING, f"filter of {name}", text))
-        else:
-            findings.append(Finding(Severity.OK, f"filter of {name}", text))
+    for strut in plan.struts:
+        remark = strut.observer.remark_on_rate(1e9 / strut.interval_ns)
+        if remark is not None:
+            severity = Severity.WARNING if remark.is_warning else Severity.OK
+            findings.append(Finding(severity, f"filter of {strut.name}", remark.text))
     return findings
 
 
-def _observability(ready: Setup, plant: Plant) -> list[Finding]:
-    """Which of the struts' forces are observable from the heights, and which are not, in words."""
-    names = [strut.name for strut in ready.model.struts]
-    linear = linear_model(plant, [strut.free_length_m for strut in ready.model.struts])
-    every = [i for i, name in enumerate(names) if name in ready.config.signals.height]
-    forces = [Unknown(f"the residual force of {names[i]}", i) for i in every]
-    found = observability(linear, every, forces)
-    text = f"the heights tell the residual force of {', '.join(names[i] for i in every)}"
-    wrong = [*(item.name for item in found.hidden), *map(_apart, found.confused)]
-    if not wrong and not found.together:
-        wrong = ["all of these forces at once, which can be in balance: leave out one observer"]
+def _observability(plan: Plan, plant: AnyPlant) -> list[Finding]:
+    """Which of the struts' forces are observable from the heights, and which are not."""
+    names = plan.strut_names
+    linear = linear_model(plant, [strut.free_length_m for strut in plan.struts])
+    measured = [channel.strut for channel in plan.heights]
+    forces = [Unknown(f"the residual force of {names[i]}", i) for i in measured]
+    result = observability(linear, measured, forces)
+    hidden = [*(item.name for item in result.hidden), *map(_pair, result.confused)]
+    if not hidden and not result.together:
+        hidden = ["all of these forces at once, which can be in balance: leave out one observer"]
+    shown = ", ".join(names[i] for i in measured)
     findings = [
-        Finding(Severity.WARNING, "observability", f"the heights do not tell {'; '.join(wrong)}")
-        if wrong
-        else Finding(Severity.OK, "observability", text)
+        Finding(
+            Severity.WARNING, "observability", f"not observable from heights: {'; '.join(hidden)}"
+        )
+        if hidden
+        else Finding(Severity.OK, "observability", f"the residual force of {shown} is observable")
     ]
-    untold: list[str] = []
-    for i in every:
+    confused: list[str] = []
+    for i in measured:
         name = names[i]
         of_strut = (
             Unknown(f"the spring's force of {name}", i),
@@ -311,22 +279,21 @@ def _observability(ready: Setup, plant: Plant) -> list[Finding]:
             Unknown("an offset of its height sensor", i, is_offset=True),
         )
         for pair in (of_strut[:2], of_strut[2:]):
-            untold += map(_apart, observability(linear, every, pair).confused)
-    if untold:
-        text = f"the heights do not tell {'; '.join(untold)}: a law or a load cell does"
-        findings.append(Finding(Severity.OK, "what heights cannot tell", text))
-    for i in every if len(every) > 1 else ():
-        name = names[i]
-        found = observability(linear, [j for j in every if j != i], forces)
-        lost = [*(item.name for item in found.hidden), *map(_apart, found.confused)]
+            confused += map(_pair, observability(linear, measured, pair).confused)
+    if confused:
+        text = f"indistinguishable: {'; '.join(confused)}: a law or a load cell separates them"
+        findings.append(Finding(Severity.OK, "limits of heights alone", text))
+    for i in measured if len(measured) > 1 else ():
+        result = observability(linear, [j for j in measured if j != i], forces)
+        lost = [*(item.name for item in result.hidden), *map(_pair, result.confused)]
         if lost:
-            text = f"the others would not tell {'; '.join(lost)}"
-            findings.append(Finding(Severity.OK, f"without the height of {name}", text))
+            text = f"not observable from the others: {'; '.join(lost)}"
+            findings.append(Finding(Severity.OK, f"without the height of {names[i]}", text))
     return findings
 
 
-def _apart(pair: tuple[Unknown, Unknown]) -> str:
-    return f"{pair[0].name} from {pair[1].name}"
+def _pair(pair: tuple[Unknown, Unknown]) -> str:
+    return f"{pair[0].name} and {pair[1].name}"
 
 
 def _worst(poles: list[Pole]) -> Finding:

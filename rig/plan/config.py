@@ -1,7 +1,6 @@
 """Configuration of the bridge: YAML -> frozen values, validated once."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -11,25 +10,34 @@ from pydantic import (
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
+    create_model,
     model_validator,
 )
 from pydantic_core import CoreSchema
 from pydantic_core.core_schema import tagged_union_schema
 
 from can_dbc.yaml_file import Finite, Positive
-from rig.bridge.contract import Observer
-from rig.bridge.devices import LARGEST_NODE_ID, Device
-from rig.bridge.messages import STATUS, STRUT, TIMING, Publication
-from rig.bridge.supervisor import Action, Limit, Supervision, Watched
+from rig.bridge.devices import DeviceSettings
+from rig.bridge.publications import STATUS, STRUT, TIMING, Publication
+from rig.bridge.supervisor import Supervision
 from rig.bus.bus import BusConfig
 from rig.bus.secoc import Authentication
+from rig.channels.channel import SignalName
+from rig.channels.quantities import (
+    APPLIED_FORCE,
+    BENCH_QUANTITIES,
+    HEIGHT,
+    LOAD_CELL_FORCE,
+    STRUT_QUANTITIES,
+    Noise,
+    Quantity,
+)
 from rig.log.captures import Window
 from rig.log.writer import Rotation
 from rig.observers import DEFAULT_KIND, OBSERVERS
-from rig.plan.quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, OTHERS, Quantity
+from rig.observers.protocol import AnyObserver
 
-_EMERGENCY_ID = 0x080
-_KEYS = (HEIGHT.key, "further", *(quantity.key for quantity in OTHERS))
+_KEYS = (HEIGHT.key, "further", *(quantity.key for quantity in BENCH_QUANTITIES))
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 """Folder of the configurations that come with the package."""
@@ -42,26 +50,39 @@ class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class SignalName(_Frozen):
-    """Where a value stands on the bus.
+class _OneOf:
+    """Reads one of several kinds of settings, told by the value of one key.
 
-    Attributes:
-        message: Message of the DBC.
-        signal: Signal of the message; its unit is converted.
+    Args:
+        key: The key.
+        choices: Value of the key -> its settings.
+        default: Value where the key is absent.
     """
 
-    message: Text
-    signal: Text
+    def __init__(self, key: str, choices: Mapping[str, type[Any]], default: str | None) -> None:
+        self._key, self._choices, self._default = key, choices, default
+
+    def _kind(self, data: object) -> str:
+        """Kind of an entry, in brackets: it is no key of the file."""
+        if isinstance(data, dict):
+            return f"<{cast('dict[str, object]', data).get(self._key, self._default)}>"
+        return f"<{getattr(data, self._key, None)}>"
+
+    def __get_pydantic_core_schema__(
+        self, _source: object, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        choices = {f"<{kind}>": handler.generate_schema(it) for kind, it in self._choices.items()}
+        return tagged_union_schema(choices, self._kind)
 
 
 class HeightSignal(SignalName):
-    """Where a height stands on the bus, and how late it comes.
+    """Where a height stands on the bus, and its delay.
 
     Attributes:
         message: Message of the DBC.
         signal: Signal of the message; its unit is converted.
-        delay_s: How much later its frame comes than it was true: filters of the sensor, its cycle,
-            the bus. The model's height of that time is compared with it.
+        delay_s: How much later its frame arrives than it was true: filters of the sensor, its
+            cycle, the bus. The model's height of that time is compared with it.
     """
 
     delay_s: Annotated[float, Field(ge=0, le=1.0, allow_inf_nan=False)] = 0.0
@@ -72,68 +93,63 @@ class HeightSignal(SignalName):
         return round(self.delay_s * 1e9)
 
 
-class FurtherHeight(HeightSignal):
-    """Another height of a strut.
+class SensorSignal(HeightSignal):
+    """A further sensor of a strut: another height, a velocity, or a load cell in the strut.
 
     Attributes:
-        measures: Tag.
-        noise_std_m: Standard deviation of a reading, quantisation included.
+        measures: What it measures.
     """
 
-    measures: Literal["height"]
-    noise_std_m: Annotated[float, Field(ge=1e-9, le=1.0)]
+    measures: str
+
+    @property
+    def quantity(self) -> Quantity:
+        """What it measures."""
+        return STRUT_QUANTITIES[self.measures]
 
     @property
     def noise_std(self) -> float:
-        """In SI."""
-        return self.noise_std_m
+        """Standard deviation of a reading in SI, quantisation included."""
+        return float(getattr(self, _noise(self.quantity).key))
 
 
-class FurtherVelocity(HeightSignal):
-    """A velocity of the height, positive in rebound.
-
-    Attributes:
-        measures: Tag.
-        noise_std_m_per_s: Standard deviation of a reading, quantisation included.
-    """
-
-    measures: Literal["velocity"]
-    noise_std_m_per_s: Annotated[float, Field(ge=1e-7, le=100.0)]
-
-    @property
-    def noise_std(self) -> float:
-        """In SI."""
-        return self.noise_std_m_per_s
+def _noise(quantity: Quantity) -> Noise:
+    if quantity.noise is None:
+        raise ValueError(f"{quantity.key}: expected the noise of a sensor that measures it")
+    return quantity.noise
 
 
-class FurtherForce(HeightSignal):
-    """A load cell in the strut, positive when the strut pushes.
+def _sensor_settings(quantity: Quantity) -> type[SensorSignal]:
+    """Settings of a sensor that measures a quantity of a strut."""
+    noise = _noise(quantity)
+    std = Annotated[float, Field(ge=noise.low, le=noise.high)]
+    fields: dict[str, Any] = {"measures": (Literal[quantity.key], ...), noise.key: (std, ...)}
+    name = f"{quantity.key.capitalize()}Sensor"
+    settings = create_model(name, __base__=SensorSignal, __module__=__name__, **fields)
+    settings.__doc__ = f"""{quantity.words[0].upper()}{quantity.words[1:]}.
 
     Attributes:
-        measures: Tag.
-        noise_std_n: Standard deviation of a reading, quantisation included.
+        message: Message of the DBC.
+        signal: Signal of the message; its unit is converted.
+        delay_s: How much later its frame arrives than it was true.
+        measures: What it measures: `{quantity.key}`.
+        {noise.key}: Standard deviation of a reading, quantisation included.
     """
-
-    measures: Literal["force"]
-    noise_std_n: Annotated[float, Field(ge=1e-4, le=1e7)]
-
-    @property
-    def noise_std(self) -> float:
-        """In SI."""
-        return self.noise_std_n
+    return settings
 
 
-FurtherSensor = Annotated[
-    FurtherHeight | FurtherVelocity | FurtherForce, Field(discriminator="measures")
-]
+SENSORS: Mapping[str, type[SensorSignal]] = {
+    key: _sensor_settings(quantity) for key, quantity in STRUT_QUANTITIES.items()
+}
+"""What a further sensor `measures` -> its settings."""
 
 
 class Signals(_Frozen):
-    """What is read from the bus: heights, and any other quantity of `OTHERS` under its key.
+    """What is read from the bus: heights, and quantities of the bench under their keys.
 
     Attributes:
         height: Measured height of each strut, by strut name.
-        further: Sensors beside it, by the names of strut and sensor.
+        further: Further sensors of a strut, by the names of strut and sensor.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")
@@ -142,9 +158,9 @@ class Signals(_Frozen):
     )
 
     height: Annotated[dict[str, HeightSignal], Field(min_length=1)]
-    further: dict[str, dict[SensorName, FurtherSensor]] = Field(
-        default_factory=dict[str, dict[str, FurtherSensor]]
-    )
+    further: dict[
+        str, dict[SensorName, Annotated[SensorSignal, _OneOf("measures", SENSORS, None)]]
+    ] = Field(default_factory=dict[str, dict[str, SensorSignal]])
 
     @model_validator(mode="before")
     @classmethod
@@ -156,57 +172,15 @@ class Signals(_Frozen):
         return cast("object", data)
 
     @property
-    def others(self) -> dict[Quantity, SignalName]:
-        """Signals of the quantities beside heights, in the order of `OTHERS`."""
+    def bench(self) -> dict[Quantity, SignalName]:
+        """Signals of the quantities of the bench, in the order of `BENCH_QUANTITIES`."""
         given = self.__pydantic_extra__
-        found = ((quantity, given.get(quantity.key)) for quantity in OTHERS)
-        return {quantity: signal for quantity, signal in found if signal is not None}
-
-    @property
-    def measured(self) -> tuple[Quantity, ...]:
-        """Quantities beside heights that the bench sends."""
-        return tuple(self.others)
-
-    def sensors(self) -> list[tuple[str, str, FurtherHeight | FurtherVelocity | FurtherForce]]:
-        """Further sensors: name with the strut's before it, strut, and the sensor itself."""
-        return [
-            (f"{strut}.{name}", strut, entry)
-            for strut, group in self.further.items()
-            for name, entry in group.items()
-        ]
-
-    def named(self) -> dict[str, SignalName]:
-        """All signals by their keys, heights first."""
-        further: dict[str, SignalName] = {
-            f"signals.further.{name}": entry for name, _, entry in self.sensors()
-        }
-        heights: dict[str, SignalName] = {
-            f"signals.height.{name}": entry for name, entry in self.height.items()
-        }
-        others = {f"signals.{quantity.key}": entry for quantity, entry in self.others.items()}
-        return {**heights, **others, **further}
-
-
-def _observer_kind(data: object) -> object:
-    """Which of `OBSERVERS` an entry is, in brackets: it is no key of the file."""
-    if isinstance(data, dict):
-        return f"<{cast('dict[str, object]', data).get('kind', DEFAULT_KIND)}>"
-    return f"<{getattr(data, 'kind', None)}>"
-
-
-class _OneOfObservers:
-    """How pydantic reads one of `OBSERVERS`, by its `kind`."""
-
-    @classmethod
-    def __get_pydantic_core_schema__(
-        cls, _source: object, handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
-        choices = {f"<{kind}>": handler.generate_schema(made) for kind, made in OBSERVERS.items()}
-        return tagged_union_schema(choices, _observer_kind)
+        entries = ((quantity, given.get(quantity.key)) for quantity in BENCH_QUANTITIES)
+        return {quantity: signal for quantity, signal in entries if signal is not None}
 
 
 class PrescribedMotion(_Frozen):
-    """A dyno: the motion is prescribed, the model follows it, and the load cell measures.
+    """A dyno: the motion is prescribed, the model follows it, and the load cell measures its force.
 
     Attributes:
         settling_s: Time constant with which older heights fade in the velocity that the model is
@@ -218,18 +192,18 @@ class PrescribedMotion(_Frozen):
 
 
 Mapped = dict[str, SignalName]
-"""What is published, by its key, and where it stands on the bus."""
+"""Signals that publish something, by its key."""
 
 
 def _is_of_one_strut(published: object) -> bool:
-    """Whether its keys are publications, and not names of struts."""
+    """Whether the keys are publications, and not names of struts."""
     given = cast("dict[object, object]", published) if isinstance(published, dict) else {}
     keys = [item.key for item in STRUT]
     return any(key in keys or not _is_group(value) for key, value in given.items())
 
 
 def _is_group(value: object) -> bool:
-    """Whether it is what one strut publishes, and not a signal."""
+    """Whether a value is a group of signals, and not a signal."""
     return isinstance(value, dict) and "message" not in value and "signal" not in value
 
 
@@ -254,125 +228,6 @@ def _mapping(choices: Sequence[Publication]) -> Callable[[object], object]:
                 return data
 
     return read
-
-
-class DeviceConfig(_Frozen):
-    """A device that says how it is; its frames are refused while something is wrong.
-
-    Attributes:
-        node_id: CANopen node id; a device has this or a NAME.
-        emergency_id: Arbitration id of its emergency frames; 128 and the node id if absent.
-        heartbeat_s: Longest time between two heartbeats; they are not watched if absent.
-        alarms: Signals that are other than zero while something is wrong with it.
-        j1939_name: NAME of a J1939 device: 64 bits, as it claims its address with.
-        source_address: Address of a J1939 device at the start; a claim later on changes it.
-    """
-
-    node_id: Annotated[int, Field(ge=1, le=LARGEST_NODE_ID, strict=True)] | None = None
-    emergency_id: Annotated[int, Field(ge=1, le=0x7FF, strict=True)] | None = None
-    heartbeat_s: Annotated[float, Field(ge=0.001, le=165.0, allow_inf_nan=False)] | None = None
-    alarms: Annotated[tuple[SignalName, ...], Field(max_length=16)] = ()
-    j1939_name: Annotated[int, Field(ge=0, lt=2**64, strict=True)] | None = None
-    source_address: Annotated[int, Field(ge=0, le=253, strict=True)] | None = None
-
-    @model_validator(mode="after")
-    def _one_kind(self) -> "DeviceConfig":
-        of_canopen = (self.node_id, self.emergency_id, self.heartbeat_s)
-        of_j1939 = (self.j1939_name, self.source_address)
-        is_canopen = self.node_id is not None and of_j1939 == (None, None)
-        if not is_canopen and (of_canopen != (None, None, None) or None in of_j1939):
-            raise ValueError(
-                "expected node_id, with emergency_id and heartbeat_s if wanted, or j1939_name and "
-                "source_address"
-            )
-        return self
-
-    def device(self, name: str, *, is_vital: bool) -> Device:
-        """As the core takes it."""
-        node_id = self.node_id or 0
-        device = Device(
-            name,
-            node_id,
-            self.emergency_id or _EMERGENCY_ID + node_id,
-            round((self.heartbeat_s or 0.0) * 1e9),
-            len(self.alarms),
-            is_vital,
-        )
-        if self.j1939_name is None or self.source_address is None:
-            return device
-        return device._replace(j1939_name=self.j1939_name, address=self.source_address)
-
-
-class LimitConfig(_Frozen):
-    """One row of the table of limits, for every strut.
-
-    Attributes:
-        value: What is limited, with its unit. Of the measurement: `measured_height_m`,
-            `measured_rate_m_per_s`, `unchanged_s` (how long it may stay exactly the same). Of the
-            estimate: `height_m`, `force_n`, `virtual_force_n`, `innovation_m`.
-        low: Smallest value within.
-        high: Largest value within.
-        action: `warn` reports it in the status; `refuse` drops the measurement; `hold` marks the
-            estimate invalid as long as it lasts; `safe` enters the safe state.
-    """
-
-    value: Watched
-    low: Finite | None = None
-    high: Finite | None = None
-    action: Literal["warn", "refuse", "hold", "safe"]
-
-    @model_validator(mode="after")
-    def _sensible(self) -> "LimitConfig":
-        if self.low is None and self.high is None:
-            raise ValueError(f"{self.value.value}: expected low, high or both")
-        if self.low is not None and self.high is not None and self.low >= self.high:
-            raise ValueError(f"low {self.low}: expected less than high ({self.high})")
-        if self.action == "refuse" and not self.value.is_measured:
-            raise ValueError(
-                f"action refuse of {self.value.value}: expected warn, hold or safe, "
-                "because only a measurement can be refused"
-            )
-        return self
-
-    def limit(self) -> Limit:
-        """As the core takes it."""
-        low = -math.inf if self.low is None else self.low
-        high = math.inf if self.high is None else self.high
-        return Limit(self.value, low, high, Action[self.action.upper()])
-
-
-class SupervisionConfig(_Frozen):
-    """Ages of the measurement, the output of the safe state, and the table of limits.
-
-    Attributes:
-        stale_after_s: Age of a height from which the estimate is marked invalid.
-        safe_after_s: Age from which the safe state is entered.
-        safe_output: Force that the safe state publishes: `zero`, or the `last` valid one.
-        limits: What is done beyond which values, row by row.
-    """
-
-    stale_after_s: Positive = 0.01
-    safe_after_s: Positive = 0.5
-    safe_output: Literal["zero", "last"] = "zero"
-    limits: Annotated[tuple[LimitConfig, ...], Field(max_length=100)] = ()
-
-    @model_validator(mode="after")
-    def _in_order(self) -> "SupervisionConfig":
-        if self.safe_after_s < self.stale_after_s:
-            raise ValueError(
-                f"safe_after_s {self.safe_after_s}: expected at least stale_after_s "
-                f"({self.stale_after_s})"
-            )
-        return self
-
-    def supervision(self) -> Supervision:
-        """As the core takes it."""
-        return Supervision(
-            round(self.stale_after_s * 1e9),
-            round(self.safe_after_s * 1e9),
-            self.safe_output == "last",
-            tuple(row.limit() for row in self.limits),
-        )
 
 
 class BusSettings(_Frozen):
@@ -487,16 +342,16 @@ class RunConfig(_Frozen):
         bus: How to open the bus.
         authentication: Authentication of all frames; none if absent.
         signals: What is read from it.
-        devices: Devices that say how they are, by the names of their nodes in the DBC.
+        devices: Devices that report their state, by the names of their nodes in the DBC.
         prescribed_motion: Declares a dyno; there is then a load cell and no applied force.
         observers: One for each strut of the model, by strut name; PI where none is named.
             `kind` says which, `pi` if absent; its other keys are its own. A dyno uses none.
         publish: What is published of each strut, by strut name: signals by the keys of
-            `rig.bridge.messages.STRUT`. By default, where the DBC has them, RIG_ESTIMATE and
+            `rig.bridge.publications.STRUT`. By default, where the DBC has them, RIG_ESTIMATE and
             RIG_KINEMATICS for the first strut, and the same with _2, _3, ... for the next ones.
-        status: What is published of the bridge, by the keys of `rig.bridge.messages.STATUS`; or a
-            message that has a signal of each name. By default RIG_STATUS, where the DBC has it.
-        timing: How well the rate is kept, by the keys of `rig.bridge.messages.TIMING`, or a
+        status: What is published of the bridge, by the keys of `rig.bridge.publications.STATUS`; or
+            a message that has a signal of each name. By default RIG_STATUS, where the DBC has it.
+        timing: How well the rate is kept, by the keys of `rig.bridge.publications.TIMING`, or a
             message;
             nothing by default.
         supervision: Ages and safe state.
@@ -512,20 +367,22 @@ class RunConfig(_Frozen):
     bus: BusSettings = BusSettings()
     authentication: AuthenticationConfig | None = None
     signals: Signals
-    devices: dict[SensorName, DeviceConfig] = Field(default_factory=dict[str, DeviceConfig])
+    devices: dict[SensorName, DeviceSettings] = Field(default_factory=dict[str, DeviceSettings])
     prescribed_motion: PrescribedMotion | None = None
-    observers: dict[str, Annotated[Observer, _OneOfObservers]] = Field(default_factory=dict)
+    observers: dict[str, Annotated[AnyObserver, _OneOf("kind", OBSERVERS, DEFAULT_KIND)]] = Field(
+        default_factory=dict
+    )
     publish: dict[str, Annotated[Mapped, BeforeValidator(_mapping(STRUT))]] | None = None
     status: Annotated[Mapped, BeforeValidator(_mapping(STATUS))] | None = None
     timing: Annotated[Mapped, BeforeValidator(_mapping(TIMING))] | None = None
-    supervision: SupervisionConfig = SupervisionConfig()
+    supervision: Supervision = Supervision()
     realtime: Realtime = Realtime()
     log: LogConfig = LogConfig()
 
     @model_validator(mode="before")
     @classmethod
     def _one_strut(cls, data: Any) -> Any:
-        """Let a model of one strut say what is measured and published without the strut's name."""
+        """Let a model of one strut be measured and published without the strut's name."""
         match data:
             case {"signals": {"height": {"message": _, "signal": _} as height, **others}, **rest}:
                 data = {**rest, "signals": {**others, "height": {"": height}}}
@@ -543,25 +400,16 @@ class RunConfig(_Frozen):
             return self
         if self.signals.further:
             raise ValueError(
-                "signals.further: expected none beside prescribed_motion, which uses no observer"
+                "signals.further: expected none with prescribed_motion, which uses no observer"
             )
-        if LOAD_CELL_FORCE not in self.signals.others:
-            raise ValueError("prescribed_motion: expected signals.load_cell_force beside it")
-        if APPLIED_FORCE in self.signals.others:
+        if LOAD_CELL_FORCE not in self.signals.bench:
+            raise ValueError("prescribed_motion: requires signals.load_cell_force")
+        if APPLIED_FORCE in self.signals.bench:
             raise ValueError(
-                "prescribed_motion: expected no signals.applied_force beside it, because a motion "
-                "that is prescribed asks for no force"
+                "prescribed_motion: expected no signals.applied_force, because a prescribed motion "
+                "requires no force"
             )
         return self
-
-    def subscribed(self) -> dict[str, SignalName]:
-        """Every signal that the bridge reads, by its key."""
-        alarms = {
-            f"devices.{name}.alarms.{place}": entry
-            for name, device in self.devices.items()
-            for place, entry in enumerate(device.alarms)
-        }
-        return {**self.signals.named(), **alarms}
 
     def published(self) -> dict[str, SignalName]:
         """Every signal that the bridge sends, by its key."""
@@ -570,10 +418,6 @@ class RunConfig(_Frozen):
         return {
             f"{name}.{key}": entry for name, group in groups.items() for key, entry in group.items()
         }
-
-    def published_messages(self) -> list[str]:
-        """Names of all messages that the bridge sends."""
-        return list(dict.fromkeys(entry.message for entry in self.published().values()))
 
     @property
     def period_ns(self) -> int:

@@ -1,8 +1,8 @@
-"""What is changed while a run goes on: gains and limits, from one tick on.
+"""Changes of gains and limits while a run is going on, from one tick on.
 
-A change is checked as the configuration is. It becomes another bridge, made ready beside the loop,
-which goes on from the state of the one before; the log says from which tick on, so that a replay
-changes there too.
+A change is checked as the configuration is. It becomes another bridge, prepared outside the loop,
+which continues from the state of the one before; the log holds the tick from which on, so that a
+replay changes there too.
 """
 
 import json
@@ -14,7 +14,7 @@ from can_dbc.errors import InputError
 from can_dbc.yaml_file import parse_mapping, read_text, validated
 from rig.bridge.bridge import Bridge
 from rig.plan.config import RunConfig
-from rig.plan.setup import Setup
+from rig.plan.plan import Plan
 
 CHANGES_FILE = "changes.jsonl"
 """Changes of a run in its folder: one a line, with the time of the first tick that had it."""
@@ -29,8 +29,8 @@ Changes = Callable[[int], Bridge | None]
 """Time of a tick -> the bridge from that tick on, if it is another one."""
 
 
-def unchanged(_t_ns: int) -> None:
-    """Nothing is changed."""
+def no_changes(_t_ns: int) -> None:
+    """Changes of a run that is never changed."""
 
 
 def parse_assignments(texts: Sequence[str]) -> dict[str, object]:
@@ -39,29 +39,29 @@ def parse_assignments(texts: Sequence[str]) -> dict[str, object]:
     Raises:
         InputError: A text is none.
     """
-    found: dict[str, object] = {}
+    assignments: dict[str, object] = {}
     for text in texts:
         key, equals, value = text.partition("=")
         if not (key and equals and value):
             raise InputError(
                 f"{text!r}: expected KEY=VALUE, as in observers.strut.force_limit_n=900"
             )
-        found[key.strip()] = parse_mapping(f"value: {value}", repr(text))["value"]
-    return found
+        assignments[key.strip()] = parse_mapping(f"value: {value}", repr(text))["value"]
+    return assignments
 
 
-def reassigned(ready: Setup, assignments: Assignments, source: str) -> Setup:
-    """A configuration with other values.
+def assign(plan: Plan, assignments: Assignments, source: str) -> Plan:
+    """The plan with other values.
 
     Args:
-        ready: The configuration.
-        assignments: What is changed.
+        plan: The plan.
+        assignments: The values.
         source: What to call the change in an error.
 
     Raises:
         InputError: A key cannot be changed or is unknown, or a value is wrong.
     """
-    content = ready.config.model_dump(mode="json")
+    content = plan.config.model_dump(mode="json")
     for key, value in assignments.items():
         section, *names = key.split(".")
         if section not in CHANGEABLE or not names:
@@ -72,33 +72,29 @@ def reassigned(ready: Setup, assignments: Assignments, source: str) -> Setup:
         _assign(content[section], names, value, source, key)
     config = validated(RunConfig, content, source)
     for name, observer in config.observers.items():
-        before = ready.config.observers[name]
-        if getattr(observer, "filter", None) != getattr(before, "filter", None):
+        before = plan.config.observers[name]
+        if not observer.can_continue(before):
+            key = "kind" if observer.kind != before.kind else "filter"
             raise InputError(
-                f"{source}: observers.{name}.filter: cannot be changed in a run, whose state is "
-                "that of the filter it has"
+                f"{source}: observers.{name}.{key}: cannot be changed in a run, which continues "
+                "from the state of its observer"
             )
-        if type(observer) is not type(before):
-            raise InputError(
-                f"{source}: observers.{name}.kind: cannot be changed in a run, whose state is "
-                "that of the observer it has"
-            )
-    return ready.model_copy(update={"config": config})
+    return plan.with_config(config)
 
 
-def _assign(place: object, names: Sequence[str], value: object, source: str, key: str) -> None:
+def _assign(section: object, names: Sequence[str], value: object, source: str, key: str) -> None:
     """Set a value in a section; a row of a list goes by its number, from 0 on."""
     name, *others = names
     known: list[str] = []
-    if isinstance(place, dict):
-        known = list(cast("dict[str, object]", place))
-    elif isinstance(place, list):
-        known = [str(number) for number in range(len(cast("list[object]", place)))]
+    if isinstance(section, dict):
+        known = list(cast("dict[str, object]", section))
+    elif isinstance(section, list):
+        known = [str(number) for number in range(len(cast("list[object]", section)))]
     if name not in known:
         expected = f"one of {', '.join(known)}" if known else "the key before it as a whole"
         raise InputError(f"{source}: {key}: no {name!r}, expected {expected}")
-    holder = cast("dict[str | int, object]", place)
-    index = int(name) if isinstance(place, list) else name
+    holder = cast("dict[str | int, object]", section)
+    index = int(name) if isinstance(section, list) else name
     if others:
         _assign(holder[index], others, value, source, key)
     elif isinstance(holder[index], dict):
@@ -108,11 +104,9 @@ def _assign(place: object, names: Sequence[str], value: object, source: str, key
         holder[index] = value
 
 
-def changed_bridge(bridge: Bridge, ready: Setup) -> Bridge:
-    """The bridge with a configuration's observers and limits; model and messages are its own."""
-    supervision = ready.config.supervision.supervision()
-    core = bridge.core.changed(tuple(ready.config.observers.values()), supervision)
-    return bridge.changed(core, supervision.limits)
+def bridge_with_settings(bridge: Bridge, plan: Plan) -> Bridge:
+    """The bridge with a plan's observers and limits; model and messages are its own."""
+    return bridge.with_settings(plan.observers, plan.config.supervision)
 
 
 def change_line(t_ns: int, assignments: Assignments) -> str:
@@ -129,11 +123,11 @@ def logged_changes(folder: Path) -> list[tuple[int, dict[str, object]]]:
     path = folder / CHANGES_FILE
     if not path.exists():
         return []
-    found: list[tuple[int, dict[str, object]]] = []
+    changes: list[tuple[int, dict[str, object]]] = []
     for number, line in enumerate(read_text(path).splitlines(keepends=True), start=1):
         try:
             entry = cast("dict[str, Any]", json.loads(line))
-            found.append((int(entry["t_ns"]), dict(entry["set"])))
+            changes.append((int(entry["t_ns"]), dict(entry["set"])))
         except (ValueError, TypeError, KeyError) as error:
             if not line.endswith("\n"):
                 break
@@ -141,10 +135,10 @@ def logged_changes(folder: Path) -> list[tuple[int, dict[str, object]]]:
                 f"{path}: line {number}: {line.strip()[:60]!r}: expected a change such as "
                 '{"t_ns": 0, "set": {}}'
             ) from error
-    return found
+    return changes
 
 
-def replayed_changes(folder: Path, ready: Setup, bridge: Bridge) -> Changes:
+def replayed_changes(folder: Path, plan: Plan, bridge: Bridge) -> Changes:
     """The changes of a run, for its replay.
 
     Raises:
@@ -152,11 +146,11 @@ def replayed_changes(folder: Path, ready: Setup, bridge: Bridge) -> Changes:
     """
     coming: list[tuple[int, Bridge]] = []
     for t_ns, assignments in logged_changes(folder):
-        ready = reassigned(ready, assignments, str(folder / CHANGES_FILE))
-        bridge = changed_bridge(bridge, ready)
+        plan = assign(plan, assignments, str(folder / CHANGES_FILE))
+        bridge = bridge_with_settings(bridge, plan)
         coming.append((t_ns, bridge))
     if not coming:
-        return unchanged
+        return no_changes
     coming.reverse()
 
     def changes(t_ns: int) -> Bridge | None:

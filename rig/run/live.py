@@ -2,196 +2,168 @@
 
 import contextlib
 import signal
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Generator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from rig.bridge.bridge import Bridge
-from rig.bridge.contract import Mode
+from rig.bridge.values import Mode
 from rig.bus.bus import Bus, BusConfig
 from rig.bus.link import Link
 from rig.bus.secoc import Authentication, Authenticator
 from rig.machine.clock import Clock, RealClock, VirtualClock
 from rig.machine.realtime import Granted, Request, realtime
-from rig.plan.assembly import build_bridge
+from rig.plan.build import build_bridge
 from rig.plan.config import RunConfig
-from rig.plan.setup import Setup, load_authentication
-from rig.run.logged_run import Ended, logged, on_signal
-from rig.run.loop import Progress, Watch, unnoted, unwatched
+from rig.plan.load import load_authentication
+from rig.plan.plan import Plan
+from rig.run.logged_run import Ended, Endpoint, on_signal, run_logged
+from rig.run.loop import RunControl
 from rig.run.ports import BenchOnBus, BusPort
 from rig.run.trace import Trace
 from rig.simulated_bench.schema import BenchConfig
 from rig.simulated_bench.simulated import Bench
 
+_DEFAULT_CONTROL = RunControl()
+
 _BENCH_PORTION_NS = 20_000_000
-"""Simulated time after which the bench looks at its bus, while it catches up."""
+"""Simulated time after which the bench reads its bus, while it catches up."""
 
 _SPINNING_SHARE = 5
 """At most this part of a period is spun away before a deadline."""
 
 
 @contextlib.contextmanager
-def on_time(config: RunConfig) -> Generator[tuple[Granted, RealClock]]:
-    """Ask the machine for what a fixed rate needs.
+def real_time(config: RunConfig) -> Generator[tuple[Granted, RealClock]]:
+    """Request what a fixed rate needs of the machine.
 
     Args:
-        config: What is asked for.
+        config: What is requested.
 
     Yields:
         What was granted, and the clock to wait on; it spins only where SCHED_FIFO was granted.
     """
-    asked = config.realtime
-    request = Request(asked.fifo_priority, asked.lock_memory, asked.cpu, asked.freeze_garbage)
+    settings = config.realtime
+    request = Request(
+        settings.fifo_priority, settings.lock_memory, settings.cpu, settings.freeze_garbage
+    )
     with realtime(request) as granted:
         # From a real-time thread that never leaves its core Linux takes it for 50 ms in every
         # second.
-        spin_ns = min(round(asked.spin_s * 1e9), config.period_ns // _SPINNING_SHARE)
+        spin_ns = min(round(settings.spin_s * 1e9), config.period_ns // _SPINNING_SHARE)
         yield granted, RealClock(spin_ns if granted.fifo else 0)
 
 
 def live(
-    ready: Setup,
+    plan: Plan,
     folder: Path,
+    control: RunControl = _DEFAULT_CONTROL,
     *,
     listen_only: bool = False,
     trace: Trace | None = None,
-    forced: Sequence[Mapping[str, str]] = (),
-    stop: Callable[[], bool],
-    progress: Progress = unnoted,
-    watch: Watch = unwatched,
 ) -> Ended:
     """Run on the configured bus in real time.
 
     Args:
-        ready: Configuration, model and DBC.
+        plan: The plan.
         folder: Folder of the run; absent or empty.
+        control: How the run is ended and followed.
         listen_only: Send nothing.
         trace: Where the parts of ticks that are late are kept; None keeps nothing.
-        forced: Errors of the check that somebody passed over, for `run.yaml`.
-        stop: Asked before each tick whether to end.
-        progress: Called with time and mode of every tick.
-        watch: Given a look five times a second.
 
     Raises:
-        InputError: Something of the configuration is wrong, or the folder cannot be written.
+        InputError: The configuration is wrong, or the folder cannot be written.
         BusError: The bus cannot be opened.
     """
-    bridge = build_bridge(ready)
-    with on_time(ready.config) as (granted, clock):
-        link = _link(ready, bridge, clock, listen_only=listen_only)
+    bridge = build_bridge(plan)
+    with real_time(plan.config) as (granted, clock):
+        link = _open_link(plan, bridge, clock, listen_only=listen_only)
         port = BusPort(link)
+        endpoint = Endpoint(port, clock, link.figures, granted, acknowledge=port.acknowledge)
         try:
             with on_signal(signal.SIGUSR1, port.acknowledge):
-                return logged(
-                    ready,
-                    bridge,
-                    port,
-                    clock,
-                    folder,
-                    figures=link.figures,
-                    granted=granted,
-                    trace=trace,
-                    forced=forced,
-                    acknowledge=port.acknowledge,
-                    stop=stop,
-                    progress=progress,
-                    watch=watch,
-                )
+                return run_logged(plan, bridge, endpoint, folder, control, trace=trace)
         finally:
             link.close()
 
 
-def _link(ready: Setup, bridge: Bridge, clock: Clock, *, listen_only: bool = False) -> Link:
-    config = ready.config
-
+def _open_link(plan: Plan, bridge: Bridge, clock: Clock, *, listen_only: bool = False) -> Link:
     def open_bus() -> Bus:
         return Bus(
-            config.bus.config(),
+            plan.config.bus.config(),
             bridge.filters,
             listen_only=listen_only,
             epoch_ns=clock.epoch_ns,
         )
 
-    authenticator = _authenticator(ready, clock)
+    authenticator = _authenticator(load_authentication(plan), clock)
     return Link(open_bus, clock.epoch_now_ns, authenticator=authenticator)
 
 
-def _authenticator(ready: Setup, clock: Clock) -> Authenticator | None:
-    how = load_authentication(ready)
-    return None if how is None else Authenticator(how, clock.epoch_ns)
+def _authenticator(authentication: Authentication | None, clock: Clock) -> Authenticator | None:
+    return None if authentication is None else Authenticator(authentication, clock.epoch_ns)
 
 
 def with_bench(
-    ready: Setup,
+    plan: Plan,
     bench_config: BenchConfig,
     folder: Path,
+    control: RunControl = _DEFAULT_CONTROL,
     *,
     lockstep: bool,
     trace: Trace | None = None,
-    stop: Callable[[], bool],
-    progress: Progress = unnoted,
-    watch: Watch = unwatched,
 ) -> Ended:
     """Run with a simulated bench at the other end of the configured bus.
 
     Args:
-        ready: Configuration, model and DBC.
+        plan: The plan.
         bench_config: The bench.
         folder: Folder of the run.
+        control: How the run is ended and followed.
         lockstep: Simulated time, as fast as the machine allows; otherwise real time.
         trace: Where the parts of ticks that are late are kept; None keeps nothing.
-        stop: Asked before each tick whether to end.
-        progress: Called with time and mode of every tick.
-        watch: Given a look five times a second.
 
     Raises:
-        InputError: Something of the configuration is wrong, or the folder cannot be written.
+        InputError: The configuration is wrong, or the folder cannot be written.
         BusError: The bus cannot be opened.
     """
-    bridge = build_bridge(ready)
-    bench = Bench(bench_config, ready.database)
+    bridge = build_bridge(plan)
+    bench = Bench(bench_config, plan.database)
     if not lockstep:
-        # What is loaded at a bench's first use would hold the first ticks up.
-        Bench(bench_config, ready.database).update(_BENCH_PORTION_NS)
+        # What is loaded at a bench's first use would delay the first ticks.
+        Bench(bench_config, plan.database).update(_BENCH_PORTION_NS)
     with contextlib.ExitStack() as stack:
         granted, clock = None, VirtualClock()
         if not lockstep:
-            granted, clock = stack.enter_context(on_time(ready.config))
-        link = _link(ready, bridge, clock)
+            granted, clock = stack.enter_context(real_time(plan.config))
+        link = _open_link(plan, bridge, clock)
         stack.callback(link.close)
-        bench_bus = Bus(ready.config.bus.config(), epoch_ns=clock.epoch_ns)
+        bench_bus = Bus(plan.config.bus.config(), epoch_ns=clock.epoch_ns)
         stack.callback(bench_bus.close)
-        authenticator = _authenticator(ready, clock)
+        authenticator = _authenticator(load_authentication(plan), clock)
         port = BusPort(link)
         on_bus = BenchOnBus(bench, bench_bus, port, authenticator)
-        return logged(
-            ready,
-            bridge,
-            on_bus,
-            clock,
-            folder,
-            figures=link.figures,
-            granted=granted,
-            trace=trace,
-            begin=None if lockstep else partial(on_bus.begin, clock),
-            while_waiting=(on_bus.send_up_to,),
-            acknowledge=None if lockstep else port.acknowledge,
-            stop=stop,
-            progress=progress,
-            watch=watch,
-        )
+        endpoint = Endpoint(on_bus, clock, link.figures, while_waiting=(on_bus.send_up_to,))
+        if not lockstep:
+            endpoint = replace(
+                endpoint,
+                granted=granted,
+                begin=partial(on_bus.begin, clock),
+                acknowledge=port.acknowledge,
+            )
+        return run_logged(plan, bridge, endpoint, folder, control, trace=trace)
 
 
 def run_bench(
     bench_config: BenchConfig,
     bus_config: BusConfig,
     dbc: Path | None,
+    control: RunControl = _DEFAULT_CONTROL,
     *,
     authentication: Authentication | None = None,
-    duration_s: float | None,
-    stop: Callable[[], bool],
-    progress: Progress,
+    duration_s: float | None = None,
 ) -> int:
     """Run a simulated bench on a bus in real time.
 
@@ -199,10 +171,9 @@ def run_bench(
         bench_config: The bench.
         bus_config: The bus.
         dbc: What its messages mean; the package's own if None.
+        control: How the bench is ended and followed; `stop` is asked at least every 0.1 s.
         authentication: How its frames are secured; not at all if None.
         duration_s: Length; until asked to stop if None.
-        stop: Asked at least every 0.1 s whether to end.
-        progress: Called with the time.
 
     Returns:
         Number of frames sent.
@@ -218,17 +189,17 @@ def run_bench(
     link = Link(
         lambda: Bus(bus_config, (), epoch_ns=clock.epoch_ns),
         clock.epoch_now_ns,
-        authenticator=authentication and Authenticator(authentication, clock.epoch_ns),
+        authenticator=_authenticator(authentication, clock),
     )
     try:
-        while not stop() and (end_ns is None or due_ns < end_ns):
+        while not control.stop() and (end_ns is None or due_ns < end_ns):
             # Woken at least every 0.1 s, so that Ctrl-C takes effect between slow frames.
             now_ns = clock.wait_until(min(due_ns, clock.now_ns() + 100_000_000))
             # A machine that is too slow gets a slow bench, not a silent one that sends in bursts.
             frames, due_ns = bench.update(min(now_ns, due_ns + _BENCH_PORTION_NS))
             link.receive(now_ns)  # an interface that has gone is noticed here
             sent += len(link.send(frames))
-            progress(now_ns, Mode.RUNNING)
+            control.progress(now_ns, Mode.RUNNING)
     finally:
         link.close()
     return sent

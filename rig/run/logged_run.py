@@ -16,8 +16,8 @@ from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from dart_model.spec import copy_files, dump_model
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
-from rig.bridge.contract import Mode
-from rig.bridge.log_columns import Record, columns
+from rig.bridge.log_columns import LogColumns
+from rig.bridge.values import Mode
 from rig.bus.link import LinkFigures
 from rig.files.folders import refuse_full
 from rig.log.reader import DBC_FILE, MODEL_FILE, RUN_SCHEMA
@@ -25,21 +25,9 @@ from rig.log.steps import Step
 from rig.log.writer import RunLog
 from rig.machine.clock import Clock, OccupiedClock
 from rig.machine.realtime import Granted
-from rig.plan.assembly import sensors
-from rig.plan.setup import Setup
-from rig.run.changes import CHANGES_FILE, Changes, unchanged
-from rig.run.loop import (
-    SHOWN_EVERY_NS,
-    Look,
-    Port,
-    Progress,
-    Sink,
-    Watch,
-    regular_ticks,
-    run,
-    unnoted,
-    unwatched,
-)
+from rig.plan.plan import Plan
+from rig.run.changes import CHANGES_FILE, Changes, no_changes
+from rig.run.loop import SHOWN_EVERY_NS, Look, Port, RunControl, Sink, regular_ticks, run
 from rig.run.ports import InformedPort
 from rig.run.requests import Requests
 from rig.run.timing import HISTOGRAMS_FILE, Timing
@@ -58,9 +46,9 @@ class Ended:
     Attributes:
         folder: Its folder.
         state: Last state of the bridge.
-        timing: How well the rate was kept.
+        timing: Timing of its ticks.
         granted: What the machine granted.
-        log_fault: What went wrong with the log, if anything.
+        log_fault: Fault of the log, if there was one.
         ticks: Number of ticks.
         period_ns: Time between two of them.
         diverged: Strut and time of the model's last divergence, if there was one.
@@ -78,7 +66,7 @@ class Ended:
     def summary(self) -> dict[str, object]:
         """Every figure, for `summary.json`."""
         return {
-            "mode": self.state.core.mode.name,
+            "mode": self.state.mode.name,
             "ticks": self.ticks,
             "counts": self.state.counts._asdict(),
             "diverged": self.diverged,
@@ -88,9 +76,208 @@ class Ended:
         }
 
 
-def _header(
-    ready: Setup, epoch_ns: int, granted: Granted | None, folder: Path
-) -> dict[str, object]:
+def _no_setup() -> None:
+    """Nothing to do before the first tick."""
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """What a run has instead of a bench: where frames come from and go to, and when.
+
+    Attributes:
+        port: Where frames come from and go to.
+        clock: When ticks are due.
+        figures: Figures of the bus behind the port, for `run.yaml`.
+        granted: What the machine granted; None for simulated time, which then waits for the disk.
+        begin: Called when all is set up, before the first tick.
+        while_waiting: Called before each wait with the time that is awaited.
+        acknowledge: Acknowledges the safe state; with it, the run accepts requests to change it.
+    """
+
+    port: Port
+    clock: Clock
+    figures: LinkFigures
+    granted: Granted | None = None
+    begin: Callable[[], None] = _no_setup
+    while_waiting: Sequence[Callable[[int], None]] = ()
+    acknowledge: Callable[[], None] | None = None
+
+
+def run_logged(
+    plan: Plan,
+    bridge: Bridge,
+    endpoint: Endpoint,
+    folder: Path,
+    control: RunControl,
+    *,
+    trace: Trace | None = None,
+) -> Ended:
+    """Run on a port and log it.
+
+    Args:
+        plan: The plan.
+        bridge: The bridge built from it.
+        endpoint: Port and clock.
+        folder: Folder of the run; absent or empty.
+        control: How the run is ended and followed.
+        trace: Where the parts of ticks that are late are kept; None keeps nothing.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    refuse_full(folder)
+    _copy_inputs(plan, folder)
+    running = _LoggedRun(plan, bridge, endpoint, folder, control)
+    try:
+        endpoint.begin()
+        running.run(trace)
+    finally:
+        running.close()
+    if trace is not None:
+        trace.write(folder)
+    return running.ended()
+
+
+class _LoggedRun:
+    """A run while it is going on.
+
+    Args:
+        plan: The plan.
+        bridge: The bridge built from it.
+        endpoint: Port and clock.
+        folder: Folder of the run, with its inputs in it.
+        control: How the run is ended and followed.
+    """
+
+    def __init__(
+        self, plan: Plan, bridge: Bridge, endpoint: Endpoint, folder: Path, control: RunControl
+    ) -> None:
+        config, granted = plan.config, endpoint.granted
+        self._plan, self._bridge, self._endpoint = plan, bridge, endpoint
+        self._folder, self._control = folder, control
+        self._timing = Timing.empty()
+        self._columns = LogColumns(plan.strut_names, plan.channels)
+        self._priority = config.realtime.fifo_priority if granted and granted.fifo else 0
+        self._log = RunLog(
+            folder,
+            _header(plan, endpoint.clock.epoch_ns, granted, folder) | _notes(control),
+            self._columns.names,
+            endpoint.clock.epoch_ns,
+            config.bus.channel,
+            paced=granted is not None,
+            priority=self._priority,
+            rotation=config.log.rotation(),
+            window=config.log.window(),
+            capture_name=_capture_name,
+            aside=None if granted is None else (HISTOGRAMS_FILE, self._timing.histograms),
+        )
+        self._reports = _FaultReports([device.name for device in plan.devices])
+        self._state = bridge.init(0)
+        self._ticks, self._shown_ns, self._status = 0, 0, "failed"
+
+    def run(self, trace: Trace | None) -> None:
+        """Run until the end."""
+        plan, endpoint, clock = self._plan, self._endpoint, self._endpoint.clock
+        informed = InformedPort(endpoint.port, self._log, self._timing)
+        source: Port = informed
+        sink: Sink = self._keep
+        if trace is not None:
+            clock = trace.clock(clock)
+            source, sink = trace.port(informed, self._log), trace.sink(sink)
+        for occupation in (*endpoint.while_waiting, informed.look):
+            clock = OccupiedClock(clock, occupation)
+        duration_s, rate_hz = plan.config.duration_s, plan.config.rate_hz
+        count = None if duration_s is None else max(1, round(duration_s * rate_hz))
+        due = regular_ticks(clock, plan.period_ns, count, self._control.stop, self._timing)
+        with contextlib.ExitStack() as around:
+            around.enter_context(on_signal(signal.SIGUSR2, lambda: self._log.trigger("user")))
+            changes = self._changes(around)
+            self._state = run(self._bridge, self._state, due, source, sink, self._columns, changes)
+        self._status = "safe" if self._state.mode is Mode.SAFE else "done"
+
+    def close(self) -> None:
+        """Close the log with how the run ended."""
+        self._log.close(self._ending)
+
+    def ended(self) -> Ended:
+        """How the run ended."""
+        return Ended(
+            self._folder,
+            self._state,
+            self._timing,
+            self._endpoint.granted,
+            self._log.trouble,
+            self._ticks,
+            self._plan.period_ns,
+            self._divergence(),
+        )
+
+    def _keep(
+        self, received: Sequence[Frame], sent: Sequence[Frame], result: TickResult, step: Step
+    ) -> None:
+        """Log a tick and show it."""
+        self._log.add(received, sent, step)
+        self._reports.note(step.t_ns, result.device_faults)
+        self._ticks += 1
+        self._control.progress(step.t_ns, result.output.mode)
+        if step.t_ns >= self._shown_ns:
+            self._shown_ns = step.t_ns + SHOWN_EVERY_NS
+            is_paced = self._endpoint.granted is not None
+            late_ns = int(self._timing.extremes_ns[0]) if is_paced else None
+            self._control.watch(
+                Look(
+                    step.t_ns,
+                    self._ticks,
+                    result.output,
+                    result.counts,
+                    late_ns,
+                    result.device_faults,
+                )
+            )
+
+    def _changes(self, around: contextlib.ExitStack) -> Changes:
+        """Changes that are requested while the run is going on."""
+        acknowledge = self._endpoint.acknowledge
+        if acknowledge is None:
+            return no_changes
+        note = partial(self._log.note, CHANGES_FILE)
+        requests = Requests(
+            self._folder, self._plan, self._bridge, acknowledge, note, self._priority
+        )
+        around.enter_context(requests.served())
+        return requests.changes
+
+    def _ending(self) -> dict[str, object]:
+        """The last section of `run.yaml`."""
+        return {
+            "ending": {
+                "status": self._status,
+                "ticks": self._ticks,
+                "counts": self._state.counts._asdict(),
+                "diverged": self._divergence(),
+                "timing": self._timing.summary(),
+                "bus": self._endpoint.figures.as_dict(),
+                "log_fault": self._log.trouble,
+                "dropped_steps": self._log.dropped,
+                "devices": self._reports.listed,
+            }
+        }
+
+    def _divergence(self) -> dict[str, object] | None:
+        """Strut and time of the model's last divergence."""
+        divergence = self._state.supervised.diverged
+        if divergence is None:
+            return None
+        strut = self._plan.struts[divergence.strut].name
+        return {"strut": strut, "t_s": divergence.t_ns * 1e-9}
+
+
+def _notes(control: RunControl) -> dict[str, object]:
+    """What `run.yaml` notes of how the run was started."""
+    return {"forced": [dict(finding) for finding in control.forced]} if control.forced else {}
+
+
+def _header(plan: Plan, epoch_ns: int, granted: Granted | None, folder: Path) -> dict[str, object]:
     files = {
         name: hashlib.sha256((folder / name).read_bytes()).hexdigest()
         for name in (MODEL_FILE, DBC_FILE)
@@ -98,8 +285,8 @@ def _header(
     return {
         "schema": RUN_SCHEMA,
         "epoch_ns": epoch_ns,
-        "config": ready.config.model_dump(mode="json"),
-        "config_source": str(ready.source),
+        "config": plan.config.model_dump(mode="json"),
+        "config_source": str(plan.source),
         "files_sha256": files,
         "versions": {
             **{name: version(name) for name in _PACKAGES},
@@ -110,181 +297,42 @@ def _header(
     }
 
 
-def _copy_inputs(ready: Setup, folder: Path) -> None:
+def _copy_inputs(plan: Plan, folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / MODEL_FILE).write_text(dump_model(ready.model), "utf-8")
-        shutil.copyfile(ready.database.path, folder / DBC_FILE)
-        copy_files(ready.model, folder)
+        (folder / MODEL_FILE).write_text(dump_model(plan.model), "utf-8")
+        shutil.copyfile(plan.database.path, folder / DBC_FILE)
+        copy_files(plan.model, folder)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
 
 
-def logged(
-    ready: Setup,
-    bridge: Bridge,
-    port: Port,
-    clock: Clock,
-    folder: Path,
-    *,
-    figures: LinkFigures,
-    granted: Granted | None = None,
-    trace: Trace | None = None,
-    forced: Sequence[Mapping[str, str]] = (),
-    begin: Callable[[], None] | None = None,
-    while_waiting: Sequence[Callable[[int], None]] = (),
-    stop: Callable[[], bool],
-    acknowledge: Callable[[], None] | None = None,
-    progress: Progress = unnoted,
-    watch: Watch = unwatched,
-) -> Ended:
-    """Run on a port and log it.
-
-    Args:
-        ready: Configuration, model and DBC.
-        bridge: The bridge built from them.
-        port: Where frames come from and go to.
-        clock: When ticks come.
-        folder: Folder of the run; absent or empty.
-        figures: What becomes of the bus behind the port, for `run.yaml`.
-        granted: What the machine granted; None for simulated time, which then waits for the disk.
-        trace: Where the parts of ticks that are late are kept; None keeps nothing.
-        forced: Errors of the check that somebody passed over, for `run.yaml`.
-        begin: Called when all is set up, before the first tick.
-        while_waiting: Called before each wait with the time that is awaited.
-        stop: Asked before each tick whether to end.
-        acknowledge: Acknowledges the safe state; with it, the run takes requests to change it.
-        progress: Called with time and mode of every tick.
-        watch: Given a look five times a second.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
-    config = ready.config
-    refuse_full(folder)
-    _copy_inputs(ready, folder)
-    header = _header(ready, clock.epoch_ns, granted, folder)
-    header |= {"forced": [dict(finding) for finding in forced]} if forced else {}
-    timing, further = Timing.empty(), sensors(ready)
-    record = Record(config.signals.measured, len(further))
-    priority = config.realtime.fifo_priority if granted is not None and granted.fifo else 0
-    log = RunLog(
-        folder,
-        header,
-        columns(list(config.observers), config.signals.measured, further),
-        clock.epoch_ns,
-        config.bus.channel,
-        paced=granted is not None,
-        priority=priority,
-        rotation=config.log.rotation(),
-        window=config.log.window(),
-        capture_name=_capture_name,
-        aside=None if granted is None else (HISTOGRAMS_FILE, timing.histograms),
-    )
-    count = None if config.duration_s is None else _ticks(config.duration_s, config.rate_hz)
-    ticks, shown_ns, status = 0, 0, "failed"
-    state, reports = bridge.init(0), _Reports(list(config.devices))
-
-    def sink(
-        received: Sequence[Frame], sent: Sequence[Frame], result: TickResult, step: Step
-    ) -> None:
-        nonlocal ticks, shown_ns
-        log.add(received, sent, step)
-        reports.note(step.t_ns, result.troubles)
-        ticks += 1
-        progress(step.t_ns, result.output.mode)
-        if step.t_ns >= shown_ns:
-            shown_ns = step.t_ns + SHOWN_EVERY_NS
-            late_ns = int(timing.extremes_ns[0]) if granted is not None else None
-            seen = (result.output, result.counts, late_ns, result.troubles)
-            watch(Look(step.t_ns, ticks, *seen))
-
-    try:
-        if begin is not None:
-            begin()
-        informed = InformedPort(port, log, timing)
-        source: Port = informed
-        keep: Sink = sink
-        if trace is not None:
-            clock, source, keep = trace.clock(clock), trace.port(informed, log), trace.sink(sink)
-        waiting = _occupied(clock, (*while_waiting, informed.look))
-        due = regular_ticks(waiting, config.period_ns, count, stop, timing)
-        with contextlib.ExitStack() as around:
-            around.enter_context(on_signal(signal.SIGUSR2, lambda: log.trigger("user")))
-            changes: Changes = unchanged
-            if acknowledge is not None:
-                note = partial(log.note, CHANGES_FILE)
-                requests = Requests(folder, ready, bridge, acknowledge, note, priority)
-                around.enter_context(requests.served())
-                changes = requests.changes
-            state = run(bridge, state, due, source, keep, record, changes)
-        status = "safe" if state.core.mode is Mode.SAFE else "done"
-    finally:
-        diverged = _divergence(ready, state)
-        log.close(
-            lambda: {
-                "ending": {
-                    "status": status,
-                    "ticks": ticks,
-                    "counts": state.counts._asdict(),
-                    "diverged": diverged,
-                    "timing": timing.summary(),
-                    "bus": figures.as_dict(),
-                    "log_fault": log.trouble,
-                    "dropped_steps": log.dropped,
-                    "devices": reports.listed,
-                }
-            }
-        )
-    if trace is not None:
-        trace.write(folder)
-    return Ended(folder, state, timing, granted, log.trouble, ticks, config.period_ns, diverged)
-
-
-def _occupied(clock: Clock, occupations: Sequence[Callable[[int], None]]) -> Clock:
-    """A clock that does something before each wait."""
-    for occupation in occupations:
-        clock = OccupiedClock(clock, occupation)
-    return clock
-
-
-class _Reports:
-    """What was wrong with devices, from when on, for `run.yaml`."""
+class _FaultReports:
+    """Faults of devices and their times, for `run.yaml`."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
         self._last: tuple[tuple[int, str], ...] = ()
         self.listed: list[dict[str, object]] = []
 
-    def note(self, t_ns: int, troubles: tuple[tuple[int, str], ...]) -> None:
-        """What is wrong at a tick; kept where it is something else than before."""
-        if troubles == self._last:
+    def note(self, t_ns: int, device_faults: tuple[tuple[int, str], ...]) -> None:
+        """Note the faults at a tick, where they differ from those before."""
+        if device_faults == self._last:
             return
-        self._last = troubles
+        self._last = device_faults
         if len(self.listed) < _MOST_REPORTS:
-            wrong = {self._names[place]: why for place, why in troubles}
+            wrong = {self._names[index]: why for index, why in device_faults}
             self.listed.append({"t_s": t_ns * 1e-9, "wrong": wrong})
 
 
-def _divergence(ready: Setup, state: BridgeState) -> dict[str, object] | None:
-    found = state.core.diverged
-    if found is None:
-        return None
-    return {"strut": ready.model.struts[found.strut].name, "t_s": found.t_ns * 1e-9}
-
-
-def _ticks(duration_s: float, rate_hz: float) -> int:
-    return max(1, round(duration_s * rate_hz))
-
-
 def _capture_name(before: int, now: int) -> str | None:
-    """Name of a mode that the log captures a window around, when the bridge comes into it."""
+    """Name of a mode that the log captures a window around, when the bridge enters it."""
     return Mode(now).name.lower() if now != before and now in (Mode.HOLD, Mode.SAFE) else None
 
 
 @contextlib.contextmanager
 def on_signal(number: signal.Signals, action: Callable[[], None]) -> Generator[None]:
-    """Do something when a signal comes, where this thread receives signals.
+    """Call an action when a signal arrives, where this thread receives signals.
 
     SIGUSR1 acknowledges the safe state, SIGUSR2 captures a window of the log.
     """

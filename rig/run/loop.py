@@ -1,18 +1,19 @@
 """The one loop: live, simulated and replayed runs differ only in ticks, source and sink."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from msgspec import Struct
 
 from can_dbc.frame import Frame
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
-from rig.bridge.contract import Mode, StepOutput
-from rig.bridge.log_columns import Record
-from rig.bridge.messages import Conditions, Counts
+from rig.bridge.log_columns import LogColumns
+from rig.bridge.report import Conditions, Counts
+from rig.bridge.values import Mode, StepOutput
 from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step
 from rig.machine.clock import Clock
-from rig.run.changes import Changes, unchanged
+from rig.run.changes import Changes, no_changes
 from rig.run.timing import BINS, Timing
 
 
@@ -59,7 +60,7 @@ class Look(NamedTuple):
         output: What it published.
         counts: What has been counted since the start.
         late_ns: Largest lateness so far; None where nothing waits for a clock.
-        troubles: Devices with something wrong, by their places, and what it is.
+        device_faults: Indices of the devices that are at fault, and their faults.
     """
 
     t_ns: int
@@ -67,19 +68,41 @@ class Look(NamedTuple):
     output: StepOutput
     counts: Counts
     late_ns: int | None
-    troubles: tuple[tuple[int, str], ...] = ()
+    device_faults: tuple[tuple[int, str], ...] = ()
 
 
 Watch = Callable[[Look], None]
-"""Given a look now and then; the loop itself calls it, so it must be quick."""
+"""Called with a look now and then; the loop itself calls it, so it must be quick."""
 
 
-def unnoted(_t_ns: int, _mode: Mode) -> None:
-    """Nobody counts the ticks."""
+def _never() -> bool:
+    """A stop that is never requested."""
+    return False
 
 
-def unwatched(_look: Look) -> None:
-    """Nobody looks."""
+def no_progress(_t_ns: int, _mode: Mode) -> None:
+    """A progress callback that does nothing."""
+
+
+def no_watch(_look: Look) -> None:
+    """A watch callback that does nothing."""
+
+
+@dataclass(frozen=True)
+class RunControl:
+    """How a run is ended and followed.
+
+    Attributes:
+        stop: Asked before each tick whether to end.
+        progress: Called with time and mode of every tick.
+        watch: Called with a look five times a second.
+        forced: Errors of the check that the user overrode, for `run.yaml`.
+    """
+
+    stop: Callable[[], bool] = _never
+    progress: Progress = no_progress
+    watch: Watch = no_watch
+    forced: Sequence[Mapping[str, str]] = ()
 
 
 def regular_ticks(
@@ -130,8 +153,8 @@ def run(
     ticks: Iterator[Tick],
     port: Port,
     sink: Sink,
-    record: Record,
-    changes: Changes = unchanged,
+    columns: LogColumns,
+    changes: Changes = no_changes,
 ) -> BridgeState:
     """Run the bridge over ticks.
 
@@ -141,7 +164,7 @@ def run(
         ticks: When.
         port: Where frames come from and go to.
         sink: Where the record of every tick goes.
-        record: What is kept of a tick.
+        columns: What the log keeps of a tick.
         changes: Asked at every tick for another bridge from there on.
 
     Returns:
@@ -154,7 +177,7 @@ def run(
             conditions = conditions._replace(overruns=tick.overruns)
         state, result = bridge.tick(state, tick.t_ns, frames, conditions)
         sent = port.send(result.frames)
-        numbers = record.numbers(result.step_input, result.output)
+        numbers = columns.numbers(result.step_input, result.output)
         flags, mode = _flags(conditions), result.output.mode
         step = Step(tick.t_ns, tick.overruns, len(frames), mode, flags, numbers)
         sink(frames, sent, result, step)

@@ -1,10 +1,10 @@
-"""Where frames come from and go to while a run is live, and what is known of the bus."""
+"""Where frames come from and go to while a run is live, and the state of the bus."""
 
 from collections.abc import Sequence
 from typing import cast
 
 from can_dbc.frame import Frame
-from rig.bridge.messages import NO_TIMING, Conditions, Levels, TimingFigures
+from rig.bridge.report import NO_TIMING, Conditions, Levels, TimingFigures
 from rig.bus.bus import Bus
 from rig.bus.link import Link
 from rig.bus.secoc import Authenticator
@@ -63,14 +63,14 @@ class InformedPort:
         self.send = port.send
 
     def look(self, t_ns: int) -> None:
-        """Take the percentiles anew, if it is time; done in a tick it would delay that tick."""
+        """Take the percentiles again, if it is time; done in a tick it would delay that tick."""
         if t_ns >= self._again_ns:
             self._again_ns = t_ns + _TIMING_EVERY_NS
             self._latest = _figures(self._timing)
             self._calm = Conditions(timing=self._latest)
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
-        """Frames of the port, with what is known of log and timing."""
+        """Frames of the port, with the state of log and timing."""
         frames, conditions = self._port.receive(t_ns)
         if conditions is _NO_CONDITIONS and self._log.fault is None:
             return frames, self._calm
@@ -106,7 +106,7 @@ class BenchOnBus:
         self.send = port.send
 
     def begin(self, clock: Clock) -> None:
-        """Let what the bench sent while the run was set up be gone before the first tick."""
+        """Discard what the bench sent while the run was set up."""
         for _ in range(_CATCHING_UP):
             now_ns = clock.now_ns()
             self.send_up_to(now_ns)
@@ -119,7 +119,7 @@ class BenchOnBus:
         self._sent_ns = t_ns
         for frame in self._bench.update(t_ns)[0]:
             self._bench_bus.send(frame if self._secured is None else self._secured(frame))
-        self._bench_bus.receive()  # the bench has no use for what the bridge says
+        self._bench_bus.receive()  # the bench does not use what the bridge sends
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
         """Frames that have come since the last tick."""

@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.bridge.bridge import TickResult
-from rig.bridge.log_columns import Record, columns
-from rig.bridge.messages import Conditions
+from rig.bridge.log_columns import LogColumns
+from rig.bridge.report import Conditions
 from rig.log.frame_columns import FrameColumns, received_frames
 from rig.log.reader import RunFolder, last_frame_ns, read_run
 from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step, StepRows
-from rig.plan.assembly import build_bridge, sensors
-from rig.plan.setup import Setup, setup_of_folder
-from rig.run.changes import replayed_changes, unchanged
-from rig.run.loop import Progress, Tick, run
+from rig.plan.build import build_bridge
+from rig.plan.load import plan_of_run
+from rig.plan.plan import Plan
+from rig.run.changes import no_changes, replayed_changes
+from rig.run.loop import Progress, Tick, no_progress, run
 
 _TICKS_AT_ONCE = 4096
 """Ticks whose frames and steps are objects in memory at once."""
@@ -37,13 +38,13 @@ _pa = cast("Any", pa)
 
 
 @dataclass(frozen=True)
-class Replayed:
+class Replay:
     """A run computed again from its log.
 
     Attributes:
         steps: Every step, as an Arrow table like that of the log.
-        logged: How many steps the log holds.
-        different: How many of them differ from the steps computed here in any bit.
+        logged: Number of steps in the log.
+        different: Number of them that differ from the steps computed here in any bit.
         first_different_ns: Time of the first that differs.
         refused_frames: Frames refused in the replay.
     """
@@ -72,39 +73,26 @@ class LoggedTicks:
     flags: NDArray[np.int64]
 
 
-def setup_of_run(folder: Path) -> tuple[RunFolder, Setup]:
-    """A logged run and the configuration it ran with.
-
-    Raises:
-        InputError: A file of the run is missing or damaged.
-        DatabaseError: Its DBC is.
-    """
-    return read_run(folder), setup_of_folder(folder)
-
-
-def replay(
-    folder: Path, *, ready: Setup | None = None, progress: Progress = lambda _t, _mode: None
-) -> Replayed:
+def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_progress) -> Replay:
     """Compute a run again from its frames, and compare it with its steps.
 
     Ticks whose steps a kill took are those of the rate, up to the last frame.
 
     Args:
         folder: Folder of the run.
-        ready: Another configuration to replay with, e.g. with a corrected model or other gains.
+        plan: Another plan to replay with, such as one with a corrected model or other gains.
         progress: Called with the time and mode of every tick.
 
     Raises:
         InputError: The run is damaged.
     """
-    found, own = setup_of_run(folder)
-    ready = ready or own
-    bridge = build_bridge(ready, sending=False)
-    frames = received_frames(found.frame_files, found.epoch_ns)
-    ticks = _ticks(found, frames, ready.config.period_ns)
-    config = ready.config
-    further = sensors(ready)
-    rows = StepRows(columns(list(config.observers), config.signals.measured, further))
+    run_folder, own = read_run(folder), plan_of_run(folder)
+    plan = plan or own
+    bridge = build_bridge(plan, sending=False)
+    frames = received_frames(run_folder.frame_files, run_folder.epoch_ns)
+    ticks = _ticks(run_folder, frames, plan.period_ns)
+    columns = LogColumns(plan.strut_names, plan.channels)
+    rows = StepRows(columns.names)
     batches: list[Any] = []
 
     def keep(
@@ -117,16 +105,15 @@ def replay(
         progress(step.t_ns, result.output.mode)
 
     port = _LogPort(frames, ticks)
-    # With another configuration the run's own changes would undo what is tried.
-    changes = replayed_changes(folder, own, bridge) if ready is own else unchanged
-    record = Record(config.signals.measured, len(further))
-    state = run(bridge, bridge.init(0), port.ticks(), port, keep, record, changes)
+    # With another plan the run's own changes would undo what is tried.
+    changes = replayed_changes(folder, own, bridge) if plan is own else no_changes
+    state = run(bridge, bridge.init(0), port.ticks(), port, keep, columns, changes)
     batches.append(rows.batch())
     steps = _pa.Table.from_batches(batches, schema=rows.schema)
-    different = _different(found.steps, steps)
-    return Replayed(
+    different = _find_differences(run_folder.steps, steps)
+    return Replay(
         steps,
-        found.steps.num_rows,
+        run_folder.steps.num_rows,
         len(different),
         int(ticks.t_ns[different[0]]) if len(different) else None,
         state.counts.refused,
@@ -149,7 +136,7 @@ class _LogPort:
             received = ticks.received[part].tolist()
             frames = list(self._frames.between(begin, begin + sum(received)))
             begin += sum(received)
-            self._waiting = _by_tick(frames, received, ticks.flags[part].tolist())
+            self._waiting = _frames_by_tick(frames, received, ticks.flags[part].tolist())
             yield from map(Tick, ticks.t_ns[part].tolist(), ticks.overruns[part].tolist())
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
@@ -162,7 +149,7 @@ class _LogPort:
         return frames
 
 
-def _by_tick(
+def _frames_by_tick(
     frames: list[Frame], received: list[int], flags: list[int]
 ) -> Iterator[tuple[Sequence[Frame], Conditions]]:
     begin = 0
@@ -178,28 +165,28 @@ def _by_tick(
         begin += count
 
 
-def _ticks(found: RunFolder, frames: FrameColumns, period_ns: int) -> LoggedTicks:
+def _ticks(log: RunFolder, frames: FrameColumns, period_ns: int) -> LoggedTicks:
     """Logged ticks whose frames are there, then those of the rate up to the last frame."""
     t_ns, overruns, received, flags = (
-        np.asarray(found.steps.column(name).to_numpy(), dtype=np.int64)
+        np.asarray(log.steps.column(name).to_numpy(), dtype=np.int64)
         for name in ("t_ns", "overruns", "received", "flags")
     )
     if (received < 0).any() or (np.diff(t_ns) <= 0).any():
         raise InputError(
-            f"{found.folder}: steps.arrow: expected times that rise and numbers of frames received"
+            f"{log.folder}: steps.arrow: expected times that rise and numbers of frames received"
         )
-    there = int(np.searchsorted(np.cumsum(received), len(frames.t_ns), side="right"))
+    complete = int(np.searchsorted(np.cumsum(received), len(frames.t_ns), side="right"))
     t_ns, overruns, received, flags = (
-        column[:there] for column in (t_ns, overruns, received, flags)
+        column[:complete] for column in (t_ns, overruns, received, flags)
     )
     used = int(received.sum())
-    begin_ns = int(t_ns[-1]) + period_ns if there else 0
-    end_ns = last_frame_ns(found.folder, found.epoch_ns) + 1
-    if there < found.steps.num_rows:
+    begin_ns = int(t_ns[-1]) + period_ns if complete else 0
+    end_ns = last_frame_ns(log.folder, log.epoch_ns) + 1
+    if complete < log.steps.num_rows:
         end_ns = begin_ns  # the next tick's frames are not all there
     if (end_ns - begin_ns) // period_ns > _MOST_LOST_A_FRAME * (len(frames.t_ns) - used + 10):
         raise InputError(
-            f"{found.folder}: the last frame is {(end_ns - begin_ns) * 1e-9:.0f} s after the last "
+            f"{log.folder}: the last frame is {(end_ns - begin_ns) * 1e-9:.0f} s after the last "
             "step, expected a log whose times belong together"
         )
     lost_ns = np.arange(begin_ns, end_ns, period_ns, dtype=np.int64)
@@ -215,7 +202,7 @@ def _ticks(found: RunFolder, frames: FrameColumns, period_ns: int) -> LoggedTick
     )
 
 
-def _different(logged: Any, again: Any) -> NDArray[np.intp]:
+def _find_differences(logged: Any, again: Any) -> NDArray[np.intp]:
     """Indices of logged steps that are not the same bit for bit."""
     count = min(logged.num_rows, again.num_rows)
     unequal = np.zeros(count, dtype=np.bool_)

@@ -19,13 +19,14 @@ from rig.bridge.bridge import Bridge
 from rig.log.reader import RUN_FILE, read_header
 from rig.machine.realtime import follow
 from rig.plan.check import errors
-from rig.plan.setup import Setup, setup_of_folder
+from rig.plan.load import plan_of_run
+from rig.plan.plan import Plan
 from rig.run.changes import (
     Assignments,
+    assign,
+    bridge_with_settings,
     change_line,
-    changed_bridge,
     logged_changes,
-    reassigned,
 )
 
 _FOLDER = "requests"
@@ -33,7 +34,7 @@ _LOOK_S = 0.1
 """Time between two looks for requests, and for whether one still waits."""
 
 _ANSWER_S = 5.0
-"""How long whoever asks waits: many looks, and a tick of the slowest rate that is of use."""
+"""Longest wait for an answer: many looks, and a tick of the slowest rate that is of use."""
 
 _MOST_BYTES = 100_000
 
@@ -46,7 +47,7 @@ class Requests:
 
     Args:
         folder: Folder of the run.
-        ready: Its configuration.
+        plan: Its plan.
         bridge: Its bridge.
         acknowledge: Acknowledges the safe state.
         log: Takes the line of a change.
@@ -56,14 +57,14 @@ class Requests:
     def __init__(
         self,
         folder: Path,
-        ready: Setup,
+        plan: Plan,
         bridge: Bridge,
         acknowledge: Callable[[], None],
         log: Callable[[str], None],
         priority: int,
     ) -> None:
         self._folder = folder / _FOLDER
-        self._ready, self._bridge = ready, bridge
+        self._plan, self._bridge = plan, bridge
         self._acknowledge, self._log = acknowledge, log
         self._priority = priority
         self._waiting: tuple[Bridge, Assignments] | None = None
@@ -124,64 +125,66 @@ class Requests:
             return {"error": f"{path.name}: is no request"}
 
     def _changed(self, path: Path, assignments: Assignments) -> Answer:
-        ready = reassigned(self._ready, assignments, "set")
-        bridge = changed_bridge(self._bridge, ready)
+        plan = assign(self._plan, assignments, "set")
+        bridge = bridge_with_settings(self._bridge, plan)
         self._taken.clear()
         self._waiting = bridge, assignments
         while not self._taken.wait(_LOOK_S):
-            # Whoever asked may have gone: what nobody waits for any more is not done.
+            # A request that was withdrawn is not carried out.
             if self._ended.is_set() or not path.exists():
                 self._waiting = None
                 if not self._taken.wait(_LOOK_S):
-                    return {"error": "the run has ended, or nobody waits for the change any more"}
-        self._ready, self._bridge = ready, bridge
+                    return {"error": "the run has ended, or the request was withdrawn"}
+        self._plan, self._bridge = plan, bridge
         return {"t_ns": self._taken_ns}
 
 
 def ask(folder: Path, content: Mapping[str, object], *, force: bool = False) -> Answer:
-    """Ask a run that goes on, and wait for its answer.
+    """Send a request to a running run, and wait for its answer.
 
     Args:
         folder: Folder of the run.
         content: ``{"set": assignments}`` or ``{"acknowledge": True}``.
-        force: Ask although the check of the changed configuration finds an error.
+        force: Send it although the check of the changed configuration finds an error.
 
     Raises:
         InputError: It is no run, it has ended, the check finds an error, or it refuses.
     """
     if "ending" in read_header(folder):
-        raise InputError(f"{folder}: the run has ended, expected one that goes on")
+        raise InputError(f"{folder}: the run has ended, expected one that is running")
     if "set" in content and not force:
         _refuse_errors(folder, cast("Assignments", content["set"]))
-    place = folder / _FOLDER
-    if not place.is_dir():
+    requests = folder / _FOLDER
+    if not requests.is_dir():
         raise InputError(f"{folder}: takes no requests, expected a run of `rig run`")
-    path = place / f"{time.time_ns()}-{uuid.uuid4().hex}.request"
+    path = requests / f"{time.time_ns()}-{uuid.uuid4().hex}.request"
     answer = path.with_suffix(".answer")
     try:
         _write(path, content)
         for _ in range(round(_ANSWER_S / 0.02)):
             if answer.exists():
-                found = cast("Answer", json.loads(answer.read_text("utf-8")))
+                content = cast("Answer", json.loads(answer.read_text("utf-8")))
                 answer.unlink()
-                if "error" in found:
-                    raise InputError(str(found["error"]))
-                return found
+                if "error" in content:
+                    raise InputError(str(content["error"]))
+                return content
             time.sleep(0.02)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
     with contextlib.suppress(OSError):
         path.unlink()
-    raise InputError(f"{folder / RUN_FILE}: no answer in {_ANSWER_S:g} s: is the run still going?")
+    raise InputError(
+        f"{folder / RUN_FILE}: no answer in {_ANSWER_S:g} s: is the run still running?"
+    )
 
 
 def _refuse_errors(folder: Path, assignments: Assignments) -> None:
     """Check the changed configuration as `rig run` does, here and not beside the loop."""
     try:
-        ready = setup_of_folder(folder)
+        plan = plan_of_run(folder)
         for _, before in logged_changes(folder):
-            ready = reassigned(ready, before, str(folder))
-        wrong = errors(reassigned(ready, assignments, "set"))
+            plan = assign(plan, before, str(folder))
+        wrong = errors(assign(plan, assignments, "set"))
     except (TypeError, AttributeError) as error:
         raise InputError("set: expected keys and values") from error
     if wrong:

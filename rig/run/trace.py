@@ -15,7 +15,7 @@ import pyarrow as pa
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.bridge.bridge import TickResult
-from rig.bridge.messages import Conditions
+from rig.bridge.report import Conditions
 from rig.log.steps import Step
 from rig.machine.clock import Clock, WrappedClock
 from rig.run.loop import Port, Sink

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
-from rig.bridge.contract import Mode
+from rig.bridge.values import Mode
 from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise, smooth
 from rig.log.reader import read_run
 
@@ -32,7 +32,7 @@ _LINES = 120
 """Frequencies into which a spectrum is gathered."""
 
 
-class Followed(NamedTuple):
+class FollowedStretch(NamedTuple):
     """A stretch of a run, as the observer of one strut saw it.
 
     Attributes:
@@ -53,7 +53,7 @@ class Followed(NamedTuple):
     velocity_m_per_s: Array
 
 
-class Residual(NamedTuple):
+class ResidualForce(NamedTuple):
     """Residual force of a stretch, smoothed over all of it.
 
     Attributes:
@@ -68,13 +68,13 @@ class Residual(NamedTuple):
 
 
 class Expectation(NamedTuple):
-    """What an observer has to expect.
+    """Noise and residual force that an observer has to expect.
 
     Attributes:
         noise_std_m: Standard deviation of the measured height.
         frequency_hz: Frequencies of the residual force, shape (N,).
         power_n2: Its mean square at them, shape (N,).
-        source: Where that comes from, as a phrase.
+        source: Their source, as a phrase.
     """
 
     noise_std_m: float
@@ -83,7 +83,9 @@ class Expectation(NamedTuple):
     source: str
 
 
-def followed(steps: Any, folder: Path, strut: str, mobility_per_kg: float) -> Followed:
+def longest_stretch(
+    steps: Any, folder: Path, strut: str, mobility_per_kg: float
+) -> FollowedStretch:
     """The longest stretch of a run in which the observer followed its bench.
 
     Args:
@@ -102,7 +104,7 @@ def followed(steps: Any, folder: Path, strut: str, mobility_per_kg: float) -> Fo
         return np.asarray(steps.column(name).to_numpy(), dtype=np.float64)
 
     running = stretches(column("mode") == Mode.RUNNING)
-    stretch = max(running, key=lambda one: one.stop - one.start, default=slice(0, 0))
+    stretch = max(running, key=lambda item: item.stop - item.start, default=slice(0, 0))
     tick_s = column("t_ns")[stretch] * 1e-9
     stretch = slice(stretch.start, stretch.start + int(np.sum(tick_s <= tick_s[:1] + _LONGEST_S)))
     tick_s = column("t_ns")[stretch] * 1e-9
@@ -119,7 +121,7 @@ def followed(steps: Any, folder: Path, strut: str, mobility_per_kg: float) -> Fo
     free_m = free_error(tick_s, -virtual_n * mobility_per_kg, t_s, innovation_m[fresh])
     law = ("law_force_n", "height_m", "velocity_m_per_s")
     law_n, height_m, velocity = (column(f"{strut}.{name}")[stretch] for name in law)
-    return Followed(t_s, free_m, tick_s, law_n, height_m, velocity)
+    return FollowedStretch(t_s, free_m, tick_s, law_n, height_m, velocity)
 
 
 def free_error(tick_s: Array, by_force: Array, t_s: Array, innovation_m: Array) -> Array:
@@ -131,24 +133,24 @@ def free_error(tick_s: Array, by_force: Array, t_s: Array, innovation_m: Array) 
         t_s: Times at which the measured heights were true, shape (N,).
         innovation_m: Innovations at them, shape (N,).
     """
-    free_m = innovation_m - _twice_integrated(tick_s, by_force, t_s)
+    free_m = innovation_m - _integrate_twice(tick_s, by_force, t_s)
     line = np.polynomial.Polynomial.fit(t_s, free_m, 1)
     return free_m - line(t_s)
 
 
-def residual(given: Followed, mobility_per_kg: float) -> Residual:
-    """The residual force of a stretch, smoothed, with what the data say of the sensor's noise."""
-    noise = estimate_noise(given.t_s, given.free_error_m)
-    found: Smoothed = smooth(given.t_s, given.free_error_m, noise)
-    return Residual(
+def residual_force(stretch: FollowedStretch, mobility_per_kg: float) -> ResidualForce:
+    """The residual force of a stretch, smoothed, and the noise of its height sensor."""
+    noise = estimate_noise(stretch.t_s, stretch.free_error_m)
+    smoothed: Smoothed = smooth(stretch.t_s, stretch.free_error_m, noise)
+    return ResidualForce(
         float(np.sqrt(noise.variance)),
-        given.t_s,
-        found.states[:, 2] / mobility_per_kg,
+        stretch.t_s,
+        smoothed.states[:, 2] / mobility_per_kg,
     )
 
 
-def of_run(folder: Path, strut: str, mobility_per_kg: float) -> Expectation:
-    """What a run says.
+def expectation_from_run(folder: Path, strut: str, mobility_per_kg: float) -> Expectation:
+    """Expectation of a strut from a run of its bench.
 
     Args:
         folder: Folder of the run.
@@ -158,13 +160,13 @@ def of_run(folder: Path, strut: str, mobility_per_kg: float) -> Expectation:
     Raises:
         InputError: It is no run, has no such strut, or is too short.
     """
-    given = followed(read_run(folder).steps, folder, strut, mobility_per_kg)
-    found = residual(given, mobility_per_kg)
-    return Expectation(found.noise_std_m, *spectrum(found.t_s, found.force_n), str(folder))
+    stretch = longest_stretch(read_run(folder).steps, folder, strut, mobility_per_kg)
+    force = residual_force(stretch, mobility_per_kg)
+    return Expectation(force.noise_std_m, *spectrum(force.t_s, force.force_n), str(folder))
 
 
-def stated(noise_std_m: float, rms_n: float, up_to_hz: float) -> Expectation:
-    """A residual force whose mean square is spread evenly over frequencies up to a highest one.
+def expectation_from_noise(noise_std_m: float, rms_n: float, up_to_hz: float) -> Expectation:
+    """Expectation of a residual force whose mean square is even over frequency.
 
     Args:
         noise_std_m: Standard deviation of the measured height.
@@ -178,12 +180,12 @@ def stated(noise_std_m: float, rms_n: float, up_to_hz: float) -> Expectation:
 
 
 def stretches(holds: NDArray[np.bool_]) -> list[slice]:
-    """The stretches in which something holds."""
+    """The stretches in which a condition holds."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], holds.astype(np.int8), [0]]))).tolist()
     return [slice(*pair) for pair in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _twice_integrated(tick_s: Array, acceleration: Array, t_s: Array) -> Array:
+def _integrate_twice(tick_s: Array, acceleration: Array, t_s: Array) -> Array:
     """An acceleration that is constant from each tick to the next, integrated twice."""
     h = np.diff(tick_s)
     rate = np.concatenate([[0.0], np.cumsum(acceleration[:-1] * h)])

@@ -1,14 +1,14 @@
-"""How much later a height comes than it is true, from a run of the bench.
+"""Delay of a height, from a run of the bench.
 
-The applied force comes at once and the height late: held against a model that does not know it,
-the strut's force seems to depend on the applied force. With the right delay it is a function of
-height and of velocity, as far as the strut is one. So the run is computed again with a delay, the
-estimated force smoothed, and fitted with functions of height and velocity and with its own
-derivative by the delay: what of that derivative the functions cannot give says how far off the
-delay is, and how well that is known. Repeated until it stays (Gauss and Newton).
+The applied force arrives at once and the height late: compared with a model without the delay, the
+strut's force seems to depend on the applied force. With the right delay it is a function of height
+and of velocity, as far as the strut is one. So the run is computed again with a delay, the
+estimated force is smoothed, and fitted with functions of height and velocity and with its own
+derivative by the delay: the part of that derivative that the functions cannot represent determines
+the error of the delay and its variance. This is repeated until it converges (Gauss and Newton).
 
-A bench moved by a single sine tells nothing: whatever is periodic is a function of height and
-velocity there. The interval says so.
+A bench moved by a single sine does not determine the delay: whatever is periodic is a function of
+height and velocity there. The interval is infinite then.
 """
 
 import math
@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.observers.kalman import KalmanObserver
-from rig.plan.setup import Setup
+from rig.plan.plan import Plan
 from rig.run.replay import replay
-from rig.tuning.expectation import followed, residual
+from rig.tuning.expectation import longest_stretch, residual_force
 
 Array = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ _STEP_S = 0.5e-3
 """Step of the derivative by the delay."""
 
 _SETTLED_S = 0.3
-"""After the start, when the observer follows."""
+"""Time after the start from which the observer follows."""
 
 
 class Latency(NamedTuple):
@@ -49,7 +49,7 @@ class Latency(NamedTuple):
 
     Attributes:
         delay_s: Its value.
-        std_s: Its standard deviation; infinite where the run does not tell it.
+        std_s: Its standard deviation; infinite where the run does not determine it.
     """
 
     delay_s: float
@@ -67,7 +67,7 @@ class Latency(NamedTuple):
 
 
 class _Series(NamedTuple):
-    """A strut as a delay lets it look, by the time at which its heights came."""
+    """A strut as it appears with a delay, by the time at which its heights arrived."""
 
     arrived_s: Array
     height_m: Array
@@ -75,9 +75,9 @@ class _Series(NamedTuple):
     force_n: Array
 
 
-def delayed(ready: Setup, delay_s: float) -> Setup:
-    """A configuration whose heights come late by some time; they go stale later by it too."""
-    config = ready.config
+def with_delay(plan: Plan, delay_s: float) -> Plan:
+    """The plan with heights delayed by some time; they become stale later by it too."""
+    config = plan.config
     heights = {
         name: entry.model_copy(update={"delay_s": delay_s})
         for name, entry in config.signals.height.items()
@@ -90,15 +90,27 @@ def delayed(ready: Setup, delay_s: float) -> Setup:
     )
     signals = config.signals.model_copy(update={"height": heights})
     config = config.model_copy(update={"signals": signals, "supervision": supervision})
-    return ready.model_copy(update={"config": config})
+    return plan.with_config(config)
+
+
+class LatencyTask(NamedTuple):
+    """The strut whose height's delay is estimated.
+
+    Attributes:
+        strut: Name of the strut.
+        mobility_per_kg: Acceleration of its height per newton in it.
+        observer: A noise-aware observer that fits its noise and its residual force.
+    """
+
+    strut: str
+    mobility_per_kg: float
+    observer: KalmanObserver
 
 
 def estimate_latency(
     folder: Path,
-    ready: Setup,
-    strut: str,
-    mobility_per_kg: float,
-    observer: KalmanObserver,
+    plan: Plan,
+    task: LatencyTask,
     longest_s: float,
     progress: Callable[[float], None] = lambda _share: None,
 ) -> Latency:
@@ -106,35 +118,33 @@ def estimate_latency(
 
     Args:
         folder: Folder of the run.
-        ready: Its configuration.
-        strut: Name of the strut.
-        mobility_per_kg: Acceleration of its height per newton in it.
-        observer: A noise-aware observer that fits its noise and its residual force.
-        longest_s: Longest delay that is looked for.
+        plan: Its plan.
+        task: The strut.
+        longest_s: Longest delay searched for.
         progress: Called with the share that is done.
 
     Raises:
         InputError: The run is damaged or too short.
     """
-    observers = {**ready.config.observers, strut: replaced(observer)}
-    config = ready.config.model_copy(update={"observers": observers})
-    ready = ready.model_copy(update={"config": config})
+    plan = plan.with_observers({task.strut: replaced(task.observer)})
+    mobility_per_kg = task.mobility_per_kg
 
     def series(delay_s: float) -> _Series:
-        steps = replay(folder, ready=delayed(ready, delay_s)).steps
-        given = followed(steps, folder, strut, mobility_per_kg)
-        found = residual(given, mobility_per_kg)
-        wanted = (found.t_s > given.tick_s[0] + _SETTLED_S) & (found.t_s <= given.tick_s[-1])
-        t_s = found.t_s[wanted]
+        steps = replay(folder, plan=with_delay(plan, delay_s)).steps
+        stretch = longest_stretch(steps, folder, task.strut, mobility_per_kg)
+        residual = residual_force(stretch, mobility_per_kg)
+        is_settled = residual.t_s > stretch.tick_s[0] + _SETTLED_S
+        is_used = is_settled & (residual.t_s <= stretch.tick_s[-1])
+        t_s = residual.t_s[is_used]
         law_n, height, velocity = (
-            np.interp(t_s, given.tick_s, column)
-            for column in (given.law_force_n, given.height_m, given.velocity_m_per_s)
+            np.interp(t_s, stretch.tick_s, column)
+            for column in (stretch.law_force_n, stretch.height_m, stretch.velocity_m_per_s)
         )
-        return _Series(t_s + delay_s, height, velocity, law_n + found.force_n[wanted])
+        return _Series(t_s + delay_s, height, velocity, law_n + residual.force_n[is_used])
 
     delay_s, std_s = 0.0, math.inf
     for number in range(_ITERATIONS):
-        step_s, std_s = _step(series(delay_s), series(delay_s + _STEP_S))
+        step_s, std_s = _delay_step(series(delay_s), series(delay_s + _STEP_S))
         progress((number + 1) / _ITERATIONS)
         before_s = delay_s
         delay_s = min(max(delay_s + step_s, 0.0), longest_s)
@@ -143,23 +153,23 @@ def estimate_latency(
     return Latency(delay_s, std_s)
 
 
-def _step(here: _Series, beside: _Series) -> tuple[float, float]:
-    """How far off the delay is, and the standard deviation of that."""
-    slope = np.interp(here.arrived_s, beside.arrived_s, beside.force_n) - here.force_n
+def _delay_step(here: _Series, later: _Series) -> tuple[float, float]:
+    """Error of the delay, and its standard deviation."""
+    slope = np.interp(here.arrived_s, later.arrived_s, later.force_n) - here.force_n
     slope = slope / _STEP_S
     rows = _functions(here.height_m, here.velocity_m_per_s)
 
     def unexplained(signal: Array) -> Array:
         return signal - rows @ np.linalg.lstsq(rows, signal, rcond=None)[0]
 
-    missed, told = unexplained(here.force_n), unexplained(slope)
-    power = float(told @ told)
+    residual, direction = unexplained(here.force_n), unexplained(slope)
+    power = float(direction @ direction)
     if power <= _LEAST_SHARE * float(slope @ slope):
         return 0.0, math.inf
-    step_s = -float(missed @ told) / power
+    step_s = -float(residual @ direction) / power
     # Correlated errors: the variance of a product's sum, from its own spectrum at zero (Newey and
     # West), with what the fit leaves as error.
-    errors = (missed + step_s * told) * told
+    errors = (residual + step_s * direction) * direction
     return step_s, math.sqrt(max(_long_run_variance(errors), 0.0)) / power
 
 

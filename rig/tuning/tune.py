@@ -1,6 +1,5 @@
-"""`rig tune` but for its words: from a configuration and a run to a configuration."""
+"""From a configuration and a run to a configuration with tuned observers."""
 
-import math
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,41 +9,38 @@ import yaml
 
 from can_dbc.codec import si_step
 from can_dbc.errors import InputError
-from can_dbc.units import Dimension
 from can_dbc.yaml_file import parse_mapping, read_text
-from rig.bridge.free_model import strut_answers
+from rig.channels.channel import Channel
 from rig.closed_loop.loop import Rhythm
+from rig.closed_loop.strut_response import strut_responses
 from rig.diagnosis.progress import Progress, within
-from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
-from rig.plan.assembly import arrivals, build_plant
-from rig.plan.setup import Setup, setup_of_folder
-from rig.tuning.expectation import Expectation, of_run, stated
+from rig.observers.pi import published_observer
+from rig.observers.protocol import AnyObserver, AnyTunableObserver
+from rig.plan.build import build_plant
+from rig.plan.load import plan_of_run
+from rig.plan.plan import Plan
+from rig.tuning.expectation import Expectation, expectation_from_noise, expectation_from_run
 from rig.tuning.gains import (
     Aim,
-    Bench,
-    Expected,
+    ExpectedError,
     Tuned,
-    bandwidth_hz,
-    expected,
-    paper,
-    swept,
-    tuned,
+    TuningProblem,
+    expect_error,
+    sweep_bandwidth,
+    tune_observer,
 )
-from rig.tuning.latency import Latency, delayed, estimate_latency
-
-_FIRST_CORNER_PER_INTERVAL = 0.1
-"""Bandwidth in rad/s times the interval of the observers that are not tuned yet: quick and tame."""
+from rig.tuning.latency import Latency, LatencyTask, estimate_latency, with_delay
 
 _FACTORS = tuple(2.0 ** (step / 6.0) for step in range(-15, 16))
-"""Of the bandwidths that are drawn: from a sixth to six times the choice."""
+"""Of the bandwidths that are plotted: from a sixth to six times the choice."""
 
 _LONGEST_DELAY_S = 0.05
-"""That is looked for: a height that is older is not one to close a loop with."""
+"""Searched for: an older height is of no use in a closed loop."""
 
 
-class Stated(NamedTuple):
-    """What somebody expects of the residual force who has no run.
+class StatedExpectation(NamedTuple):
+    """Expectation of the residual force as the user states it, where there is no run.
 
     Attributes:
         rms_n: Its root mean square.
@@ -66,29 +62,41 @@ class TunedStrut:
         expectation: What it was tuned for.
         latency: Delay of its height as the run shows it; None where it was given.
         delay_s: Delay that it was tuned with.
-        found: The observer.
-        paper: What is expected of the published gains, scaled by the effective mass.
+        tuned: The observer.
+        published: Expected error of the published gains, scaled by the effective mass.
         bandwidth_hz: Bandwidth of the observer.
-        sweep: What is expected at other bandwidths.
+        sweep: Expected errors at other bandwidths, by their frequencies in Hz.
     """
 
     name: str
     expectation: Expectation
     latency: Latency | None
     delay_s: float
-    found: Tuned
-    paper: Expected
+    tuned: Tuned
+    published: ExpectedError
     bandwidth_hz: float
-    sweep: list[tuple[float, Expected]]
+    sweep: list[tuple[float, ExpectedError]]
+
+
+class _Height(NamedTuple):
+    """Delay of a height.
+
+    Attributes:
+        latency: The delay as the run shows it; None where it was given.
+        delay_s: The delay to tune with.
+    """
+
+    latency: Latency | None
+    delay_s: float
 
 
 def tune(
-    ready: Setup, source: Path | Stated, kind: str, aim: Aim, progress: Progress
+    plan: Plan, source: Path | StatedExpectation, kind: str, aim: Aim, progress: Progress
 ) -> list[TunedStrut]:
     """Tune the observer of every strut.
 
     Args:
-        ready: The configuration.
+        plan: The configuration.
         source: A run of the bench, or what is expected of it.
         kind: One of `rig.tuning.gains.KINDS`.
         aim: What the loops must keep.
@@ -97,124 +105,119 @@ def tune(
     Raises:
         InputError: The run cannot be used.
     """
-    if ready.config.prescribed_motion is not None:
+    if plan.is_prescribed:
         raise InputError(
-            f"{ready.source}: prescribed_motion: no loop is closed, expected a free model"
+            f"{plan.source}: prescribed_motion: no loop is closed, expected a free model"
         )
-    names = list(ready.config.observers)
-    if len(names) > len(ready.config.signals.height):
+    if len(plan.struts) > len(plan.heights):
         raise InputError(
-            f"{ready.source}: observers: kind none beside others cannot be tuned, expected a "
-            "height of each strut"
+            f"{plan.source}: observers: kind none together with others cannot be tuned, expected "
+            "a height of each strut"
         )
-    plant = build_plant(ready)
-    heights = [strut.free_length_m for strut in ready.model.struts]
-    answers = strut_answers(plant, heights)
+    plant = build_plant(plan)
+    heights_m = [strut.free_length_m for strut in plan.struts]
+    responses = strut_responses(plant, heights_m)
     progress("reading what is to be expected", 0.0)
     expectations = [
-        _expectation(ready, source, name, answer.mobility_per_kg)
-        for name, answer in zip(names, answers, strict=True)
+        _expectation(source, channel, response.mobility_per_kg)
+        for channel, response in zip(plan.heights, responses, strict=True)
     ]
-    every = arrivals(ready)
-    first = tuple(
-        KalmanObserver("kalman", _first_filter(item.noise_std_m, arrival.interval_ns))
-        for item, arrival in zip(expectations, every, strict=True)
+    untuned = tuple(
+        KalmanObserver.untuned(item.noise_std_m, strut.interval_ns)
+        for item, strut in zip(expectations, plan.struts, strict=True)
     )
-    found: list[TunedStrut] = []
-    for index, name in enumerate(names):
-        share = index / len(names), (index + 1) / len(names)
-        part = within(progress, *share, of=name)
-        mobility_per_kg = answers[index].mobility_per_kg
-        latency = _latency(ready, source, name, mobility_per_kg, first[index], part)
-        delay_s = ready.config.signals.height[name].delay_s
-        if latency is not None and latency.low_s > 0.0:
-            delay_s = float(f"{latency.delay_s:.3g}")
-        part("gains", 0.7)
-        interval_ns, limit = every[index].interval_ns, cast("Any", ready.config.observers[name])
-        bench = Bench(
+    tuned: list[TunedStrut] = []
+    for index, strut in enumerate(plan.struts):
+        share = index / len(plan.struts), (index + 1) / len(plan.struts)
+        part = within(progress, *share, of=strut.name)
+        task = LatencyTask(strut.name, responses[index].mobility_per_kg, untuned[index])
+        height = _find_delay(plan, source, task, part)
+        problem = TuningProblem(
             plant,
-            first,
+            untuned,
             index,
-            answers,
-            heights,
-            Rhythm.of(ready.config.period_ns, interval_ns, round(delay_s * 1e9)),
+            responses,
+            heights_m,
+            Rhythm.of(plan.period_ns, strut.interval_ns, round(height.delay_s * 1e9)),
             expectations[index],
-            limit.force_limit_n,
+            cast("AnyTunableObserver", strut.observer).force_limit_n,
         )
-        best = tuned(bench, kind, aim)
-        part("other bandwidths", 0.9)
-        found.append(
-            TunedStrut(
-                name,
-                expectations[index],
-                latency,
-                delay_s,
-                best,
-                expected(bench, paper(bench)),
-                bandwidth_hz(best.observer, mobility_per_kg),
-                swept(bench, best.observer, _FACTORS),
-            )
-        )
-    return found
+        tuned.append(_tune_strut(strut.name, problem, kind, aim, height, part))
+    return tuned
+
+
+def _tune_strut(
+    name: str, problem: TuningProblem, kind: str, aim: Aim, height: _Height, progress: Progress
+) -> TunedStrut:
+    """Tune the observer of one strut, and compare it with the published gains."""
+    progress("gains", 0.7)
+    tuned = tune_observer(problem, kind, aim)
+    progress("other bandwidths", 0.9)
+    published = published_observer(problem.mobility_per_kg, problem.force_limit_n)
+    return TunedStrut(
+        name,
+        problem.expectation,
+        height.latency,
+        height.delay_s,
+        tuned,
+        expect_error(problem, published),
+        tuned.observer.bandwidth_hz(problem.mobility_per_kg),
+        sweep_bandwidth(problem, tuned.observer, _FACTORS),
+    )
 
 
 def _expectation(
-    ready: Setup, source: Path | Stated, name: str, mobility_per_kg: float
+    source: Path | StatedExpectation, height: Channel, mobility_per_kg: float
 ) -> Expectation:
     if isinstance(source, Path):
-        return of_run(source, name, mobility_per_kg)
-    noise_std_m = source.noise_std_m or _quantisation_m(ready, name)
-    return stated(noise_std_m, source.rms_n, source.up_to_hz)
+        return expectation_from_run(source, height.name, mobility_per_kg)
+    noise_std_m = source.noise_std_m or _quantisation_m(height)
+    return expectation_from_noise(noise_std_m, source.rms_n, source.up_to_hz)
 
 
-def _latency(
-    ready: Setup,
-    source: Path | Stated,
-    name: str,
-    mobility_per_kg: float,
-    observer: KalmanObserver,
-    progress: Progress,
-) -> Latency | None:
-    """The latency of a height; None where there is no run, or the configuration gives it."""
-    if not isinstance(source, Path) or ready.config.signals.height[name].delay_s:
-        return None
+def _find_delay(
+    plan: Plan, source: Path | StatedExpectation, task: LatencyTask, progress: Progress
+) -> _Height:
+    """Delay of a height: the configuration's, or what the run shows where that gives none."""
+    delay_s = plan.config.signals.height[task.strut].delay_s
+    if delay_s or not isinstance(source, Path):
+        return _Height(None, delay_s)
     # The run's own signals and bus, with the model that is tuned.
-    own = setup_of_folder(source).model_copy(update={"model": ready.model})
-    return estimate_latency(
-        source,
-        own,
-        name,
-        mobility_per_kg,
-        observer,
-        _LONGEST_DELAY_S,
-        lambda share: progress("latency", 0.7 * share),
+    own = plan_of_run(source).with_model(plan.model)
+    latency = estimate_latency(
+        source, own, task, _LONGEST_DELAY_S, lambda share: progress("latency", 0.7 * share)
     )
+    if latency.low_s > 0.0:
+        delay_s = float(f"{latency.delay_s:.3g}")
+    return _Height(latency, delay_s)
 
 
-def write_config(ready: Setup, found: list[TunedStrut], path: Path) -> None:
+def write_config(plan: Plan, tuned: list[TunedStrut], path: Path) -> None:
     """Write the configuration with the tuned observers; comments are lost.
 
     Args:
-        ready: The configuration.
-        found: The observers.
-        path: New file, in the folder of the configuration: what it names lies beside it.
+        plan: The configuration.
+        tuned: The observers.
+        path: New file, in the folder of the configuration, whose other files it names.
 
     Raises:
         InputError: The file exists, lies elsewhere or cannot be written.
     """
-    if path.absolute().parent != ready.source.absolute().parent:
-        raise InputError(f"--out {path}: expected a file beside {ready.source}: it names others")
-    content = parse_mapping(read_text(ready.source), str(ready.source))
-    content["observers"] = {strut.name: plain(strut.found.observer) for strut in found}
-    late = {strut.name: strut.delay_s for strut in found if strut.latency and strut.delay_s}
+    if path.absolute().parent != plan.source.absolute().parent:
+        raise InputError(
+            f"--out {path}: expected a file in the folder of {plan.source}, whose files it names"
+        )
+    content = parse_mapping(read_text(plan.source), str(plan.source))
+    content["observers"] = {strut.name: settings_of(strut.tuned.observer) for strut in tuned}
+    late = {strut.name: strut.delay_s for strut in tuned if strut.latency and strut.delay_s}
     if late:
         signals = cast("dict[str, Any]", content["signals"])
         signals["height"] = {
             name: entry.model_dump(exclude_defaults=True)
             | ({"delay_s": late[name]} if name in late else {})
-            for name, entry in ready.config.signals.height.items()
+            for name, entry in plan.config.signals.height.items()
         }
-        supervision = delayed(ready, max(late.values())).config.supervision
+        supervision = with_delay(plan, max(late.values())).config.supervision
         content["supervision"] = cast("dict[str, Any]", content.get("supervision") or {}) | {
             "stale_after_s": round(supervision.stale_after_s, 9),
             "safe_after_s": round(supervision.safe_after_s, 9),
@@ -226,23 +229,19 @@ def write_config(ready: Setup, found: list[TunedStrut], path: Path) -> None:
         raise InputError(f"--out {path}: {os.strerror(error.errno or 0)}") from error
 
 
-def plain(observer: Any) -> dict[str, Any]:
+def settings_of(observer: AnyObserver) -> dict[str, Any]:
     """An observer as it stands in a configuration; what is absent or zero there is left out."""
-    return {key: value for key, value in asdict(observer).items() if value}
+    return {key: value for key, value in asdict(cast("Any", observer)).items() if value}
 
 
-def _first_filter(noise_std_m: float, interval_ns: int) -> ErrorFilter:
-    corner = _FIRST_CORNER_PER_INTERVAL / (interval_ns * 1e-9)
-    return ErrorFilter.within(corner / (2.0 * math.pi), noise_std_m)
-
-
-def _quantisation_m(ready: Setup, name: str) -> float:
+def _quantisation_m(height: Channel) -> float:
     """Standard deviation of the rounding of a height to its signal's steps."""
-    entry = ready.config.signals.height[name]
-    step_m = si_step(ready.database.message(entry.message), entry.signal, Dimension.LENGTH)
+    if height.message is None:
+        raise InputError(f"{height.key}: is on no bus, expected --noise-std-m")
+    step_m = si_step(height.message, height.signal, height.quantity.dimension)
     if step_m <= 0.0:
         raise InputError(
-            f"{entry.message}.{entry.signal}: has no steps to take the noise from, expected "
+            f"{height.message.name}.{height.signal}: has no steps to take the noise from, expected "
             "--noise-std-m"
         )
     return step_m / 12.0**0.5

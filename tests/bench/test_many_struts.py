@@ -19,9 +19,9 @@ from can_dbc.frame import Frame
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from rig.bridge.bridge import Bridge, BridgeState
-from rig.bridge.contract import Mode
-from rig.plan import assembly
-from rig.plan.setup import load_setup
+from rig.bridge.values import Mode
+from rig.plan import build
+from rig.plan.load import load_plan
 from tests.bench.test_tick_speed import TICKS, Subject, compared
 from tests.bridge.cores import MS
 from tests.bridge.full_car import FullCar
@@ -146,12 +146,12 @@ def bridge_of(folder: Path, model: str, names: list[str], observer: dict[str, ob
         },
     }
     (folder / "many.yaml").write_text(json.dumps(content))
-    return assembly.build_bridge(load_setup(folder / "many.yaml"))
+    return build.build_bridge(load_plan(folder / "many.yaml"))
 
 
 def ticks_of(bridge: Bridge, folder: Path, count: int) -> Subject:
     """Whole ticks, from frames of all heights to frames of all estimates."""
-    database = load_setup(folder / "many.yaml").database
+    database = load_plan(folder / "many.yaml").database
     messages = [database.message(f"HEIGHT_{k}") for k in range(count)]
     encoders = [compile_encoder(message, ["VALUE"], [Dimension.LENGTH]) for message in messages]
     guards = [compile_protector(message.protection) for message in messages if message.protection]
@@ -180,7 +180,7 @@ def ticks_of(bridge: Bridge, folder: Path, count: int) -> Subject:
 
 
 def test_four_observers_in_a_full_car_against_one(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(assembly, "ENGINES", MappingProxyType({"standing": StandStill}))
+    monkeypatch.setattr(build, "ENGINES", MappingProxyType({"standing": StandStill}))
     suspensions = [f"suspension_{name}" for name in FullCar.corners]
     subjects: dict[str, Subject] = {}
     for kind, observer in (("PI", PI), ("noise-aware", KALMAN)):

@@ -22,14 +22,15 @@ from can_dbc.frame import Frame
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model
 from rig.bridge.bridge import Bridge, BridgeState
-from rig.bridge.contract import Innovation, Measurement, Start, StepInput
-from rig.bridge.free_model import RigCore, RigState
-from rig.bridge.supervisor import Supervision
+from rig.bridge.supervisor import SupervisedState, Supervision, Supervisor
+from rig.bridge.values import StepInput
 from rig.bus.bus import Bus, BusConfig
+from rig.channels.channel import Sample
 from rig.observers.pi import PiState
-from rig.plan.assembly import build_bridge
+from rig.observers.protocol import Innovation, Start
+from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.replay import replay
 from tests.bridge.cores import GAINS, core, measured
 from tests.run.listed import MS, ListPort, bench_frames, live
@@ -39,7 +40,7 @@ ROUNDS = 50
 TIMES_NS = tuple(tick * MS for tick in range(TICKS))
 APPLIED_N = tuple(100.0 * math.sin(0.01 * tick) for tick in range(TICKS))
 MEASURED = tuple(
-    Measurement(0.4 + 0.02 * math.sin(0.02 * tick), t_ns) for tick, t_ns in enumerate(TIMES_NS)
+    Sample(0, 0.4 + 0.02 * math.sin(0.02 * tick), t_ns) for tick, t_ns in enumerate(TIMES_NS)
 )
 
 pytestmark = pytest.mark.long
@@ -94,7 +95,7 @@ def array_loop(*, observing: bool) -> Subject:
         for t_ns, applied_n, measurement in zip(TIMES_NS, APPLIED_N, MEASURED, strict=True):
             q, v = float(positions()[0]), float(velocities()[0])
             model_m = q - v * (t_ns - measurement.t_ns) * 1e-9
-            innovation = Innovation(measurement.height_m - model_m, measurement.t_ns)
+            innovation = Innovation(measurement.value - model_m, measurement.t_ns)
             observer = GAINS.step(observer, t_ns, innovation)
             put_forces([500.0 * (0.5 - q) - 100.0 * v + applied_n + observer.virtual_force_n])
             step()
@@ -119,7 +120,7 @@ def scalar_loop(*, observing: bool) -> Subject:
         for t_ns, applied_n, measurement in zip(TIMES_NS, APPLIED_N, MEASURED, strict=True):
             q, v = position(0), velocity(0)
             model_m = q - v * (t_ns - measurement.t_ns) * 1e-9
-            innovation = Innovation(measurement.height_m - model_m, measurement.t_ns)
+            innovation = Innovation(measurement.value - model_m, measurement.t_ns)
             observer = GAINS.step(observer, t_ns, innovation)
             put_force(0, 500.0 * (0.5 - q) - 100.0 * v + applied_n + observer.virtual_force_n)
             step()
@@ -129,7 +130,7 @@ def scalar_loop(*, observing: bool) -> Subject:
 
 def bridge_and_frames() -> tuple[Bridge, BridgeState, list[list[Frame]]]:
     """One BENCH_MEASUREMENT in, one RIG_ESTIMATE out."""
-    ready = load_setup(CONFIGS / "reference.yaml")
+    ready = load_plan(CONFIGS / "reference.yaml")
     signals = ready.config.signals.model_copy(update={"load_cell_force": None, "temperature": None})
     keys = ("force", "virtual_force", "valid")
     publish = {
@@ -138,7 +139,7 @@ def bridge_and_frames() -> tuple[Bridge, BridgeState, list[list[Frame]]]:
     config = ready.config.model_copy(
         update={"signals": signals, "publish": publish, "status": None, "timing": None}
     )
-    ready = ready.model_copy(update={"config": config})
+    ready = ready.with_config(config)
     frames = bench_frames(ready, TICKS + 1, {})
     bridge = build_bridge(ready)
     state, _ = bridge.tick(bridge.init(0), 0, frames[0])
@@ -156,18 +157,18 @@ def whole_ticks() -> Subject:
     return ticks
 
 
-def steps(rig: RigCore, start: RigState, inputs: list[StepInput]) -> Subject:
+def steps(rig: Supervisor, start: SupervisedState, inputs: list[StepInput]) -> Subject:
     def ticks() -> None:
         state = start
         for step_input in inputs:
-            state, _ = rig.step(state, step_input)
+            state, _, _ = rig.step(state, step_input)
 
     return ticks
 
 
 def core_steps(model: str, heights: tuple[float, ...], *, observing: bool) -> Subject:
-    rig = core(model, supervision=Supervision(10**15, 10**16, safe_holds_last=False))
-    start, _ = rig.step(rig.init(0), measured(0, *heights))
+    rig = core(model, supervision=Supervision(stale_after_s=1e6, safe_after_s=1e7))
+    start, _, _ = rig.step(rig.init(0), measured(0, *heights))
     given = heights if observing else (None,) * len(heights)
     inputs = [measured(tick, *given, applied_n=10.0) for tick in range(1, TICKS + 1)]
     return steps(rig, start, inputs)
@@ -257,7 +258,7 @@ def test_a_tick_over_a_virtual_bus(capsys):
 
 def test_a_replay_against_the_bare_dart_loop(tmp_path: Path, capsys):
     ticks = 20_000
-    ready = load_setup(CONFIGS / "reference.yaml", duration_s=ticks / 1000)
+    ready = load_plan(CONFIGS / "reference.yaml", duration_s=ticks / 1000)
     live(ready, tmp_path / "run", ListPort(bench_frames(ready, ticks, {}), set()))
     bare, per_tick_us = scalar_loop(observing=False), []
     bare_us: list[float] = []

@@ -1,12 +1,23 @@
-"""Cores and inputs that the tests of this folder share."""
+"""Estimators, supervisors and inputs that the tests of this folder share."""
+
+from collections.abc import Sequence
 
 from dart_model.plant import DartPlant
+from dart_model.protocol import AnyPlant
 from dart_model.spec import MODELS, load_model
-from rig.bridge.contract import Measurement, StepInput, StepOutput
-from rig.bridge.free_model import RigCore, RigState
-from rig.bridge.supervisor import Supervision
+from rig.bridge.free_model import FreeModelEstimator
+from rig.bridge.supervisor import SupervisedState, Supervision, Supervisor
+from rig.bridge.values import StepInput, StepOutput
+from rig.channels.channel import Channel, Role, Sample
+from rig.channels.quantities import (
+    APPLIED_FORCE,
+    BENCH_QUANTITIES,
+    HEIGHT,
+    TEMPERATURE,
+    Quantity,
+)
 from rig.observers.pi import PiObserver
-from rig.plan.quantities import OTHERS
+from rig.observers.protocol import AnyObserver
 
 MS = 1_000_000
 
@@ -18,44 +29,95 @@ def gains(proportional: float, integral: float, limit_n: float = 5000.0) -> PiOb
     )
 
 
-def others(**given: float | None) -> tuple[float | None, ...]:
-    """Quantities beside heights, by their keys."""
-    assert set(given) <= {quantity.key for quantity in OTHERS}
-    return tuple(given.get(quantity.key) for quantity in OTHERS)
-
-
 GAINS = gains(1e5, 1e4)
-SUPERVISION = Supervision(10 * MS, 500 * MS, safe_holds_last=False)
+SUPERVISION = Supervision(stale_after_s=0.01, safe_after_s=0.5)
+
+
+def channels(
+    struts: int,
+    *,
+    interval_ns: int | Sequence[int] = MS,
+    delay_ns: int | Sequence[int] = 0,
+    measured: Sequence[int] | None = None,
+    sensors: Sequence[Channel] = (),
+) -> list[Channel]:
+    """Channels of a bench: heights of struts, every quantity of the bench, further sensors."""
+    intervals = [interval_ns] * struts if isinstance(interval_ns, int) else interval_ns
+    delays = [delay_ns] * struts if isinstance(delay_ns, int) else delay_ns
+    made: list[Channel] = []
+    for strut in range(struts) if measured is None else measured:
+        made.append(
+            Channel(
+                len(made),
+                Role.HEIGHT,
+                HEIGHT,
+                f"strut{strut}",
+                f"signals.height.strut{strut}",
+                strut,
+                intervals[strut],
+                delays[strut],
+            )
+        )
+    for quantity in BENCH_QUANTITIES:
+        key = f"signals.{quantity.key}"
+        made.append(Channel(len(made), Role.BENCH, quantity, quantity.key, key, -1, MS))
+    return [*made, *sensors]
+
+
+def supervised(
+    plant: AnyPlant,
+    observers: Sequence[AnyObserver],
+    supervision: Supervision = SUPERVISION,
+    bench: Sequence[Channel] | None = None,
+) -> Supervisor:
+    """A supervised estimator of a model."""
+    bench = channels(plant.struts) if bench is None else bench
+    estimator = FreeModelEstimator(plant, observers, bench, supervision.stale_after_ns)
+    return Supervisor(estimator, supervision)
 
 
 def core(
     model: str = "reference", observer: PiObserver = GAINS, supervision: Supervision = SUPERVISION
-) -> RigCore:
-    """The core of a shipped model with the same gains for every strut."""
+) -> Supervisor:
+    """The estimator of a shipped model with the same gains for every strut."""
     spec = load_model(MODELS / f"{model}.yaml")
-    return RigCore(DartPlant(spec), (observer,) * len(spec.struts), supervision)
+    return supervised(DartPlant(spec), (observer,) * len(spec.struts), supervision)
+
+
+def bench_sample(struts: int, quantity: Quantity, value: float, t_ns: int) -> Sample:
+    """A sample of a quantity of the bench, with the channels of `channels`."""
+    return Sample(struts + BENCH_QUANTITIES.index(quantity), value, t_ns)
 
 
 def measured(
-    tick: int, *heights_m: float | None, applied_n: float | None = None, late_ns: int = 0
+    tick: int,
+    *heights_m: float | None,
+    applied_n: float | None = None,
+    temperature_c: float | None = None,
+    late_ns: int = 0,
 ) -> StepInput:
     """Input of a tick at 1 kHz."""
-    t_ns = tick * MS
-    heights = tuple(
-        None if height is None else Measurement(height, t_ns - late_ns) for height in heights_m
-    )
-    return StepInput(t_ns, heights, others(applied_force=applied_n))
+    t_ns, struts = tick * MS, len(heights_m)
+    samples = [
+        Sample(strut, height_m, t_ns - late_ns)
+        for strut, height_m in enumerate(heights_m)
+        if height_m is not None
+    ]
+    for quantity, value in ((APPLIED_FORCE, applied_n), (TEMPERATURE, temperature_c)):
+        if value is not None:
+            samples.append(bench_sample(struts, quantity, value, t_ns))
+    return StepInput(t_ns, tuple(samples))
 
 
 def run(
-    rig: RigCore, inputs: list[StepInput], state: RigState | None = None
-) -> tuple[list[RigState], list[StepOutput]]:
+    rig: Supervisor, inputs: list[StepInput], state: SupervisedState | None = None
+) -> tuple[list[SupervisedState], list[StepOutput]]:
     """All states and outputs."""
     state = rig.init(0) if state is None else state
-    states: list[RigState] = []
+    states: list[SupervisedState] = []
     outputs: list[StepOutput] = []
     for step_input in inputs:
-        state, output = rig.step(state, step_input)
+        state, output, _ = rig.step(state, step_input)
         states.append(state)
         outputs.append(output)
     return states, outputs

@@ -7,16 +7,17 @@ import numpy as np
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model
-from rig.bridge.contract import Measurement, StepInput
-from rig.bridge.free_model import Arrival, RigCore
 from rig.bridge.supervisor import Supervision
+from rig.bridge.values import StepInput
+from rig.channels.channel import Sample
+from rig.channels.quantities import APPLIED_FORCE
 from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
 from rig.observers.none import NoObserver
-from tests.bridge.cores import MS, others
+from tests.bridge.cores import bench_sample, channels, supervised
 from tests.diagnosis.mechanisms import QuarterCar, TrailingArm
 
-SUPERVISION = Supervision(30 * MS, 500 * MS, safe_holds_last=False)
+SUPERVISION = Supervision(stale_after_s=0.03, safe_after_s=0.5)
 OBSERVER = KalmanObserver(
     "kalman", ErrorFilter(bandwidth_hz=25.0, noise_std_m=1e-5), force_limit_n=20_000.0
 )
@@ -27,17 +28,15 @@ def follow(plant, heights_m, applied_n, observers=None):
     """Published forces, shape (N, struts), NaN before the model started."""
     count = heights_m.shape[1]
     period_ns = round(1e9 / RATE_HZ)
-    core = RigCore(
-        plant, observers or (OBSERVER,) * count, SUPERVISION, (Arrival(period_ns),) * count
-    )
+    bench = channels(count, interval_ns=period_ns)
+    core = supervised(plant, observers or (OBSERVER,) * count, SUPERVISION, bench)
     state = core.init(0)
     found = np.full(heights_m.shape, np.nan)
     for tick, (heights, force) in enumerate(zip(heights_m, applied_n, strict=True)):
-        measured = tuple(
-            None if np.isnan(h) else Measurement(float(h), tick * period_ns) for h in heights
-        )
-        given = StepInput(tick * period_ns, measured, others(applied_force=float(force)))
-        state, output = core.step(state, given)
+        t_ns = tick * period_ns
+        samples = [Sample(i, float(h), t_ns) for i, h in enumerate(heights) if not np.isnan(h)]
+        samples.append(bench_sample(count, APPLIED_FORCE, float(force), t_ns))
+        state, output, _ = core.step(state, StepInput(t_ns, tuple(samples)))
         for index, strut in enumerate(output.struts):
             found[tick, index] = strut.force_n
     return found

@@ -7,17 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.bridge.contract import Innovation, Start
 from rig.observers.error_filter import (
     ErrorFilter,
     Pace,
     _gain,
     _steady,
     _transition,
-    spread,
+    predict_covariance,
 )
 from rig.observers.kalman import KalmanObserver
 from rig.observers.pi import PiObserver
+from rig.observers.protocol import Innovation, Start
 
 MS = 1_000_000
 START = Start(0, 0.1, MS)
@@ -27,7 +27,7 @@ FILTER = ErrorFilter(bandwidth_hz=20.0, noise_std_m=2e-5)
 def test_the_steady_covariance_solves_the_riccati_equation():
     for interval in (0.02, 0.1, 0.5):
         steady = _steady(Pace(interval))
-        gain, after = _gain(spread(steady.covariance, Pace(interval), 1))
+        gain, after = _gain(predict_covariance(steady.covariance, Pace(interval), 1))
         assert np.allclose(after, steady.covariance, rtol=1e-5)
         assert np.allclose(gain, steady.gain, rtol=1e-5)
         assert np.all(np.linalg.eigvalsh(steady.covariance) > 0.0)
@@ -78,8 +78,8 @@ def test_the_mean_moves_as_the_transition_says():
     """At steps of a quarter of the model's own radian; the Taylor series ends at the fifth."""
     follower = ErrorFilter(bandwidth_hz=1.0 / (2.0 * math.pi), noise_std_m=1.0)
     start = Start(0, 1.0, 250 * MS, 0, 1.0, 0.4)
-    state = follower.with_numbers(follower.settled(start), (0.3, -0.2, 0.5, 0.1, -0.4, 0.0))
-    moved = follower.predicted(state, 250 * MS)
+    state = follower.with_numbers(follower.steady_state(start), (0.3, -0.2, 0.5, 0.1, -0.4, 0.0))
+    moved = follower.predict(state, 250 * MS)
     transition, _ = _transition(0.25, 1.0, 0.4)
     assert moved == pytest.approx(transition @ np.array(state.mean), abs=1e-5)
 
@@ -89,7 +89,7 @@ def run_filter(error_m, inputs, follower=FILTER, start=START):
     state = follower.init(start)
     states = []
     for tick, (value, acceleration) in enumerate(zip(error_m, inputs, strict=True), start=1):
-        state = follower.updated(state, Innovation(value, tick * start.interval_ns))
+        state = follower.update(state, Innovation(value, tick * start.interval_ns))
         state = follower.with_input(state, tick * start.interval_ns, acceleration)
         states.append(state)
     return states
@@ -131,7 +131,7 @@ def test_its_standard_deviation_is_that_of_its_errors():
         for tick in range(1, 161):
             walk = transition @ walk + root @ rng.standard_normal(5)
             seen = (walk[0] + rng.standard_normal()) * FILTER.noise_std_m
-            state = FILTER.updated(state, Innovation(seen, tick * MS))
+            state = FILTER.update(state, Innovation(seen, tick * MS))
         std = FILTER.residual_std(state, 160 * MS) / math.sqrt(state.scale)
         squares.append(((state.mean[2] - walk[2] * unit[2]) / std) ** 2)
     # The sum of 400 squares of standard normal numbers, within four deviations.
@@ -148,20 +148,20 @@ def test_the_scale_follows_a_sensor_that_is_noisier_than_configured():
 @given(missing=st.integers(1, 40), seed=st.integers(0, 9))
 def test_after_missing_measurements_it_knows_less_and_then_as_much_again(missing, seed):
     rng = np.random.default_rng(seed)
-    state = FILTER.settled(START)
+    state = FILTER.steady_state(START)
     steady = FILTER.residual_std(state, 0)
     t_ns = missing * MS + MS
     assert FILTER.residual_std(state, t_ns) > steady
-    state = FILTER.updated(state, Innovation(2e-5 * rng.standard_normal(), t_ns))
+    state = FILTER.update(state, Innovation(2e-5 * rng.standard_normal(), t_ns))
     assert state.covariance is not None
     for tick in range(1, 400):
-        state = FILTER.updated(state, Innovation(2e-5 * rng.standard_normal(), t_ns + tick * MS))
+        state = FILTER.update(state, Innovation(2e-5 * rng.standard_normal(), t_ns + tick * MS))
     assert state.covariance is None
 
 
 def test_an_old_measurement_is_used_once():
-    state = FILTER.updated(FILTER.settled(START), Innovation(1e-4, MS))
-    assert FILTER.updated(state, Innovation(5e-4, MS)) is state
+    state = FILTER.update(FILTER.steady_state(START), Innovation(1e-4, MS))
+    assert FILTER.update(state, Innovation(5e-4, MS)) is state
 
 
 def test_its_numbers_are_all_that_the_next_state_depends_on():
@@ -170,7 +170,7 @@ def test_its_numbers_are_all_that_the_next_state_depends_on():
         KalmanObserver("kalman", FILTER),
         PiObserver(filter=FILTER, derivative_n_s_per_m=100.0),
     ):
-        here, there = observer.settled(START), observer.settled(START)
+        here, there = observer.steady_state(START), observer.steady_state(START)
         for tick in range(1, 8):
             here = observer.step(here, tick * MS, Innovation(1e-5 * rng.normal(), tick * MS))
             there = observer.step(there, tick * MS, Innovation(0.0, tick * MS))
@@ -181,7 +181,7 @@ def test_its_numbers_are_all_that_the_next_state_depends_on():
 
 def test_without_measurements_the_virtual_force_comes_to_rest():
     observer = KalmanObserver("kalman", FILTER)
-    state = observer.settled(START)
+    state = observer.steady_state(START)
     for tick in range(1, 50):
         state = observer.step(state, tick * MS, Innovation(1e-3 * math.sin(0.05 * tick), tick * MS))
     forces = []
@@ -194,14 +194,14 @@ def test_without_measurements_the_virtual_force_comes_to_rest():
 
 
 def test_a_derivative_of_the_raw_innovation_is_refused():
-    with pytest.raises(ValueError, match="expected filter beside it"):
+    with pytest.raises(ValueError, match="requires filter"):
         PiObserver(derivative_n_s_per_m=5.0)
 
 
 @pytest.mark.parametrize("gap_ms", [200, 5_000, 3_600_000])
-def test_after_a_long_gap_it_starts_anew(gap_ms):
+def test_after_a_long_gap_it_restarts(gap_ms):
     observer = KalmanObserver("kalman", FILTER)
-    state = observer.settled(START)
+    state = observer.steady_state(START)
     for tick in range(1, 50):
         state = observer.step(state, tick * MS, Innovation(1e-3 * math.sin(0.1 * tick), tick * MS))
     for tick in range(gap_ms, gap_ms + 400):
@@ -216,7 +216,7 @@ def test_after_a_long_gap_it_starts_anew(gap_ms):
 def test_a_gap_on_a_stiffly_damped_model_stays_finite_and_sane(damping_per_s, gap_ms):
     observer = KalmanObserver("kalman", FILTER)
     start = Start(0, 0.1, MS, 0, 500.0, damping_per_s)
-    state = observer.settled(start)
+    state = observer.steady_state(start)
     for tick in range(1, gap_ms):
         state = observer.step(state, tick * MS, None)
         assert math.isfinite(state.force_std_n)
@@ -233,7 +233,7 @@ def test_a_gap_on_a_stiffly_damped_model_stays_finite_and_sane(damping_per_s, ga
 
 def test_a_bench_two_millimetres_off_after_a_gap_is_no_blow():
     observer = KalmanObserver("kalman", FILTER)
-    state = observer.settled(START)
+    state = observer.steady_state(START)
     x = 2e-3
     v, forces = 0.0, []
     for tick in range(300, 700):

@@ -3,8 +3,9 @@
 from can_dbc.database import load_database
 from can_dbc.frame import Frame
 from can_dbc.protection import SequenceState, Verdict
-from rig.bridge.messages import HeightTarget, Wanted, incoming
-from rig.plan.quantities import HEIGHT
+from rig.bridge.incoming import HeightDelivery, compile_incoming
+from rig.channels.channel import Channel, Role
+from rig.channels.quantities import HEIGHT
 
 DBC = """VERSION ""
 NS_ :
@@ -20,8 +21,10 @@ BO_ 256 M: 8 BENCH
 def verdicts(tmp_path, *payloads):
     path = tmp_path / "paged.dbc"
     path.write_text(DBC)
-    made = incoming(load_database(path).message("M"), [Wanted("LEVEL", HEIGHT)])
-    assert made.heights == (HeightTarget(0, 0),)
+    message = load_database(path).message("M")
+    level = Channel(0, Role.HEIGHT, HEIGHT, "strut", "", 0, 1, message=message, signal="LEVEL")
+    made = compile_incoming(message, [level])
+    assert made.heights == (HeightDelivery(0, 0),)
     return [made.read(SequenceState(), Frame(0, 256, data))[1:] for data in payloads]
 
 

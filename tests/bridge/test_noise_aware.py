@@ -8,20 +8,23 @@ import pytest
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model
-from rig.bridge.contract import Measurement, StepInput
-from rig.bridge.free_model import Arrival, RigCore, started_at, strut_answers
+from rig.bridge.free_model import start_of_motion
 from rig.bridge.supervisor import Supervision
+from rig.bridge.values import StepInput
+from rig.channels.channel import Sample
+from rig.channels.quantities import APPLIED_FORCE
 from rig.closed_loop.loop import Loop, Rhythm
 from rig.closed_loop.poles import closed_loop_poles
+from rig.closed_loop.strut_response import strut_responses
 from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
 from rig.observers.pi import PiObserver
 from rig.plan.config import CONFIGS
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.trajectory import simulate
-from tests.bridge.cores import MS, others
+from tests.bridge.cores import MS, bench_sample, channels, supervised
 
-SUPERVISION = Supervision(30 * MS, 500 * MS, safe_holds_last=False)
+SUPERVISION = Supervision(stale_after_s=0.03, safe_after_s=0.5)
 PAPER = PiObserver(force_limit_n=5000.0)
 EXACT = ErrorFilter(bandwidth_hz=40.0, noise_std_m=5.8e-7)
 NOISY = ErrorFilter(bandwidth_hz=19.5, noise_std_m=2.05e-5)
@@ -47,15 +50,14 @@ def follow(observer, heights, applied, delay=0, known=True, first=0):
     """Columns height, velocity, force, deviation of each tick; NaN before the model started."""
     delay_ns = delay * MS if known else 0
     plant = DartPlant(load_model(MODELS / "reference.yaml"))
-    core = RigCore(plant, (observer,), SUPERVISION, (Arrival(MS, delay_ns),))
+    core = supervised(plant, (observer,), SUPERVISION, channels(1, delay_ns=delay_ns))
     state = core.init(0)
     found = np.full((len(heights), 4), np.nan)
     for tick in range(first, len(heights)):
-        measured = None
+        samples = [bench_sample(1, APPLIED_FORCE, float(applied[tick]), tick * MS)]
         if tick - delay >= first:
-            measured = Measurement(float(heights[tick - delay]), tick * MS - delay_ns, delay_ns)
-        given = StepInput(tick * MS, (measured,), others(applied_force=float(applied[tick])))
-        state, output = core.step(state, given)
+            samples.append(Sample(0, float(heights[tick - delay]), tick * MS - delay_ns))
+        state, output, _ = core.step(state, StepInput(tick * MS, tuple(samples)))
         if output.struts:
             strut = output.struts[0]
             found[tick] = (
@@ -164,17 +166,17 @@ def test_noise_and_lag_of_the_linear_loop_are_those_of_the_simulated_one(observe
 def test_a_start_from_several_heights_is_a_parabola_through_them():
     t_ms = np.arange(-11, 1)
     heights = 0.3 + 0.8 * t_ms * 1e-3 + 4.0 * (t_ms * 1e-3) ** 2
-    given = [Measurement(float(h), int(t) * MS) for h, t in zip(heights, t_ms, strict=True)]
-    assert started_at(given, 0) == pytest.approx((0.3, 0.8), abs=1e-9)
+    given = [Sample(0, float(h), int(t) * MS) for h, t in zip(heights, t_ms, strict=True)]
+    assert start_of_motion(given, 0) == pytest.approx((0.3, 0.8), abs=1e-9)
     # They came 5 ms late.
-    late = started_at(given, 5 * MS)
+    late = start_of_motion(given, 5 * MS)
     assert late == pytest.approx((0.3 + 0.004 + 1e-4, 0.84), abs=1e-9)
-    assert started_at(given[:1], 0) == (heights[0], 0.0)
+    assert start_of_motion(given[:1], 0) == (heights[0], 0.0)
 
 
 def test_answers_are_those_of_masses_springs_and_dampers():
     plant = DartPlant(load_model(MODELS / "quarter_car.yaml"))
-    tyre, suspension = strut_answers(plant, (0.29, 0.35))
+    tyre, suspension = strut_responses(plant, (0.29, 0.35))
     both = 1.0 / 3.0 + 1.0 / 15.0
     assert tyre == pytest.approx((1.0 / 3.0, 20000.0 / 3.0, 130.0 / 3.0), rel=1e-6)
     assert suspension == pytest.approx((both, 800.0 * both, 120.0 * both), rel=1e-6)

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.bridge.contract import Innovation, Start
 from rig.observers.pi import PiObserver, PiState
+from rig.observers.protocol import Innovation, Start
 from tests.bridge.cores import GAINS, gains
 
 BEGIN = Start(0, 0.1, 1_000_000)

@@ -7,10 +7,17 @@ import pytest
 from can_dbc.errors import InputError
 from dart_model.plant import PrescribedStrut
 from dart_model.spec import MODELS, EffectSpec, load_model, parse_model
-from rig.bridge.contract import Measurement, Mode, StepInput
-from rig.bridge.prescribed_motion import PrescribedCore, Tracked, followed, predicted
-from rig.bridge.supervisor import Supervision
-from tests.bridge.cores import others
+from rig.bridge.prescribed_motion import (
+    Motion,
+    PrescribedMotionEstimator,
+    predict_motion,
+    update_motion,
+)
+from rig.bridge.supervisor import Supervision, Supervisor
+from rig.bridge.values import Mode, StepInput
+from rig.channels.channel import Sample
+from rig.channels.quantities import LOAD_CELL_FORCE, TEMPERATURE
+from tests.bridge.cores import bench_sample, channels
 
 MODEL = """
 name: dyno
@@ -26,7 +33,7 @@ struts:
     damping_n_s_per_m: 2000.0
 """
 TICK_NS = 1_000_000
-SUPERVISION = Supervision(5 * TICK_NS, 50 * TICK_NS, False)
+SUPERVISION = Supervision(stale_after_s=0.005, safe_after_s=0.05)
 
 
 def plant(*effects: EffectSpec) -> PrescribedStrut:
@@ -40,35 +47,43 @@ def motion(t_s: float) -> tuple[float, float]:
 
 def step_input(number: int, cell_n: float | None, *, measured: bool = True) -> StepInput:
     t_ns = number * TICK_NS
-    height = Measurement(motion(t_ns * 1e-9)[0], t_ns) if measured else None
-    return StepInput(t_ns, (height,), others(load_cell_force=cell_n))
+    samples = [Sample(0, motion(t_ns * 1e-9)[0], t_ns)] if measured else []
+    if cell_n is not None:
+        samples.append(bench_sample(1, LOAD_CELL_FORCE, cell_n, t_ns))
+    return StepInput(t_ns, tuple(samples))
+
+
+def dyno(strut: PrescribedStrut, supervision: Supervision = SUPERVISION) -> Supervisor:
+    stale_after_ns = supervision.stale_after_ns
+    estimator = PrescribedMotionEstimator(strut, 0.002, channels(1), stale_after_ns)
+    return Supervisor(estimator, supervision)
 
 
 def test_the_filter_follows_a_constant_acceleration_without_lag() -> None:
-    tracked = Tracked(0.3, 0.0, 0.0, 0.0, 0)
+    tracked = Motion(0.3, 0.0, 0.0, 0.0, 0)
     for number in range(1, 200):
         t_s = number * 1e-3
         height_m = 0.3 + 0.2 * t_s + 0.5 * 1.5 * t_s * t_s
-        tracked = followed(tracked, Measurement(height_m, number * TICK_NS), 0.002)
+        tracked = update_motion(tracked, Sample(0, height_m, number * TICK_NS), 0.002)
     assert tracked.velocity_m_per_s == pytest.approx(0.2 + 1.5 * 0.199, abs=1e-9)
     assert tracked.acceleration_m_per_s2 == pytest.approx(1.5, abs=1e-6)
-    height_m, velocity, _ = predicted(tracked, 204 * TICK_NS)
+    height_m, velocity, _ = predict_motion(tracked, 204 * TICK_NS)
     assert height_m == pytest.approx(0.3 + 0.2 * 0.204 + 0.75 * 0.204**2, abs=1e-9)
     assert velocity == pytest.approx(0.2 + 1.5 * 0.204, abs=1e-7)
 
 
 def test_a_measurement_that_is_not_newer_changes_nothing() -> None:
-    tracked = Tracked(0.3, 0.1, 0.0, 0.0, 5)
-    assert followed(tracked, Measurement(0.4, 5), 0.002) is tracked
+    tracked = Motion(0.3, 0.1, 0.0, 0.0, 5)
+    assert update_motion(tracked, Sample(0, 0.4, 5), 0.002) is tracked
 
 
 def test_the_virtual_force_is_what_the_cell_shows_beyond_the_model() -> None:
-    core = PrescribedCore(plant(), 0.002, SUPERVISION)
+    core = dyno(plant())
     state = core.init(0)
     for number in range(400):
         height_m, velocity = motion(number * 1e-3)
         law_n = -5000.0 * (height_m - 0.3) - 2000.0 * velocity
-        state, output = core.step(state, step_input(number, law_n + 37.0))
+        state, output, _ = core.step(state, step_input(number, law_n + 37.0))
         if number > 50:
             (strut,) = output.struts
             assert strut.valid
@@ -81,14 +96,14 @@ def test_what_effects_remember_is_led_along_the_motion() -> None:
     branch = EffectSpec(
         name="maxwell", parameters={"stiffness_n_per_m": 8000.0, "relaxation_time_s": 0.03}
     )
-    core = PrescribedCore(plant(branch), 0.002, SUPERVISION)
+    core = dyno(plant(branch))
     state = core.init(0)
     deflection_m, virtual = 0.0, []
     for number in range(600):
         t_s = number * 1e-3
         height_m, velocity = motion(t_s)
         truth_n = -5000.0 * (height_m - 0.3) - 2000.0 * velocity - 8000.0 * deflection_m
-        state, output = core.step(state, step_input(number, truth_n))
+        state, output, _ = core.step(state, step_input(number, truth_n))
         virtual.append(output.struts[0].virtual_force_n)
         for fine in range(100):
             at_s = t_s + (fine + 0.5) * 1e-5
@@ -100,29 +115,31 @@ def test_a_measured_temperature_holds_until_the_next() -> None:
     fade = EffectSpec(
         name="linear_temperature_fade", parameters={"fraction_per_k": 0.01, "reference_c": 20.0}
     )
-    core = PrescribedCore(plant(fade), 0.002, SUPERVISION)
+    core = dyno(plant(fade))
     state = core.init(0)
     for number in range(400):
         height_m, velocity = motion(number * 1e-3)
         warm = 45.0 if number >= 100 else 20.0
         law_n = -5000.0 * (height_m - 0.3) - 2000.0 * (1.0 - 0.01 * (warm - 20.0)) * velocity
         measured = {20.0: None, 45.0: 45.0 if number == 100 else None}[warm]
-        height = Measurement(height_m, number * TICK_NS)
-        given = others(load_cell_force=law_n, temperature=measured)
-        state, output = core.step(state, StepInput(number * TICK_NS, (height,), given))
+        t_ns = number * TICK_NS
+        samples = [Sample(0, height_m, t_ns), bench_sample(1, LOAD_CELL_FORCE, law_n, t_ns)]
+        if measured is not None:
+            samples.append(bench_sample(1, TEMPERATURE, measured, t_ns))
+        state, output, _ = core.step(state, StepInput(t_ns, tuple(samples)))
         if number > 110:
-            assert state.temperature_c == 45.0
+            assert state.estimator.temperature_c == 45.0
             assert output.struts[0].virtual_force_n == pytest.approx(0.0, abs=2.5)
 
 
 def test_the_safe_state_publishes_the_last_valid_force_where_that_is_asked_for() -> None:
-    holds = Supervision(5 * TICK_NS, 50 * TICK_NS, True)
-    core = PrescribedCore(plant(), 0.002, holds)
+    holds = SUPERVISION.model_copy(update={"safe_output": "last"})
+    core = dyno(plant(), holds)
     state = core.init(0)
     for number in range(20):
-        state, output = core.step(state, step_input(number, 100.0 + number))
+        state, output, _ = core.step(state, step_input(number, 100.0 + number))
     for number in range(20, 120):
-        state, output = core.step(state, step_input(number, None, measured=False))
+        state, output, _ = core.step(state, step_input(number, None, measured=False))
     assert output.mode is Mode.SAFE
     assert not output.struts[0].valid
     # The cell's last force counts as valid as long as it is fresh.
@@ -131,46 +148,46 @@ def test_the_safe_state_publishes_the_last_valid_force_where_that_is_asked_for()
 
 def test_effects_age_with_the_time_of_the_run() -> None:
     fade = EffectSpec(name="time_fade", parameters={"final_fraction": 0.0, "time_constant_s": 0.5})
-    core = PrescribedCore(plant(fade), 0.002, SUPERVISION)
+    core = dyno(plant(fade))
     state = core.init(0)
     for number in range(1500):
         height_m, velocity = motion(number * 1e-3)
         left = math.exp(-number * 1e-3 / 0.5)
         law_n = -5000.0 * (height_m - 0.3) - 2000.0 * left * velocity
-        state, output = core.step(state, step_input(number, law_n))
+        state, output, _ = core.step(state, step_input(number, law_n))
         if number > 50:
             assert output.struts[0].virtual_force_n == pytest.approx(0.0, abs=3.0)
 
 
 def test_nothing_is_said_before_both_channels_came() -> None:
-    core = PrescribedCore(plant(), 0.002, SUPERVISION)
-    state, output = core.step(core.init(0), step_input(0, None))
+    core = dyno(plant())
+    state, output, _ = core.step(core.init(0), step_input(0, None))
     assert output.mode is Mode.WAITING
     assert output.struts == ()
-    state, output = core.step(state, step_input(1, 12.0))
+    state, output, _ = core.step(state, step_input(1, 12.0))
     assert output.mode is Mode.RUNNING
     assert output.struts[0].force_n == 12.0
 
 
 @pytest.mark.parametrize("silent", ["height", "cell"])
 def test_a_channel_that_falls_silent_ends_in_the_safe_state(silent: str) -> None:
-    core = PrescribedCore(plant(), 0.002, SUPERVISION)
+    core = dyno(plant())
     state = core.init(0)
     modes: list[Mode] = []
     for number in range(120):
         quiet = number > 20
         cell_n = None if quiet and silent == "cell" else 5.0
         given = step_input(number, cell_n, measured=not (quiet and silent == "height"))
-        state, output = core.step(state, given)
+        state, output, _ = core.step(state, given)
         modes.append(output.mode)
     assert modes[24:27] == [Mode.RUNNING, Mode.RUNNING, Mode.HOLD]
     assert modes[70:72] == [Mode.HOLD, Mode.SAFE]
     assert output.struts[0].force_n == 0.0
     assert not output.struts[0].valid
-    acknowledged = StepInput(120 * TICK_NS, (None,), acknowledged=True)
-    state, output = core.step(state, acknowledged)
+    acknowledged = StepInput(120 * TICK_NS, acknowledged=True)
+    state, output, _ = core.step(state, acknowledged)
     assert output.mode is Mode.WAITING
-    state, output = core.step(state, step_input(121, 5.0))
+    state, output, _ = core.step(state, step_input(121, 5.0))
     assert output.mode is Mode.RUNNING
 
 

@@ -6,26 +6,29 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from rig.bridge.contract import (
-    Deviation,
-    Innovation,
-    Measurement,
-    Measures,
-    Mode,
-    Reading,
-    Sensor,
-    Start,
-    StepInput,
-)
-from rig.bridge.free_model import Arrival, RigCore
 from rig.bridge.supervisor import Supervision
+from rig.bridge.values import Mode, StepInput
+from rig.channels.channel import Channel, Role, Sample
+from rig.channels.quantities import APPLIED_FORCE, FORCE, HEIGHT, VELOCITY
 from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
-from tests.bridge.cores import MS, others
+from rig.observers.protocol import Innovation, Start
+from tests.bridge.cores import MS, bench_sample, channels, supervised
 from tests.observers.benches import Truth
 
 NOISE_M, BANDWIDTH_HZ = 2e-5, 20.0
-HEIGHT = Sensor("strut.wire", 0, Measures.HEIGHT, NOISE_M, MS)
+FIRST = 4
+"""Index of the first further sensor: one height and three quantities of the bench are before it."""
+
+
+def sensor(name, quantity, noise_std, interval_ns, delay_ns=0):
+    key = f"signals.further.{name}"
+    return Channel(
+        FIRST, Role.SENSOR, quantity, name, key, 0, interval_ns, delay_ns, noise_std=noise_std
+    )
+
+
+SECOND_HEIGHT = sensor("strut.wire", HEIGHT, NOISE_M, MS)
 
 
 def kalman(bandwidth_hz=BANDWIDTH_HZ, noise_std_m=NOISE_M):
@@ -33,7 +36,7 @@ def kalman(bandwidth_hz=BANDWIDTH_HZ, noise_std_m=NOISE_M):
 
 
 def start(*sensors):
-    return Start(0, 0.1, MS, 0, 40.0, 2.0, tuple(enumerate(sensors)))
+    return Start(0, 0.1, MS, 0, 40.0, 2.0, sensors)
 
 
 def undriven(state, t_ns):
@@ -44,11 +47,11 @@ def undriven(state, t_ns):
 def test_two_equal_sensors_are_one_of_half_the_variance():
     # The intensity of the force's noise is omega^10 sigma^2 h: the same with both.
     both, one = kalman(), kalman(BANDWIDTH_HZ * 2.0**0.1, NOISE_M / np.sqrt(2.0))
-    fusing, alone = both.init(start(HEIGHT)), one.init(start())
+    fusing, alone = both.init(start(SECOND_HEIGHT)), one.init(start())
     rng = np.random.default_rng(1)
     for tick in range(1, 2001):
         t_ns, (a, b) = tick * MS, NOISE_M * rng.standard_normal(2)
-        fusing = both.fuse(fusing, t_ns, Innovation(a, t_ns), [Deviation(0, b, t_ns)])
+        fusing = both.step(fusing, t_ns, Innovation(a, t_ns), [Innovation(b, t_ns, FIRST)])
         alone = one.step(alone, t_ns, Innovation((a + b) / 2.0, t_ns))
         fusing, alone = undriven(fusing, t_ns), undriven(alone, t_ns)
         if tick > 1000:  # the scales of the variances follow other innovations
@@ -66,7 +69,7 @@ def test_two_equal_sensors_are_one_of_half_the_variance():
 def test_a_late_reading_is_used_at_its_time(late, seed):
     """Whatever comes late: in the end the filter is the one that had all in order."""
     observer, rng = kalman(), np.random.default_rng(seed)
-    delayed = Sensor("strut.wire", 0, Measures.VELOCITY, 1e-3, MS, 5 * MS)
+    delayed = sensor("strut.wire", VELOCITY, 1e-3, MS, 5 * MS)
     readings = [(tick * MS + MS // 2, 1e-4 * rng.standard_normal()) for tick in range(30)]
     heights = NOISE_M * rng.standard_normal(40)
     found = []
@@ -75,11 +78,11 @@ def test_a_late_reading_is_used_at_its_time(late, seed):
         for tick in range(1, 40):
             t_ns = tick * MS
             here = [
-                Deviation(0, value, at_ns)
+                Innovation(value, at_ns, FIRST)
                 for (at_ns, value), delay in zip(readings, delays, strict=True)
                 if t_ns - MS < at_ns + delay * MS <= t_ns
             ]
-            state = observer.fuse(state, t_ns, Innovation(heights[tick], t_ns), here)
+            state = observer.step(state, t_ns, Innovation(heights[tick], t_ns), here)
             state = undriven(state, t_ns)
         found.append(state.error)
     assert np.allclose(found[0].mean, found[1].mean, rtol=1e-9, atol=1e-15)
@@ -87,7 +90,7 @@ def test_a_late_reading_is_used_at_its_time(late, seed):
 
 
 TRUTH = Truth(10.0, 2.0, 1000, 4.0)
-SUPERVISION = Supervision(30 * MS, 500 * MS, safe_holds_last=False)
+SUPERVISION = Supervision(stale_after_s=0.03, safe_after_s=0.5)
 
 
 def velocity():
@@ -97,20 +100,23 @@ def velocity():
 def follow(sensors, readings, *, heights=None, observer=None):
     """Outputs of the bench of 10 kg; `readings` of a tick: place and value, now."""
     seen = TRUTH.height_m if heights is None else heights
-    core = RigCore(
-        TRUTH.plant, (observer or kalman(25.0, NOISE_M),), SUPERVISION, (Arrival(MS),), sensors
+    core = supervised(
+        TRUTH.plant,
+        (observer or kalman(25.0, NOISE_M),),
+        SUPERVISION,
+        channels(1, sensors=sensors),
     )
     state, outputs = core.init(0), []
     for tick, (height_m, applied_n) in enumerate(zip(seen, TRUTH.applied_n, strict=True)):
         t_ns = tick * MS
-        measured = None if np.isnan(height_m) else Measurement(float(height_m), t_ns)
-        came = tuple(
-            Reading(place, value, t_ns - sensors[place].delay_ns)
-            for place, value in readings(tick)
+        samples = [] if np.isnan(height_m) else [Sample(0, float(height_m), t_ns)]
+        samples += [
+            Sample(FIRST + index, value, t_ns - sensors[index].delay_ns)
+            for index, value in readings(tick)
             if value is not None
-        )
-        given_now = others(applied_force=float(applied_n))
-        state, output = core.step(state, StepInput(t_ns, (measured,), given_now, readings=came))
+        ]
+        samples.append(bench_sample(1, APPLIED_FORCE, float(applied_n), t_ns))
+        state, output, _ = core.step(state, StepInput(t_ns, tuple(samples)))
         outputs.append(output)
     return outputs
 
@@ -133,24 +139,24 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-CELL = Sensor("strut.cell", 0, Measures.FORCE, 0.5, MS)
-TACHO = Sensor("strut.tacho", 0, Measures.VELOCITY, 1e-3, MS)
-WIRE = Sensor("strut.wire", 0, Measures.HEIGHT, 1e-5, 5 * MS)
+CELL = sensor("strut.cell", FORCE, 0.5, MS)
+TACHO = sensor("strut.tacho", VELOCITY, 1e-3, MS)
+WIRE = sensor("strut.wire", HEIGHT, 1e-5, 5 * MS)
 
 
-@pytest.mark.parametrize(("sensor", "share"), [(CELL, 0.4), (TACHO, 0.85), (WIRE, 1.0)])
-def test_a_further_sensor_makes_the_force_better_and_its_interval_honest(sensor, share):
+@pytest.mark.parametrize(("channel", "share"), [(CELL, 0.4), (TACHO, 0.85), (WIRE, 1.0)])
+def test_a_further_sensor_makes_the_force_better_and_its_interval_honest(channel, share):
     heights = noisy(TRUTH.height_m, NOISE_M, 1)
     values = {
-        Measures.FORCE: TRUTH.force_n,
-        Measures.VELOCITY: velocity(),
-        Measures.HEIGHT: TRUTH.height_m,
-    }[sensor.measures]
-    read = noisy(values, sensor.noise_std, 2)
-    every = sensor.interval_ns // MS
+        FORCE: TRUTH.force_n,
+        VELOCITY: velocity(),
+        HEIGHT: TRUTH.height_m,
+    }[channel.quantity]
+    read = noisy(values, channel.noise_std, 2)
+    every = channel.interval_ns // MS
     alone, _ = errors(follow((), lambda _tick: [], heights=heights))
     outputs = follow(
-        (sensor,), lambda tick: [(0, read[tick])] if tick % every == 0 else [], heights=heights
+        (channel,), lambda tick: [(0, read[tick])] if tick % every == 0 else [], heights=heights
     )
     missed, std_n = errors(outputs)
     assert rms(missed) < share * rms(alone)
@@ -158,17 +164,17 @@ def test_a_further_sensor_makes_the_force_better_and_its_interval_honest(sensor,
     assert not any(output.left_out for output in outputs)
 
 
-@pytest.mark.parametrize("sensor", [CELL, TACHO])
-def test_a_late_sensor_is_held_against_the_model_of_its_time(sensor):
-    late = Sensor(sensor.name, 0, sensor.measures, sensor.noise_std, MS, 5 * MS)
-    values = TRUTH.force_n if sensor is CELL else velocity()
-    heights, read = noisy(TRUTH.height_m, NOISE_M, 1), noisy(values, sensor.noise_std, 2)
-    at_once, _ = errors(follow((sensor,), lambda tick: [(0, read[tick])], heights=heights))
+@pytest.mark.parametrize("channel", [CELL, TACHO])
+def test_a_late_sensor_is_held_against_the_model_of_its_time(channel):
+    late = sensor(channel.name, channel.quantity, channel.noise_std, MS, 5 * MS)
+    values = TRUTH.force_n if channel is CELL else velocity()
+    heights, read = noisy(TRUTH.height_m, NOISE_M, 1), noisy(values, channel.noise_std, 2)
+    at_once, _ = errors(follow((channel,), lambda tick: [(0, read[tick])], heights=heights))
     delayed, _ = errors(
         follow((late,), lambda tick: [(0, read[tick - 5])] if tick >= 5 else [], heights=heights)
     )
     ignored, _ = errors(
-        follow((sensor,), lambda tick: [(0, read[tick - 5])] if tick >= 5 else [], heights=heights)
+        follow((channel,), lambda tick: [(0, read[tick - 5])] if tick >= 5 else [], heights=heights)
     )
     alone, _ = errors(follow((), lambda _tick: [], heights=heights))
     assert rms(at_once) <= rms(delayed) < 0.7 * rms(alone)
@@ -216,7 +222,7 @@ def test_a_sensor_that_is_out_does_not_come_back_without_the_reference():
     heights, read = noisy(TRUTH.height_m, NOISE_M, 1), TRUTH.height_m.copy()
     read[900:] += 5e-3
     heights[1000:1400] = np.nan
-    wire = Sensor("strut.wire", 0, Measures.HEIGHT, 1e-5, MS)
+    wire = sensor("strut.wire", HEIGHT, 1e-5, MS)
     outputs = follow((wire,), lambda tick: [(0, read[tick])], heights=heights)
     assert all(output.left_out for output in outputs[910:])
     assert not any(output.struts[0].valid for output in outputs[1100:1390])
@@ -225,14 +231,17 @@ def test_a_sensor_that_is_out_does_not_come_back_without_the_reference():
 
 
 def test_two_steps_at_one_time_keep_the_input_of_both():
-    core = RigCore(TRUTH.plant, (kalman(),), SUPERVISION, (Arrival(MS),), (WIRE,))
+    core = supervised(TRUTH.plant, (kalman(),), SUPERVISION, channels(1, sensors=(WIRE,)))
     state = core.init(0)
     for tick in range(100):
-        given_now = StepInput(tick * MS, (Measurement(0.4 + 1e-5 * tick, tick * MS),))
-        state, _ = core.step(state, given_now)
+        sample = Sample(0, 0.4 + 1e-5 * tick, tick * MS)
+        state, _, _ = core.step(state, StepInput(tick * MS, (sample,)))
     for height_m in (0.40, 0.41):
-        state, output = core.step(state, StepInput(100 * MS, (Measurement(height_m, 100 * MS),)))
-    driven = -output.struts[0].virtual_force_n * state.observers[0].error.start.mobility_per_kg
-    state, _ = core.step(state, StepInput(101 * MS, (Measurement(0.4, 101 * MS),)))
-    inputs = dict(state.observers[0].several.inputs)
+        sample = Sample(0, height_m, 100 * MS)
+        state, output, _ = core.step(state, StepInput(100 * MS, (sample,)))
+    driven = (
+        -output.struts[0].virtual_force_n * state.estimator.observers[0].error.start.mobility_per_kg
+    )
+    state, _, _ = core.step(state, StepInput(101 * MS, (Sample(0, 0.4, 101 * MS),)))
+    inputs = dict(state.estimator.observers[0].fusion.inputs)
     assert inputs[100 * MS] == driven

@@ -7,15 +7,14 @@ import pytest
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model, parse_model
-from rig.bridge.free_model import RigCore
 from rig.bridge.supervisor import Supervision
 from rig.closed_loop.loop import Rhythm
 from rig.closed_loop.poles import Pole, closed_loop_poles
 from rig.observers.pi import PiObserver
-from tests.bridge.cores import GAINS, MS, gains, measured, run
+from tests.bridge.cores import GAINS, MS, gains, measured, run, supervised
 
 REST_M = 0.5 - 10.0 * 9.81 / 500.0
-ALWAYS_FRESH = Supervision(10**15, 10**16, safe_holds_last=False)
+ALWAYS_FRESH = Supervision(stale_after_s=1e6, safe_after_s=1e7)
 
 
 def reference() -> DartPlant:
@@ -28,7 +27,7 @@ def poles(observer: PiObserver, every: int = 1, delay: int = 0) -> list[Pole]:
 
 def ringing(observer: PiObserver, every: int) -> tuple[float, float]:
     """Decay per measurement and frequency (Hz) of the simulated loop's innovation."""
-    rig = RigCore(reference(), (observer,), ALWAYS_FRESH)
+    rig = supervised(reference(), (observer,), ALWAYS_FRESH)
     count = 600 * every
     inputs = [measured(0, REST_M + 1e-3)] + [
         measured(tick, REST_M if tick % every == 0 else None) for tick in range(1, count)
@@ -89,7 +88,7 @@ def test_a_loop_that_runs_away_has_a_pole_outside(gains, every, delay):
 
 def test_a_slow_measurement_that_runs_away_does_so_at_the_speed_of_its_pole():
     fastest = max(pole.magnitude for pole in poles(GAINS, 10))
-    rig = RigCore(reference(), (gains(1e5, 1e4, 1e12),), ALWAYS_FRESH)
+    rig = supervised(reference(), (gains(1e5, 1e4, 1e12),), ALWAYS_FRESH)
     inputs = [measured(0, REST_M + 1e-6)] + [
         measured(tick, REST_M if tick % 10 == 0 else None) for tick in range(1, 600)
     ]

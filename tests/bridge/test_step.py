@@ -1,7 +1,6 @@
 """A tick: what it does with what came, and with what did not."""
 
 import math
-from dataclasses import replace as with_changes
 from itertools import pairwise
 
 import pytest
@@ -10,9 +9,20 @@ from hypothesis import strategies as st
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model
-from rig.bridge.contract import Mode, StepInput, StepOutput, StrutOutput
-from rig.bridge.free_model import RigCore
-from tests.bridge.cores import GAINS, MS, SUPERVISION, core, gains, measured, others, run
+from rig.bridge.free_model import FreeModelEstimator
+from rig.bridge.supervisor import Supervisor
+from rig.bridge.values import Mode, StepInput, StepOutput, StrutOutput
+from tests.bridge.cores import (
+    GAINS,
+    MS,
+    SUPERVISION,
+    channels,
+    core,
+    gains,
+    measured,
+    run,
+    supervised,
+)
 
 REST_M = 0.5 - 10.0 * 9.81 / 500.0
 
@@ -25,14 +35,14 @@ def test_nothing_is_said_before_every_strut_was_measured():
     assert [output.mode for output in outputs] == [Mode.WAITING, Mode.WAITING, Mode.RUNNING]
     assert [len(output.struts) for output in outputs] == [0, 0, 2]
     assert [strut.height_m for strut in outputs[2].struts] == pytest.approx([0.29, 0.4])
-    assert states[2].model is not None
+    assert states[2].estimator.model is not None
 
 
 def test_the_model_keeps_the_time_of_the_run():
     rig = core()
     states, _ = run(rig, [measured(tick, REST_M) for tick in (2500, 2501)])
-    assert states[0].model.state.t_s == pytest.approx(2.5, abs=1e-12)
-    assert states[1].model.state.t_s == pytest.approx(2.501, abs=1e-12)
+    assert states[0].estimator.model.state.t_s == pytest.approx(2.5, abs=1e-12)
+    assert states[1].estimator.model.state.t_s == pytest.approx(2.501, abs=1e-12)
 
 
 def test_a_first_measurement_that_has_grown_old_does_not_start_the_model():
@@ -56,13 +66,12 @@ def test_a_constant_unknown_force_leaves_no_steady_innovation():
     assert strut.force_n == pytest.approx(10.0 * 9.81, abs=0.001)
 
 
-def damped(rig: RigCore) -> RigCore:
+def damped(rig: Supervisor) -> Supervisor:
     """The same with a damper that lets a high integral gain settle."""
-    spec = rig._plant.spec
+    spec = rig.estimator._plant.spec
     strut = spec.struts[0].model_copy(update={"damping_n_s_per_m": 2000.0})
-    return RigCore(
-        DartPlant(spec.model_copy(update={"struts": (strut,)})), rig._observers, rig._supervision
-    )
+    plant = DartPlant(spec.model_copy(update={"struts": (strut,)}))
+    return supervised(plant, rig.estimator._observers)
 
 
 def test_the_seed_gains_leave_what_proportional_control_leaves():
@@ -81,7 +90,7 @@ def test_between_measurements_the_virtual_force_is_held(gap):
     inputs = [measured(tick, 0.4 if tick % (gap + 1) == 0 else None) for tick in range(100)]
     _, outputs = run(rig, inputs)
     for tick, (before, after) in enumerate(pairwise(outputs), start=1):
-        if inputs[tick].heights[0] is None:
+        if not inputs[tick].samples:
             assert after.struts[0].virtual_force_n == before.struts[0].virtual_force_n
             assert after.struts[0].innovation_m == before.struts[0].innovation_m
         assert after.struts[0].height_m != before.struts[0].height_m
@@ -103,8 +112,8 @@ def test_a_late_measurement_is_compared_with_the_model_of_its_own_time():
     rig = core()
     states, _ = run(rig, [measured(tick, 0.4) for tick in range(20)])
     late_ns = 600_000
-    _, fresh = rig.step(states[-1], measured(20, 0.41))
-    _, late = rig.step(states[-1], measured(20, 0.41, late_ns=late_ns))
+    _, fresh, _ = rig.step(states[-1], measured(20, 0.41))
+    _, late, _ = rig.step(states[-1], measured(20, 0.41, late_ns=late_ns))
     # The model's velocity before the correction is the same in both.
     free = rig.step(states[-1], measured(20, None))[1].struts[0].velocity_m_per_s
     difference = late.struts[0].innovation_m - fresh.struts[0].innovation_m
@@ -125,8 +134,8 @@ def test_a_stale_measurement_freezes_the_integral_and_then_leads_to_the_safe_sta
     assert modes[:20] == [Mode.RUNNING] * 20
     assert modes[20:510] == [Mode.HOLD] * 490
     assert set(modes[510:]) == {Mode.SAFE}
-    assert {states[k].observers[0].integral_m_s for k in range(9, 600)} == {
-        states[9].observers[0].integral_m_s
+    assert {states[k].estimator.observers[0].integral_m_s for k in range(9, 600)} == {
+        states[9].estimator.observers[0].integral_m_s
     }
     assert [output.struts[0].valid for output in outputs[:21]] == [True] * 20 + [False]
 
@@ -139,9 +148,9 @@ def test_a_fresh_measurement_ends_the_hold():
     assert outputs[-1].struts[0].valid
 
 
-@pytest.mark.parametrize("holds_last", [False, True])
-def test_the_safe_output_is_held_until_it_is_acknowledged(holds_last):
-    rig = core(supervision=with_changes(SUPERVISION, safe_holds_last=holds_last))
+@pytest.mark.parametrize("safe_output", ["zero", "last"])
+def test_the_safe_output_is_held_until_it_is_acknowledged(safe_output):
+    rig = core(supervision=SUPERVISION.model_copy(update={"safe_output": safe_output}))
     running = [measured(tick, 0.4) for tick in range(10)]
     _, outputs = run(rig, running)
     last_valid = outputs[-1].struts[0].force_n
@@ -153,10 +162,10 @@ def test_the_safe_output_is_held_until_it_is_acknowledged(holds_last):
     assert {output.struts[0] for output in outputs} == {safe}
     before_stale = run(rig, running + gone(10, 20))[1][-1].struts[0].force_n
     assert safe == StrutOutput(
-        before_stale if holds_last else 0.0, 0.0, False, safe.height_m, 0.0, 0.0, 0.0
+        before_stale if safe_output == "last" else 0.0, 0.0, False, safe.height_m, 0.0, 0.0, 0.0
     )
     assert math.isfinite(last_valid)
-    acknowledged = StepInput(560 * MS, (None,), acknowledged=True)
+    acknowledged = StepInput(560 * MS, acknowledged=True)
     states, outputs = run(rig, [acknowledged, measured(561, 0.45)], states[-1])
     assert [output.mode for output in outputs] == [Mode.WAITING, Mode.RUNNING]
     assert outputs[1].struts[0].height_m == pytest.approx(0.45)
@@ -166,8 +175,8 @@ def test_an_acknowledgement_means_nothing_elsewhere():
     rig = core()
     states, _ = run(rig, [measured(tick, 0.4) for tick in range(10)])
     plain = measured(10, 0.4)
-    told = StepInput(plain.t_ns, plain.heights, acknowledged=True)
-    assert rig.step(states[-1], told) == rig.step(states[-1], plain)
+    acknowledged = StepInput(plain.t_ns, plain.samples, acknowledged=True)
+    assert rig.step(states[-1], acknowledged) == rig.step(states[-1], plain)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e308])
@@ -186,9 +195,8 @@ def test_a_model_that_diverges_goes_to_the_safe_state(model, bad, capfd):
         assert strut.force_n == 0.0
         assert not strut.valid
         assert strut.height_m == pytest.approx(last.height_m, abs=1e-3)
-    acknowledged = StepInput(
-        9 * MS, measured(9, *heights).heights, others(applied_force=0.0), acknowledged=True
-    )
+    samples = measured(9, *heights, applied_n=0.0).samples
+    acknowledged = StepInput(9 * MS, samples, acknowledged=True)
     _, outputs = run(rig, [acknowledged], states[-1])
     assert outputs[-1].mode is Mode.RUNNING
 
@@ -196,7 +204,7 @@ def test_a_model_that_diverges_goes_to_the_safe_state(model, bad, capfd):
 def test_a_measurement_that_is_no_number_goes_to_the_safe_state(capfd):
     rig = core()
     states, _ = run(rig, [measured(tick, 0.4) for tick in range(5)])
-    _, output = rig.step(states[-1], measured(5, math.nan))
+    _, output, _ = rig.step(states[-1], measured(5, math.nan))
     capfd.readouterr()
     assert output.mode is Mode.SAFE
     assert math.isfinite(output.struts[0].height_m)
@@ -220,8 +228,7 @@ def test_a_run_continues_identically_from_any_of_its_states(drawn, cut, stride):
     inputs = [
         StepInput(
             tick * stride * MS,
-            measured(tick * stride, tyre, suspension).heights,
-            others(applied_force=applied_n),
+            measured(tick * stride, tyre, suspension, applied_n=applied_n).samples,
             acknowledged=acknowledged,
         )
         for tick, (tyre, suspension, applied_n, acknowledged) in enumerate(drawn)
@@ -240,7 +247,7 @@ def test_every_tick_says_something_whether_or_not_a_frame_came():
     assert all(len(output.struts) == 1 for output in outputs)
 
 
-def strut_alone(index: int) -> RigCore:
+def strut_alone(index: int) -> Supervisor:
     """A core of one strut of the quarter car, with the same gains."""
     spec = load_model(MODELS / "quarter_car.yaml")
     body = spec.skeleton.bodies[index]
@@ -250,7 +257,7 @@ def strut_alone(index: int) -> RigCore:
     )
     strut = spec.struts[index].model_copy(update={"between": ("world", body.name)})
     alone = spec.model_copy(update={"skeleton": skeleton, "struts": (strut,)})
-    return RigCore(DartPlant(alone), (GAINS,), SUPERVISION)
+    return supervised(DartPlant(alone), (GAINS,))
 
 
 @pytest.mark.parametrize("index", [0, 1])
@@ -264,10 +271,10 @@ def test_an_observer_is_the_same_alone_and_in_the_quarter_car(index):
     state = alone.init(0)
     for tick, quarter in enumerate(states):
         # The height that makes the same innovation at the model that is alone.
-        state_free, free = alone.step(state, measured(tick, None if tick else heights[0][index]))
-        target = quarter.observers[index]
+        state_free, free, _ = alone.step(state, measured(tick, None if tick else heights[0][index]))
+        target = quarter.estimator.observers[index]
         model_m = free.struts[0].height_m
-        state, output = alone.step(state, measured(tick, model_m + target.innovation_m))
+        state, output, _ = alone.step(state, measured(tick, model_m + target.innovation_m))
         assert state_free.mode is state.mode
         assert output.struts[0].innovation_m == pytest.approx(target.innovation_m, abs=1e-15)
         assert output.struts[0].virtual_force_n == pytest.approx(target.virtual_force_n, abs=1e-8)
@@ -277,14 +284,17 @@ def test_one_observer_hears_only_its_own_strut():
     rig = core("quarter_car")
     both = [measured(tick, 0.29, 0.4) for tick in range(5)]
     states, _ = run(rig, both)
-    other, _ = rig.step(states[-1], measured(5, None, 0.41))
-    assert other.observers[0] == states[-1].observers[0]
-    assert other.observers[1] != states[-1].observers[1]
+    other, _, _ = rig.step(states[-1], measured(5, None, 0.41))
+    before, after = states[-1].estimator.observers, other.estimator.observers
+    assert after[0] == before[0]
+    assert after[1] != before[1]
 
 
 def test_each_strut_has_one_observer():
     with pytest.raises(ValueError, match="1 observers for 2 struts"):
-        RigCore(DartPlant(load_model(MODELS / "quarter_car.yaml")), (GAINS,), SUPERVISION)
+        FreeModelEstimator(
+            DartPlant(load_model(MODELS / "quarter_car.yaml")), (GAINS,), channels(2), 10 * MS
+        )
 
 
 def test_output_before_the_model_runs_is_empty():

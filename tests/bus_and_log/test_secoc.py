@@ -15,8 +15,9 @@ from rig.bus.secoc import Authentication, Authenticator, cmac, read_key
 from rig.log.reader import STEPS_FILE
 from rig.plan.check import Severity, check
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.live import with_bench
+from rig.run.loop import RunControl
 from rig.run.ports import BusPort
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
@@ -201,12 +202,11 @@ def configured(tmp_path):
 
 def in_lockstep(path, folder):
     with_bench(
-        load_setup(path, duration_s=0.3),
+        load_plan(path, duration_s=0.3),
         load_bench_config(CONFIGS / "reference_bench.yaml"),
         folder,
         lockstep=True,
-        stop=lambda: False,
-        progress=lambda _t_ns, _mode: None,
+        control=RunControl(progress=lambda _t_ns, _mode: None),
     )
     return (folder / STEPS_FILE).read_bytes()
 
@@ -226,7 +226,7 @@ def test_the_check_tells_of_it(configured):
     path = configured()
 
     def found():
-        [finding] = [item for item in check(load_setup(path)) if item.what == "authentication"]
+        [finding] = [item for item in check(load_plan(path)) if item.what == "authentication"]
         return finding
 
     assert found().severity is Severity.OK
@@ -246,7 +246,7 @@ def test_the_check_tells_of_it(configured):
 )
 def test_a_configuration_that_cannot_work_is_refused(configured, keys, said):
     with pytest.raises(InputError, match=said):
-        load_setup(configured(**keys))
+        load_plan(configured(**keys))
 
 
 @pytest.mark.parametrize("text", ["", "00" * 15, "00" * 17, "zz" * 16, KEY.hex()[:-1]])

@@ -7,8 +7,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from rig.bridge.contract import Mode, StepOutput, StrutOutput
-from rig.bridge.messages import Counts
+from rig.bridge.report import Counts
+from rig.bridge.values import Mode, StepOutput, StrutOutput
 from rig.cli.main import main
 from rig.cli.output import console, table
 from rig.cli.progress import status_line

@@ -9,7 +9,7 @@ from rig.cli.main import main
 from rig.formats import export as exported
 from rig.log.reader import changed_files, read_run
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from tests.run.listed import ListPort, bench_frames, live
 
 
@@ -22,7 +22,7 @@ def rig(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    ready = load_setup(CONFIGS / "reference.yaml", duration_s=0.2)
+    ready = load_plan(CONFIGS / "reference.yaml", duration_s=0.2)
     live(ready, tmp_path / "run", ListPort(bench_frames(ready, 200, {}), set()))
     return tmp_path / "run"
 
@@ -100,9 +100,9 @@ def test_a_run_without_a_tick_is_no_success(run, monkeypatch, capsys):
     ("channel", "written"), [("two words", "two_words"), ("zwölf\n", "zw_lf_"), ("can0", "can0")]
 )
 def test_a_channel_of_any_name_gives_a_log_that_can_be_read(tmp_path, channel, written):
-    ready = load_setup(CONFIGS / "reference.yaml", duration_s=0.05)
+    ready = load_plan(CONFIGS / "reference.yaml", duration_s=0.05)
     bus = ready.config.bus.model_copy(update={"channel": channel})
-    ready = ready.model_copy(update={"config": ready.config.model_copy(update={"bus": bus})})
+    ready = ready.with_config(ready.config.model_copy(update={"bus": bus}))
     live(ready, tmp_path / "run", ListPort(bench_frames(ready, 50, {}), set()))
     assert len(list(read_run(tmp_path / "run").frames())) > 50
     assert f" {written} " in (tmp_path / "run" / "frames.log").read_text().splitlines()[0]
@@ -170,12 +170,12 @@ def test_a_run_that_never_had_a_height_is_no_success(tmp_path, monkeypatch, caps
 
 
 def test_a_run_with_heights_alone_is_not_diagnosed(tmp_path, monkeypatch, capsys):
-    ready = load_setup(CONFIGS / "reference.yaml", duration_s=1.0)
+    ready = load_plan(CONFIGS / "reference.yaml", duration_s=1.0)
     signals = ready.config.signals.model_copy(
         update=dict.fromkeys(("applied_force", "load_cell_force", "temperature"))
     )
     config = ready.config.model_copy(update={"signals": signals})
-    ready = ready.model_copy(update={"config": config})
+    ready = ready.with_config(config)
     live(ready, tmp_path / "run", ListPort(bench_frames(ready, 1000, {}), set()))
     arguments = ("diagnose", tmp_path / "run", "--model", "reference", "--out", tmp_path / "found")
     assert rig(monkeypatch, *arguments) == 2

@@ -14,8 +14,9 @@ from can_dbc.frame import Frame
 from rig.formats.export import FORMATS, export_run, import_run
 from rig.log.reader import parse_frame, read_run
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.live import with_bench
+from rig.run.loop import RunControl
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
 
@@ -24,17 +25,16 @@ from rig.simulated_bench.config import load_bench_config
 def run(tmp_path_factory):
     """A rotated run of half a second, with an extended, an FD and an error frame at its end."""
     folder = tmp_path_factory.mktemp("export") / "run"
-    ready = load_setup(CONFIGS / "reference.yaml", duration_s=1.5)
+    ready = load_plan(CONFIGS / "reference.yaml", duration_s=1.5)
     log = ready.config.log.model_copy(update={"rotate_s": 1.0})
     bus = ready.config.bus.model_copy(update={"channel": "export"})
     config = ready.config.model_copy(update={"log": log, "bus": bus})
     with_bench(
-        ready.model_copy(update={"config": config}),
+        ready.with_config(config),
         load_bench_config(CONFIGS / "reference_bench.yaml"),
         folder,
         lockstep=True,
-        stop=lambda: False,
-        progress=lambda _t_ns, _mode: None,
+        control=RunControl(progress=lambda _t_ns, _mode: None),
     )
     last = read_run(folder).frame_files[-1]
     assert last.name == "frames.0001.log"

@@ -10,13 +10,13 @@ import pytest
 import yaml
 
 from can_dbc.errors import InputError
-from rig.bridge.contract import Mode
+from rig.bridge.values import Mode
 from rig.cli.main import main
 from rig.formats import smoothed
 from rig.formats.smoothed import read_smoothed
 from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.live import with_bench
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.trajectory import simulate
@@ -37,9 +37,9 @@ def bench_run(folder: Path, case: str, changed=None, **sent):
     (folder / "bench.yaml").write_text(yaml.safe_dump(content))
     config = yaml.safe_load((CONFIGS / f"{case}.yaml").read_text()) | (changed or {})
     (folder / "rig.yaml").write_text(yaml.safe_dump(config))
-    ready = load_setup(folder / "rig.yaml", duration_s=DURATION_S)
+    ready = load_plan(folder / "rig.yaml", duration_s=DURATION_S)
     bench = load_bench_config(folder / "bench.yaml")
-    with_bench(ready, bench, folder / "run", lockstep=True, stop=lambda: False)
+    with_bench(ready, bench, folder / "run", lockstep=True)
     period_ns = ready.config.period_ns
     return simulate(bench, int(DURATION_S * 1e9) + period_ns, period_ns).strut_force_n
 
@@ -130,9 +130,9 @@ def test_an_old_height_is_taken_at_its_own_time(tmp_path):
     (tmp_path / "bench.yaml").write_text(yaml.safe_dump(content))
     config = yaml.safe_load((CONFIGS / "reference.yaml").read_text()) | changed
     (tmp_path / "rig.yaml").write_text(yaml.safe_dump(config))
-    ready = load_setup(tmp_path / "rig.yaml", duration_s=DURATION_S)
+    ready = load_plan(tmp_path / "rig.yaml", duration_s=DURATION_S)
     bench = load_bench_config(tmp_path / "bench.yaml")
-    with_bench(ready, bench, tmp_path / "run", lockstep=True, stop=lambda: False)
+    with_bench(ready, bench, tmp_path / "run", lockstep=True)
     truth_n = simulate(bench, int(DURATION_S * 1e9) + MS, MS).strut_force_n
     online_n, smoothed_n, held = errors(tmp_path / "run", truth_n, "strut")
     assert smoothed_n < 0.3 * online_n
@@ -214,21 +214,19 @@ def test_what_is_read_back_stays_as_it_was(reference, tmp_path, monkeypatch, cap
 
 def test_what_cannot_be_smoothed_is_refused(reference, tmp_path, monkeypatch, capsys):
     run, _ = reference
-    ready = load_setup(CONFIGS / "dyno.yaml", duration_s=0.2)
+    ready = load_plan(CONFIGS / "dyno.yaml", duration_s=0.2)
     bench = load_bench_config(CONFIGS / "dyno_bench.yaml")
-    with_bench(ready, bench, tmp_path / "dyno", lockstep=True, stop=lambda: False)
+    with_bench(ready, bench, tmp_path / "dyno", lockstep=True)
     out = ("--format", "csv", "--smoothed", "--out", tmp_path / "out.csv")
     assert rig(monkeypatch, "export", tmp_path / "dyno", *out) == 2
     assert "prescribed_motion" in capsys.readouterr().err
-    ready = load_setup(CONFIGS / "reference.yaml", duration_s=0.1)
+    ready = load_plan(CONFIGS / "reference.yaml", duration_s=0.1)
     bench = load_bench_config(CONFIGS / "reference_bench.yaml")
-    with_bench(ready, bench, tmp_path / "short", lockstep=True, stop=lambda: False)
+    with_bench(ready, bench, tmp_path / "short", lockstep=True)
     assert rig(monkeypatch, "export", tmp_path / "short", *out) == 2
     assert "nowhere RUNNING with 200 heights" in capsys.readouterr().err
     assert not (tmp_path / "out.csv").exists()
     pitching = FullCar().model(tmp_path)
     found, ready = smoothed.setup_of_run(run)
     with pytest.raises(InputError, match="straight guides"):
-        smoothed.smoothed_forces(
-            found, ready.model_copy(update={"model": pitching}), lambda _what, _share: None
-        )
+        smoothed.smoothed_forces(found, ready.with_model(pitching), lambda _what, _share: None)

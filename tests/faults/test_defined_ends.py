@@ -2,13 +2,14 @@
 
 import numpy as np
 
-from rig.bridge.contract import Mode
-from rig.bridge.messages import Conditions
+from rig.bridge.report import Conditions
+from rig.bridge.values import Mode
 from rig.log.reader import read_run
 from rig.log.whole_file import WholeFile
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.live import with_bench
+from rig.run.loop import RunControl
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
 from tests.faults.trial import MS, Trial
@@ -52,12 +53,11 @@ def test_an_emergency_stop_while_the_disk_is_full_ends_the_run_in_order(tmp_path
 
     monkeypatch.setattr(WholeFile, "append", broken)
     ended = with_bench(
-        load_setup(CONFIGS / "reference.yaml"),
+        load_plan(CONFIGS / "reference.yaml"),
         load_bench_config(CONFIGS / "reference_bench.yaml"),
         tmp_path / "run",
         lockstep=True,
-        stop=lambda: now_ns[0] >= 600 * MS,
-        progress=progress,
+        control=RunControl(stop=lambda: now_ns[0] >= 600 * MS, progress=progress),
     )
     assert ended.ticks == 601
     ending = read_run(tmp_path / "run").header["ending"]

@@ -1,16 +1,23 @@
 """Faults that a CANopen device reports of itself, between bench and bridge, at 1 kHz."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.bridge.contract import Mode
-from rig.bridge.devices import Device, after_alarm, after_frame, trouble, well
-from rig.plan.assembly import build_bridge
-from rig.plan.setup import load_setup
-from tests.faults.trial import BEGIN_NS, MEASUREMENT, MS, Trial, after, first_ms
+from rig.bridge.devices import (
+    Device,
+    fault,
+    initial_health,
+    update_by_alarm,
+    update_by_frame,
+)
+from rig.bridge.values import Mode
+from rig.plan.build import build_bridge
+from rig.plan.load import load_plan
+from tests.faults.trial import BEGIN_NS, MEASUREMENT, MS, Trial, after, first_ms, height_of
 
 NODE = 5
 EMERGENCY, HEARTBEAT = 0x80 + NODE, 0x700 + NODE
@@ -80,8 +87,8 @@ def test_an_emergency(row):
     assert found_ms <= 1
     assert len(held) in (100, 101)
     assert not any(tick.is_valid for tick in held)
-    assert all(tick.result.step_input.heights[0] is None for tick in held[1:])
-    assert held[3].result.troubles == ((0, "emergency 0x8130"),)
+    assert all(trial.value(tick.result.step_input, "strut") is None for tick in held[1:])
+    assert held[3].result.device_faults == ((0, "emergency 0x8130"),)
     assert ticks[-1].mode is Mode.RUNNING
     counts = ticks[-1].counts
     assert counts.device_faulty == 100
@@ -128,9 +135,9 @@ def test_an_alarm_in_the_measurement_itself(row):
     # The counter stands in for an alarm: 1 to 15 are alarms, 0 is none.
     trial = Trial({"BENCH": {"node_id": NODE, "alarms": [alarm]}})
     ticks = trial.run(200)
-    assert all(tick.mode is not Mode.RUNNING for tick in ticks if tick.result.troubles)
-    assert all(tick.result.troubles for tick in ticks[20:] if tick.mode is Mode.HOLD)
-    used = [tick for tick in ticks if tick.result.step_input.heights[0] is not None]
+    assert all(tick.mode is not Mode.RUNNING for tick in ticks if tick.result.device_faults)
+    assert all(tick.result.device_faults for tick in ticks[20:] if tick.mode is Mode.HOLD)
+    used = [tick for tick in ticks if height_of(tick.result) is not None]
     assert len(used) == pytest.approx(len(ticks) / 16, abs=2)
     row(
         33,
@@ -168,7 +175,8 @@ def test_a_payload_of_another_length(row):
 def test_a_device_without_a_height_does_not_hold_the_estimate():
     device = Device("CELL", 7, 0x87, 0, is_vital=False)
     trial = Trial()
-    bridge = type(trial.bridge)(trial.bridge.core, trial.bridge.incoming, (), devices=(device,))
+    plan = replace(trial.ready, devices=(device,))
+    bridge = build_bridge(plan)
     trial.bridge, trial.state = bridge, bridge.init(0)
     told = Frame(BEGIN_NS, 0x87, b"\x30\x81\x01" + bytes(5), is_extended=False)
     ticks = trial.run(400, at(BEGIN_NS // MS, told))
@@ -178,27 +186,27 @@ def test_a_device_without_a_height_does_not_hold_the_estimate():
 
 def test_errors_that_overlap_last_until_the_register_is_clear():
     device = Device("D", NODE, EMERGENCY, 0)
-    health = well(device, 0)
-    health = after_frame(device, health, emergency(0x5000, 0x21, 1))
-    health = after_frame(device, health, emergency(0x8130, 0x31, 2))
-    health = after_frame(device, health, emergency(0x0000, 0x20, 3))
-    assert trouble(device, health, 4) == "emergency 0x8130"
-    health = after_frame(device, health, emergency(0x0000, 0x00, 5))
-    assert trouble(device, health, 6) is None
+    health = initial_health(device, 0)
+    health = update_by_frame(device, health, emergency(0x5000, 0x21, 1))
+    health = update_by_frame(device, health, emergency(0x8130, 0x31, 2))
+    health = update_by_frame(device, health, emergency(0x0000, 0x20, 3))
+    assert fault(device, health, 4) == "emergency 0x8130"
+    health = update_by_frame(device, health, emergency(0x0000, 0x00, 5))
+    assert fault(device, health, 6) is None
 
 
 def test_frames_of_another_length_say_nothing():
     device = Device("D", NODE, EMERGENCY, MS)
-    health = well(device, 0)
+    health = initial_health(device, 0)
     for key, data in ((EMERGENCY, b"\x00\x50"), (HEARTBEAT, b""), (HEARTBEAT, b"\x04\x04")):
-        assert after_frame(device, health, Frame(1, key, data, is_extended=False)) == health
+        assert update_by_frame(device, health, Frame(1, key, data, is_extended=False)) == health
 
 
 def test_alarms_are_kept_apart():
     device = Device("D", NODE, EMERGENCY, 0, alarms=2)
-    health = after_alarm(after_alarm(well(device, 0), 0, 3), 1, 9)
-    assert trouble(device, after_alarm(health, 0, 0), 1) == "alarm 0x9"
-    assert trouble(device, after_alarm(after_alarm(health, 0, 0), 1, 0), 1) is None
+    health = update_by_alarm(update_by_alarm(initial_health(device, 0), 0, 3), 1, 9)
+    assert fault(device, update_by_alarm(health, 0, 0), 1) == "alarm 0x9"
+    assert fault(device, update_by_alarm(update_by_alarm(health, 0, 0), 1, 0), 1) is None
 
 
 @pytest.mark.parametrize(
@@ -234,7 +242,7 @@ def test_devices_that_cannot_be(tmp_path, devices, expected):
     }
     (tmp_path / "rig.yaml").write_text(json.dumps(config))
     with pytest.raises(InputError, match=r".") as error:
-        build_bridge(load_setup(tmp_path / "rig.yaml"))
+        build_bridge(load_plan(tmp_path / "rig.yaml"))
     assert expected in str(error.value)
     assert "\n" not in str(error.value)
 

@@ -8,8 +8,8 @@ from msgspec.structs import replace
 from can_dbc.codec import compile_decoder
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
-from rig.bridge.bridge import RIVAL_FRAMES
-from rig.bridge.contract import Mode
+from rig.bridge.gates import SECOND_SENDER_FRAMES
+from rig.bridge.values import Mode
 from tests.faults.trial import (
     BEGIN_NS,
     MEASUREMENT,
@@ -18,6 +18,7 @@ from tests.faults.trial import (
     after,
     first_ms,
     force_error_n,
+    height_of,
     measurements_only,
 )
 
@@ -42,8 +43,8 @@ def genuine_heights(trial):
 
 def assert_only_genuine_heights_were_used(trial):
     genuine = genuine_heights(trial)
-    used = [tick.result.step_input.heights[0] for tick in trial.ticks]
-    assert {item.height_m for item in used if item is not None} <= genuine
+    used = [height_of(tick.result) for tick in trial.ticks]
+    assert {item.value for item in used if item is not None} <= genuine
 
 
 def test_loss(row, undisturbed_n):
@@ -205,7 +206,7 @@ def test_a_second_sender_of_the_benchs_id(row):
 
     ticks = trial.run(END_MS, after(BEGIN_NS, measurements_only(rival)))
     found_ms = first_ms(ticks, lambda tick: tick.counts.second_sender > 0)
-    assert found_ms <= 2 * RIVAL_FRAMES
+    assert found_ms <= 2 * SECOND_SENDER_FRAMES
     row(
         8,
         "a second sender of the bench's id, with valid frames",
@@ -251,8 +252,8 @@ def test_flood(row):
 
     ticks = trial.run(END_MS, after(BEGIN_NS, flood))
     genuine = genuine_heights(trial)
-    used = [tick.result.step_input.heights[0] for tick in ticks]
-    wrong = [item for item in used if item is not None and item.height_m not in genuine]
+    used = [height_of(tick.result) for tick in ticks]
+    wrong = [item for item in used if item is not None and item.value not in genuine]
     counts, sent = ticks[-1].counts, 20 * (END_MS - BEGIN_NS // MS)
     assert counts.wrong_crc + counts.masquerade > 0.99 * sent
     assert len(wrong) <= sent // 5000

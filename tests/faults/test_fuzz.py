@@ -57,7 +57,7 @@ def fuzz(ticks, seed):
         trial.state, result = bridge.tick(trial.state, index * 1_000_000, given)
         counts = trial.state.counts
         heights = {_height(frame, heights_of.get(frame.arbitration_id)) for frame in given}
-        used = {item.height_m for item in result.step_input.heights if item is not None}
+        used = {item.value for item in result.step_input.samples if item.channel == 0}
         assert used <= heights - {None}
         assert counts.refused - before.refused <= len(given)
         for strut in result.output.struts:

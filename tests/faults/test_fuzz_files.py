@@ -11,13 +11,13 @@ import pytest
 import yaml
 
 import rig.log.reader
-import rig.plan.setup
+import rig.plan.load
 from can_dbc.errors import DatabaseError, InputError
 from rig.diagnosis.recording import RecordingError, read_csv
 from rig.formats.mapping import load_mapping
 from rig.log.reader import DBC_FILE, FRAMES_FILE, MODEL_FILE, RUN_FILE, STEPS_FILE
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.schema import BenchConfigError
@@ -107,8 +107,8 @@ def run(tmp_path_factory):
 def known(monkeypatch):
     """Reads what stays the same once."""
     for module, name in (
-        (rig.plan.setup, "load_database"),
-        (rig.plan.setup, "load_model"),
+        (rig.plan.load, "load_database"),
+        (rig.plan.load, "load_model"),
     ):
         monkeypatch.setattr(module, name, once_for_each_content(getattr(module, name)))
     parse, texts = rig.log.reader.parse_mapping, {}
@@ -142,7 +142,7 @@ def other(kind):
     """Content, name and reader of a file that belongs to no run."""
     match kind:
         case "config":
-            return (CONFIGS / "reference.yaml").read_bytes(), "reference.yaml", load_setup
+            return (CONFIGS / "reference.yaml").read_bytes(), "reference.yaml", load_plan
         case "bench":
             return (CONFIGS / "story_bench.yaml").read_bytes(), "bench.yaml", load_bench_config
         case "mapping":

@@ -13,16 +13,17 @@ import yaml
 from msgspec.structs import replace
 
 from can_dbc.frame import Frame
-from rig.bridge.contract import Mode
-from rig.bridge.messages import Conditions
+from rig.bridge.report import Conditions
+from rig.bridge.values import Mode
 from rig.bus.bus import BusError
 from rig.bus.link import Link
 from rig.log.reader import read_run
 from rig.log.steps import LOG_FAULT
 from rig.log.whole_file import WholeFile
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.live import with_bench
+from rig.run.loop import RunControl
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
 from tests.bus_and_log.at_once import AtOnce
@@ -156,15 +157,14 @@ def test_clock_jump(row, step_s):
 
 
 def lockstep(folder, name, duration_s, progress=lambda _t_ns, _mode: None):
-    ready = load_setup(CONFIGS / "reference.yaml", duration_s=duration_s)
+    ready = load_plan(CONFIGS / "reference.yaml", duration_s=duration_s)
     bus = ready.config.bus.model_copy(update={"channel": name})
     return with_bench(
-        ready.model_copy(update={"config": ready.config.model_copy(update={"bus": bus})}),
+        ready.with_config(ready.config.model_copy(update={"bus": bus})),
         load_bench_config(CONFIGS / "reference_bench.yaml"),
         folder,
         lockstep=True,
-        stop=lambda: False,
-        progress=progress,
+        control=RunControl(progress=progress),
     )
 
 
@@ -237,7 +237,7 @@ def test_slow_disk(row, tmp_path, monkeypatch):
             reached.set()
 
     monkeypatch.setattr(WholeFile, "append", slow)
-    ready = load_setup(CONFIGS / "reference.yaml", duration_s=1.0)
+    ready = load_plan(CONFIGS / "reference.yaml", duration_s=1.0)
     quiet = {"fifo_priority": 0, "lock_memory": False, "freeze_garbage": False}
     config = ready.config.model_copy(
         update={
@@ -248,12 +248,11 @@ def test_slow_disk(row, tmp_path, monkeypatch):
     timer = threading.Timer(1.5, released.set)
     timer.start()
     ended = with_bench(
-        ready.model_copy(update={"config": config}),
+        ready.with_config(config),
         load_bench_config(CONFIGS / "reference_bench.yaml"),
         tmp_path / "run",
         lockstep=False,
-        stop=lambda: False,
-        progress=progress,
+        control=RunControl(progress=progress),
     )
     timer.join()
     assert len(modes) == ended.ticks

@@ -8,10 +8,11 @@ from can_dbc.errors import InputError
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from can_dbc.yaml_file import load_validated
-from rig.bridge.contract import Measurement, Mode
-from rig.bridge.messages import Conditions
-from rig.bridge.supervisor import TRANSITIONS, Action, Event, Limit, Watched, judged
-from rig.plan.config import CONFIGS, LimitConfig, RunConfig
+from rig.bridge.limits import Action, Limit, LimitedValue, judge_height
+from rig.bridge.report import Conditions
+from rig.bridge.supervisor import TRANSITIONS, Event, next_mode
+from rig.bridge.values import Mode
+from rig.plan.config import CONFIGS, RunConfig
 from tests.faults.trial import BEGIN_NS, MS, Trial, after, measurements_only
 
 STATUS = 0x300
@@ -87,38 +88,42 @@ def test_an_implausible_height_is_refused_with_all_of_its_frame():
     trial = Trial(limits=limits)
     ticks = trial.run(300)
     used = [tick.result.step_input for tick in ticks]
-    refused = [item for item in used if item.heights[0] is None]
+    refused = [item for item in used if trial.value(item, "strut") is None]
     assert refused
-    assert all(item.applied_force_n is None for item in refused)
-    assert all(0.38 <= item.heights[0].height_m <= 0.45 for item in used if item.heights[0])
+    assert all(trial.value(item, "applied_force") is None for item in refused)
+    assert all(0.38 <= trial.value(item, "strut") <= 0.45 for item in used if item not in refused)
     assert ticks[-1].counts.implausible == len(refused)
     assert status_flags(trial, 0, 300)[-1]["REFUSED_FRAMES"] > 0
+
+
+def row(value, low, high, action):
+    return Limit(value=LimitedValue(value), low=low, high=high, action=action)
 
 
 def seen_after(limits, *measured):
     seen, actions = None, []
     for height_m, t_ms in measured:
-        seen, action = judged(limits, seen, Measurement(height_m, t_ms * MS))
+        seen, action = judge_height(limits, seen, height_m, t_ms * MS)
         actions.append(action)
     return actions
 
 
 def test_a_jump_is_refused_until_the_time_allows_for_it():
-    rate = [Limit(Watched.MEASURED_RATE_M_PER_S, -1.0, 1.0, Action.REFUSE)]
+    rate = [row("measured_rate_m_per_s", -1.0, 1.0, "refuse")]
     jumped = [(0.5, 0), (0.5005, 1), (0.51, 2), (0.51, 3), (0.51, 10), (0.51, 11)]
     assert seen_after(rate, *jumped) == [0, 0, Action.REFUSE, Action.REFUSE, Action.REFUSE, 0]
 
 
 def test_a_height_may_stay_the_same_for_as_long_as_the_limit_says():
-    stuck = [Limit(Watched.UNCHANGED_S, 0.0, 0.002, Action.HOLD)]
+    stuck = [row("unchanged_s", 0.0, 0.002, "hold")]
     same = [(0.5, 0), (0.5, 1), (0.5, 2), (0.5, 3), (0.5, 4), (0.50001, 5), (0.50001, 6)]
     assert seen_after(stuck, *same) == [0, 0, 0, Action.HOLD, Action.HOLD, 0, 0]
 
 
 def test_the_severest_action_counts():
     rows = [
-        Limit(Watched.MEASURED_HEIGHT_M, 0.2, 0.8, Action.WARN),
-        Limit(Watched.MEASURED_HEIGHT_M, 0.1, 0.9, Action.SAFE),
+        row("measured_height_m", 0.2, 0.8, "warn"),
+        row("measured_height_m", 0.1, 0.9, "safe"),
     ]
     assert seen_after(rows, (0.5, 0), (0.85, 1), (0.95, 2)) == [0, Action.WARN, Action.SAFE]
 
@@ -175,5 +180,25 @@ def test_a_wrong_row_is_one_line_that_names_it(tmp_path, row, expected):
 
 
 def test_an_open_limit_has_no_end():
-    limit_of = LimitConfig(value=Watched.FORCE_N, high=5.0, action="warn").limit()
-    assert limit_of == Limit(Watched.FORCE_N, float("-inf"), 5.0, Action.WARN)
+    open_below = row("force_n", None, 5.0, "warn")
+    assert [open_below.action_at(value) for value in (-1e300, 5.0, 5.1)] == [0, 0, Action.WARN]
+    open_above = row("force_n", 5.0, None, "safe")
+    assert [open_above.action_at(value) for value in (4.9, 5.0, 1e300)] == [Action.SAFE, 0, 0]
+    assert open_above.action_at(float("nan")) == Action.SAFE
+
+
+@pytest.mark.parametrize("mode", Mode)
+@pytest.mark.parametrize("event", Event)
+def test_the_table_of_modes(mode, event):
+    """Every pair: faults never lead towards RUNNING, and only fresh data or the user lead away."""
+    after = next_mode(mode, event)
+    if (mode, event) not in TRANSITIONS:
+        assert after is mode
+    if event in (Event.FRESH, Event.ACKNOWLEDGED):
+        assert after <= mode or (mode, after) == (Mode.WAITING, Mode.RUNNING)
+    else:
+        assert after >= mode
+    if event in (Event.BEYOND_SAFE, Event.DIVERGED, Event.TIMEOUT):
+        assert after in (Mode.SAFE, Mode.INIT, Mode.WAITING)
+    if mode is Mode.RUNNING and event is not Event.FRESH and event is not Event.ACKNOWLEDGED:
+        assert after in (Mode.HOLD, Mode.SAFE)

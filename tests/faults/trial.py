@@ -7,11 +7,12 @@ import numpy as np
 
 from can_dbc.frame import Frame
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
-from rig.bridge.contract import Mode
-from rig.bridge.messages import Conditions, Counts
-from rig.plan.assembly import build_bridge
+from rig.bridge.report import Conditions, Counts
+from rig.bridge.values import Mode, StepInput
+from rig.channels.channel import Sample
+from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.simulated import Bench
 
@@ -20,6 +21,13 @@ BEGIN_NS = 300 * MS
 """When a fault begins: the estimate has settled by then."""
 
 MEASUREMENT = 0x100
+
+
+def height_of(result: TickResult) -> Sample | None:
+    """The height that the last step of a tick was given; None where none came."""
+    heights = [item for item in result.step_input.samples if item.channel == 0]
+    return heights[-1] if heights else None
+
 
 Inject = Callable[[int, list[Frame]], list[Frame]]
 """Time of a tick and the bench's frames up to it -> the frames that arrive."""
@@ -57,17 +65,21 @@ class Trial:
     """A bridge and a bench, joined tick by tick."""
 
     def __init__(self, devices: object = None, **supervision: object) -> None:
-        ready = load_setup(CONFIGS / "reference.yaml")
-        changed = ready.config.supervision.model_validate(
-            ready.config.supervision.model_dump() | supervision
-        )
-        config = ready.config.model_copy(update={"supervision": changed})
-        named = config.model_validate(config.model_dump() | {"devices": devices or {}})
-        self.ready = ready.model_copy(update={"config": named})
+        ready = load_plan(CONFIGS / "reference.yaml")
+        content = ready.config.model_dump(mode="json")
+        content["supervision"] |= supervision
+        config = ready.config.model_validate(content | {"devices": devices or {}})
+        self.ready = ready.with_config(config)
         self.bridge: Bridge = build_bridge(self.ready)
         self.bench = Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), ready.database)
         self.state: BridgeState = self.bridge.init(0)
         self.ticks: list[Tick] = []
+
+    def value(self, step_input: StepInput, name: str) -> float | None:
+        """Last value of a channel in the input of a step; None where none came."""
+        index = next(channel.index for channel in self.ready.channels if channel.name == name)
+        values = [item.value for item in step_input.samples if item.channel == index]
+        return values[-1] if values else None
 
     def run(
         self,

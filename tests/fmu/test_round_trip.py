@@ -18,7 +18,7 @@ from rig.fmu.import_fmu import FMU_FILE, MODEL_FILE, import_fmu
 from rig.log.reader import read_run
 from rig.plan.check import check
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
@@ -45,14 +45,12 @@ def run_beside(folder, model, effects, excitation=3):
     components = [c.model_copy(update={"seed": excitation}) for c in bench.applied_force.components]
     force = bench.applied_force.model_copy(update={"components": tuple(components)})
     changed = {"undeclared_effects": effects, "seed": excitation, "applied_force": force}
-    ready = load_setup(CONFIGS / "story.yaml", duration_s=DURATION_S)
+    ready = load_plan(CONFIGS / "story.yaml", duration_s=DURATION_S)
     with_bench(
-        ready.model_copy(update={"model": model}),
+        ready.with_model(model),
         bench.model_copy(update=changed),
         folder,
         lockstep=True,
-        stop=lambda: False,
-        progress=lambda _t, _mode: None,
     )
     column = read_run(folder).steps.column("strut.virtual_force_n").to_numpy()
     return float(np.sqrt(np.mean(np.asarray(column)[SETTLED:] ** 2)))
@@ -113,7 +111,7 @@ def test_a_defective_fmu_is_run_replayed_checked_and_diagnosed(tmp_path):
     before_n = run_beside(tmp_path / "run", model, effects, 1)
     run_beside(tmp_path / "held_out", model, effects, 2)
     assert replay(tmp_path / "run").different == 0
-    ready = load_setup(CONFIGS / "story.yaml").model_copy(update={"model": model})
+    ready = load_plan(CONFIGS / "story.yaml").with_model(model)
     assert {finding.severity.value for finding in check(ready)} <= {"ok", "note", "warning"}
     result = diagnose_runs(
         [tmp_path / "run"], model, [tmp_path / "held_out"], tmp_path / "found", lambda *_: None

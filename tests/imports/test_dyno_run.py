@@ -13,7 +13,7 @@ from rig.diagnosis.files import diagnose_runs
 from rig.diagnosis.recording import read_recording
 from rig.plan.check import check
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
@@ -25,14 +25,12 @@ DURATION_S = 3.0
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dyno") / "run"
-    ready = load_setup(CONFIGS / "dyno.yaml", duration_s=DURATION_S)
+    ready = load_plan(CONFIGS / "dyno.yaml", duration_s=DURATION_S)
     with_bench(
         ready,
         load_bench_config(CONFIGS / "dyno_bench.yaml"),
         folder,
         lockstep=True,
-        stop=lambda: False,
-        progress=lambda _t, _mode: None,
     )
     return folder
 
@@ -126,12 +124,10 @@ def test_the_corrected_model_on_the_bus_lacks_nothing(run: Path, tmp_path: Path)
     diagnose_runs([run], model, [], tmp_path / "found", lambda _what, _share: None)
     corrected = tmp_path / "found" / "corrected.yaml"
     with_bench(
-        load_setup(CONFIGS / "dyno.yaml", model=corrected, duration_s=DURATION_S),
+        load_plan(CONFIGS / "dyno.yaml", model=corrected, duration_s=DURATION_S),
         load_bench_config(CONFIGS / "dyno_bench.yaml"),
         tmp_path / "again",
         lockstep=True,
-        stop=lambda: False,
-        progress=lambda _t, _mode: None,
     )
     steps = [
         pa.ipc.open_stream(pa.OSFile(str(folder / "steps.arrow"))).read_all()
@@ -146,11 +142,11 @@ def test_a_dyno_asks_for_a_load_cell_and_no_applied_force(tmp_path: Path) -> Non
     path = tmp_path / "dyno.yaml"
     path.write_text(given.replace("load_cell_force:", "applied_force:"))
     with pytest.raises(InputError, match=r"prescribed_motion: expected signals\.load_cell_force"):
-        load_setup(path)
+        load_plan(path)
 
 
 def test_a_dyno_has_no_loop_that_could_ring() -> None:
-    findings = {item.what: item.text for item in check(load_setup(CONFIGS / "dyno.yaml"))}
+    findings = {item.what: item.text for item in check(load_plan(CONFIGS / "dyno.yaml"))}
     assert "the motion is prescribed" in findings["poles"]
 
 

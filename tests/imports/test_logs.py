@@ -17,7 +17,8 @@ from rig.formats.foreign_table import import_table
 from rig.formats.mapping import load_mapping
 from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
-from rig.plan.setup import Setup, load_setup
+from rig.plan.load import load_plan
+from rig.plan.plan import Plan
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.simulated import Bench
@@ -26,12 +27,12 @@ EPOCH_S = 1_700_000_000.0
 
 
 @pytest.fixture(scope="module")
-def ready() -> Setup:
-    return load_setup(CONFIGS / "reference.yaml")
+def ready() -> Plan:
+    return load_plan(CONFIGS / "reference.yaml")
 
 
 @pytest.fixture(scope="module")
-def frames(ready: Setup) -> list[Frame]:
+def frames(ready: Plan) -> list[Frame]:
     bench = Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), ready.database)
     return bench.update(500_000_000)[0]
 
@@ -50,7 +51,7 @@ def messages(frames: list[Frame]) -> Iterator[can.Message]:
 
 @pytest.mark.parametrize("ending", [".blf", ".asc", ".log", ".trc", ".mf4"])
 def test_a_log_becomes_the_run_that_was_heard(
-    tmp_path: Path, ready: Setup, frames: list[Frame], ending: str
+    tmp_path: Path, ready: Plan, frames: list[Frame], ending: str
 ) -> None:
     if ending == ".mf4":
         pytest.importorskip("asammdf", reason="MF4 logs want the package asammdf")
@@ -73,7 +74,7 @@ def test_a_log_becomes_the_run_that_was_heard(
 
 
 def test_frames_of_others_are_left_out_and_counted(
-    tmp_path: Path, ready: Setup, frames: list[Frame]
+    tmp_path: Path, ready: Plan, frames: list[Frame]
 ) -> None:
     foreign = [replace(frame, arbitration_id=0x7F0) for frame in frames[:50]]
     mixed = sorted([*frames, *foreign], key=lambda frame: frame.t_ns)
@@ -87,7 +88,7 @@ def test_frames_of_others_are_left_out_and_counted(
 
 
 def test_a_log_without_the_bench_is_refused(
-    tmp_path: Path, ready: Setup, frames: list[Frame]
+    tmp_path: Path, ready: Plan, frames: list[Frame]
 ) -> None:
     path = tmp_path / "bench.blf"
     with can.Logger(path) as log:
@@ -98,7 +99,7 @@ def test_a_log_without_the_bench_is_refused(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_day_without_frames_is_refused(tmp_path: Path, ready: Setup, frames: list[Frame]) -> None:
+def test_a_day_without_frames_is_refused(tmp_path: Path, ready: Plan, frames: list[Frame]) -> None:
     later = [replace(frame, t_ns=frame.t_ns + 86_400_000_000_000) for frame in frames]
     path = tmp_path / "bench.blf"
     with can.Logger(path) as log:
@@ -113,7 +114,7 @@ def test_a_day_without_frames_is_refused(tmp_path: Path, ready: Setup, frames: l
     "content", [b"", b"LOGG" + bytes(200), b"(x) can0 1#Z\n", b"\xff\x00" * 99]
 )
 def test_a_damaged_log_is_refused_in_one_line(
-    tmp_path: Path, ready: Setup, ending: str, content: bytes
+    tmp_path: Path, ready: Plan, ending: str, content: bytes
 ) -> None:
     path = tmp_path / f"bench{ending}"
     path.write_bytes(content)

@@ -17,22 +17,23 @@ import numpy as np
 import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
-from rig.bridge.free_model import strut_answers
 from rig.closed_loop.loop import Rhythm
+from rig.closed_loop.strut_response import strut_responses
 from rig.demo.cases import compared
 from rig.log.reader import read_run
 from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
+from rig.observers.pi import published_observer
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run import live
 from rig.run.live import with_bench
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.simulated import Bench as SimulatedBench
 from rig.simulated_bench.trajectory import simulate
-from rig.tuning.expectation import Expectation, followed, residual, spectrum
-from rig.tuning.gains import Aim, Bench, expected, gain_margin, paper, tuned
-from rig.tuning.tune import plain, tune
+from rig.tuning.expectation import Expectation, longest_stretch, residual_force, spectrum
+from rig.tuning.gains import Aim, TuningProblem, expect_error, gain_margin, tune_observer
+from rig.tuning.tune import settings_of, tune
 from tests.observers.benches import STRUT, Truth, follow, judged
 
 MASSES_KG = (1.0, 10.0, 100.0, 1000.0)
@@ -52,27 +53,29 @@ def point(given):
     )
     corner_hz = 0.1 * rate_hz / 2.0 / math.pi
     start = KalmanObserver("kalman", ErrorFilter(bandwidth_hz=corner_hz, noise_std_m=noise_m), 1e7)
-    answers = strut_answers(truth.plant, [truth.rest_m])
+    answers = strut_responses(truth.plant, [truth.rest_m])
     [(mobility, *_)] = answers
-    seen = followed(follow(truth, first, start), Path("grid"), STRUT, mobility)
-    smoothed = residual(seen, mobility)
+    seen = longest_stretch(follow(truth, first, start), Path("grid"), STRUT, mobility)
+    smoothed = residual_force(seen, mobility)
     expectation = Expectation(
         smoothed.noise_std_m, *spectrum(smoothed.t_s, smoothed.force_n), "its run"
     )
     rhythm = Rhythm(truth.period_ns)
-    bench = Bench(truth.plant, (start,), 0, answers, [truth.rest_m], rhythm, expectation, 1e7)
+    bench = TuningProblem(
+        truth.plant, (start,), 0, answers, [truth.rest_m], rhythm, expectation, 1e7
+    )
     settled = round(min(2.0, 0.25 * len(fresh) / rate_hz) * rate_hz)
     row = {"given": given, "noise_std_m": smoothed.noise_std_m}
     for name, observer in (
-        ("paper", paper(bench)),
-        *((kind, tuned(bench, kind, Aim()).observer) for kind in ("pi", "kalman")),
+        ("paper", published_observer(bench.mobility_per_kg, bench.force_limit_n)),
+        *((kind, tune_observer(bench, kind, Aim()).observer) for kind in ("pi", "kalman")),
     ):
         share, coverage = judged(truth, follow(truth, fresh, observer), settled)
         row[name] = share
-        row[f"{name}_expected"] = expected(bench, observer).force_n
+        row[f"{name}_expected"] = expect_error(bench, observer).force_n
         row[f"{name}_coverage"] = coverage
         if name != "paper":
-            row[f"{name}_damping"] = expected(bench, observer).damping_ratio
+            row[f"{name}_damping"] = expect_error(bench, observer).damping_ratio
             row[f"{name}_margin"] = gain_margin(bench, observer)
     return row
 
@@ -107,7 +110,7 @@ def grid(jobs):
 def reference(folder, seed, noise_m, step_m, latency_ns=0, observers=None, delay_s=0.0):
     """A run of 20 s through CAN; returns its case."""
     ready, bench = prepared(folder, seed, noise_m, step_m, latency_ns, observers, delay_s)
-    ended = with_bench(ready, bench, folder / "run", lockstep=True, stop=lambda: False)
+    ended = with_bench(ready, bench, folder / "run", lockstep=True)
     return compared(ended, ready, bench).struts[0]
 
 
@@ -141,7 +144,7 @@ def prepared(folder, seed, noise_m, step_m, latency_ns=0, observers=None, delay_
     if observers is not None:
         config["observers"] = observers
     (folder / "rig.yaml").write_text(yaml.safe_dump(config))
-    return load_setup(folder / "rig.yaml"), load_bench_config(folder / "bench.yaml")
+    return load_plan(folder / "rig.yaml"), load_bench_config(folder / "bench.yaml")
 
 
 def share(case):
@@ -152,8 +155,8 @@ def share(case):
 
 def smoothed_share(case, folder):
     """The same of the force that is smoothed over the whole run."""
-    seen = followed(open_steps(folder), folder, STRUT, 0.1)
-    found = residual(seen, 0.1)
+    seen = longest_stretch(open_steps(folder), folder, STRUT, 0.1)
+    found = residual_force(seen, 0.1)
     force_n = found.force_n + np.interp(found.t_s, seen.tick_s, seen.law_force_n)
     settled = found.t_s >= 0.5
     truth = np.interp(found.t_s, case.t_s, case.truth[:, 2])
@@ -174,11 +177,11 @@ def reference_table(seeds):
         with tempfile.TemporaryDirectory() as temporary:
             place = Path(temporary)
             reference(place / "tuning", 1000, noise_m, step_m)
-            ready = load_setup(place / "tuning" / "rig.yaml")
+            ready = load_plan(place / "tuning" / "rig.yaml")
             observers = {"paper": None}
             for kind in ("pi", "kalman"):
                 [found] = tune(ready, place / "tuning" / "run", kind, Aim(), lambda _w, _s: None)
-                observers[kind] = {STRUT: plain(found.found.observer)}
+                observers[kind] = {STRUT: settings_of(found.tuned.observer)}
             shares = {kind: [] for kind in (*observers, "smoothed")}
             for seed, (kind, given) in itertools.product(range(1, seeds + 1), observers.items()):
                 folder = place / f"{kind}{seed}"
@@ -236,11 +239,9 @@ def moving_table(seeds):
             with tempfile.TemporaryDirectory() as temporary:
                 folder = Path(temporary) / "case"
                 _, bench = prepared(folder, seed, 20e-6, 15e-6, observers=observers)
-                ready = load_setup(folder / "rig.yaml", duration_s=8.0)
+                ready = load_plan(folder / "rig.yaml", duration_s=8.0)
                 live.Bench = bench_class
-                ended = with_bench(
-                    ready, bench, folder / "run", lockstep=lockstep, stop=lambda: False
-                )
+                ended = with_bench(ready, bench, folder / "run", lockstep=lockstep)
                 steps = open_steps(ended.folder)
             t_ns, force_n = (steps.column(key).to_numpy() for key in ("t_ns", f"{STRUT}.force_n"))
             since_ns = AGO_NS if bench_class is LongAgo else 0

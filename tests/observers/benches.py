@@ -6,14 +6,15 @@ import yaml
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, parse_model
-from rig.bridge.contract import Measurement, Mode, StepInput
-from rig.bridge.free_model import Arrival, RigCore
-from rig.bridge.log_columns import Record, columns
+from rig.bridge.log_columns import LogColumns
 from rig.bridge.supervisor import Supervision
+from rig.bridge.values import Mode, StepInput
+from rig.channels.channel import Channel, Role, Sample
+from rig.channels.quantities import APPLIED_FORCE, HEIGHT
 from rig.plan.config import CONFIGS
-from rig.plan.quantities import APPLIED_FORCE, OTHERS
 from rig.simulated_bench.schema import BenchConfig
 from rig.simulated_bench.trajectory import simulate
+from tests.bridge.cores import supervised
 
 STRUT = "strut"
 REST_M = 0.4
@@ -79,17 +80,21 @@ class Truth:
 def follow(truth, heights_m, observer):
     """Steps of an observer that follows heights, as an Arrow table like that of a log."""
     period_ns = truth.period_ns
-    supervision = Supervision(100 * period_ns, 1000 * period_ns, safe_holds_last=False)
-    core = RigCore(truth.plant, (observer,), supervision, (Arrival(period_ns),))
-    state, record, rows = core.init(0), Record([APPLIED_FORCE]), []
-    place = OTHERS.index(APPLIED_FORCE)
+    stale_s = 100 * period_ns * 1e-9
+    supervision = Supervision(stale_after_s=stale_s, safe_after_s=10 * stale_s)
+    bench = (
+        Channel(0, Role.HEIGHT, HEIGHT, STRUT, "", 0, period_ns),
+        Channel(1, Role.BENCH, APPLIED_FORCE, "applied_force", "", -1, period_ns),
+    )
+    core = supervised(truth.plant, (observer,), supervision, bench)
+    state, columns, rows = core.init(0), LogColumns([STRUT], bench), []
     for tick, (height_m, applied_n) in enumerate(zip(heights_m, truth.applied_n, strict=True)):
         t_ns = tick * period_ns
-        others = tuple(float(applied_n) if i == place else None for i in range(len(OTHERS)))
-        given = StepInput(t_ns, (Measurement(float(height_m), t_ns),), others)
-        state, output = core.step(state, given)
-        rows.append((t_ns, int(output.mode), *record.numbers(given, output)))
-    names = ("t_ns", "mode", *columns([STRUT], [APPLIED_FORCE]))
+        samples = (Sample(0, float(height_m), t_ns), Sample(1, float(applied_n), t_ns))
+        given = StepInput(t_ns, samples)
+        state, output, _ = core.step(state, given)
+        rows.append((t_ns, int(output.mode), *columns.numbers(given, output)))
+    names = ("t_ns", "mode", *columns.names)
     return pa.table(
         {
             name: np.array(column)

@@ -14,13 +14,14 @@ import numpy as np
 
 from dart_model.plant import DartPlant
 from dart_model.spec import parse_model
-from rig.bridge.free_model import strut_answers
 from rig.closed_loop.loop import Rhythm
+from rig.closed_loop.strut_response import strut_responses
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
 from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
-from rig.tuning.expectation import Expectation, followed, residual, spectrum
-from rig.tuning.gains import Aim, Bench, paper, tuned
+from rig.observers.pi import published_observer
+from rig.tuning.expectation import Expectation, longest_stretch, residual_force, spectrum
+from rig.tuning.gains import Aim, TuningProblem, tune_observer
 from tests.observers.benches import STRUT, follow
 
 MODEL = """
@@ -50,24 +51,26 @@ class Record:
 
 def compare(name, record, force_n=None):
     """Print the errors of the published gains, the tuned PI and the noise-aware observer."""
-    answers = strut_answers(record.plant, [record.rest_m])
+    answers = strut_responses(record.plant, [record.rest_m])
     [(mobility, *_)] = answers
     corner_hz = 0.1 / (record.period_ns * 1e-9) / 6.2832
     start = KalmanObserver("kalman", ErrorFilter(bandwidth_hz=corner_hz, noise_std_m=1e-5), 1e6)
-    seen = followed(follow(record, record.height_m, start), Path(name), STRUT, mobility)
-    found = residual(seen, mobility)
+    seen = longest_stretch(follow(record, record.height_m, start), Path(name), STRUT, mobility)
+    found = residual_force(seen, mobility)
     smoothed = np.interp(seen.tick_s, found.t_s, found.force_n) + seen.law_force_n
     first = len(record.height_m) - len(seen.tick_s)
     truth = smoothed if force_n is None else force_n[first : first + len(smoothed)]
     expectation = Expectation(found.noise_std_m, *spectrum(found.t_s, found.force_n), name)
     rhythm = Rhythm(record.period_ns)
-    bench = Bench(record.plant, (start,), 0, answers, [record.rest_m], rhythm, expectation, 1e6)
+    bench = TuningProblem(
+        record.plant, (start,), 0, answers, [record.rest_m], rhythm, expectation, 1e6
+    )
     settled = round(0.5e9 / record.period_ns)
     deviation = np.std(truth[settled:])
     figures = [f"noise {1e6 * found.noise_std_m:.2g} um"]
     for kind, observer in (
-        ("published", paper(bench)),
-        *((kind, tuned(bench, kind, Aim()).observer) for kind in ("pi", "kalman")),
+        ("published", published_observer(bench.mobility_per_kg, bench.force_limit_n)),
+        *((kind, tune_observer(bench, kind, Aim()).observer) for kind in ("pi", "kalman")),
     ):
         force = follow(record, record.height_m, observer).column(f"{STRUT}.force_n").to_numpy()
         missed = (force[first : first + len(truth)] - truth)[settled:]

@@ -6,15 +6,15 @@ import threading
 import pytest
 
 from can_dbc.errors import InputError
-from rig.plan.assembly import build_bridge
+from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.changes import (
     CHANGES_FILE,
+    assign,
     change_line,
     logged_changes,
     parse_assignments,
-    reassigned,
 )
 from rig.run.replay import replay
 from rig.run.requests import Requests, ask
@@ -25,7 +25,7 @@ GAIN = "observers.strut.proportional_n_per_m"
 
 @pytest.fixture(scope="module")
 def ready():
-    return load_setup(CONFIGS / "reference.yaml")
+    return load_plan(CONFIGS / "reference.yaml")
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def ready():
 )
 def test_a_change_is_checked_as_the_configuration_is(ready, text, expected):
     with pytest.raises(InputError) as caught:
-        reassigned(ready, parse_assignments([text]), "set")
+        assign(ready, parse_assignments([text]), "set")
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -79,7 +79,7 @@ def test_a_request_is_taken_at_a_tick_and_answered_with_its_time(tmp_path, ready
             ask(run, {"sett": 1})
     assert answers == [{"t_ns": 42_000_000}]
     assert lines == [change_line(42_000_000, {GAIN: 5e4})]
-    assert bridge.core._observers[0].proportional_n_per_m == 5e4
+    assert bridge._supervisor.estimator._observers[0].proportional_n_per_m == 5e4
     assert not (run / "requests").exists()
 
 
@@ -105,7 +105,7 @@ def test_what_nobody_waits_for_any_more_is_not_done(tmp_path, ready):
     thread.join()
     assert requests.changes(5) is None
     assert lines == []
-    assert "nobody waits" in answers[0]["error"]
+    assert "withdrawn" in answers[0]["error"]
 
 
 @pytest.mark.parametrize("content", ['{"set": [[1, 2]]}', "[" * 50_000, "{", '{"set": {"": 1}}'])
@@ -118,31 +118,31 @@ def test_no_request_ends_the_reading_of_requests(tmp_path, ready, content):
 def test_a_limit_goes_by_the_number_of_its_row(ready):
     content = ready.config.model_dump(mode="json")
     content["supervision"]["limits"] = [{"value": "force_n", "high": 900.0, "action": "hold"}]
-    limited = ready.model_copy(update={"config": type(ready.config).model_validate(content)})
-    found = reassigned(limited, {"supervision.limits.0.high": 700.0}, "set")
+    limited = ready.with_config(type(ready.config).model_validate(content))
+    found = assign(limited, {"supervision.limits.0.high": 700.0}, "set")
     assert found.config.supervision.limits[0].high == 700.0
     with pytest.raises(InputError, match=r"limits.1.high: no '1', expected one of 0"):
-        reassigned(limited, {"supervision.limits.1.high": 700.0}, "set")
+        assign(limited, {"supervision.limits.1.high": 700.0}, "set")
     with pytest.raises(InputError, match=r"limits.0: expected one of supervision.limits.0.value"):
-        reassigned(limited, {"supervision.limits.0": 700.0}, "set")
+        assign(limited, {"supervision.limits.0": 700.0}, "set")
 
 
 def test_a_filter_is_not_changed_in_a_run(ready):
     added = {"observers.strut.filter": {"bandwidth_hz": 20.0, "noise_std_m": 1e-5}}
     with pytest.raises(InputError, match="filter: cannot be changed in a run"):
-        reassigned(ready, added, "set")
+        assign(ready, added, "set")
     content = ready.config.model_dump(mode="json")
     content["observers"]["strut"]["filter"] = added["observers.strut.filter"]
-    filtered = ready.model_copy(update={"config": type(ready.config).model_validate(content)})
+    filtered = ready.with_config(type(ready.config).model_validate(content))
     with pytest.raises(InputError, match="filter: cannot be changed in a run"):
-        reassigned(filtered, {"observers.strut.filter.bandwidth_hz": 25.0}, "set")
-    found = reassigned(filtered, {"observers.strut.force_limit_n": 700.0}, "set")
+        assign(filtered, {"observers.strut.filter.bandwidth_hz": 25.0}, "set")
+    found = assign(filtered, {"observers.strut.force_limit_n": 700.0}, "set")
     assert found.config.observers["strut"].force_limit_n == 700.0
 
 
 def test_a_group_of_values_is_not_replaced(ready):
     with pytest.raises(InputError, match=r"observers.strut: expected one of observers.strut.kind"):
-        reassigned(ready, {"observers.strut": {"proportional_n_per_m": 5e4}}, "set")
+        assign(ready, {"observers.strut": {"proportional_n_per_m": 5e4}}, "set")
 
 
 def test_a_run_that_has_ended_takes_no_request(tmp_path):
@@ -159,7 +159,7 @@ def test_a_replay_changes_where_the_run_did(tmp_path):
     changed = replay(run)
     # From the changed tick on, and not before it, another force is computed.
     assert changed.first_different_ns == 200_000_000
-    other = replay(run, ready=load_setup(CONFIGS / "reference.yaml"))
+    other = replay(run, plan=load_plan(CONFIGS / "reference.yaml"))
     assert other.different == 0
 
 

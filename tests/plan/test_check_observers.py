@@ -5,7 +5,7 @@ import pytest
 from can_dbc.errors import InputError
 from rig.plan.check import Severity, check
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 
 FILTER = "{kind: kalman, filter: {bandwidth_hz: %s, noise_std_m: %s}}"
 
@@ -15,7 +15,7 @@ def findings(folder, bandwidth_hz="20", noise_std_m="2.0e-5", name="reference", 
     observer = FILTER % (bandwidth_hz, noise_std_m)
     head = text[: text.index("observers:")]
     (folder / "rig.yaml").write_text(head + f"observers: {{strut: {observer}}}\n" + more)
-    return {item.what: item for item in check(load_setup(folder / "rig.yaml"))}
+    return {item.what: item for item in check(load_plan(folder / "rig.yaml"))}
 
 
 def test_a_filter_within_its_rate_is_fine(tmp_path):
@@ -52,7 +52,7 @@ def test_senseless_filters_are_refused_in_a_line(tmp_path, bandwidth_hz, noise_s
 
 
 def test_what_heights_cannot_tell_stands_in_words(tmp_path):
-    found = findings(tmp_path)["what heights cannot tell"].text
+    found = findings(tmp_path)["limits of heights alone"].text
     assert "the spring's force of strut from the damper's" in found
     assert "a preload of strut from an offset of its height sensor" in found
 
@@ -61,7 +61,7 @@ def quarter(folder, observers, heights):
     text = (CONFIGS / "quarter_car.yaml").read_text()
     head = text[: text.index("signals:")] + f"signals: {{height: {heights}}}\n"
     (folder / "rig.yaml").write_text(head + f"observers: {observers}\n")
-    return load_setup(folder / "rig.yaml")
+    return load_plan(folder / "rig.yaml")
 
 
 TYRE = "tyre: {message: BENCH_MEASUREMENT, signal: HEIGHT}"
@@ -69,7 +69,7 @@ SUSPENSION = "suspension: {message: BENCH_MEASUREMENT_2, signal: HEIGHT}"
 
 
 def test_without_a_height_the_check_says_what_is_lost():
-    found = {item.what: item.text for item in check(load_setup(CONFIGS / "quarter_car.yaml"))}
+    found = {item.what: item.text for item in check(load_plan(CONFIGS / "quarter_car.yaml"))}
     assert "the residual force of tyre" in found["without the height of tyre"]
     assert "tyre, suspension" in found["observability"]
 
@@ -81,7 +81,7 @@ def test_a_strut_that_nobody_measures_has_to_be_declared(tmp_path):
         quarter(tmp_path, "{tyre: {kind: none}}", f"{{{TYRE}, {SUSPENSION}}}")
     ready = quarter(tmp_path, "{tyre: {kind: none}}", f"{{{SUSPENSION}}}")
     found = {item.what: item for item in check(ready)}
-    assert found["observability"].text == "the heights tell the residual force of suspension"
+    assert found["observability"].text == "the residual force of suspension is observable"
 
 
 def test_a_height_that_is_old_goes_stale_later(tmp_path):
@@ -89,6 +89,6 @@ def test_a_height_that_is_old_goes_stale_later(tmp_path):
     text = (CONFIGS / "reference.yaml").read_text()
     head = text[: text.index("signals:")]
     (tmp_path / "rig.yaml").write_text(head + late)
-    found = {item.what: item for item in check(load_setup(tmp_path / "rig.yaml"))}
+    found = {item.what: item for item in check(load_plan(tmp_path / "rig.yaml"))}
     assert found["supervision.stale_after_s"].severity is Severity.ERROR
-    assert "20 ms old when it comes" in found["supervision.stale_after_s"].text
+    assert "20 ms old when it arrives" in found["supervision.stale_after_s"].text

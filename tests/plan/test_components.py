@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple
 
 from msgspec import Struct
 from pydantic.dataclasses import dataclass
+from rig.observers.protocol import Remark
 
 class State(Struct, frozen=True):
     height_m: float
@@ -36,6 +37,7 @@ class Loaded(Struct, frozen=True):
 class ToyPlant:
     """Semi-implicit Euler in tenths of a step: enough to be followed by an observer."""
     struts = 1
+    is_constant = True
 
     def __init__(self, spec):
         (self.strut,), (body,) = spec.struts, spec.skeleton.bodies
@@ -75,6 +77,7 @@ class Held(NamedTuple):
     virtual_force_n: float
     measured_ns: int
     force_std_n: float = float("nan")
+    left_out: tuple = ()
 
     @property
     def residual_force_n(self):
@@ -85,18 +88,20 @@ class Proportional:
     kind: Literal["proportional"] = "proportional"
     gain_n_per_m: float = 1e5
 
-    first_measurements = 1
+    measurements_to_start = 1
+    requires_height = True
+    fuses_sensors = knows_std = False
 
     def init(self, start):
         return Held(0.0, 0.0, start.t_ns)
 
-    settled = init
+    steady_state = init
 
-    def step(self, state, t_ns, innovation):
+    def step(self, state, t_ns, innovation, further=()):
         if innovation is None:
             return state
-        force_n = self.gain_n_per_m * innovation.value_m
-        return Held(innovation.value_m, force_n, innovation.t_ns)
+        force_n = self.gain_n_per_m * innovation.value
+        return Held(innovation.value, force_n, innovation.t_ns)
 
     def numbers(self, state):
         return (state.virtual_force_n,)
@@ -104,10 +109,19 @@ class Proportional:
     def with_numbers(self, state, numbers):
         return Held(0.0, numbers[0], 0)
 
+    def can_continue(self, other):
+        return type(other) is type(self)
+
+    def remark_on_step(self, step):
+        return Remark("", False)
+
+    def remark_on_rate(self, rate_hz):
+        return None
+
 import rig.observers as observers
 observers.OBSERVERS = {**observers.OBSERVERS, "proportional": Proportional}
-import rig.plan.assembly as assembly
-assembly.ENGINES = {**assembly.ENGINES, "toy": ToyPlant}
+import rig.plan.build as build
+build.ENGINES = {**build.ENGINES, "toy": ToyPlant}
 
 from rig.simulated_bench.config import load_bench_config
 from rig.log.reader import read_run
@@ -115,16 +129,16 @@ from rig.plan.check import check
 from rig.plan.config import CONFIGS
 from rig.run.live import with_bench
 from rig.run.replay import replay
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 
 folder = Path(sys.argv[1])
 text = (CONFIGS / "reference.yaml").read_text()
 text = text[: text.index("observers:")] if "observers:" in text else text
 (folder / "toy.yaml").write_text(
     text + "\\nengine: toy\\nobservers: {strut: {kind: proportional, gain_n_per_m: 5.0e4}}\\n")
-ready = load_setup(folder / "toy.yaml", duration_s=1.0)
+ready = load_plan(folder / "toy.yaml", duration_s=1.0)
 with_bench(ready, load_bench_config(CONFIGS / "reference_bench.yaml"), folder / "run",
-           lockstep=True, stop=lambda: False, progress=lambda _t, _mode: None)
+           lockstep=True)
 steps = read_run(folder / "run").steps
 found = replay(folder / "run")
 print(json.dumps({
@@ -154,11 +168,10 @@ QUANTITY = '''
 import json, re, sys
 from pathlib import Path
 
-import rig.plan.quantities as quantities
+import rig.channels.quantities as quantities
 from can_dbc.units import Dimension
 GAS = quantities.Quantity("humidity", "humidity", Dimension.NUMBER, "relative humidity")
-quantities.OTHERS = (*quantities.OTHERS, GAS)
-quantities.PLACES = {quantity: place for place, quantity in enumerate(quantities.OTHERS)}
+quantities.BENCH_QUANTITIES = (*quantities.BENCH_QUANTITIES, GAS)
 
 from can_dbc.database import DEFAULT_DATABASE
 from rig.simulated_bench.config import load_bench_config
@@ -167,7 +180,7 @@ from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
 from rig.run.live import with_bench
 from rig.run.replay import replay
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 
 folder = Path(sys.argv[1])
 # The auxiliary message's temperature without a unit stands for it.
@@ -175,11 +188,10 @@ dbc = DEFAULT_DATABASE.read_text().replace('"degC" RIG', '"" RIG')
 (folder / "my.dbc").write_text(dbc)
 text = (CONFIGS / "reference.yaml").read_text().replace("temperature:", "humidity:")
 (folder / "my.yaml").write_text(text + "\\ndbc: my.dbc\\n")
-ready = load_setup(folder / "my.yaml", duration_s=0.5)
+ready = load_plan(folder / "my.yaml", duration_s=0.5)
 bench = load_bench_config(CONFIGS / "reference_bench.yaml")
 bench = bench.model_copy(update={"transmissions": bench.transmissions[:1]})
-with_bench(ready, bench, folder / "run", lockstep=True, stop=lambda: False,
-           progress=lambda _t, _mode: None)
+with_bench(ready, bench, folder / "run", lockstep=True)
 export_run(folder / "run", "csv", folder / "run.csv")
 print(json.dumps({
     "columns": read_run(folder / "run").steps.schema.names,

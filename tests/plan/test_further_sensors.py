@@ -7,11 +7,11 @@ import pytest
 import yaml
 
 from can_dbc.errors import InputError
-from rig.bridge.contract import Mode
+from rig.bridge.values import Mode
 from rig.log.reader import read_run
 from rig.plan.check import check
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
@@ -37,7 +37,7 @@ def configured(folder, further, observer=KALMAN):
     config["signals"]["further"] = further
     config |= {"observers": {"strut": observer}, "duration_s": 2.0}
     (folder / "rig.yaml").write_text(json.dumps(config))
-    return load_setup(folder / "rig.yaml")
+    return load_plan(folder / "rig.yaml")
 
 
 def run(folder, further, *, losses=(0.0, 0.0, 0.0)):
@@ -66,7 +66,7 @@ def run(folder, further, *, losses=(0.0, 0.0, 0.0)):
     ]
     (folder / "bench.yaml").write_text(yaml.safe_dump(content))
     bench = load_bench_config(folder / "bench.yaml")
-    ended = with_bench(ready, bench, folder / "run", lockstep=True, stop=lambda: False)
+    ended = with_bench(ready, bench, folder / "run", lockstep=True)
     steps = read_run(folder / "run").steps
     return {name: steps.column(name).to_numpy() for name in steps.column_names}, ended
 

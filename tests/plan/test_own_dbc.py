@@ -12,11 +12,12 @@ from can_dbc.errors import InputError
 from rig.bus.bus import Bus
 from rig.bus.link import Link, LinkFigures
 from rig.machine.clock import VirtualClock
-from rig.plan.assembly import build_bridge
+from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
+from rig.plan.load import load_plan
 from rig.plan.proposal import propose
-from rig.plan.setup import load_setup
-from rig.run.logged_run import logged
+from rig.run.logged_run import Endpoint, run_logged
+from rig.run.loop import RunControl
 from rig.run.ports import BusPort
 from rig.run.replay import replay
 from tests.bus_and_log.at_once import AtOnce
@@ -78,7 +79,7 @@ def test_what_was_proposed_runs_over_a_bus_and_replays(dbc, tmp_path):
     lines = [line for line in text.splitlines() if "temperature" not in line]
     assert len(lines) == 7
     config.write_text("\n".join(lines))
-    ready = load_setup(config, duration_s=0.3)
+    ready = load_plan(config, duration_s=0.3)
     bridge = build_bridge(ready)
     clock = VirtualClock()
     bus = ready.config.bus.config()
@@ -108,16 +109,8 @@ def test_what_was_proposed_runs_over_a_bus_and_replays(dbc, tmp_path):
 
     port, bench = BusPort(link), Bench()
     try:
-        ended = logged(
-            ready,
-            bridge,
-            bench,
-            clock,
-            tmp_path / "run",
-            figures=LinkFigures(),
-            stop=lambda: False,
-            progress=lambda _t, _mode: None,
-        )
+        endpoint = Endpoint(bench, clock, LinkFigures())
+        ended = run_logged(ready, bridge, endpoint, tmp_path / "run", RunControl())
     finally:
         link.close()
         peer.close()
@@ -149,4 +142,4 @@ def test_an_engine_that_is_not_there_is_one_line(tmp_path):
     text = (CONFIGS / "reference.yaml").read_text() + "\nengine: magic\n"
     (tmp_path / "my.yaml").write_text(text)
     with pytest.raises(InputError, match=r"my\.yaml: engine 'magic': expected one of dart"):
-        build_bridge(load_setup(tmp_path / "my.yaml"))
+        build_bridge(load_plan(tmp_path / "my.yaml"))

@@ -10,7 +10,7 @@ import yaml
 from rig.cli.main import main
 from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.live import with_bench
 from rig.simulated_bench.config import load_bench_config
 
@@ -84,12 +84,10 @@ def test_a_model_that_diverges_is_told_with_its_strut_and_time(tmp_path):
     path = tmp_path / "my.yaml"
     path.write_text(yaml.safe_dump(data))
     ended = with_bench(
-        load_setup(path, duration_s=1.0),
+        load_plan(path, duration_s=1.0),
         load_bench_config(CONFIGS / "reference_bench.yaml"),
         tmp_path / "run",
         lockstep=True,
-        stop=lambda: False,
-        progress=lambda _t, _mode: None,
     )
     assert ended.diverged is not None
     assert ended.diverged["strut"] == "strut"

@@ -12,7 +12,7 @@ from can_dbc.errors import InputError
 from dart_model.effects import CATALOGUE, FAMILY_WORDS
 from rig.guide.reference import write_reference
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from tests.public.bench import heights
 from tests.run.listed import ListPort, bench_frames, live
 
@@ -33,7 +33,7 @@ def test_a_model_comes_by_name():
 
 
 def test_a_run_is_arrays_by_column(tmp_path):
-    ready = load_setup(CONFIGS / "reference.yaml", duration_s=0.3)
+    ready = load_plan(CONFIGS / "reference.yaml", duration_s=0.3)
     live(ready, tmp_path / "run", ListPort(bench_frames(ready, 300, {}), set()))
     run = rig.open_run(tmp_path / "run")
     assert run.t_s.tolist() == pytest.approx(np.arange(300) * 1e-3)

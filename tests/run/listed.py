@@ -10,12 +10,13 @@ from can_dbc.codec import compile_encoder
 from can_dbc.frame import Frame
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
-from rig.bridge.messages import Conditions
+from rig.bridge.report import Conditions
 from rig.bus.link import LinkFigures
 from rig.machine.clock import VirtualClock
-from rig.plan.assembly import build_bridge
-from rig.plan.setup import Setup
-from rig.run.logged_run import logged
+from rig.plan.build import build_bridge
+from rig.plan.plan import Plan
+from rig.run.logged_run import Endpoint, run_logged
+from rig.run.loop import RunControl
 
 MS = 1_000_000
 
@@ -36,7 +37,7 @@ class ListPort:
         return frames
 
 
-def bench_frames(ready: Setup, ticks: int, faults: dict[int, str]) -> dict[int, list[Frame]]:
+def bench_frames(ready: Plan, ticks: int, faults: dict[int, str]) -> dict[int, list[Frame]]:
     """Frames of a bench at 1 kHz, with faults at some ticks."""
     message = ready.database.message("BENCH_MEASUREMENT")
     assert message.protection is not None
@@ -74,15 +75,7 @@ def disturbed(frame: Frame, fault: str) -> list[Frame]:
     }.get(fault, [frame])
 
 
-def live(ready: Setup, folder: Path, port: ListPort) -> None:
+def live(ready: Plan, folder: Path, port: ListPort) -> None:
     """The run as the loop does it."""
-    logged(
-        ready,
-        build_bridge(ready),
-        port,
-        VirtualClock(),
-        folder,
-        figures=LinkFigures(),
-        stop=lambda: False,
-        progress=lambda _t, _mode: None,
-    )
+    endpoint = Endpoint(port, VirtualClock(), LinkFigures())
+    run_logged(ready, build_bridge(ready), endpoint, folder, RunControl())

@@ -9,15 +9,16 @@ from hypothesis import strategies as st
 
 from rig.bridge.supervisor import Supervision
 from rig.plan.config import CONFIGS
-from rig.plan.setup import Setup, load_setup
+from rig.plan.load import load_plan
+from rig.plan.plan import Plan
 from rig.run.replay import replay
 from tests.run.listed import MS, ListPort, bench_frames, live
 
 FAULTS = ("lost", "repeated", "flipped", "short", "late", "foreign", "error", "again", "silent")
 
 
-def ready_for(ticks: int) -> Setup:
-    return load_setup(CONFIGS / "reference.yaml", duration_s=ticks / 1000)
+def ready_for(ticks: int) -> Plan:
+    return load_plan(CONFIGS / "reference.yaml", duration_s=ticks / 1000)
 
 
 @settings(max_examples=20, deadline=None)
@@ -64,5 +65,5 @@ def test_refused_frames_are_counted_as_they_were_live(tmp_path):
 
 
 def test_the_default_supervision_is_what_these_tests_assume():
-    supervision = ready_for(1).config.supervision.supervision()
-    assert supervision == Supervision(10 * MS, 500 * MS, safe_holds_last=False)
+    supervision = ready_for(1).config.supervision
+    assert supervision == Supervision(stale_after_s=0.01, safe_after_s=0.5, safe_output="zero")

@@ -16,7 +16,8 @@ from can_dbc.database import DEFAULT_DATABASE
 from can_dbc.errors import InputError
 from rig.log.reader import FRAMES_FILE, STEPS_FILE, read_run
 from rig.plan.config import CONFIGS
-from rig.plan.setup import Setup, load_setup
+from rig.plan.load import load_plan
+from rig.plan.plan import Plan
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
@@ -27,22 +28,20 @@ MS = 1_000_000
 _CHANNELS = count()
 
 
-def setup(name: str, duration_s: float) -> Setup:
+def setup(name: str, duration_s: float) -> Plan:
     """A shipped configuration, on a channel that no other test has."""
-    ready = load_setup(CONFIGS / f"{name}.yaml", duration_s=duration_s)
+    ready = load_plan(CONFIGS / f"{name}.yaml", duration_s=duration_s)
     channel = f"test-{os.getpid()}-{next(_CHANNELS)}"
     bus = ready.config.bus.model_copy(update={"channel": channel})
     config = ready.config.model_copy(update={"bus": bus})
-    return ready.model_copy(update={"config": config})
+    return ready.with_config(config)
 
 
 def lockstep(folder: Path, name: str, duration_s: float, bench: BenchConfig | None = None) -> Path:
     """A run in simulated time."""
     bench = bench or load_bench_config(CONFIGS / f"{name}_bench.yaml")
     ready = setup(name, duration_s)
-    with_bench(
-        ready, bench, folder, lockstep=True, stop=lambda: False, progress=lambda _t, _mode: None
-    )
+    with_bench(ready, bench, folder, lockstep=True)
     return folder
 
 
@@ -157,7 +156,7 @@ def test_a_replay_with_other_gains_is_another_run(reference_run):
         for name, observer in ready.config.observers.items()
     }
     config = ready.config.model_copy(update={"observers": weak})
-    found = replay(reference_run, ready=ready.model_copy(update={"config": config}))
+    found = replay(reference_run, plan=ready.with_config(config))
     assert found.different > 3000
     assert found.first_different_ns is not None
 

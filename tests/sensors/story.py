@@ -11,12 +11,13 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from rig.bridge.contract import Mode
+from rig.bridge.values import Mode
 from rig.cli.main import app
 from rig.log.reader import read_run
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.run.live import live
 from rig.run.logged_run import Ended
+from rig.run.loop import RunControl
 from rig.run.replay import replay
 from tests.sensors.dyno import (
     AMPLIFIER,
@@ -108,8 +109,8 @@ def run(config: Path, folder: Path, seconds: float, at: Callable[[float], None])
             done.add(t_s)
             at(t_s)
 
-    ready = load_setup(config, duration_s=seconds)
-    return live(ready, folder, stop=lambda: False, progress=progress)
+    ready = load_plan(config, duration_s=seconds)
+    return live(ready, folder, control=RunControl(progress=progress))
 
 
 def diagnosed(line: Line, folder: Path, seconds: float) -> dict[str, Any]:
@@ -117,7 +118,7 @@ def diagnosed(line: Line, folder: Path, seconds: float) -> dict[str, Any]:
     config = configured(line, folder)
     line.orders.put("move")
     ended = run(config, folder / "run", seconds, lambda _t_s: None)
-    assert ended.state.core.mode is Mode.RUNNING
+    assert ended.state.mode is Mode.RUNNING
     counts = ended.state.counts
     assert (counts.device_faulty, counts.wrong_length, counts.no_value) == (0, 0, 0)
     assert replay(folder / "run").different == 0
@@ -170,4 +171,4 @@ def assert_faults_ended(found: dict[str, Fault]) -> None:
         assert found[order].modes >= {Mode.RUNNING, Mode.HOLD}
         assert found[order].ended.state.counts.from_faulty_device > 50
     assert found["short"].ended.state.counts.wrong_length > 50
-    assert found["short"].ended.state.core.mode is Mode.HOLD
+    assert found["short"].ended.state.mode is Mode.HOLD

@@ -10,12 +10,13 @@ from can_dbc.codec import compile_decoder, si_range
 from can_dbc.database import load_database
 from can_dbc.frame import Frame
 from can_dbc.units import Dimension
-from rig.bridge.contract import Mode
+from rig.bridge.values import Mode
 from rig.bus.bus import BusConfig
-from rig.plan.assembly import build_bridge
-from rig.plan.setup import load_setup
+from rig.plan.build import build_bridge
+from rig.plan.load import load_plan
 from rig.sensors.j1939 import Claim, claims, group_number, spoken
 from rig.sensors.proposal import configuration_text, dbc_text
+from tests.faults.trial import height_of
 
 MS = 1_000_000
 NAME = 0x8000_2E05_1234_5678
@@ -63,7 +64,7 @@ def ready(tmp_path):
     found, known = spoken(heard), claims(heard)
     (tmp_path / "sensors.dbc").write_text(dbc_text((), found))
     (tmp_path / "rig.yaml").write_text(configuration_text((), found, known, BUS))
-    return load_setup(tmp_path / "rig.yaml")
+    return load_plan(tmp_path / "rig.yaml")
 
 
 def test_levels_are_described(ready):
@@ -92,7 +93,7 @@ def test_a_value_that_is_none_is_refused(ready):
     error = Frame(0, LEVELS | 0x20, b"\x00\xfe" * 4, is_extended=True)
     absent = Frame(0, LEVELS | 0x20, b"\xff\xff" * 4, is_extended=True)
     results, state = driven(ready, {0: [levels(0x20, 0.4)], 1: [error], 2: [absent]})
-    assert [result.step_input.heights[0] is None for result in results] == [False, True, True]
+    assert [height_of(result) is None for result in results] == [False, True, True]
     assert (state.counts.no_value, state.counts.refused) == (2, 2)
 
 
@@ -104,8 +105,8 @@ def test_a_device_that_moves_is_followed(ready):
         3: [levels(0x21, 0.42)],
     }
     results, _ = driven(ready, given)
-    used = [result.step_input.heights[0] for result in results]
-    heights = [None if item is None else round(item.height_m, 4) for item in used]
+    used = [height_of(result) for result in results]
+    heights = [None if item is None else round(item.value, 4) for item in used]
     assert heights == [0.4, 0.41, None, 0.42]
 
 
@@ -117,11 +118,11 @@ def test_an_address_that_somebody_else_takes_is_not_believed(ready):
         3: [claim(0x30), levels(0x30, 0.4)],
     }
     results, _ = driven(ready, given)
-    assert results[1].troubles == ((0, "has no address"),)
+    assert results[1].device_faults == ((0, "has no address"),)
     assert results[1].output.mode is Mode.HOLD
-    assert results[2].step_input.heights[0] is None
-    assert results[3].step_input.heights[0] is not None
-    assert results[3].troubles == ()
+    assert height_of(results[2]) is None
+    assert height_of(results[3]) is not None
+    assert results[3].device_faults == ()
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
@@ -133,13 +134,13 @@ def test_a_float_that_is_no_number_is_refused(tmp_path, value):
     )
     config = {"dbc": "float.dbc", "signals": {"height": {"message": "M", "signal": "H"}}}
     (tmp_path / "rig.yaml").write_text(json.dumps(config))
-    ready = load_setup(tmp_path / "rig.yaml")
+    ready = load_plan(tmp_path / "rig.yaml")
     assert load_database(tmp_path / "float.dbc").message("M").signals["H"].is_float
     bad = Frame(0, 256, struct.pack("<2f", value, 0.0))
     good = Frame(0, 256, struct.pack("<2f", 0.5, math.nan))  # what is not read may be anything
     results, state = driven(ready, {0: [good], 1: [bad]})
-    assert results[0].step_input.heights[0].height_m == 0.5
-    assert results[1].step_input.heights[0] is None
+    assert height_of(results[0]).value == 0.5
+    assert height_of(results[1]) is None
     assert state.counts.no_value == 1
 
 

@@ -17,7 +17,7 @@ from rig.bus.bus import BusConfig
 from rig.bus.canopen_network import CanOpenNetwork
 from rig.cli.main import app
 from rig.plan.check import check
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from rig.sensors.canopen_description import described
 from rig.sensors.proposal import Origin, dbc_text
 from rig.sensors.scan import scan
@@ -136,7 +136,7 @@ def test_dbc_and_configuration_are_read_back(bus, channel, tmp_path):
     force = compile_decoder(database.message("NODE_6_TPDO1"), ["FORCE_1"], [Dimension.FORCE])
     assert force((-1234).to_bytes(4, "little", signed=True) + b"\0")[0] == pytest.approx(-123.4)
     assert database.message("RIG_ESTIMATE").protection is not None
-    ready = load_setup(out / "rig.yaml")
+    ready = load_plan(out / "rig.yaml")
     assert ready.config.devices["NODE_5"].heartbeat_s == pytest.approx(0.25)
     assert [item.signal for item in ready.config.devices["NODE_5"].alarms] == ["ALARMS"]
     assert [item.signal for item in ready.config.devices["NODE_6"].alarms] == ["STATUS_1"]

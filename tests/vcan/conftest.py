@@ -17,10 +17,11 @@ import yaml
 from can_dbc.database import DEFAULT_DATABASE
 from rig.bus.bus import BusConfig
 from rig.plan.config import CONFIGS
-from rig.plan.setup import Setup, load_setup
+from rig.plan.load import load_plan
+from rig.plan.plan import Plan
 from rig.run.live import live, run_bench
 from rig.run.logged_run import Ended
-from rig.run.loop import Progress
+from rig.run.loop import Progress, RunControl
 from rig.simulated_bench.config import load_bench_config
 
 TOOLS = ("ip", "candump", "canplayer", "cangen", "cangw", "cansend")
@@ -180,8 +181,8 @@ def run_until_terminated(bench: Path, channel: str, dbc: Path) -> None:
 
 def run_for(config: Path, folder: Path, seconds: float) -> None:
     """What `rig run` does."""
-    ready = load_setup(config, duration_s=seconds)
-    live(ready, folder, stop=lambda: False, progress=lambda _t_ns, _mode: None)
+    ready = load_plan(config, duration_s=seconds)
+    live(ready, folder, control=RunControl(progress=lambda _t_ns, _mode: None))
 
 
 @pytest.fixture(scope="session")
@@ -205,13 +206,12 @@ def bridge(files: Files, tmp_path: Path) -> Callable[..., Ended]:
         stop: Callable[[], bool] = lambda: False,
         listen_only: bool = False,
     ) -> Ended:
-        ready: Setup = load_setup(files.bridge(channel), duration_s=seconds)
+        ready: Plan = load_plan(files.bridge(channel), duration_s=seconds)
         return live(
             ready,
             tmp_path / "run",
             listen_only=listen_only,
-            stop=stop,
-            progress=progress,
+            control=RunControl(stop=stop, progress=progress),
         )
 
     return run

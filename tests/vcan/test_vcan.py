@@ -15,11 +15,11 @@ from can_dbc.addressing import Filter
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.frame import Frame
 from can_dbc.protection import check_crc
-from rig.bridge.contract import Mode
+from rig.bridge.values import Mode
 from rig.bus.bus import Bus, BusConfig
 from rig.log.reader import RunFolder, parse_frame, read_run
-from rig.plan.assembly import build_bridge
-from rig.plan.setup import load_setup
+from rig.plan.build import build_bridge
+from rig.plan.load import load_plan
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.simulated import Bench
@@ -74,7 +74,7 @@ def logged_error_n(found: RunFolder, dbc: Path) -> float:
 
 def lockstep_error_n(files: Files, age_ns: int, ticks_ns: list[int]) -> float:
     """The force error without processes and clocks, with measurements of a given age."""
-    ready = load_setup(files.bridge("vcan0"))
+    ready = load_plan(files.bridge("vcan0"))
     bridge, bench = build_bridge(ready), Bench(load_bench_config(files.bench), ready.database)
     message = cantools.database.load_file(files.dbc).get_message_by_name("BENCH_AUXILIARY")
     state, cell, t_ns, force_n = bridge.init(0), [], [], []
@@ -268,7 +268,7 @@ def test_ten_times_down_and_up_are_survived_and_each_gap_is_shown(bench, bridge)
         assert inside.sum() > 0.1 * RATE_HZ
         assert (flags[inside] & 2).all()
         assert (steps["received"].to_numpy()[inside] == 0).all()
-    assert ended.state.core.mode is Mode.RUNNING
+    assert ended.state.mode is Mode.RUNNING
 
 
 def test_a_flood_of_foreign_and_of_broken_frames_changes_nothing(bench, bridge):
@@ -286,7 +286,7 @@ def test_a_flood_of_foreign_and_of_broken_frames_changes_nothing(bench, bridge):
     assert heights.min() > 0.1
     assert heights.max() < 0.7
     assert replay(ended.folder).different == 0
-    assert ended.state.core.mode is Mode.RUNNING
+    assert ended.state.mode is Mode.RUNNING
     # One broken frame of 256 carries the right CRC by chance. It may cost the few frames that
     # follow it, but never so many that an estimate turns stale.
     right_crc = _with_right_crc(found, "BENCH_MEASUREMENT")
@@ -328,7 +328,7 @@ def test_frames_that_a_gateway_corrupts_are_all_refused(bench, second_vcan, brid
     assert np.isnan(found.steps["strut.measured_height_m"].to_numpy()[late]).all()
     assert not (found.steps["strut.valid"].to_numpy()[late] == 1.0).any()
     assert counts.wrong_crc + counts.masquerade > 1.5 * RATE_HZ
-    assert ended.state.core.mode is Mode.SAFE
+    assert ended.state.mode is Mode.SAFE
 
 
 def test_listening_only_sends_nothing(bench, bridge, tmp_path):
@@ -341,4 +341,4 @@ def test_listening_only_sends_nothing(bench, bridge, tmp_path):
         ended = bridge(bench, 3.0, listen_only=True)
     assert record.read_text() == ""
     assert {direction for _, direction in read_run(ended.folder).frames()} == {"R"}
-    assert ended.state.core.model is not None  # it had something to say
+    assert ended.state.model is not None  # it had something to say

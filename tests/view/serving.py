@@ -10,7 +10,7 @@ import numpy as np
 
 from rig.pages.view.server import ViewServer
 from rig.plan.config import CONFIGS
-from rig.plan.setup import load_setup
+from rig.plan.load import load_plan
 from tests.run.listed import ListPort, bench_frames, live
 
 COUNT = 800
@@ -18,7 +18,7 @@ COUNT = 800
 
 def make_run(folder, count=COUNT):
     """A run of the reference case, on a fake clock."""
-    ready = load_setup(CONFIGS / "reference.yaml", duration_s=count * 1e-3)
+    ready = load_plan(CONFIGS / "reference.yaml", duration_s=count * 1e-3)
     live(ready, folder, ListPort(bench_frames(ready, count, {}), set()))
     return folder
 

@@ -1,0 +1,101 @@
+"""What a model that runs in step with a bench must be able to do, whatever simulates it."""
+
+from collections.abc import Sequence
+from typing import Any, Protocol, TypeVar
+
+AMBIENT_C = 20.0
+"""Damper temperature where none was measured."""
+
+
+class ModelState(Protocol):
+    """State of a model, made by its plant and frozen."""
+
+    @property
+    def struts(self) -> Sequence[tuple[float, float]]:
+        """Height (m) and velocity (m/s) of each strut."""
+        ...
+
+
+StateT = TypeVar("StateT", bound=ModelState)
+StateT_co = TypeVar("StateT_co", bound=ModelState, covariant=True)
+
+
+class LoadedModel(Protocol[StateT_co]):
+    """A state of a model under the forces that act from it on; frozen."""
+
+    @property
+    def state(self) -> StateT_co:
+        """The state."""
+        ...
+
+    @property
+    def forces_n(self) -> Sequence[float]:
+        """Spring-damper force of each strut, without the virtual force."""
+        ...
+
+    @property
+    def accelerations_m_per_s2(self) -> Sequence[float]:
+        """Second derivative of each strut's height."""
+        ...
+
+    @property
+    def applied_force_n(self) -> float:
+        """Applied force."""
+        ...
+
+    @property
+    def temperature_c(self) -> float:
+        """Damper temperature."""
+        ...
+
+
+LoadedT = TypeVar("LoadedT", bound=LoadedModel[Any])
+
+
+class Plant(Protocol[StateT, LoadedT]):
+    """A model that runs in step with a bench. Its answers depend on its arguments alone."""
+
+    @property
+    def struts(self) -> int:
+        """Number of struts."""
+        ...
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether mass matrix and Jacobians of the struts are the same in every state."""
+        ...
+
+    def init(
+        self,
+        heights_m: Sequence[float],
+        velocities_m_per_s: Sequence[float] | None = None,
+        t_s: float = 0.0,
+    ) -> StateT:
+        """State with given strut heights, at rest unless velocities are given."""
+        ...
+
+    def load(
+        self,
+        state: StateT,
+        virtual_forces_n: Sequence[float],
+        applied_force_n: float,
+        temperature_c: float,
+    ) -> LoadedT:
+        """The state with forces on it; virtual forces are constant from it on."""
+        ...
+
+    def step(self, loaded: LoadedT, dt_s: float, applied_force_end_n: float) -> StateT:
+        """State after `dt_s`, with an applied force that is linear in between."""
+        ...
+
+    def numbers(self, state: StateT) -> Sequence[float]:
+        """A state as numbers, for differences of a step."""
+        ...
+
+    def state_of(self, numbers: Sequence[float]) -> StateT:
+        """The state that `numbers` returned."""
+        ...
+
+
+AnyPlant = Plant[Any, Any]
+"""A plant of whatever engine: its states come from it alone and go back to it alone."""

@@ -1,0 +1,99 @@
+"""Estimators of the struts' forces: one protocol, and one file for each kind of bench.
+
+    free_model          a model under the applied force, corrected by observers
+    prescribed_motion   a strut whose motion is prescribed and whose force is measured
+
+An estimator knows no modes: when its estimate is published, and as what, is decided by
+`rig.bridge.supervisor`.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Protocol, TypeVar
+
+from msgspec import Struct
+
+from rig.bridge.values import StepInput, StrutOutput
+from rig.observers.protocol import AnyObserver
+
+StateT = TypeVar("StateT")
+
+
+class Estimate(Struct, frozen=True, gc=False):
+    """What a step of an estimator computed.
+
+    Attributes:
+        struts: One per strut, in the model's order, as published while the bridge is running.
+        measured_ns: Time of the oldest of the newest measurements that it rests on.
+        diverged: Index of the first strut whose numbers no bench has; -1 if there is none.
+        left_out: Channels of further sensors that are not used now.
+    """
+
+    struts: tuple[StrutOutput, ...]
+    measured_ns: int
+    diverged: int = -1
+    left_out: tuple[int, ...] = ()
+
+
+class Estimator(Protocol[StateT]):
+    """The arithmetic of a bridge: samples in, estimates out."""
+
+    @property
+    def struts(self) -> int:
+        """Number of struts."""
+        ...
+
+    def init(self, t_ns: int) -> StateT:
+        """State before the first step: it waits for measurements."""
+        ...
+
+    def restart(self, state: StateT, t_ns: int) -> StateT:
+        """State that waits for measurements again, its last step at a time."""
+        ...
+
+    def step(self, state: StateT, step_input: StepInput) -> tuple[StateT, Estimate | None]:
+        """State after a step, and its estimate; None while it waits for measurements."""
+        ...
+
+    def discard(self, before: StateT, after: StateT) -> StateT:
+        """State of a model that stopped before a step whose motion is not to be used.
+
+        Args:
+            before: State before the step.
+            after: State after it.
+        """
+        ...
+
+    def heights_m(self, state: StateT) -> Sequence[float]:
+        """Height at which each strut stands if the model stops here; empty while it waits."""
+        ...
+
+    def with_settings(
+        self, observers: Sequence[AnyObserver], stale_after_ns: int
+    ) -> "Estimator[StateT]":
+        """The same with other settings; a state of one is a state of the other.
+
+        Args:
+            observers: One per strut.
+            stale_after_ns: Age up to which a measurement can start the model.
+        """
+        ...
+
+
+AnyEstimator = Estimator[Any]
+"""An estimator of whatever kind: its states come from it alone and go back to it alone."""
+
+_LARGEST = 1e12
+"""No bench has heights, velocities or forces of this size: the model has diverged."""
+
+
+def is_sensible(number: float) -> bool:
+    """Whether a number, or a sum of some, in SI is of a size that a bench may have; NaN is not."""
+    return -_LARGEST < number < _LARGEST
+
+
+def first_diverged(struts: Sequence[StrutOutput]) -> int:
+    """Index of the first strut whose numbers no bench has; 0 where only their sum shows it."""
+    for index, strut in enumerate(struts):
+        if not is_sensible(strut.force_n + strut.height_m + strut.velocity_m_per_s):
+            return index
+    return 0

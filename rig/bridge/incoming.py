@@ -1,0 +1,210 @@
+"""Incoming messages, compiled from the DBC and the channels that they carry."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from typing import NamedTuple
+
+from can_dbc.codec import Decoder, compile_decoder, si_range
+from can_dbc.database import Message
+from can_dbc.frame import Frame
+from can_dbc.protection import SequenceState, Verdict, compile_checker
+from can_dbc.units import Dimension
+from rig.channels.channel import Channel, Role
+
+Values = tuple[float, ...]
+"""Values of a frame in SI, in the order of the message's signals that are read."""
+
+Reading = tuple[SequenceState, Verdict, Values | None]
+"""State of the message's counter after a frame, the frame's verdict, and its values; None where
+there are none to be used."""
+
+Reader = Callable[[SequenceState, Frame], Reading]
+"""State of a message's counter, and a frame of the message -> its reading."""
+
+
+class Delivery(NamedTuple):
+    """A value of a frame that goes to a channel.
+
+    Attributes:
+        value: Index of the value among the frame's.
+        channel: Index of the channel.
+        delay_ns: How much later the value arrives than it is true.
+    """
+
+    value: int
+    channel: int
+    delay_ns: int
+
+
+class Alarm(NamedTuple):
+    """A signal whose raw value is other than zero while its device is at fault.
+
+    Attributes:
+        signal: Name of the signal.
+        device: Index of the device.
+        alarm: Index of the alarm among the device's.
+    """
+
+    signal: str
+    device: int
+    alarm: int
+
+
+class AlarmDelivery(NamedTuple):
+    """A value of a frame that is an alarm.
+
+    Attributes:
+        value: Index of the value among the frame's.
+        device: Index of the device.
+        alarm: Index of the alarm among the device's.
+    """
+
+    value: int
+    device: int
+    alarm: int
+
+
+class HeightDelivery(NamedTuple):
+    """A value of a frame that is the reference height of a strut.
+
+    Attributes:
+        value: Index of the value among the frame's.
+        strut: Index of the strut.
+    """
+
+    value: int
+    strut: int
+
+
+@dataclass(frozen=True, slots=True)
+class Incoming:
+    """A message of the bench.
+
+    Attributes:
+        message: Its definition.
+        read: Reads its frames.
+        deliveries: Values that go to channels.
+        heights: Values that are reference heights.
+        alarms: Values that are alarms.
+        device: Index of the device that sends it; None if none is configured.
+    """
+
+    message: Message
+    read: Reader
+    deliveries: tuple[Delivery, ...]
+    heights: tuple[HeightDelivery, ...] = ()
+    alarms: tuple[AlarmDelivery, ...] = ()
+    device: int | None = None
+
+
+def compile_incoming(
+    message: Message,
+    channels: Sequence[Channel],
+    alarms: Sequence[Alarm] = (),
+    device: int | None = None,
+) -> Incoming:
+    """Compile an incoming message.
+
+    Args:
+        message: Message of the bench.
+        channels: Channels that it carries.
+        alarms: Alarms among its signals.
+        device: Index of the device that sends it.
+
+    Raises:
+        DatabaseError: A signal is missing, or its unit does not fit its quantity.
+    """
+    # A load cell may be recorded and also be a further sensor: one value, two channels.
+    signals = list(
+        dict.fromkeys(
+            [
+                *((channel.signal, channel.quantity.dimension) for channel in channels),
+                *((alarm.signal, Dimension.NUMBER) for alarm in alarms),
+            ]
+        )
+    )
+    decode = compile_decoder(message, [name for name, _ in signals], [unit for _, unit in signals])
+    deliveries = [
+        Delivery(
+            signals.index((channel.signal, channel.quantity.dimension)),
+            channel.index,
+            channel.delay_ns,
+        )
+        for channel in channels
+    ]
+    heights = [
+        HeightDelivery(delivery.value, channel.strut)
+        for delivery, channel in zip(deliveries, channels, strict=True)
+        if channel.role is Role.HEIGHT
+    ]
+    read = _compile_reader(message, decode)
+    are_values = _check_of_values(message, signals)
+    if are_values is not None:
+        read = _with_check(read, are_values)
+    return Incoming(
+        message,
+        read,
+        tuple(deliveries),
+        tuple(heights),
+        tuple(
+            AlarmDelivery(signals.index((item.signal, Dimension.NUMBER)), item.device, item.alarm)
+            for item in alarms
+        ),
+        device,
+    )
+
+
+_Check = Callable[[Values], bool]
+"""Signals of a frame in SI -> whether each of them holds a value."""
+
+
+def _check_of_values(message: Message, signals: Sequence[tuple[str, Dimension]]) -> _Check | None:
+    """Check for errors, "not available" and NaN; None where a signal always holds a value."""
+    if message.is_j1939:
+        ranges = [si_range(message, name, dimension) for name, dimension in signals]
+
+        def within(values: Values) -> bool:
+            # A bound may differ from the value there in its last bits.
+            return all(
+                low - 1e-9 * abs(low) <= value <= high + 1e-9 * abs(high)
+                for value, (low, high) in zip(values, ranges, strict=True)
+            )
+
+        return within
+    if any(message.signal(name).is_float for name, _ in signals):
+        return lambda values: all(map(isfinite, values))
+    return None
+
+
+def _with_check(read: Reader, are_values: _Check) -> Reader:
+    """A reader that refuses frames without values; most messages cannot hold such."""
+
+    def read_checked(sequence: SequenceState, frame: Frame) -> Reading:
+        sequence, verdict, values = read(sequence, frame)
+        if values is None or are_values(values):
+            return sequence, verdict, values
+        return sequence, Verdict.NO_VALUE, None
+
+    return read_checked
+
+
+def _compile_reader(message: Message, decode: Decoder) -> Reader:
+    length, ok = message.length_bytes, Verdict.OK
+
+    def read_unprotected(sequence: SequenceState, frame: Frame) -> Reading:
+        values = decode(frame.data)
+        # A multiplexed frame without these signals is no fault, a short one is.
+        is_short = values is None and len(frame.data) != length
+        return sequence, Verdict.WRONG_LENGTH if is_short else ok, values
+
+    if message.protection is None:
+        return read_unprotected
+    check = compile_checker(message.protection)
+
+    def read(sequence: SequenceState, frame: Frame) -> Reading:
+        data = frame.data
+        sequence, verdict = check(sequence, data, frame.t_ns)
+        return sequence, verdict, decode(data) if verdict is ok or verdict.accepted else None
+
+    return read

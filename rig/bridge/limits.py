@@ -1,0 +1,152 @@
+"""Limits on measurements and estimates, and what is done beyond them."""
+
+from collections.abc import Sequence
+from enum import Enum, IntEnum
+from typing import Literal, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, model_validator
+
+from can_dbc.yaml_file import Finite
+from rig.bridge.values import StrutOutput
+
+
+class Action(IntEnum):
+    """What is done beyond a limit, the severest last.
+
+    WARN reports it in the status. REFUSE also drops the measurement, with all of its frame. HOLD
+    also marks the estimate invalid as long as it lasts. SAFE enters the safe state. HOLD and SAFE
+    for a measurement drop it too.
+    """
+
+    WARN = 1
+    REFUSE = 2
+    HOLD = 3
+    SAFE = 4
+
+
+class LimitedValue(Enum):
+    """What a limit is set on: the first three of the measurement, the others of the estimate."""
+
+    MEASURED_HEIGHT_M = "measured_height_m"
+    MEASURED_RATE_M_PER_S = "measured_rate_m_per_s"
+    UNCHANGED_S = "unchanged_s"
+    HEIGHT_M = "height_m"
+    FORCE_N = "force_n"
+    VIRTUAL_FORCE_N = "virtual_force_n"
+    INNOVATION_M = "innovation_m"
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether it is of the measurement."""
+        return self in _MEASURED
+
+
+_MEASURED = (
+    LimitedValue.MEASURED_HEIGHT_M,
+    LimitedValue.MEASURED_RATE_M_PER_S,
+    LimitedValue.UNCHANGED_S,
+)
+
+
+class Limit(BaseModel):
+    """One row of the table of limits, for every strut.
+
+    Attributes:
+        value: What is limited, with its unit. Of the measurement: `measured_height_m`,
+            `measured_rate_m_per_s`, `unchanged_s` (how long it may stay exactly the same). Of the
+            estimate: `height_m`, `force_n`, `virtual_force_n`, `innovation_m`.
+        low: Smallest value within.
+        high: Largest value within.
+        action: `warn` reports it in the status; `refuse` drops the measurement; `hold` marks the
+            estimate invalid as long as it lasts; `safe` enters the safe state.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    value: LimitedValue
+    low: Finite | None = None
+    high: Finite | None = None
+    action: Literal["warn", "refuse", "hold", "safe"]
+
+    @model_validator(mode="after")
+    def _sensible(self) -> "Limit":
+        if self.low is None and self.high is None:
+            raise ValueError(f"{self.value.value}: expected low, high or both")
+        if self.low is not None and self.high is not None and self.low >= self.high:
+            raise ValueError(f"low {self.low}: expected less than high ({self.high})")
+        if self.action == "refuse" and not self.value.is_measured:
+            raise ValueError(
+                f"action refuse of {self.value.value}: expected warn, hold or safe, "
+                "because only a measurement can be refused"
+            )
+        return self
+
+    def action_at(self, value: float) -> int:
+        """Action at a value, 0 within the limit; a value that is not a number is beyond it."""
+        is_high_enough = self.low is None or value >= self.low
+        if is_high_enough and (self.high is None or value <= self.high):
+            return 0
+        return Action[self.action.upper()]
+
+
+class Plausibility(NamedTuple):
+    """Memory of one strut's measurements.
+
+    Attributes:
+        height_m: Last measured height that was used.
+        t_ns: Its time.
+        since_ns: Since when the height is exactly that.
+    """
+
+    height_m: float
+    t_ns: int
+    since_ns: int
+
+
+def judge_height(
+    limits: Sequence[Limit], memory: Plausibility | None, height_m: float, t_ns: int
+) -> tuple[Plausibility, int]:
+    """Hold the limits against a new measured height.
+
+    Args:
+        limits: Limits on measurements.
+        memory: Memory of the strut; None before its first measurement.
+        height_m: The height.
+        t_ns: Time of its arrival.
+
+    Returns:
+        Memory after it, and the severest action required, 0 if none.
+    """
+    last = memory or Plausibility(height_m, t_ns, t_ns)
+    age_s = (t_ns - last.t_ns) * 1e-9
+    values = {
+        LimitedValue.MEASURED_HEIGHT_M: height_m,
+        LimitedValue.MEASURED_RATE_M_PER_S: (
+            (height_m - last.height_m) / age_s if age_s > 0.0 else 0.0
+        ),
+        LimitedValue.UNCHANGED_S: (
+            (t_ns - last.since_ns) * 1e-9 if height_m == last.height_m else 0.0
+        ),
+    }
+    action = max([limit.action_at(values[limit.value]) for limit in limits], default=0)
+    if action >= Action.REFUSE:
+        # What was used last stays the reference, but only for as long as the rate allows for.
+        return last, action
+    since_ns = last.since_ns if height_m == last.height_m else t_ns
+    return Plausibility(height_m, t_ns, since_ns), action
+
+
+def worst_action(limits: Sequence[Limit], strut: StrutOutput) -> int:
+    """The severest action that limits on estimates require of a strut, 0 if it is within them all.
+
+    Args:
+        limits: Limits on estimates.
+        strut: What a tick publishes of the strut.
+    """
+    values = {
+        LimitedValue.HEIGHT_M: strut.height_m,
+        LimitedValue.FORCE_N: strut.force_n,
+        LimitedValue.VIRTUAL_FORCE_N: strut.virtual_force_n,
+        LimitedValue.INNOVATION_M: strut.innovation_m,
+    }
+    return max([limit.action_at(values[limit.value]) for limit in limits], default=0)

@@ -1,0 +1,85 @@
+"""What a step is given and what it publishes."""
+
+from enum import IntEnum
+from math import nan
+
+from msgspec import Struct
+
+from rig.channels.channel import Sample
+
+
+class Mode(IntEnum):
+    """State of the bridge, with the numbers it has on the bus."""
+
+    INIT = 0
+    WAITING = 1
+    RUNNING = 2
+    HOLD = 3
+    SAFE = 4
+
+
+class StepInput(Struct, frozen=True, gc=False):
+    """All that one step is given.
+
+    Attributes:
+        t_ns: Time of the step.
+        samples: Samples that arrived since the last one, in the order of their arrival; at most one
+            of each reference height.
+        acknowledged: The user acknowledged the safe state.
+    """
+
+    t_ns: int
+    samples: tuple[Sample, ...] = ()
+    acknowledged: bool = False
+
+
+class StrutOutput(Struct, frozen=True, gc=False):
+    """What a tick publishes of one strut; each attribute is a column of the log.
+
+    Attributes:
+        force_n: Estimated spring-damper force: the law's, and the residual force.
+        virtual_force_n: Virtual force.
+        valid: Whether the estimate rests on a fresh measurement.
+        height_m: Model height.
+        velocity_m_per_s: Model velocity.
+        acceleration_m_per_s2: Model acceleration.
+        innovation_m: Innovation.
+        force_std_n: Standard deviation of the estimated force; NaN where it is not known.
+        law_force_n: Force of the model's law alone, part of the estimated force.
+    """
+
+    force_n: float
+    virtual_force_n: float
+    valid: bool
+    height_m: float
+    velocity_m_per_s: float
+    acceleration_m_per_s2: float
+    innovation_m: float
+    force_std_n: float = nan
+    law_force_n: float = nan
+
+
+class StepOutput(Struct, frozen=True, gc=False):
+    """What a tick publishes.
+
+    Attributes:
+        mode: State of the bridge.
+        struts: One per strut, in the model's order; empty before the first measurements.
+        left_out: Channels of further sensors that are not used now.
+    """
+
+    mode: Mode
+    struts: tuple[StrutOutput, ...]
+    left_out: tuple[int, ...] = ()
+
+
+class Divergence(Struct, frozen=True, gc=False):
+    """A model whose numbers no bench has.
+
+    Attributes:
+        strut: Index of the first strut that shows it.
+        t_ns: Time of the tick at which it showed.
+    """
+
+    strut: int
+    t_ns: int

@@ -1,0 +1,1 @@
+"""The quantities of a bench, and the channels that carry them."""

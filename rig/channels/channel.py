@@ -1,0 +1,90 @@
+"""A channel: a quantity of the bench from its signal on the bus to its column in the log."""
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Annotated
+
+from msgspec import Struct
+from pydantic import BaseModel, ConfigDict, Field
+
+from can_dbc.database import Message
+from rig.channels.quantities import Quantity
+
+
+class SignalName(BaseModel):
+    """Where a value stands on the bus.
+
+    Attributes:
+        message: Message of the DBC.
+        signal: Signal of the message; its unit is converted.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    message: Annotated[str, Field(min_length=1, max_length=255)]
+    signal: Annotated[str, Field(min_length=1, max_length=255)]
+
+
+class Role(Enum):
+    """What a step does with a channel's samples.
+
+    HEIGHT is the reference height of a strut, SENSOR a further sensor of a strut, and BENCH a
+    quantity of which the bench has one.
+    """
+
+    HEIGHT = "height"
+    SENSOR = "sensor"
+    BENCH = "bench"
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A quantity of the bench wherever it stands.
+
+    Attributes:
+        index: Position among the channels of the plan.
+        role: What a step does with its samples.
+        quantity: What is measured.
+        name: Its name in messages to the user, and in the log what stands before the dot of its
+            columns: a strut, or a strut and a sensor; of a quantity of the bench its key.
+        key: Its key in the configuration.
+        strut: Index of the strut that it is of; -1 for a quantity of the bench.
+        interval_ns: Time between two samples.
+        delay_ns: How much later a sample arrives than it is true.
+        noise_std: Standard deviation of a sample in SI, quantisation included; of a further sensor.
+        message: Message that carries it; None for a channel that is on no bus.
+        signal: Name of its signal in the message.
+    """
+
+    index: int
+    role: Role
+    quantity: Quantity
+    name: str
+    key: str
+    strut: int
+    interval_ns: int
+    delay_ns: int = 0
+    noise_std: float = 0.0
+    message: Message | None = None
+    signal: str = ""
+
+    @property
+    def column(self) -> str:
+        """Its column in the log."""
+        if self.role is Role.BENCH:
+            return self.quantity.column
+        return f"{self.name}.measured_{self.quantity.column}"
+
+
+class Sample(Struct, frozen=True, gc=False):
+    """A value that a channel delivered.
+
+    Attributes:
+        channel: Index of the channel.
+        value: The value in SI.
+        t_ns: Time at which it was true: the delay of the channel before its arrival.
+    """
+
+    channel: int
+    value: float
+    t_ns: int

@@ -1,0 +1,81 @@
+"""Every quantity that a bench may send, each declared here and nowhere else.
+
+A quantity of the table can be named under `signals` of a configuration; it reaches the step, the
+log, its replay and its exports under its own name.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from can_dbc.units import Dimension
+
+
+@dataclass(frozen=True)
+class Noise:
+    """How a configuration states the standard deviation of a sensor's readings.
+
+    Attributes:
+        key: Its key, with the unit.
+        low: Smallest value accepted, SI.
+        high: Largest value accepted, SI.
+    """
+
+    key: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A measured quantity.
+
+    Attributes:
+        key: Its key under `signals`; of a further sensor of a strut, what it `measures`.
+        column: Its column in the log and in a CSV of measured data, with the unit.
+        dimension: What a signal of it measures; its unit is converted to SI.
+        words: The quantity as a phrase.
+        noise: Noise of a sensor that measures it on a strut; None for a quantity of the bench.
+    """
+
+    key: str
+    column: str
+    dimension: Dimension
+    words: str
+    noise: Noise | None = None
+
+
+HEIGHT = Quantity("height", "height_m", Dimension.LENGTH, "height", Noise("noise_std_m", 1e-9, 1.0))
+"""Height of a strut; the one under `signals.height` is the reference of its observer."""
+
+VELOCITY = Quantity(
+    "velocity",
+    "velocity_m_per_s",
+    Dimension.VELOCITY,
+    "velocity of the height, positive in rebound",
+    Noise("noise_std_m_per_s", 1e-7, 100.0),
+)
+FORCE = Quantity(
+    "force",
+    "force_n",
+    Dimension.FORCE,
+    "force of a load cell in the strut, positive when the strut pushes",
+    Noise("noise_std_n", 1e-4, 1e7),
+)
+
+STRUT_QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
+    {quantity.key: quantity for quantity in (HEIGHT, VELOCITY, FORCE)}
+)
+"""What a sensor of a strut may measure, by key. `rig.observers.strut_sensors` says what the model
+reads of each."""
+
+APPLIED_FORCE = Quantity("applied_force", "applied_force_n", Dimension.FORCE, "applied force")
+LOAD_CELL_FORCE = Quantity(
+    "load_cell_force", "strut_force_n", Dimension.FORCE, "force of the load cell"
+)
+TEMPERATURE = Quantity(
+    "temperature", "temperature_c", Dimension.TEMPERATURE, "temperature of the damper"
+)
+
+BENCH_QUANTITIES = (APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE)
+"""What a bench sends once, beside the sensors of its struts, in the order of the log's columns."""

@@ -1,0 +1,247 @@
+"""What an observer is, and what it exchanges with the step, the check and the tuning."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
+
+from msgspec import Struct
+
+from rig.channels.channel import Channel
+
+REFERENCE_HEIGHT = -1
+"""Channel of an innovation of the strut's own height, `signals.height`."""
+
+
+class Innovation(Struct, frozen=True, gc=False):
+    """A sample compared with the model.
+
+    Attributes:
+        value: Measured value less the model's, both at the time of the measurement, in SI; of a
+            force that of the model's law.
+        t_ns: That time.
+        channel: Index of the further sensor's channel.
+    """
+
+    value: float
+    t_ns: int
+    channel: int = REFERENCE_HEIGHT
+
+
+class Start(Struct, frozen=True, gc=False):
+    """What an observer is given when the model starts.
+
+    Attributes:
+        t_ns: Time of the measurement that it starts with.
+        mobility_per_kg: Acceleration of the strut's height per newton in the strut.
+        interval_ns: Time between two measurements.
+        delay_ns: How much later a measurement arrives than it is true.
+        stiffness_per_s2: Decrease of that acceleration per metre of height: of the model's own
+            law, its stiffness over the effective mass.
+        damping_per_s: The same per m/s.
+        sensors: Channels of the strut's further sensors.
+    """
+
+    t_ns: int
+    mobility_per_kg: float
+    interval_ns: int
+    delay_ns: int = 0
+    stiffness_per_s2: float = 0.0
+    damping_per_s: float = 0.0
+    sensors: tuple[Channel, ...] = ()
+
+
+class ObserverState(Protocol):
+    """State of an observer; frozen."""
+
+    @property
+    def innovation_m(self) -> float:
+        """Last innovation of the height."""
+        ...
+
+    @property
+    def virtual_force_n(self) -> float:
+        """Virtual force, constant until the next step."""
+        ...
+
+    @property
+    def residual_force_n(self) -> float:
+        """Estimate of the force that the model's law lacks; published with the law's own."""
+        ...
+
+    @property
+    def force_std_n(self) -> float:
+        """Standard deviation of that estimate; NaN where the observer does not know it."""
+        ...
+
+    @property
+    def measured_ns(self) -> int:
+        """Time of the last measurement of the height."""
+        ...
+
+    @property
+    def left_out(self) -> tuple[int, ...]:
+        """Channels of further sensors that are not used now."""
+        ...
+
+
+class SensorStep(NamedTuple):
+    """A step of the height sensor, for the check.
+
+    Attributes:
+        step_m: Its size.
+        weight_n: Weight of the model's bodies; None where it is not known.
+    """
+
+    step_m: float
+    weight_n: float | None
+
+
+class Remark(NamedTuple):
+    """What a check of an observer found.
+
+    Attributes:
+        text: Text with figures.
+        is_warning: Whether the user is to be warned.
+    """
+
+    text: str
+    is_warning: bool
+
+
+StateT = TypeVar("StateT", bound=ObserverState)
+
+
+class Observer(Protocol[StateT]):
+    """What makes the model of one strut follow its bench. It knows no other strut.
+
+    The settings of an observer are its own attributes: it is a frozen pydantic dataclass with a
+    `kind`, which `rig.observers.OBSERVERS` lists.
+
+    Attributes:
+        requires_height: Whether the strut's height must be measured.
+        fuses_sensors: Whether it uses further sensors of the strut.
+        knows_std: Whether it knows the standard deviation of its estimate.
+    """
+
+    requires_height: ClassVar[bool]
+    fuses_sensors: ClassVar[bool]
+    knows_std: ClassVar[bool]
+
+    @property
+    def kind(self) -> str:
+        """Its name in a configuration."""
+        ...
+
+    @property
+    def measurements_to_start(self) -> int:
+        """Measurements that the model's start is computed from; with more than one it moves."""
+        ...
+
+    def init(self, start: Start) -> StateT:
+        """State at the model's start, without virtual force."""
+        ...
+
+    def steady_state(self, start: Start) -> StateT:
+        """State after a long time at rest, whose variances no longer change."""
+        ...
+
+    def step(
+        self,
+        state: StateT,
+        t_ns: int,
+        innovation: Innovation | None,
+        further: Sequence[Innovation] = (),
+    ) -> StateT:
+        """State after a tick.
+
+        Args:
+            state: State after the last tick.
+            t_ns: Time of the tick.
+            innovation: Of a new measurement of the height; None where no frame came.
+            further: Of new samples of further sensors.
+        """
+        ...
+
+    def numbers(self, state: StateT) -> Sequence[float]:
+        """What of a state the next one depends on, but for times and variances."""
+        ...
+
+    def with_numbers(self, state: StateT, numbers: Sequence[float]) -> StateT:
+        """A state with other numbers, as `numbers` returns them."""
+        ...
+
+    def can_continue(self, other: "AnyObserver") -> bool:
+        """Whether a state of another observer of this kind is a state of this one too."""
+        ...
+
+    def remark_on_step(self, step: SensorStep) -> Remark:
+        """What one step of the height sensor means to the observer."""
+        ...
+
+    def remark_on_rate(self, rate_hz: float) -> Remark | None:
+        """What the rate of the measurements means to it; None where it means nothing."""
+        ...
+
+
+AnyObserver = Observer[Any]
+"""An observer of whatever kind: its states come from it alone and go back to it alone."""
+
+
+class Search(NamedTuple):
+    """How the parameters of a kind of observer are searched; vectors are of any length.
+
+    Attributes:
+        observer: Parameter vector -> the observer.
+        candidates: Vectors that are tried first.
+        starts: How many of the best candidates a local search begins at.
+        gain_margin: Gain margin that the loop must keep unless the user states another.
+    """
+
+    observer: Callable[[Sequence[float]], Any]
+    candidates: Sequence[Sequence[float]]
+    starts: int
+    gain_margin: float
+
+
+class TuningTask(NamedTuple):
+    """The strut that an observer is tuned for.
+
+    Attributes:
+        mass_kg: Effective mass that the strut's force moves.
+        noise_std_m: Standard deviation of its height measurement.
+        interval_s: Time between two measurements.
+        force_limit_n: Limit of the virtual force.
+    """
+
+    mass_kg: float
+    noise_std_m: float
+    interval_s: float
+    force_limit_n: float
+
+
+class TunableObserver(Observer[StateT], Protocol[StateT]):
+    """An observer with parameters that `rig tune` can choose."""
+
+    @property
+    def force_limit_n(self) -> float:
+        """Largest magnitude of the virtual force."""
+        ...
+
+    @classmethod
+    def search(cls, task: TuningTask) -> Search:
+        """How its parameters are searched for a strut."""
+        ...
+
+    def bandwidth_hz(self, mobility_per_kg: float) -> float:
+        """Bandwidth on a strut of some mobility."""
+        ...
+
+    def with_bandwidth(self, factor: float) -> "TunableObserver[StateT]":
+        """The observer with its bandwidth multiplied by a factor."""
+        ...
+
+    def rounded(self) -> "TunableObserver[StateT]":
+        """The observer with parameters of four digits, as they stand in a configuration."""
+        ...
+
+
+AnyTunableObserver = TunableObserver[Any]

@@ -1,0 +1,119 @@
+"""What a sensor of a strut measures: on the model, and of the model's error.
+
+A further kind of sensor is a quantity in `rig.channels.quantities.STRUT_QUANTITIES` and an entry
+here.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
+
+from rig.channels.channel import Channel
+from rig.channels.quantities import FORCE, HEIGHT, VELOCITY, Quantity
+from rig.observers.protocol import Start
+
+
+class Instant(NamedTuple):
+    """The model at a time.
+
+    Attributes:
+        t_ns: The time.
+        struts: Height (m) and velocity (m/s) of each strut.
+        forces_n: Force of each strut's law; empty where no sensor requires it.
+    """
+
+    t_ns: int
+    struts: Sequence[tuple[float, float]]
+    forces_n: Sequence[float]
+
+
+@dataclass(frozen=True)
+class StrutSensor:
+    """How a kind of sensor sees the model.
+
+    Attributes:
+        reading: The model at a time and the index of a strut -> what the sensor reads there, SI.
+        row: Start of the observer -> change of the reading per model error (m), its rate (m/s) and
+            acceleration by the residual force (m/s²).
+    """
+
+    reading: Callable[[Instant, int], float]
+    row: Callable[[Start], tuple[float, float, float]]
+
+
+def _read_velocity(instant: Instant, strut: int) -> float:
+    return instant.struts[strut][1]
+
+
+def _read_force(instant: Instant, strut: int) -> float:
+    return instant.forces_n[strut]
+
+
+def _read_height(instant: Instant, strut: int) -> float:
+    return instant.struts[strut][0]
+
+
+def _force_row(start: Start) -> tuple[float, float, float]:
+    """The force that the law lacks, m (d/m - k x - c dx/dt)."""
+    mass_kg = 1.0 / start.mobility_per_kg
+    return -start.stiffness_per_s2 * mass_kg, -start.damping_per_s * mass_kg, mass_kg
+
+
+STRUT_SENSORS: Mapping[Quantity, StrutSensor] = MappingProxyType(
+    {
+        HEIGHT: StrutSensor(_read_height, lambda _start: (1.0, 0.0, 0.0)),
+        VELOCITY: StrutSensor(_read_velocity, lambda _start: (0.0, 1.0, 0.0)),
+        FORCE: StrutSensor(_read_force, _force_row),
+    }
+)
+
+
+def model_reading(t_ns: int, channel: Channel, instants: Sequence[Instant]) -> float:
+    """What a sensor of the model would have read at a time.
+
+    A height is first order from the tick after that time, anything else linear between two ticks.
+
+    Args:
+        t_ns: The time.
+        channel: The sensor.
+        instants: The model at the ticks, the newest first.
+    """
+    now, strut = instants[0], channel.strut
+    if channel.quantity is HEIGHT:
+        return model_height_m(t_ns, strut, now.t_ns, now.struts, instants)
+    before = after = now
+    for before in instants[1:]:
+        if before.t_ns <= t_ns:
+            break
+        after = before
+    read = STRUT_SENSORS[channel.quantity].reading
+    earlier, later = read(before, strut), read(after, strut)
+    if after.t_ns == before.t_ns:
+        return later
+    share = min(max((t_ns - before.t_ns) / (after.t_ns - before.t_ns), 0.0), 1.0)
+    return earlier + share * (later - earlier)
+
+
+def model_height_m(
+    measured_ns: int,
+    strut: int,
+    t_ns: int,
+    struts: Sequence[tuple[float, float]],
+    instants: Sequence[Instant],
+) -> float:
+    """Height of the model at the time of a measurement, to first order from the tick after it.
+
+    Args:
+        measured_ns: Time of the measurement.
+        strut: Index of the strut.
+        t_ns: Time of the newest tick.
+        struts: Height (m) and velocity (m/s) of each strut at it.
+        instants: The model at the ticks, the newest first; empty where no measurement is late.
+    """
+    for earlier in instants:
+        if earlier.t_ns < measured_ns:
+            break
+        t_ns, struts = earlier.t_ns, earlier.struts
+    height_m, velocity_m_per_s = struts[strut]
+    return height_m - velocity_m_per_s * (t_ns - measured_ns) * 1e-9

@@ -1,0 +1,92 @@
+"""The bridge that a plan describes, and the model in it."""
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+from can_dbc.database import Message
+from can_dbc.errors import InputError
+from dart_model.plant import DartPlant, PrescribedStrut
+from dart_model.protocol import AnyPlant
+from dart_model.spec import ModelSpec
+from rig.bridge.bridge import Bridge
+from rig.bridge.estimator import AnyEstimator
+from rig.bridge.free_model import FreeModelEstimator
+from rig.bridge.incoming import Alarm, Incoming, compile_incoming
+from rig.bridge.outgoing import compile_outgoing
+from rig.bridge.prescribed_motion import PrescribedMotionEstimator
+from rig.bridge.supervisor import Supervisor
+from rig.channels.channel import Channel
+from rig.plan.plan import Plan
+
+ENGINES: Mapping[str, Callable[[ModelSpec], AnyPlant]] = MappingProxyType({"dart": DartPlant})
+"""`engine` in a configuration -> what makes a plant of a model. A further one is a line here."""
+
+
+def build_bridge(plan: Plan, *, sending: bool = True) -> Bridge:
+    """Build the bridge of a plan.
+
+    Args:
+        plan: The plan.
+        sending: Whether it makes frames to send; what it computes is the same without.
+
+    Raises:
+        InputError: The model cannot be built.
+        DatabaseError: A signal does not fit its quantity.
+    """
+    supervision = plan.config.supervision
+    outgoing = plan.outgoing if sending else ()
+    return Bridge(
+        Supervisor(_build_estimator(plan), supervision),
+        plan.channels,
+        _compile_incoming(plan),
+        [compile_outgoing(item.message, item.signals) for item in outgoing],
+        plan.devices,
+        supervision,
+    )
+
+
+def build_plant(plan: Plan) -> AnyPlant:
+    """Build the model of a plan in the configuration's engine.
+
+    Raises:
+        InputError: There is no such engine, or the model cannot be built.
+    """
+    make = ENGINES.get(plan.config.engine)
+    if make is None:
+        raise InputError(
+            f"{plan.source}: engine {plan.config.engine!r}: expected one of {', '.join(ENGINES)}"
+        )
+    return make(plan.model)
+
+
+def _build_estimator(plan: Plan) -> AnyEstimator:
+    stale_after_ns = plan.config.supervision.stale_after_ns
+    motion = plan.config.prescribed_motion
+    if motion is not None:
+        model = PrescribedStrut(plan.model)
+        return PrescribedMotionEstimator(model, motion.settling_s, plan.channels, stale_after_ns)
+    return FreeModelEstimator(build_plant(plan), plan.observers, plan.channels, stale_after_ns)
+
+
+def _compile_incoming(plan: Plan) -> list[Incoming]:
+    """The messages of the bench, in the order in which the channels name them."""
+    messages: dict[str, Message] = {}
+    channels: dict[str, list[Channel]] = {}
+    alarms: dict[str, list[Alarm]] = {}
+    for channel in plan.channels:
+        if channel.message is not None:
+            messages[channel.message.name] = channel.message
+            channels.setdefault(channel.message.name, []).append(channel)
+    for message, alarm in plan.alarms:
+        messages[message.name] = message
+        alarms.setdefault(message.name, []).append(alarm)
+    devices = {device.name: index for index, device in enumerate(plan.devices)}
+    return [
+        compile_incoming(
+            message,
+            channels.get(name, ()),
+            alarms.get(name, ()),
+            devices.get(message.sender or ""),
+        )
+        for name, message in messages.items()
+    ]

@@ -1,0 +1,72 @@
+"""Plans read from files: of a configuration, and of a run."""
+
+from pathlib import Path
+
+from can_dbc.database import DEFAULT_DATABASE, load_database
+from can_dbc.errors import InputError
+from can_dbc.yaml_file import load_validated, validated
+from dart_model.spec import load_model, model_file
+from rig.bus.secoc import Authentication, read_key
+from rig.log.reader import DBC_FILE, MODEL_FILE, RUN_FILE, read_header
+from rig.plan.config import RunConfig
+from rig.plan.plan import Plan, resolve
+
+
+def load_plan(path: Path, *, model: str | None = None, duration_s: float | None = None) -> Plan:
+    """The plan of a configuration, with all files that it names.
+
+    Args:
+        path: YAML file; the files that it names lie in its folder.
+        model: File or name of a model to use instead of the configuration's.
+        duration_s: A length to use instead of the configuration's.
+
+    Raises:
+        InputError: One line that names file, key, value and what was expected.
+        DatabaseError: The same, of the DBC.
+    """
+    config = load_validated(RunConfig, path)
+    if duration_s is not None:
+        if not 0.0 < duration_s < float("inf"):
+            raise InputError(f"--duration-s {duration_s}: expected a finite number above zero")
+        config = config.model_copy(update={"duration_s": duration_s})
+    spec = load_model(_model_path(config.model, path) if model is None else _own_model(model))
+    database = load_database(DEFAULT_DATABASE if config.dbc is None else path.parent / config.dbc)
+    return resolve(config, path, spec, database)
+
+
+def plan_of_run(folder: Path) -> Plan:
+    """The plan that a run follows, or followed, from the files in its folder.
+
+    Raises:
+        InputError: A file of the run is missing or damaged.
+        DatabaseError: Its DBC is.
+    """
+    source = folder / RUN_FILE
+    config = validated(RunConfig, read_header(folder).get("config"), f"{source}: config")
+    model, database = load_model(folder / MODEL_FILE), load_database(folder / DBC_FILE)
+    return resolve(config, source, model, database)
+
+
+def load_authentication(plan: Plan) -> Authentication | None:
+    """How frames are authenticated, with its key; None without authentication.
+
+    Raises:
+        InputError: The key cannot be read.
+    """
+    settings = plan.config.authentication
+    if settings is None:
+        return None
+    return settings.with_key(read_key(plan.source.parent / settings.key_file))
+
+
+def _own_model(name: str) -> Path:
+    """A model that the user names: from the working directory on, or a shipped one."""
+    return model_file(name, Path())
+
+
+def _model_path(name: str, source: Path) -> Path:
+    """A model that a configuration names: from its folder on, or a shipped one."""
+    try:
+        return model_file(name, source.parent)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None

@@ -1,0 +1,566 @@
+"""The plan of a run: a configuration resolved once against its model and its DBC.
+
+Below it nothing looks up a name or opens a file.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from can_dbc.database import Database, Message
+from can_dbc.errors import DatabaseError, InputError
+from dart_model.spec import ModelSpec
+from rig.bridge.devices import Device
+from rig.bridge.incoming import Alarm
+from rig.bridge.outgoing import PublishedSignal
+from rig.bridge.publications import (
+    ESTIMATE,
+    KINEMATICS,
+    STATUS,
+    STRUT,
+    TIMING,
+    UNCERTAINTY,
+    Publication,
+)
+from rig.bus.secoc import FD_LENGTHS
+from rig.channels.channel import Channel, Role, SignalName
+from rig.channels.quantities import HEIGHT, LOAD_CELL_FORCE, Quantity
+from rig.observers.pi import PiObserver
+from rig.observers.protocol import AnyObserver
+from rig.plan.config import AuthenticationConfig, Mapped, RunConfig
+
+_LARGEST_DELAY_DIFFERENCE_S = 0.02
+"""Between the sensors of one strut: a filter that goes back by more at every reading takes half a
+tick of 1 kHz, and more than a tick from twice that on."""
+
+
+@dataclass(frozen=True)
+class PlannedStrut:
+    """A strut of the model as the bridge runs it.
+
+    Attributes:
+        name: Its name.
+        free_length_m: Its free length, at which a bench is assumed to rest.
+        observer: Its observer.
+        height: Channel of its measured height; None where none is measured.
+        interval_ns: Time between two measurements: that of the height's message, or a tick.
+        delay_ns: How much later a measurement arrives than it is true.
+    """
+
+    name: str
+    free_length_m: float
+    observer: AnyObserver
+    height: Channel | None
+    interval_ns: int
+    delay_ns: int
+
+
+@dataclass(frozen=True)
+class PlannedMessage:
+    """A message that the bridge sends.
+
+    Attributes:
+        message: Its definition.
+        signals: What its signals publish.
+    """
+
+    message: Message
+    signals: tuple[PublishedSignal, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A run as it was configured, with every name resolved.
+
+    Attributes:
+        source: File of the configuration, for messages.
+        config: The configuration, with every strut and every published signal named.
+        model: The model.
+        database: The DBC.
+        struts: Struts in the model's order.
+        channels: Channels of the bench: heights, quantities of the bench, further sensors.
+        outgoing: Messages that the bridge sends.
+        devices: Devices that it watches.
+        alarms: Messages with alarms of the devices, and the alarms.
+    """
+
+    source: Path
+    config: RunConfig
+    model: ModelSpec
+    database: Database
+    struts: tuple[PlannedStrut, ...]
+    channels: tuple[Channel, ...]
+    outgoing: tuple[PlannedMessage, ...]
+    devices: tuple[Device, ...]
+    alarms: tuple[tuple[Message, Alarm], ...]
+
+    @property
+    def period_ns(self) -> int:
+        """Time between two ticks."""
+        return self.config.period_ns
+
+    @property
+    def strut_names(self) -> list[str]:
+        """Names of the struts."""
+        return [strut.name for strut in self.struts]
+
+    @property
+    def observers(self) -> tuple[AnyObserver, ...]:
+        """Observer of each strut."""
+        return tuple(strut.observer for strut in self.struts)
+
+    @property
+    def heights(self) -> tuple[Channel, ...]:
+        """Channels of the measured heights."""
+        return tuple(channel for channel in self.channels if channel.role is Role.HEIGHT)
+
+    @property
+    def sensors(self) -> tuple[Channel, ...]:
+        """Channels of further sensors."""
+        return tuple(channel for channel in self.channels if channel.role is Role.SENSOR)
+
+    @property
+    def is_prescribed(self) -> bool:
+        """Whether the motion is prescribed: a dyno."""
+        return self.config.prescribed_motion is not None
+
+    def bench_channel(self, quantity: Quantity) -> Channel | None:
+        """Channel of a quantity of the bench; None where it is not measured."""
+        for channel in self.channels:
+            if channel.role is Role.BENCH and channel.quantity is quantity:
+                return channel
+        return None
+
+    def messages(self) -> list[Message]:
+        """Every message that the bridge reads or sends, once."""
+        read = [channel.message for channel in self.channels if channel.message is not None]
+        read += [message for message, _ in self.alarms]
+        return list({item.name: item for item in (*read, *self.sent_messages())}.values())
+
+    def sent_messages(self) -> list[Message]:
+        """Messages that the bridge sends."""
+        return [item.message for item in self.outgoing]
+
+    def with_config(self, config: RunConfig) -> "Plan":
+        """The plan of another configuration with the same model and DBC.
+
+        Raises:
+            InputError: The configuration does not fit them.
+        """
+        return resolve(config, self.source, self.model, self.database)
+
+    def with_model(self, model: ModelSpec) -> "Plan":
+        """The plan with another model of the same struts, such as a corrected one.
+
+        Raises:
+            InputError: The configuration does not fit it.
+        """
+        return resolve(self.config, self.source, model, self.database)
+
+    def with_observers(self, observers: Mapping[str, AnyObserver]) -> "Plan":
+        """The plan with other observers, by strut name.
+
+        Raises:
+            InputError: They do not fit what is measured.
+        """
+        every = {**self.config.observers, **observers}
+        return self.with_config(self.config.model_copy(update={"observers": every}))
+
+
+def resolve(config: RunConfig, source: Path, model: ModelSpec, database: Database) -> Plan:
+    """Resolve a configuration against its model and its DBC.
+
+    Args:
+        config: The configuration.
+        source: File it was read from, for messages.
+        model: The model.
+        database: The DBC.
+
+    Raises:
+        InputError: One line that names file, key, value and what was expected.
+        DatabaseError: The same, of the DBC.
+    """
+    config = _with_names(config, model, database, source)
+    reader = _SignalReader(config, database, source)
+    channels = reader.channels()
+    outgoing = reader.outgoing()
+    alarms = reader.alarms()
+    for key, message in reader.read.items():
+        if message.name in {item.message.name for item in outgoing}:
+            raise InputError(
+                f"{source}: {key}: {message.name} is also published, "
+                "expected a message of the bench"
+            )
+    plan = Plan(
+        source,
+        config,
+        model,
+        database,
+        _struts(config, model, channels),
+        channels,
+        outgoing,
+        _devices(config, channels),
+        alarms,
+    )
+    if config.authentication is not None:
+        _check_authentication(config, config.authentication, plan.messages(), source)
+    _check_devices(plan)
+    return plan
+
+
+# --- Names ------------------------------------------------------------------------------------
+
+
+_Entry = TypeVar("_Entry")
+
+
+def _with_names(config: RunConfig, model: ModelSpec, database: Database, source: Path) -> RunConfig:
+    """The configuration with every strut and every published signal named."""
+    struts = [strut.name for strut in model.struts]
+    heights = _by_strut(config.signals.height, struts, f"{source}: signals.height")
+    publish = config.publish
+    if publish is None:
+        publish = _default_messages(struts, database, config)
+    publish = _by_strut(publish, struts, f"{source}: publish")
+    for key, names in (
+        ("signals.height", heights),
+        ("signals.further", config.signals.further),
+        ("observers", config.observers),
+        ("publish", publish),
+    ):
+        for name in names:
+            if name not in struts:
+                raise InputError(
+                    f"{source}: {key}.{name}: no such strut, expected {', '.join(struts)}"
+                )
+    status = config.status
+    if "status" not in config.model_fields_set:
+        status = _signals_of("RIG_STATUS", STATUS, database) or None
+    observers = {name: config.observers.get(name, PiObserver()) for name in struts}
+    _check_observed(config, observers, list(heights), source)
+    height = {name: heights[name] for name in struts if name in heights}
+    return config.model_copy(
+        update={
+            "signals": config.signals.model_copy(update={"height": height}),
+            "observers": observers,
+            "publish": {name: publish[name] for name in struts if name in publish},
+            "status": status,
+        }
+    )
+
+
+def _by_strut(given: Mapping[str, _Entry], struts: list[str], key: str) -> Mapping[str, _Entry]:
+    """Entries by strut name, where a model of one strut may leave the name out."""
+    if list(given) != [""]:
+        return given
+    if len(struts) > 1:
+        raise InputError(
+            f"{key}: the model has {len(struts)} struts, expected one entry for each of "
+            f"{', '.join(struts)}"
+        )
+    return {struts[0]: given[""]}
+
+
+def _check_observed(
+    config: RunConfig, observers: Mapping[str, AnyObserver], heights: list[str], source: Path
+) -> None:
+    """Refuse an observer without its height, a height and sensors that no observer uses."""
+    for name, observer in observers.items():
+        if name not in heights and observer.requires_height:
+            raise InputError(
+                f"{source}: signals.height.{name}: is missing, expected its signal, or observers."
+                f"{name}: {{kind: none}} for a strut whose height is not measured"
+            )
+        if name in heights and not observer.requires_height:
+            raise InputError(
+                f"{source}: observers.{name}.kind: {observer.kind} takes no height, expected "
+                f"signals.height.{name} to be left out"
+            )
+    for name in config.signals.further:
+        if not observers[name].fuses_sensors:
+            raise InputError(
+                f"{source}: signals.further.{name}: expected observers.{name}.kind kalman, "
+                "because the others use the height alone"
+            )
+
+
+def _default_messages(
+    struts: list[str], database: Database, config: RunConfig
+) -> dict[str, Mapped]:
+    messages: dict[str, Mapped] = {}
+    for index, name in enumerate(struts):
+        ending = "" if index == 0 else f"_{index + 1}"
+        estimate = _signals_of(f"RIG_ESTIMATE{ending}", ESTIMATE, database)
+        kinematics = _signals_of(f"RIG_KINEMATICS{ending}", KINEMATICS, database)
+        messages[name] = {**estimate, **kinematics}
+        observer = config.observers.get(name)
+        if observer is not None and observer.knows_std:
+            messages[name] |= _signals_of(f"RIG_UNCERTAINTY{ending}", UNCERTAINTY, database)
+    return messages
+
+
+def _signals_of(message: str, publications: Iterable[Publication], database: Database) -> Mapped:
+    """The publications that a message has a signal of that name for, if the DBC has it."""
+    if message not in database.messages:
+        return {}
+    signals = database.messages[message].signals
+    return {
+        item.key: SignalName(message=message, signal=item.signal)
+        for item in publications
+        if item.signal in signals
+    }
+
+
+# --- Signals ----------------------------------------------------------------------------------
+
+
+class _SignalReader:
+    """Looks the configured signals up in the DBC, each once.
+
+    Attributes:
+        read: Message of each signal that the bridge reads, by the signal's key.
+    """
+
+    def __init__(self, config: RunConfig, database: Database, source: Path) -> None:
+        self._config, self._database, self._source = config, database, source
+        self._used = [(item.message, item.signal) for item in config.signals.height.values()]
+        self.read: dict[str, Message] = {}
+
+    def channels(self) -> tuple[Channel, ...]:
+        """Channels of the bench: heights, quantities of the bench, further sensors."""
+        signals, struts = self._config.signals, list(self._config.observers)
+        channels: list[Channel] = []
+
+        def add(
+            role: Role,
+            quantity: Quantity,
+            name: str,
+            key: str,
+            strut: int,
+            entry: SignalName,
+            delay_ns: int = 0,
+            noise_std: float = 0.0,
+        ) -> None:
+            message = self._message(entry, key)
+            interval_ns = message.cycle_time_ns or self._config.period_ns
+            channels.append(
+                Channel(
+                    len(channels),
+                    role,
+                    quantity,
+                    name,
+                    key,
+                    strut,
+                    interval_ns,
+                    delay_ns,
+                    noise_std,
+                    message,
+                    entry.signal,
+                )
+            )
+
+        for strut, entry in signals.height.items():
+            index = struts.index(strut)
+            key = f"signals.height.{strut}"
+            add(Role.HEIGHT, HEIGHT, strut, key, index, entry, entry.delay_ns)
+        for quantity, entry in signals.bench.items():
+            key = f"signals.{quantity.key}"
+            add(Role.BENCH, quantity, quantity.key, key, -1, entry)
+        for strut, group in signals.further.items():
+            for sensor, entry in group.items():
+                self._check_sensor(strut, sensor)
+                key, name = f"signals.further.{strut}.{sensor}", f"{strut}.{sensor}"
+                index, quantity = struts.index(strut), entry.quantity
+                delay_ns = entry.delay_ns
+                add(Role.SENSOR, quantity, name, key, index, entry, delay_ns, entry.noise_std)
+        return tuple(channels)
+
+    def outgoing(self) -> tuple[PlannedMessage, ...]:
+        """Messages that the bridge sends, in the order in which they are named."""
+        config = self._config
+        published: dict[str, list[PublishedSignal]] = {}
+        messages: dict[str, Message] = {}
+        taken: list[SignalName] = []
+
+        def add(key: str, entry: SignalName, publication: Publication, strut: int = 0) -> None:
+            messages[entry.message] = self._signal(entry, key)
+            if entry in taken:
+                raise InputError(
+                    f"{self._source}: {key}: signal {entry.signal} of {entry.message} stands "
+                    "twice, expected once"
+                )
+            taken.append(entry)
+            signal = PublishedSignal(entry.signal, publication, strut)
+            published.setdefault(entry.message, []).append(signal)
+
+        choices = {item.key: item for item in STRUT}
+        for strut, name in enumerate(config.observers):
+            for key, entry in (config.publish or {}).get(name, {}).items():
+                add(f"publish.{name}.{key}", entry, choices[key], strut)
+        for group, entries, publications in (
+            ("status", config.status, STATUS),
+            ("timing", config.timing, TIMING),
+        ):
+            choices = {item.key: item for item in publications}
+            for key, entry in (entries or {}).items():
+                add(f"{group}.{key}", entry, choices[key])
+        return tuple(PlannedMessage(messages[name], tuple(it)) for name, it in published.items())
+
+    def alarms(self) -> tuple[tuple[Message, Alarm], ...]:
+        """Alarms of the devices, with their messages."""
+        return tuple(
+            (
+                self._message(entry, f"devices.{name}.alarms.{number}"),
+                Alarm(entry.signal, index, number),
+            )
+            for index, (name, device) in enumerate(self._config.devices.items())
+            for number, entry in enumerate(device.alarms)
+        )
+
+    def _message(self, entry: SignalName, key: str) -> Message:
+        """Message of a signal that the bridge reads."""
+        self.read[key] = message = self._signal(entry, key)
+        return message
+
+    def _signal(self, entry: SignalName, key: str) -> Message:
+        """Message of a signal.
+
+        Raises:
+            InputError: The DBC has no such message, or the message no such signal.
+        """
+        try:
+            message = self._database.message(entry.message)
+            message.signal(entry.signal)
+        except DatabaseError as error:
+            raise InputError(f"{self._source}: {key}: {error}") from error
+        return message
+
+    def _check_sensor(self, strut: str, sensor: str) -> None:
+        """Refuse a further sensor whose signal is in use, or whose delay differs too much."""
+        signals = self._config.signals
+        entry, key = signals.further[strut][sensor], f"signals.further.{strut}.{sensor}"
+        if (entry.message, entry.signal) in self._used:
+            raise InputError(
+                f"{self._source}: {key}: {entry.message}.{entry.signal} is a height or "
+                "a further sensor already, expected another signal"
+            )
+        self._used.append((entry.message, entry.signal))
+        own_s = signals.height[strut].delay_s if strut in signals.height else 0.0
+        if abs(entry.delay_s - own_s) > _LARGEST_DELAY_DIFFERENCE_S:
+            raise InputError(
+                f"{self._source}: {key}.delay_s: {entry.delay_s:g}: expected at most "
+                f"{_LARGEST_DELAY_DIFFERENCE_S:g} s more or less than that of the height "
+                f"({own_s:g})"
+            )
+
+
+def _struts(
+    config: RunConfig, model: ModelSpec, channels: Sequence[Channel]
+) -> tuple[PlannedStrut, ...]:
+    heights = {channel.strut: channel for channel in channels if channel.role is Role.HEIGHT}
+    struts: list[PlannedStrut] = []
+    for index, strut in enumerate(model.struts):
+        height = heights.get(index)
+        interval_ns, delay_ns = config.period_ns, 0
+        if height is not None:
+            interval_ns, delay_ns = height.interval_ns, height.delay_ns
+        observer = config.observers[strut.name]
+        struts.append(
+            PlannedStrut(strut.name, strut.free_length_m, observer, height, interval_ns, delay_ns)
+        )
+    return tuple(struts)
+
+
+# --- Devices and authentication -----------------------------------------------------------------
+
+
+def _devices(config: RunConfig, channels: Sequence[Channel]) -> tuple[Device, ...]:
+    """Devices that are watched; the estimate rests on those that send a height."""
+    vital = {
+        channel.message.sender
+        for channel in channels
+        if channel.message is not None
+        and (
+            channel.role is Role.HEIGHT
+            or (config.prescribed_motion is not None and channel.quantity is LOAD_CELL_FORCE)
+        )
+    }
+    return tuple(
+        entry.device(name, is_vital=name in vital) for name, entry in config.devices.items()
+    )
+
+
+def _check_devices(plan: Plan) -> None:
+    """Refuse devices that send nothing that is used, and ids that are in use already."""
+    config, database = plan.config, plan.database
+    read = {channel.message.name: channel.message for channel in plan.channels if channel.message}
+    read |= {message.name: message for message, _ in plan.alarms}
+    taken = {
+        message.arbitration_id: message.name
+        for message in plan.messages()
+        if not message.is_extended
+    }
+    senders = sorted({message.sender for message in read.values() if message.sender})
+    for device, (name, entry) in zip(plan.devices, config.devices.items(), strict=True):
+        key = f"{plan.source}: devices.{name}"
+        if config.authentication is not None:
+            raise InputError(f"{key}: expected none with authentication, which it does not support")
+        if name not in senders:
+            raise InputError(
+                f"{key}: sends none of the signals in {database.path.name}, expected the name of "
+                f"a node that does: {', '.join(senders) or 'the DBC names none'}"
+            )
+        other = next(
+            (item.name for item in read.values() if item.sender == name and not item.is_j1939), None
+        )
+        if entry.j1939_name is not None and other is not None:
+            raise InputError(f"{key}.j1939_name: {other} is no message of J1939 in the DBC")
+        if any(entry.alarms.count(alarm) > 1 for alarm in entry.alarms):
+            raise InputError(f"{key}.alarms: a signal stands twice, expected it once")
+        _check_ids(device, taken, key)
+    for message, alarm in plan.alarms:
+        device = plan.devices[alarm.device]
+        signal = message.signal(alarm.signal)
+        if message.sender != device.name or signal.is_float or signal.scale != 1 or signal.offset:
+            raise InputError(
+                f"{plan.source}: devices.{device.name}.alarms.{alarm.alarm}: "
+                f"{message.name}.{alarm.signal}: expected an integer without scale and offset "
+                f"that {device.name} sends"
+            )
+
+
+def _check_ids(device: Device, taken: dict[int, str], key: str) -> None:
+    """Refuse ids of a device that are in use; the others are then."""
+    ids = device.ids
+    if len(set(ids)) < len(ids):
+        raise InputError(f"{key}.emergency_id: {ids[0]:#x} is the id of its heartbeats")
+    for arbitration_id in ids:
+        other = taken.setdefault(arbitration_id, f"devices.{device.name}")
+        if other != f"devices.{device.name}":
+            raise InputError(
+                f"{key}: {arbitration_id:#x} is an id of {other} already, expected another "
+                "node_id or emergency_id"
+            )
+
+
+def _check_authentication(
+    config: RunConfig, settings: AuthenticationConfig, messages: list[Message], source: Path
+) -> None:
+    """Refuse messages that have no room for authentication."""
+    if config.bus.data_bitrate is None:
+        raise InputError(
+            f"{source}: authentication: classic CAN has no room for it, expected bus.data_bitrate"
+        )
+    for message in sorted(messages, key=lambda item: item.name):
+        if message.is_extended:
+            raise InputError(
+                f"{source}: authentication: {message.name} has a 29-bit id, expected 11 bits, "
+                "because SecOC's data ids have 16"
+            )
+        length = message.length_bytes + settings.trailer_bytes
+        if length not in FD_LENGTHS:
+            raise InputError(
+                f"{source}: authentication: {message.name} would be {length} bytes long, "
+                f"expected one of CAN FD's lengths {', '.join(map(str, FD_LENGTHS))}"
+            )
