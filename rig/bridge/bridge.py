@@ -7,12 +7,13 @@ from msgspec.structs import replace
 
 from can_dbc.addressing import Directory, Filter
 from can_dbc.frame import Frame
+from can_dbc.protection import SequenceState
 from rig.bridge.devices import CLAIM, CLAIM_MASK, Device, faults
-from rig.bridge.gates import Gates, GateState, Reception
+from rig.bridge.gates import GateMemory, Gates, Reception
 from rig.bridge.incoming import Incoming
 from rig.bridge.outgoing import Outgoing
 from rig.bridge.report import Conditions, Counts, Report
-from rig.bridge.supervisor import Reports, SupervisedState, Supervision, Supervisor
+from rig.bridge.supervisor import NO_REPORTS, Reports, SupervisedState, Supervision, Supervisor
 from rig.bridge.values import Mode, StepInput, StepOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.observers.protocol import AnyObserver
@@ -38,20 +39,22 @@ class BridgeState(Struct, frozen=True, gc=False):
 
     Attributes:
         supervised: State of estimator and supervisor.
-        gates: State of the gates.
+        sequences: Counter state of each incoming message.
+        memory: Memory of the gates.
         sendings: State of each outgoing message.
         reported: Counts at the last status that was sent.
     """
 
     supervised: SupervisedState
-    gates: GateState
+    sequences: tuple[SequenceState, ...]
+    memory: GateMemory
     sendings: tuple[Sending, ...]
     reported: Counts
 
     @property
     def counts(self) -> Counts:
         """Counts since the start."""
-        return self.gates.counts
+        return self.memory.counts
 
     @property
     def mode(self) -> Mode:
@@ -136,7 +139,9 @@ class Bridge:
     def init(self, t_ns: int) -> BridgeState:
         """State before the first tick."""
         sendings = (Sending(0, t_ns),) * len(self._outgoing)
-        return BridgeState(self._supervisor.init(t_ns), self._gates.init(t_ns), sendings, Counts())
+        sequences, memory = self._gates.init(t_ns)
+        supervised = self._supervisor.init(t_ns)
+        return BridgeState(supervised, sequences, memory, sendings, memory.counts)
 
     def tick(
         self,
@@ -156,19 +161,24 @@ class Bridge:
         Returns:
             State after the tick, and what it did.
         """
-        reception = Reception(state.gates)
+        reception = Reception(state.sequences, state.memory)
         supervised, samples = self._receive(state.supervised, reception, t_ns, frames)
         step_input = StepInput(t_ns, tuple(samples), conditions.acknowledged)
-        wrong = faults(self._devices, reception.healths, t_ns) if self._devices else ()
-        is_faulty = any(self._devices[index].is_vital for index, _ in wrong)
-        reports = Reports(reception.action, is_faulty)
+        memory, reports = reception.memory, NO_REPORTS
+        wrong: tuple[tuple[int, str], ...] = ()
+        if self._devices:
+            wrong = faults(self._devices, memory.healths, t_ns)
+        if wrong or reception.action:
+            is_faulty = any(self._devices[index].is_vital for index, _ in wrong)
+            reports = Reports(reception.action, is_faulty)
         supervised, output, action = self._supervisor.step(supervised, step_input, reports)
-        counts = _count_tick(reception.counts, output, action, conditions, len(wrong))
+        counts = _count_tick(memory.counts, output, action, conditions, len(wrong))
         sent = self._send(state, t_ns, output, counts, conditions)
-        sendings, sent_frames, reception.counts, reported = sent
-        gates = reception.state()
-        after = BridgeState(supervised, gates, sendings, reported)
-        return after, TickResult(sent_frames, step_input, output, gates.counts, wrong)
+        sendings, sent_frames, counts, reported = sent
+        if counts is not memory.counts:
+            memory = replace(memory, counts=counts)
+        after = BridgeState(supervised, tuple(reception.sequences), memory, sendings, reported)
+        return after, TickResult(sent_frames, step_input, output, counts, wrong)
 
     def _receive(
         self,
@@ -184,19 +194,16 @@ class Bridge:
         """
         samples: list[Sample] = []
         measured = 0
-        for frame in frames:
-            received = self._gates.receive(reception, frame)
-            if received is None:
-                continue
-            incoming, values = received
-            if measured and incoming.heights and measured >> incoming.heights[0].strut & 1:
+        for incoming, values, frame_ns in self._gates.receive(reception, frames):
+            if measured & incoming.first_strut:
                 supervised, samples = self._catch_up(supervised, samples)
                 measured = 0
-            arrived_ns = min(frame.t_ns, t_ns)
-            for value, channel, delay_ns in incoming.deliveries:
-                samples.append(Sample(channel, values[value], arrived_ns - delay_ns))
-            for _, strut in incoming.heights:
-                measured |= 1 << strut
+            arrived_ns = min(frame_ns, t_ns)
+            samples += [
+                Sample(channel, values[value], arrived_ns - delay_ns)
+                for value, channel, delay_ns in incoming.deliveries
+            ]
+            measured |= incoming.struts
         return supervised, samples
 
     def _catch_up(

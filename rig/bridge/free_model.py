@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import Struct
@@ -43,7 +43,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
     past: tuple[Instant, ...] = ()
 
 
-class _Received(Struct, gc=False):
+class _Received(NamedTuple):
     """Samples of a step, by what they are used for.
 
     Attributes:
@@ -53,10 +53,10 @@ class _Received(Struct, gc=False):
         temperature_c: New damper temperature, None where none arrived.
     """
 
-    heights: list[Sample | None]
-    readings: list[Sample]
-    applied_n: float | None = None
-    temperature_c: float | None = None
+    heights: Sequence[Sample | None]
+    readings: Sequence[Sample]
+    applied_n: float | None
+    temperature_c: float | None
 
 
 class FreeModelEstimator:
@@ -148,19 +148,21 @@ class FreeModelEstimator:
 
     def _sort(self, samples: Sequence[Sample]) -> _Received:
         """Samples by what they are used for; of a quantity of the bench the newest."""
-        received = _Received([None] * len(self._observers), [])
+        heights: list[Sample | None] = [None] * len(self._observers)
+        readings: list[Sample] = []
+        applied_n = temperature_c = None
         routes = self._routes
         for sample in samples:
             route = routes[sample.channel]
             if route >= 0:
-                received.heights[route] = sample
+                heights[route] = sample
             elif route == _APPLIED:
-                received.applied_n = sample.value
+                applied_n = sample.value
             elif route == _TEMPERATURE:
-                received.temperature_c = sample.value
+                temperature_c = sample.value
             elif route == _READING:
-                received.readings.append(sample)
-        return received
+                readings.append(sample)
+        return _Received(heights, readings, applied_n, temperature_c)
 
     def _try_to_start(
         self, state: FreeModelState, t_ns: int, received: _Received
@@ -223,23 +225,26 @@ class FreeModelEstimator:
         self, state: FreeModelState, loaded: LoadedModel[Any], t_ns: int, received: _Received
     ) -> tuple[FreeModelState, Estimate]:
         """Advance the model to the tick and correct it with what was measured."""
-        applied_n = _latest(received.applied_n, loaded.applied_force_n)
-        temperature_c = _latest(received.temperature_c, loaded.temperature_c)
+        heights, readings, applied_n, temperature_c = received
+        if applied_n is None:
+            applied_n = loaded.applied_force_n
+        if temperature_c is None:
+            temperature_c = loaded.temperature_c
         model = self._plant.step(loaded, (t_ns - state.t_ns) * 1e-9, applied_n)
         instants: tuple[Instant, ...] = ()
         further: Sequence[tuple[Innovation, ...]] = ()
         if self._oldest_ns:
             forces_n: Sequence[float] = ()
-            if received.readings:
+            if readings:
                 no_forces = (0.0,) * self.struts
                 forces_n = self._plant.load(model, no_forces, applied_n, temperature_c).forces_n
             instants = self._recent_instants(state, loaded, Instant(t_ns, model.struts, forces_n))
-            further = self._compare(received.readings, instants)
+            further = self._compare(readings, instants)
         observers: list[ObserverState] = []
         virtual_n: list[float] = []
         oldest_ns = t_ns
         for strut, observer in enumerate(self._observers):
-            measured = received.heights[strut]
+            measured = heights[strut]
             innovation = None
             if measured is not None:
                 measured_ns = measured.t_ns

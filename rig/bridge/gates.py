@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from can_dbc.addressing import Directory
 from can_dbc.frame import Frame
@@ -36,6 +37,9 @@ from rig.bridge.incoming import Incoming, Values
 from rig.bridge.limits import Action, Limit, Plausibility, judge_height
 from rig.bridge.report import Counts
 
+# Looking up a member of an enum costs as much as the CRC of a frame.
+_OK = Verdict.OK
+
 SECOND_SENDER_FRAMES = 12
 """Frames out of sequence in close succession that only a second sender explains: a restarted sender
 is accepted after three, and frames that overtake others are single."""
@@ -56,18 +60,16 @@ class Strays(NamedTuple):
     t_ns: int = 0
 
 
-class GateState(Struct, frozen=True, gc=False):
-    """What the gates remember between two ticks.
+class GateMemory(Struct, frozen=True, gc=False):
+    """What the gates remember between two ticks; most ticks leave it as it is.
 
     Attributes:
-        sequences: Counter state of each incoming message.
         strays: Frames of each incoming message that contradicted its counter.
         heights: Memory of each strut's measured heights.
         healths: Health of each device.
         counts: Counts since the start.
     """
 
-    sequences: tuple[SequenceState, ...]
     strays: tuple[Strays, ...]
     heights: tuple[Plausibility | None, ...]
     healths: tuple[DeviceHealth, ...]
@@ -75,39 +77,39 @@ class GateState(Struct, frozen=True, gc=False):
 
 
 class Reception:
-    """The gates' state while the frames of one tick pass; written in place.
+    """What the frames of one tick change while they pass; written in place.
 
     Args:
-        state: State at the beginning of the tick.
+        sequences: Counter state of each incoming message at the beginning of the tick.
+        memory: Memory of the gates at the beginning of the tick.
 
     Attributes:
         action: Severest action that limits on measurements require, 0 if none.
     """
 
-    __slots__ = ("action", "counts", "healths", "heights", "sequences", "strays")
+    __slots__ = ("action", "memory", "sequences")
 
-    def __init__(self, state: GateState) -> None:
-        self.sequences = list(state.sequences)
-        self.strays, self.heights, self.healths = state.strays, state.heights, state.healths
-        self.counts = state.counts
+    def __init__(self, sequences: Sequence[SequenceState], memory: GateMemory) -> None:
+        self.sequences = list(sequences)
+        self.memory = memory
         self.action = 0
+
+    def count(self, **increments: int) -> None:
+        """Add to counts, by the names of `Counts`."""
+        counts = self.memory.counts
+        more = {name: getattr(counts, name) + number for name, number in increments.items()}
+        self.memory = replace(self.memory, counts=counts._replace(**more))
 
     def refuse(self, cause: str) -> None:
         """Count a refused frame, and its cause: the name of one of `Counts`."""
-        counts = self.counts
-        self.counts = counts._replace(
-            **{"refused": counts.refused + 1, cause: getattr(counts, cause) + 1}
-        )
+        self.count(**{"refused": 1, cause: 1})
 
     def set_health(self, index: int, health: DeviceHealth) -> None:
         """Replace the health of a device."""
-        self.healths = (*self.healths[:index], health, *self.healths[index + 1 :])
-
-    def state(self) -> GateState:
-        """State at the end of the tick."""
-        return GateState(
-            tuple(self.sequences), self.strays, self.heights, self.healths, self.counts
-        )
+        healths = self.memory.healths
+        if healths[index] is not health:
+            healths = (*healths[:index], health, *healths[index + 1 :])
+            self.memory = replace(self.memory, healths=healths)
 
 
 Gate = Callable[[Reception, Frame, Values], Values | None]
@@ -144,68 +146,69 @@ class Gates:
         self._gates = [self._gates_of(item) for item in incoming]
         self._index_of = self.directory.place
 
-    def init(self, t_ns: int) -> GateState:
-        """State before the first tick."""
+    def init(self, t_ns: int) -> tuple[tuple[SequenceState, ...], GateMemory]:
+        """Counter states and memory before the first tick."""
         messages = len(self.incoming)
-        return GateState(
-            (INITIAL,) * messages,
+        memory = GateMemory(
             (Strays(),) * messages,
             (None,) * self._struts,
             tuple(initial_health(device, t_ns) for device in self._devices),
             Counts(),
         )
+        return (INITIAL,) * messages, memory
 
-    def receive(self, reception: Reception, frame: Frame) -> tuple[Incoming, Values] | None:
-        """Pass a frame through all gates.
+    def receive(
+        self, reception: Reception, frames: Sequence[Frame]
+    ) -> list[tuple[Incoming, Values, int]]:
+        """Pass frames through all gates.
 
         Returns:
-            Its message and its values, or None if a gate refused it.
+            Message, values and arrival time of each frame that no gate refused.
         """
-        index = self._index_of(frame.arbitration_id, frame.is_extended)
-        if index is None or frame.is_error:
-            self._receive_other(reception, frame)
-            return None
-        incoming = self.incoming[index]
-        sequence, verdict, values = incoming.read(reception.sequences[index], frame)
-        reception.sequences[index] = sequence
-        if verdict is not Verdict.OK:
-            self._count(reception, index, frame.t_ns, verdict)
-        for gate in self._gates[index]:
-            if values is None:
-                return None
-            values = gate(reception, frame, values)
-        return None if values is None else (incoming, values)
+        passed: list[tuple[Incoming, Values, int]] = []
+        index_of, sequences = self._index_of, reception.sequences
+        for frame in frames:
+            index = index_of(frame.arbitration_id, frame.is_extended)
+            if index is None or frame.is_error:
+                self._receive_other(reception, frame)
+                continue
+            incoming = self.incoming[index]
+            sequences[index], verdict, values = incoming.read(sequences[index], frame)
+            if verdict is not _OK:
+                self._count(reception, index, frame.t_ns, verdict)
+            if values is not None and (gates := self._gates[index]):
+                values = _pass(gates, reception, frame, values)
+            if values is not None:
+                passed.append((incoming, values, frame.t_ns))
+        return passed
 
     def _receive_other(self, reception: Reception, frame: Frame) -> None:
         """Receive a frame of no incoming message: of a device, or of a second sender."""
         if frame.is_error:
             return
-        if reception.healths:
+        if self._devices:
             self._update_healths(reception, frame)
         if (frame.arbitration_id, frame.is_extended) in self._own:
-            counts = reception.counts
-            reception.counts = counts._replace(second_sender=counts.second_sender + 1)
+            reception.count(second_sender=1)
 
     def _update_healths(self, reception: Reception, frame: Frame) -> None:
         """Update the devices' health by a heartbeat, an emergency or an address claim."""
+        healths = reception.memory.healths
         if frame.is_extended and frame.arbitration_id & CLAIM_MASK == CLAIM & CLAIM_MASK:
-            pairs = zip(self._devices, reception.healths, strict=True)
-            reception.healths = tuple(
-                [update_by_claim(device, health, frame) for device, health in pairs]
-            )
+            for index, device in enumerate(self._devices):
+                reception.set_health(index, update_by_claim(device, healths[index], frame))
             return
         index = None if frame.is_extended else self._device_of_id.get(frame.arbitration_id)
         if index is not None:
-            health = update_by_frame(self._devices[index], reception.healths[index], frame)
+            health = update_by_frame(self._devices[index], healths[index], frame)
             reception.set_health(index, health)
 
     def _count(self, reception: Reception, index: int, t_ns: int, verdict: Verdict) -> None:
         """Count a frame that did not simply follow the one before."""
         if verdict is Verdict.FIRST:
-            reception.counts = reception.counts._replace(started=reception.counts.started + 1)
+            reception.count(started=1)
         elif verdict.accepted:
-            lost = reception.counts.lost + reception.sequences[index].lost
-            reception.counts = reception.counts._replace(lost=lost)
+            reception.count(lost=reception.sequences[index].lost)
         else:
             reception.refuse(verdict.value)
         if verdict is Verdict.OUT_OF_SEQUENCE:
@@ -214,13 +217,14 @@ class Gates:
     def _count_stray(self, reception: Reception, index: int, t_ns: int) -> None:
         """Count a frame that contradicts its message's counter, and a second sender if need be."""
         cycle_ns = self.incoming[index].message.cycle_time_ns or 0
-        before = reception.strays[index]
+        strays = reception.memory.strays
+        before = strays[index]
         follows = t_ns - before.t_ns <= _SUCCESSION_CYCLES * cycle_ns
         stray = Strays(before.frames + 1 if follows else 1, t_ns)
-        reception.strays = (*reception.strays[:index], stray, *reception.strays[index + 1 :])
+        strays = (*strays[:index], stray, *strays[index + 1 :])
+        reception.memory = replace(reception.memory, strays=strays)
         if stray.frames >= SECOND_SENDER_FRAMES:
-            counts = reception.counts
-            reception.counts = counts._replace(second_sender=counts.second_sender + 1)
+            reception.count(second_sender=1)
 
     def _gates_of(self, incoming: Incoming) -> tuple[Gate, ...]:
         """The gates that a message needs after its protection, in their order."""
@@ -233,11 +237,23 @@ class Gates:
         return tuple(gates)
 
 
+def _pass(
+    gates: Sequence[Gate], reception: Reception, frame: Frame, values: Values
+) -> Values | None:
+    """Values of a frame behind some gates; None if one of them refused the frame."""
+    for gate in gates:
+        passed = gate(reception, frame, values)
+        if passed is None:
+            return None
+        values = passed
+    return values
+
+
 def _sent_by_device(index: int, device: Device) -> Gate:
     """A gate for frames of the device alone: another one may send the same group."""
 
     def gate(reception: Reception, frame: Frame, values: Values) -> Values | None:
-        return values if is_from(device, reception.healths[index], frame) else None
+        return values if is_from(device, reception.memory.healths[index], frame) else None
 
     return gate
 
@@ -246,12 +262,12 @@ def _healthy_sender(incoming: Incoming, index: int, device: Device) -> Gate:
     """A gate for frames of a healthy device; alarms in the frame itself count."""
 
     def gate(reception: Reception, frame: Frame, values: Values) -> Values | None:
-        reception.set_health(index, update_by_data(device, reception.healths[index]))
+        reception.set_health(index, update_by_data(device, reception.memory.healths[index]))
         for alarm in incoming.alarms:
-            health = reception.healths[alarm.device]
+            health = reception.memory.healths[alarm.device]
             raw = int(values[alarm.value])
             reception.set_health(alarm.device, update_by_alarm(health, alarm.alarm, raw))
-        if fault(device, reception.healths[index], frame.t_ns) is None:
+        if fault(device, reception.memory.healths[index], frame.t_ns) is None:
             return values
         reception.refuse("from_faulty_device")
         return None
@@ -263,7 +279,7 @@ def _plausible(incoming: Incoming, limits: Sequence[Limit]) -> Gate:
     """A gate for heights within the limits: a frame is used whole or not at all."""
 
     def gate(reception: Reception, frame: Frame, values: Values) -> Values | None:
-        heights, action = list(reception.heights), 0
+        heights, action = list(reception.memory.heights), 0
         for target in incoming.heights:
             memory = heights[target.strut]
             heights[target.strut], required = judge_height(
@@ -272,7 +288,7 @@ def _plausible(incoming: Incoming, limits: Sequence[Limit]) -> Gate:
             action = max(action, required)
         reception.action = max(reception.action, action)
         if action < Action.REFUSE:
-            reception.heights = tuple(heights)
+            reception.memory = replace(reception.memory, heights=tuple(heights))
             return values
         reception.refuse("implausible")
         return None

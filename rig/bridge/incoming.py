@@ -88,6 +88,8 @@ class Incoming:
         heights: Values that are reference heights.
         alarms: Values that are alarms.
         device: Index of the device that sends it; None if none is configured.
+        struts: Struts whose reference heights it carries, a bit each.
+        first_strut: The bit of the first of them; 0 if there is none.
     """
 
     message: Message
@@ -96,6 +98,8 @@ class Incoming:
     heights: tuple[HeightDelivery, ...] = ()
     alarms: tuple[AlarmDelivery, ...] = ()
     device: int | None = None
+    struts: int = 0
+    first_strut: int = 0
 
 
 def compile_incoming(
@@ -152,6 +156,8 @@ def compile_incoming(
             for item in alarms
         ),
         device,
+        sum({1 << height.strut for height in heights}),
+        1 << heights[0].strut if heights else 0,
     )
 
 

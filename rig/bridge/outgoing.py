@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import NamedTuple
 
 from can_dbc.codec import compile_encoder, si_range
@@ -96,6 +97,11 @@ def _page(message: Message, published: Sequence[PublishedSignal]) -> _Payload:
     names = [item.signal for item in published]
     dimensions = [item.publication.dimension for item in published]
     encode = compile_encoder(message, names, dimensions)
+    attributes = [item.publication.attribute for item in published]
+    if len(published) > 1 and all(attributes) and len({item.strut for item in published}) == 1:
+        # An estimate is sent at every tick: its values are looked up in one call.
+        get, strut = attrgetter(*attributes), published[0].strut
+        return lambda report: encode(get(report.output.struts[strut]))
     values = [(_value(message, item), item.strut) for item in published]
 
     def payload(report: Report) -> tuple[bytes, bool]:

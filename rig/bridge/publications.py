@@ -20,6 +20,7 @@ class Publication:
         value: What the tick reports, and the index of a strut -> the value in SI.
         signal: Name of its signal where the configuration names a message alone.
         stops_at_range: A value beyond the signal's range is sent as the end of it, and no fault.
+        attribute: Attribute of `StrutOutput` that is published as it is; empty for all else.
     """
 
     key: str
@@ -27,28 +28,33 @@ class Publication:
     value: Callable[[Report, int], float]
     signal: str
     stops_at_range: bool = False
+    attribute: str = ""
 
 
-def _strut_value(attribute: str) -> Callable[[Report, int], float]:
+def _of_strut(key: str, dimension: Dimension, attribute: str, signal: str) -> Publication:
+    """An attribute of a strut's output."""
     get = attrgetter(attribute)
-    return lambda report, strut: get(report.output.struts[strut])
+    return Publication(
+        key,
+        dimension,
+        lambda report, strut: get(report.output.struts[strut]),
+        signal,
+        attribute=attribute,
+    )
 
 
 ESTIMATE = (
-    Publication("force", Dimension.FORCE, _strut_value("force_n"), "SPRING_DAMPER_FORCE"),
-    Publication("virtual_force", Dimension.FORCE, _strut_value("virtual_force_n"), "VIRTUAL_FORCE"),
-    Publication("valid", Dimension.NUMBER, _strut_value("valid"), "VALID"),
+    _of_strut("force", Dimension.FORCE, "force_n", "SPRING_DAMPER_FORCE"),
+    _of_strut("virtual_force", Dimension.FORCE, "virtual_force_n", "VIRTUAL_FORCE"),
+    _of_strut("valid", Dimension.NUMBER, "valid", "VALID"),
 )
 KINEMATICS = (
-    Publication("height", Dimension.LENGTH, _strut_value("height_m"), "MODEL_HEIGHT"),
-    Publication("velocity", Dimension.VELOCITY, _strut_value("velocity_m_per_s"), "MODEL_VELOCITY"),
-    Publication(
-        "acceleration",
-        Dimension.ACCELERATION,
-        _strut_value("acceleration_m_per_s2"),
-        "MODEL_ACCELERATION",
+    _of_strut("height", Dimension.LENGTH, "height_m", "MODEL_HEIGHT"),
+    _of_strut("velocity", Dimension.VELOCITY, "velocity_m_per_s", "MODEL_VELOCITY"),
+    _of_strut(
+        "acceleration", Dimension.ACCELERATION, "acceleration_m_per_s2", "MODEL_ACCELERATION"
     ),
-    Publication("innovation", Dimension.LENGTH, _strut_value("innovation_m"), "INNOVATION"),
+    _of_strut("innovation", Dimension.LENGTH, "innovation_m", "INNOVATION"),
 )
 
 

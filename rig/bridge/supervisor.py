@@ -122,16 +122,9 @@ class Reports(Struct, frozen=True, gc=False):
     is_device_faulty: bool = False
 
 
-_NO_REPORTS = Reports()
+NO_REPORTS = Reports()
 _EVENT_OF_ACTION = {Action.HOLD: Event.BEYOND_HOLD, Action.SAFE: Event.BEYOND_SAFE}
 """Action -> event; the others change no mode."""
-
-
-def _mode_by_reports(mode: Mode, action: int, reports: Reports) -> Mode:
-    """Mode after the limits' action and the devices' state."""
-    if action in _EVENT_OF_ACTION:
-        mode = next_mode(mode, _EVENT_OF_ACTION[Action(action)])
-    return next_mode(mode, Event.DEVICE_FAULT) if reports.is_device_faulty else mode
 
 
 class Supervisor:
@@ -154,7 +147,7 @@ class Supervisor:
         return SupervisedState(t_ns, Mode.WAITING, self.estimator.init(t_ns))
 
     def step(
-        self, state: SupervisedState, step_input: StepInput, reports: Reports = _NO_REPORTS
+        self, state: SupervisedState, step_input: StepInput, reports: Reports = NO_REPORTS
     ) -> tuple[SupervisedState, StepOutput, int]:
         """One step.
 
@@ -177,27 +170,37 @@ class Supervisor:
         if estimate is None:
             state = SupervisedState(t_ns, mode, after, state.last_valid, (), state.diverged)
             return state, StepOutput(mode, ()), reports.action
-        mode = self._mode_by_age(mode, t_ns - estimate.measured_ns)
+        age_ns = t_ns - estimate.measured_ns
+        if mode is not Mode.RUNNING or age_ns > self._stale_after_ns:
+            mode = next_mode(mode, self.age_event(age_ns))
         if estimate.diverged >= 0:
             mode = next_mode(mode, Event.DIVERGED)
             state = replace(state, diverged=Divergence(estimate.diverged, t_ns))
+        action = reports.action
         if mode is Mode.SAFE:
             # The model stops where it was before a motion that no measurement supports.
-            after = self.estimator.discard(before, after)
-            return *self._stop(state, t_ns, after), reports.action
-        action = reports.action
-        if self._limits:
-            action = max([action, *[worst_action(self._limits, item) for item in estimate.struts]])
-        mode = _mode_by_reports(mode, action, reports)
+            return *self._stop(state, t_ns, self.estimator.discard(before, after)), action
+        if self._limits or reports is not NO_REPORTS:
+            mode, action = self._mode_by_reports(mode, estimate, reports)
+        if mode is Mode.RUNNING:
+            struts = estimate.struts
+            state = SupervisedState(t_ns, mode, after, struts, (), state.diverged)
+            return state, StepOutput(mode, struts, estimate.left_out), action
         if mode is Mode.SAFE:
             return *self._stop(state, t_ns, after), action
-        return *self._publish(state, t_ns, mode, after, estimate), action
+        return *self._hold(state, t_ns, after, estimate), action
 
-    def _mode_by_age(self, mode: Mode, age_ns: int) -> Mode:
-        """Mode after a step at which the oldest measurement is of some age."""
-        if mode is Mode.RUNNING and age_ns <= self._stale_after_ns:
-            return mode
-        return next_mode(mode, self.age_event(age_ns))
+    def _mode_by_reports(
+        self, mode: Mode, estimate: Estimate, reports: Reports
+    ) -> tuple[Mode, int]:
+        """Mode after limits and devices, and the severest action that a limit requires."""
+        actions = [worst_action(self._limits, strut) for strut in estimate.struts]
+        action = max([reports.action, *actions])
+        if action in _EVENT_OF_ACTION:
+            mode = next_mode(mode, _EVENT_OF_ACTION[Action(action)])
+        if reports.is_device_faulty:
+            mode = next_mode(mode, Event.DEVICE_FAULT)
+        return mode, action
 
     def age_event(self, age_ns: int) -> Event:
         """What the age of the oldest measurement means."""
@@ -205,16 +208,13 @@ class Supervisor:
             return Event.FRESH
         return Event.STALE if age_ns <= self._safe_after_ns else Event.TIMEOUT
 
-    def _publish(
-        self, state: SupervisedState, t_ns: int, mode: Mode, after: object, estimate: Estimate
+    def _hold(
+        self, state: SupervisedState, t_ns: int, estimator: object, estimate: Estimate
     ) -> tuple[SupervisedState, StepOutput]:
-        """State and output while the model moves: valid in RUNNING alone."""
-        struts = last_valid = estimate.struts
-        if mode is not Mode.RUNNING:
-            struts = tuple([replace(strut, valid=False) for strut in struts])
-            last_valid = state.last_valid
-        state = SupervisedState(t_ns, mode, after, last_valid, (), state.diverged)
-        return state, StepOutput(mode, struts, estimate.left_out)
+        """State and output while the model moves and its estimate is not valid."""
+        struts = tuple([replace(strut, valid=False) for strut in estimate.struts])
+        after = SupervisedState(t_ns, Mode.HOLD, estimator, state.last_valid, (), state.diverged)
+        return after, StepOutput(Mode.HOLD, struts, estimate.left_out)
 
     def _stop(
         self, state: SupervisedState, t_ns: int, estimator: object

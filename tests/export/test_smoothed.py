@@ -16,7 +16,7 @@ from rig.formats import smoothed
 from rig.formats.smoothed import read_smoothed
 from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
-from rig.plan.load import load_plan
+from rig.plan.load import load_plan, plan_of_run
 from rig.run.live import with_bench
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.trajectory import simulate
@@ -227,6 +227,6 @@ def test_what_cannot_be_smoothed_is_refused(reference, tmp_path, monkeypatch, ca
     assert "nowhere RUNNING with 200 heights" in capsys.readouterr().err
     assert not (tmp_path / "out.csv").exists()
     pitching = FullCar().model(tmp_path)
-    found, ready = smoothed.setup_of_run(run)
+    found, ready = read_run(run), plan_of_run(run)
     with pytest.raises(InputError, match="straight guides"):
         smoothed.smoothed_forces(found, ready.with_model(pitching), lambda _what, _share: None)

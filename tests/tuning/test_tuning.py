@@ -148,8 +148,8 @@ def test_the_command(late, monkeypatch, capsys, tmp_path):
     [
         ((), "expected --run RUN, or --residual-n and --up-to-hz above zero"),
         (("--residual-n", 5), "expected --run RUN"),
-        (("--run", "{run}", "--residual-n", 5), "--run: says what is to be expected"),
-        (("--run", "{run}", "--observer", "luenberger"), "expected one of kalman, pi"),
+        (("--run", "{run}", "--residual-n", 5), "--run: contains what is to be expected"),
+        (("--run", "{run}", "--observer", "luenberger"), "expected one of pi, kalman"),
         (("--run", "{folder}"), "run.yaml"),
         (("--run", "{run}", "--out", "{folder}/rig.yaml"), "exists, expected a new file"),
     ],
