@@ -3,6 +3,7 @@
 import csv
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -229,4 +230,4 @@ def test_what_cannot_be_smoothed_is_refused(reference, tmp_path, monkeypatch, ca
     pitching = FullCar().model(tmp_path)
     found, ready = read_run(run), plan_of_run(run)
     with pytest.raises(InputError, match="straight guides"):
-        smoothed.smoothed_forces(found, ready.with_model(pitching), lambda _what, _share: None)
+        smoothed.smoothed_forces(found, replace(ready, model=pitching), lambda _what, _share: None)
