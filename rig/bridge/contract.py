@@ -419,9 +419,6 @@ class Core(Protocol):
         ...
 
 
-AMBIENT_C = 20.0
-"""Damper temperature where none was measured."""
-
 _SENSELESS = 1e12
 """No bench has heights, velocities or forces of this size: the model has diverged."""
 

@@ -9,8 +9,8 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from dart_model.effects import AMBIENT_C
 from rig.bridge.contract import (
-    AMBIENT_C,
     CoreState,
     Deviation,
     Divergence,

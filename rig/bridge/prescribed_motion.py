@@ -16,8 +16,8 @@ from typing import Any, Protocol
 from msgspec import Struct
 from msgspec.structs import replace
 
+from dart_model.effects import AMBIENT_C
 from rig.bridge.contract import (
-    AMBIENT_C,
     CoreState,
     Divergence,
     Measurement,

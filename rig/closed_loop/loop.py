@@ -13,7 +13,8 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.bridge.contract import AMBIENT_C, Innovation, Observer, Plant, Start
+from dart_model.effects import AMBIENT_C
+from rig.bridge.contract import Innovation, Observer, Plant, Start
 from rig.bridge.free_model import Answer, strut_answers
 from rig.closed_loop.derivatives import slopes
 

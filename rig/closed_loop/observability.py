@@ -20,7 +20,8 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.bridge.contract import AMBIENT_C, Plant
+from dart_model.effects import AMBIENT_C
+from rig.bridge.contract import Plant
 from rig.closed_loop.derivatives import slopes
 
 Array = NDArray[np.float64]

@@ -3,8 +3,6 @@
 import dataclasses
 import json
 import math
-import os
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
@@ -12,6 +10,7 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from can_dbc.atomic_file import write_whole
 from dart_model.spec import ModelSpec, copy_files, dump_model
 
 Array = NDArray[np.float64]
@@ -320,21 +319,6 @@ def write_results(result: Result, nominal: ModelSpec, folder: Path) -> None:
         OSError: The folder cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / CORRECTED_FILE, dump_model(result.corrected))
-    write_text(folder / DIAGNOSIS_FILE, to_json(result.diagnosis))
+    write_whole(folder / CORRECTED_FILE, dump_model(result.corrected))
+    write_whole(folder / DIAGNOSIS_FILE, to_json(result.diagnosis))
     copy_files(nominal, folder)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file so that nobody ever sees half of it."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(name).chmod(0o644)
-        Path(name).replace(path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise

@@ -4,17 +4,21 @@ A point passes when its interval lies inside the band, fails when it lies outsid
 the interval crosses a limit: the measurement then proves neither (ISO 14253-1, 2017).
 """
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.errors import InputError
-from can_dbc.yaml_file import load_validated, read_text, validated
+from can_dbc.yaml_file import load_validated, validated
 from rig.dyno.figures import Step
 from rig.dyno.stroke_force import Figure
+from rig.files.delimited_text import read_csv_columns
+
+_MAX_BYTES = 4_000_000
+"""Largest file of a band, whose points are at most a thousand."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Verdict = Literal["pass", "fail", "open", "not measured"]
@@ -116,27 +120,22 @@ def load_tolerance(path: Path) -> Tolerance:
     """
     if path.suffix.lower() != ".csv":
         return load_validated(Tolerance, path)
-    text = read_text(path).removeprefix("\ufeff")  # as spreadsheets begin a file
-    rows = list(csv.reader(text.splitlines()))
-    while rows and not any(cell.strip() for cell in rows[-1]):
-        rows.pop()
-    if not rows or tuple(cell.strip() for cell in rows[0]) != _COLUMNS:
-        raise InputError(f"{path}: line 1: expected the header {','.join(_COLUMNS)}")
-    points: list[dict[str, float]] = []
-    for number, row in enumerate(rows[1:], start=2):
-        if len(row) != len(_COLUMNS):
-            raise InputError(f"{path}: line {number}: {len(row)} cells, expected {len(_COLUMNS)}")
-        points.append(dict(zip(_COLUMNS, _numbers(path, number, row), strict=True)))
+    columns, _ = read_csv_columns(
+        path, str(path), _MAX_BYTES, lambda header: _check_header(path, header)
+    )
+    points = [
+        dict(zip(columns, row, strict=True))
+        for row in np.column_stack(list(columns.values())).tolist()
+    ]
     if not points:
         raise InputError(f"{path}: holds no point, expected rows under the header")
     return validated(Tolerance, {"name": path.stem, "points": points}, str(path))
 
 
-def _numbers(path: Path, line: int, row: Sequence[str]) -> list[float]:
-    try:
-        return [float(cell) for cell in row]
-    except ValueError:
-        raise InputError(f"{path}: line {line}: {','.join(row)}: expected numbers") from None
+def _check_header(path: Path, header: Sequence[str]) -> Sequence[str]:
+    if tuple(header) != _COLUMNS:
+        raise InputError(f"{path}: line 1: expected the header {','.join(_COLUMNS)}")
+    return header
 
 
 def judged(steps: Sequence[Step], kinds: Sequence[str], tolerance: Tolerance) -> list[Judged]:

@@ -13,7 +13,6 @@ import datetime
 import glob
 import hashlib
 import importlib
-import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ from urllib.parse import quote
 import pyarrow as pa
 from pyarrow import dataset, parquet
 
+from can_dbc.atomic_file import replacing
 from can_dbc.errors import InputError
 from rig.fleet.one_run import Row, Value
 
@@ -116,10 +116,9 @@ def _write(store: Path, partition: str, rows: Sequence[Row]) -> None:
     for name, schema, content in (("values", _VALUE, values), ("runs", _RUN, runs)):
         path = store / name / partition / f"{part}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
         kept = [{key: item[key] for key in schema.names} for item in content]
-        _parquet.write_table(_pa.Table.from_pylist(kept, schema=schema), temporary)
-        temporary.replace(path)
+        with replacing(path) as temporary:
+            _parquet.write_table(_pa.Table.from_pylist(kept, schema=schema), temporary)
 
 
 def _columns(value: Value) -> dict[str, Any]:
