@@ -1,17 +1,16 @@
 """What a diagnosis found, as a value, and its JSON."""
 
 import dataclasses
-import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from can_dbc.atomic_file import write_whole
 from dart_model.spec import ModelSpec, copy_files, dump_model
+from rig.files.json_text import json_text
 
 Array = NDArray[np.float64]
 Verdict = Literal["nothing_missing", "explained", "partly_explained", "ambiguous", "not_explained"]
@@ -297,19 +296,7 @@ class Result:
 
 def to_json(diagnosis: Diagnosis) -> str:
     """The diagnosis as JSON text; numbers that are not finite become null."""
-    data = {"schema": SCHEMA} | dataclasses.asdict(diagnosis)
-    return json.dumps(_finite(data), indent=2, ensure_ascii=False) + "\n"
-
-
-def _finite(value: object) -> object:
-    if isinstance(value, dict):
-        items = cast("dict[object, object]", value).items()
-        return {str(key): _finite(item) for key, item in items}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in cast("list[object]", value)]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return json_text({"schema": SCHEMA} | dataclasses.asdict(diagnosis))
 
 
 def write_results(result: Result, nominal: ModelSpec, folder: Path) -> None:

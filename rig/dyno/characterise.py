@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.diagnosis.recording import Recording, read_recording
-from rig.dyno.damper import Damper, damper_of
-from rig.dyno.figures import Side, Step, step_of
+from rig.dyno.damper import Damper, summarise_damper
+from rig.dyno.figures import DynoStep, Side, compute_step
 from rig.dyno.quality import quality
 from rig.dyno.stroke_force import Figure
-from rig.dyno.strokes import blocks_of, holds_of, strokes_of
+from rig.dyno.strokes import find_blocks, find_holds, find_strokes
 from rig.log.reader import read_run
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ class Characteristics:
     source: str
     height_m: Array
     force_n: Array
-    steps: tuple[Step, ...]
+    steps: tuple[DynoStep, ...]
     holds: tuple[AtRest, ...]
     damper: Damper
     quality: tuple[str, ...]
@@ -126,10 +126,10 @@ def characterise(path: Path, strut: str | None = None) -> Characteristics:
     good = np.isfinite(height_m) & np.isfinite(force_n)
     t_s, height_m, force_n = recording.t_s[good], height_m[good], force_n[good]
     temperature_c = None if recording.temperature_c is None else recording.temperature_c[good]
-    return of_arrays(recording.name, t_s, height_m, force_n, temperature_c, name, source)
+    return characterise_arrays(recording.name, t_s, height_m, force_n, temperature_c, name, source)
 
 
-def of_arrays(
+def characterise_arrays(
     name: str,
     t_s: Array,
     height_m: Array,
@@ -155,9 +155,9 @@ def of_arrays(
     largest_n = float(np.abs(force_n).max(initial=0.0))
     if largest_n > _LARGEST_N:
         raise InputError(f"{name}: a force of {largest_n:.3g} N, expected at most {_LARGEST_N:g}")
-    strokes = strokes_of(t_s, height_m)
-    blocks = blocks_of(strokes)
-    steps = [step_of(t_s, height_m, force_n, temperature_c, block) for block in blocks]
+    strokes = find_strokes(t_s, height_m)
+    blocks = find_blocks(strokes)
+    steps = [compute_step(t_s, height_m, force_n, temperature_c, block) for block in blocks]
     found = tuple(step for step in steps if step is not None)
     if not found:
         raise InputError(
@@ -166,11 +166,11 @@ def of_arrays(
         )
     holds = tuple(
         _at_rest(t_s, height_m, force_n, temperature_c, hold.begin, hold.end)
-        for hold in holds_of(t_s, height_m, blocks)
+        for hold in find_holds(t_s, height_m, blocks)
     )
     rests = [(hold.begin_s, hold.height_m, hold.force) for hold in holds]
     warned = quality(t_s, force_n, found, rests, len(strokes))
-    damper = damper_of(found)
+    damper = summarise_damper(found)
     return Characteristics(name, strut, source, height_m, force_n, found, holds, damper, warned)
 
 
@@ -230,7 +230,7 @@ def _or_none(figure: Figure | None) -> dict[str, object] | None:
     return None if figure is None else figure.as_dict()
 
 
-def _step_dict(step: Step) -> dict[str, Any]:
+def _step_dict(step: DynoStep) -> dict[str, Any]:
     return {
         "begin_s": step.begin_s,
         "end_s": step.end_s,

@@ -18,8 +18,8 @@ from scipy.special import ndtr  # pyright: ignore[reportUnknownVariableType]
 
 from can_dbc.errors import InputError
 from rig.dyno.characterise import Characteristics
-from rig.dyno.figures import Step
-from rig.dyno.stroke_force import Figure, student
+from rig.dyno.figures import DynoStep
+from rig.dyno.stroke_force import Figure, student_factor
 
 _ALIKE = 0.1
 """Relative difference of speed and amplitude up to which steps are held against each other."""
@@ -96,15 +96,15 @@ class Trend(NamedTuple):
         }
 
 
-def compared(before: Characteristics, after: Characteristics) -> list[Difference]:
+def compare_dampers(before: Characteristics, after: Characteristics) -> list[Difference]:
     """Differences of two states, those that are more than chance first.
 
     Raises:
         InputError: They have no figure in common.
     """
-    pairs = _common([before, after])
-    changes = [_less(second, first) for _, (first, second) in pairs.values()]
-    differs = _holm([_by_chance(change) for change in changes])
+    pairs = _common_figures([before, after])
+    changes = [_difference(second, first) for _, (first, second) in pairs.values()]
+    differs = _holm_procedure([_p_value(change) for change in changes])
     found = [
         Difference(name, unit, first, second, change, differ)
         for (name, (unit, (first, second))), change, differ in zip(
@@ -114,7 +114,7 @@ def compared(before: Characteristics, after: Characteristics) -> list[Difference
     return sorted(found, key=lambda item: not item.differs)
 
 
-def over_dose(items: Sequence[Characteristics], doses: Sequence[float]) -> list[Trend]:
+def trends_over_dose(items: Sequence[Characteristics], doses: Sequence[float]) -> list[Trend]:
     """Figures over a dosed cause, those that follow it first.
 
     Args:
@@ -132,10 +132,10 @@ def over_dose(items: Sequence[Characteristics], doses: Sequence[float]) -> list[
             "different ones"
         )
     fits = {
-        name: (unit, _line(np.array(doses), figures))
-        for name, (unit, figures) in _common(items).items()
+        name: (unit, _fit_line(np.array(doses), figures))
+        for name, (unit, figures) in _common_figures(items).items()
     }
-    differs = _holm([_by_chance(slope) for _, (slope, _, _) in fits.values()])
+    differs = _holm_procedure([_p_value(slope) for _, (slope, _, _) in fits.values()])
     found = [
         Trend(name, unit, slope, at_zero, differ, straight)
         for (name, (unit, (slope, at_zero, straight))), differ in zip(
@@ -145,26 +145,28 @@ def over_dose(items: Sequence[Characteristics], doses: Sequence[float]) -> list[
     return sorted(found, key=lambda item: not item.differs)
 
 
-def paired(reference: Characteristics, item: Characteristics) -> list[tuple[Step, Step]]:
+def pair_steps(
+    reference: Characteristics, item: Characteristics
+) -> list[tuple[DynoStep, DynoStep]]:
     """Steps of one speed and amplitude: of the reference, and of the other record."""
-    found: list[tuple[Step, Step]] = []
+    found: list[tuple[DynoStep, DynoStep]] = []
     taken: set[int] = set()
     for wanted in reference.steps:
-        place = _nearest(wanted, item.steps, taken)
+        place = _find_nearest(wanted, item.steps, taken)
         if place is not None:
             taken.add(place)
             found.append((wanted, item.steps[place]))
     return found
 
 
-def unpaired(items: Sequence[Characteristics]) -> list[str]:
+def steps_without_partner(items: Sequence[Characteristics]) -> list[str]:
     """Steps that have no partner of their speed and amplitude in every other record, in words."""
     found: list[str] = []
     for item in items:
         for other in items:
             taken: set[int] = set()
             for wanted in item.steps if other is not item else ():
-                place = _nearest(wanted, other.steps, taken)
+                place = _find_nearest(wanted, other.steps, taken)
                 if place is not None:
                     taken.add(place)
                     continue
@@ -175,25 +177,25 @@ def unpaired(items: Sequence[Characteristics]) -> list[str]:
     return found
 
 
-def _line(doses: "np.ndarray", figures: Sequence[Figure]) -> tuple[Figure, float, bool]:
+def _fit_line(doses: "np.ndarray", figures: Sequence[Figure]) -> tuple[Figure, float, bool]:
     """Slope, value at zero and whether a line is enough, by weighted least squares."""
     values = np.array([figure.value for figure in figures])
-    stds = np.array([_std(figure) for figure in figures])
+    stds = np.array([_standard_deviation(figure) for figure in figures])
     design = np.column_stack([np.ones_like(doses), doses]) / stds[:, None]
     weights = np.linalg.lstsq(design, values / stds, rcond=None)[0]
     left = values / stds - design @ weights
     freedom = len(doses) - 2
     misfit = float(left @ left) / freedom
     covariance = np.linalg.inv(design.T @ design) * max(misfit, 1.0)
-    half = (student(freedom) if misfit > 1.0 else _STDS) * float(np.sqrt(covariance[1, 1]))
+    half = (student_factor(freedom) if misfit > 1.0 else _STDS) * float(np.sqrt(covariance[1, 1]))
     at_zero, slope = (float(value) for value in weights)
     figure = Figure(slope, slope - half, slope + half, f"line through {len(doses)} doses")
     return figure, at_zero, misfit < _MISFIT
 
 
-def _common(items: Sequence[Characteristics]) -> dict[str, tuple[str, list[Figure]]]:
+def _common_figures(items: Sequence[Characteristics]) -> dict[str, tuple[str, list[Figure]]]:
     """Figures that all states have: by name their unit, and one a state."""
-    first, *others = [_named(item, items[0]) for item in items]
+    first, *others = [_figures_by_name(item, items[0]) for item in items]
     found = {
         name: (unit, [figure, *(other[name][1] for other in others)])
         for name, (unit, figure) in first.items()
@@ -205,7 +207,9 @@ def _common(items: Sequence[Characteristics]) -> dict[str, tuple[str, list[Figur
     return found
 
 
-def _named(item: Characteristics, reference: Characteristics) -> Mapping[str, tuple[str, Figure]]:
+def _figures_by_name(
+    item: Characteristics, reference: Characteristics
+) -> Mapping[str, tuple[str, Figure]]:
     """Figures by name; steps are called by their speed in the first record."""
     damper = item.damper
     found: dict[str, tuple[str, Figure | None]] = {
@@ -217,7 +221,7 @@ def _named(item: Characteristics, reference: Characteristics) -> Mapping[str, tu
     }
     taken: set[int] = set()
     for wanted in reference.steps:
-        place = _nearest(wanted, item.steps, taken)
+        place = _find_nearest(wanted, item.steps, taken)
         if place is None:
             continue
         taken.add(place)
@@ -232,10 +236,10 @@ def _named(item: Characteristics, reference: Characteristics) -> Mapping[str, tu
     return {name: (unit, figure) for name, (unit, figure) in found.items() if figure is not None}
 
 
-def _nearest(wanted: Step, steps: Sequence[Step], taken: set[int]) -> int | None:
+def _find_nearest(wanted: DynoStep, steps: Sequence[DynoStep], taken: set[int]) -> int | None:
     """Place of the step that is most like another, if one is."""
 
-    def apart(step: Step) -> float:
+    def apart(step: DynoStep) -> float:
         pairs = (
             (step.peak_speed_m_per_s, wanted.peak_speed_m_per_s),
             (step.amplitude_m, wanted.amplitude_m),
@@ -247,22 +251,22 @@ def _nearest(wanted: Step, steps: Sequence[Step], taken: set[int]) -> int | None
     return best if best is not None and apart(steps[best]) <= _ALIKE else None
 
 
-def _std(figure: Figure) -> float:
+def _standard_deviation(figure: Figure) -> float:
     return max(0.5 * (figure.high - figure.low) / _STDS, 1e-12)
 
 
-def _less(second: Figure, first: Figure) -> Figure:
+def _difference(second: Figure, first: Figure) -> Figure:
     value = second.value - first.value
-    half = _STDS * math.hypot(_std(second), _std(first))
+    half = _STDS * math.hypot(_standard_deviation(second), _standard_deviation(first))
     return Figure(value, value - half, value + half, second.method)
 
 
-def _by_chance(figure: Figure) -> float:
+def _p_value(figure: Figure) -> float:
     """Probability of a value as far from zero by chance."""
-    return 2.0 * float(ndtr(-abs(figure.value) / _std(figure)))  # pyright: ignore[reportUnknownArgumentType]
+    return 2.0 * float(ndtr(-abs(figure.value) / _standard_deviation(figure)))  # pyright: ignore[reportUnknownArgumentType]
 
 
-def _holm(chances: Sequence[float]) -> list[bool]:
+def _holm_procedure(chances: Sequence[float]) -> list[bool]:
     """Which are more than chance, all of them together at one level."""
     order = sorted(range(len(chances)), key=lambda place: chances[place])
     found = [False] * len(chances)

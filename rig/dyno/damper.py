@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.dyno.figures import QUASI_STATIC_M_PER_S, Step
-from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, student
+from rig.dyno.figures import QUASI_STATIC_M_PER_S, DynoStep
+from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, student_factor
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ class Damper(NamedTuple):
     notes: tuple[str, ...]
 
 
-def damper_of(steps: Sequence[Step]) -> Damper:
+def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
     """Figures of a damper.
 
     Args:
@@ -108,7 +108,7 @@ def damper_of(steps: Sequence[Step]) -> Damper:
     )
 
 
-def _kinds(steps: Sequence[Step]) -> tuple[str, ...]:
+def _kinds(steps: Sequence[DynoStep]) -> tuple[str, ...]:
     kinds = [
         "quasi_static" if step.peak_speed_m_per_s <= QUASI_STATIC_M_PER_S else "velocity_step"
         for step in steps
@@ -120,7 +120,7 @@ def _kinds(steps: Sequence[Step]) -> tuple[str, ...]:
     return tuple(kinds)
 
 
-def _asymmetry(step: Step, gas: Figure | None) -> Figure | None:
+def _asymmetry(step: DynoStep, gas: Figure | None) -> Figure | None:
     """Ratio of the forces, by the delta method."""
     up, down = step.rebound.force_at_peak_velocity, step.compression.force_at_peak_velocity
     offset = 0.0 if gas is None else gas.value
@@ -150,7 +150,12 @@ def _knee(stroke: MeanStroke) -> Figure | None:
     if not 0 < top < len(speed) - 1:
         return None
     # Both halves of the stroke: lag and spring, which turn their sign, drop out.
-    rows = np.array([0.5 * (_at(speed[: top + 1], v, 0) + _at(speed[top:], v, top)) for v in grid])
+    rows = np.array(
+        [
+            0.5 * (_force_row_at(speed[: top + 1], v, 0) + _force_row_at(speed[top:], v, top))
+            for v in grid
+        ]
+    )
     tried = np.linspace(_LOWEST_OF_KNEE, _HIGHEST_OF_KNEE, 2 * _KNEE_POINTS) * peak
     bases = [np.column_stack([np.ones_like(grid), grid, np.maximum(grid - v, 0.0)]) for v in tried]
     solvers = [np.linalg.pinv(base) for base in bases]
@@ -184,7 +189,7 @@ def _knee(stroke: MeanStroke) -> Figure | None:
     return Figure(value, low, high, "two straight lines through force over speed, fastest step")
 
 
-def _at(speed: Array, value: float, offset: int) -> Array:
+def _force_row_at(speed: Array, value: float, offset: int) -> Array:
     """Row over the angles that gives the force where a half stroke has a speed."""
     order = np.argsort(speed)
     place = float(np.interp(value, speed[order], order.astype(np.float64)))
@@ -195,14 +200,14 @@ def _at(speed: Array, value: float, offset: int) -> Array:
     return row
 
 
-def _per_kelvin(steps: Sequence[Step], index: int) -> Figure | None:
+def _per_kelvin(steps: Sequence[DynoStep], index: int) -> Figure | None:
     """Change of the force at peak velocity per kelvin over steps of one speed and amplitude."""
-    groups: list[list[Step]] = []
+    groups: list[list[DynoStep]] = []
     for step in steps:
         if step.temperature_c is None:
             return None
         for group in groups:
-            if _same(group[0], step):
+            if _is_same_step(group[0], step):
                 group.append(step)
                 break
         else:
@@ -215,14 +220,14 @@ def _per_kelvin(steps: Sequence[Step], index: int) -> Figure | None:
     return best
 
 
-def _same(a: Step, b: Step) -> bool:
+def _is_same_step(a: DynoStep, b: DynoStep) -> bool:
     return all(
         abs(x - y) <= _ALIKE_SPEED * x
         for x, y in ((a.peak_speed_m_per_s, b.peak_speed_m_per_s), (a.amplitude_m, b.amplitude_m))
     )
 
 
-def _slope(group: Sequence[Step], index: int) -> Figure | None:
+def _slope(group: Sequence[DynoStep], index: int) -> Figure | None:
     """Least squares through the strokes of like steps."""
     temperatures = np.concatenate([step.warmth[index][0] for step in group])
     forces = np.concatenate([step.warmth[index][1] for step in group])
@@ -233,7 +238,7 @@ def _slope(group: Sequence[Step], index: int) -> Figure | None:
     left = forces - forces.mean() - slope * about
     freedom = len(forces) - 2
     std = float(np.sqrt(left @ left / freedom / (about @ about)))
-    half = student(freedom) * std
+    half = student_factor(freedom) * std
     speed = group[0].peak_speed_m_per_s
     text = f"line through the strokes at {speed:.3g} m/s over {np.ptp(temperatures):.1f} K"
     return Figure(slope, slope - half, slope + half, text)

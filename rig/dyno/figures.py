@@ -26,8 +26,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, combined, mean_stroke
-from rig.dyno.strokes import Block, Motion, motion_of, repeats
+from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, combine, mean_stroke
+from rig.dyno.strokes import Block, BlockMotion, fit_motion, is_repetition
 
 Array = NDArray[np.float64]
 
@@ -71,7 +71,7 @@ class Side(NamedTuple):
     hysteresis: Mapping[str, Figure]
 
 
-class Step(NamedTuple):
+class DynoStep(NamedTuple):
     """Figures of a block: one step of a test.
 
     Attributes:
@@ -119,9 +119,9 @@ class Step(NamedTuple):
         return max(self.compression.peak_velocity.value, self.rebound.peak_velocity.value)
 
 
-def step_of(
+def compute_step(
     t_s: Array, height_m: Array, force_n: Array, temperature_c: Array | None, block: Block
-) -> Step | None:
+) -> DynoStep | None:
     """Figures of a block; None where it has too few samples for any, or does not repeat.
 
     Args:
@@ -132,8 +132,8 @@ def step_of(
         block: The block.
     """
     here = slice(block.begin, block.end)
-    motion = motion_of(t_s[here], height_m[here], len(block.strokes))
-    if np.isnan(motion.period_s) and not repeats(t_s, height_m, block):
+    motion = fit_motion(t_s[here], height_m[here], len(block.strokes))
+    if np.isnan(motion.period_s) and not is_repetition(t_s, height_m, block):
         return None
     velocity = motion.velocity_m_per_s
     # A stroke ends where the velocity turns, which the samples hardly ever hit.
@@ -147,7 +147,7 @@ def step_of(
     down, up = found
     speed_std = motion.velocity_std_m_per_s
     warm = None if temperature_c is None else float(np.mean(temperature_c[here]))
-    return Step(
+    return DynoStep(
         float(t_s[block.begin]),
         float(t_s[block.end - 1]),
         0.5 * len(block.strokes),
@@ -168,7 +168,7 @@ def step_of(
 
 def _warmth(
     stroke: MeanStroke,
-    motion: Motion,
+    motion: BlockMotion,
     force_n: Array,
     number: NDArray[np.int64],
     temperature_c: Array | None,
@@ -231,7 +231,7 @@ def _hysteresis(stroke: MeanStroke, down: MeanStroke, up: MeanStroke, speed: flo
     for item, row in _spring(down, up):
         rows[id(item)] -= apart_m * row
     parts = [(rows[id(item)], item) for item in (down, up)]
-    return combined(parts, "same speed, speeding up less slowing down, spring removed")
+    return combine(parts, "same speed, speeding up less slowing down, spring removed")
 
 
 def _spring(down: MeanStroke, up: MeanStroke) -> list[tuple[MeanStroke, Array]]:
@@ -265,16 +265,14 @@ def _of_both(
     turning_down = (down.row(first) + down.row(last))[0]
     turning_up = (up.row(first) + up.row(last))[0]
     return (
-        combined(work, "area of the loop", 1.0, relative_std),
-        combined(
+        combine(work, "area of the loop", 1.0, relative_std),
+        combine(
             work, "energy over that of a linear damper of 1 N·s/m", 1.0 / squared, relative_std
         ),
-        combined(spring, "slope of the mean of both strokes, inner 90 %", 1.0, relative_std),
-        combined([(mid_down, down), (mid_up, up)], "mean of both strokes at mid-stroke", 0.5),
-        combined(
+        combine(spring, "slope of the mean of both strokes, inner 90 %", 1.0, relative_std),
+        combine([(mid_down, down), (mid_up, up)], "mean of both strokes at mid-stroke", 0.5),
+        combine(
             [(mid_down, down), (-mid_up, up)], "half the difference of both at mid-stroke", 0.5
         ),
-        combined(
-            [(turning_down, down), (-turning_up, up)], "difference at the turning points", 0.5
-        ),
+        combine([(turning_down, down), (-turning_up, up)], "difference at the turning points", 0.5),
     )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.dyno.characterise import Characteristics
-from rig.dyno.figures import Step
+from rig.dyno.figures import DynoStep
 from rig.dyno.stroke_force import ANGLES, MeanStroke
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ _TIMES = 720
 """Times of a cycle at which it is run; two cycles, of which the second counts."""
 
 
-class Curve(NamedTuple):
+class DampingCurve(NamedTuple):
     """Damping over speed of one direction, rising from zero.
 
     Attributes:
@@ -86,8 +86,8 @@ class Master(NamedTuple):
     gas_rate_n_per_m: float
     middle_m: float
     friction_n: float
-    compression: Curve
-    rebound: Curve
+    compression: DampingCurve
+    rebound: DampingCurve
 
     def gas(self, height_m: Array) -> Array:
         """Gas force at heights."""
@@ -112,7 +112,7 @@ def master_of(found: Characteristics) -> Master:
     Raises:
         InputError: It has no step slow enough for gas force and friction.
     """
-    refuse_unlike(found)
+    refuse_unsuitable(found)
     damper = found.damper
     if damper.gas_force is None or damper.gas_rate is None or damper.friction is None:
         raise InputError(
@@ -135,13 +135,13 @@ def master_of(found: Characteristics) -> Master:
         damper.gas_rate.value,
         slowest.middle_m,
         friction_n,
-        *(Curve(np.zeros(2), np.zeros(2)),) * 2,
+        *(DampingCurve(np.zeros(2), np.zeros(2)),) * 2,
     )
     down, up = (_curve(bare, stroke) for stroke in fastest.strokes)
     return bare._replace(compression=down, rebound=up)
 
 
-def refuse_unlike(found: Characteristics) -> None:
+def refuse_unsuitable(found: Characteristics) -> None:
     """Refuse what a fault cannot be told from: a force of the wrong sign, and a constant speed.
 
     Raises:
@@ -158,7 +158,7 @@ def refuse_unlike(found: Characteristics) -> None:
         )
 
 
-def _curve(bare: Master, stroke: MeanStroke) -> Curve:
+def _curve(bare: Master, stroke: MeanStroke) -> DampingCurve:
     """Damping over speed: what is left of a stroke, speeding up and slowing down together."""
     height = stroke.middle_m + stroke.sign * stroke.amplitude_m * np.sin(ANGLES)
     left = -stroke.sign * (stroke.force_n - bare.gas(height)) - bare.friction_n
@@ -167,7 +167,7 @@ def _curve(bare: Master, stroke: MeanStroke) -> Curve:
     peak = float(speed[top])
     nodes = np.linspace(0.0, peak, _NODES - 1)
     halves = [
-        np.interp(nodes, *_sorted(speed[part], left[part]))
+        np.interp(nodes, *_by_speed(speed[part], left[part]))
         for part in (slice(None, top + 1), slice(top, None))
     ]
     force = np.maximum.accumulate(np.maximum(0.5 * (halves[0] + halves[1]), 0.0))
@@ -177,10 +177,10 @@ def _curve(bare: Master, stroke: MeanStroke) -> Curve:
     farther = _FASTER * peak
     last = force[-1] + slope * (farther - peak)
     speeds: Array = np.append(nodes, farther).astype(np.float64)
-    return Curve(speeds, np.append(force, last).astype(np.float64))
+    return DampingCurve(speeds, np.append(force, last).astype(np.float64))
 
 
-def _sorted(speed: Array, force: Array) -> tuple[Array, Array]:
+def _by_speed(speed: Array, force: Array) -> tuple[Array, Array]:
     order = np.argsort(speed)
     return speed[order], force[order]
 
@@ -199,7 +199,7 @@ class Cycle(NamedTuple):
     velocity_m_per_s: Array
 
 
-def cycle_of(step: Step) -> Cycle:
+def cycle_of(step: DynoStep) -> Cycle:
     """A sine of a step's amplitude and speed."""
     omega = step.peak_speed_m_per_s / step.amplitude_m
     angle = 2.0 * np.pi * np.arange(2 * _TIMES) / _TIMES

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.dyno.figures import Step
+from rig.dyno.figures import DynoStep
 from rig.dyno.stroke_force import Figure
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ _COARSE = 2.0
 def quality(
     t_s: Array,
     force_n: Array,
-    steps: Sequence[Step],
+    steps: Sequence[DynoStep],
     rests: Sequence[tuple[float, float, Figure]],
     strokes: int,
 ) -> tuple[str, ...]:
@@ -48,7 +48,7 @@ def quality(
     """
     first = preflight(t_s, {"force": force_n})
     said = [*first, *_few_samples(t_s, steps), *_coarse(force_n), *_drift(rests)]
-    return (*_sign(steps), *_left_out(steps, strokes), *said)
+    return (*_sign(steps), *_strokes_outside_steps(steps, strokes), *said)
 
 
 def preflight(t_s: Array, channels: Mapping[str, Array]) -> tuple[str, ...]:
@@ -80,7 +80,7 @@ def _clipped(name: str, values: Array) -> list[str]:
     return found
 
 
-def _sign(steps: Sequence[Step]) -> list[str]:
+def _sign(steps: Sequence[DynoStep]) -> list[str]:
     giving = [step for step in steps if step.energy_per_cycle.high < 0.0]
     if not giving:
         return []
@@ -92,7 +92,7 @@ def _sign(steps: Sequence[Step]) -> list[str]:
     ]
 
 
-def _left_out(steps: Sequence[Step], strokes: int) -> list[str]:
+def _strokes_outside_steps(steps: Sequence[DynoStep], strokes: int) -> list[str]:
     used = sum(round(2.0 * step.cycles) for step in steps)
     if used >= _USED_SHARE * strokes:
         return []
@@ -111,7 +111,7 @@ def _gaps(t_s: Array) -> list[str]:
     ]
 
 
-def _few_samples(t_s: Array, steps: Sequence[Step]) -> list[str]:
+def _few_samples(t_s: Array, steps: Sequence[DynoStep]) -> list[str]:
     usual_s = float(np.median(np.diff(t_s)))
     counts = [
         (1.0 / (step.frequency_hz * usual_s), step)

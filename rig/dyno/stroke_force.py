@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.special import stdtrit  # pyright: ignore[reportUnknownVariableType]
 
-from rig.dyno.strokes import Motion
+from rig.dyno.strokes import BlockMotion
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ _VELOCITY_PIECES = (16, 8, 4, 2, 1, 0)
 _WIDER = 1.2
 """Of all half widths: a spline that the data chose is known less well than one given beforehand.
 Without it 93 to 96 % of the intervals held the truth over 240 dynos at random
-(`python -m tests.characteristics`, seed 1)."""
+(`python -m tests.dyno`, seed 1)."""
 
 _WORST_CONDITION = 1e10
 """Of the normal equations: beyond it the samples leave a part of the stroke open."""
@@ -131,10 +131,10 @@ class MeanStroke(NamedTuple):
 
     def figure(self, row: Array, method: str) -> Figure:
         """A linear functional of the force, with its interval."""
-        return combined([(row, self)], method)
+        return combine([(row, self)], method)
 
 
-def combined(
+def combine(
     parts: Sequence[tuple[Array, MeanStroke]],
     method: str,
     factor: float = 1.0,
@@ -154,17 +154,17 @@ def combined(
     # Welch's and Satterthwaite's degrees of freedom of a sum.
     weighted = sum(v * v / stroke.freedom for v, (_, stroke) in zip(variances, parts, strict=True))
     freedom = variance * variance / weighted if weighted > 0.0 else 1e9
-    half = _WIDER * student(freedom) * (variance + (relative_std * value) ** 2) ** 0.5
+    half = _WIDER * student_factor(freedom) * (variance + (relative_std * value) ** 2) ** 0.5
     return Figure(value, value - half, value + half, method)
 
 
-def student(freedom: float) -> float:
+def student_factor(freedom: float) -> float:
     """Half width of a 95 % interval in standard deviations, by Student's t."""
     return float(cast("Any", stdtrit)(freedom, 0.5 + 0.5 * _COVERAGE))
 
 
 def mean_stroke(
-    motion: Motion, force_n: Array, number: NDArray[np.int64], sign: int
+    motion: BlockMotion, force_n: Array, number: NDArray[np.int64], sign: int
 ) -> MeanStroke | None:
     """The mean of the strokes of one direction; None where there are too few samples.
 
@@ -185,7 +185,7 @@ def mean_stroke(
         np.arcsin(np.clip(sign * (height_m - middle) / amplitude, -1.0, 1.0))
         for height_m in (motion.height_m[mine], motion.between_m[along])
     )
-    made = [_fitted(theta, force_n, number, pieces) for pieces in _PIECES]
+    made = [_fit_spline(theta, force_n, number, pieces) for pieces in _PIECES]
     fits = [item for item in made if item is not None]
     if not fits:
         return None
@@ -271,7 +271,9 @@ class _Fit(NamedTuple):
     clusters: int
 
 
-def _fitted(theta: Array, force_n: Array, number: NDArray[np.int64], pieces: int) -> _Fit | None:
+def _fit_spline(
+    theta: Array, force_n: Array, number: NDArray[np.int64], pieces: int
+) -> _Fit | None:
     """A spline; None where the samples do not carry it."""
     design = _design(theta, pieces)
     # A machine in step with the clock samples the same few places in every cycle.

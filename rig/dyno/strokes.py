@@ -92,7 +92,7 @@ class Stroke(NamedTuple):
     duration_s: float
 
 
-class Motion(NamedTuple):
+class BlockMotion(NamedTuple):
     """The motion of a block.
 
     Attributes:
@@ -133,7 +133,7 @@ class Hold(NamedTuple):
     end: int
 
 
-def strokes_of(t_s: Array, height_m: Array) -> list[Stroke]:
+def find_strokes(t_s: Array, height_m: Array) -> list[Stroke]:
     """All strokes of a record.
 
     Args:
@@ -175,23 +175,23 @@ def _turns(height_m: Array, least_m: float) -> Iterator[int]:
         yield high if rising else low
 
 
-def blocks_of(strokes: list[Stroke]) -> list[Block]:
+def find_blocks(strokes: list[Stroke]) -> list[Block]:
     """Blocks of a record: at least three like strokes in a row."""
     blocks: list[Block] = []
     run: list[Stroke] = []
     for stroke in [*strokes, Stroke(-1, -1, 0.0, 0.0)]:
-        if run and not _alike(run, stroke):
+        if run and not _is_alike(run, stroke):
             if len(run) >= _FEWEST_STROKES:
-                kept = _settled(run)
+                kept = _without_ramps(run)
                 blocks.append(Block(tuple(kept), kept[0].first, kept[-1].last + 1))
             # A stroke that a machine changes its step in may have been like the next by chance.
-            keeps = len(run) < _FEWEST_STROKES and _alike(run[-1:], stroke)
+            keeps = len(run) < _FEWEST_STROKES and _is_alike(run[-1:], stroke)
             run = run[-1:] if keeps else []
         run.append(stroke)
     return blocks
 
 
-def _settled(run: list[Stroke]) -> list[Stroke]:
+def _without_ramps(run: list[Stroke]) -> list[Stroke]:
     """A run without strokes at its ends that a machine takes to get there, or back."""
     usual_m = float(np.median([abs(stroke.rise_m) for stroke in run]))
 
@@ -206,7 +206,7 @@ def _settled(run: list[Stroke]) -> list[Stroke]:
     return kept
 
 
-def repeats(t_s: Array, height_m: Array, block: Block) -> bool:
+def is_repetition(t_s: Array, height_m: Array, block: Block) -> bool:
     """Whether the strokes of a block are one motion again and again, and not alike by chance.
 
     Args:
@@ -229,7 +229,7 @@ def repeats(t_s: Array, height_m: Array, block: Block) -> bool:
     return True
 
 
-def _alike(run: list[Stroke], stroke: Stroke) -> bool:
+def _is_alike(run: list[Stroke], stroke: Stroke) -> bool:
     """Whether a stroke goes on like the last one of its direction, or returns as far."""
     before = run[-2] if len(run) > 1 else run[-1]
     same_size = abs(abs(stroke.rise_m) - abs(run[-1].rise_m)) <= _ALIKE * abs(run[-1].rise_m)
@@ -239,7 +239,7 @@ def _alike(run: list[Stroke], stroke: Stroke) -> bool:
     return same_size and same_time and stroke.first == run[-1].last
 
 
-def holds_of(t_s: Array, height_m: Array, blocks: list[Block]) -> list[Hold]:
+def find_holds(t_s: Array, height_m: Array, blocks: list[Block]) -> list[Hold]:
     """Times at rest between the blocks."""
     ends = [0, *(edge for block in blocks for edge in (block.begin, block.end - 1)), len(t_s) - 1]
     usual_s = float(np.median(np.diff(t_s)))
@@ -264,11 +264,11 @@ def holds_of(t_s: Array, height_m: Array, blocks: list[Block]) -> list[Hold]:
         ]
         if rests:  # the longest without a break
             longest = max(rests, key=lambda hold: hold.end - hold.begin)
-            holds.append(_trimmed(longest, height_m, still_m))
+            holds.append(_trim(longest, height_m, still_m))
     return holds
 
 
-def _trimmed(hold: Hold, height_m: Array, still_m: float) -> Hold:
+def _trim(hold: Hold, height_m: Array, still_m: float) -> Hold:
     """A rest without the ends of the strokes beside it."""
     part = height_m[hold.begin : hold.end]
     apart = np.abs(part - np.median(part))
@@ -283,7 +283,7 @@ def _turns_slowly(height_m: Array, still_m: float) -> bool:
     return float(np.ptp(curve)) > _BENT * still_m
 
 
-def motion_of(t_s: Array, height_m: Array, strokes: int) -> Motion:
+def fit_motion(t_s: Array, height_m: Array, strokes: int) -> BlockMotion:
     """Height and velocity of a block.
 
     Args:
@@ -291,7 +291,7 @@ def motion_of(t_s: Array, height_m: Array, strokes: int) -> Motion:
         height_m: Its measured heights, shape (N,).
         strokes: Number of its strokes.
     """
-    series = _series(t_s - t_s[0], height_m, strokes)
+    series = _fourier_series(t_s - t_s[0], height_m, strokes)
     if series is not None:
         return series
     found = smooth(t_s, height_m, estimate_noise(t_s, height_m))
@@ -303,12 +303,12 @@ def motion_of(t_s: Array, height_m: Array, strokes: int) -> Motion:
     height = height - _wander(t_s, t_s, height)
     between = between - _wander(fine_s, t_s, curve(t_s))
     std = float(np.median(found.deviations[:, 1]))
-    return Motion(height, velocity, between, rate, std, float("nan"))
+    return BlockMotion(height, velocity, between, rate, std, float("nan"))
 
 
 def _wander(at_s: Array, t_s: Array, height_m: Array) -> Array:
     """By how much the middle of the strokes is away from its mean, at times."""
-    strokes = strokes_of(t_s, height_m)
+    strokes = find_strokes(t_s, height_m)
     if len(strokes) < _FEWEST_STROKES:
         return np.zeros_like(at_s)
     middles = [0.5 * (height_m[item.first] + height_m[item.last]) for item in strokes]
@@ -319,7 +319,7 @@ def _wander(at_s: Array, t_s: Array, height_m: Array) -> Array:
     return wandered - float(np.mean(pairs[0]))
 
 
-def _series(t_s: Array, height_m: Array, strokes: int) -> Motion | None:
+def _fourier_series(t_s: Array, height_m: Array, strokes: int) -> BlockMotion | None:
     """A Fourier series through a block; None where the motion is none."""
     span_s = float(t_s[-1])
     per_cycle = 2.0 * len(t_s) / strokes
@@ -367,7 +367,7 @@ def _series(t_s: Array, height_m: Array, strokes: int) -> Motion | None:
         np.sqrt(12.0) * size / span_s * float(np.max(np.abs(rate))) / order[0] / amplitude
     )
     std = float(np.hypot(of_rates, of_frequency))
-    return Motion(fitted, rate, fine @ weights, fine @ rates, std, 1.0 / chosen)
+    return BlockMotion(fitted, rate, fine @ weights, fine @ rates, std, 1.0 / chosen)
 
 
 def _harmonics(t_s: Array, frequency_hz: float, count: int) -> Array:

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import load_validated, validated
-from rig.dyno.figures import Step
+from rig.dyno.figures import DynoStep
 from rig.dyno.stroke_force import Figure
 from rig.files.delimited_text import read_csv_columns
 
@@ -27,7 +27,7 @@ _COLUMNS = ("velocity_m_per_s", "compression_low_n", "compression_high_n", "rebo
             "rebound_high_n")  # fmt: skip
 
 
-class Point(BaseModel):
+class BandPoint(BaseModel):
     """Limits at one peak velocity.
 
     Attributes:
@@ -47,7 +47,7 @@ class Point(BaseModel):
     rebound_high_n: Finite
 
     @model_validator(mode="after")
-    def _in_order(self) -> "Point":
+    def _in_order(self) -> "BandPoint":
         for side in ("compression", "rebound"):
             low, high = getattr(self, f"{side}_low_n"), getattr(self, f"{side}_high_n")
             if low >= high:
@@ -55,7 +55,7 @@ class Point(BaseModel):
         return self
 
 
-class Tolerance(BaseModel):
+class ToleranceBand(BaseModel):
     """A band about a master curve.
 
     Attributes:
@@ -66,17 +66,17 @@ class Tolerance(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: Annotated[str, Field(min_length=1, max_length=200)]
-    points: Annotated[tuple[Point, ...], Field(min_length=1, max_length=1000)]
+    points: Annotated[tuple[BandPoint, ...], Field(min_length=1, max_length=1000)]
 
     @model_validator(mode="after")
-    def _in_order(self) -> "Tolerance":
+    def _in_order(self) -> "ToleranceBand":
         speeds = [point.velocity_m_per_s for point in self.points]
         if sorted(set(speeds)) != speeds:
             raise ValueError("points: expected velocities that increase")
         return self
 
 
-class Judged(NamedTuple):
+class PointVerdict(NamedTuple):
     """A point of a damper.
 
     Attributes:
@@ -112,14 +112,14 @@ class Judged(NamedTuple):
         )
 
 
-def load_tolerance(path: Path) -> Tolerance:
-    """A band from YAML, or from CSV with the columns of `Point`.
+def load_tolerance(path: Path) -> ToleranceBand:
+    """A band from YAML, or from CSV with the columns of `BandPoint`.
 
     Raises:
         InputError: One line that names file, key, value and what was expected.
     """
     if path.suffix.lower() != ".csv":
-        return load_validated(Tolerance, path)
+        return load_validated(ToleranceBand, path)
     columns, _ = read_csv_columns(
         path, str(path), _MAX_BYTES, lambda header: _check_header(path, header)
     )
@@ -129,7 +129,7 @@ def load_tolerance(path: Path) -> Tolerance:
     ]
     if not points:
         raise InputError(f"{path}: holds no point, expected rows under the header")
-    return validated(Tolerance, {"name": path.stem, "points": points}, str(path))
+    return validated(ToleranceBand, {"name": path.stem, "points": points}, str(path))
 
 
 def _check_header(path: Path, header: Sequence[str]) -> Sequence[str]:
@@ -138,7 +138,9 @@ def _check_header(path: Path, header: Sequence[str]) -> Sequence[str]:
     return header
 
 
-def judged(steps: Sequence[Step], kinds: Sequence[str], tolerance: Tolerance) -> list[Judged]:
+def evaluate_band(
+    steps: Sequence[DynoStep], kinds: Sequence[str], tolerance: ToleranceBand
+) -> list[PointVerdict]:
     """Every point of a band, compression and rebound.
 
     A point belongs to the velocity step nearest to its speed within 1 %; the force is then less
@@ -148,12 +150,12 @@ def judged(steps: Sequence[Step], kinds: Sequence[str], tolerance: Tolerance) ->
 
     Args:
         steps: The steps of a damper.
-        kinds: What each of them is, as `damper_of` says.
+        kinds: What each of them is, as `summarise_damper` says.
         tolerance: The band.
     """
     used = [step for step, kind in zip(steps, kinds, strict=True) if kind != "warm_up"]
     ordered = sorted(used, key=lambda step: step.peak_speed_m_per_s)
-    found: list[Judged] = []
+    found: list[PointVerdict] = []
     for point in tolerance.points:
         for side, low, high in (
             ("compression", point.compression_low_n, point.compression_high_n),
@@ -161,7 +163,7 @@ def judged(steps: Sequence[Step], kinds: Sequence[str], tolerance: Tolerance) ->
         ):
             force = _force_at(ordered, side, point.velocity_m_per_s)
             verdict = _verdict(force, low, high)
-            found.append(Judged(point.velocity_m_per_s, side, force, low, high, verdict))
+            found.append(PointVerdict(point.velocity_m_per_s, side, force, low, high, verdict))
     return found
 
 
@@ -172,7 +174,7 @@ _STEEPEST = 2.0
 """Power of the speed with which the force of an orifice rises: no damper's rises faster."""
 
 
-def _force_at(ordered: Sequence[Step], side: str, speed: float) -> Figure | None:
+def _force_at(ordered: Sequence[DynoStep], side: str, speed: float) -> Figure | None:
     sides = [step.compression if side == "compression" else step.rebound for step in ordered]
     speeds = [one.peak_velocity.value for one in sides]
     figures = [one.force_at_peak_velocity for one in sides]

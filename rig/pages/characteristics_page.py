@@ -11,10 +11,11 @@ import numpy as np
 from matplotlib.figure import Figure as Drawing
 
 from rig.dyno.characterise import AtRest, Characteristics
-from rig.dyno.faults import Naming
-from rig.dyno.figures import SIDES, Step
+from rig.dyno.faults import MasterComparison
+from rig.dyno.figures import SIDES, DynoStep
+from rig.dyno.report import DamperReport
 from rig.dyno.stroke_force import ANGLES, Figure
-from rig.dyno.tolerance import Judged
+from rig.dyno.tolerance import PointVerdict
 from rig.pages.report.page import render, write_page
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers and in grey print.
@@ -32,24 +33,20 @@ _KINDS = {
 
 
 def write_characteristics_page(
-    found: Sequence[Characteristics],
-    path: Path,
-    points: Sequence[Sequence[Judged]] = (),
-    namings: Sequence[Naming | None] = (),
-    serial: str | None = None,
+    reports: Sequence[DamperReport], path: Path, serial: str | None = None
 ) -> None:
     """Write the page of one record, or of several laid over one another.
 
     Args:
-        found: The records.
+        reports: The records.
         path: New HTML file.
-        points: How each record stands in a band; empty without one.
-        namings: What each record is against a master; empty without one.
         serial: Serial number.
 
     Raises:
         InputError: The file cannot be written.
     """
+    found = [report.characteristics for report in reports]
+    points = [report.points for report in reports]
     text = render(
         "characteristics.html",
         names=[item.name for item in found],
@@ -58,19 +55,18 @@ def write_characteristics_page(
         picture="data:image/svg+xml;base64,"
         + base64.b64encode(draw(found, points)).decode("ascii"),
         serial=serial,
-        badge=_badge(points, namings),
+        badge=_badge(points, [report.against_master for report in reports]),
         records=[
-            _record(item) | {"points": of, "naming": naming}
-            for item, of, naming in zip(
-                found, points or [()] * len(found), namings or [None] * len(found), strict=True
-            )
+            _record(report.characteristics)
+            | {"points": report.points, "naming": report.against_master}
+            for report in reports
         ],
     )
     write_page(text, path)
 
 
 def _badge(
-    points: Sequence[Sequence[Judged]], namings: Sequence[Naming | None]
+    points: Sequence[Sequence[PointVerdict]], namings: Sequence[MasterComparison | None]
 ) -> tuple[str, str, str] | None:
     """Tone, sign and words of the whole verdict; None without a band and a master."""
     verdicts = {point.verdict for of in points for point in of}
@@ -84,7 +80,7 @@ def _badge(
     return ("good", "✓", "In tolerance") if verdicts == {"pass"} else ("part", "?", "Not proven")
 
 
-def draw(found: Sequence[Characteristics], points: Sequence[Sequence[Judged]] = ()) -> bytes:
+def draw(found: Sequence[Characteristics], points: Sequence[Sequence[PointVerdict]] = ()) -> bytes:
     """Peak force over peak velocity, force over velocity and force over displacement, as SVG."""
     style = {
         "axes.grid": True,
@@ -144,7 +140,7 @@ def _draw_peaks(axes: Any, item: Characteristics, colour: str) -> None:
         )  # fmt: skip
 
 
-def _draw_band(axes: Any, points: Sequence[Sequence[Judged]]) -> None:
+def _draw_band(axes: Any, points: Sequence[Sequence[PointVerdict]]) -> None:
     """The band that is allowed, of either side."""
     for side in SIDES:
         mine = [point for point in (points[0] if points else ()) if point.side == side]
@@ -206,7 +202,7 @@ def _record(item: Characteristics) -> dict[str, object]:
     }
 
 
-def _cells(step: Step, *, warm: bool) -> list[str]:
+def _cells(step: DynoStep, *, warm: bool) -> list[str]:
     down, up = step.compression, step.rebound
     speeds = dict.fromkeys(f"{side.peak_velocity.value:.3g}" for side in (down, up))
     temperature = "—" if step.temperature_c is None else f"{step.temperature_c:.1f}"
