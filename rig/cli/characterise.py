@@ -137,17 +137,17 @@ def _print_steps(record: "Characteristics") -> None:
         "rebound N",
         "J a cycle",
         "N·s/m",
-        title=f"{record.name} (force: {record.source})",
+        title=f"{record.name} (force: {record.record.source})",
     )
     for kind, step in zip(record.damper.kinds, record.steps, strict=True):
         shown.add_row(
             kind_words(kind),
             f"±{1e3 * step.amplitude_m:.2f}",
             f"{step.peak_speed_m_per_s:.3g}",
-            with_half(step.compression.force_at_peak_velocity),
-            with_half(step.rebound.force_at_peak_velocity),
-            with_half(step.energy_per_cycle),
-            with_half(step.equivalent_damping),
+            with_half(step.compression.force_at_peak_velocity_n),
+            with_half(step.rebound.force_at_peak_velocity_n),
+            with_half(step.energy_per_cycle_j),
+            with_half(step.equivalent_damping_n_s_per_m),
         )
     console.print(shown)
     rows = damper_rows(record)

@@ -50,14 +50,14 @@ def compare_command(
     if dose:
         trends = trends_over_dose(records, dose)
         if as_json:
-            print_json({"schema": 1, "trends": [item.as_dict() for item in trends]})
+            print_json({"schema": 1, "trends": trends})
         else:
             _print_trends(trends)
             _print_not_compared(records)
         return
     differences = compare_dampers(records[0], records[1])
     if as_json:
-        print_json({"schema": 1, "differences": [item.as_dict() for item in differences]})
+        print_json({"schema": 1, "differences": differences})
         return
     _print_differences(differences, records[0].name, records[1].name)
     _print_not_compared(records)
@@ -78,10 +78,10 @@ def _print_differences(differences: "list[Difference]", before: str, after: str)
     for item in differences:
         if not item.differs:
             unit = f" {item.unit}" if item.unit else ""
-            same.append(f"{item.name} (by at most {_bound(item.change)}{unit})")
+            same.append(f"{item.figure} (by at most {_bound(item.change)}{unit})")
             continue
         shown.add_row(
-            item.name,
+            item.figure,
             with_half(item.before),
             with_half(item.after),
             _interval(item.change, item.unit),
@@ -100,14 +100,14 @@ def _print_trends(trends: "list[Trend]") -> None:
         if item.differs:
             shape = "straight" if item.is_straight else "bent: no straight line"
             shown.add_row(
-                item.name,
+                item.figure,
                 _interval(item.slope, item.unit),
                 f"{item.at_zero:.4g} {item.unit}",
                 shape,
             )
     if shown.rows:
         console.print(shown)
-    same = [item.name for item in trends if not item.differs]
+    same = [item.figure for item in trends if not item.differs]
     if same:
         console.print(f"No change over the dose: {'; '.join(same)}.", markup=False)
 

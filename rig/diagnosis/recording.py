@@ -16,6 +16,7 @@ from can_dbc.codec import decode_log
 from can_dbc.database import Message
 from can_dbc.errors import InputError
 from can_dbc.protection import check_crc_log
+from rig.diagnosis.clipping import find_long_plateaus
 from rig.files.delimited_text import read_csv_columns
 from rig.log.reader import RunFolder
 from rig.plan.config import SignalName
@@ -38,13 +39,6 @@ _MOST_MISSING = 0.3
 """Share of missing heights above which a sensor is taken for broken."""
 _LONGEST_STEP_S = 0.05
 """Usual time between samples above which a time in other units is more likely."""
-_LONGEST_PLATEAU = 0.002
-"""Share of the samples that a signal that is not clipped may stand at its extreme value on end."""
-_STANDS = 4
-"""Samples on end at an extreme value that are no coincidence."""
-_FULL_SPEED = 0.3
-"""Share of its usual speed with which a signal enters a plateau by being clipped: one that comes
-to rest slows down before."""
 
 
 class RecordingError(InputError):
@@ -211,8 +205,8 @@ def read_run(folder: Path) -> Recording:
         InputError: The run is damaged, or holds no height.
         RecordingError: It holds nothing that can be diagnosed.
     """
-    found, ready = setup_of_run(folder)
-    payloads = _payloads(found, ready)
+    run, ready = setup_of_run(folder)
+    payloads = _payloads(run, ready)
     signals = ready.config.signals
     heights = [_channel(ready, payloads, entry, HEIGHT) for entry in signals.height.values()]
     for (name, entry), (t_s, _) in zip(signals.height.items(), heights, strict=True):
@@ -250,26 +244,26 @@ def read_run(folder: Path) -> Recording:
 _Payloads = dict[str, tuple[NDArray[np.int64], NDArray[np.uint8]]]
 
 
-def _payloads(found: RunFolder, ready: Setup) -> _Payloads:
+def _payloads(run: RunFolder, ready: Setup) -> _Payloads:
     """Times and payloads of every received message, wrong lengths left out."""
     names = sorted({entry.message for entry in ready.config.signals.named().values()})
     messages = [ready.database.message(name) for name in names]
     directory = Directory(messages)
     times: list[list[int]] = [[] for _ in messages]
     data: list[list[bytes]] = [[] for _ in messages]
-    for frame, direction in found.frames():
-        place = directory.place(frame.arbitration_id, frame.is_extended)
-        if place is None or direction != "R" or frame.is_error:
+    for frame, direction in run.frames():
+        index = directory.place(frame.arbitration_id, frame.is_extended)
+        if index is None or direction != "R" or frame.is_error:
             continue
-        if len(frame.data) == messages[place].length_bytes:
-            times[place].append(frame.t_ns)
-            data[place].append(frame.data)
+        if len(frame.data) == messages[index].length_bytes:
+            times[index].append(frame.t_ns)
+            data[index].append(frame.data)
     return {
         message.name: (
-            np.array(times[place], dtype=np.int64),
-            np.frombuffer(b"".join(data[place]), dtype=np.uint8).reshape(-1, message.length_bytes),
+            np.array(times[index], dtype=np.int64),
+            np.frombuffer(b"".join(data[index]), dtype=np.uint8).reshape(-1, message.length_bytes),
         )
-        for place, message in enumerate(messages)
+        for index, message in enumerate(messages)
     }
 
 
@@ -336,7 +330,7 @@ def checked(recording: Recording) -> Recording:
                 f"{advice}"
             )
         if label == "strut_force_n":
-            _check_clipped(name, label, "N", channel)
+            _refuse_clipped(name, label, "N", channel)
     return recording
 
 
@@ -393,30 +387,14 @@ def _check_height(name: str, height_m: Array) -> None:
             f"{name}: height_m is constant at {heights[0]:.6g} m, "
             "expected motion: is the sensor connected?"
         )
-    _check_clipped(name, "height_m", "m", heights)
+    _refuse_clipped(name, "height_m", "m", heights)
 
 
-def _check_clipped(name: str, label: str, unit: str, values: Array) -> None:
-    """Refuse a signal that stands at an extreme value which it entered at full speed."""
-    steps = np.diff(np.unique(values))
-    if len(steps) == 0 or float(np.ptp(values)) <= 50.0 * float(steps.min()):
-        return
-    usual = float(np.mean(np.abs(np.diff(values))))
-    for extreme, limit in (("lowest", float(values.min())), ("highest", float(values.max()))):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], values == limit, [0]])))
-        firsts, lasts = edges[::2], edges[1::2]
-        length = int(np.max(lasts - firsts))
-        if length <= max(20, _LONGEST_PLATEAU * len(values)):
-            continue
-        speeds = [
-            float(np.mean(np.abs(np.diff(values[max(first - 4, 0) : first + 1]))))
-            for first in firsts[lasts - firsts > _STANDS]
-            if first > 0
-        ]
-        if not speeds or float(np.median(speeds)) < _FULL_SPEED * usual:
-            continue  # It came to rest there.
+def _refuse_clipped(name: str, label: str, unit: str, values: Array) -> None:
+    plateaus = find_long_plateaus(values)
+    if plateaus is not None:
         raise RecordingError(
-            f"{name}: {label} stays at its {extreme} value {limit:.6g} {unit} for {length} "
-            "samples on end, expected a sensor that is not clipped: widen its range or reduce "
-            "the load"
+            f"{name}: {label} stays at its {plateaus.extreme} value {plateaus.limit:.6g} {unit} "
+            f"for {int(np.max(plateaus.lengths))} samples in a row, expected a sensor that is not "
+            "clipped: widen its range or reduce the load"
         )

@@ -1,9 +1,9 @@
-"""What is wrong with a damper that is not as its master: named, with its size.
+"""Names the fault of a damper that differs from its master, with its size.
 
-Every fault that is known is run in the master, step by step; what it changes there is held against
-what the damper's mean strokes differ by from the master's. Good dampers differ too: by their
-measurement, and by what manufacturing scatters in gas force, friction, damping below and above the
-knee, and the knee's place. A fault is named where it explains far more than both.
+Every known fault is simulated in the master, step by step; its changes are compared with the
+differences between the damper's mean strokes and the master's. Good dampers differ too: by their
+measurement, and by the scatter of manufacturing in gas force, friction, damping below and above the
+knee, and the knee's speed. A fault is named if it explains far more than both.
 
 The comparison is that of Gaussian likelihoods: differences are normal about what a fault of some
 size makes of them, with a covariance of measurement, scatter and the model's own coarseness; the
@@ -45,19 +45,19 @@ _BINS = 24
 """Parts of a stroke whose samples' means are held against the master."""
 
 _OWN_SHARE = 0.004
-"""Of the largest force of a step: what the model leaves out at each angle by itself."""
+"""Model error at each angle, over the largest force of a step."""
 
 _DAMPING_SHARE = 0.02
-"""Of the damping at each angle: the same."""
+"""Model error at each angle, over the damping there."""
 
 _EXPLAINED = 0.5
-"""Share of what differs that faults have to explain to be named."""
+"""Share of the difference that faults have to explain to be named."""
 
 _MODEL_SHARE = 0.1
-"""Of what a fault changes: how well the run of it in the master is known."""
+"""Relative uncertainty of a fault's changes by the simulation in the master."""
 
 _SIZE_SHARE = 0.15
-"""Of a size: how well the run of a fault in the master tells it."""
+"""Relative uncertainty of a size by the simulation in the master."""
 
 _MOST_FAULTS = 2
 _SIZES = 401
@@ -68,11 +68,11 @@ _FALL = 3.84
 
 
 class Fault(NamedTuple):
-    """Something that can be wrong.
+    """A fault that can be simulated.
 
     Attributes:
-        name: What it is called.
-        quantity: What its size is.
+        name: Its name.
+        quantity: Meaning of its size.
         unit: Unit of the size.
         sizes: Sizes that are tried, rising, shape (K,).
         changes: What each changes of the stacked forces, shape (K, N).
@@ -90,11 +90,11 @@ class Fault(NamedTuple):
 
 
 class NamedFault(NamedTuple):
-    """A fault that was found.
+    """A fault with its size.
 
     Attributes:
-        name: What it is called.
-        quantity: What its size is.
+        name: Its name.
+        quantity: Meaning of its size.
         unit: Unit of the size.
         size: Its size, with a 95 % interval.
         evidence: By how much it lowers chi-squared.
@@ -105,10 +105,6 @@ class NamedFault(NamedTuple):
     unit: str
     size: Figure
     evidence: float
-
-    def as_dict(self) -> dict[str, object]:
-        """For a file."""
-        return {**self._asdict(), "size": self.size.as_dict()}
 
     def words(self) -> str:
         """The same in a line."""
@@ -122,7 +118,7 @@ class NamedFault(NamedTuple):
 
 
 class MasterComparison(NamedTuple):
-    """What a damper is against its master.
+    """Comparison of a damper with its master.
 
     Attributes:
         named: Faults, the one that explains most first; empty of a good damper.
@@ -151,12 +147,8 @@ class MasterComparison(NamedTuple):
             return "as its master, within what manufacturing scatters"
         if not self.named:
             return "not as its master, and no fault that is known explains it"
-        found = "; ".join(item.words() for item in self.named)
-        return f"{found}: explains {100 * self.explained:.0f} % of what differs"
-
-    def as_dict(self) -> dict[str, object]:
-        """For a file."""
-        return {**self._asdict(), "named": [item.as_dict() for item in self.named]}
+        faults = "; ".join(item.words() for item in self.named)
+        return f"{faults}: explains {100 * self.explained:.0f} % of what differs"
 
 
 class _Stack(NamedTuple):
@@ -203,22 +195,22 @@ def _fine(stroke: MeanStroke) -> Array:
     return stroke.row(FINE) @ stroke.force_n
 
 
-def name_faults(found: Characteristics, master: Master, scatter: float) -> MasterComparison:
-    """What is wrong with a damper.
+def name_faults(tested: Characteristics, master: Master, scatter: float) -> MasterComparison:
+    """The comparison of a damper with its master.
 
     Args:
-        found: The damper.
-        master: The good one, of the same test.
+        tested: Figures of the damper.
+        master: The good item, of the same test.
         scatter: Relative standard deviation that manufacturing leaves of each property.
 
     Raises:
-        InputError: No step of one has a partner in the other.
+        InputError: No step of item has a partner in the other.
     """
-    refuse_unsuitable(found)
-    steps = pair_steps(master.characteristics, found)
+    refuse_unsuitable(tested)
+    steps = pair_steps(master.characteristics, tested)
     if not steps:
         raise InputError(
-            f"{found.name}, {master.characteristics.name}: no step of one speed and amplitude in "
+            f"{tested.name}, {master.characteristics.name}: no step of item speed and amplitude in "
             "common, expected the same test as the master's"
         )
     stack = _stack(steps)
@@ -226,15 +218,15 @@ def name_faults(found: Characteristics, master: Master, scatter: float) -> Maste
         fault._replace(changes=stack.bin_means(np.split(fault.changes, len(stack.strokes), axis=1)))
         for fault in simulate_faults(master, [theirs for theirs, _ in steps])
     ]
-    covariance, left = _covariance(stack, master, scatter), stack.less_n
-    count = len(left)
-    before = _misfit(left, covariance)
+    covariance, residual_n = _covariance(stack, master, scatter), stack.less_n
+    count = len(residual_n)
+    before = _misfit(residual_n, covariance)
     beyond = max(before - count, 1.0)
     kept: list[NamedFault] = []
     for _ in range(_MOST_FAULTS):
-        rest = [item for item in faults if item.name not in [one.name for one in kept]]
+        rest = [item for item in faults if item.name not in {named.name for named in kept}]
         best = min(
-            (_fit_size(item, left, covariance) for item in rest), key=lambda item: item.misfit
+            (_fit_size(item, residual_n, covariance) for item in rest), key=lambda item: item.misfit
         )
         if before - best.misfit < _NAMED:
             break
@@ -242,20 +234,20 @@ def name_faults(found: Characteristics, master: Master, scatter: float) -> Maste
         kept.append(
             NamedFault(fault.name, fault.quantity, fault.unit, best.size, before - best.misfit)
         )
-        # What a fault makes is known but so well, and the less the more it makes.
-        left = left - best.explained_n
+        # The uncertainty of a simulated fault grows with its size.
+        residual_n = residual_n - best.explained_n
         covariance = covariance + np.diag((_MODEL_SHARE * best.explained_n) ** 2)
-        before = _misfit(left, covariance)
+        before = _misfit(residual_n, covariance)
     remains = max(before - count, 0.0)
     is_good = not kept and remains <= (_WORST_MISFIT - 1.0) * count
     compared = [theirs for theirs, _ in steps]
     lacking = tuple(
         f"±{1e3 * step.amplitude_m:.3g} mm at {step.peak_speed_m_per_s:.3g} m/s"
         for step in master.characteristics.steps
-        if not any(step is one for one in compared)
+        if not any(step is other for other in compared)
     )
     if kept and remains > (1.0 - _EXPLAINED) * beyond:
-        kept = []  # the nearest fault is no name
+        kept = []  # the nearest fault does not explain enough
     explained = 1.0 if is_good else max(1.0 - remains / beyond, 0.0)
     return MasterComparison(tuple(kept), is_good, explained, lacking)
 
@@ -272,7 +264,7 @@ class _FaultFit(NamedTuple):
         fault: The fault.
         size: Its best size, with its interval.
         misfit: Chi-squared there.
-        explained_n: What it makes of the differences.
+        explained_n: Its share of the differences.
     """
 
     fault: Fault
@@ -281,17 +273,17 @@ class _FaultFit(NamedTuple):
     explained_n: Array
 
 
-def _fit_size(fault: Fault, left: Array, covariance: Array) -> _FaultFit:
+def _fit_size(fault: Fault, residual_n: Array, covariance: Array) -> _FaultFit:
     """A fault at its best size."""
     nodes: Array = np.arange(len(fault.sizes), dtype=np.float64)
     tried: Array = np.linspace(0.0, float(nodes[-1]), _SIZES)
     sizes: Array = np.interp(tried, nodes, fault.sizes).astype(np.float64)
     columns: list[Array] = [
-        np.interp(sizes, fault.sizes, fault.changes[:, place]).astype(np.float64)
-        for place in range(fault.changes.shape[1])
+        np.interp(sizes, fault.sizes, fault.changes[:, index]).astype(np.float64)
+        for index in range(fault.changes.shape[1])
     ]
     changes: Array = np.array(columns).T
-    apart = left - changes
+    apart = residual_n - changes
     factor = cast("Any", cho_factor)(covariance, lower=True)
     solved = cast("Any", cho_solve)(factor, apart.T).T
     chi: Array = np.einsum("ij,ij->i", apart, solved)
@@ -314,9 +306,9 @@ def _fit_size(fault: Fault, left: Array, covariance: Array) -> _FaultFit:
     return _FaultFit(fault, size, float(chi[best]), changes[best])
 
 
-def _misfit(left: Array, covariance: Array) -> float:
+def _misfit(residual_n: Array, covariance: Array) -> float:
     factor = cast("Any", cho_factor)(covariance, lower=True)
-    return float(left @ cast("Any", cho_solve)(factor, left))
+    return float(residual_n @ cast("Any", cho_solve)(factor, residual_n))
 
 
 def _covariance(stack: _Stack, master: Master, scatter: float) -> Array:
@@ -500,7 +492,7 @@ def _at_stroke_angles(stroke: MeanStroke, changes: Array) -> Array:
     """Changes over a cycle at the angles of a stroke; a cycle begins in the middle of rebound."""
     turn = FINE if stroke.sign > 0 else np.pi + FINE
     times = changes.shape[1]
-    place = turn / (2.0 * np.pi) * times % times
+    position = turn / (2.0 * np.pi) * times % times
     grid: Array = np.arange(times + 1, dtype=np.float64)
     closed = np.concatenate([changes, changes[:, :1]], axis=1)
-    return np.array([np.interp(place, grid, row) for row in closed], dtype=np.float64)
+    return np.array([np.interp(position, grid, row) for row in closed], dtype=np.float64)

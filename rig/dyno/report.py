@@ -68,11 +68,10 @@ class DamperReport(NamedTuple):
 
     def as_dict(self) -> dict[str, object]:
         """For `characteristics.json`."""
-        comparison = self.against_master
         return {
             **self.characteristics.as_dict(),
-            "points": [point.as_dict() for point in self.points],
-            "against_master": None if comparison is None else comparison.as_dict(),
+            "points": list(self.points),
+            "against_master": self.against_master,
         }
 
 

@@ -1,7 +1,7 @@
 """One fit of a block's force, of which every figure is a functional.
 
-All strokes of one direction lie over one another along the angle theta = asin(u), u the place in
-the stroke from -1 to 1: along it the force of a damper under a sine is smooth up to the turning
+All strokes of one direction lie over one another along the angle theta = asin(u), u the position
+in the stroke from -1 to 1: along it the force of a damper under a sine is smooth up to the turning
 points, where along the height it has infinite slopes. A cubic spline through the samples of all
 strokes is the mean stroke. Its uncertainty is what the strokes differ by, and the noise: the
 sandwich of the least squares with strokes as clusters, or the plain covariance, whichever is
@@ -57,17 +57,13 @@ class Figure(NamedTuple):
         value: The figure.
         low: Lower end.
         high: Upper end.
-        method: How it was found.
+        method: Method that gave it.
     """
 
     value: float
     low: float
     high: float
     method: str
-
-    def as_dict(self) -> dict[str, object]:
-        """For a file."""
-        return self._asdict()
 
 
 _MIDDLE, _CONSTANT = 0.5, 0.1
@@ -121,12 +117,12 @@ class MeanStroke(NamedTuple):
 
     def row(self, theta: Array | float) -> Array:
         """The force at angles as rows over `force_n`, shape (M, 181)."""
-        place = (np.atleast_1d(theta) + 0.5 * np.pi) / np.pi * (_GRID - 1.0)
-        before = np.clip(place.astype(np.int64), 0, _GRID - 2)
-        share = np.clip(place - before, 0.0, 1.0)
-        rows = np.zeros((len(place), _GRID))
-        rows[np.arange(len(place)), before] = 1.0 - share
-        rows[np.arange(len(place)), before + 1] = share
+        position = (np.atleast_1d(theta) + 0.5 * np.pi) / np.pi * (_GRID - 1.0)
+        before = np.clip(position.astype(np.int64), 0, _GRID - 2)
+        share = np.clip(position - before, 0.0, 1.0)
+        rows = np.zeros((len(position), _GRID))
+        rows[np.arange(len(position)), before] = 1.0 - share
+        rows[np.arange(len(position)), before + 1] = share
         return rows
 
     def figure(self, row: Array, method: str) -> Figure:
@@ -144,7 +140,7 @@ def combine(
 
     Args:
         parts: Row and mean stroke of each.
-        method: How it is found.
+        method: Method that gives it.
         factor: Of the sum.
         relative_std: Relative standard deviation of the factor.
     """
@@ -189,9 +185,9 @@ def mean_stroke(
     fits = [item for item in made if item is not None]
     if not fits:
         return None
-    place = int(np.argmin([item.criterion for item in fits]))
-    place = min(place + _UNDERSMOOTHED, len(fits) - 1)
-    best = fits[place]
+    chosen = int(np.argmin([item.criterion for item in fits]))
+    chosen = min(chosen + _UNDERSMOOTHED, len(fits) - 1)
+    best = fits[chosen]
     # The noise is that of the most flexible fit: what the chosen one leaves out counts too.
     noise = max(best.variance, fits[-1].variance)
     covariance, freedom = noise * best.inverse, fits[-1].freedom
@@ -200,7 +196,7 @@ def mean_stroke(
     rows = _design(ANGLES, best.pieces)
     forces = rows @ best.weights
     covariance = rows @ covariance @ rows.T
-    for other in (*fits[:place][-1:], *fits[place + 1 : place + 2]):
+    for other in (*fits[:chosen][-1:], *fits[chosen + 1 : chosen + 2]):
         # What the next simpler curve and the next one would say shows what this one leaves out.
         apart = forces - _design(ANGLES, other.pieces) @ other.weights
         covariance = covariance + np.outer(apart, apart)
@@ -276,25 +272,25 @@ def _fit_spline(
 ) -> _Fit | None:
     """A spline; None where the samples do not carry it."""
     design = _design(theta, pieces)
-    # A machine in step with the clock samples the same few places in every cycle.
-    places = len(np.unique(np.round(theta, 2)))
+    # A machine in step with the clock samples the same few angles in every cycle.
+    angles = len(np.unique(np.round(theta, 2)))
     count, size = design.shape
-    if places < size + (pieces > 0) or count < 2 * size:
+    if angles < size + (pieces > 0) or count < 2 * size:
         return None
     gram = design.T @ design
     if np.linalg.cond(gram) > _WORST_CONDITION:
         return None
     inverse: Array = np.linalg.inv(gram).astype(np.float64)
     weights = inverse @ (design.T @ force_n)
-    left = force_n - design @ weights
-    squares = float(left @ left)
+    residual_n = force_n - design @ weights
+    squares = float(residual_n @ residual_n)
     criterion = count * np.log(max(squares / count, 1e-300)) + 2.0 * size * count / (
         count - size - 1.0
     )
     clusters = np.unique(number)
     clustered: Array | None = None
     if len(clusters) >= _FEWEST_CLUSTERS:
-        scores = np.array([design[number == c].T @ left[number == c] for c in clusters])
+        scores = np.array([design[number == c].T @ residual_n[number == c] for c in clusters])
         share = len(clusters) / (len(clusters) - 1.0)
         clustered = inverse @ (share * scores.T @ scores) @ inverse
     variance, freedom = squares / (count - size), float(count - size)

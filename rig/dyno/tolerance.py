@@ -1,4 +1,4 @@
-"""A band of tolerance about a master curve, and where a damper stands in it.
+"""A band of tolerance about a master curve, and the verdict on a damper at each of its points.
 
 A point passes when its interval lies inside the band, fails when it lies outside, and is open when
 the interval crosses a limit: the measurement then proves neither (ISO 14253-1, 2017).
@@ -85,7 +85,7 @@ class PointVerdict(NamedTuple):
         force: Its force there; None where no step is near.
         low_n: Smallest that is allowed.
         high_n: Largest.
-        verdict: How it stands.
+        verdict: Whether the force lies inside.
     """
 
     velocity_m_per_s: float
@@ -94,11 +94,6 @@ class PointVerdict(NamedTuple):
     low_n: float
     high_n: float
     verdict: Verdict
-
-    def as_dict(self) -> dict[str, object]:
-        """For a file."""
-        force = None if self.force is None else self.force.as_dict()
-        return {**self._asdict(), "force": force}
 
     def words(self) -> str:
         """The same in a line."""
@@ -155,7 +150,7 @@ def evaluate_band(
     """
     used = [step for step, kind in zip(steps, kinds, strict=True) if kind != "warm_up"]
     ordered = sorted(used, key=lambda step: step.peak_speed_m_per_s)
-    found: list[PointVerdict] = []
+    verdicts: list[PointVerdict] = []
     for point in tolerance.points:
         for side, low, high in (
             ("compression", point.compression_low_n, point.compression_high_n),
@@ -163,8 +158,8 @@ def evaluate_band(
         ):
             force = _force_at(ordered, side, point.velocity_m_per_s)
             verdict = _verdict(force, low, high)
-            found.append(PointVerdict(point.velocity_m_per_s, side, force, low, high, verdict))
-    return found
+            verdicts.append(PointVerdict(point.velocity_m_per_s, side, force, low, high, verdict))
+    return verdicts
 
 
 _SAME = 0.01
@@ -176,24 +171,24 @@ _STEEPEST = 2.0
 
 def _force_at(ordered: Sequence[DynoStep], side: str, speed: float) -> Figure | None:
     sides = [step.compression if side == "compression" else step.rebound for step in ordered]
-    speeds = [one.peak_velocity.value for one in sides]
-    figures = [one.force_at_peak_velocity for one in sides]
+    speeds = [side_figures.peak_velocity_m_per_s.value for side_figures in sides]
+    figures = [side_figures.force_at_peak_velocity_n for side_figures in sides]
     if not speeds:
         return None
-    nearest = min(range(len(speeds)), key=lambda place: abs(speeds[place] / speed - 1.0))
+    nearest = min(range(len(speeds)), key=lambda index: abs(speeds[index] / speed - 1.0))
     apart = abs(speeds[nearest] / speed - 1.0)
     if apart <= _SAME:
-        found = figures[nearest]
-        more = _STEEPEST * apart * abs(found.value)
+        figure = figures[nearest]
+        more = _STEEPEST * apart * abs(figure.value)
         method = f"step at {speeds[nearest]:.4g} m/s"
-        return Figure(found.value, found.low - more, found.high + more, method)
-    for place in range(len(speeds) - 1):
-        if speeds[place] <= speed <= speeds[place + 1]:
-            share = (speed - speeds[place]) / (speeds[place + 1] - speeds[place])
-            below, above = figures[place], figures[place + 1]
+        return Figure(figure.value, figure.low - more, figure.high + more, method)
+    for index in range(len(speeds) - 1):
+        if speeds[index] <= speed <= speeds[index + 1]:
+            share = (speed - speeds[index]) / (speeds[index + 1] - speeds[index])
+            below, above = figures[index], figures[index + 1]
             value = (1.0 - share) * below.value + share * above.value
             low, high = min(below.low, above.low), max(below.high, above.high)
-            method = f"between steps at {speeds[place]:.3g} and {speeds[place + 1]:.3g} m/s"
+            method = f"between steps at {speeds[index]:.3g} and {speeds[index + 1]:.3g} m/s"
             return Figure(value, low, high, method)
     return None
 

@@ -251,9 +251,9 @@ def _figures(path: Path, recording: Recording) -> list[RunValue]:
     except InputError:
         return []
     named = {
-        "gas_force_n": damper.gas_force,
-        "gas_rate_n_per_m": damper.gas_rate,
-        "friction_n": damper.friction,
+        "gas_force_n": damper.gas_force_n,
+        "gas_rate_n_per_m": damper.gas_rate_n_per_m,
+        "friction_n": damper.friction_n,
         "asymmetry": damper.asymmetry,
     }
     return [

@@ -129,8 +129,8 @@ def _draw_peaks(axes: Any, item: Characteristics, colour: str) -> None:
     steps = sorted(item.steps, key=lambda step: step.peak_speed_m_per_s)
     for number, (side, marker) in enumerate((("compression", "o"), ("rebound", "s"))):
         sides = [(step.compression, step.rebound)[number] for step in steps]
-        speeds = [one.peak_velocity.value for one in sides]
-        figures = [one.force_at_peak_velocity for one in sides]
+        speeds = [one.peak_velocity_m_per_s.value for one in sides]
+        figures = [one.force_at_peak_velocity_n for one in sides]
         values = np.array([figure.value for figure in figures])
         errors = np.array([[f.value - f.low, f.high - f.value] for f in figures]).T
         label = f"{item.name}: {side}" if number == 0 else side
@@ -157,9 +157,9 @@ def _draw_loops(
     for number, step in enumerate(item.steps):
         middle_m = step.middle_m
         if with_samples and number == len(item.steps) - 1:
-            every = max(1, len(item.height_m) // _MOST_SAMPLES)
+            every = max(1, len(item.record.height_m) // _MOST_SAMPLES)
             heights.plot(
-                1e3 * (item.height_m[::every] - middle_m), item.force_n[::every], ".",
+                1e3 * (item.record.height_m[::every] - middle_m), item.record.force_n[::every], ".",
                 color="#9aa5b1", markersize=1.5, zorder=1,
             )  # fmt: skip
         for place, stroke in enumerate(step.strokes):
@@ -179,8 +179,8 @@ def _headline(found: Sequence[Characteristics]) -> str:
         down, up = fastest.compression, fastest.rebound
         steps = f"{len(item.steps)} steps" if len(item.steps) > 1 else "one step"
         parts.append(
-            f"{item.name}: {steps}, {down.force_at_peak_velocity.value:.0f} N in compression and "
-            f"{up.force_at_peak_velocity.value:.0f} N in rebound at "
+            f"{item.name}: {steps}, {down.force_at_peak_velocity_n.value:.0f} N in compression and "
+            f"{up.force_at_peak_velocity_n.value:.0f} N in rebound at "
             f"{fastest.peak_speed_m_per_s:.3g} m/s."
         )
     return " ".join(parts)
@@ -192,9 +192,9 @@ def _record(item: Characteristics) -> dict[str, object]:
         {"kind": kind_words(kind), "cells": _cells(step, warm=warm)}
         for kind, step in zip(item.damper.kinds, item.steps, strict=True)
     ]
-    name = f"{item.name}, strut {item.strut}" if item.strut else item.name
+    name = f"{item.name}, strut {item.record.strut}" if item.record.strut else item.name
     return {
-        "name": f"{name} (force: {item.source})",
+        "name": f"{name} (force: {item.record.source})",
         "warm": warm,
         "rows": rows,
         "damper": damper_rows(item),
@@ -204,7 +204,7 @@ def _record(item: Characteristics) -> dict[str, object]:
 
 def _cells(step: DynoStep, *, warm: bool) -> list[str]:
     down, up = step.compression, step.rebound
-    speeds = dict.fromkeys(f"{side.peak_velocity.value:.3g}" for side in (down, up))
+    speeds = dict.fromkeys(f"{side.peak_velocity_m_per_s.value:.3g}" for side in (down, up))
     temperature = "—" if step.temperature_c is None else f"{step.temperature_c:.1f}"
     return [
         f"{step.cycles:g}",
@@ -212,10 +212,10 @@ def _cells(step: DynoStep, *, warm: bool) -> list[str]:
         "—" if step.frequency_hz is None else f"{step.frequency_hz:.3f}",
         *([temperature] if warm else []),
         " / ".join(speeds),
-        with_half(down.force_at_peak_velocity),
-        with_half(up.force_at_peak_velocity),
-        with_half(step.energy_per_cycle),
-        with_half(step.equivalent_damping),
+        with_half(down.force_at_peak_velocity_n),
+        with_half(up.force_at_peak_velocity_n),
+        with_half(step.energy_per_cycle_j),
+        with_half(step.equivalent_damping_n_s_per_m),
     ]
 
 
@@ -228,16 +228,16 @@ def damper_rows(item: Characteristics) -> list[tuple[str, str, str, str]]:
     """Figures over all steps and at rest: name, value, interval and method."""
     damper = item.damper
     named = [
-        ("gas force", damper.gas_force, "N"),
-        ("gas spring rate", damper.gas_rate, "N/m"),
-        ("friction", damper.friction, "N"),
-        *[(f"knee, {side}", figure, "m/s") for side, figure in damper.knee.items()],
+        ("gas force", damper.gas_force_n, "N"),
+        ("gas spring rate", damper.gas_rate_n_per_m, "N/m"),
+        ("friction", damper.friction_n, "N"),
+        *[(f"knee, {side}", figure, "m/s") for side, figure in damper.knee_m_per_s.items()],
         ("rebound over compression", damper.asymmetry, ""),
         *[
             (f"change per kelvin, {side}", figure, "N/K")
-            for side, figure in damper.per_kelvin.items()
+            for side, figure in damper.force_per_kelvin_n_per_k.items()
         ],
-        *[(_place_of(hold), hold.force, "N") for hold in item.holds],
+        *[(_place_of(hold), hold.force_n, "N") for hold in item.holds],
     ]
     return [_row(name, figure, unit) for name, figure, unit in named if figure is not None]
 

@@ -5,7 +5,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from rig.dyno.characterise import characterise_arrays
+from rig.dyno.characterise import ForceRecord, characterise_record
 from tests.dyno.dynos import drawn, found
 
 
@@ -15,7 +15,7 @@ def study(cases, seed):
     hits = defaultdict(list)
     for _ in range(cases):
         dyno = drawn(rng)
-        [step] = characterise_arrays("drawn", *dyno.record(rng)).steps
+        [step] = characterise_record(ForceRecord("drawn", *dyno.record(rng))).steps
         figures = found(step)
         for name, truth in dyno.truth().items():
             pairs = zip(np.atleast_1d(truth), _each(figures[name]), strict=True)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rig.dyno.characterise import characterise_arrays
+from rig.dyno.characterise import ForceRecord, characterise_record
 from rig.dyno.faults import name_faults
 from rig.dyno.master import master_of
 
@@ -176,7 +176,9 @@ def with_play(damper, x, v, dt):
 
 
 def characterised(damper, seed):
-    return characterise_arrays(f"damper {seed}", *record(damper, np.random.default_rng(seed)))
+    return characterise_record(
+        ForceRecord(f"damper {seed}", *record(damper, np.random.default_rng(seed)))
+    )
 
 
 def one(job):

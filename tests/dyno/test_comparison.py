@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from can_dbc.errors import InputError
 from rig.cli.main import app
-from rig.dyno.characterise import characterise_arrays
+from rig.dyno.characterise import ForceRecord, characterise_record
 from rig.dyno.comparison import compare_dampers, trends_over_dose
 from rig.dyno.tolerance import evaluate_band, load_tolerance
 from tests.dyno.test_characteristics import written
@@ -40,7 +40,7 @@ def columns(seed, *, gas_n=200.0, friction_n=15.0, damping=1500.0):
 
 @cache
 def state(seed, **changed):
-    return characterise_arrays(f"state{seed}", *columns(seed, **changed))
+    return characterise_record(ForceRecord(f"state{seed}", *columns(seed, **changed)))
 
 
 def test_a_damper_does_not_differ_from_itself():
@@ -66,7 +66,7 @@ def test_a_damper_does_not_differ_from_itself():
     ],
 )
 def test_what_was_changed_is_found_and_nothing_else(changed, name, by, untouched):
-    found = {item.name: item for item in compare_dampers(state(1), state(2, **changed))}
+    found = {item.figure: item for item in compare_dampers(state(1), state(2, **changed))}
     item = found[name]
     assert item.differs
     assert item.change.low <= by <= item.change.high
@@ -76,14 +76,14 @@ def test_what_was_changed_is_found_and_nothing_else(changed, name, by, untouched
 def test_over_a_dose():
     pressures = (2.0, 4.0, 6.0, 8.0)
     states = [state(k, gas_n=50.0 * bar) for k, bar in enumerate(pressures)]
-    trends = {item.name: item for item in trends_over_dose(states, pressures)}
+    trends = {item.figure: item for item in trends_over_dose(states, pressures)}
     gas = trends["gas force"]
     assert gas.differs
     assert gas.is_straight
     assert gas.slope.low <= 50.0 <= gas.slope.high
     assert not trends["friction"].differs
     squared = [state(k, gas_n=10.0 * bar**2) for k, bar in enumerate(pressures)]
-    bent = {item.name: item for item in trends_over_dose(squared, pressures)}["gas force"]
+    bent = {item.figure: item for item in trends_over_dose(squared, pressures)}["gas force"]
     assert not bent.is_straight
     with pytest.raises(InputError, match="at least three different ones"):
         trends_over_dose(states, (1.0, 1.0, 1.0, 1.0))

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from can_dbc.errors import InputError
 from rig.cli.main import app
-from rig.dyno.characterise import characterise_arrays
+from rig.dyno.characterise import ForceRecord, characterise_record
 from rig.dyno.faults import name_faults
 from rig.dyno.master import cycle_of, master_of, with_compliance, with_play
 from tests.dyno.population import (
@@ -109,7 +109,7 @@ def test_a_master_of_another_test_is_refused():
 
 def test_a_master_without_a_slow_step_is_refused():
     fast = state(1)
-    damper = fast.damper._replace(gas_force=None)
+    damper = fast.damper._replace(gas_force_n=None)
     with pytest.raises(InputError, match="5 mm/s or less"):
         master_of(type(fast)(**{**vars(fast), "damper": damper}))
 
@@ -133,7 +133,7 @@ def test_a_size_beyond_all_that_are_tried_is_that_at_least():
 
 def test_a_force_of_the_wrong_sign_is_refused():
     t_s, height_m, force_n = record(Damper(), np.random.default_rng(1))
-    wrong = characterise_arrays("wrong", t_s, height_m, -force_n)
+    wrong = characterise_record(ForceRecord("wrong", t_s, height_m, -force_n))
     with pytest.raises(InputError, match="gives energy"):
         master_of(wrong)
     with pytest.raises(InputError, match="gives energy"):
