@@ -3,9 +3,6 @@
 from collections.abc import Sequence
 from typing import Any, Protocol, TypeVar
 
-AMBIENT_C = 20.0
-"""Damper temperature where none was measured."""
-
 
 class ModelState(Protocol):
     """State of a model, made by its plant and frozen."""

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from dart_model.spec import ModelSpec
     from rig.diagnosis.recording import Recording
-    from rig.formats.arrays import Run
+    from rig.formats.run_arrays import Run
     from rig.pages.notebook import Found
 
 __all__ = ["diagnose", "load_model", "open_run", "read_csv"]
@@ -41,9 +41,9 @@ def open_run(folder: Path | str) -> "Run":
     Raises:
         InputError: It is no run, or damaged.
     """
-    from rig.formats import arrays
+    from rig.formats import run_arrays
 
-    return arrays.open_run(folder)
+    return run_arrays.open_run(folder)
 
 
 def read_csv(path: Path | str, struts: Sequence[str] | None = None) -> "Recording":

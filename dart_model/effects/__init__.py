@@ -24,6 +24,7 @@ from dart_model.effects import (
     stop,
     unmodelled_mode,
 )
+from dart_model.effects.fade import AMBIENT_C
 from dart_model.effects.law import (
     Bench,
     Bounds,
@@ -38,6 +39,7 @@ from dart_model.effects.law import (
 )
 
 __all__ = [
+    "AMBIENT_C",
     "CATALOGUE",
     "FAMILY_WORDS",
     "Bench",

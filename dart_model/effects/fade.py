@@ -9,8 +9,9 @@ _FAMILY = "fade"
 _REFERENCE = "Dixon, The Shock Absorber Handbook (2007), 7.12, temperature effects"
 _FINAL = Parameter("final_fraction", "", 0.0, 3.0, "share of the damping that stays")
 _COLD = Parameter("reference_c", "°C", -273.15, 2000.0, "temperature with full damping")
-# ISO 1, the reference temperature of geometrical specifications; a bench hall has about as much.
-_STANDARD_C = 20.0
+AMBIENT_C = 20.0
+"""Damper temperature where none is measured: that of a bench hall, and the reference of ISO 1."""
+
 _LARGEST_EXPONENT = 40.0
 
 
@@ -92,19 +93,19 @@ def _shows_temperature(motion: Motion) -> bool:
 def _temperature_starts(motion: Motion) -> list[Start]:
     if not _shows_temperature(motion):
         return []
-    return grid([0.003, 0.015, -0.005], [_STANDARD_C])
+    return grid([0.003, 0.015, -0.005], [AMBIENT_C])
 
 
 @moving
 def _linear_temperature_starts(motion: Motion) -> list[Start]:
     if not _shows_temperature(motion):
         return []
-    return grid([0.01], [_STANDARD_C])
+    return grid([0.01], [AMBIENT_C])
 
 
 def _standard(_: Motion) -> tuple[float, float]:
     # Another reference temperature is another damping: no data distinguish the two.
-    return _STANDARD_C, _STANDARD_C
+    return AMBIENT_C, AMBIENT_C
 
 
 @moving

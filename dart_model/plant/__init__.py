@@ -20,6 +20,7 @@ import numpy as np
 from scipy.linalg import null_space  # pyright: ignore[reportUnknownVariableType]
 
 from can_dbc.errors import InputError
+from dart_model.effects import AMBIENT_C
 from dart_model.plant.backend import ManyCoordinates, OneCoordinate
 from dart_model.plant.fmu import MockUp
 from dart_model.plant.geometry import Array, Geometry, Jacobians, sample_positions
@@ -47,9 +48,6 @@ __all__ = [
     "PrescribedState",
     "PrescribedStrut",
 ]
-
-AMBIENT_C = 20.0
-"""Temperature at which a bench rests."""
 
 _RESTING_STEPS, _RESTING_STEP, _RESTED, _LONGEST_MOVE, _SPRINGLESS = 50, 1e-6, 1e-9, 0.1, 1e-9
 """Newton's method for a bench at rest: steps, difference and end (m or rad), longest move, and the

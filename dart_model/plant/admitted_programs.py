@@ -5,10 +5,10 @@ was imported is known by its content (SHA-256), so that it may lie anywhere.
 """
 
 import hashlib
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from can_dbc.atomic_file import write_whole
 from can_dbc.errors import InputError
 
 
@@ -64,9 +64,7 @@ def _write(fingerprints: Sequence[str]) -> None:
     path = _list()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
-        temporary.write_text("".join(f"{item}\n" for item in fingerprints), "ascii")
-        temporary.replace(path)
+        write_whole(path, "".join(f"{item}\n" for item in fingerprints))
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 

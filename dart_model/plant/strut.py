@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from can_dbc.errors import InputError
-from dart_model.effects import Effect, effect
+from dart_model.effects import AMBIENT_C, Effect, effect
 from dart_model.plant.fmu import MockUp
 from dart_model.spec import ModelSpec, StrutSpec
 
@@ -116,11 +116,11 @@ class Strut:
         internal = [0.0] * self._laws[-1].end
         try:
             by_height = [
-                self.force_n(x, 0.0, internal, 0.0, 0.0, 20.0, internal.copy())
+                self.force_n(x, 0.0, internal, 0.0, 0.0, AMBIENT_C, internal.copy())
                 for x in heights.tolist()
             ]
             by_velocity = [
-                self.force_n(self._free_length, v, internal, 0.0, 0.0, 20.0, internal.copy())
+                self.force_n(self._free_length, v, internal, 0.0, 0.0, AMBIENT_C, internal.copy())
                 for v in velocities.tolist()
             ]
         except (ArithmeticError, ValueError) as error:

@@ -8,7 +8,8 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from dart_model.protocol import AMBIENT_C, AnyPlant, LoadedModel
+from dart_model.effects import AMBIENT_C
+from dart_model.protocol import AnyPlant, LoadedModel
 from rig.bridge.estimator import Estimate, first_diverged, is_sensible
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample

@@ -15,7 +15,7 @@ from typing import Any, Protocol, TypeVar
 
 from msgspec import Struct
 
-from dart_model.protocol import AMBIENT_C
+from dart_model.effects import AMBIENT_C
 from rig.bridge.estimator import Estimate, is_sensible
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample

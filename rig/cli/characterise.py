@@ -1,6 +1,6 @@
 """`rig characterise`."""
 
-import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +13,6 @@ from rig.cli.output import (
     JUnitFile,
     Outcome,
     console,
-    finite,
     print_json,
     refuse_existing,
     table,
@@ -22,8 +21,8 @@ from rig.cli.output import (
 
 if TYPE_CHECKING:
     from rig.dyno.characterise import Characteristics
-    from rig.dyno.faults import Naming
-    from rig.dyno.tolerance import Judged
+    from rig.dyno.report import DamperReport
+    from rig.dyno.tolerance import PointVerdict
 
 EXAMPLES = (
     "Examples: `rig characterise dyno.csv` · `rig characterise left.csv right.csv --out found` · "
@@ -80,116 +79,54 @@ def characterise_command(
 ) -> None:
     """Find the figures of a damper: force over velocity, energy, gas, friction, knee, temperature.
 
-    Wants a record whose cycles repeat; several are laid over one another on the page. With a
+    The cycles of a record must repeat; the page lays several records over one another. With a
     tolerance the exit code is 1 unless every point of the band is proven to be kept, with a master
     unless the damper is as good as it.
     """
-    from rig.dyno.characterise import characterise
-    from rig.dyno.faults import named
-    from rig.dyno.master import master_of
-    from rig.dyno.tolerance import judged, load_tolerance
+    from rig.dyno.report import Criteria, content_of, evaluate_records, write_content
+    from rig.dyno.tolerance import load_tolerance
+    from rig.files.folders import refuse_full
 
-    _refuse(out, junit, is_judged=tolerance is not None or master is not None)
-    band = None if tolerance is None else load_tolerance(tolerance)
-    found = [characterise(path, strut) for path in runs]
-    good = None if master is None else master_of(characterise(master, strut))
-    namings = [None if good is None else named(item, good, scatter) for item in found]
-    points = [[] if band is None else judged(item.steps, item.damper.kinds, band) for item in found]
-    content = _content(found, points, namings, serial, None if band is None else band.name)
     if out is not None:
-        _write(found, points, namings, serial, content, out)
-    outcomes = _outcomes(found, points, namings)
+        refuse_full(out)
     if junit is not None:
+        refuse_existing(junit)
+        if tolerance is None and master is None:
+            raise InputError("--junit: expected --tolerance or --master, which it reports on")
+    band = None if tolerance is None else load_tolerance(tolerance)
+    reports = evaluate_records(runs, strut, Criteria(band, master, scatter))
+    content = content_of(reports, serial, band)
+    if out is not None:
+        from rig.pages.characteristics_page import write_characteristics_page
+
+        write_content(content, out)
+        write_characteristics_page(reports, out / "report.html", serial)
+    checks = [check for report in reports for check in report.checks()]
+    if junit is not None:
+        outcomes = [Outcome(check.name, check.words, not check.passes) for check in checks]
         write_junit(junit, f"rig characterise {serial or ''}".strip(), outcomes)
     if as_json:
         print_json(content)
     else:
-        for item, of, naming in zip(found, points, namings, strict=True):
-            _print(item, of)
-            if naming is not None:
-                console.print(f"Against the master: {naming.words()}.", markup=False)
+        for report in reports:
+            _print(report)
         if out is not None:
             console.print(f"Report: {out / 'report.html'}", markup=False)
-    if any(outcome.failed for outcome in outcomes):
+    if not all(check.passes for check in checks):
         raise typer.Exit(FAILED)
 
 
-def _refuse(out: Path | None, junit: Path | None, *, is_judged: bool) -> None:
-    """Refuse what would be overwritten, and a test report of nothing."""
-    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"--out {out}: holds something, expected a new or empty folder")
-    if junit is not None:
-        refuse_existing(junit)
-        if not is_judged:
-            raise InputError("--junit: says what is good, expected --tolerance or --master")
+def _print(report: "DamperReport") -> None:
+    record = report.characteristics
+    _print_steps(record)
+    _print_points(report.points)
+    for note in (*record.quality, *record.damper.notes):
+        console.print(f"- {note}", markup=False)
+    if report.against_master is not None:
+        console.print(f"Against the master: {report.against_master.words()}.", markup=False)
 
 
-def _content(
-    found: "list[Characteristics]",
-    points: "list[list[Judged]]",
-    namings: "list[Naming | None]",
-    serial: str | None,
-    band: str | None,
-) -> dict[str, object]:
-    """All of it, for a file."""
-    from rig.dyno.characterise import SCHEMA
-
-    return {
-        "schema": SCHEMA,
-        "serial": serial,
-        "tolerance": band,
-        "records": [
-            item.as_dict()
-            | {"points": [point.as_dict() for point in of]}
-            | {"against_master": None if naming is None else naming.as_dict()}
-            for item, of, naming in zip(found, points, namings, strict=True)
-        ],
-    }
-
-
-def _outcomes(
-    found: "list[Characteristics]",
-    points: "list[list[Judged]]",
-    namings: "list[Naming | None]",
-) -> list[Outcome]:
-    """What is good and what is not, for a CI server."""
-    outcomes = [
-        Outcome(
-            f"{item.name}: {point.side} at {point.velocity_m_per_s:g} m/s",
-            f"{point.verdict}: {point.words()}",
-            point.verdict != "pass",
-        )
-        for item, of in zip(found, points, strict=True)
-        for point in of
-    ]
-    outcomes += [
-        Outcome(f"{item.name}: against the master", naming.words(), not naming.passes)
-        for item, naming in zip(found, namings, strict=True)
-        if naming is not None
-    ]
-    return outcomes
-
-
-def _write(
-    found: "list[Characteristics]",
-    points: "list[list[Judged]]",
-    namings: "list[Naming | None]",
-    serial: str | None,
-    content: dict[str, object],
-    out: Path,
-) -> None:
-    from rig.pages.characteristics_page import write_characteristics_page
-
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(finite(content), indent=2, ensure_ascii=False) + "\n"
-        (out / "characteristics.json").write_text(text, "utf-8")
-    except OSError as error:
-        raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
-    write_characteristics_page(found, out / "report.html", points, namings, serial)
-
-
-def _print(item: "Characteristics", points: "list[Judged]") -> None:
+def _print_steps(record: "Characteristics") -> None:
     from rig.pages.characteristics_page import damper_rows, kind_words, with_half
 
     shown = table(
@@ -200,30 +137,31 @@ def _print(item: "Characteristics", points: "list[Judged]") -> None:
         "rebound N",
         "J a cycle",
         "N·s/m",
-        title=f"{item.name} (force: {item.source})",
+        title=f"{record.name} (force: {record.record.source})",
     )
-    for kind, step in zip(item.damper.kinds, item.steps, strict=True):
+    for kind, step in zip(record.damper.kinds, record.steps, strict=True):
         shown.add_row(
             kind_words(kind),
             f"±{1e3 * step.amplitude_m:.2f}",
             f"{step.peak_speed_m_per_s:.3g}",
-            with_half(step.compression.force_at_peak_velocity),
-            with_half(step.rebound.force_at_peak_velocity),
-            with_half(step.energy_per_cycle),
-            with_half(step.equivalent_damping),
+            with_half(step.compression.force_at_peak_velocity_n),
+            with_half(step.rebound.force_at_peak_velocity_n),
+            with_half(step.energy_per_cycle_j),
+            with_half(step.equivalent_damping_n_s_per_m),
         )
     console.print(shown)
-    rows = damper_rows(item)
+    rows = damper_rows(record)
     if rows:
-        over_all = table("over all steps", "value", "95 % interval", "how it was found")
+        over_all = table("over all steps", "value", "95 % interval", "method")
         for row in rows:
             over_all.add_row(*row)
         console.print(over_all)
+
+
+def _print_points(points: "Sequence[PointVerdict]") -> None:
     if points:
         band = table("point", "force", "verdict")
         for point in points:
             where = f"{point.side} at {point.velocity_m_per_s:g} m/s"
             band.add_row(where, point.words(), point.verdict)
         console.print(band)
-    for note in (*item.quality, *item.damper.notes):
-        console.print(f"- {note}", markup=False)

@@ -29,7 +29,7 @@ def compare_command(
     dose: Annotated[
         list[float] | None,
         typer.Option(
-            "--dose", metavar="NUMBER", help="Of each state: pressure, clicks, °C; once for each."
+            "--dose", metavar="NUMBER", help="Pressure, clicks, °C of a state; once for each."
         ),
     ] = None,
     strut: Annotated[
@@ -37,85 +37,84 @@ def compare_command(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Say what differs between two states of a damper, by how much, and what does not.
+    """Compare two states of a damper: which figures differ, by how much, and which do not.
 
-    With --dose, once for each state: how each figure changes over the dose.
+    With --dose, once for each state: the change of each figure over the dose.
     """
     from rig.dyno.characterise import characterise
-    from rig.dyno.comparison import compared, over_dose
+    from rig.dyno.comparison import compare_dampers, trends_over_dose
 
     if not dose and len(runs) != 2:
         raise InputError(f"{len(runs)} records, expected two, or --dose once for each")
-    found = [characterise(path, strut) for path in runs]
+    records = [characterise(path, strut) for path in runs]
     if dose:
-        trends = over_dose(found, dose)
+        trends = trends_over_dose(records, dose)
         if as_json:
-            print_json({"schema": 1, "trends": [item.as_dict() for item in trends]})
+            print_json({"schema": 1, "trends": trends})
         else:
             _print_trends(trends)
-            _print_unpaired(found)
+            _print_not_compared(records)
         return
-    differences = compared(found[0], found[1])
+    differences = compare_dampers(records[0], records[1])
     if as_json:
-        print_json({"schema": 1, "differences": [item.as_dict() for item in differences]})
+        print_json({"schema": 1, "differences": differences})
         return
-    _print_differences(differences, found[0].name, found[1].name)
-    _print_unpaired(found)
+    _print_differences(differences, records[0].name, records[1].name)
+    _print_not_compared(records)
 
 
-def _print_unpaired(found: "list[Characteristics]") -> None:
-    from rig.dyno.comparison import unpaired
+def _print_not_compared(records: "list[Characteristics]") -> None:
+    from rig.dyno.comparison import steps_without_partner
 
-    for text in unpaired(found):
+    for text in steps_without_partner(records):
         console.print(f"- not compared: {text}", markup=False)
 
 
-def _print_differences(found: "list[Difference]", before: str, after: str) -> None:
+def _print_differences(differences: "list[Difference]", before: str, after: str) -> None:
+    from rig.pages.characteristics_page import with_half
+
     shown = table("figure", before, after, "change, 95 % interval", title="What differs")
     same: list[str] = []
-    for item in found:
+    for item in differences:
         if not item.differs:
             unit = f" {item.unit}" if item.unit else ""
-            same.append(f"{item.name} (by at most {_reach(item.change)}{unit})")
+            same.append(f"{item.figure} (by at most {_bound(item.change)}{unit})")
             continue
         shown.add_row(
-            item.name, _number(item.before), _number(item.after), _interval(item.change, item.unit)
+            item.figure,
+            with_half(item.before),
+            with_half(item.after),
+            _interval(item.change, item.unit),
         )
     if shown.rows:
         console.print(shown)
     else:
-        console.print("Nothing that was compared differs by more than chance.")
+        console.print("No figure that was compared differs by more than chance.")
     if same:
         console.print(f"Not shown to differ: {'; '.join(same)}.", markup=False)
 
 
-def _print_trends(found: "list[Trend]") -> None:
+def _print_trends(trends: "list[Trend]") -> None:
     shown = table("figure", "change per unit of dose", "at zero", "", title="Over the dose")
-    for item in found:
+    for item in trends:
         if item.differs:
-            shape = "straight" if item.is_straight else "bent: a line is not all"
+            shape = "straight" if item.is_straight else "bent: no straight line"
             shown.add_row(
-                item.name,
+                item.figure,
                 _interval(item.slope, item.unit),
                 f"{item.at_zero:.4g} {item.unit}",
                 shape,
             )
     if shown.rows:
         console.print(shown)
-    same = [item.name for item in found if not item.differs]
+    same = [item.figure for item in trends if not item.differs]
     if same:
         console.print(f"No change over the dose: {'; '.join(same)}.", markup=False)
-
-
-def _number(figure: "Figure") -> str:
-    from rig.pages.characteristics_page import with_half
-
-    return with_half(figure)
 
 
 def _interval(figure: "Figure", unit: str) -> str:
     return f"{figure.value:+.3g} {unit} ({figure.low:+.3g} to {figure.high:+.3g})"
 
 
-def _reach(figure: "Figure") -> str:
+def _bound(figure: "Figure") -> str:
     return f"{max(abs(figure.low), abs(figure.high)):.2g}"

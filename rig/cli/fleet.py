@@ -1,7 +1,9 @@
-"""`rig fleet`: many runs at once, a store of what was found, and reports over it."""
+"""`rig fleet`: many runs at once, a store of their results, and reports over it."""
 
+import contextlib
 import csv
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,11 +18,8 @@ from rig.cli.output import FAILED, OK, JsonFlag, console, print_json, table
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator
 
-    from rig.fleet.campaign import Progress as State
+    from rig.fleet.campaign import CampaignProgress
     from rig.fleet.overview import Overview
-
-import contextlib
-import time
 
 RUN = "run"
 
@@ -36,7 +35,7 @@ class _OrRun(TyperGroup):
 
 app = typer.Typer(
     cls=_OrRun,
-    help="Many runs of many dampers: diagnose them, keep what was found, report over it. "
+    help="Many runs of many dampers: diagnose them, keep the results, report over them. "
     "`rig fleet SOURCE...` is `rig fleet run SOURCE...`.",
     no_args_is_help=True,
 )
@@ -67,9 +66,10 @@ def run_command(
         ),
     ],
     model: Annotated[
-        str, typer.Option("--model", metavar="MODEL", help="Model file, or a shipped one's name.")
+        str,
+        typer.Option("--model", metavar="MODEL", help="Model file, or a shipped one's name."),
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="STORE", help="Store, new or begun.")],
+    out: Annotated[Path, typer.Option("--out", metavar="STORE", help="Store, new or to continue.")],
     path: Annotated[
         str | None,
         typer.Option(
@@ -95,66 +95,44 @@ def run_command(
     ] = False,
     as_json: JsonFlag = False,
 ) -> int:
-    """Diagnose many runs, each by itself, and keep what was found in a store of Parquet files.
+    """Diagnose many runs, each by itself, and keep the results in a store of Parquet files.
 
-    What is in the store is not computed again: a fleet that was ended is gone on with by the same
-    command. A run that fails is a row with its error. Exit code 1 if any failed now.
+    What is in the store is not computed again: the same command continues a fleet that was
+    interrupted. A run that fails is a row with its error. Exit code 1 if any failed now.
     """
     from dart_model.spec import model_file
-    from rig.fleet.campaign import campaign, model_of
+    from rig.fleet.campaign import load_fleet_model, run_campaign
     from rig.fleet.executors import dask as dask_at
     from rig.fleet.executors import processes
-    from rig.fleet.sources import find_sources, shard_of
+    from rig.fleet.sources import find_sources, parse_shard, select_shard
+    from rig.fleet.store import refuse_other
 
     if jobs is not None and dask is not None:
         raise InputError("--jobs and --dask: expected one of them")
-    part = None if shard is None else _shard(shard)
-    given = model_of(model_file(model, Path()))  # Refused now, not by every worker.
-    _refuse_other(out)
-    found = find_sources(sources, path)
+    part = None if shard is None else parse_shard(shard)
+    nominal = load_fleet_model(model_file(model, Path()))  # refused now, not by every worker
+    refuse_other(out)
+    runs = find_sources(sources, path)
     if part is not None:
-        found = shard_of(found, *part)
+        runs = select_shard(runs, *part)
     computing = contextlib.nullcontext(processes(jobs)) if dask is None else dask_at(dask)
     with computing as engine:
         if not as_json:
-            console.print(f"{len(found)} runs, {engine.words}", markup=False)
-        with _shown() as show:
-            end = campaign(
-                found, given, out, engine.make, engine.window, again=again, progress=show
+            console.print(f"{len(runs)} runs, {engine.words}", markup=False)
+        with _progress() as show:
+            end = run_campaign(
+                runs, nominal, out, engine.make, engine.window, again=again, progress=show
             )
     if as_json:
         print_json(end._asdict())
     else:
-        console.print(_sentence(end), markup=False)
+        console.print(end.words, markup=False)
         console.print(f"Store: {out}", markup=False)
     return FAILED if end.failed else OK
 
 
-def _shard(text: str) -> tuple[int, int]:
-    first, _, last = text.partition("/")
-    is_number = text.isascii() and first.isdecimal() and last.isdecimal()
-    if not (is_number and 1 <= int(first) <= int(last)):
-        raise InputError(f"--shard {text!r}: expected I/N with I from 1 to N, such as 3/16")
-    return int(first), int(last)
-
-
-def _refuse_other(out: Path) -> None:
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: is a file, expected a folder")
-    if out.is_dir() and any(out.iterdir()) and not (out / "values").is_dir():
-        raise InputError(f"{out}: holds something else, expected a store or a new folder")
-
-
-def _sentence(end: "State") -> str:
-    rate = end.done / end.elapsed_s if end.elapsed_s > 0.0 else 0.0
-    return (
-        f"{end.done} evaluated in {end.elapsed_s:.1f} s ({rate:.2f} a second), "
-        f"{end.failed} of them failed; {end.skipped} were in the store"
-    )
-
-
 @contextlib.contextmanager
-def _shown() -> "Generator[Callable[[State], None]]":
+def _progress() -> "Generator[Callable[[CampaignProgress], None]]":
     """A bar, or a line every ten seconds where there is no terminal."""
     from rich.console import Console
 
@@ -172,7 +150,7 @@ def _shown() -> "Generator[Callable[[State], None]]":
         return
     due_s = time.monotonic() + 10.0
 
-    def line(now: "State") -> None:
+    def line(now: "CampaignProgress") -> None:
         nonlocal due_s
         if time.monotonic() >= due_s:
             due_s = time.monotonic() + 10.0
@@ -223,34 +201,34 @@ def report_command(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """What a store says as a whole: verdicts, change-points, wear, outliers, jumps of a bench."""
-    from rig.fleet.overview import overview
+    """Summarise a store: verdicts, change-points, wear, outliers, jumps of a bench."""
+    from rig.fleet.overview import read_overview
 
     if out is not None and out.exists():
         raise InputError(f"{out}: exists, expected a new file")
-    found = overview(store)
+    whole = read_overview(store)
     if as_json:
-        print_json(found.as_dict())
+        print_json(whole.as_dict())
     else:
-        _print(found)
+        _print(whole)
     if out is not None:
         from rig.pages.fleet_page import write_fleet_page
 
-        write_fleet_page(found, out)
+        write_fleet_page(whole, out)
         if not as_json:
             console.print(f"Written: {out}", markup=False)
 
 
-def _print(found: "Overview") -> None:
-    from rig.fleet.sentences import alarms
+def _print(whole: "Overview") -> None:
+    from rig.fleet.sentences import alarm_sentences
 
-    console.print(found.words, markup=False)
+    console.print(whole.words, markup=False)
     shown = table("bench", "verdicts")
-    for bench, counts in found.verdicts.items():
-        said = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
-        shown.add_row(escape(bench), said)
+    for bench, counts in whole.verdicts.items():
+        text = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
+        shown.add_row(escape(bench), text)
     console.print(shown)
-    for line in alarms(found) or ["Nothing changed, drifts or stands out."]:
+    for line in alarm_sentences(whole) or ["Nothing changed, drifts or stands out."]:
         console.print(f"- {line}", markup=False)
-    for error, count in list(found.failed.items())[:5]:
+    for error, count in list(whole.failed.items())[:5]:
         console.print(f"failed, {count}: {error}", markup=False, style="red")

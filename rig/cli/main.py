@@ -17,8 +17,9 @@ from rig.cli import (
     demo,
     diagnose,
     docs,
-    export_import,
+    export,
     fleet,
+    import_,
     init,
     replay,
     report,
@@ -57,8 +58,8 @@ app.command("timing", epilog=timing.EXAMPLES)(timing.timing)
 app.command("replay", epilog=replay.EXAMPLES)(replay.replay_command)
 app.command("diagnose", epilog=diagnose.EXAMPLES)(diagnose.diagnose)
 app.add_typer(fleet.app, name=_GROUPS[1])
-app.command("import", epilog=export_import.IMPORT_EXAMPLES)(export_import.import_command)
-app.command("export", epilog=export_import.EXPORT_EXAMPLES)(export_import.export_command)
+app.command("import", epilog=import_.EXAMPLES)(import_.import_command)
+app.command("export", epilog=export.EXAMPLES)(export.export_command)
 app.command("docs", epilog=docs.EXAMPLES)(docs.docs)
 app.command("report", epilog=report.EXAMPLES)(report.report)
 

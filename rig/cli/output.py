@@ -1,10 +1,9 @@
 """Where commands print and write, and the exit codes they end with."""
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple, cast
+from typing import Annotated, NamedTuple
 from xml.etree import ElementTree
 
 import typer
@@ -12,6 +11,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from can_dbc.errors import InputError
+from rig.files.json_text import json_text
 
 OK, FAILED, WRONG_INPUT = 0, 1, 2
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file.")]
@@ -45,17 +45,7 @@ def table(*heads: str, title: str | None = None) -> Table:
 
 def print_json(content: object) -> None:
     """Print as JSON; numbers that are not finite become null."""
-    typer.echo(json.dumps(finite(content), indent=2, ensure_ascii=False))
-
-
-def finite(content: object) -> object:
-    """Content for JSON, which knows no number that is not finite: these become null."""
-    if isinstance(content, dict):
-        items = cast("dict[object, object]", content).items()
-        return {str(key): finite(item) for key, item in items}
-    if isinstance(content, list | tuple):
-        return [finite(item) for item in cast("list[object]", content)]
-    return None if isinstance(content, float) and not math.isfinite(content) else content
+    typer.echo(json_text(content), nl=False)
 
 
 def refuse_existing(path: Path) -> None:

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.protocol import AMBIENT_C, AnyPlant
+from dart_model.effects import AMBIENT_C
+from dart_model.protocol import AnyPlant
 from rig.closed_loop.derivatives import central_differences
 from rig.closed_loop.strut_response import StrutResponse, strut_responses
 from rig.observers.protocol import AnyObserver, Innovation, Start

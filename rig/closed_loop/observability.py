@@ -20,7 +20,8 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.protocol import AMBIENT_C, AnyPlant
+from dart_model.effects import AMBIENT_C
+from dart_model.protocol import AnyPlant
 from rig.closed_loop.derivatives import central_differences
 
 Array = NDArray[np.float64]

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.protocol import AMBIENT_C, AnyPlant
+from dart_model.effects import AMBIENT_C
+from dart_model.protocol import AnyPlant
 from rig.closed_loop.derivatives import central_differences
 
 _SECANT_M, _SECANT_M_PER_S = 2e-3, 0.1

@@ -135,7 +135,11 @@ def run_case(
     plan = load_plan(CONFIGS / f"{name}.yaml", duration_s=duration_s)
     bench = load_bench_config(CONFIGS / f"{name}_bench.yaml")
     ended = with_bench(
-        plan, bench, folder / "run", lockstep=lockstep, control=RunControl(stop=stop, watch=watch)
+        plan,
+        bench,
+        folder / "run",
+        lockstep=lockstep,
+        control=RunControl(stop=stop, watch=watch),
     )
     case = compared(ended, plan, bench)
     (folder / "summary.json").write_text(json.dumps(case.summary(), indent=2) + "\n", "utf-8")

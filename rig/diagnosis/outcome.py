@@ -1,18 +1,16 @@
 """What a diagnosis found, as a value, and its JSON."""
 
 import dataclasses
-import json
-import math
-import os
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from can_dbc.atomic_file import write_whole
 from dart_model.spec import ModelSpec, copy_files, dump_model
+from rig.files.json_text import json_text
 
 Array = NDArray[np.float64]
 Verdict = Literal["nothing_missing", "explained", "partly_explained", "ambiguous", "not_explained"]
@@ -298,19 +296,7 @@ class Result:
 
 def to_json(diagnosis: Diagnosis) -> str:
     """The diagnosis as JSON text; numbers that are not finite become null."""
-    data = {"schema": SCHEMA} | dataclasses.asdict(diagnosis)
-    return json.dumps(_finite(data), indent=2, ensure_ascii=False) + "\n"
-
-
-def _finite(value: object) -> object:
-    if isinstance(value, dict):
-        items = cast("dict[object, object]", value).items()
-        return {str(key): _finite(item) for key, item in items}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in cast("list[object]", value)]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return json_text({"schema": SCHEMA} | dataclasses.asdict(diagnosis))
 
 
 def write_results(result: Result, nominal: ModelSpec, folder: Path) -> None:
@@ -320,21 +306,6 @@ def write_results(result: Result, nominal: ModelSpec, folder: Path) -> None:
         OSError: The folder cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / CORRECTED_FILE, dump_model(result.corrected))
-    write_text(folder / DIAGNOSIS_FILE, to_json(result.diagnosis))
+    write_whole(folder / CORRECTED_FILE, dump_model(result.corrected))
+    write_whole(folder / DIAGNOSIS_FILE, to_json(result.diagnosis))
     copy_files(nominal, folder)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file so that nobody ever sees half of it."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(name).chmod(0o644)
-        Path(name).replace(path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise

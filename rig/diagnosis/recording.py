@@ -4,11 +4,9 @@ A recording that cannot be diagnosed is refused here with one line that says wha
 would help, before anything is computed from it.
 """
 
-import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +18,8 @@ from can_dbc.errors import InputError
 from can_dbc.protection import check_crc_log
 from rig.channels.channel import Channel
 from rig.channels.quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE, Quantity
+from rig.diagnosis.clipping import find_long_plateaus
+from rig.files.delimited_text import read_csv_columns
 from rig.log.reader import RunFolder
 from rig.log.reader import read_run as read_run_folder
 from rig.plan.load import plan_of_run
@@ -35,19 +35,11 @@ _OF_A_STRUT = ("height_m", "strut_force_n")
 _LEAST_SAMPLES = 200
 _LEAST_DURATION_S = 0.5
 _LARGEST_BYTES = 2_000_000_000
-_LARGEST_SAMPLES = 5_000_000
 _LARGEST_HEIGHT_M = 100.0
 _MOST_MISSING = 0.3
 """Share of missing heights above which a sensor is taken for broken."""
 _LONGEST_STEP_S = 0.05
 """Usual time between samples above which a time in other units is more likely."""
-_LONGEST_PLATEAU = 0.002
-"""Share of the samples that a signal that is not clipped may stand at its extreme value on end."""
-_STANDS = 4
-"""Samples on end at an extreme value that are no coincidence."""
-_FULL_SPEED = 0.3
-"""Share of its usual speed with which a signal enters a plateau by being clipped: one that comes
-to rest slows down before."""
 
 
 class RecordingError(InputError):
@@ -114,16 +106,15 @@ def read_csv(path: Path, struts: Sequence[str] | None = None) -> Recording:
         RecordingError: The file is no such table, or holds no run that can be diagnosed.
     """
     name = path.name
-    columns, table = _read_table(path)
-    for i, column in enumerate(columns):
-        bad = ~np.isfinite(table[:, i])
-        if np.any(bad):
-            raise RecordingError(
-                f"{name}: line {int(np.argmax(bad)) + 2}: {column} is no finite number "
-                f"({int(bad.sum())} such values), expected numbers: leave out rows without a "
-                "measurement, gaps in time are understood"
-            )
-    values = {column: table[:, i] for i, column in enumerate(columns)}
+    try:
+        values, _ = read_csv_columns(
+            path, name, _LARGEST_BYTES, lambda header: _check_header(name, header)
+        )
+    except InputError as error:
+        raise RecordingError(str(error)) from error
+    columns, samples = list(values), len(values["t_s"])
+    if not samples:
+        raise RecordingError(f"{name}: holds no samples, expected at least {_LEAST_SAMPLES}")
     names = _struts_of(name, columns, struts)
     heights = [_column_of(name, values, "height_m", strut, names) for strut in names]
     if any(height is None for height in heights):
@@ -136,13 +127,13 @@ def read_csv(path: Path, struts: Sequence[str] | None = None) -> Recording:
             values["t_s"],
             np.column_stack([height for height in heights if height is not None]),
             values.get("applied_force_n"),
-            _stacked(cells, len(table)),
+            _stack_columns(cells, samples),
             values.get("temperature_c"),
         )
     )
 
 
-def _stacked(cells: Sequence[Array | None], samples: int) -> Array | None:
+def _stack_columns(cells: Sequence[Array | None], samples: int) -> Array | None:
     if all(cell is None for cell in cells):
         return None
     return np.column_stack([np.full(samples, np.nan) if cell is None else cell for cell in cells])
@@ -173,28 +164,10 @@ def _struts_of(name: str, columns: Sequence[str], struts: Sequence[str] | None) 
     return list(struts)
 
 
-def _read_table(path: Path) -> tuple[list[str], Array]:
-    name = path.name
-    try:
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise RecordingError(
-                f"{name}: larger than {_LARGEST_BYTES} bytes, expected a shorter run"
-            )
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            first = next(csv.reader(file), None)
-            if first is None:
-                raise RecordingError(f"{name}: is empty, expected a header {','.join(COLUMNS[:3])}")
-            columns = [column.strip() for column in first]
-            _check_header(name, columns)
-            return columns, _read_rows(name, columns, file)
-    except OSError as error:
-        raise RecordingError(f"{name}: cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        reason = " ".join(str(error).split())
-        raise RecordingError(f"{name}: is no CSV text in UTF-8: {reason}") from error
-
-
-def _check_header(name: str, columns: list[str]) -> None:
+def _check_header(name: str, columns: list[str]) -> list[str]:
+    """The columns of a file's header, all of them, if they are those of a recording."""
+    if not columns:
+        raise RecordingError(f"{name}: is empty, expected a header {','.join(COLUMNS[:3])}")
     kinds: list[str] = []
     for column in columns:
         kind, colon, strut = column.partition(":")
@@ -204,52 +177,17 @@ def _check_header(name: str, columns: list[str]) -> None:
                 "a height or strut force with its strut as in height_m:tyre"
             )
         if columns.count(column) > 1:
-            raise RecordingError(
-                f"{name}: header: column {column} stands there twice, expected once"
-            )
+            raise RecordingError(f"{name}: header: column {column} occurs twice, expected once")
         kinds.append(kind)
     for column in COLUMNS[:2]:
         if column not in kinds:
             raise RecordingError(f"{name}: header: column {column} is missing, expected it")
     if "applied_force_n" not in kinds and "strut_force_n" not in kinds:
         raise RecordingError(
-            f"{name}: header: expected applied_force_n or strut_force_n beside t_s and height_m"
+            f"{name}: header: expected applied_force_n or strut_force_n, in addition to t_s and "
+            "height_m"
         )
-
-
-def _read_rows(name: str, columns: list[str], lines: object) -> Array:
-    rows: list[list[str]] = []
-    for number, row in enumerate(csv.reader(cast("list[str]", lines)), start=2):
-        if not row:
-            continue
-        if len(row) != len(columns):
-            raise RecordingError(
-                f"{name}: line {number}: {len(row)} values, expected {len(columns)}"
-            )
-        rows.append(row)
-        if len(rows) > _LARGEST_SAMPLES:
-            raise RecordingError(f"{name}: more than {_LARGEST_SAMPLES} samples, expected fewer")
-    if not rows:
-        raise RecordingError(f"{name}: holds no samples, expected at least {_LEAST_SAMPLES}")
-    table = np.empty((len(rows), len(columns)))
-    for i, column in enumerate(columns):
-        cells = [row[i].strip() or "nan" for row in rows]
-        try:
-            table[:, i] = np.array(cells, dtype=np.float64)
-        except ValueError:
-            bad = next(k for k, cell in enumerate(cells) if not _is_number(cell))
-            raise RecordingError(
-                f"{name}: line {bad + 2}: {column} = {cells[bad][:40]!r}, expected a number"
-            ) from None
-    return table
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
+    return columns
 
 
 # --- Run folders ------------------------------------------------------------------------------
@@ -401,7 +339,7 @@ def checked(recording: Recording) -> Recording:
                 f"{advice}"
             )
         if label == "strut_force_n":
-            _check_clipped(name, label, "N", channel)
+            _refuse_clipped(name, label, "N", channel)
     return recording
 
 
@@ -458,30 +396,14 @@ def _check_height(name: str, height_m: Array) -> None:
             f"{name}: height_m is constant at {heights[0]:.6g} m, "
             "expected motion: is the sensor connected?"
         )
-    _check_clipped(name, "height_m", "m", heights)
+    _refuse_clipped(name, "height_m", "m", heights)
 
 
-def _check_clipped(name: str, label: str, unit: str, values: Array) -> None:
-    """Refuse a signal that stands at an extreme value which it entered at full speed."""
-    steps = np.diff(np.unique(values))
-    if len(steps) == 0 or float(np.ptp(values)) <= 50.0 * float(steps.min()):
-        return
-    usual = float(np.mean(np.abs(np.diff(values))))
-    for extreme, limit in (("lowest", float(values.min())), ("highest", float(values.max()))):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], values == limit, [0]])))
-        firsts, lasts = edges[::2], edges[1::2]
-        length = int(np.max(lasts - firsts))
-        if length <= max(20, _LONGEST_PLATEAU * len(values)):
-            continue
-        speeds = [
-            float(np.mean(np.abs(np.diff(values[max(first - 4, 0) : first + 1]))))
-            for first in firsts[lasts - firsts > _STANDS]
-            if first > 0
-        ]
-        if not speeds or float(np.median(speeds)) < _FULL_SPEED * usual:
-            continue  # It came to rest there.
+def _refuse_clipped(name: str, label: str, unit: str, values: Array) -> None:
+    plateaus = find_long_plateaus(values)
+    if plateaus is not None:
         raise RecordingError(
-            f"{name}: {label} stays at its {extreme} value {limit:.6g} {unit} for {length} "
-            "samples on end, expected a sensor that is not clipped: widen its range or reduce "
-            "the load"
+            f"{name}: {label} stays at its {plateaus.extreme} value {plateaus.limit:.6g} {unit} "
+            f"for {int(np.max(plateaus.lengths))} samples in a row, expected a sensor that is not "
+            "clipped: widen its range or reduce the load"
         )

@@ -6,59 +6,59 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.dyno.figures import QUASI_STATIC_M_PER_S, Step
-from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, student
+from rig.dyno.figures import QUASI_STATIC_M_PER_S, DynoStep
+from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, student_factor
 
 Array = NDArray[np.float64]
 
 _ALIKE_SPEED = 0.05
-"""Relative difference of speed and amplitude up to which steps are the same, another time."""
+"""Relative difference of speed and amplitude up to which steps are repetitions of each other."""
 
 _LEAST_WARMING_K = 2.0
-"""Span of temperatures from which on a change per kelvin is told: sensors agree within one."""
+"""Least span of temperatures for a change per kelvin: sensors agree within one kelvin."""
 
 _WARM_UP = 2.0
-"""Times the cycles of the other steps that the first one has where it is a warm-up."""
+"""Ratio of the first step's cycles to those of the others, from which it is a warm-up."""
 
 _DRAWS = 300
-"""Of the curve, for the interval of a knee: its ends are known to a tenth of themselves."""
+"""Random curves for the interval of a knee, which determine its ends to a tenth."""
 
 _STRAIGHT = 1.25
-"""Ratio of the slopes below a knee and above it that is none."""
+"""Ratio of the slopes below and above, under which there is no knee."""
 
 _KNEE_POINTS = 60
 _LOWEST_OF_KNEE, _HIGHEST_OF_KNEE = 0.05, 0.9
-"""Shares of the peak speed between which a knee is looked for."""
+"""Shares of the peak speed between which a knee is searched."""
 
 _FEWEST_STROKES = 6
-"""Of a change per kelvin."""
+"""Fewest strokes for a change per kelvin."""
 
 
 class Damper(NamedTuple):
-    """Figures over all steps; None where the test does not tell them.
+    """Figures over all steps; None where the test does not determine them.
 
     Attributes:
         kinds: Of each step `warm_up`, `quasi_static` or `velocity_step`.
-        gas_force: At mid-stroke of the slowest step, in N.
-        gas_rate: Its rise per compression there, in N/m.
-        friction: Half the difference of both directions there, in N.
-        knee: By direction the speed in m/s at which the curve bends.
+        gas_force_n: At mid-stroke of the slowest step.
+        gas_rate_n_per_m: Its rise per compression there.
+        friction_n: Half the difference of both directions there.
+        knee_m_per_s: By direction the speed at which the curve bends.
         asymmetry: Rebound over compression at peak velocity of the fastest step, without gas.
-        per_kelvin: By direction the change of force per kelvin, in N/K.
+        force_per_kelvin_n_per_k: By direction the change of force per kelvin.
         notes: Why a figure is missing, and what was assumed.
     """
 
     kinds: tuple[str, ...]
-    gas_force: Figure | None
-    gas_rate: Figure | None
-    friction: Figure | None
-    knee: dict[str, Figure | None]
+    gas_force_n: Figure | None
+    gas_rate_n_per_m: Figure | None
+    friction_n: Figure | None
+    knee_m_per_s: dict[str, Figure | None]
     asymmetry: Figure | None
-    per_kelvin: dict[str, Figure | None]
+    force_per_kelvin_n_per_k: dict[str, Figure | None]
     notes: tuple[str, ...]
 
 
-def damper_of(steps: Sequence[Step]) -> Damper:
+def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
     """Figures of a damper.
 
     Args:
@@ -73,7 +73,11 @@ def damper_of(steps: Sequence[Step]) -> Damper:
         speed = 1e3 * slowest.peak_speed_m_per_s
         gas_force, gas_rate, friction = (
             figure._replace(method=f"{figure.method}, at {speed:.2g} mm/s")
-            for figure in (slowest.mean_force, slowest.spring_rate, slowest.half_difference)
+            for figure in (
+                slowest.mean_force_n,
+                slowest.spring_rate_n_per_m,
+                slowest.half_difference_n,
+            )
         )
         notes.append(
             f"friction and gas force are forces at {speed:.2g} mm/s: what bleeds there is in them, "
@@ -81,7 +85,7 @@ def damper_of(steps: Sequence[Step]) -> Damper:
         )
     else:
         notes.append(
-            "no step of 5 mm/s or less: friction, gas force and its rate are not told, and "
+            "no step of 5 mm/s or less: friction, gas force and its rate cannot be determined, and "
             "asymmetry is that of whole forces"
         )
     fastest = max(steps, key=lambda step: step.peak_speed_m_per_s)
@@ -90,7 +94,7 @@ def damper_of(steps: Sequence[Step]) -> Damper:
         for name, stroke in zip(("compression", "rebound"), fastest.strokes, strict=True)
     }
     if any(stroke.is_constant for stroke in fastest.strokes):
-        notes.append("no knee: the fastest step has one speed, which tells no curve")
+        notes.append("no knee: the fastest step has a single speed")
     elif not any(knee.values()):
         notes.append("no knee: the curve of the fastest step is straight within its noise")
     per_kelvin = {name: _per_kelvin(steps, index) for index, name in enumerate(knee)}
@@ -108,7 +112,7 @@ def damper_of(steps: Sequence[Step]) -> Damper:
     )
 
 
-def _kinds(steps: Sequence[Step]) -> tuple[str, ...]:
+def _kinds(steps: Sequence[DynoStep]) -> tuple[str, ...]:
     kinds = [
         "quasi_static" if step.peak_speed_m_per_s <= QUASI_STATIC_M_PER_S else "velocity_step"
         for step in steps
@@ -120,9 +124,9 @@ def _kinds(steps: Sequence[Step]) -> tuple[str, ...]:
     return tuple(kinds)
 
 
-def _asymmetry(step: Step, gas: Figure | None) -> Figure | None:
+def _asymmetry(step: DynoStep, gas: Figure | None) -> Figure | None:
     """Ratio of the forces, by the delta method."""
-    up, down = step.rebound.force_at_peak_velocity, step.compression.force_at_peak_velocity
+    up, down = step.rebound.force_at_peak_velocity_n, step.compression.force_at_peak_velocity_n
     offset = 0.0 if gas is None else gas.value
     rebound, compression = -(up.value - offset), down.value - offset
     if compression <= 0.0 or rebound <= 0.0:
@@ -140,41 +144,46 @@ def _asymmetry(step: Step, gas: Figure | None) -> Figure | None:
 
 
 def _knee(stroke: MeanStroke) -> Figure | None:
-    """Where two straight lines through the curve meet, with the percentiles of redrawn curves."""
+    """Speed where two straight lines through the curve meet; interval from random curves."""
     if stroke.is_constant:
-        return None  # one speed tells no curve
+        return None  # a single speed has no curve
     speed = np.abs(stroke.velocity_m_per_s)
     peak = float(speed.max())
     grid = np.linspace(0.03, 0.99, _KNEE_POINTS) * peak
     top = int(np.argmax(speed))
     if not 0 < top < len(speed) - 1:
         return None
-    # Both halves of the stroke: lag and spring, which turn their sign, drop out.
-    rows = np.array([0.5 * (_at(speed[: top + 1], v, 0) + _at(speed[top:], v, top)) for v in grid])
+    # Mean of both halves of the stroke, in which lag and spring cancel.
+    rows = np.array(
+        [
+            0.5 * (_force_row_at(speed[: top + 1], v, 0) + _force_row_at(speed[top:], v, top))
+            for v in grid
+        ]
+    )
     tried = np.linspace(_LOWEST_OF_KNEE, _HIGHEST_OF_KNEE, 2 * _KNEE_POINTS) * peak
     bases = [np.column_stack([np.ones_like(grid), grid, np.maximum(grid - v, 0.0)]) for v in tried]
     solvers = [np.linalg.pinv(base) for base in bases]
 
-    def found(force_n: Array) -> tuple[float, float]:
+    def best_knee(force_n: Array) -> tuple[float, float]:
         curve = rows @ force_n
-        left = [
+        squares = [
             float(np.sum((curve - base @ (solver @ curve)) ** 2))
             for base, solver in zip(bases, solvers, strict=True)
         ]
-        best = int(np.argmin(left))
+        best = int(np.argmin(squares))
         _, below, bend = solvers[best] @ curve
         above = below + bend
         steep, flat = max(abs(below), abs(above)), min(abs(below), abs(above))
         return float(tried[best]), steep / max(flat, 1e-12)
 
-    value, ratio = found(stroke.force_n)
+    value, ratio = best_knee(stroke.force_n)
     if ratio < _STRAIGHT:
         return None
     rng = np.random.default_rng(0)
     values, vectors = np.linalg.eigh(stroke.covariance)
     spread = vectors * np.sqrt(np.clip(values, 0.0, None))
     drawn = [
-        found(stroke.force_n + spread @ rng.standard_normal(len(values))) for _ in range(_DRAWS)
+        best_knee(stroke.force_n + spread @ rng.standard_normal(len(values))) for _ in range(_DRAWS)
     ]
     if np.mean([item[1] < _STRAIGHT for item in drawn]) > 0.05:
         return None
@@ -184,25 +193,25 @@ def _knee(stroke: MeanStroke) -> Figure | None:
     return Figure(value, low, high, "two straight lines through force over speed, fastest step")
 
 
-def _at(speed: Array, value: float, offset: int) -> Array:
+def _force_row_at(speed: Array, value: float, offset: int) -> Array:
     """Row over the angles that gives the force where a half stroke has a speed."""
     order = np.argsort(speed)
-    place = float(np.interp(value, speed[order], order.astype(np.float64)))
-    before = min(int(place), len(speed) - 2)
+    position = float(np.interp(value, speed[order], order.astype(np.float64)))
+    before = min(int(position), len(speed) - 2)
     row = np.zeros(len(ANGLES))
-    row[offset + before] = 1.0 - (place - before)
-    row[offset + before + 1] = place - before
+    row[offset + before] = 1.0 - (position - before)
+    row[offset + before + 1] = position - before
     return row
 
 
-def _per_kelvin(steps: Sequence[Step], index: int) -> Figure | None:
+def _per_kelvin(steps: Sequence[DynoStep], index: int) -> Figure | None:
     """Change of the force at peak velocity per kelvin over steps of one speed and amplitude."""
-    groups: list[list[Step]] = []
+    groups: list[list[DynoStep]] = []
     for step in steps:
         if step.temperature_c is None:
             return None
         for group in groups:
-            if _same(group[0], step):
+            if _is_same_step(group[0], step):
                 group.append(step)
                 break
         else:
@@ -215,14 +224,14 @@ def _per_kelvin(steps: Sequence[Step], index: int) -> Figure | None:
     return best
 
 
-def _same(a: Step, b: Step) -> bool:
+def _is_same_step(a: DynoStep, b: DynoStep) -> bool:
     return all(
         abs(x - y) <= _ALIKE_SPEED * x
         for x, y in ((a.peak_speed_m_per_s, b.peak_speed_m_per_s), (a.amplitude_m, b.amplitude_m))
     )
 
 
-def _slope(group: Sequence[Step], index: int) -> Figure | None:
+def _slope(group: Sequence[DynoStep], index: int) -> Figure | None:
     """Least squares through the strokes of like steps."""
     temperatures = np.concatenate([step.warmth[index][0] for step in group])
     forces = np.concatenate([step.warmth[index][1] for step in group])
@@ -230,10 +239,10 @@ def _slope(group: Sequence[Step], index: int) -> Figure | None:
         return None
     about = temperatures - temperatures.mean()
     slope = float(about @ forces) / float(about @ about)
-    left = forces - forces.mean() - slope * about
+    residual = forces - forces.mean() - slope * about
     freedom = len(forces) - 2
-    std = float(np.sqrt(left @ left / freedom / (about @ about)))
-    half = student(freedom) * std
+    std = float(np.sqrt(residual @ residual / freedom / (about @ about)))
+    half = student_factor(freedom) * std
     speed = group[0].peak_speed_m_per_s
     text = f"line through the strokes at {speed:.3g} m/s over {np.ptp(temperatures):.1f} K"
     return Figure(slope, slope - half, slope + half, text)

@@ -1,9 +1,9 @@
-"""What is wrong with a damper that is not as its master: named, with its size.
+"""Names the fault of a damper that differs from its master, with its size.
 
-Every fault that is known is run in the master, step by step; what it changes there is held against
-what the damper's mean strokes differ by from the master's. Good dampers differ too: by their
-measurement, and by what manufacturing scatters in gas force, friction, damping below and above the
-knee, and the knee's place. A fault is named where it explains far more than both.
+Every known fault is simulated in the master, step by step; its changes are compared with the
+differences between the damper's mean strokes and the master's. Good dampers differ too: by their
+measurement, and by the scatter of manufacturing in gas force, friction, damping below and above the
+knee, and the knee's speed. A fault is named if it explains far more than both.
 
 The comparison is that of Gaussian likelihoods: differences are normal about what a fault of some
 size makes of them, with a covariance of measurement, scatter and the model's own coarseness; the
@@ -20,14 +20,14 @@ from scipy.linalg import cho_factor, cho_solve  # pyright: ignore[reportUnknownV
 
 from can_dbc.errors import InputError
 from rig.dyno.characterise import Characteristics
-from rig.dyno.comparison import paired
-from rig.dyno.figures import Step
+from rig.dyno.comparison import pair_steps
+from rig.dyno.figures import DynoStep
 from rig.dyno.master import (
-    Curve,
     Cycle,
+    DampingCurve,
     Master,
     cycle_of,
-    refuse_unlike,
+    refuse_unsuitable,
     with_compliance,
     with_play,
 )
@@ -38,26 +38,26 @@ Array = NDArray[np.float64]
 _NAMED = 32.0
 """Fall of chi-squared from which on a fault is named. Of differences that are normal one in a
 million reaches 25 by chance; the model describes dampers but roughly. With this value and the
-shares below none of 420 good dampers was named (`python -m tests.characteristics.population`, seeds
+shares below none of 420 good dampers was named (`python -m tests.dyno.population`, seeds
 4 and 5), with a first choice of them seven of 720 were (seeds 2 to 4)."""
 
 _BINS = 24
 """Parts of a stroke whose samples' means are held against the master."""
 
 _OWN_SHARE = 0.004
-"""Of the largest force of a step: what the model leaves out at each angle by itself."""
+"""Model error at each angle, over the largest force of a step."""
 
 _DAMPING_SHARE = 0.02
-"""Of the damping at each angle: the same."""
+"""Model error at each angle, over the damping there."""
 
 _EXPLAINED = 0.5
-"""Share of what differs that faults have to explain to be named."""
+"""Share of the difference that faults have to explain to be named."""
 
 _MODEL_SHARE = 0.1
-"""Of what a fault changes: how well the run of it in the master is known."""
+"""Relative uncertainty of a fault's changes by the simulation in the master."""
 
 _SIZE_SHARE = 0.15
-"""Of a size: how well the run of a fault in the master tells it."""
+"""Relative uncertainty of a size by the simulation in the master."""
 
 _MOST_FAULTS = 2
 _SIZES = 401
@@ -68,11 +68,11 @@ _FALL = 3.84
 
 
 class Fault(NamedTuple):
-    """Something that can be wrong.
+    """A fault that can be simulated.
 
     Attributes:
-        name: What it is called.
-        quantity: What its size is.
+        name: Its name.
+        quantity: Meaning of its size.
         unit: Unit of the size.
         sizes: Sizes that are tried, rising, shape (K,).
         changes: What each changes of the stacked forces, shape (K, N).
@@ -89,12 +89,12 @@ class Fault(NamedTuple):
     most: float = np.inf
 
 
-class Named(NamedTuple):
-    """A fault that was found.
+class NamedFault(NamedTuple):
+    """A fault with its size.
 
     Attributes:
-        name: What it is called.
-        quantity: What its size is.
+        name: Its name.
+        quantity: Meaning of its size.
         unit: Unit of the size.
         size: Its size, with a 95 % interval.
         evidence: By how much it lowers chi-squared.
@@ -105,10 +105,6 @@ class Named(NamedTuple):
     unit: str
     size: Figure
     evidence: float
-
-    def as_dict(self) -> dict[str, object]:
-        """For a file."""
-        return {**self._asdict(), "size": self.size.as_dict()}
 
     def words(self) -> str:
         """The same in a line."""
@@ -121,8 +117,8 @@ class Named(NamedTuple):
         )
 
 
-class Naming(NamedTuple):
-    """What a damper is against its master.
+class MasterComparison(NamedTuple):
+    """Comparison of a damper with its master.
 
     Attributes:
         named: Faults, the one that explains most first; empty of a good damper.
@@ -132,7 +128,7 @@ class Naming(NamedTuple):
         not_compared: Steps of the master that the damper's record has not.
     """
 
-    named: tuple[Named, ...]
+    named: tuple[NamedFault, ...]
     is_good: bool
     explained: float
     not_compared: tuple[str, ...] = ()
@@ -151,12 +147,8 @@ class Naming(NamedTuple):
             return "as its master, within what manufacturing scatters"
         if not self.named:
             return "not as its master, and no fault that is known explains it"
-        found = "; ".join(item.words() for item in self.named)
-        return f"{found}: explains {100 * self.explained:.0f} % of what differs"
-
-    def as_dict(self) -> dict[str, object]:
-        """For a file."""
-        return {**self._asdict(), "named": [item.as_dict() for item in self.named]}
+        faults = "; ".join(item.words() for item in self.named)
+        return f"{faults}: explains {100 * self.explained:.0f} % of what differs"
 
 
 class _Stack(NamedTuple):
@@ -174,13 +166,13 @@ class _Stack(NamedTuple):
     less_n: Array
     noise_n: Array
 
-    def gathered(self, fine: Sequence[Array]) -> Array:
+    def bin_means(self, fine: Sequence[Array]) -> Array:
         """Curves over `FINE` of every stroke, shape (..., 361), as means over its parts."""
         parts = [curve @ rows.T for curve, rows in zip(fine, self.gathers, strict=True)]
         return np.concatenate(parts, axis=-1)
 
 
-def _stack(steps: Sequence[tuple[Step, Step]]) -> _Stack:
+def _stack(steps: Sequence[tuple[DynoStep, DynoStep]]) -> _Stack:
     strokes: list[MeanStroke] = []
     gathers: list[Array] = []
     less: list[Array] = []
@@ -203,57 +195,61 @@ def _fine(stroke: MeanStroke) -> Array:
     return stroke.row(FINE) @ stroke.force_n
 
 
-def named(found: Characteristics, master: Master, scatter: float) -> Naming:
-    """What is wrong with a damper.
+def name_faults(tested: Characteristics, master: Master, scatter: float) -> MasterComparison:
+    """The comparison of a damper with its master.
 
     Args:
-        found: The damper.
-        master: The good one, of the same test.
+        tested: Figures of the damper.
+        master: The good item, of the same test.
         scatter: Relative standard deviation that manufacturing leaves of each property.
 
     Raises:
-        InputError: No step of one has a partner in the other.
+        InputError: No step of item has a partner in the other.
     """
-    refuse_unlike(found)
-    steps = paired(master.characteristics, found)
+    refuse_unsuitable(tested)
+    steps = pair_steps(master.characteristics, tested)
     if not steps:
         raise InputError(
-            f"{found.name}, {master.characteristics.name}: no step of one speed and amplitude in "
+            f"{tested.name}, {master.characteristics.name}: no step of item speed and amplitude in "
             "common, expected the same test as the master's"
         )
     stack = _stack(steps)
     faults = [
-        fault._replace(changes=stack.gathered(np.split(fault.changes, len(stack.strokes), axis=1)))
-        for fault in faults_of(master, [theirs for theirs, _ in steps])
+        fault._replace(changes=stack.bin_means(np.split(fault.changes, len(stack.strokes), axis=1)))
+        for fault in simulate_faults(master, [theirs for theirs, _ in steps])
     ]
-    covariance, left = _covariance(stack, master, scatter), stack.less_n
-    count = len(left)
-    before = _chi_squared(left, covariance)
+    covariance, residual_n = _covariance(stack, master, scatter), stack.less_n
+    count = len(residual_n)
+    before = _misfit(residual_n, covariance)
     beyond = max(before - count, 1.0)
-    kept: list[Named] = []
+    kept: list[NamedFault] = []
     for _ in range(_MOST_FAULTS):
-        rest = [item for item in faults if item.name not in [one.name for one in kept]]
-        best = min((_tried(item, left, covariance) for item in rest), key=lambda item: item.misfit)
+        rest = [item for item in faults if item.name not in {named.name for named in kept}]
+        best = min(
+            (_fit_size(item, residual_n, covariance) for item in rest), key=lambda item: item.misfit
+        )
         if before - best.misfit < _NAMED:
             break
         fault = best.fault
-        kept.append(Named(fault.name, fault.quantity, fault.unit, best.size, before - best.misfit))
-        # What a fault makes is known but so well, and the less the more it makes.
-        left = left - best.explained_n
+        kept.append(
+            NamedFault(fault.name, fault.quantity, fault.unit, best.size, before - best.misfit)
+        )
+        # The uncertainty of a simulated fault grows with its size.
+        residual_n = residual_n - best.explained_n
         covariance = covariance + np.diag((_MODEL_SHARE * best.explained_n) ** 2)
-        before = _chi_squared(left, covariance)
+        before = _misfit(residual_n, covariance)
     remains = max(before - count, 0.0)
     is_good = not kept and remains <= (_WORST_MISFIT - 1.0) * count
     compared = [theirs for theirs, _ in steps]
     lacking = tuple(
         f"±{1e3 * step.amplitude_m:.3g} mm at {step.peak_speed_m_per_s:.3g} m/s"
         for step in master.characteristics.steps
-        if not any(step is one for one in compared)
+        if not any(step is other for other in compared)
     )
     if kept and remains > (1.0 - _EXPLAINED) * beyond:
-        kept = []  # the nearest fault is no name
+        kept = []  # the nearest fault does not explain enough
     explained = 1.0 if is_good else max(1.0 - remains / beyond, 0.0)
-    return Naming(tuple(kept), is_good, explained, lacking)
+    return MasterComparison(tuple(kept), is_good, explained, lacking)
 
 
 _WORST_MISFIT = 1.5
@@ -261,14 +257,14 @@ _WORST_MISFIT = 1.5
 the good ones of the study have 0.6 to 1.2."""
 
 
-class _Tried(NamedTuple):
+class _FaultFit(NamedTuple):
     """A fault at its best size.
 
     Attributes:
         fault: The fault.
         size: Its best size, with its interval.
         misfit: Chi-squared there.
-        explained_n: What it makes of the differences.
+        explained_n: Its share of the differences.
     """
 
     fault: Fault
@@ -277,17 +273,17 @@ class _Tried(NamedTuple):
     explained_n: Array
 
 
-def _tried(fault: Fault, left: Array, covariance: Array) -> _Tried:
+def _fit_size(fault: Fault, residual_n: Array, covariance: Array) -> _FaultFit:
     """A fault at its best size."""
     nodes: Array = np.arange(len(fault.sizes), dtype=np.float64)
     tried: Array = np.linspace(0.0, float(nodes[-1]), _SIZES)
     sizes: Array = np.interp(tried, nodes, fault.sizes).astype(np.float64)
     columns: list[Array] = [
-        np.interp(sizes, fault.sizes, fault.changes[:, place]).astype(np.float64)
-        for place in range(fault.changes.shape[1])
+        np.interp(sizes, fault.sizes, fault.changes[:, index]).astype(np.float64)
+        for index in range(fault.changes.shape[1])
     ]
     changes: Array = np.array(columns).T
-    apart = left - changes
+    apart = residual_n - changes
     factor = cast("Any", cho_factor)(covariance, lower=True)
     solved = cast("Any", cho_solve)(factor, apart.T).T
     chi: Array = np.einsum("ij,ij->i", apart, solved)
@@ -307,12 +303,12 @@ def _tried(fault: Fault, left: Array, covariance: Array) -> _Tried:
         float(min(high, fault.most)),
         "profile of the likelihood, and what the run in the master is known by",
     )
-    return _Tried(fault, size, float(chi[best]), changes[best])
+    return _FaultFit(fault, size, float(chi[best]), changes[best])
 
 
-def _chi_squared(left: Array, covariance: Array) -> float:
+def _misfit(residual_n: Array, covariance: Array) -> float:
     factor = cast("Any", cho_factor)(covariance, lower=True)
-    return float(left @ cast("Any", cho_solve)(factor, left))
+    return float(residual_n @ cast("Any", cho_solve)(factor, residual_n))
 
 
 def _covariance(stack: _Stack, master: Master, scatter: float) -> Array:
@@ -323,7 +319,7 @@ def _covariance(stack: _Stack, master: Master, scatter: float) -> Array:
     for stroke, rows in zip(stack.strokes, stack.gathers, strict=True):
         here = slice(begin, begin + len(rows))
         begin += len(rows)
-        columns = _properties(stroke, master)
+        columns = _property_forces(stroke, master)
         damping = rows @ (columns["compression"] + columns["rebound"])
         largest = float(np.abs(stroke.force_n).max())
         extra = (_OWN_SHARE * largest) ** 2 + (_DAMPING_SHARE * damping) ** 2
@@ -332,7 +328,7 @@ def _covariance(stack: _Stack, master: Master, scatter: float) -> Array:
         for name, column in columns.items():
             parts.setdefault(name, []).append(column)
     for curves in parts.values():
-        column = stack.gathered(curves)
+        column = stack.bin_means(curves)
         # The master is one of them too.
         whole += 2.0 * scatter**2 * np.outer(column, column)
     return whole
@@ -342,7 +338,7 @@ def _velocity(stroke: MeanStroke) -> Array:
     return stroke.row(FINE) @ stroke.velocity_m_per_s
 
 
-def _properties(stroke: MeanStroke, master: Master) -> Mapping[str, Array]:
+def _property_forces(stroke: MeanStroke, master: Master) -> Mapping[str, Array]:
     """What each property that scatters makes of a stroke's force at `FINE`, whole."""
     height = stroke.middle_m + stroke.sign * stroke.amplitude_m * np.sin(FINE)
     velocity = _velocity(stroke)
@@ -361,7 +357,7 @@ def _properties(stroke: MeanStroke, master: Master) -> Mapping[str, Array]:
         opens = max(at_zero, 0.0) / max(curve.lower_slope() - upper, 1.0)
         columns[side] = damping * is_it
         columns[f"{side} above"] = -sign * upper * np.maximum(speed - opens, 0.0) * is_it
-        less = _less_by_opening(curve, speed, np.array([_SMALL]))[0]
+        less = _opening_loss(curve, speed, np.array([_SMALL]))[0]
         columns[f"{side} knee"] = -sign * less / _SMALL * is_it
     return columns
 
@@ -370,7 +366,7 @@ _SMALL = 0.05
 """Share by which a knee is moved to see what its scatter makes."""
 
 
-def _less_by_opening(curve: Curve, speed: Array, shares: Array) -> Array:
+def _opening_loss(curve: DampingCurve, speed: Array, shares: Array) -> Array:
     """By how much a valve lowers the force that opens at a speed lower by shares, shape (K, N).
 
     Above the knee a curve is a line, and a knee at a lower speed is the same line lower down.
@@ -381,7 +377,7 @@ def _less_by_opening(curve: Curve, speed: Array, shares: Array) -> Array:
     return np.minimum(good, lines) - np.minimum(good, at_zero + upper * speed)
 
 
-def faults_of(master: Master, steps: Sequence[Step]) -> list[Fault]:
+def simulate_faults(master: Master, steps: Sequence[DynoStep]) -> list[Fault]:
     """All faults that are known, run in the master.
 
     Args:
@@ -392,14 +388,14 @@ def faults_of(master: Master, steps: Sequence[Step]) -> list[Fault]:
         Faults whose changes are those at `FINE` of all strokes of the steps, one after the other.
     """
     strokes = [stroke for step in steps for stroke in step.strokes]
-    gas = np.concatenate([_properties(stroke, master)["gas"] for stroke in strokes])
+    gas = np.concatenate([_property_forces(stroke, master)["gas"] for stroke in strokes])
     against = np.repeat([-float(stroke.sign) for stroke in strokes], len(FINE))
     lost = np.concatenate([[-4.0, -2.0], np.linspace(-1.0, 1.0, 41)])
     usual_n = max(master.friction_n, 5.0)
     more_n = np.concatenate(
         [np.linspace(-master.friction_n, 10.0 * usual_n, 61), usual_n * np.array([20.0, 60.0])]
     )
-    gives = _gives(master)
+    gives = _compliances(master)
     plays = np.concatenate([[0.0], np.geomspace(2e-5, 8e-3, 32)])
     rates = 1e6 / np.maximum(gives, 1e-3 * gives[1])
     return [
@@ -417,7 +413,7 @@ def faults_of(master: Master, steps: Sequence[Step]) -> list[Fault]:
             "the oil gives by",
             "mm/kN",
             gives,
-            _run(steps, lambda cycle: with_compliance(master, cycle, rates)),
+            _changes_by_cycle(steps, lambda cycle: with_compliance(master, cycle, rates)),
             least=0.0,
         ),
         Fault(
@@ -425,11 +421,11 @@ def faults_of(master: Master, steps: Sequence[Step]) -> list[Fault]:
             "of",
             "mm",
             1e3 * plays,
-            _run(steps, lambda cycle: with_play(master, cycle, plays)),
+            _changes_by_cycle(steps, lambda cycle: with_play(master, cycle, plays)),
             least=0.0,
         ),
-        *[_early(master, strokes, sides) for sides in _SIDES if _bend(master, sides)],
-        *[_weaker(master, strokes, sides) for sides in _SIDES],
+        *[_early_opening(master, strokes, sides) for sides in _SIDES if _bend(master, sides)],
+        *[_other_damping(master, strokes, sides) for sides in _SIDES],
     ]
 
 
@@ -446,7 +442,7 @@ _BEND = 0.1
 """Force at no speed of the upper line, over the largest force, from which on a curve has a knee."""
 
 
-def _early(master: Master, strokes: Sequence[MeanStroke], sides: Sequence[str]) -> Fault:
+def _early_opening(master: Master, strokes: Sequence[MeanStroke], sides: Sequence[str]) -> Fault:
     """A valve that blows off at a lower speed, and from there on has the slope it has above."""
     shares = np.linspace(0.0, 0.9, 31)
     rows: list[Array] = []
@@ -457,7 +453,7 @@ def _early(master: Master, strokes: Sequence[MeanStroke], sides: Sequence[str]) 
         if side not in sides:
             rows.append(np.zeros((len(shares), len(FINE))))
             continue
-        less = _less_by_opening(curve, np.abs(_velocity(stroke)), shares)
+        less = _opening_loss(curve, np.abs(_velocity(stroke)), shares)
         rows.append(-stroke.sign * less)
     name = f"blow-off early in {' and '.join(sides)}"
     changes = np.concatenate(rows, axis=1)
@@ -465,16 +461,16 @@ def _early(master: Master, strokes: Sequence[MeanStroke], sides: Sequence[str]) 
     return Fault(name, quantity, "", shares, changes, least=0.0, most=1.0)
 
 
-def _weaker(master: Master, strokes: Sequence[MeanStroke], sides: Sequence[str]) -> Fault:
+def _other_damping(master: Master, strokes: Sequence[MeanStroke], sides: Sequence[str]) -> Fault:
     """Another damping at all speeds alike: a valve or an oil of another kind."""
     shares = np.concatenate([np.linspace(-1.0, 1.0, 41), [2.0, 4.0]])
-    rows = [sum(_properties(stroke, master)[side] for side in sides) for stroke in strokes]
+    rows = [sum(_property_forces(stroke, master)[side] for side in sides) for stroke in strokes]
     name = f"another damping in {' and '.join(sides)}"
     changes = shares[:, None] * np.concatenate(rows)
     return Fault(name, "at all speeds more by the share", "", shares, changes, least=-1.0)
 
 
-def _gives(master: Master) -> Array:
+def _compliances(master: Master) -> Array:
     """How far the oil gives way, in mm/kN, up to half the amplitude at the largest force."""
     largest = max(float(master.compression.force_n[-2]), float(master.rebound.force_n[-2]))
     amplitude = max(step.amplitude_m for step in master.characteristics.steps)
@@ -482,21 +478,21 @@ def _gives(master: Master) -> Array:
     return np.concatenate([[0.0], np.geomspace(1e-3 * most, most, 24)])
 
 
-def _run(steps: Sequence[Step], run: Callable[[Cycle], Array]) -> Array:
+def _changes_by_cycle(steps: Sequence[DynoStep], run: Callable[[Cycle], Array]) -> Array:
     """What a fault's sizes change of a cycle of each step, along its strokes; first size: none."""
     parts: list[Array] = []
     for step in steps:
         made = run(cycle_of(step))
         changes = made - made[0]
-        parts += [_along(stroke, changes) for stroke in step.strokes]
+        parts += [_at_stroke_angles(stroke, changes) for stroke in step.strokes]
     return np.concatenate(parts, axis=1)
 
 
-def _along(stroke: MeanStroke, changes: Array) -> Array:
+def _at_stroke_angles(stroke: MeanStroke, changes: Array) -> Array:
     """Changes over a cycle at the angles of a stroke; a cycle begins in the middle of rebound."""
     turn = FINE if stroke.sign > 0 else np.pi + FINE
     times = changes.shape[1]
-    place = turn / (2.0 * np.pi) * times % times
+    position = turn / (2.0 * np.pi) * times % times
     grid: Array = np.arange(times + 1, dtype=np.float64)
     closed = np.concatenate([changes, changes[:, :1]], axis=1)
-    return np.array([np.interp(place, grid, row) for row in closed], dtype=np.float64)
+    return np.array([np.interp(position, grid, row) for row in closed], dtype=np.float64)

@@ -26,13 +26,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, combined, mean_stroke
-from rig.dyno.strokes import Block, Motion, motion_of, repeats
+from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, combine, mean_stroke
+from rig.dyno.strokes import Block, BlockMotion, fit_motion, is_repetition
 
 Array = NDArray[np.float64]
 
 QUASI_STATIC_M_PER_S = 5e-3
-"""Peak speed up to which a step tells friction and gas force: seals and bleed alone damp there."""
+"""Peak speed up to which a step gives friction and gas force: seals and bleed alone damp there."""
 
 _WINDOW = 0.1
 """Of half the stroke, to either side of the middle."""
@@ -42,10 +42,10 @@ _CENTRAL = 0.2
 per cent of its peak there."""
 
 _SPEEDS = (0.25, 0.5, 0.75)
-"""Shares of the peak speed at which hysteresis is told."""
+"""Shares of the peak speed at which hysteresis is reported."""
 
 _RULE: tuple[Array, Array] = np.polynomial.legendre.leggauss(400)
-_PLACE, _WEIGHT = 0.5 * np.pi * _RULE[0], 0.5 * np.pi * _RULE[1]
+_ANGLE_NODES, _WEIGHT = 0.5 * np.pi * _RULE[0], 0.5 * np.pi * _RULE[1]
 """Angles and weights of an integral over a stroke."""
 
 SIDES = ("compression", "rebound")
@@ -55,23 +55,23 @@ class Side(NamedTuple):
     """Figures of one direction.
 
     Attributes:
-        peak_velocity: Largest speed, in m/s, positive.
-        force_at_peak_velocity: Force there, in N.
-        force_window: Mean about mid-stroke, in N.
-        force_zero_crossing: Force at mid-stroke, in N.
-        peak_force: Largest force against the motion, in N.
-        hysteresis: By share of the peak speed: force speeding up less force slowing down, in N.
+        peak_velocity_m_per_s: Largest speed, positive.
+        force_at_peak_velocity_n: Force there.
+        force_window_n: Mean about mid-stroke.
+        force_zero_crossing_n: Force at mid-stroke.
+        peak_force_n: Largest force against the motion.
+        hysteresis_n: By share of the peak speed: force speeding up less force slowing down.
     """
 
-    peak_velocity: Figure
-    force_at_peak_velocity: Figure
-    force_window: Figure
-    force_zero_crossing: Figure
-    peak_force: Figure
-    hysteresis: Mapping[str, Figure]
+    peak_velocity_m_per_s: Figure
+    force_at_peak_velocity_n: Figure
+    force_window_n: Figure
+    force_zero_crossing_n: Figure
+    peak_force_n: Figure
+    hysteresis_n: Mapping[str, Figure]
 
 
-class Step(NamedTuple):
+class DynoStep(NamedTuple):
     """Figures of a block: one step of a test.
 
     Attributes:
@@ -84,13 +84,13 @@ class Step(NamedTuple):
         temperature_c: Mean temperature; None where none was measured.
         compression: Figures of the compression strokes.
         rebound: Figures of the rebound strokes.
-        energy_per_cycle: In J.
-        equivalent_damping: In N·s/m.
-        spring_rate: In N/m.
-        mean_force: Mean of both strokes at mid-stroke, in N: the gas force where it is slow.
-        half_difference: Half of compression less rebound at mid-stroke, in N: the friction where it
-            is slow.
-        hysteresis_at_zero: In N.
+        energy_per_cycle_j: Energy that the loop of force over height encloses.
+        equivalent_damping_n_s_per_m: Linear damping that takes the same energy.
+        spring_rate_n_per_m: Fall of the mean force per height.
+        mean_force_n: Mean of both strokes at mid-stroke: the gas force where it is slow.
+        half_difference_n: Half of compression less rebound at mid-stroke: the friction where it is
+            slow.
+        hysteresis_at_zero_n: Compression less rebound stroke at the turning points.
         strokes: The mean strokes, compression and rebound.
         warmth: Of both directions the temperature of each stroke and its force about mid-stroke.
     """
@@ -104,24 +104,31 @@ class Step(NamedTuple):
     temperature_c: float | None
     compression: Side
     rebound: Side
-    energy_per_cycle: Figure
-    equivalent_damping: Figure
-    spring_rate: Figure
-    mean_force: Figure
-    half_difference: Figure
-    hysteresis_at_zero: Figure
+    energy_per_cycle_j: Figure
+    equivalent_damping_n_s_per_m: Figure
+    spring_rate_n_per_m: Figure
+    mean_force_n: Figure
+    half_difference_n: Figure
+    hysteresis_at_zero_n: Figure
     strokes: tuple[MeanStroke, MeanStroke]
     warmth: tuple[tuple[Array, Array], tuple[Array, Array]]
+
+    def figures(self) -> dict[str, object]:
+        """All but the arrays, by name."""
+        arrays = ("strokes", "warmth")
+        return {key: value for key, value in self._asdict().items() if key not in arrays}
 
     @property
     def peak_speed_m_per_s(self) -> float:
         """Larger of both sides' peak velocities."""
-        return max(self.compression.peak_velocity.value, self.rebound.peak_velocity.value)
+        return max(
+            self.compression.peak_velocity_m_per_s.value, self.rebound.peak_velocity_m_per_s.value
+        )
 
 
-def step_of(
+def compute_step(
     t_s: Array, height_m: Array, force_n: Array, temperature_c: Array | None, block: Block
-) -> Step | None:
+) -> DynoStep | None:
     """Figures of a block; None where it has too few samples for any, or does not repeat.
 
     Args:
@@ -132,22 +139,22 @@ def step_of(
         block: The block.
     """
     here = slice(block.begin, block.end)
-    motion = motion_of(t_s[here], height_m[here], len(block.strokes))
-    if np.isnan(motion.period_s) and not repeats(t_s, height_m, block):
+    motion = fit_motion(t_s[here], height_m[here], len(block.strokes))
+    if np.isnan(motion.period_s) and not is_repetition(t_s, height_m, block):
         return None
     velocity = motion.velocity_m_per_s
     # A stroke ends where the velocity turns, which the samples hardly ever hit.
     turned = np.concatenate([[0], np.cumsum(np.diff(np.sign(velocity)) != 0)])
-    found: list[MeanStroke] = []
+    means: list[MeanStroke] = []
     for sign in (-1, 1):
         stroke = mean_stroke(motion, force_n[here], turned, sign)
         if stroke is None:
             return None
-        found.append(stroke)
-    down, up = found
+        means.append(stroke)
+    down, up = means
     speed_std = motion.velocity_std_m_per_s
     warm = None if temperature_c is None else float(np.mean(temperature_c[here]))
-    return Step(
+    return DynoStep(
         float(t_s[block.begin]),
         float(t_s[block.end - 1]),
         0.5 * len(block.strokes),
@@ -168,7 +175,7 @@ def step_of(
 
 def _warmth(
     stroke: MeanStroke,
-    motion: Motion,
+    motion: BlockMotion,
     force_n: Array,
     number: NDArray[np.int64],
     temperature_c: Array | None,
@@ -177,11 +184,11 @@ def _warmth(
     """Temperature of each stroke, and its force about mid-stroke as the mean stroke's and more."""
     if temperature_c is None:
         return np.empty(0), np.empty(0)
-    place = stroke.sign * (motion.height_m - stroke.middle_m) / stroke.amplitude_m
-    central = (np.abs(place) < _CENTRAL) & (stroke.sign * motion.velocity_m_per_s > 0.0)
+    position = stroke.sign * (motion.height_m - stroke.middle_m) / stroke.amplitude_m
+    central = (np.abs(position) < _CENTRAL) & (stroke.sign * motion.velocity_m_per_s > 0.0)
     if not central.any():
         return np.empty(0), np.empty(0)
-    theta = np.arcsin(place[central])
+    theta = np.arcsin(position[central])
     more_n = force_n[central] - stroke.row(theta) @ stroke.force_n
     middle_n = float((stroke.row(0.0) @ stroke.force_n)[0])
     numbers = number[central]
@@ -199,14 +206,14 @@ def _side(stroke: MeanStroke, down: MeanStroke, up: MeanStroke, speed_std: float
     row, what = np.eye(len(ANGLES))[int(np.argmax(speed))], "mean stroke at the largest speed"
     method = "largest slope of the fitted motion"
     if stroke.is_constant:
-        # What a smoothed motion has beside its turning points is no larger speed.
+        # Overshoot of the smoothed motion near its turning points is no larger speed.
         plateau = speed[np.abs(np.sin(ANGLES)) <= _WINDOW]
         peak, speed_std = float(plateau.mean()), float(np.hypot(speed_std, plateau.std()))
         row, what = stroke.row(0.0)[0], "mean stroke at mid-stroke: the speed is constant"
         method = "speed about mid-stroke, where it is constant"
     middle = np.arcsin(np.linspace(-_WINDOW, _WINDOW, 21))
     against = int(np.argmax(-stroke.sign * stroke.force_n))
-    one = np.eye(len(ANGLES))
+    unit = np.eye(len(ANGLES))
     half = 1.96 * speed_std
     return Side(
         Figure(peak, peak - half, peak + half, method),
@@ -215,7 +222,7 @@ def _side(stroke: MeanStroke, down: MeanStroke, up: MeanStroke, speed_std: float
             stroke.row(middle).mean(axis=0), f"window of {100 * _WINDOW:.0f} % about mid-stroke"
         ),
         stroke.figure(stroke.row(0.0)[0], "zero crossing of the height"),
-        stroke.figure(one[against], "largest force of the mean stroke"),
+        stroke.figure(unit[against], "largest force of the mean stroke"),
         {f"{share:g}": _hysteresis(stroke, down, up, share * peak) for share in _SPEEDS},
     )
 
@@ -231,17 +238,17 @@ def _hysteresis(stroke: MeanStroke, down: MeanStroke, up: MeanStroke, speed: flo
     for item, row in _spring(down, up):
         rows[id(item)] -= apart_m * row
     parts = [(rows[id(item)], item) for item in (down, up)]
-    return combined(parts, "same speed, speeding up less slowing down, spring removed")
+    return combine(parts, "same speed, speeding up less slowing down, spring removed")
 
 
 def _spring(down: MeanStroke, up: MeanStroke) -> list[tuple[MeanStroke, Array]]:
     """The spring rate as rows: the least-squares slope of both strokes' mean, with its sign."""
-    place = _PLACE
-    inside = np.abs(place) <= np.arcsin(0.9)
-    u, w = np.sin(place[inside]), (_WEIGHT * np.cos(place))[inside]
+    angles = _ANGLE_NODES
+    inside = np.abs(angles) <= np.arcsin(0.9)
+    u, w = np.sin(angles[inside]), (_WEIGHT * np.cos(angles))[inside]
     slope = w * u / float(np.sum(w * u * u))
     return [
-        (item, -0.5 * item.sign / item.amplitude_m * (slope @ item.row(place[inside])))
+        (item, -0.5 * item.sign / item.amplitude_m * (slope @ item.row(angles[inside])))
         for item in (down, up)
     ]
 
@@ -249,13 +256,13 @@ def _spring(down: MeanStroke, up: MeanStroke) -> list[tuple[MeanStroke, Array]]:
 def _of_both(
     down: MeanStroke, up: MeanStroke, relative_std: float
 ) -> tuple[Figure, Figure, Figure, Figure, Figure, Figure]:
-    place = _PLACE
-    along = _WEIGHT * np.cos(place)
+    angles = _ANGLE_NODES
+    along = _WEIGHT * np.cos(angles)
     work = [
-        (-item.sign * item.amplitude_m * (along @ item.row(place)), item) for item in (down, up)
+        (-item.sign * item.amplitude_m * (along @ item.row(angles)), item) for item in (down, up)
     ]
     squared = sum(
-        item.amplitude_m * float(along @ np.abs(item.row(place) @ item.velocity_m_per_s))
+        item.amplitude_m * float(along @ np.abs(item.row(angles) @ item.velocity_m_per_s))
         for item in (down, up)
     )
     spring = [(row, item) for item, row in _spring(down, up)]
@@ -265,16 +272,14 @@ def _of_both(
     turning_down = (down.row(first) + down.row(last))[0]
     turning_up = (up.row(first) + up.row(last))[0]
     return (
-        combined(work, "area of the loop", 1.0, relative_std),
-        combined(
+        combine(work, "area of the loop", 1.0, relative_std),
+        combine(
             work, "energy over that of a linear damper of 1 N·s/m", 1.0 / squared, relative_std
         ),
-        combined(spring, "slope of the mean of both strokes, inner 90 %", 1.0, relative_std),
-        combined([(mid_down, down), (mid_up, up)], "mean of both strokes at mid-stroke", 0.5),
-        combined(
+        combine(spring, "slope of the mean of both strokes, inner 90 %", 1.0, relative_std),
+        combine([(mid_down, down), (mid_up, up)], "mean of both strokes at mid-stroke", 0.5),
+        combine(
             [(mid_down, down), (-mid_up, up)], "half the difference of both at mid-stroke", 0.5
         ),
-        combined(
-            [(turning_down, down), (-turning_up, up)], "difference at the turning points", 0.5
-        ),
+        combine([(turning_down, down), (-turning_up, up)], "difference at the turning points", 0.5),
     )

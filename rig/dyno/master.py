@@ -1,4 +1,4 @@
-"""A good damper as its record tells it, simple enough to be run with something wrong in it.
+"""A good damper by its record, as a model simple enough to simulate faults in it.
 
 Its force is a straight gas spring and Coulomb friction, from the slowest step, and a curve of
 damping over speed, from the fastest one. That is coarse; only what a fault changes in it is used,
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.dyno.characterise import Characteristics
-from rig.dyno.figures import Step
+from rig.dyno.figures import DynoStep
 from rig.dyno.stroke_force import ANGLES, MeanStroke
 
 Array = NDArray[np.float64]
@@ -25,8 +25,8 @@ _NODES = 120
 """Speeds at which a curve is kept."""
 
 _FASTER = 1.5
-"""Times the largest measured speed to which the curve goes on straight: a fault may move the piston
-faster than the machine."""
+"""Times the largest measured speed to which the curve continues straight, because a fault may move
+the piston faster than the machine."""
 
 _UPPER, _LOWER = 0.6, 0.06
 """Shares of the largest speed from which on the curve is its upper line, and where it is its lower.
@@ -36,7 +36,7 @@ _TIMES = 720
 """Times of a cycle at which it is run; two cycles, of which the second counts."""
 
 
-class Curve(NamedTuple):
+class DampingCurve(NamedTuple):
     """Damping over speed of one direction, rising from zero.
 
     Attributes:
@@ -72,7 +72,7 @@ class Master(NamedTuple):
     """A good damper.
 
     Attributes:
-        characteristics: What its record tells.
+        characteristics: Figures of its record.
         gas_n: Gas force at the middle of the slowest step.
         gas_rate_n_per_m: Its rise per compression.
         middle_m: That height.
@@ -86,8 +86,8 @@ class Master(NamedTuple):
     gas_rate_n_per_m: float
     middle_m: float
     friction_n: float
-    compression: Curve
-    rebound: Curve
+    compression: DampingCurve
+    rebound: DampingCurve
 
     def gas(self, height_m: Array) -> Array:
         """Gas force at heights."""
@@ -106,68 +106,68 @@ class Master(NamedTuple):
         return np.where(damping_n > 0.0, down, up)
 
 
-def master_of(found: Characteristics) -> Master:
+def master_of(record: Characteristics) -> Master:
     """A good damper from its record.
 
     Raises:
         InputError: It has no step slow enough for gas force and friction.
     """
-    refuse_unlike(found)
-    damper = found.damper
-    if damper.gas_force is None or damper.gas_rate is None or damper.friction is None:
+    refuse_unsuitable(record)
+    damper = record.damper
+    if damper.gas_force_n is None or damper.gas_rate_n_per_m is None or damper.friction_n is None:
         raise InputError(
-            f"{found.name}: no step of 5 mm/s or less, expected one in a master record: it tells "
+            f"{record.name}: no step of 5 mm/s or less, expected one in a master record: it gives "
             "gas force and friction"
         )
-    slowest, *others = sorted(found.steps, key=lambda step: step.peak_speed_m_per_s)
-    fastest = max(found.steps, key=lambda step: step.peak_speed_m_per_s)
-    friction_n, gas_n = damper.friction.value, damper.gas_force.value
+    slowest, *others = sorted(record.steps, key=lambda step: step.peak_speed_m_per_s)
+    fastest = max(record.steps, key=lambda step: step.peak_speed_m_per_s)
+    friction_n, gas_n = damper.friction_n.value, damper.gas_force_n.value
     if others:
-        # What bleeds in the slowest step is what the next one has more, share by share of speed.
+        # Bleed in the slowest step: the increase up to the next step, scaled by speed.
         speed, more = slowest.peak_speed_m_per_s, others[0]
         share = speed / max(more.peak_speed_m_per_s - speed, 1e-9)
-        friction_n -= share * max(more.half_difference.value - friction_n, 0.0)
-        gas_n -= share * (more.mean_force.value - gas_n)
+        friction_n -= share * max(more.half_difference_n.value - friction_n, 0.0)
+        gas_n -= share * (more.mean_force_n.value - gas_n)
     friction_n = max(friction_n, 0.0)
     bare = Master(
-        found,
+        record,
         gas_n,
-        damper.gas_rate.value,
+        damper.gas_rate_n_per_m.value,
         slowest.middle_m,
         friction_n,
-        *(Curve(np.zeros(2), np.zeros(2)),) * 2,
+        *(DampingCurve(np.zeros(2), np.zeros(2)),) * 2,
     )
     down, up = (_curve(bare, stroke) for stroke in fastest.strokes)
     return bare._replace(compression=down, rebound=up)
 
 
-def refuse_unlike(found: Characteristics) -> None:
-    """Refuse what a fault cannot be told from: a force of the wrong sign, and a constant speed.
+def refuse_unsuitable(record: Characteristics) -> None:
+    """Refuse a record in which faults cannot be identified: wrong sign of force, constant speed.
 
     Raises:
         InputError: It is such a record.
     """
-    if any(step.energy_per_cycle.high < 0.0 for step in found.steps):
+    if any(step.energy_per_cycle_j.high < 0.0 for step in record.steps):
         raise InputError(
-            f"{found.name}: the strut gives energy, expected the force of a damper (is its sign "
+            f"{record.name}: the strut gives energy, expected the force of a damper (is its sign "
             "right?)"
         )
-    if any(stroke.is_constant for step in found.steps for stroke in step.strokes):
+    if any(stroke.is_constant for step in record.steps for stroke in step.strokes):
         raise InputError(
-            f"{found.name}: a step of constant speed, expected sines: faults are run in those"
+            f"{record.name}: a step of constant speed, expected sines: faults are run in those"
         )
 
 
-def _curve(bare: Master, stroke: MeanStroke) -> Curve:
-    """Damping over speed: what is left of a stroke, speeding up and slowing down together."""
+def _curve(bare: Master, stroke: MeanStroke) -> DampingCurve:
+    """Damping over speed: a stroke without gas and friction, mean of both its halves."""
     height = stroke.middle_m + stroke.sign * stroke.amplitude_m * np.sin(ANGLES)
-    left = -stroke.sign * (stroke.force_n - bare.gas(height)) - bare.friction_n
+    damping_n = -stroke.sign * (stroke.force_n - bare.gas(height)) - bare.friction_n
     speed = np.abs(stroke.velocity_m_per_s)
     top = int(np.argmax(speed))
     peak = float(speed[top])
     nodes = np.linspace(0.0, peak, _NODES - 1)
     halves = [
-        np.interp(nodes, *_sorted(speed[part], left[part]))
+        np.interp(nodes, *_by_speed(speed[part], damping_n[part]))
         for part in (slice(None, top + 1), slice(top, None))
     ]
     force = np.maximum.accumulate(np.maximum(0.5 * (halves[0] + halves[1]), 0.0))
@@ -177,10 +177,10 @@ def _curve(bare: Master, stroke: MeanStroke) -> Curve:
     farther = _FASTER * peak
     last = force[-1] + slope * (farther - peak)
     speeds: Array = np.append(nodes, farther).astype(np.float64)
-    return Curve(speeds, np.append(force, last).astype(np.float64))
+    return DampingCurve(speeds, np.append(force, last).astype(np.float64))
 
 
-def _sorted(speed: Array, force: Array) -> tuple[Array, Array]:
+def _by_speed(speed: Array, force: Array) -> tuple[Array, Array]:
     order = np.argsort(speed)
     return speed[order], force[order]
 
@@ -199,7 +199,7 @@ class Cycle(NamedTuple):
     velocity_m_per_s: Array
 
 
-def cycle_of(step: Step) -> Cycle:
+def cycle_of(step: DynoStep) -> Cycle:
     """A sine of a step's amplitude and speed."""
     omega = step.peak_speed_m_per_s / step.amplitude_m
     angle = 2.0 * np.pi * np.arange(2 * _TIMES) / _TIMES
@@ -227,13 +227,13 @@ def with_compliance(master: Master, cycle: Cycle, rates_n_per_m: Array) -> Array
     steps = rates_n_per_m * cycle.interval_s
     sums = forces - steps[:, None] * speeds
     now: Array = np.zeros(len(steps))
-    found = np.empty((len(steps), _TIMES))
-    for place, velocity in enumerate(cycle.velocity_m_per_s):
-        wanted = now - steps * velocity
-        pairs = zip(wanted.tolist(), sums, strict=True)
+    forces_n = np.empty((len(steps), _TIMES))
+    for index, velocity in enumerate(cycle.velocity_m_per_s):
+        sought = now - steps * velocity
+        pairs = zip(sought.tolist(), sums, strict=True)
         now = np.array([np.interp(w, row, forces) for w, row in pairs], dtype=np.float64)
-        found[:, place % _TIMES] = now
-    return found
+        forces_n[:, index % _TIMES] = now
+    return forces_n
 
 
 def with_play(master: Master, cycle: Cycle, plays_m: Array) -> Array:
@@ -247,9 +247,9 @@ def with_play(master: Master, cycle: Cycle, plays_m: Array) -> Array:
     Returns:
         Forces, shape (K, 720).
     """
-    found = np.empty((len(plays_m), _TIMES))
+    forces_n = np.empty((len(plays_m), _TIMES))
     gap = np.zeros_like(plays_m)  # from the side on which the strut pushes
-    for place, (height, velocity) in enumerate(
+    for index, (height, velocity) in enumerate(
         zip(cycle.height_m, cycle.velocity_m_per_s, strict=True)
     ):
         gas = float(master.gas(np.array(height)))
@@ -263,9 +263,9 @@ def with_play(master: Master, cycle: Cycle, plays_m: Array) -> Array:
         in_contact = is_pushing | is_pulling
         moved = gap + (velocity - free) * cycle.interval_s
         inside = np.clip(moved, 0.0, plays_m)
-        # The share of the time that is left when the gap closes within it.
-        left = np.abs(moved - inside) / max(abs(velocity - free) * cycle.interval_s, 1e-12)
+        # Share of the interval after the gap closes within it.
+        contact_share = np.abs(moved - inside) / max(abs(velocity - free) * cycle.interval_s, 1e-12)
         is_held = held <= 0.0 if velocity > free else held >= 0.0
-        found[:, place % _TIMES] = np.where(in_contact, held, held * left * is_held)
+        forces_n[:, index % _TIMES] = np.where(in_contact, held, held * contact_share * is_held)
         gap = np.where(in_contact, gap, inside)
-    return found
+    return forces_n

@@ -1,11 +1,12 @@
-"""What in a record may mislead, in words, before its figures are read."""
+"""Warnings about a record that may mislead, in words."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.dyno.figures import Step
+from rig.diagnosis.clipping import find_sudden_plateaus
+from rig.dyno.figures import DynoStep
 from rig.dyno.stroke_force import Figure
 
 Array = NDArray[np.float64]
@@ -13,12 +14,8 @@ Array = NDArray[np.float64]
 _GAP = 2.5
 """Times the usual time between samples: one is missing at least, however the clock jitters."""
 
-_CLIPPED_SAMPLES, _CLIPPED_STEPS = 4, 4.0
-"""Samples in a row at the end of a range, and steps of the channel by which it comes there, from
-which on it is cut off."""
-
 _USED_SHARE = 0.8
-"""Strokes that are of a step below which it is said: ramps between steps are some in a hundred."""
+"""Share of strokes in steps below which a warning is due: ramps between steps are few."""
 
 _FEW_A_CYCLE = 16.0
 """Samples of a cycle below which a stroke has hardly eight: its shape is mostly the spline's."""
@@ -33,11 +30,11 @@ _COARSE = 2.0
 def quality(
     t_s: Array,
     force_n: Array,
-    steps: Sequence[Step],
+    steps: Sequence[DynoStep],
     rests: Sequence[tuple[float, float, Figure]],
     strokes: int,
 ) -> tuple[str, ...]:
-    """Gaps, cycles of few samples, a coarse force, a wrong sign, what is left out, a drift at rest.
+    """Warnings of gaps, few samples, a coarse force, a wrong sign, unused strokes, a drift at rest.
 
     Args:
         t_s: Times, shape (N,).
@@ -47,56 +44,43 @@ def quality(
         strokes: How many strokes the record has.
     """
     first = preflight(t_s, {"force": force_n})
-    said = [*first, *_few_samples(t_s, steps), *_coarse(force_n), *_drift(rests)]
-    return (*_sign(steps), *_left_out(steps, strokes), *said)
+    others = [*first, *_few_samples(t_s, steps), *_coarse(force_n), *_drift(rests)]
+    return (*_sign(steps), *_strokes_outside_steps(steps, strokes), *others)
 
 
 def preflight(t_s: Array, channels: Mapping[str, Array]) -> tuple[str, ...]:
-    """Gaps, and channels that were cut off at an end of their range.
+    """Warnings of gaps, and of channels that were clipped at an end of their range.
 
     Args:
         t_s: Times, increasing, shape (N,).
         channels: Measured values by their names, each of shape (N,); NaN where there is none.
     """
-    cut = [text for name, values in channels.items() for text in _clipped(name, values)]
-    return (*_gaps(t_s), *cut)
+    clipped = [
+        f"{name} stays at its {plateau.extreme} value {plateau.limit:.6g}, "
+        f"{len(plateau.firsts)} times: clipped?"
+        for name, values in channels.items()
+        for plateau in find_sudden_plateaus(values[np.isfinite(values)])
+    ]
+    return (*_gaps(t_s), *clipped)
 
 
-def _clipped(name: str, values: Array) -> list[str]:
-    """A channel that stays at its largest or smallest value, and comes there at a jump."""
-    values = values[np.isfinite(values)]
-    apart = np.abs(np.diff(values))
-    if not np.any(apart):
-        return []
-    step = float(np.min(apart[apart > 0.0]))
-    found: list[str] = []
-    for end, what in ((float(values.max()), "largest"), (float(values.min()), "smallest")):
-        at_end = np.concatenate([[0], (values == end).astype(np.int64), [0]])
-        starts, stops = np.flatnonzero(np.diff(at_end) == 1), np.flatnonzero(np.diff(at_end) == -1)
-        long = starts[(stops - starts >= _CLIPPED_SAMPLES) & (starts > 0)]
-        # A flat top of a channel in steps is one step above its sides.
-        if len(long) and float(np.median(apart[long - 1])) > _CLIPPED_STEPS * step:
-            found.append(f"{name} stays at its {what} value {end:.6g}, {len(long)} times: clipped?")
-    return found
-
-
-def _sign(steps: Sequence[Step]) -> list[str]:
-    giving = [step for step in steps if step.energy_per_cycle.high < 0.0]
+def _sign(steps: Sequence[DynoStep]) -> list[str]:
+    giving = [step for step in steps if step.energy_per_cycle_j.high < 0.0]
     if not giving:
         return []
-    step = min(giving, key=lambda item: item.energy_per_cycle.value)
+    step = min(giving, key=lambda item: item.energy_per_cycle_j.value)
     return [
-        f"the strut gives energy, {-step.energy_per_cycle.value:.3g} J a cycle at "
+        f"the strut gives energy, {-step.energy_per_cycle_j.value:.3g} J a cycle at "
         f"{step.peak_speed_m_per_s:.3g} m/s, which no damper does: is the sign of its force right "
         "(`rig import --rebound`)?"
     ]
 
 
-def _left_out(steps: Sequence[Step], strokes: int) -> list[str]:
+def _strokes_outside_steps(steps: Sequence[DynoStep], strokes: int) -> list[str]:
     used = sum(round(2.0 * step.cycles) for step in steps)
     if used >= _USED_SHARE * strokes:
         return []
-    return [f"{strokes - used} of {strokes} strokes repeat nothing and are left out"]
+    return [f"{strokes - used} of {strokes} strokes do not repeat and are not used"]
 
 
 def _gaps(t_s: Array) -> list[str]:
@@ -111,7 +95,7 @@ def _gaps(t_s: Array) -> list[str]:
     ]
 
 
-def _few_samples(t_s: Array, steps: Sequence[Step]) -> list[str]:
+def _few_samples(t_s: Array, steps: Sequence[DynoStep]) -> list[str]:
     usual_s = float(np.median(np.diff(t_s)))
     counts = [
         (1.0 / (step.frequency_hz * usual_s), step)
@@ -143,8 +127,8 @@ def _coarse(force_n: Array) -> list[str]:
 
 def _drift(rests: Sequence[tuple[float, float, Figure]]) -> list[str]:
     """Two rests at one height whose forces differ by more than both their intervals."""
-    for place, (begin_s, height_m, force) in enumerate(rests):
-        for later_s, later_m, later in rests[place + 1 :]:
+    for index, (begin_s, height_m, force) in enumerate(rests):
+        for later_s, later_m, later in rests[index + 1 :]:
             if abs(later_m - height_m) > _SAME_HEIGHT_M:
                 continue
             if later.low > force.high or later.high < force.low:

@@ -1,7 +1,7 @@
 """One fit of a block's force, of which every figure is a functional.
 
-All strokes of one direction lie over one another along the angle theta = asin(u), u the place in
-the stroke from -1 to 1: along it the force of a damper under a sine is smooth up to the turning
+All strokes of one direction lie over one another along the angle theta = asin(u), u the position
+in the stroke from -1 to 1: along it the force of a damper under a sine is smooth up to the turning
 points, where along the height it has infinite slopes. A cubic spline through the samples of all
 strokes is the mean stroke. Its uncertainty is what the strokes differ by, and the noise: the
 sandwich of the least squares with strokes as clusters, or the plain covariance, whichever is
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.special import stdtrit  # pyright: ignore[reportUnknownVariableType]
 
-from rig.dyno.strokes import Motion
+from rig.dyno.strokes import BlockMotion
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ _VELOCITY_PIECES = (16, 8, 4, 2, 1, 0)
 _WIDER = 1.2
 """Of all half widths: a spline that the data chose is known less well than one given beforehand.
 Without it 93 to 96 % of the intervals held the truth over 240 dynos at random
-(`python -m tests.characteristics`, seed 1)."""
+(`python -m tests.dyno`, seed 1)."""
 
 _WORST_CONDITION = 1e10
 """Of the normal equations: beyond it the samples leave a part of the stroke open."""
@@ -57,17 +57,13 @@ class Figure(NamedTuple):
         value: The figure.
         low: Lower end.
         high: Upper end.
-        method: How it was found.
+        method: Method that gave it.
     """
 
     value: float
     low: float
     high: float
     method: str
-
-    def as_dict(self) -> dict[str, object]:
-        """For a file."""
-        return self._asdict()
 
 
 _MIDDLE, _CONSTANT = 0.5, 0.1
@@ -121,20 +117,20 @@ class MeanStroke(NamedTuple):
 
     def row(self, theta: Array | float) -> Array:
         """The force at angles as rows over `force_n`, shape (M, 181)."""
-        place = (np.atleast_1d(theta) + 0.5 * np.pi) / np.pi * (_GRID - 1.0)
-        before = np.clip(place.astype(np.int64), 0, _GRID - 2)
-        share = np.clip(place - before, 0.0, 1.0)
-        rows = np.zeros((len(place), _GRID))
-        rows[np.arange(len(place)), before] = 1.0 - share
-        rows[np.arange(len(place)), before + 1] = share
+        position = (np.atleast_1d(theta) + 0.5 * np.pi) / np.pi * (_GRID - 1.0)
+        before = np.clip(position.astype(np.int64), 0, _GRID - 2)
+        share = np.clip(position - before, 0.0, 1.0)
+        rows = np.zeros((len(position), _GRID))
+        rows[np.arange(len(position)), before] = 1.0 - share
+        rows[np.arange(len(position)), before + 1] = share
         return rows
 
     def figure(self, row: Array, method: str) -> Figure:
         """A linear functional of the force, with its interval."""
-        return combined([(row, self)], method)
+        return combine([(row, self)], method)
 
 
-def combined(
+def combine(
     parts: Sequence[tuple[Array, MeanStroke]],
     method: str,
     factor: float = 1.0,
@@ -144,7 +140,7 @@ def combined(
 
     Args:
         parts: Row and mean stroke of each.
-        method: How it is found.
+        method: Method that gives it.
         factor: Of the sum.
         relative_std: Relative standard deviation of the factor.
     """
@@ -154,17 +150,17 @@ def combined(
     # Welch's and Satterthwaite's degrees of freedom of a sum.
     weighted = sum(v * v / stroke.freedom for v, (_, stroke) in zip(variances, parts, strict=True))
     freedom = variance * variance / weighted if weighted > 0.0 else 1e9
-    half = _WIDER * student(freedom) * (variance + (relative_std * value) ** 2) ** 0.5
+    half = _WIDER * student_factor(freedom) * (variance + (relative_std * value) ** 2) ** 0.5
     return Figure(value, value - half, value + half, method)
 
 
-def student(freedom: float) -> float:
+def student_factor(freedom: float) -> float:
     """Half width of a 95 % interval in standard deviations, by Student's t."""
     return float(cast("Any", stdtrit)(freedom, 0.5 + 0.5 * _COVERAGE))
 
 
 def mean_stroke(
-    motion: Motion, force_n: Array, number: NDArray[np.int64], sign: int
+    motion: BlockMotion, force_n: Array, number: NDArray[np.int64], sign: int
 ) -> MeanStroke | None:
     """The mean of the strokes of one direction; None where there are too few samples.
 
@@ -185,13 +181,13 @@ def mean_stroke(
         np.arcsin(np.clip(sign * (height_m - middle) / amplitude, -1.0, 1.0))
         for height_m in (motion.height_m[mine], motion.between_m[along])
     )
-    made = [_fitted(theta, force_n, number, pieces) for pieces in _PIECES]
+    made = [_fit_spline(theta, force_n, number, pieces) for pieces in _PIECES]
     fits = [item for item in made if item is not None]
     if not fits:
         return None
-    place = int(np.argmin([item.criterion for item in fits]))
-    place = min(place + _UNDERSMOOTHED, len(fits) - 1)
-    best = fits[place]
+    chosen = int(np.argmin([item.criterion for item in fits]))
+    chosen = min(chosen + _UNDERSMOOTHED, len(fits) - 1)
+    best = fits[chosen]
     # The noise is that of the most flexible fit: what the chosen one leaves out counts too.
     noise = max(best.variance, fits[-1].variance)
     covariance, freedom = noise * best.inverse, fits[-1].freedom
@@ -200,7 +196,7 @@ def mean_stroke(
     rows = _design(ANGLES, best.pieces)
     forces = rows @ best.weights
     covariance = rows @ covariance @ rows.T
-    for other in (*fits[:place][-1:], *fits[place + 1 : place + 2]):
+    for other in (*fits[:chosen][-1:], *fits[chosen + 1 : chosen + 2]):
         # What the next simpler curve and the next one would say shows what this one leaves out.
         apart = forces - _design(ANGLES, other.pieces) @ other.weights
         covariance = covariance + np.outer(apart, apart)
@@ -271,28 +267,30 @@ class _Fit(NamedTuple):
     clusters: int
 
 
-def _fitted(theta: Array, force_n: Array, number: NDArray[np.int64], pieces: int) -> _Fit | None:
+def _fit_spline(
+    theta: Array, force_n: Array, number: NDArray[np.int64], pieces: int
+) -> _Fit | None:
     """A spline; None where the samples do not carry it."""
     design = _design(theta, pieces)
-    # A machine in step with the clock samples the same few places in every cycle.
-    places = len(np.unique(np.round(theta, 2)))
+    # A machine in step with the clock samples the same few angles in every cycle.
+    angles = len(np.unique(np.round(theta, 2)))
     count, size = design.shape
-    if places < size + (pieces > 0) or count < 2 * size:
+    if angles < size + (pieces > 0) or count < 2 * size:
         return None
     gram = design.T @ design
     if np.linalg.cond(gram) > _WORST_CONDITION:
         return None
     inverse: Array = np.linalg.inv(gram).astype(np.float64)
     weights = inverse @ (design.T @ force_n)
-    left = force_n - design @ weights
-    squares = float(left @ left)
+    residual_n = force_n - design @ weights
+    squares = float(residual_n @ residual_n)
     criterion = count * np.log(max(squares / count, 1e-300)) + 2.0 * size * count / (
         count - size - 1.0
     )
     clusters = np.unique(number)
     clustered: Array | None = None
     if len(clusters) >= _FEWEST_CLUSTERS:
-        scores = np.array([design[number == c].T @ left[number == c] for c in clusters])
+        scores = np.array([design[number == c].T @ residual_n[number == c] for c in clusters])
         share = len(clusters) / (len(clusters) - 1.0)
         clustered = inverse @ (share * scores.T @ scores) @ inverse
     variance, freedom = squares / (count - size), float(count - size)

@@ -60,10 +60,10 @@ _TAIL_SHARE = 0.02
 
 _BENT = 0.4
 """Range of the parabola through a rest over what is still, from which on it is a turning point: one
-that passes for still rises by all of it, a rest with the ends of strokes beside it by a fifth."""
+that passes for still rises by all of it, a rest with the ends of strokes next to it by a fifth."""
 
 _FEWEST_AT_REST = 20
-"""Samples of a hold: two for each of the batches whose means tell its uncertainty."""
+"""Samples of a hold: two for each of the batches whose means give its uncertainty."""
 
 _HARMONICS = 6
 """Most harmonics of a motion."""
@@ -92,7 +92,7 @@ class Stroke(NamedTuple):
     duration_s: float
 
 
-class Motion(NamedTuple):
+class BlockMotion(NamedTuple):
     """The motion of a block.
 
     Attributes:
@@ -133,7 +133,7 @@ class Hold(NamedTuple):
     end: int
 
 
-def strokes_of(t_s: Array, height_m: Array) -> list[Stroke]:
+def find_strokes(t_s: Array, height_m: Array) -> list[Stroke]:
     """All strokes of a record.
 
     Args:
@@ -175,23 +175,23 @@ def _turns(height_m: Array, least_m: float) -> Iterator[int]:
         yield high if rising else low
 
 
-def blocks_of(strokes: list[Stroke]) -> list[Block]:
+def find_blocks(strokes: list[Stroke]) -> list[Block]:
     """Blocks of a record: at least three like strokes in a row."""
     blocks: list[Block] = []
     run: list[Stroke] = []
     for stroke in [*strokes, Stroke(-1, -1, 0.0, 0.0)]:
-        if run and not _alike(run, stroke):
+        if run and not _is_alike(run, stroke):
             if len(run) >= _FEWEST_STROKES:
-                kept = _settled(run)
+                kept = _without_ramps(run)
                 blocks.append(Block(tuple(kept), kept[0].first, kept[-1].last + 1))
             # A stroke that a machine changes its step in may have been like the next by chance.
-            keeps = len(run) < _FEWEST_STROKES and _alike(run[-1:], stroke)
+            keeps = len(run) < _FEWEST_STROKES and _is_alike(run[-1:], stroke)
             run = run[-1:] if keeps else []
         run.append(stroke)
     return blocks
 
 
-def _settled(run: list[Stroke]) -> list[Stroke]:
+def _without_ramps(run: list[Stroke]) -> list[Stroke]:
     """A run without strokes at its ends that a machine takes to get there, or back."""
     usual_m = float(np.median([abs(stroke.rise_m) for stroke in run]))
 
@@ -206,7 +206,7 @@ def _settled(run: list[Stroke]) -> list[Stroke]:
     return kept
 
 
-def repeats(t_s: Array, height_m: Array, block: Block) -> bool:
+def is_repetition(t_s: Array, height_m: Array, block: Block) -> bool:
     """Whether the strokes of a block are one motion again and again, and not alike by chance.
 
     Args:
@@ -219,18 +219,21 @@ def repeats(t_s: Array, height_m: Array, block: Block) -> bool:
     share = np.linspace(0.0, 1.0, _SHAPE_POINTS)
     for side in (block.strokes[::2], block.strokes[1::2]):
         shapes: Array = np.array(
-            [np.interp(t_s[one.first] + share * one.duration_s, t_s, height_m) for one in side],
+            [
+                np.interp(t_s[stroke.first] + share * stroke.duration_s, t_s, height_m)
+                for stroke in side
+            ],
             dtype=np.float64,
         )
         apart = shapes - shapes.mean(axis=1, keepdims=True)
-        usual_m = float(np.median([abs(one.rise_m) for one in side]))
+        usual_m = float(np.median([abs(stroke.rise_m) for stroke in side]))
         if float(np.std(apart - apart.mean(axis=0))) > _SAME_SHAPE * usual_m:
             return False
     return True
 
 
-def _alike(run: list[Stroke], stroke: Stroke) -> bool:
-    """Whether a stroke goes on like the last one of its direction, or returns as far."""
+def _is_alike(run: list[Stroke], stroke: Stroke) -> bool:
+    """Whether a stroke is like the last one of its direction, or returns as far."""
     before = run[-2] if len(run) > 1 else run[-1]
     same_size = abs(abs(stroke.rise_m) - abs(run[-1].rise_m)) <= _ALIKE * abs(run[-1].rise_m)
     if len(run) == 1:
@@ -239,7 +242,7 @@ def _alike(run: list[Stroke], stroke: Stroke) -> bool:
     return same_size and same_time and stroke.first == run[-1].last
 
 
-def holds_of(t_s: Array, height_m: Array, blocks: list[Block]) -> list[Hold]:
+def find_holds(t_s: Array, height_m: Array, blocks: list[Block]) -> list[Hold]:
     """Times at rest between the blocks."""
     ends = [0, *(edge for block in blocks for edge in (block.begin, block.end - 1)), len(t_s) - 1]
     usual_s = float(np.median(np.diff(t_s)))
@@ -258,18 +261,20 @@ def holds_of(t_s: Array, height_m: Array, blocks: list[Block]) -> list[Hold]:
         if not len(inside):
             continue
         runs = np.split(inside, np.flatnonzero(np.diff(inside) > 1) + 1)
-        found = [Hold(begin + int(run[0]), begin + int(run[-1]) + window) for run in runs]
+        candidates = [Hold(begin + int(run[0]), begin + int(run[-1]) + window) for run in runs]
         rests = [
-            hold for hold in found if not _turns_slowly(height_m[hold.begin : hold.end], still_m)
+            hold
+            for hold in candidates
+            if not _turns_slowly(height_m[hold.begin : hold.end], still_m)
         ]
         if rests:  # the longest without a break
             longest = max(rests, key=lambda hold: hold.end - hold.begin)
-            holds.append(_trimmed(longest, height_m, still_m))
+            holds.append(_trim(longest, height_m, still_m))
     return holds
 
 
-def _trimmed(hold: Hold, height_m: Array, still_m: float) -> Hold:
-    """A rest without the ends of the strokes beside it."""
+def _trim(hold: Hold, height_m: Array, still_m: float) -> Hold:
+    """A rest without the ends of the adjacent strokes."""
     part = height_m[hold.begin : hold.end]
     apart = np.abs(part - np.median(part))
     inside = np.flatnonzero(apart <= max(_TAIL_SHARE * still_m, 4.0 * _noise_m(height_m)))
@@ -278,12 +283,12 @@ def _trimmed(hold: Hold, height_m: Array, still_m: float) -> Hold:
 
 def _turns_slowly(height_m: Array, still_m: float) -> bool:
     """Whether what looks like a rest is the turning point of a slow stroke: a parabola, or half."""
-    place = np.linspace(-1.0, 1.0, len(height_m))
-    curve = np.polynomial.Polynomial.fit(place, height_m, 2)(place)
+    position = np.linspace(-1.0, 1.0, len(height_m))
+    curve = np.polynomial.Polynomial.fit(position, height_m, 2)(position)
     return float(np.ptp(curve)) > _BENT * still_m
 
 
-def motion_of(t_s: Array, height_m: Array, strokes: int) -> Motion:
+def fit_motion(t_s: Array, height_m: Array, strokes: int) -> BlockMotion:
     """Height and velocity of a block.
 
     Args:
@@ -291,24 +296,24 @@ def motion_of(t_s: Array, height_m: Array, strokes: int) -> Motion:
         height_m: Its measured heights, shape (N,).
         strokes: Number of its strokes.
     """
-    series = _series(t_s - t_s[0], height_m, strokes)
+    series = _fourier_series(t_s - t_s[0], height_m, strokes)
     if series is not None:
         return series
-    found = smooth(t_s, height_m, estimate_noise(t_s, height_m))
-    height, velocity = found.states[:, 0].copy(), found.states[:, 1].copy()
+    smoothed = smooth(t_s, height_m, estimate_noise(t_s, height_m))
+    height, velocity = smoothed.states[:, 0].copy(), smoothed.states[:, 1].copy()
     fine_s: Array = np.linspace(float(t_s[0]), float(t_s[-1]), _BETWEEN * len(t_s))
     curve: Any = CubicHermiteSpline(t_s, height, velocity)
     between, rate = curve(fine_s), curve.derivative()(fine_s)
-    # The places of a stroke are those of the motion about its middle, which may wander.
+    # Positions in a stroke are relative to its middle, which may wander.
     height = height - _wander(t_s, t_s, height)
     between = between - _wander(fine_s, t_s, curve(t_s))
-    std = float(np.median(found.deviations[:, 1]))
-    return Motion(height, velocity, between, rate, std, float("nan"))
+    std = float(np.median(smoothed.deviations[:, 1]))
+    return BlockMotion(height, velocity, between, rate, std, float("nan"))
 
 
 def _wander(at_s: Array, t_s: Array, height_m: Array) -> Array:
-    """By how much the middle of the strokes is away from its mean, at times."""
-    strokes = strokes_of(t_s, height_m)
+    """Deviation of the strokes' mid-position from its mean, m, shape (times,)."""
+    strokes = find_strokes(t_s, height_m)
     if len(strokes) < _FEWEST_STROKES:
         return np.zeros_like(at_s)
     middles = [0.5 * (height_m[item.first] + height_m[item.last]) for item in strokes]
@@ -319,7 +324,7 @@ def _wander(at_s: Array, t_s: Array, height_m: Array) -> Array:
     return wandered - float(np.mean(pairs[0]))
 
 
-def _series(t_s: Array, height_m: Array, strokes: int) -> Motion | None:
+def _fourier_series(t_s: Array, height_m: Array, strokes: int) -> BlockMotion | None:
     """A Fourier series through a block; None where the motion is none."""
     span_s = float(t_s[-1])
     per_cycle = 2.0 * len(t_s) / strokes
@@ -330,22 +335,22 @@ def _series(t_s: Array, height_m: Array, strokes: int) -> Motion | None:
 
     def misfit(frequency_hz: float, count: int) -> float:
         made = _harmonics(t_s, frequency_hz, count)
-        left = height_m - made @ np.linalg.lstsq(made, height_m, rcond=None)[0]
-        return float(left @ left)
+        residual_m = height_m - made @ np.linalg.lstsq(made, height_m, rcond=None)[0]
+        return float(residual_m @ residual_m)
 
     best, count, chosen = np.inf, 1, coarse_hz
     for tried in range(1, harmonics + 1):
         width = 0.35 / span_s
-        found = cast("Any", minimize_scalar)(
+        minimum = cast("Any", minimize_scalar)(
             misfit,
             bounds=(coarse_hz - width, coarse_hz + width),
             args=(tried,),
             method="bounded",
             options={"xatol": 1e-6 * coarse_hz},
         )
-        value = len(t_s) * np.log(max(float(found.fun), 1e-30)) + 2.0 * (2 * tried + 2)
+        value = len(t_s) * np.log(max(float(minimum.fun), 1e-30)) + 2.0 * (2 * tried + 2)
         if value < best:
-            best, count, chosen = value, tried, float(found.x)
+            best, count, chosen = value, tried, float(minimum.x)
     made = _harmonics(t_s, chosen, count)
     weights = np.linalg.lstsq(made, height_m, rcond=None)[0]
     fitted = made @ weights
@@ -360,14 +365,14 @@ def _series(t_s: Array, height_m: Array, strokes: int) -> Motion | None:
     freedom = max(len(t_s) - 2 * count - 2, 1)
     noise_m = float(np.linalg.norm(height_m - fitted)) / np.sqrt(freedom)
     size = np.sqrt(2.0 / len(t_s)) * noise_m
-    # One harmonic more than was found to be there: that it is not is not known either.
+    # One harmonic more than were chosen, because its absence is uncertain too.
     more = 2.0 * np.pi * chosen * np.arange(1, count + 2)
     of_rates = size * float(np.linalg.norm(more))
     of_frequency = (
         np.sqrt(12.0) * size / span_s * float(np.max(np.abs(rate))) / order[0] / amplitude
     )
     std = float(np.hypot(of_rates, of_frequency))
-    return Motion(fitted, rate, fine @ weights, fine @ rates, std, 1.0 / chosen)
+    return BlockMotion(fitted, rate, fine @ weights, fine @ rates, std, 1.0 / chosen)
 
 
 def _harmonics(t_s: Array, frequency_hz: float, count: int) -> Array:

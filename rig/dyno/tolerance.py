@@ -1,20 +1,24 @@
-"""A band of tolerance about a master curve, and where a damper stands in it.
+"""A band of tolerance about a master curve, and the verdict on a damper at each of its points.
 
 A point passes when its interval lies inside the band, fails when it lies outside, and is open when
 the interval crosses a limit: the measurement then proves neither (ISO 14253-1, 2017).
 """
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.errors import InputError
-from can_dbc.yaml_file import load_validated, read_text, validated
-from rig.dyno.figures import Step
+from can_dbc.yaml_file import load_validated, validated
+from rig.dyno.figures import DynoStep
 from rig.dyno.stroke_force import Figure
+from rig.files.delimited_text import read_csv_columns
+
+_MAX_BYTES = 4_000_000
+"""Largest file of a band, whose points are at most a thousand."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Verdict = Literal["pass", "fail", "open", "not measured"]
@@ -23,7 +27,7 @@ _COLUMNS = ("velocity_m_per_s", "compression_low_n", "compression_high_n", "rebo
             "rebound_high_n")  # fmt: skip
 
 
-class Point(BaseModel):
+class BandPoint(BaseModel):
     """Limits at one peak velocity.
 
     Attributes:
@@ -43,7 +47,7 @@ class Point(BaseModel):
     rebound_high_n: Finite
 
     @model_validator(mode="after")
-    def _in_order(self) -> "Point":
+    def _in_order(self) -> "BandPoint":
         for side in ("compression", "rebound"):
             low, high = getattr(self, f"{side}_low_n"), getattr(self, f"{side}_high_n")
             if low >= high:
@@ -51,7 +55,7 @@ class Point(BaseModel):
         return self
 
 
-class Tolerance(BaseModel):
+class ToleranceBand(BaseModel):
     """A band about a master curve.
 
     Attributes:
@@ -62,17 +66,17 @@ class Tolerance(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: Annotated[str, Field(min_length=1, max_length=200)]
-    points: Annotated[tuple[Point, ...], Field(min_length=1, max_length=1000)]
+    points: Annotated[tuple[BandPoint, ...], Field(min_length=1, max_length=1000)]
 
     @model_validator(mode="after")
-    def _in_order(self) -> "Tolerance":
+    def _in_order(self) -> "ToleranceBand":
         speeds = [point.velocity_m_per_s for point in self.points]
         if sorted(set(speeds)) != speeds:
             raise ValueError("points: expected velocities that increase")
         return self
 
 
-class Judged(NamedTuple):
+class PointVerdict(NamedTuple):
     """A point of a damper.
 
     Attributes:
@@ -81,7 +85,7 @@ class Judged(NamedTuple):
         force: Its force there; None where no step is near.
         low_n: Smallest that is allowed.
         high_n: Largest.
-        verdict: How it stands.
+        verdict: Whether the force lies inside.
     """
 
     velocity_m_per_s: float
@@ -90,11 +94,6 @@ class Judged(NamedTuple):
     low_n: float
     high_n: float
     verdict: Verdict
-
-    def as_dict(self) -> dict[str, object]:
-        """For a file."""
-        force = None if self.force is None else self.force.as_dict()
-        return {**self._asdict(), "force": force}
 
     def words(self) -> str:
         """The same in a line."""
@@ -108,38 +107,35 @@ class Judged(NamedTuple):
         )
 
 
-def load_tolerance(path: Path) -> Tolerance:
-    """A band from YAML, or from CSV with the columns of `Point`.
+def load_tolerance(path: Path) -> ToleranceBand:
+    """A band from YAML, or from CSV with the columns of `BandPoint`.
 
     Raises:
         InputError: One line that names file, key, value and what was expected.
     """
     if path.suffix.lower() != ".csv":
-        return load_validated(Tolerance, path)
-    text = read_text(path).removeprefix("\ufeff")  # as spreadsheets begin a file
-    rows = list(csv.reader(text.splitlines()))
-    while rows and not any(cell.strip() for cell in rows[-1]):
-        rows.pop()
-    if not rows or tuple(cell.strip() for cell in rows[0]) != _COLUMNS:
-        raise InputError(f"{path}: line 1: expected the header {','.join(_COLUMNS)}")
-    points: list[dict[str, float]] = []
-    for number, row in enumerate(rows[1:], start=2):
-        if len(row) != len(_COLUMNS):
-            raise InputError(f"{path}: line {number}: {len(row)} cells, expected {len(_COLUMNS)}")
-        points.append(dict(zip(_COLUMNS, _numbers(path, number, row), strict=True)))
+        return load_validated(ToleranceBand, path)
+    columns, _ = read_csv_columns(
+        path, str(path), _MAX_BYTES, lambda header: _check_header(path, header)
+    )
+    points = [
+        dict(zip(columns, row, strict=True))
+        for row in np.column_stack(list(columns.values())).tolist()
+    ]
     if not points:
         raise InputError(f"{path}: holds no point, expected rows under the header")
-    return validated(Tolerance, {"name": path.stem, "points": points}, str(path))
+    return validated(ToleranceBand, {"name": path.stem, "points": points}, str(path))
 
 
-def _numbers(path: Path, line: int, row: Sequence[str]) -> list[float]:
-    try:
-        return [float(cell) for cell in row]
-    except ValueError:
-        raise InputError(f"{path}: line {line}: {','.join(row)}: expected numbers") from None
+def _check_header(path: Path, header: Sequence[str]) -> Sequence[str]:
+    if tuple(header) != _COLUMNS:
+        raise InputError(f"{path}: line 1: expected the header {','.join(_COLUMNS)}")
+    return header
 
 
-def judged(steps: Sequence[Step], kinds: Sequence[str], tolerance: Tolerance) -> list[Judged]:
+def evaluate_band(
+    steps: Sequence[DynoStep], kinds: Sequence[str], tolerance: ToleranceBand
+) -> list[PointVerdict]:
     """Every point of a band, compression and rebound.
 
     A point belongs to the velocity step nearest to its speed within 1 %; the force is then less
@@ -149,12 +145,12 @@ def judged(steps: Sequence[Step], kinds: Sequence[str], tolerance: Tolerance) ->
 
     Args:
         steps: The steps of a damper.
-        kinds: What each of them is, as `damper_of` says.
+        kinds: What each of them is, as `summarise_damper` says.
         tolerance: The band.
     """
     used = [step for step, kind in zip(steps, kinds, strict=True) if kind != "warm_up"]
     ordered = sorted(used, key=lambda step: step.peak_speed_m_per_s)
-    found: list[Judged] = []
+    verdicts: list[PointVerdict] = []
     for point in tolerance.points:
         for side, low, high in (
             ("compression", point.compression_low_n, point.compression_high_n),
@@ -162,8 +158,8 @@ def judged(steps: Sequence[Step], kinds: Sequence[str], tolerance: Tolerance) ->
         ):
             force = _force_at(ordered, side, point.velocity_m_per_s)
             verdict = _verdict(force, low, high)
-            found.append(Judged(point.velocity_m_per_s, side, force, low, high, verdict))
-    return found
+            verdicts.append(PointVerdict(point.velocity_m_per_s, side, force, low, high, verdict))
+    return verdicts
 
 
 _SAME = 0.01
@@ -173,26 +169,26 @@ _STEEPEST = 2.0
 """Power of the speed with which the force of an orifice rises: no damper's rises faster."""
 
 
-def _force_at(ordered: Sequence[Step], side: str, speed: float) -> Figure | None:
+def _force_at(ordered: Sequence[DynoStep], side: str, speed: float) -> Figure | None:
     sides = [step.compression if side == "compression" else step.rebound for step in ordered]
-    speeds = [one.peak_velocity.value for one in sides]
-    figures = [one.force_at_peak_velocity for one in sides]
+    speeds = [side_figures.peak_velocity_m_per_s.value for side_figures in sides]
+    figures = [side_figures.force_at_peak_velocity_n for side_figures in sides]
     if not speeds:
         return None
-    nearest = min(range(len(speeds)), key=lambda place: abs(speeds[place] / speed - 1.0))
+    nearest = min(range(len(speeds)), key=lambda index: abs(speeds[index] / speed - 1.0))
     apart = abs(speeds[nearest] / speed - 1.0)
     if apart <= _SAME:
-        found = figures[nearest]
-        more = _STEEPEST * apart * abs(found.value)
+        figure = figures[nearest]
+        more = _STEEPEST * apart * abs(figure.value)
         method = f"step at {speeds[nearest]:.4g} m/s"
-        return Figure(found.value, found.low - more, found.high + more, method)
-    for place in range(len(speeds) - 1):
-        if speeds[place] <= speed <= speeds[place + 1]:
-            share = (speed - speeds[place]) / (speeds[place + 1] - speeds[place])
-            below, above = figures[place], figures[place + 1]
+        return Figure(figure.value, figure.low - more, figure.high + more, method)
+    for index in range(len(speeds) - 1):
+        if speeds[index] <= speed <= speeds[index + 1]:
+            share = (speed - speeds[index]) / (speeds[index + 1] - speeds[index])
+            below, above = figures[index], figures[index + 1]
             value = (1.0 - share) * below.value + share * above.value
             low, high = min(below.low, above.low), max(below.high, above.high)
-            method = f"between steps at {speeds[place]:.3g} and {speeds[place + 1]:.3g} m/s"
+            method = f"between steps at {speeds[index]:.3g} and {speeds[index + 1]:.3g} m/s"
             return Figure(value, low, high, method)
     return None
 

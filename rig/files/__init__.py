@@ -1,1 +1,1 @@
-"""Files and folders: what every reader and writer shares."""
+"""Folders and delimited text, for every reader and writer of measured data."""

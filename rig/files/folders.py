@@ -1,4 +1,4 @@
-"""Folders that are written into."""
+"""Folders to write into."""
 
 import itertools
 from pathlib import Path
@@ -7,16 +7,16 @@ from can_dbc.errors import InputError
 
 
 def refuse_full(folder: Path) -> None:
-    """Refuse a folder that holds anything: nothing that somebody has is overwritten.
+    """Refuse a folder that is not empty, so that nothing is overwritten.
 
     Raises:
-        InputError: It does, or is no folder.
+        InputError: It is not empty, or no folder.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder}: is not empty, expected a new or an empty folder")
 
 
 def free_folder(folder: Path) -> Path:
-    """`folder`, or with the first number behind its name that makes it new."""
+    """`folder` if it is new, else the same name with the first free number appended."""
     numbered = (folder.with_name(f"{folder.name}-{number}") for number in itertools.count(2))
     return next(path for path in itertools.chain([folder], numbered) if not path.exists())

@@ -17,8 +17,8 @@ from can_dbc.errors import InputError
 from can_dbc.yaml_file import read_text
 from dart_model.spec import files_of, load_model
 from rig.fleet import store
-from rig.fleet.one_run import Row, Task, evaluated, identity_of, lost
-from rig.fleet.sources import Source
+from rig.fleet.one_run import RunRow, Task, evaluate_run, identity_of, lost_row
+from rig.fleet.sources import RunSource
 
 PART_ROWS = 500
 """Rows that are held until they are written, at most."""
@@ -27,7 +27,7 @@ PART_S = 20.0
 """Longest time for which a row is held: what a killed writer loses."""
 
 
-class Progress(NamedTuple):
+class CampaignProgress(NamedTuple):
     """How far a campaign is.
 
     Attributes:
@@ -46,8 +46,17 @@ class Progress(NamedTuple):
     elapsed_s: float
     worked_s: float
 
+    @property
+    def words(self) -> str:
+        """The same in a sentence."""
+        rate = self.done / self.elapsed_s if self.elapsed_s > 0.0 else 0.0
+        return (
+            f"{self.done} evaluated in {self.elapsed_s:.1f} s ({rate:.2f} a second), "
+            f"{self.failed} of them failed; {self.skipped} were in the store"
+        )
 
-class Model(NamedTuple):
+
+class FleetModel(NamedTuple):
     """A model as workers are given it.
 
     Attributes:
@@ -61,7 +70,7 @@ class Model(NamedTuple):
     sha256: str
 
 
-def model_of(file: Path) -> Model:
+def load_fleet_model(file: Path) -> FleetModel:
     """A model from its file.
 
     Raises:
@@ -74,19 +83,19 @@ def model_of(file: Path) -> Model:
             found.update((spec.folder / name).read_bytes())
         except OSError as error:
             raise InputError(f"{spec.folder / name}: cannot be read ({error.strerror})") from error
-    return Model(text, str(file.parent.absolute()), found.hexdigest())
+    return FleetModel(text, str(file.parent.absolute()), found.hexdigest())
 
 
-def campaign(
-    sources: Sequence[Source],
-    model: Model,
+def run_campaign(
+    sources: Sequence[RunSource],
+    model: FleetModel,
     out: Path,
     make_executor: Callable[[], Executor],
     window: int,
     *,
     again: bool = False,
-    progress: Callable[[Progress], None] = lambda _: None,
-) -> Progress:
+    progress: Callable[[CampaignProgress], None] = lambda _: None,
+) -> CampaignProgress:
     """Evaluate what is not in the store yet.
 
     A worker that dies takes those with it that were being computed: they are tried again one by
@@ -105,15 +114,15 @@ def campaign(
         InputError: The store cannot be read or written.
     """
     store.sweep(out)
-    known = store.identities(out, with_failed=not again)
-    keys = store.keys(out)
+    known = store.read_identities(out, with_failed=not again)
+    keys = store.read_keys(out)
     todo = [s for s in sources if identity_of(s, model.sha256) not in known]
     tasks = (Task(source, *model) for source in todo)
     begun = last_s = time.monotonic()
-    held: list[Row] = []
+    held: list[RunRow] = []
     done = failed = 0
     worked_s = 0.0
-    now = Progress(0, 0, len(todo), len(sources) - len(todo), 0.0, 0.0)
+    now = CampaignProgress(0, 0, len(todo), len(sources) - len(todo), 0.0, 0.0)
     progress(now)
     if not todo:
         return now
@@ -141,11 +150,11 @@ def campaign(
 
 def _rows(
     tasks: Iterator[Task], make_executor: Callable[[], Executor], window: int
-) -> Iterator[Row | None]:
+) -> Iterator[RunRow | None]:
     """Rows in the order in which they are ready; None where none was for a while."""
     executor = make_executor()
-    pending: dict[Future[Row], Task] = {}
-    ready: SimpleQueue[Future[Row]] = SimpleQueue()
+    pending: dict[Future[RunRow], Task] = {}
+    ready: SimpleQueue[Future[RunRow]] = SimpleQueue()
     try:
         while True:
             while len(pending) < window and (task := next(tasks, None)) is not None:
@@ -170,13 +179,13 @@ def _rows(
                 executor = make_executor()
                 continue
             except Exception as error:  # of an engine elsewhere, e.g. a killed worker
-                row = lost(task, f"no worker gave it back: {type(error).__name__}: {error}")
+                row = lost_row(task, f"no worker gave it back: {type(error).__name__}: {error}")
             yield row
     finally:
         _end(executor, pending)
 
 
-def _end(executor: Executor, pending: Iterable[Future[Row]]) -> None:
+def _end(executor: Executor, pending: Iterable[Future[RunRow]]) -> None:
     """Leave an executor with what it was not yet given a worker for."""
     for future in pending:
         future.cancel()
@@ -186,12 +195,12 @@ def _end(executor: Executor, pending: Iterable[Future[Row]]) -> None:
 def _submit(
     executor: Executor,
     task: Task,
-    pending: dict[Future[Row], Task],
-    ready: "SimpleQueue[Future[Row]]",
+    pending: dict[Future[RunRow], Task],
+    ready: "SimpleQueue[Future[RunRow]]",
 ) -> None:
-    future: Future[Row]
+    future: Future[RunRow]
     try:
-        future = executor.submit(evaluated, task)
+        future = executor.submit(evaluate_run, task)
     except BrokenExecutor as error:
         future = Future()
         future.set_exception(error)
@@ -201,12 +210,12 @@ def _submit(
     future.add_done_callback(ready.put)
 
 
-def _alone(task: Task, make_executor: Callable[[], Executor]) -> Row:
+def _alone(task: Task, make_executor: Callable[[], Executor]) -> RunRow:
     """A run in an executor of its own, which it may break."""
     executor = make_executor()
     try:
-        return executor.submit(evaluated, task).result()
+        return executor.submit(evaluate_run, task).result()
     except (BrokenExecutor, CancelledError):
-        return lost(task, "killed its worker, alone as well")
+        return lost_row(task, "killed its worker, alone as well")
     finally:
         _end(executor, ())

@@ -26,7 +26,7 @@ from rig.diagnosis.outcome import Estimate, FoundEffect
 from rig.diagnosis.recording import Recording, read_recording
 from rig.diagnosis.refit import refitted
 from rig.dyno.characterise import characterise
-from rig.fleet.sources import Source, shown
+from rig.fleet.sources import RunSource, printable
 from rig.log.reader import RUN_FILE
 
 _PIECE = 1 << 20
@@ -43,14 +43,14 @@ class Task:
         model_sha256: Of the file and of those.
     """
 
-    source: Source
+    source: RunSource
     model: str
     folder: str
     model_sha256: str
 
 
 @dataclass(frozen=True)
-class Row:
+class RunRow:
     """What is known of a run; a row of the store, and one for each of its values.
 
     Attributes:
@@ -93,7 +93,7 @@ class Row:
     after: float = math.nan
     floor: float = math.nan
     took_s: float = math.nan
-    values: tuple["Value", ...] = ()
+    values: tuple["RunValue", ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """As columns, without its values."""
@@ -103,7 +103,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Value:
+class RunValue:
     """A number that a run gave.
 
     Attributes:
@@ -128,41 +128,41 @@ class Value:
     high: float
 
 
-def evaluated(task: Task) -> Row:
+def evaluate_run(task: Task) -> RunRow:
     """Diagnose a run by itself; what goes wrong is in the row."""
     begun = time.perf_counter()
     source = task.source
     try:
-        row = _evaluated(task)
+        row = _diagnose_run(task)
     except InputError as error:
-        row = _failed(task, str(error))
+        row = _error_row(task, str(error))
     except Exception as error:  # one bad run never stops the rest
-        row = _failed(task, f"unexpected: {type(error).__name__}: {error}")
+        row = _error_row(task, f"unexpected: {type(error).__name__}: {error}")
     took_s = time.perf_counter() - begun
     # Without the run's own name and place: alike errors are counted as one.
     name = re.escape(source.url.rsplit("/", 1)[-1])
     error = re.sub(rf"[^\s:]*{name}", "run", row.error.replace(source.url, "run"))
-    return replace(row, took_s=took_s, error=shown(error)[:500])
+    return replace(row, took_s=took_s, error=printable(error)[:500])
 
 
-def lost(task: Task, why: str) -> Row:
+def lost_row(task: Task, why: str) -> RunRow:
     """The row of a run that came back from no worker."""
-    return _failed(task, why)
+    return _error_row(task, why)
 
 
-def identity_of(source: Source, model_sha256: str) -> str:
+def identity_of(source: RunSource, model_sha256: str) -> str:
     """What a run is known by without being read."""
     parts = [source.url, str(source.size), source.stamp, source.bench, source.damper, source.date]
     text = "\0".join([*parts, model_sha256, rig_version()])
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
 
-def _failed(task: Task, why: str) -> Row:
+def _error_row(task: Task, why: str) -> RunRow:
     source, identity = task.source, identity_of(task.source, task.model_sha256)
-    return Row(
+    return RunRow(
         identity,
         identity,
-        shown(source.url),
+        printable(source.url),
         source.bench,
         source.damper,
         source.date or source.changed,
@@ -184,7 +184,7 @@ def _model(text: str, folder: str) -> ModelSpec:
     return parse_model(text, "model", Path(folder))
 
 
-def _evaluated(task: Task) -> Row:
+def _diagnose_run(task: Task) -> RunRow:
     source, spec = task.source, _model(task.model, task.folder)
     with _local(source) as path:
         key = _key(path, task)
@@ -197,7 +197,7 @@ def _evaluated(task: Task) -> Row:
         _value("model", item.strut, item.effect, item.parameter, item.estimate)
         for item in refitted(spec, [recording])
     ]
-    new = [value for item in found.effects for value in _found(item)]
+    new = [value for item in found.effects for value in _effect_values(item)]
     held_out = found.held_out
     heights, forces = held_out.height_rmse_m, held_out.residual_force_rmse_n
     counted, floor = (
@@ -205,10 +205,10 @@ def _evaluated(task: Task) -> Row:
         if math.isfinite(heights.after)
         else (forces, found.noise_floor.residual_force_rmse_n)
     )
-    return Row(
+    return RunRow(
         key,
         identity_of(source, task.model_sha256),
-        shown(source.url),
+        printable(source.url),
         source.bench,
         source.damper,
         day,
@@ -225,14 +225,14 @@ def _evaluated(task: Task) -> Row:
     )
 
 
-def _value(kind: str, strut: str, name: str, parameter: str, estimate: Estimate) -> Value:
+def _value(kind: str, strut: str, name: str, parameter: str, estimate: Estimate) -> RunValue:
     low = math.nan if estimate.low is None else estimate.low
     high = math.nan if estimate.high is None else estimate.high
     family = effect(name).family if name else ""
-    return Value(kind, strut, name, family, parameter, estimate.value, low, high)
+    return RunValue(kind, strut, name, family, parameter, estimate.value, low, high)
 
 
-def _found(item: FoundEffect) -> list[Value]:
+def _effect_values(item: FoundEffect) -> list[RunValue]:
     """What an effect is worth, and its parameters; of a table without a name the worth alone."""
     worth = Estimate(item.force_rms_n, None, None)
     listed = {} if item.name == "restoring_surface" else item.parameters
@@ -242,7 +242,7 @@ def _found(item: FoundEffect) -> list[Value]:
     ]
 
 
-def _figures(path: Path, recording: Recording) -> list[Value]:
+def _figures(path: Path, recording: Recording) -> list[RunValue]:
     """Figures of a damper that was moved in strokes; none where it was not."""
     if recording.strut_forces_n is None or recording.heights_m.shape[1] != 1:
         return []
@@ -251,20 +251,20 @@ def _figures(path: Path, recording: Recording) -> list[Value]:
     except InputError:
         return []
     named = {
-        "gas_force_n": damper.gas_force,
-        "gas_rate_n_per_m": damper.gas_rate,
-        "friction_n": damper.friction,
+        "gas_force_n": damper.gas_force_n,
+        "gas_rate_n_per_m": damper.gas_rate_n_per_m,
+        "friction_n": damper.friction_n,
         "asymmetry": damper.asymmetry,
     }
     return [
-        Value("figure", "", "", "", name, figure.value, figure.low, figure.high)
+        RunValue("figure", "", "", "", name, figure.value, figure.low, figure.high)
         for name, figure in named.items()
         if figure is not None
     ]
 
 
 @contextlib.contextmanager
-def _local(source: Source) -> Generator[Path]:
+def _local(source: RunSource) -> Generator[Path]:
     """The run as files of this machine."""
     if "://" not in source.url:
         yield Path(source.url)
@@ -297,7 +297,7 @@ def _key(path: Path, task: Task) -> str:
     return found.hexdigest()[:32]
 
 
-def _day_of(path: Path, source: Source) -> str:
+def _day_of(path: Path, source: RunSource) -> str:
     """The day on which a run of the bridge began; empty for other recordings."""
     if not source.is_folder:
         return ""

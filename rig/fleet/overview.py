@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rig.fleet.sources import UNKNOWN
-from rig.fleet.store import opened
+from rig.fleet.store import connect
 from rig.fleet.trends import (
     FEWEST,
     LEVEL,
-    Change,
+    ChangePoint,
+    DatedValue,
     Drift,
-    Point,
-    bench_jump,
-    change_point,
-    drift,
-    outliers,
+    find_bench_jump,
+    find_change_point,
+    find_outliers,
+    fit_drift,
     without_step,
 )
 
@@ -33,7 +33,7 @@ _RECENT = 5
 """Last points of a series whose median stands for the damper as it is now."""
 
 
-class Quantity(NamedTuple):
+class SeriesQuantity(NamedTuple):
     """What a series is of.
 
     Attributes:
@@ -73,10 +73,10 @@ class Series(NamedTuple):
     """
 
     where: Where
-    quantity: Quantity
-    points: tuple[Point, ...]
+    quantity: SeriesQuantity
+    points: tuple[DatedValue, ...]
     drift: Drift | None
-    change: Change | None
+    change: ChangePoint | None
     is_change: bool
     is_drift: bool
 
@@ -94,7 +94,7 @@ class Jump(NamedTuple):
     bench: str
     parameter: str
     factor: float
-    change: Change
+    change: ChangePoint
 
 
 class Outlier(NamedTuple):
@@ -109,7 +109,7 @@ class Outlier(NamedTuple):
     """
 
     where: Where
-    quantity: Quantity
+    quantity: SeriesQuantity
     value: float
     usual: float
     distance: float
@@ -191,13 +191,13 @@ def date_of(day: float) -> str:
     return datetime.date.fromordinal(round(day)).isoformat()
 
 
-def overview(store: Path) -> Overview:
+def read_overview(store: Path) -> Overview:
     """Read a store.
 
     Raises:
         InputError: There is none, or it cannot be read.
     """
-    connection = opened(store)
+    connection = connect(store)
     try:
         model, sha256, version = connection.execute(
             "SELECT model, model_sha256, version FROM runs ORDER BY written DESC LIMIT 1"
@@ -220,12 +220,12 @@ def overview(store: Path) -> Overview:
             "FROM these GROUP BY bench, said ORDER BY bench, count(*) DESC, said"
         ).fetchall():
             verdicts.setdefault(bench, {})[verdict] = count
-        collected = _collected(connection)
+        collected = _read_series(connection)
     finally:
         connection.close()
     jumps = _jumps(collected)
     stepped_on = _step_days(collected, jumps)
-    cleared = _without(collected, stepped_on)
+    cleared = _without_jumps(collected, stepped_on)
     words = f"{model} ({sha256[:8]}), rig {version}"
     return Overview(
         runs,
@@ -239,10 +239,10 @@ def overview(store: Path) -> Overview:
     )
 
 
-_Collected = dict[Quantity, dict[Where, list[Point]]]
+_Collected = dict[SeriesQuantity, dict[Where, list[DatedValue]]]
 
 
-def _collected(connection: Any) -> _Collected:
+def _read_series(connection: Any) -> _Collected:
     """Every series by quantity.
 
     Values that their run does not bound are left out, and dampers that nobody named: of several,
@@ -259,8 +259,8 @@ def _collected(connection: Any) -> _Collected:
     while batch := rows.fetchmany(100_000):
         for strut, effect, parameter, bench, damper, date, value in batch:
             day = float(datetime.date.fromisoformat(date).toordinal())
-            series = found.setdefault(Quantity(strut, effect, parameter), {})
-            series.setdefault(Where(bench, damper), []).append(Point(day, value))
+            series = found.setdefault(SeriesQuantity(strut, effect, parameter), {})
+            series.setdefault(Where(bench, damper), []).append(DatedValue(day, value))
     return found
 
 
@@ -281,14 +281,16 @@ def _jumps(collected: _Collected) -> tuple[Jump, ...]:
                 for where, points in by_place.items()
                 if where.bench == bench and all(point.value > 0.0 for point in points)
             }
-            change = bench_jump(logs, level)
+            change = find_bench_jump(logs, level)
             if change is not None and (bench not in found or change.p < found[bench].change.p):
                 factor = math.exp(change.after - change.before)
                 found[bench] = Jump(bench, quantity.parameter, factor, change)
     return tuple(found.values())
 
 
-def _step_days(collected: _Collected, jumps: Sequence[Jump]) -> dict[tuple[Where, Quantity], float]:
+def _step_days(
+    collected: _Collected, jumps: Sequence[Jump]
+) -> dict[tuple[Where, SeriesQuantity], float]:
     """Day of the bench's jump for each series that it is in."""
     by_bench = {jump.bench: jump.change.day for jump in jumps}
     return {
@@ -299,7 +301,9 @@ def _step_days(collected: _Collected, jumps: Sequence[Jump]) -> dict[tuple[Where
     }
 
 
-def _without(collected: _Collected, days: Mapping[tuple[Where, Quantity], float]) -> _Collected:
+def _without_jumps(
+    collected: _Collected, days: Mapping[tuple[Where, SeriesQuantity], float]
+) -> _Collected:
     """Every series without the jump of its bench, whose size is its own best one."""
     return {
         quantity: {
@@ -312,12 +316,12 @@ def _without(collected: _Collected, days: Mapping[tuple[Where, Quantity], float]
     }
 
 
-def _logarithms(points: Sequence[Point]) -> list[Point]:
+def _logarithms(points: Sequence[DatedValue]) -> list[DatedValue]:
     return [point._replace(value=math.log(point.value)) for point in points]
 
 
 def _series(
-    collected: _Collected, stepped_on: Mapping[tuple[Where, Quantity], float]
+    collected: _Collected, stepped_on: Mapping[tuple[Where, SeriesQuantity], float]
 ) -> tuple[Series, ...]:
     """Every series with what is significant among all of them."""
     every = [
@@ -328,8 +332,8 @@ def _series(
     level = LEVEL / max(1, sum(len(points) >= FEWEST for _, _, points in every))
     found: list[Series] = []
     for where, quantity, points in every:
-        line = drift(points, stepped_on.get((where, quantity)))
-        change = change_point(points)
+        line = fit_drift(points, stepped_on.get((where, quantity)))
+        change = find_change_point(points)
         is_change = change is not None and change.p < level
         is_drift = line is not None and len(points) >= FEWEST and line.p < level and not is_change
         found.append(Series(where, quantity, tuple(points), line, change, is_change, is_drift))
@@ -346,7 +350,7 @@ def _outliers(collected: _Collected) -> tuple[Outlier, ...]:
         names = {f"{where.bench}\0{where.damper}": where for where in latest}
         usual = sorted(latest.values())[len(latest) // 2]
         values = {key: latest[where] for key, where in names.items()}
-        for name, distance in outliers(values, LEVEL / len(collected)).items():
+        for name, distance in find_outliers(values, LEVEL / len(collected)).items():
             found.append(Outlier(names[name], quantity, latest[names[name]], usual, distance))
     return tuple(found)
 
@@ -355,6 +359,6 @@ def _place(item: Series) -> dict[str, str]:
     return {**item.where._asdict(), **item.quantity._asdict()}
 
 
-def _change_dict(change: Change) -> dict[str, Any]:
+def _change_dict(change: ChangePoint) -> dict[str, Any]:
     dates = {key: date_of(getattr(change, key)) for key in ("day", "low", "high")}
     return {**change._asdict(), **dates}

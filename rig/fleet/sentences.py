@@ -1,16 +1,16 @@
 """What a store says, in sentences."""
 
 from rig.fleet.overview import Jump, Overview, Series, date_of
-from rig.fleet.trends import Change, Drift
+from rig.fleet.trends import ChangePoint, Drift
 
 
-def alarms(found: Overview) -> list[str]:
+def alarm_sentences(found: Overview) -> list[str]:
     """A sentence for each jump, change, drift and outlier, the surest first."""
     changes = [(s.change.p, s, s.change) for s in found.series if s.is_change and s.change]
     drifts = [(s.drift.p, s, s.drift) for s in found.series if s.is_drift and s.drift]
-    lines = [_jumped(jump) for jump in found.jumps]
-    lines += [_changed(s, change) for _, s, change in sorted(changes)]
-    lines += [_drifting(s, line) for _, s, line in sorted(drifts)]
+    lines = [_jump_sentence(jump) for jump in found.jumps]
+    lines += [_change_sentence(s, change) for _, s, change in sorted(changes)]
+    lines += [_drift_sentence(s, line) for _, s, line in sorted(drifts)]
     lines += [
         f"Damper {item.where.damper} on {item.where.bench}: {item.quantity.words} is "
         f"{item.value:.4g}, usual is {item.usual:.4g}"
@@ -19,12 +19,12 @@ def alarms(found: Overview) -> list[str]:
     return lines
 
 
-def name_of(item: Series) -> str:
+def series_name(item: Series) -> str:
     """Which damper, and what of it."""
     return f"Damper {item.where.damper} on {item.where.bench}: {item.quantity.words}"
 
 
-def _jumped(jump: Jump) -> str:
+def _jump_sentence(jump: Jump) -> str:
     change = jump.change
     return (
         f"Bench {jump.bench}: {jump.parameter} of its dampers steps by "
@@ -34,21 +34,21 @@ def _jumped(jump: Jump) -> str:
     )
 
 
-def _changed(item: Series, change: Change) -> str:
+def _change_sentence(item: Series, change: ChangePoint) -> str:
     what = (
         f"steps from {change.before:.4g} to {change.after:.4g}"
         if change.kind == "step"
         else f"bends from {change.before:.4g} to {change.after:.4g} at the end"
     )
     return (
-        f"{name_of(item)} {what}, from {date_of(change.day)} on "
+        f"{series_name(item)} {what}, from {date_of(change.day)} on "
         f"({date_of(change.low)} to {date_of(change.high)})"
     )
 
 
-def _drifting(item: Series, line: Drift) -> str:
+def _drift_sentence(item: Series, line: Drift) -> str:
     share = 700.0 / abs(line.level) if line.level else 0.0
     return (
-        f"{name_of(item)} drifts by {share * line.per_day:+.2f} % a week "
+        f"{series_name(item)} drifts by {share * line.per_day:+.2f} % a week "
         f"({share * line.low:+.2f} to {share * line.high:+.2f})"
     )

@@ -32,7 +32,7 @@ _FORBIDDEN = re.compile(r"[/\\\x00-\x1f]")
 
 
 @dataclass(frozen=True)
-class Source:
+class RunSource:
     """A run that may be evaluated.
 
     Attributes:
@@ -56,7 +56,7 @@ class Source:
     stamp: str
 
 
-def find_sources(given: Sequence[str], pattern: str | None = None) -> list[Source]:
+def find_sources(given: Sequence[str], pattern: str | None = None) -> list[RunSource]:
     """All runs in or at some places, by bench, day and place.
 
     Args:
@@ -69,10 +69,10 @@ def find_sources(given: Sequence[str], pattern: str | None = None) -> list[Sourc
     Raises:
         InputError: A place is not there, or holds no run; the pattern is wrong, or does not fit.
     """
-    compiled = None if pattern is None else _compiled(pattern)
-    found: dict[str, Source] = {}
+    compiled = None if pattern is None else _compile_pattern(pattern)
+    found: dict[str, RunSource] = {}
     for place in given:
-        there = list(_in_place(place, compiled, pattern))
+        there = list(_find_in(place, compiled, pattern))
         if not there:
             raise InputError(f"{place}: no runs, expected run folders or CSV files")
         found |= {source.url: source for source in there}
@@ -81,7 +81,20 @@ def find_sources(given: Sequence[str], pattern: str | None = None) -> list[Sourc
     )
 
 
-def shard_of(sources: Sequence[Source], index: int, count: int) -> list[Source]:
+def parse_shard(text: str) -> tuple[int, int]:
+    """Number of a part, from 1 on, and how many there are, from a text such as `3/16`.
+
+    Raises:
+        InputError: It is none.
+    """
+    first, _, last = text.partition("/")
+    is_number = text.isascii() and first.isdecimal() and last.isdecimal()
+    if not (is_number and 1 <= int(first) <= int(last)):
+        raise InputError(f"--shard {text!r}: expected I/N with I from 1 to N, such as 3/16")
+    return int(first), int(last)
+
+
+def select_shard(sources: Sequence[RunSource], index: int, count: int) -> list[RunSource]:
     """One of so many parts; a run is in the same part whatever else there is.
 
     Args:
@@ -92,10 +105,10 @@ def shard_of(sources: Sequence[Source], index: int, count: int) -> list[Source]:
     return [item for item in sources if zlib.crc32(os.fsencode(item.url)) % count == index - 1]
 
 
-def _in_place(
+def _find_in(
     place: str, compiled: re.Pattern[str] | None, pattern: str | None
-) -> Iterator[Source]:
-    files, protocol, root = _listed(place)
+) -> Iterator[RunSource]:
+    files, protocol, root = _list_files(place)
     folders = {str(PurePosixPath(p).parent) for p in files if PurePosixPath(p).name == RUN_FILE}
     sizes: dict[str, int] = {}
     stamps: dict[str, str] = {}
@@ -115,11 +128,11 @@ def _in_place(
         if "date" in fields and not day:
             raise InputError(f"{inside}: {fields['date']!r}: expected a day such as 2026-01-05")
         _refuse_names(inside, fields)
-        yield Source(
+        yield RunSource(
             f"{protocol}{run}",
             run in folders,
-            shown(fields.get("bench") or UNKNOWN),
-            shown(fields.get("damper") or UNKNOWN),
+            printable(fields.get("bench") or UNKNOWN),
+            printable(fields.get("damper") or UNKNOWN),
             day,
             stamps[run][:10],
             size,
@@ -127,10 +140,10 @@ def _in_place(
         )
 
 
-def _listed(place: str) -> tuple[Mapping[str, Any], str, str]:
+def _list_files(place: str) -> tuple[Mapping[str, Any], str, str]:
     """Files at a place with what is known of them, what URLs of it begin with, and its root."""
     if "://" not in place:
-        return _here(Path(place)), "", str(Path(place).absolute())
+        return _list_local_files(Path(place)), "", str(Path(place).absolute())
     try:
         system, root = url_to_fs(place)
         files = system.find(root, detail=True)
@@ -139,7 +152,7 @@ def _listed(place: str) -> tuple[Mapping[str, Any], str, str]:
     return files, place.split("://", 1)[0] + "://", root.rstrip("/")
 
 
-def _here(place: Path) -> dict[str, dict[str, float]]:
+def _list_local_files(place: Path) -> dict[str, dict[str, float]]:
     """Files of this machine at a place, also behind links."""
     found: dict[str, dict[str, float]] = {}
     place = place.absolute()
@@ -166,7 +179,7 @@ def _stamp(info: Mapping[str, Any]) -> str:
     return str(changed)
 
 
-def _compiled(pattern: str) -> re.Pattern[str]:
+def _compile_pattern(pattern: str) -> re.Pattern[str]:
     parts = re.split(r"(\{[^{}]*\}|\*)", pattern.removesuffix(".csv"))
     seen: set[str] = set()
     text = ""
@@ -206,7 +219,7 @@ def _refuse_names(inside: str, fields: Mapping[str, str]) -> None:
             )
 
 
-def shown(text: str) -> str:
+def printable(text: str) -> str:
     """A path as text that can be written, whatever its bytes are."""
     return text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 

@@ -13,7 +13,6 @@ import datetime
 import glob
 import hashlib
 import importlib
-import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -23,8 +22,9 @@ from urllib.parse import quote
 import pyarrow as pa
 from pyarrow import dataset, parquet
 
+from can_dbc.atomic_file import replacing
 from can_dbc.errors import InputError
-from rig.fleet.one_run import Row, Value
+from rig.fleet.one_run import RunRow, RunValue
 
 _duckdb: Any = None
 with contextlib.suppress(ModuleNotFoundError):  # It only reads; the store is written without it.
@@ -87,13 +87,25 @@ _ABANDONED_S = 3600.0
 """Age from which on a part without its runs was left by a program that was killed."""
 
 
-def append(store: Path, rows: Sequence[Row]) -> None:
+def refuse_other(store: Path) -> None:
+    """Refuse a folder that holds something other than a store.
+
+    Raises:
+        InputError: It does, or is a file.
+    """
+    if store.exists() and not store.is_dir():
+        raise InputError(f"{store}: is a file, expected a folder")
+    if store.is_dir() and any(store.iterdir()) and not (store / "values").is_dir():
+        raise InputError(f"{store}: holds something else, expected a store or a new folder")
+
+
+def append(store: Path, rows: Sequence[RunRow]) -> None:
     """Write rows, a part for each bench and day.
 
     Raises:
         InputError: The store cannot be written.
     """
-    groups: dict[tuple[str, str], list[Row]] = {}
+    groups: dict[tuple[str, str], list[RunRow]] = {}
     for row in rows:
         groups.setdefault((row.bench, row.date), []).append(row)
     try:
@@ -103,7 +115,7 @@ def append(store: Path, rows: Sequence[Row]) -> None:
         raise InputError(f"{store}: cannot be written ({error.strerror})") from error
 
 
-def _write(store: Path, partition: str, rows: Sequence[Row]) -> None:
+def _write(store: Path, partition: str, rows: Sequence[RunRow]) -> None:
     content = "\0".join([partition, *(row.key for row in rows)])
     part = hashlib.sha256(content.encode("utf-8", "surrogateescape")).hexdigest()[:24]
     written = datetime.datetime.now(datetime.UTC).isoformat(timespec="microseconds")
@@ -116,17 +128,16 @@ def _write(store: Path, partition: str, rows: Sequence[Row]) -> None:
     for name, schema, content in (("values", _VALUE, values), ("runs", _RUN, runs)):
         path = store / name / partition / f"{part}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
         kept = [{key: item[key] for key in schema.names} for item in content]
-        _parquet.write_table(_pa.Table.from_pylist(kept, schema=schema), temporary)
-        temporary.replace(path)
+        with replacing(path) as temporary:
+            _parquet.write_table(_pa.Table.from_pylist(kept, schema=schema), temporary)
 
 
-def _columns(value: Value) -> dict[str, Any]:
+def _columns(value: RunValue) -> dict[str, Any]:
     return {name: getattr(value, name) for name in _VALUE.names if hasattr(value, name)}
 
 
-def identities(store: Path, *, with_failed: bool) -> set[str]:
+def read_identities(store: Path, *, with_failed: bool) -> set[str]:
     """What was evaluated already.
 
     Args:
@@ -145,7 +156,7 @@ def identities(store: Path, *, with_failed: bool) -> set[str]:
     return found
 
 
-def keys(store: Path) -> set[str]:
+def read_keys(store: Path) -> set[str]:
     """Keys of all runs of a store.
 
     Raises:
@@ -190,7 +201,7 @@ def _age_s(path: Path, now: float) -> float:
         return 0.0
 
 
-def opened(store: Path) -> Any:
+def connect(store: Path) -> Any:
     """A DuckDB connection with the views `runs`, `values` and `effects`.
 
     Raises:
@@ -201,7 +212,7 @@ def opened(store: Path) -> Any:
     if _duckdb is None:
         raise InputError("duckdb is not installed, expected `pip install 'rig[fleet]'`")
     connection = _duckdb.connect()
-    runs, values = (_quoted(store / name / "**" / "*.parquet") for name in ("runs", "values"))
+    runs, values = (_quote(store / name / "**" / "*.parquet") for name in ("runs", "values"))
     try:
         connection.execute(_VIEWS.format(runs=runs, values=values))
     except _duckdb.Error as error:
@@ -209,7 +220,7 @@ def opened(store: Path) -> Any:
     return connection
 
 
-def _quoted(path: Path) -> str:
+def _quote(path: Path) -> str:
     text = glob.escape(str(path.parents[1])) + f"/{path.parent.name}/{path.name}"
     return "'" + text.replace("'", "''") + "'"
 
@@ -220,7 +231,7 @@ def query(store: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
     Raises:
         InputError: There is no store, or DuckDB refuses the query.
     """
-    connection = opened(store)
+    connection = connect(store)
     try:
         answer = connection.execute(sql)
         if answer is None or answer.description is None:

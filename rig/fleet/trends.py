@@ -52,7 +52,7 @@ _GAUSS = 1.4826
 """Standard deviation over median absolute deviation of a Gaussian."""
 
 
-class Point(NamedTuple):
+class DatedValue(NamedTuple):
     """A value on a day.
 
     Attributes:
@@ -64,7 +64,7 @@ class Point(NamedTuple):
     value: float
 
 
-class Change(NamedTuple):
+class ChangePoint(NamedTuple):
     """A change-point.
 
     Attributes:
@@ -108,7 +108,7 @@ class Drift(NamedTuple):
     p: float
 
 
-def change_point(points: Sequence[Point]) -> Change | None:
+def find_change_point(points: Sequence[DatedValue]) -> ChangePoint | None:
     """The likeliest change of a series, significant or not; None where it is too short.
 
     Args:
@@ -118,13 +118,13 @@ def change_point(points: Sequence[Point]) -> Change | None:
     if len(points) < FEWEST or np.ptp(days) <= 0.0:
         return None
     y = np.array([point.value for point in points])
-    if not _places(days):
+    if not _change_indices(days):
         return None
     statistic = float(_largest(days, y[:, np.newaxis])[0])
-    return _described(days, y, _chance(tuple(np.round(days - days[0], 6)), statistic))
+    return _describe_change(days, y, _chance(tuple(np.round(days - days[0], 6)), statistic))
 
 
-def drift(points: Sequence[Point], stepped_on: float | None = None) -> Drift | None:
+def fit_drift(points: Sequence[DatedValue], stepped_on: float | None = None) -> Drift | None:
     """The straight line through a series; None with too few days for it.
 
     Args:
@@ -132,7 +132,7 @@ def drift(points: Sequence[Point], stepped_on: float | None = None) -> Drift | N
         stepped_on: Day of a step of unknown size that is not its own.
     """
     days = np.array([point.day for point in points])
-    columns = _beside_step(days, stepped_on)
+    columns = _line_and_step(days, stepped_on)
     free = len(days) - columns.shape[1]
     if len(np.unique(days)) < 3 or free < 1:
         return None
@@ -148,9 +148,9 @@ def drift(points: Sequence[Point], stepped_on: float | None = None) -> Drift | N
     return Drift(slope, slope - half, slope + half, float(y.mean()), p)
 
 
-def without_step(points: Sequence[Point], day: float) -> list[Point]:
+def without_step(points: Sequence[DatedValue], day: float) -> list[DatedValue]:
     """A series without the step that it has on a day, beside its straight line."""
-    columns = _beside_step(np.array([point.day for point in points]), day)
+    columns = _line_and_step(np.array([point.day for point in points]), day)
     if columns.shape[1] < 3:
         return list(points)
     y = np.array([point.value for point in points])
@@ -158,7 +158,7 @@ def without_step(points: Sequence[Point], day: float) -> list[Point]:
     return [p._replace(value=p.value - step) if p.day >= day else p for p in points]
 
 
-def _beside_step(days: Array, day: float | None) -> Array:
+def _line_and_step(days: Array, day: float | None) -> Array:
     """Line, and step where there are points enough on either side, shape (N, 2 or 3)."""
     place = len(days) if day is None else int(np.searchsorted(days, day))
     has_step = _EDGE <= place <= len(days) - _EDGE
@@ -166,7 +166,7 @@ def _beside_step(days: Array, day: float | None) -> Array:
     return columns[:, : 3 if has_step else 2]
 
 
-def outliers(values: Mapping[str, float], level: float) -> dict[str, float]:
+def find_outliers(values: Mapping[str, float], level: float) -> dict[str, float]:
     """How many robust standard deviations away from the others members are that stand out.
 
     Args:
@@ -200,7 +200,7 @@ def _farthest(members: int, level: float) -> float:
     return float(np.quantile(farthest, 1.0 - level))
 
 
-def bench_jump(series: Mapping[str, Sequence[Point]], level: float) -> Change | None:
+def find_bench_jump(series: Mapping[str, Sequence[DatedValue]], level: float) -> ChangePoint | None:
     """A step that the dampers of one bench have in common: of its calibration, not of theirs.
 
     Args:
@@ -220,11 +220,11 @@ def bench_jump(series: Mapping[str, Sequence[Point]], level: float) -> Change | 
         for point in points:
             by_day.setdefault(point.day, []).append(point.value - middle)
     common = [
-        Point(day, float(np.median(left)))
+        DatedValue(day, float(np.median(left)))
         for day, left in sorted(by_day.items())
         if len(left) >= _SHARED
     ]
-    change = change_point(common)
+    change = find_change_point(common)
     if change is None or change.kind != "step" or change.p > level:
         return None
     size = change.after - change.before
@@ -234,9 +234,9 @@ def bench_jump(series: Mapping[str, Sequence[Point]], level: float) -> Change | 
     return change if len(shared) >= max(_SHARED, 0.5 * len(both)) else None
 
 
-def _step_at(points: Sequence[Point], day: float) -> float | None:
+def _step_at(points: Sequence[DatedValue], day: float) -> float | None:
     """Size of a step on a day beside the line of wear; None where a side has too few points."""
-    columns = _beside_step(np.array([point.day for point in points]), day)
+    columns = _line_and_step(np.array([point.day for point in points]), day)
     if columns.shape[1] < 3:
         return None
     values = np.array([point.value for point in points])
@@ -246,7 +246,7 @@ def _step_at(points: Sequence[Point], day: float) -> float | None:
 # --- the statistic --------------------------------------------------------------------------------
 
 
-def _places(days: Array) -> list[int]:
+def _change_indices(days: Array) -> list[int]:
     """Indices of the first point after a change, each on a day of its own."""
     found = [k for k in range(_EDGE, len(days) - _EDGE + 1) if days[k] > days[k - 1]]
     return found[:: -(-len(found) // _MOST_PLACES)] if found else []
@@ -266,7 +266,7 @@ def _largest(days: Array, y: Array) -> Array:
     left = y - line @ (line.T @ y)
     total = np.sum(left**2, axis=0)
     best = np.zeros(y.shape[1])
-    for place in _places(days):
+    for place in _change_indices(days):
         basis, _ = np.linalg.qr(_columns(days, place))
         explained = np.sum((basis[:, 2:].T @ left) ** 2, axis=0)
         f = (explained / 2.0) / np.maximum((total - explained) / (len(days) - 4), 1e-300)
@@ -307,10 +307,10 @@ _KINDS: tuple[tuple[Literal["step", "bend"], list[int]], ...] = (
 )
 
 
-def _described(days: Array, y: Array, p: float) -> Change:
+def _describe_change(days: Array, y: Array, p: float) -> ChangePoint:
     """The likelier of a step and a bend, where it likeliest is, and from what to what it leads."""
     kinds = {
-        kind: {place: _rss(_columns(days, place)[:, own], y) for place in _places(days)}
+        kind: {place: _rss(_columns(days, place)[:, own], y) for place in _change_indices(days)}
         for kind, own in _KINDS
     }
     kind, own = min(_KINDS, key=lambda item: min(kinds[item[0]].values()))
@@ -327,7 +327,7 @@ def _described(days: Array, y: Array, p: float) -> Change:
     # A bend begins on a day that is still on the line, a step is there on the day.
     day, low, high = (float(days[k - is_bend]) for k in (at, min(likely), max(likely)))
     before = float(weights[0]) + slope * (day - float(days.mean()))
-    return Change(
+    return ChangePoint(
         day,
         low,
         high,

@@ -10,11 +10,11 @@ from uuid import UUID
 
 from rig.fmu.binaries import TARGETS, Target, compile_for
 from rig.fmu.component import Component
-from rig.fmu.description import Made, build_description, description_2, description_3
-from rig.fmu.source import Fmi, compiled_files, sources
+from rig.fmu.description import Provenance, build_description, description_2, description_3
+from rig.fmu.source import Fmi, select_c_files, sources
 
-_MADE_AT = (1980, 1, 1, 0, 0, 0)
-"""Of every file in the archive: the same model gives the same bytes."""
+_FILE_TIME = (1980, 1, 1, 0, 0, 0)
+"""Time of every file in the archive, so that the same model gives the same bytes."""
 
 _EXPERIMENT_S, _STEP_S = 10.0, 0.001
 
@@ -31,9 +31,9 @@ def archive(
     Args:
         component: What it computes.
         version: Version of the interface, ``2.0`` or ``3.0``.
-        model: Text of the model file, which is put beside it.
-        targets: Systems to compile for; those that the version has no name for are left out.
-        done: Called after each.
+        model: Text of the model file, which the archive contains too.
+        targets: Systems to compile for, except those that the version has no name for.
+        done: Called after each system.
 
     Raises:
         InputError: There is no compiler, or it refuses.
@@ -41,37 +41,37 @@ def archive(
     tool = f"rig {installed('rig')}"
     token = _token(component, version, tool)
     code = sources(component, version, token)
-    compiled = compiled_files(code)
-    made = Made(tool, token, _EXPERIMENT_S, _STEP_S)
+    c_files = select_c_files(code)
+    provenance = Provenance(tool, token, _EXPERIMENT_S, _STEP_S)
     files: dict[str, bytes | str] = {}
     if version == "2.0":
-        files["modelDescription.xml"] = description_2(component, made, compiled)
+        files["modelDescription.xml"] = description_2(component, provenance, c_files)
     else:
-        files["modelDescription.xml"] = description_3(component, made)
-        files["sources/buildDescription.xml"] = build_description(component, compiled)
+        files["modelDescription.xml"] = description_3(component, provenance)
+        files["sources/buildDescription.xml"] = build_description(component, c_files)
     files |= {f"sources/{name}": text for name, text in code.items()}
     files["resources/model.yaml"] = model
     files["documentation/index.html"] = _page(component)
-    wanted = [target for target in targets if target.folder(version) is not None]
-    binaries = compile_for(wanted, code, component.identifier, done)
+    supported = [target for target in targets if target.folder(version) is not None]
+    binaries = compile_for(supported, code, component.identifier, done)
     for target, content in binaries.items():
         name = f"{component.identifier}{target.suffix}"
         files[f"binaries/{target.folder(version)}/{name}"] = content
-    return _zipped(files)
+    return _zip_files(files)
 
 
 def _token(component: Component, version: Fmi, tool: str) -> str:
-    """What is the same for the same content, and for no other."""
+    """A token that only the same content has."""
     code = sources(component, version, "")
     text = "\0".join([tool, version, *(f"{name}\0{code[name]}" for name in sorted(code))])
     return f"{{{UUID(bytes=hashlib.sha256(text.encode()).digest()[:16])}}}"
 
 
-def _zipped(files: dict[str, bytes | str]) -> bytes:
+def _zip_files(files: dict[str, bytes | str]) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as zipped:
         for name, content in files.items():
-            entry = zipfile.ZipInfo(name, _MADE_AT)
+            entry = zipfile.ZipInfo(name, _FILE_TIME)
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = 0o644 << 16
             zipped.writestr(entry, content)
@@ -79,7 +79,7 @@ def _zipped(files: dict[str, bytes | str]) -> bytes:
 
 
 def _page(component: Component) -> str:
-    """What a person finds who unpacks the FMU."""
+    """The page for a user who unpacks the FMU."""
     rows = "".join(
         f"<tr><td><code>{html.escape(item.name)}</code></td><td>{item.kind}</td>"
         f"<td>{'' if item.start is None else f'{item.start:.9g}'}</td>"

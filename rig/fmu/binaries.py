@@ -10,18 +10,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 from can_dbc.errors import InputError
-from rig.fmu.source import compiled_files
+from rig.fmu.source import select_c_files
 
 
 class Target(NamedTuple):
     """A system that an FMU runs on.
 
     Attributes:
-        words: What it is called.
-        triple: What the compiler calls it. The oldest C library of Linux that is still met.
+        words: Its name.
+        triple: Its name for the compiler, with the oldest C library of Linux that is still in use.
         fmi_2: Its folder in an FMU of FMI 2.0, or None where that has no name for it.
         fmi_3: The same of FMI 3.0.
-        suffix: Of a shared library.
+        suffix: Suffix of a shared library.
     """
 
     words: str
@@ -44,7 +44,7 @@ TARGETS = (
 )
 """Every system that binaries are made for."""
 
-# No contraction: a product and a sum that become one rounding would not be what Python computes.
+# No contraction: one rounding for a product and a sum would not be what Python computes.
 _FLAGS = (
     "-DFMI2_OVERRIDE_FUNCTION_PREFIX",
     "-DFMI3_OVERRIDE_FUNCTION_PREFIX",
@@ -55,11 +55,11 @@ _FLAGS = (
     "-Wall",
     "-Wextra",
 )
-_TAKES_S = 300.0
+_TIMEOUT_S = 300.0
 
 
 def this_system() -> Target:
-    """The one of `TARGETS` that this program runs on.
+    """The target of this program's own system.
 
     Raises:
         InputError: It is none of them.
@@ -81,13 +81,13 @@ def compile_for(
     identifier: str,
     done: Callable[[Target], None] = lambda _: None,
 ) -> dict[Target, bytes]:
-    """Shared libraries of some C files.
+    """Shared libraries compiled from C files, by target.
 
     Args:
-        targets: Systems.
-        sources: The files by their names.
+        targets: Systems to compile for.
+        sources: Content of each file, by its name.
         identifier: Name of the library, without its suffix.
-        done: Called after each.
+        done: Called after each system.
 
     Raises:
         InputError: The package `ziglang` is not installed, or its compiler refuses.
@@ -96,7 +96,7 @@ def compile_for(
         raise InputError(
             "the package ziglang, a C compiler, is not installed, expected `pip install 'rig[fmu]'`"
         )
-    made: dict[Target, bytes] = {}
+    libraries: dict[Target, bytes] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for file, text in sources.items():
@@ -104,10 +104,10 @@ def compile_for(
         for target in targets:
             out = folder / target.fmi_3 / f"{identifier}{target.suffix}"
             out.parent.mkdir()
-            _compile(folder, compiled_files(sources), target, out)
-            made[target] = out.read_bytes()
+            _compile(folder, select_c_files(sources), target, out)
+            libraries[target] = out.read_bytes()
             done(target)
-    return made
+    return libraries
 
 
 def _compile(folder: Path, files: list[str], target: Target, out: Path) -> None:
@@ -116,7 +116,7 @@ def _compile(folder: Path, files: list[str], target: Target, out: Path) -> None:
     shared = ["-shared", "-fPIC"] if target.suffix != ".dll" else ["-shared"]
     command = [*compiler, *_FLAGS, *shared, "-o", str(out), *files, *linked]
     result = subprocess.run(  # noqa: S603  # a list, no shell
-        command, cwd=folder, capture_output=True, text=True, timeout=_TAKES_S, check=False
+        command, cwd=folder, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
     )
     if result.returncode != 0:
         first = next((line for line in result.stderr.splitlines() if "error" in line), "no reason")

@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from can_dbc.errors import InputError
-from dart_model.effects import Effect, effect
+from dart_model.effects import AMBIENT_C, Effect, effect
 from dart_model.plant import DartPlant
 from dart_model.spec import EffectSpec, ModelSpec, StrutSpec
 from rig.fmu.law_in_c import ARGUMENTS, InC, in_c
@@ -32,7 +32,6 @@ KINDS: tuple[Kind, ...] = (
 """Of variables, in the order in which they lie in memory; `parameter` may be tuned in a run."""
 
 LONGEST_STEP = "longest_step_s"
-AMBIENT_C = 20.0
 
 _STRUT_STEP_S = 0.5e-3
 """Longest step of an element's internal states where nobody has said how fast the motion is: that

@@ -33,15 +33,15 @@ _BASE: Mapping[str, Mapping[str, int]] = {
     "rad": {"rad": 1},
     "1": {},
 }
-"""Units as products of base units; another unit is named without them."""
+"""Units as products of base units; any other unit has a name alone."""
 
 
-class Made(NamedTuple):
-    """By what an FMU is made.
+class Provenance(NamedTuple):
+    """Tool and defaults that an FMU's description contains.
 
     Attributes:
         tool: Program and version.
-        token: What tells this FMU from any other.
+        token: Identifies the FMU's content.
         experiment_s: Length of a usual simulation.
         step_s: Its step.
     """
@@ -52,21 +52,21 @@ class Made(NamedTuple):
     step_s: float
 
 
-def description_2(component: Component, made: Made, files: list[str]) -> str:
+def description_2(component: Component, provenance: Provenance, files: list[str]) -> str:
     """``modelDescription.xml`` of FMI 2.0.
 
     Args:
         component: What the FMU computes.
-        made: By what it is made.
+        provenance: Tool and defaults.
         files: C files that a compiler is given.
     """
     root = Element(
         "fmiModelDescription",
         fmiVersion="2.0",
         modelName=component.name,
-        guid=made.token,
+        guid=provenance.token,
         description=component.meaning,
-        generationTool=made.tool,
+        generationTool=provenance.tool,
         variableNamingConvention="structured",
         numberOfEventIndicators=str(len(component.of("indicator"))),
     )
@@ -84,46 +84,44 @@ def description_2(component: Component, made: Made, files: list[str]) -> str:
         | states,
     )
     for parent in (exchange, simulation):
-        listed = SubElement(parent, "SourceFiles")
+        source_files = SubElement(parent, "SourceFiles")
         for name in files:
-            SubElement(listed, "File", name=name)
-    _about_all(root, component, made)
-    known = [item for item in component.variables if item.kind != "indicator"]
+            SubElement(source_files, "File", name=name)
+    _add_definitions(root, component, provenance)
+    listed = [item for item in component.variables if item.kind != "indicator"]
     variables = SubElement(root, "ModelVariables")
-    rates = {place: state for (place, _), (state, _) in _rates(component)}
-    for place, item in enumerate(known):
-        scalar = SubElement(variables, "ScalarVariable", _attributes(item, place))
+    states = _state_of_rate(component)
+    for index, item in enumerate(listed):
+        scalar = SubElement(variables, "ScalarVariable", _attributes(item, index))
         real = SubElement(scalar, "Real", _unit(item))
         if item.start is not None:
             real.set("start", repr(float(item.start)))
         if item.kind == "state":
             real.set("nominal", repr(float(item.nominal)))
-        if place in rates:
-            real.set("derivative", str(rates[place] + 1))
+        if index in states:
+            real.set("derivative", str(states[index] + 1))
     structure = SubElement(root, "ModelStructure")
-    outputs = [place for place, item in enumerate(known) if _is_output(item)]
-    calculated = [place for place, item in enumerate(known) if item.kind in ("rate", "output")]
-    for tag, places in (
-        ("Outputs", outputs),
-        ("Derivatives", list(rates)),
-        ("InitialUnknowns", calculated),
+    for tag, indices in (
+        ("Outputs", _outputs(component)),
+        ("Derivatives", list(states)),
+        ("InitialUnknowns", _calculated(component)),
     ):
-        if places:
-            listed = SubElement(structure, tag)
-            for place in places:
-                SubElement(listed, "Unknown", index=str(place + 1))
+        if indices:
+            unknowns = SubElement(structure, tag)
+            for index in indices:
+                SubElement(unknowns, "Unknown", index=str(index + 1))
     return _text(root)
 
 
-def description_3(component: Component, made: Made) -> str:
+def description_3(component: Component, provenance: Provenance) -> str:
     """``modelDescription.xml`` of FMI 3.0; arguments as of `description_2`."""
     root = Element(
         "fmiModelDescription",
         fmiVersion="3.0",
         modelName=component.name,
-        instantiationToken=made.token,
+        instantiationToken=provenance.token,
         description=component.meaning,
-        generationTool=made.tool,
+        generationTool=provenance.tool,
         variableNamingConvention="structured",
     )
     able = {
@@ -133,30 +131,27 @@ def description_3(component: Component, made: Made) -> str:
     }
     SubElement(root, "ModelExchange", able)
     SubElement(root, "CoSimulation", able | {"canHandleVariableCommunicationStepSize": "true"})
-    _about_all(root, component, made)
+    _add_definitions(root, component, provenance)
     variables = SubElement(root, "ModelVariables")
-    rates = {place: state for (place, _), (state, _) in _rates(component)}
-    for place, item in enumerate(component.variables):
-        made_of = _attributes(item, place) | _unit(item)
+    states = _state_of_rate(component)
+    for index, item in enumerate(component.variables):
+        attributes = _attributes(item, index) | _unit(item)
         if item.start is not None:
-            made_of["start"] = repr(float(item.start))
+            attributes["start"] = repr(float(item.start))
         if item.kind == "state":
-            made_of["nominal"] = repr(float(item.nominal))
-        if place in rates:
-            made_of["derivative"] = str(rates[place])
-        SubElement(variables, "Float64", made_of)
+            attributes["nominal"] = repr(float(item.nominal))
+        if index in states:
+            attributes["derivative"] = str(states[index])
+        SubElement(variables, "Float64", attributes)
     structure = SubElement(root, "ModelStructure")
-    outputs = [place for place, item in enumerate(component.variables) if _is_output(item)]
-    calculated = [place for place, _ in (*component.of("rate"), *component.of("output"))]
-    indicators = [place for place, _ in component.of("indicator")]
-    for tag, places in (
-        ("Output", outputs),
-        ("ContinuousStateDerivative", list(rates)),
-        ("InitialUnknown", calculated),
-        ("EventIndicator", indicators),
+    for tag, indices in (
+        ("Output", _outputs(component)),
+        ("ContinuousStateDerivative", list(states)),
+        ("InitialUnknown", _calculated(component)),
+        ("EventIndicator", [index for index, _ in component.of("indicator")]),
     ):
-        for place in places:
-            SubElement(structure, tag, valueReference=str(place))
+        for index in indices:
+            SubElement(structure, tag, valueReference=str(index))
     return _text(root)
 
 
@@ -166,14 +161,14 @@ def build_description(component: Component, files: list[str]) -> str:
     configuration = SubElement(
         root, "BuildConfiguration", modelIdentifier=component.identifier, description="C99"
     )
-    listed = SubElement(configuration, "SourceFileSet", language="C99")
+    source_files = SubElement(configuration, "SourceFileSet", language="C99")
     for name in files:
-        SubElement(listed, "SourceFile", name=name)
+        SubElement(source_files, "SourceFile", name=name)
     return _text(root)
 
 
-def _about_all(root: Element, component: Component, made: Made) -> None:
-    """Units, log categories and a usual experiment."""
+def _add_definitions(root: Element, component: Component, provenance: Provenance) -> None:
+    """Add units, log categories and the default experiment."""
     units = SubElement(root, "UnitDefinitions")
     for name in sorted({item.unit for item in component.variables if item.unit}):
         unit = SubElement(units, "Unit", name=name)
@@ -186,13 +181,13 @@ def _about_all(root: Element, component: Component, made: Made) -> None:
         root,
         "DefaultExperiment",
         startTime="0",
-        stopTime=repr(made.experiment_s),
-        stepSize=repr(made.step_s),
+        stopTime=repr(provenance.experiment_s),
+        stepSize=repr(provenance.step_s),
     )
 
 
 def _base_units(name: str) -> dict[str, str] | None:
-    """A unit such as ``N.s/m`` in base units; None if it cannot be said in them."""
+    """A unit such as ``N.s/m`` in base units; None if they do not express it."""
     if name == "degC":
         return {"K": "1", "offset": "273.15"}
     exponents: dict[str, int] = {}
@@ -208,29 +203,35 @@ def _base_units(name: str) -> dict[str, str] | None:
 
 def _attributes(item: Variable, reference: int) -> dict[str, str]:
     causality, variability, initial = _CAUSALITY[item.kind]
-    made = {
+    attributes = {
         "name": item.name,
         "valueReference": str(reference),
         "description": item.meaning,
         "causality": "output" if item.is_output else causality,
         "variability": variability,
     }
-    return made if initial is None else made | {"initial": initial}
+    return attributes if initial is None else attributes | {"initial": initial}
 
 
 def _unit(item: Variable) -> dict[str, str]:
     return {"unit": item.unit} if item.unit else {}
 
 
-def _is_output(item: Variable) -> bool:
-    return item.kind == "output" or item.is_output
+def _outputs(component: Component) -> list[int]:
+    """Indices of the outputs; indicators, the last variables, are none."""
+    variables = enumerate(component.variables)
+    return [index for index, item in variables if item.kind == "output" or item.is_output]
 
 
-def _rates(
-    component: Component,
-) -> list[tuple[tuple[int, Variable], tuple[int, Variable]]]:
-    """Every rate with the state that it is of."""
-    return list(zip(component.of("rate"), component.of("state"), strict=True))
+def _calculated(component: Component) -> list[int]:
+    """Indices of the rates and the outputs."""
+    return [index for index, _ in (*component.of("rate"), *component.of("output"))]
+
+
+def _state_of_rate(component: Component) -> dict[int, int]:
+    """Index of the state by the index of its rate."""
+    pairs = zip(component.of("rate"), component.of("state"), strict=True)
+    return {rate: state for (rate, _), (state, _) in pairs}
 
 
 def _text(root: Element) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import parse_mapping, read_text, validated
+from dart_model.effects import AMBIENT_C
 from dart_model.plant import DartPlant
 from dart_model.plant.admitted_programs import admit, withdraw
 from dart_model.plant.fmu import MockUp, described, read_program
@@ -17,7 +18,7 @@ from rig.files.folders import refuse_full
 MODEL_FILE, FMU_FILE = "model.yaml", "strut.fmu"
 
 _FORCES_N = (0.0, 1.0, 1000.0)
-"""Applied forces from which the mass of a bench is found."""
+"""Applied forces from which the mass of a bench is computed."""
 
 _PROPORTIONAL = 1e-6
 """Share by which the mass may depend on the force."""
@@ -28,9 +29,9 @@ def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: P
 
     Args:
         source: The FMU.
-        mapping: What its variables are, as in the `fmu` of a model file; without it, they are
+        mapping: Roles of its variables, as in the `fmu` of a model file; without it, they are
             called as in an FMU of `rig export`.
-        mass_kg: Mass that the strut carries; of a bench it is found where it is not given.
+        mass_kg: Mass that the strut carries; of a bench it is computed if it is None.
         out: New folder for the model file and the FMU.
 
     Returns:
@@ -39,10 +40,12 @@ def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: P
     Raises:
         InputError: The FMU, the mapping or the folder is wrong, or a mass is missing.
     """
+    if mass_kg is not None and not 0.0 < mass_kg < math.inf:
+        raise InputError(f"--mass-kg {mass_kg}: expected a mass")
     refuse_full(out)
     content = read_program(source)
     description = described(content, source)
-    roles = _named(description, source) if mapping is None else _mapped(mapping)
+    roles = _roles_by_name(description, source) if mapping is None else _read_roles(mapping)
     _refuse_contradictions(roles, mapping or source)
     if roles.force is not None and mass_kg is None:
         raise InputError(f"{source}: a strut alone, expected --mass-kg with what it carries")
@@ -66,76 +69,89 @@ def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: P
     return spec.model_copy(update={"folder": out})
 
 
-def _mapped(mapping: Path) -> FmuSpec:
-    given = parse_mapping(read_text(mapping), str(mapping))
-    return validated(FmuSpec, {**given, "file": FMU_FILE}, str(mapping))
+def _read_roles(mapping: Path) -> FmuSpec:
+    roles = parse_mapping(read_text(mapping), str(mapping))
+    return validated(FmuSpec, {**roles, "file": FMU_FILE}, str(mapping))
+
+
+def variables_of(roles: FmuSpec) -> dict[str, str]:
+    """Variable of each role that the FMU has."""
+    keys = ("height", "velocity", "force", "acceleration", "temperature", "applied_force")
+    return {key: name for key in keys if (name := getattr(roles, key)) is not None}
 
 
 def _refuse_contradictions(roles: FmuSpec, source: Path) -> None:
-    named = [roles.height, roles.velocity, roles.force, roles.acceleration]
-    named += [roles.temperature, roles.applied_force]
-    plain = [name.removeprefix("-") for name in named if name is not None]
+    variables = variables_of(roles)
+    plain = [name.removeprefix("-") for name in variables.values()]
     if len(set(plain)) < len(plain):
-        raise InputError(f"{source}: one variable stands for two things, expected one for each")
-    motion = [name for name in named[:4] if name is not None and name != roles.force]
+        raise InputError(f"{source}: one variable has two roles, expected one for each")
+    motion = [variables.get(key, roles.height) for key in ("height", "velocity", "acceleration")]
     if len({name.startswith("-") for name in motion}) > 1:
         raise InputError(
             f"{source}: height, velocity and acceleration have different signs, expected one"
         )
 
 
-def _named(description: Any, source: Path) -> FmuSpec:
-    """What the variables of an FMU of ours are."""
+def _roles_by_name(description: Any, source: Path) -> FmuSpec:
+    """Roles of the variables of an FMU of `rig export`, by their names."""
     causality = {item.name: item.causality for item in description.modelVariables}
 
-    def there(name: str) -> str | None:
+    def input_named(name: str) -> str | None:
         return name if causality.get(name) == "input" else None
 
-    further = {"temperature": there("temperature_c"), "applied_force": there("applied_force_n")}
-    if there("height_m") and there("velocity_m_per_s") and causality.get("force_n") == "output":
+    further = {
+        "temperature": input_named("temperature_c"),
+        "applied_force": input_named("applied_force_n"),
+    }
+    if (
+        input_named("height_m")
+        and input_named("velocity_m_per_s")
+        and causality.get("force_n") == "output"
+    ):
         own = {"height": "height_m", "velocity": "velocity_m_per_s", "force": "force_n"}
         return validated(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
     rates = {item.variable.derivative.name: item.variable.name for item in description.derivatives}
-    found = [name.removesuffix("height_m") for name in rates if name.endswith(".height_m")]
-    for prefix in found:
+    prefixes = [name.removesuffix("height_m") for name in rates if name.endswith(".height_m")]
+    for prefix in prefixes:
         height, velocity = f"{prefix}height_m", f"{prefix}velocity_m_per_s"
         if velocity in rates and further["applied_force"]:
             own = {"height": height, "velocity": velocity, "acceleration": rates[velocity]}
             return validated(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
     names = ", ".join(n for n, kind in causality.items() if kind in ("input", "output"))
     raise InputError(
-        f"{source}: its variables are not named as ours, expected --mapping FILE that says which "
-        f"are height, velocity and force (it has {names[:300]})"
+        f"{source}: its variables have other names than those of `rig export`, expected --mapping "
+        f"FILE that gives height, velocity and force (it has {names[:300]})"
     )
 
 
 def _mass_kg(roles: FmuSpec, description: Any, folder: Path, source: Path) -> float:
     """Mass of a bench along its height: force over acceleration.
 
-    Of an FMU of ours the strut's force belongs to it, which an effect may make of the applied one.
+    In an FMU of `rig export` the strut's force counts too, because an effect may depend on the
+    applied force.
     """
     if roles.applied_force is None:
         raise InputError(f"{source}: a bench without applied_force, expected it or --mass-kg")
     own = f"{roles.height.removesuffix('height_m')}force_n"
-    is_ours = roles.height.endswith(".height_m") and own in {
+    is_exported = roles.height.endswith(".height_m") and own in {
         item.name for item in description.modelVariables
     }
-    # With a mass of 1 kg and no gravity, what it gives is the acceleration less the applied force.
+    # With a mass of 1 kg and no gravity, its force is the acceleration less the applied force.
     unit = MockUp(roles.model_copy(update={"mass_kg": 1.0}), folder, 0.0)
     rest = [0.0] * len(unit.state_scales)
-    accelerations = [unit.force(0.0, 0.0, 0.0, f, 20.0, rest) + f for f in _FORCES_N]
+    accelerations = [unit.force(0.0, 0.0, 0.0, f, AMBIENT_C, rest) + f for f in _FORCES_N]
     forces = list(_FORCES_N)
-    if is_ours:
+    if is_exported:
         update = {"force": own, "acceleration": None}
         strut = MockUp(roles.model_copy(update=update), folder, 0.0)
-        forces = [f + strut.force(0.0, 0.0, 0.0, f, 20.0, rest) for f in _FORCES_N]
+        forces = [f + strut.force(0.0, 0.0, 0.0, f, AMBIENT_C, rest) for f in _FORCES_N]
     masses = [
         (force - forces[0]) / (a - accelerations[0]) if a != accelerations[0] else math.nan
         for force, a in zip(forces[1:], accelerations[1:], strict=True)
     ]
     if not (masses[0] > 0.0 and math.isclose(*masses, rel_tol=_PROPORTIONAL)):
         raise InputError(
-            f"{source}: applied forces of 1 N and of 1000 N tell of masses of {masses[0]:.6g} and "
+            f"{source}: applied forces of 1 N and of 1000 N give masses of {masses[0]:.6g} and "
             f"{masses[1]:.6g} kg, expected one on a straight guide, or --mass-kg"
         )
     return float(f"{masses[0]:.12g}")
@@ -167,7 +183,7 @@ def _model(
 
 
 def _start_m(description: Any, height: str) -> float:
-    """Height at which the FMU begins; zero if it does not say."""
+    """Height at which the FMU begins, m; zero if it has no start value."""
     starts = {item.name: item.start for item in description.modelVariables}
     try:
         start = float(starts.get(height.removeprefix("-")) or 0.0)

@@ -1,4 +1,4 @@
-"""The C of an FMU: what is the same for all, and two files of its own."""
+"""The C sources of an FMU: those that all FMUs share, and the model's two."""
 
 from collections.abc import Iterable, Mapping
 from importlib.resources import files
@@ -14,7 +14,7 @@ VERSIONS: Mapping[Fmi, tuple[str, ...]] = {
 }
 """Files of each version of the interface."""
 
-_SHARED = ("component.c", "component.h", "switches.h")
+_COMMON = ("component.c", "component.h", "switches.h")
 _COUNTED: Mapping[Kind, str] = {
     "input": "INPUT",
     "parameter": "PARAMETER",
@@ -40,21 +40,21 @@ def sources(component: Component, version: Fmi, token: str) -> dict[str, str]:
     Args:
         component: What it computes.
         version: Version of the interface.
-        token: What the description calls it, so that no other binary passes for it.
+        token: Token in the description, so that no other binary is taken for it.
     """
-    made = {name: shared(name) for name in (*_SHARED, *VERSIONS[version])}
-    made["model.h"] = _header(component, token, version)
-    made["model.c"] = _model(component)
-    return made
+    code = {name: read_common_source(name) for name in (*_COMMON, *VERSIONS[version])}
+    code["model.h"] = _header(component, token, version)
+    code["model.c"] = _model(component)
+    return code
 
 
-def shared(name: str) -> str:
-    """A C file that is the same for all FMUs."""
+def read_common_source(name: str) -> str:
+    """A C file that all FMUs share."""
     return (files("rig.fmu") / "c" / name).read_text(encoding="utf-8")
 
 
-def compiled_files(names: Iterable[str]) -> list[str]:
-    """Those of some files that a compiler is given."""
+def select_c_files(names: Iterable[str]) -> list[str]:
+    """The names of the files that are compiled, sorted."""
     return sorted(name for name in names if name.endswith(".c"))
 
 

@@ -1,4 +1,4 @@
-"""A bus log of another program becomes a run, as if the bridge had received it live."""
+"""Turns a bus log of another program into a run, as if the bridge had received it live."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,17 +19,18 @@ from rig.run.logged_run import Endpoint, run_logged
 from rig.run.loop import Progress, RunControl
 
 _LONGEST_GAP_NS = 3_600_000_000_000
-"""Time between two frames of one recording, an hour; more is another day's, or a wrong clock."""
+"""Longest time between two frames of one recording, an hour; more is another recording, or a wrong
+clock."""
 
 
 class _LogPort:
-    """Frames of a foreign log, tick by tick. What the bridge sends goes nowhere."""
+    """Frames of a foreign log, tick by tick. What the bridge sends is discarded."""
 
     def __init__(self, source: Path, directory: Directory, first_due_ns: int) -> None:
         self._source = source
         self._frames = read_log(source)
         self._directory = directory
-        self.taken = 0
+        self.received = 0
         self.others = 0
         self.last_ns = 0
         self._waiting = self._next()
@@ -37,7 +38,7 @@ class _LogPort:
         self._shift_ns = first_due_ns - self.first_ns
 
     @property
-    def ended(self) -> bool:
+    def is_exhausted(self) -> bool:
         """Whether all frames were read."""
         return self._waiting is None
 
@@ -45,10 +46,10 @@ class _LogPort:
         """Frames up to a tick."""
         frames: list[Frame] = []
         while (frame := self._waiting) is not None and frame.t_ns + self._shift_ns <= t_ns:
-            # A log that several channels were written to may be out of order by a little.
+            # A log of several channels may be slightly out of order.
             self.last_ns = max(frame.t_ns, self.last_ns)
             frames.append(replace(frame, t_ns=self.last_ns + self._shift_ns))
-            self.taken += 1
+            self.received += 1
             self._waiting = self._next()
         return frames, Conditions()
 
@@ -59,7 +60,7 @@ class _LogPort:
     def _next(self) -> Frame | None:
         for _, frame in self._frames:
             if self._directory.place(frame.arbitration_id, frame.is_extended) is not None:
-                if self.taken and frame.t_ns - self.last_ns > _LONGEST_GAP_NS:
+                if self.received and frame.t_ns - self.last_ns > _LONGEST_GAP_NS:
                     gap_s = (frame.t_ns - self.last_ns) * 1e-9
                     raise InputError(
                         f"{self._source}: {gap_s:.0f} s without a frame of the bench, "
@@ -77,7 +78,7 @@ def import_log(
 
     Args:
         source: BLF, ASC, candump, TRC or MF4 log of a bus.
-        plan: Configuration that says which signals are read, with model and DBC.
+        plan: Plan with the signals to read.
         out: Folder of the run to write; absent or empty.
         progress: Called with time and mode of every tick.
 
@@ -85,35 +86,35 @@ def import_log(
         What was made and what was assumed.
 
     Raises:
-        InputError: The log cannot be read, holds no frame that the bridge hears, or the folder
+        InputError: The log cannot be read, holds no frame of the configured signals, or the folder
             cannot be written.
     """
     bridge = build_bridge(plan)
     # Half a tick after a tick, so that the jitter of a bench as fast as the bridge gives each tick
     # one frame, and not two to one and none to the next.
     port = _LogPort(source, bridge.directory, plan.period_ns // 2)
-    wanted = tuple(item.message.name for item in bridge.incoming)
-    if port.ended:
+    names = tuple(item.message.name for item in bridge.incoming)
+    if port.is_exhausted:
         raise InputError(
-            f"{source}: none of its {port.others} frames is one of {', '.join(wanted)}, "
+            f"{source}: none of its {port.others} frames is one of {', '.join(names)}, "
             "expected a log of the bench that the configuration describes"
         )
     endless = plan.with_config(plan.config.model_copy(update={"duration_s": None}))
     endpoint = Endpoint(port, VirtualClock(), LinkFigures())
-    control = RunControl(stop=lambda: port.ended, progress=progress)
+    control = RunControl(stop=lambda: port.is_exhausted, progress=progress)
     ended = run_logged(endless, bridge, endpoint, out, control)
     duration_s = (port.last_ns - port.first_ns) * 1e-9
     counts = ended.state.counts
     return ImportReport(
         out,
-        port.taken,
+        port.received,
         duration_s,
-        port.taken / duration_s if duration_s > 0.0 else 0.0,
-        wanted,
+        port.received / duration_s if duration_s > 0.0 else 0.0,
+        names,
         (
             f"meaning of the frames from {plan.database.path.name}; "
             f"{port.others} frames of other ids left out",
-            "all frames taken as received, error frames left out; the first one is at half a tick",
+            "all frames taken as received, without error frames; the first one is at half a tick",
             f"estimates computed with model {plan.model.name} at {plan.config.rate_hz:g} Hz",
             f"{counts.lost} frames lost and {counts.refused} refused by counter and checksum",
         ),

@@ -4,10 +4,10 @@
     csv       every step, one column a quantity with its unit in the name
     parquet   `steps.parquet` and `frames.parquet`, with the run's other files in their metadata
     mf4       ASAM MDF 4: the frames as a bus log with the DBC attached, their decoded signals, and
-              every step (wants the package asammdf)
+              every step (requires the package asammdf)
 
-Parquet and MF4 hold everything: `import_run` makes the same run of them again, but for the time of
-day of the files.
+Parquet and MF4 hold everything: `import_run` restores the same run from them, except the files'
+modification times.
 """
 
 import contextlib
@@ -22,9 +22,10 @@ import pyarrow.csv
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import parse_mapping
 from rig.files.folders import refuse_full
-from rig.formats.content import channel_of, inside
-from rig.formats.mf4 import from_mf4, to_mf4
-from rig.formats.parquet import from_parquet, to_parquet
+from rig.formats.mf4 import read_mf4, write_mf4
+from rig.formats.mts import is_mts
+from rig.formats.parquet import read_parquet, write_parquet
+from rig.formats.run_content import channel_of, path_inside
 from rig.log.reader import (
     FRAMES_FILE,
     RUN_FILE,
@@ -53,25 +54,25 @@ def export_run(
         The files that were written.
 
     Raises:
-        InputError: The run is damaged, the format is unknown or wants a package that is missing, or
+        InputError: The run is damaged, the format is unknown or requires a missing package, or
             `out` exists or cannot be written.
     """
     if kind not in FORMATS:
         raise InputError(f"format {kind!r}: expected one of {', '.join(FORMATS)}")
     if out.exists():
         raise InputError(f"{out}: exists, expected a new file")
-    found = read(folder)
+    run = read(folder)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        with _all_or_nothing(out):
-            return FORMATS[kind](found, out)
+        with _removed_on_failure(out):
+            return FORMATS[kind](run, out)
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror or error}") from error
 
 
 @contextlib.contextmanager
-def _all_or_nothing(out: Path) -> Generator[None]:
-    """Leave nothing under a name whose content is not whole."""
+def _removed_on_failure(out: Path) -> Generator[None]:
+    """Remove the file or folder if the block fails, so that no partial export remains."""
     try:
         yield
     except BaseException:
@@ -83,7 +84,7 @@ def _all_or_nothing(out: Path) -> Generator[None]:
 
 
 def import_run(source: Path, folder: Path) -> None:
-    """Make the folder of a run again from what `export_run` wrote.
+    """Restore the folder of a run from what `export_run` wrote.
 
     Args:
         source: An MF4 file, or a folder with Parquet files.
@@ -93,7 +94,13 @@ def import_run(source: Path, folder: Path) -> None:
         InputError: The source is no such export, or the folder cannot be written.
     """
     refuse_full(folder)
-    content = from_parquet(source) if source.is_dir() else from_mf4(source)
+    if is_mts(source):
+        raise InputError(f"{source}: a file of MTS, expected --rebound positive or negative")
+    if source.is_dir() and not any(source.glob("*.parquet")):
+        raise InputError(
+            f"{source}: is no run in Parquet, expected --mapping FILE or --rebound for tables"
+        )
+    content = read_parquet(source) if source.is_dir() else read_mf4(source)
     header = parse_mapping(content.files[RUN_FILE].decode("utf-8"), f"{source}: {RUN_FILE}")
     epoch_ns, channel = header.get("epoch_ns"), channel_of(header)
     if not isinstance(epoch_ns, int):
@@ -101,7 +108,7 @@ def import_run(source: Path, folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, data in content.files.items():
-            path = folder / inside(name, source)
+            path = folder / path_inside(name, source)
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
         with (folder / FRAMES_FILE).open("w", encoding="ascii") as file:
@@ -118,28 +125,28 @@ def import_run(source: Path, folder: Path) -> None:
         raise InputError(f"{folder}: cannot be written: {error.strerror or error}") from error
 
 
-def _to_candump(found: RunFolder, out: Path) -> list[Path]:
-    channel = channel_of(found.header)
+def _write_candump(run: RunFolder, out: Path) -> list[Path]:
+    channel = channel_of(run.header)
     with out.open("w", encoding="ascii") as file:
-        for frame, direction in found.frames():
-            # candump's time is in us, and it says nothing of the direction.
-            line = format_frame(frame, found.epoch_ns, channel, direction)
+        for frame, direction in run.frames():
+            # candump has times in us, and no direction.
+            line = format_frame(frame, run.epoch_ns, channel, direction)
             stamp, rest = line.split(" ", 1)
             file.write(f"{stamp[:-4]}) {rest[:-2].rstrip()}\n")
     return [out]
 
 
-def _to_csv(found: RunFolder, out: Path) -> list[Path]:
-    steps = found.steps
+def _write_csv(run: RunFolder, out: Path) -> list[Path]:
+    steps = run.steps
     t_s = _pa.array(steps.column("t_ns").to_numpy() * 1e-9)
     _csv.write_csv(steps.add_column(0, "t_s", t_s), str(out))
     return [out]
 
 
 FORMATS: dict[str, Callable[[RunFolder, Path], list[Path]]] = {
-    "candump": _to_candump,
-    "csv": _to_csv,
-    "parquet": to_parquet,
-    "mf4": to_mf4,
+    "candump": _write_candump,
+    "csv": _write_csv,
+    "parquet": write_parquet,
+    "mf4": write_mf4,
 }
-"""How each format is written."""
+"""Writer of each format; it returns the files that it wrote."""

@@ -6,17 +6,19 @@ from pathlib import Path
 
 import numpy as np
 
+from can_dbc.atomic_file import replacing
 from can_dbc.errors import InputError
 from rig.dyno.quality import preflight
-from rig.formats.array_tables import READERS, array_columns
+from rig.files.delimited_text import ROWS_AT_ONCE
 from rig.formats.import_report import ImportReport
-from rig.formats.mapping import Mapping, outputs_of
-from rig.formats.mf4_channels import mf4_channels
+from rig.formats.mapping import TableMapping, output_columns
+from rig.formats.mf4_channels import read_mf4_channels
 from rig.formats.mts import is_mts
-from rig.formats.text_table import ROWS_AT_ONCE, Array, text_columns
+from rig.formats.named_columns import READERS, read_named_columns
+from rig.formats.text_table import Array, read_text_columns
 
 
-def import_table(source: Path, mapping: Mapping, out: Path) -> ImportReport:
+def import_table(source: Path, mapping: TableMapping, out: Path) -> ImportReport:
     """Turn a foreign table, or the channels of a file, into the project's CSV.
 
     The text is read in pieces, so memory does not grow with the width of the table.
@@ -35,42 +37,44 @@ def import_table(source: Path, mapping: Mapping, out: Path) -> ImportReport:
     """
     if out.exists():
         raise InputError(f"{out}: exists already, expected a new file")
-    outputs = outputs_of(mapping)
-    if is_mts(source):
-        t_s, values, said = array_columns(source, mapping, outputs)
-    elif source.suffix.lower() in (".mf4", ".mdf", ".dat"):
-        t_s, values, said = mf4_channels(source, mapping, outputs)
-    elif source.suffix.lower() in READERS:
-        t_s, values, said = array_columns(source, mapping, outputs)
+    outputs = output_columns(mapping)
+    suffix = source.suffix.lower()
+    if is_mts(source) or suffix in READERS:
+        read_columns = read_named_columns
+    elif suffix in (".mf4", ".mdf", ".dat"):
+        read_columns = read_mf4_channels
     else:
-        t_s, values, said = text_columns(source, mapping, outputs)
+        read_columns = read_text_columns
+    t_s, readings, assumptions = read_columns(source, mapping, outputs)
     _check_times(source, t_s)
     values = [
         output.factor * column + output.offset
-        for output, column in zip(outputs, values, strict=True)
+        for output, column in zip(outputs, readings, strict=True)
     ]
     names = ("t_s", *(output.name for output in outputs))
-    _write(out, names, [t_s, *values])
-    said += [output.words for output in outputs]
+    _write_csv(out, names, [t_s, *values])
+    assumptions += [output.words for output in outputs]
     missing = int(np.count_nonzero(np.isnan(values[0])))
     if missing:
-        said.append(f"height_m is missing in {missing} of {len(t_s)} rows; its cells are empty")
-    said += _said_of_signs(mapping)
-    said += preflight(t_s, dict(zip(names[1:], values, strict=True)))
+        assumptions.append(
+            f"height_m is missing in {missing} of {len(t_s)} rows; its cells are empty"
+        )
+    assumptions += _assumed_signs(mapping)
+    assumptions += preflight(t_s, dict(zip(names[1:], values, strict=True)))
     duration_s = float(t_s[-1] - t_s[0])
     rate_hz = 1.0 / float(np.median(np.diff(t_s)))
-    return ImportReport(out, len(t_s), duration_s, rate_hz, names, tuple(said))
+    return ImportReport(out, len(t_s), duration_s, rate_hz, names, tuple(assumptions))
 
 
-def _said_of_signs(mapping: Mapping) -> list[str]:
-    said = ["height is taken as positive when the bodies move apart"]
+def _assumed_signs(mapping: TableMapping) -> list[str]:
+    signs = ["height is taken as positive when the bodies move apart"]
     if mapping.applied_force is not None:
-        said.append("applied force is taken as positive upwards, without the weight")
+        signs.append("applied force is taken as positive upwards, without the weight")
     if mapping.strut_force is not None:
-        said.append("strut force is taken as positive when the strut pushes its bodies apart")
+        signs.append("strut force is taken as positive when the strut pushes its bodies apart")
     if mapping.applied_force is None:
-        said.append("there is no applied force: the motion is taken as prescribed")
-    return said
+        signs.append("there is no applied force: the motion is taken as prescribed")
+    return signs
 
 
 def _check_times(source: Path, t_s: Array) -> None:
@@ -85,23 +89,21 @@ def _check_times(source: Path, t_s: Array) -> None:
         )
 
 
-def _write(out: Path, names: Sequence[str], columns: Sequence[Array]) -> None:
-    beside = out.with_name(out.name + ".part")
+def _write_csv(out: Path, names: Sequence[str], columns: Sequence[Array]) -> None:
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        with beside.open("x", encoding="ascii", newline="\n") as file:
+        with (
+            replacing(out) as temporary,
+            temporary.open("w", encoding="ascii", newline="\n") as file,
+        ):
             file.write(",".join(names) + "\n")
             for first in range(0, len(columns[0]), ROWS_AT_ONCE):
                 part = np.column_stack([column[first : first + ROWS_AT_ONCE] for column in columns])
-                file.writelines(_line(row) for row in part.tolist())
-        beside.replace(out)
-    except FileExistsError as error:
-        raise InputError(f"{beside}: exists, expected that name to be free") from error
+                file.writelines(_csv_line(row) for row in part.tolist())
     except OSError as error:
-        beside.unlink(missing_ok=True)
         raise InputError(f"{out}: cannot be written: {error.strerror}") from error
 
 
-def _line(row: list[float]) -> str:
+def _csv_line(row: list[float]) -> str:
     cells = [f"{row[0]:.9f}", *("" if isnan(value) else f"{value:.10g}" for value in row[1:])]
     return ",".join(cells) + "\n"

@@ -1,4 +1,4 @@
-"""What an import made, and what it assumed."""
+"""The report of an import."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What an import made.
+    """Result of an import, and what it assumed.
 
     Attributes:
         out: The file or folder written.

@@ -1,6 +1,6 @@
-"""What a foreign table means: its layout, its times, and the unit and sign of each column.
+"""The meaning of a foreign table: its layout, its times, and the unit and sign of each column.
 
-Nothing is guessed: what the mapping leaves open is assumed as documented.
+Nothing is guessed: what the mapping leaves open has a documented default.
 """
 
 from pathlib import Path
@@ -16,7 +16,7 @@ Text = Annotated[str, Field(min_length=1, max_length=200)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Unit = Annotated[str, Field(min_length=1, max_length=40)]
-Place = Text | Annotated[int, Field(ge=1, le=10_000)]
+ColumnName = Text | Annotated[int, Field(ge=1, le=10_000)]
 """A column by its name, or by its number, the first one being 1."""
 
 
@@ -24,15 +24,15 @@ class _Section(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
 
-class Table(_Section):
-    """How the text is laid out.
+class TextLayout(_Section):
+    """Layout of a text table.
 
     Attributes:
-        separator: Between cells: one character, ``tab``, or ``whitespace`` for any run of blanks.
+        separator: One character, ``tab``, or ``whitespace`` for any run of blanks.
         decimal: Decimal point or comma.
-        encoding: Of the text, as Python calls it.
+        encoding: Encoding of the text, by Python's name.
         skip_lines: Lines before the column names, or before the data where there are no names.
-        column_names: Whether a line with the column names stands before the data.
+        column_names: Whether a line with the column names precedes the data.
         skip_after_names: Lines between the names and the data, e.g. one with units.
         first_row: First row of data that is taken, counted from 0.
         rows: Number of rows that are taken; all if absent.
@@ -48,7 +48,7 @@ class Table(_Section):
     rows: Annotated[int, Field(ge=1, le=10**12)] | None = None
 
     @model_validator(mode="after")
-    def _one_meaning_a_character(self) -> "Table":
+    def _one_meaning_a_character(self) -> "TextLayout":
         if self.separator == self.decimal:
             raise ValueError(
                 f"separator {self.separator!r} is also the decimal sign, expected another"
@@ -56,28 +56,28 @@ class Table(_Section):
         return self
 
 
-class Time(_Section):
+class TimeColumn(_Section):
     """When a row was measured: a column of numbers, a column of dates, or a sampling rate.
 
     Attributes:
         column: Column of the time.
         unit: Unit of a column of numbers, e.g. ``s`` or ``ms``.
-        date_format: How a column of dates is written, in the letters of C's ``strptime``; ``iso``
+        date_format: Format of a column of dates, in the letters of C's ``strptime``; ``iso``
             for ISO 8601.
         sampling_rate_hz: Rows a second, where there is no column.
     """
 
-    column: Place | None = None
+    column: ColumnName | None = None
     unit: Unit | None = None
     date_format: Text | None = None
     sampling_rate_hz: Positive | None = None
 
     @model_validator(mode="after")
-    def _one_way(self) -> "Time":
+    def _one_way(self) -> "TimeColumn":
         if (self.column is None) == (self.sampling_rate_hz is None):
             raise ValueError("expected one of column and sampling_rate_hz")
         if self.column is None and (self.unit or self.date_format):
-            raise ValueError("unit and date_format go with a column, expected none of them")
+            raise ValueError("unit and date_format require a column, expected none of them")
         if self.column is not None and (self.unit is None) == (self.date_format is None):
             raise ValueError("expected one of unit and date_format with the column")
         return self
@@ -90,16 +90,16 @@ class _Channel(_Section):
         column: Its column.
         unit: Unit of gain times reading, e.g. ``mm``, ``kN``, ``lbf``.
         gain: Units a reading, e.g. of a sensor whose volts were recorded.
-        sign: -1 where the foreign table counts the other way.
+        sign: -1 where the foreign table has the opposite sign.
     """
 
-    column: Place
+    column: ColumnName
     unit: Unit
     gain: Number = 1.0
     sign: Literal[1, -1] = 1
 
     @model_validator(mode="after")
-    def _says_something(self) -> "_Channel":
+    def _is_not_constant(self) -> "_Channel":
         if self.gain == 0.0:
             raise ValueError("gain 0: expected another number")
         return self
@@ -123,11 +123,11 @@ class TemperatureChannel(_Channel):
     offset_k: Number = 0.0
 
 
-class Mapping(_Section):
-    """What a foreign table means.
+class TableMapping(_Section):
+    """The meaning of a foreign table.
 
     Attributes:
-        table: How the text is laid out; not read for MF4 files.
+        table: Layout of a text; not read for MF4 files.
         time: When a row was measured; not read for MF4 files, whose channels have times.
         height: Strut height, positive apart.
         applied_force: Force on the body, positive upwards (force-driven bench).
@@ -135,89 +135,87 @@ class Mapping(_Section):
         temperature: Damper temperature.
     """
 
-    table: Table = Table()
-    time: Time | None = None
+    table: TextLayout = TextLayout()
+    time: TimeColumn | None = None
     height: HeightChannel
     applied_force: ForceChannel | None = None
     strut_force: ForceChannel | None = None
     temperature: TemperatureChannel | None = None
 
     @model_validator(mode="after")
-    def _has_a_force(self) -> "Mapping":
+    def _has_a_force(self) -> "TableMapping":
         if self.applied_force is None and self.strut_force is None:
-            raise ValueError("expected applied_force or strut_force beside height")
+            raise ValueError("expected applied_force or strut_force in addition to height")
         return self
 
 
-def load_mapping(path: Path) -> Mapping:
+def load_mapping(path: Path) -> TableMapping:
     """Read a mapping.
 
     Raises:
         InputError: One line that names file, key, value and what was expected.
     """
-    mapping = load_validated(Mapping, path)
+    mapping = load_validated(TableMapping, path)
     try:
-        outputs_of(mapping)
+        output_columns(mapping)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return mapping
 
 
-class Output(NamedTuple):
-    """A column of the CSV that is written, and how it comes from a reading: `a * reading + b`."""
+class OutputColumn(NamedTuple):
+    """A column of the CSV that is written: `factor * reading + offset`."""
 
     name: str
     key: str
-    place: Place
+    column: ColumnName
     unit: str
     factor: float
     offset: float
     words: str
 
 
-def outputs_of(mapping: Mapping) -> list[Output]:
+def output_columns(mapping: TableMapping) -> list[OutputColumn]:
     """The columns of the CSV that a mapping gives.
 
     Raises:
         InputError: A unit is unknown or of another dimension.
     """
-    made: list[Output] = []
     height, temperature = mapping.height, mapping.temperature
-    made.append(_output("height_m", "height", height, Dimension.LENGTH, height.offset_m))
-    for name, key, force in (
-        ("applied_force_n", "applied_force", mapping.applied_force),
-        ("strut_force_n", "strut_force", mapping.strut_force),
+    columns = [_output_column("height_m", height, Dimension.LENGTH, height.offset_m)]
+    for name, force in (
+        ("applied_force_n", mapping.applied_force),
+        ("strut_force_n", mapping.strut_force),
     ):
         if force is not None:
-            made.append(_output(name, key, force, Dimension.FORCE, force.offset_n))
+            columns.append(_output_column(name, force, Dimension.FORCE, force.offset_n))
     if temperature is not None:
-        made.append(
-            _output(
-                "temperature_c",
-                "temperature",
-                temperature,
-                Dimension.TEMPERATURE,
-                temperature.offset_k,
+        columns.append(
+            _output_column(
+                "temperature_c", temperature, Dimension.TEMPERATURE, temperature.offset_k
             )
         )
-    return made
+    return columns
 
 
-def _output(name: str, key: str, channel: _Channel, dimension: Dimension, add: float) -> Output:
+def _output_column(
+    name: str, channel: _Channel, dimension: Dimension, added: float
+) -> OutputColumn:
+    key = name.rpartition("_")[0]
     conversion = unit_conversion(channel.unit, dimension, key)
     factor = conversion.factor * channel.gain * channel.sign
     words = f"{name} = {factor:.9g} * column {channel.column!r}"
-    offset = conversion.offset + add
+    offset = conversion.offset + added
     if offset:
         words += f" {'+' if offset > 0 else '-'} {abs(offset):.9g}"
     gain = "" if channel.gain == 1.0 else f", {channel.gain:g} {channel.unit} a reading"
-    turned = ", sign turned" if channel.sign < 0 else ""
-    words += f" (read in {channel.unit}{gain}{turned})"
-    return Output(name, key, channel.column, channel.unit, factor, offset, words)
+    reversed_ = ", sign reversed" if channel.sign < 0 else ""
+    words += f" (read in {channel.unit}{gain}{reversed_})"
+    return OutputColumn(name, key, channel.column, channel.unit, factor, offset, words)
 
 
 def unit_conversion(unit: str, dimension: Dimension, key: str) -> SiConversion:
-    """How readings become SI; `key` names the channel in an error.
+    """The conversion of readings to SI; `key` names the channel in an error.
 
     Raises:
         InputError: The unit is unknown or of another dimension.

@@ -14,13 +14,8 @@ from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.formats.content import Content, content_of
-from rig.log.reader import (
-    DBC_FILE,
-    MODEL_FILE,
-    RUN_FILE,
-    RunFolder,
-)
+from rig.formats.run_content import RunContent, read_content
+from rig.log.reader import DBC_FILE, MODEL_FILE, RUN_FILE, RunFolder
 
 _pa = cast("Any", pa)
 _CAN, _STEPS = "CAN_DataFrame", "steps"
@@ -72,18 +67,18 @@ def _asammdf() -> Any:
         ) from error
 
 
-def to_mf4(found: RunFolder, out: Path) -> list[Path]:
+def write_mf4(run: RunFolder, out: Path) -> list[Path]:
     """Write a run as an MF4 file; returns it.
 
     Raises:
         InputError: The package asammdf is missing.
     """
     asammdf = _asammdf()
-    content = content_of(found)
+    content = read_content(run)
     source = asammdf.Source("CAN", "CAN", "", source_type=2, bus_type=2)
     dbc = content.files.get(DBC_FILE, b"")
     with closing(asammdf.MDF(version="4.10")) as mdf:
-        epoch = datetime.fromtimestamp(0, UTC) + timedelta(microseconds=found.epoch_ns // 1000)
+        epoch = datetime.fromtimestamp(0, UTC) + timedelta(microseconds=run.epoch_ns // 1000)
         mdf.header.start_time = epoch
         for name, is_error in ((_CAN, False), ("CAN_ErrorFrame", True)):
             frames = [pair for pair in content.frames if pair[0].is_error is is_error]
@@ -99,7 +94,7 @@ def to_mf4(found: RunFolder, out: Path) -> list[Path]:
                 ),
                 comment="frames of the bus",
             )
-        _append_decoded(mdf, found.folder / DBC_FILE, content)
+        _append_signals(mdf, run.folder / DBC_FILE, content)
         _append_steps(asammdf, mdf, content.steps)
         for name, data in content.files.items():
             if name != DBC_FILE:
@@ -108,14 +103,14 @@ def to_mf4(found: RunFolder, out: Path) -> list[Path]:
     return [out]
 
 
-def _append_decoded(mdf: Any, dbc: Path, content: Content) -> None:
+def _append_signals(mdf: Any, dbc: Path, content: RunContent) -> None:
     """The signals of the frames, decoded by asammdf with the DBC."""
     if not any(not frame.is_error for frame, _ in content.frames):
         return
     with closing(mdf.extract_bus_logging({"CAN": [(str(dbc), 0)]})) as decoded:
         for number in range(len(decoded.groups)):
             channels = [
-                _as_decoded(signal)
+                _rename_decoded(signal)
                 for signal in decoded.iter_channels(skip_master=True)
                 if signal.group_index == number
             ]
@@ -123,8 +118,8 @@ def _append_decoded(mdf: Any, dbc: Path, content: Content) -> None:
                 mdf.append(channels, comment="decoded with the DBC")
 
 
-def _as_decoded(signal: Any) -> Any:
-    """A signal under a name of its own: readers that decode the frames themselves use the plain."""
+def _rename_decoded(signal: Any) -> Any:
+    """Prefix a signal's name: readers that decode the frames themselves use the plain one."""
     names = [name for name in signal.display_names if name.endswith(f".{signal.name}")]
     signal.name = f"decoded.{min(names, key=len, default=signal.name)}"
     signal.display_names = {}
@@ -144,8 +139,8 @@ def _append_steps(asammdf: Any, mdf: Any, steps: Any) -> None:
     )
 
 
-def from_mf4(source: Path) -> Content:
-    """Read what `to_mf4` wrote.
+def read_mf4(source: Path) -> RunContent:
+    """The content of a run that `write_mf4` wrote.
 
     Raises:
         InputError: It is something else, or the package asammdf is missing.
@@ -163,12 +158,12 @@ def from_mf4(source: Path) -> Content:
         }
         if RUN_FILE not in files or MODEL_FILE not in files:
             raise InputError(f"{source}: holds no {RUN_FILE}, expected an exported run")
-        frames = [*_frames_of(mdf, _CAN), *_frames_of(mdf, "CAN_ErrorFrame")]
+        frames = [*_read_frames(mdf, _CAN), *_read_frames(mdf, "CAN_ErrorFrame")]
         frames.sort(key=lambda pair: pair[0].t_ns)
-        return Content(files, frames, _steps_of(mdf))
+        return RunContent(files, frames, _read_steps(mdf))
 
 
-def _frames_of(mdf: Any, name: str) -> Iterable[tuple[Frame, str]]:
+def _read_frames(mdf: Any, name: str) -> Iterable[tuple[Frame, str]]:
     if name not in mdf:
         return
     signal = mdf.get(name)
@@ -188,7 +183,7 @@ def _frames_of(mdf: Any, name: str) -> Iterable[tuple[Frame, str]]:
         yield frame, "T" if sent else "R"
 
 
-def _steps_of(mdf: Any) -> Any:
+def _read_steps(mdf: Any) -> Any:
     prefix = f"{_STEPS}."
     group = next(
         (

@@ -9,20 +9,28 @@ from typing import Any, cast
 import numpy as np
 
 from can_dbc.errors import InputError
-from rig.formats.mapping import Mapping, Output
+from rig.formats.mapping import OutputColumn, TableMapping
 from rig.formats.text_table import Array, Columns
 
 
-def mf4_channels(source: Path, mapping: Mapping, outputs: Sequence[Output]) -> Columns:
-    """Channels of an MF4 file at the height's times."""
+def read_mf4_channels(
+    source: Path, mapping: TableMapping, outputs: Sequence[OutputColumn]
+) -> Columns:
+    """Times and readings of the channels of an MF4 file, at the height's times.
+
+    Raises:
+        InputError: The package asammdf is missing, the file is damaged, or a channel is not there.
+    """
     try:
         asammdf = cast("Any", importlib.import_module("asammdf"))  # optional, and slow to import
         damaged = cast("type[Exception]", asammdf.blocks.utils.MdfException)
     except ImportError as error:
-        raise InputError(f"{source}: wants the package asammdf: pip install 'rig[mf4]'") from error
+        raise InputError(
+            f"{source}: requires the package asammdf: pip install 'rig[mf4]'"
+        ) from error
     try:
         with source.open("rb") as raw, asammdf.MDF(raw) as file:
-            signals = [_signal(source, file, output) for output in outputs]
+            signals = [_read_channel(source, file, output) for output in outputs]
     except InputError:
         raise
     except (damaged, OSError, ValueError, LookupError, AttributeError, struct.error) as error:
@@ -30,26 +38,26 @@ def mf4_channels(source: Path, mapping: Mapping, outputs: Sequence[Output]) -> C
         raise InputError(f"{source}: is no such MF4 file, or is damaged: {reason}") from error
     at_s = signals[0][0]
     t_s = at_s - at_s[0]
-    said = [f"t_s from the times of channel {mapping.height.column!r}, 0 at {at_s[0]:.9g} s"]
+    assumptions = [f"t_s from the times of channel {mapping.height.column!r}, 0 at {at_s[0]:.9g} s"]
     values = [signals[0][1]]
     for output, (own_s, readings) in zip(outputs[1:], signals[1:], strict=True):
         values.append(np.interp(at_s, own_s, readings))
         if not np.array_equal(own_s, at_s):
-            said.append(f"{output.name}: {len(own_s)} samples, linear between them")
-    return t_s, values, said
+            assumptions.append(f"{output.name}: {len(own_s)} samples, linear between them")
+    return t_s, values, assumptions
 
 
-def _signal(source: Path, file: Any, output: Output) -> tuple[Array, Array]:
-    name = output.place
+def _read_channel(source: Path, file: Any, output: OutputColumn) -> tuple[Array, Array]:
+    name = output.column
     if not isinstance(name, str):
         raise InputError(f"{source}: {output.key}.column = {name}: expected the name of a channel")
-    found = cast("tuple[tuple[int, int], ...]", file.channels_db.get(name, ()))
-    if len(found) != 1:
-        what = "not there" if not found else f"there {len(found)} times"
+    entries = cast("tuple[tuple[int, int], ...]", file.channels_db.get(name, ()))
+    if len(entries) != 1:
+        wrong = f"there {len(entries)} times" if entries else "not there"
         raise InputError(
-            f"{source}: {output.key}.column = {name!r} is {what}, expected one channel"
+            f"{source}: {output.key}.column = {name!r} is {wrong}, expected one channel"
         )
-    group, index = found[0]
+    group, index = entries[0]
     signal = file.get(group=group, index=index)
     values = np.array(signal.samples, dtype=np.float64)
     t_s = np.array(signal.timestamps, dtype=np.float64)
@@ -57,6 +65,6 @@ def _signal(source: Path, file: Any, output: Output) -> tuple[Array, Array]:
         raise InputError(f"{source}: channel {name!r}: expected two or more numbers")
     if signal.unit and signal.unit != output.unit:
         raise InputError(
-            f"{source}: {output.key}.unit = {output.unit!r}, but the file says {signal.unit!r}"
+            f"{source}: {output.key}.unit = {output.unit!r}, but the file has {signal.unit!r}"
         )
     return t_s, values

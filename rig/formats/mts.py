@@ -1,9 +1,9 @@
 """Data files of MTS controllers (Series 793, MultiPurpose TestWare): blocks of columns as text.
 
-The first line says how the file is laid out, `MTS793|program|language|version|delimiter|decimal|`
-and more, with delimiter 0 for blanks, 1 for commas and 2 for tabs. Each acquisition then has a line
-of its own, a line of names, one of units, and rows of numbers; a file may hold many of them, one
-after the other. Blanks are refused: names hold some too.
+The first line gives the layout, `MTS793|program|language|version|delimiter|decimal|` and more, with
+delimiter 0 for blanks, 1 for commas and 2 for tabs. Each acquisition then has a title line, a line
+of names, one of units, and rows of numbers; a file may hold several acquisitions. Blanks as
+delimiter are refused, because names contain some too.
 
 Reference: MTS Series 793 Application User Manual, Model 793.10 MultiPurpose TestWare, "Data file
 header" and "About Specimen.dat files".
@@ -11,30 +11,33 @@ header" and "About Specimen.dat files".
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from can_dbc.errors import DatabaseError, InputError
 from can_dbc.units import Dimension, si_conversion
-from rig.formats.mapping import ForceChannel, HeightChannel, Mapping, TemperatureChannel, Time
+from rig.formats.mapping import (
+    ForceChannel,
+    HeightChannel,
+    TableMapping,
+    TemperatureChannel,
+    TimeColumn,
+)
 
 Array = NDArray[np.float64]
 
 SIGNATURE = b"MTS793|"
-"""With which such a file begins."""
+"""First bytes of such a file."""
 
 _MAX_BYTES = 1_000_000_000
 _DELIMITERS = {"1": ",", "2": "\t"}
 _SECONDS = {"sec": "s", "seconds": "s", "msec": "ms"}
-"""Units of time as these files call them."""
-
-Rebound = Literal["positive", "negative"]
+"""Units of time by the names that these files use."""
 
 
 def is_mts(source: Path) -> bool:
-    """Whether a file begins as one of these."""
+    """Whether a file begins with the signature."""
     try:
         with source.open("rb") as file:
             return file.read(len(SIGNATURE)) == SIGNATURE
@@ -42,7 +45,7 @@ def is_mts(source: Path) -> bool:
         return False
 
 
-def mts_columns(source: Path) -> tuple[dict[str, Array], dict[str, str]]:
+def read_mts(source: Path) -> tuple[dict[str, Array], dict[str, str]]:
     """Columns of all acquisitions of a file one after the other, and their units.
 
     Raises:
@@ -55,10 +58,10 @@ def mts_columns(source: Path) -> tuple[dict[str, Array], dict[str, str]]:
     except OSError as error:
         raise InputError(f"{source}: cannot be read: {error.strerror}") from error
     lines = text.splitlines()
-    delimiter, comma = _layout(source, lines[0] if lines else "")
+    delimiter, comma = _read_layout(source, lines[0] if lines else "")
     if not text.endswith(("\n", "\r")):
         raise InputError(
-            f"{source}: line {len(lines)}: does not end: the file was cut, expected it whole"
+            f"{source}: line {len(lines)}: has no line end, expected the whole file: it was cut"
         )
     names: list[str] = []
     units: list[str] = []
@@ -68,27 +71,26 @@ def mts_columns(source: Path) -> tuple[dict[str, Array], dict[str, str]]:
         if not line.strip() or line.startswith("MTS793|"):
             continue
         cells = [cell.strip().strip('"') for cell in line.rstrip("\t, ").split(delimiter)]
-        row = _numbers(cells, comma=comma)
+        row = _parse_numbers(cells, comma=comma)
         if row is None:
             texts.append(cells)
             continue
         if texts:
-            names, units = _heads(source, number, texts, names, units)
+            names, units = _read_heads(source, number, texts, names, units)
             texts = []
         if len(row) != len(names):
             raise InputError(
                 f"{source}: line {number}: {len(row)} numbers, expected {len(names)}: "
-                f"{', '.join(names) or 'no names stand before them'}"
+                f"{', '.join(names) or 'a line of names before them'}"
             )
         rows.append(row)
     if not rows:
         raise InputError(f"{source}: holds no row of numbers, expected an acquisition")
     table = np.array(rows)
-    columns = {name: table[:, place] for place, name in enumerate(names)}
-    return columns, dict(zip(names, units, strict=True))
+    return dict(zip(names, table.T, strict=True)), dict(zip(names, units, strict=True))
 
 
-def _layout(source: Path, first: str) -> tuple[str, bool]:
+def _read_layout(source: Path, first: str) -> tuple[str, bool]:
     """Delimiter, and whether the decimal sign is a comma."""
     fields = first.split("|")
     if fields[0] != "MTS793":
@@ -104,19 +106,19 @@ def _layout(source: Path, first: str) -> tuple[str, bool]:
     return _DELIMITERS[code], decimal == ","
 
 
-def _numbers(cells: Sequence[str], *, comma: bool) -> list[float] | None:
-    """A row of numbers; None of a line of text."""
+def _parse_numbers(cells: Sequence[str], *, comma: bool) -> list[float] | None:
+    """The numbers of a row; None if it is a line of text."""
     try:
-        found = [float(cell.replace(",", ".") if comma else cell) for cell in cells]
+        numbers = [float(cell.replace(",", ".") if comma else cell) for cell in cells]
     except ValueError:
         return None
-    return found if all(map(np.isfinite, found)) else None
+    return numbers if all(map(np.isfinite, numbers)) else None
 
 
-def _heads(
+def _read_heads(
     source: Path, number: int, texts: list[list[str]], names: list[str], units: list[str]
 ) -> tuple[list[str], list[str]]:
-    """Names and units before a row: the last two lines of text, which every block repeats."""
+    """Names and units before a row: the last two lines of text, the same in every acquisition."""
     if names and len(texts) == 1:
         raise InputError(
             f"{source}: line {number - 1}: {', '.join(texts[0])[:60]}: expected "
@@ -133,42 +135,45 @@ def _heads(
             f"{', '.join(names)}: expected the same columns in all"
         )
     if len(set(new)) != len(new):
-        raise InputError(f"{source}: line {number}: a name stands twice: {', '.join(new)}")
+        raise InputError(f"{source}: line {number}: a name occurs twice: {', '.join(new)}")
     return new, new_units
 
 
-def mts_mapping(source: Path, rebound: Rebound) -> Mapping:
-    """What a file means, by its own names and units.
+def mts_mapping(source: Path, rebound: str) -> TableMapping:
+    """The mapping that a file's own names and units give.
 
     Displacement counts as positive in rebound.
 
     Args:
         source: The file.
-        rebound: Sign of the force in rebound, where the damper pulls.
+        rebound: Sign of the force in rebound, where the damper pulls: `positive` or `negative`.
 
     Raises:
-        InputError: A quantity is not there, or several times, or its unit is unknown.
+        InputError: It is no file of MTS, the sign is neither, a quantity is missing or ambiguous,
+            or its unit is unknown.
     """
-    columns, units = mts_columns(source)
+    if rebound not in ("positive", "negative"):
+        raise InputError(f"--rebound {rebound!r}: expected positive or negative")
+    if not is_mts(source):
+        raise InputError(f"{source}: is no file of MTS, expected --mapping FILE")
+    columns, units = read_mts(source)
 
-    def one(what: str, *words: str) -> str | None:
-        found = [name for name in columns if any(word in name.lower() for word in words)]
-        if len(found) > 1:
+    def find_column(quantity: str, *words: str) -> str | None:
+        names = [name for name in columns if any(word in name.lower() for word in words)]
+        if len(names) > 1:
             raise InputError(
-                f"{source}: {what} may be {' or '.join(found)}, expected one: write a --mapping"
+                f"{source}: {quantity} may be {' or '.join(names)}, expected one: write a --mapping"
             )
-        return found[0] if found else None
+        return names[0] if names else None
 
-    time, height, force = (
-        one("time", "running time", "time"),
-        one("height", "displacement", "length"),
-        one("force", "force", "load"),
-    )
+    time = find_column("time", "time")
+    height = find_column("height", "displacement", "length")
+    force = find_column("force", "force", "load")
     if time is None or height is None or force is None:
         raise InputError(
             f"{source}: has {', '.join(columns)}, expected a time, a displacement and a force"
         )
-    temperature = one("temperature", "temperature")
+    temperature = find_column("temperature", "temperature")
     unit = {name: _SECONDS.get(text.lower(), text) for name, text in units.items()}
     for name, dimension in (
         (time, Dimension.TIME),
@@ -179,8 +184,8 @@ def mts_mapping(source: Path, rebound: Rebound) -> Mapping:
             si_conversion(unit[name], dimension)
         except DatabaseError as error:
             raise InputError(f"{source}: {name}: {error}") from error
-    return Mapping(
-        time=Time(column=time, unit=unit[time]),
+    return TableMapping(
+        time=TimeColumn(column=time, unit=unit[time]),
         height=HeightChannel(column=height, unit=unit[height]),
         strut_force=ForceChannel(
             column=force, unit=unit[force], sign=-1 if rebound == "positive" else 1

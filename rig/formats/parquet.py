@@ -10,11 +10,8 @@ from msgspec.structs import astuple
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.formats.content import Content, content_of
-from rig.log.reader import (
-    RUN_FILE,
-    RunFolder,
-)
+from rig.formats.run_content import RunContent, read_content
+from rig.log.reader import RUN_FILE, RunFolder
 
 _STEPS_PARQUET, _FRAMES_PARQUET = "steps.parquet", "frames.parquet"
 _KEY = b"rig.run"
@@ -35,9 +32,9 @@ _FRAME_SCHEMA = _pa.schema(
 )
 
 
-def to_parquet(found: RunFolder, out: Path) -> list[Path]:
+def write_parquet(run: RunFolder, out: Path) -> list[Path]:
     """Write a run into a new folder; returns the files."""
-    content = content_of(found)
+    content = read_content(run)
     rows = [(*astuple(frame), direction == "T") for frame, direction in content.frames]
     columns = [list(column) for column in zip(*rows, strict=True)] or [[] for _ in _FRAME_SCHEMA]
     arrays = [
@@ -54,8 +51,8 @@ def to_parquet(found: RunFolder, out: Path) -> list[Path]:
     return [out / _FRAMES_PARQUET, out / _STEPS_PARQUET]
 
 
-def from_parquet(source: Path) -> Content:
-    """Read what `to_parquet` wrote.
+def read_parquet(source: Path) -> RunContent:
+    """The content of a run that `write_parquet` wrote.
 
     Raises:
         InputError: It is something else.
@@ -77,4 +74,4 @@ def from_parquet(source: Path) -> Content:
         raise InputError(f"{source}: {_FRAMES_PARQUET}: its columns are not those of frames")
     columns = [frames.column(name).to_pylist() for name in frames.schema.names]
     pairs = [(Frame(*values), "T" if sent else "R") for *values, sent in zip(*columns, strict=True)]
-    return Content(files, pairs, steps.replace_schema_metadata(None))
+    return RunContent(files, pairs, steps.replace_schema_metadata(None))

@@ -1,15 +1,15 @@
-"""The spring-damper forces of a finished run, smoothed over the whole of it.
+"""The spring-damper forces of a finished run, smoothed over the whole run.
 
-An observer knows the past alone, and lags. A finished run has both sides of every instant. The
-error that the model would have had without virtual forces is the innovation plus what these have
-moved; its second derivative is the residual forces times the model's mobility,
+An observer uses the past alone, and lags; a finished run also has what follows each instant. The
+error of the model without virtual forces is the innovation plus the displacement that the virtual
+forces caused; its second derivative is the residual forces times the model's mobility W,
 
     d²(z - z_free)/dt² = W d,    F = F_law + d,
 
-and is smoothed as in a diagnosis, which also finds the sensor's noise and the deviation. That holds
-exactly where W does not depend on where the bench is, and as far as the log has the virtual force
-at all times: a tick that takes several heights changes it in between, so heights that are faster
-than the ticks are refused, and a stretch ends where ticks were missed.
+and is smoothed as in a diagnosis, which also estimates the sensor's noise and the standard
+deviation. This is exact where W does not depend on the position of the bench and the log holds the
+virtual force at all times: several heights in one tick change the force between log entries, so
+heights that are faster than the ticks are refused, and a stretch ends where ticks were missed.
 
 References:
     Rauch, Tung, Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA J. 3 (1965).
@@ -27,7 +27,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
-from dart_model.protocol import AMBIENT_C
+from dart_model.effects import AMBIENT_C
 from rig.bridge.values import Mode
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
 from rig.log.reader import RunFolder, read_run
@@ -40,24 +40,24 @@ Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 _LONGEST_S, _OVERLAP_S = 60.0, 2.0
-"""Of a piece: a force that the model lacks all the time moves its error by t², and digits with it;
-and by how much two pieces overlap, each used up to the middle: filters settle in less."""
+"""Length of a piece: a constant missing force lets the error grow with t², which costs digits; and
+overlap of two pieces, each used up to its middle: filters settle in less."""
 
 _MISSED = 1.5
-"""Periods between two ticks from which on one was missed."""
+"""Periods between two ticks above which one was missed."""
 
 _SINGULAR = 1e-9
-"""Share of the largest mobility below which a combination of forces moves nothing."""
+"""Share of the largest mobility below which a combination of forces causes no motion."""
 
 
-class _Strut(NamedTuple):
-    """A strut's columns of a run, by tick.
+class _StrutColumns(NamedTuple):
+    """Columns of a run that belong to a strut, shape (ticks,) each.
 
     Attributes:
         virtual_n: Virtual force.
         law_n: Force of the model's law.
         innovation_m: Innovation.
-        measured_s: Time of the measurement; NaN where none came.
+        measured_s: Time of the measurement; NaN in a tick without one.
     """
 
     virtual_n: Array
@@ -66,33 +66,31 @@ class _Strut(NamedTuple):
     measured_s: Array
 
 
-def read_smoothed(folder: Path, progress: Progress) -> RunFolder:
+def read_with_smoothed_forces(folder: Path, progress: Progress) -> RunFolder:
     """A run whose steps also have `STRUT.smoothed_force_n` and `STRUT.smoothed_force_std_n`.
 
     Args:
         folder: The run's folder.
-        progress: Called with what is being done and the share that is done.
+        progress: Called with the name of the stage and the share that is done.
 
     Raises:
         InputError: The run is damaged, or its forces cannot be smoothed.
     """
-    found, plan = read_run(folder), plan_of_run(folder)
-    steps = found.steps
-    for name, (force_n, std_n) in smoothed_forces(found, plan, progress).items():
+    run, plan = read_run(folder), plan_of_run(folder)
+    steps = run.steps
+    for name, (force_n, std_n) in smooth_forces(run, plan, progress).items():
         for key, values in (("smoothed_force_n", force_n), ("smoothed_force_std_n", std_n)):
             steps = steps.append_column(f"{name}.{key}", cast("Any", pa).array(values))
-    return replace(found, steps=steps)
+    return replace(run, steps=steps)
 
 
-def smoothed_forces(
-    found: RunFolder, plan: Plan, progress: Progress
-) -> dict[str, tuple[Array, Array]]:
+def smooth_forces(run: RunFolder, plan: Plan, progress: Progress) -> dict[str, tuple[Array, Array]]:
     """Force of each strut at each tick, and its standard deviation, by the strut's name.
 
     Args:
-        found: The run.
-        plan: The configuration it ran with.
-        progress: Called with what is being done and the share that is done.
+        run: The run.
+        plan: Its plan.
+        progress: Called with the name of the stage and the share that is done.
 
     Returns:
         Two arrays in N of shape (ticks,); NaN where the bridge was not RUNNING, and of all struts
@@ -103,49 +101,44 @@ def smoothed_forces(
             come faster than ticks, or there is nothing to smooth.
     """
     names = plan.strut_names
-    mobility = _mobility(found, plan, names)
-    tick_s = found.steps.column("t_ns").to_numpy() * 1e-9
-    struts = [_strut(found, name) for name in names]
+    mobility = _mobility(run, plan, names)
+    tick_s = run.steps.column("t_ns").to_numpy() * 1e-9
+    struts = [_strut_columns(run, name) for name in names]
     forces = {name: (np.full(len(tick_s), np.nan), np.full(len(tick_s), np.nan)) for name in names}
-    running = found.steps.column("mode").to_numpy() == Mode.RUNNING
+    running = run.steps.column("mode").to_numpy() == Mode.RUNNING
     missed_s = _MISSED * plan.period_ns * 1e-9
     unbroken = [
-        part for stretch in stretches(running) for part in _unbroken(tick_s, stretch, missed_s)
+        part for stretch in stretches(running) for part in _split_at_gaps(tick_s, stretch, missed_s)
     ]
-    pieces = [piece for stretch in unbroken for piece in _pieces(tick_s, stretch)]
+    pieces = [piece for stretch in unbroken for piece in _split_long(tick_s, stretch)]
     for number, (piece, inner) in enumerate(pieces):
         progress("smoothing", number / len(pieces))
-        residual = _residual(tick_s, piece, struts, mobility)
+        residual = _residual_forces(tick_s, piece, struts, mobility)
         if residual is None:
             continue
         used = slice(inner.start - piece.start, inner.stop - piece.start)
-        for strut, (force, deviation), of in zip(struts, residual, forces.values(), strict=True):
-            of[0][inner] = strut.law_n[inner] + force[used]
-            of[1][inner] = deviation[used]
+        for strut, (force, deviation), result in zip(
+            struts, residual, forces.values(), strict=True
+        ):
+            result[0][inner] = strut.law_n[inner] + force[used]
+            result[1][inner] = deviation[used]
     if all(np.all(np.isnan(force)) for force, _ in forces.values()):
         raise InputError(
-            f"{found.folder}: nowhere RUNNING with {FEWEST} heights of each strut within "
+            f"{run.folder}: nowhere RUNNING with {FEWEST} heights of each strut within "
             f"{_LONGEST_S:g} s and no tick missed between them"
         )
     return forces
 
 
-def _mobility(found: RunFolder, plan: Plan, names: list[str]) -> Array:
+def _mobility(run: RunFolder, plan: Plan, names: list[str]) -> Array:
     """Second derivative of each height per newton in each strut, in 1/kg."""
-    wanted = "smoothing wants a model whose masses move along straight guides"
-    if plan.is_prescribed:
-        raise InputError(f"{found.folder}: prescribed_motion: its load cell measures the force")
-    if len(plan.struts) > len(plan.heights):
-        raise InputError(f"{found.folder}: observers: kind none: smoothing wants every height")
-    for strut in plan.struts:
-        if strut.interval_ns * _MISSED < plan.period_ns:
-            raise InputError(
-                f"{found.folder}: height {strut.name}: every {strut.interval_ns} ns, ticks every "
-                f"{plan.period_ns} ns: smoothing wants at most one height a tick"
-            )
+    _refuse_unsmoothable(run, plan)
     plant = build_plant(plan)
     if not plant.is_constant:
-        raise InputError(f"{found.folder}: model {plan.model.name}: {wanted}")
+        raise InputError(
+            f"{run.folder}: model {plan.model.name}: smoothing requires a model whose masses move "
+            "along straight guides"
+        )
     rest = plant.numbers(plant.init([strut.free_length_m for strut in plan.struts]))
     state = plant.state_of([0.0] * len(rest))
 
@@ -153,22 +146,39 @@ def _mobility(found: RunFolder, plan: Plan, names: list[str]) -> Array:
         loaded = plant.load(state, tuple(virtual_n.tolist()), 0.0, AMBIENT_C)
         return np.array(loaded.accelerations_m_per_s2)
 
-    without = accelerations(np.zeros(len(names)))
-    mobility = np.column_stack([accelerations(one) - without for one in np.eye(len(names))])
+    free = accelerations(np.zeros(len(names)))
+    mobility = np.column_stack([accelerations(unit) - free for unit in np.eye(len(names))])
     singular = np.linalg.svd(mobility, compute_uv=False)
     if singular[-1] < _SINGULAR * singular[0]:
-        raise InputError(f"{found.folder}: model {plan.model.name}: more struts than coordinates")
+        raise InputError(f"{run.folder}: model {plan.model.name}: more struts than coordinates")
     return mobility
 
 
-def _strut(found: RunFolder, name: str) -> _Strut:
-    if f"{name}.law_force_n" not in found.steps.schema.names:
-        raise InputError(f"{found.folder}: has no steps of strut {name}, expected a run with some")
+def _refuse_unsmoothable(run: RunFolder, plan: Plan) -> None:
+    """Refuse a run whose configuration does not give the forces."""
+    if plan.is_prescribed:
+        raise InputError(f"{run.folder}: prescribed_motion: its load cell measures the force")
+    if len(plan.struts) > len(plan.heights):
+        raise InputError(
+            f"{run.folder}: observers: kind none: smoothing requires a measured height on every "
+            "strut"
+        )
+    for strut in plan.struts:
+        if strut.interval_ns * _MISSED < plan.period_ns:
+            raise InputError(
+                f"{run.folder}: height {strut.name}: every {strut.interval_ns} ns, ticks every "
+                f"{plan.period_ns} ns: smoothing requires at most one height a tick"
+            )
+
+
+def _strut_columns(run: RunFolder, name: str) -> _StrutColumns:
+    if f"{name}.law_force_n" not in run.steps.schema.names:
+        raise InputError(f"{run.folder}: has no steps of strut {name}, expected a run with some")
 
     def column(key: str) -> Array:
-        return np.asarray(found.steps.column(f"{name}.{key}").to_numpy(), dtype=np.float64)
+        return np.asarray(run.steps.column(f"{name}.{key}").to_numpy(), dtype=np.float64)
 
-    return _Strut(
+    return _StrutColumns(
         column("virtual_force_n"),
         column("law_force_n"),
         column("innovation_m"),
@@ -176,35 +186,35 @@ def _strut(found: RunFolder, name: str) -> _Strut:
     )
 
 
-def _unbroken(tick_s: Array, stretch: slice, missed_s: float) -> list[slice]:
-    """The parts of a stretch between which ticks were missed."""
+def _split_at_gaps(tick_s: Array, stretch: slice, missed_s: float) -> list[slice]:
+    """Split a stretch where ticks were missed."""
     breaks = np.flatnonzero(np.diff(tick_s[stretch]) > missed_s) + 1 + stretch.start
     edges = [stretch.start, *breaks.tolist(), stretch.stop]
     return [slice(begin, end) for begin, end in itertools.pairwise(edges)]
 
 
-def _pieces(tick_s: Array, stretch: slice) -> list[tuple[slice, slice]]:
-    """A stretch in pieces that overlap, each with the part that it is used for."""
+def _split_long(tick_s: Array, stretch: slice) -> list[tuple[slice, slice]]:
+    """Split a stretch into overlapping pieces, each with the part of it that is used."""
     within_s = tick_s[stretch]
     first_s, last_s = float(within_s[0]), float(within_s[-1])
 
-    def place(t_s: float) -> int:
+    def tick_at(t_s: float) -> int:
         return stretch.start + int(np.searchsorted(within_s, t_s))
 
     count = max(1, math.ceil((last_s - first_s) / _LONGEST_S))
     length_s = (last_s - first_s) / count
-    edges = [*(place(first_s + k * length_s) for k in range(count)), stretch.stop]
-    found: list[tuple[slice, slice]] = []
+    edges = [*(tick_at(first_s + k * length_s) for k in range(count)), stretch.stop]
+    pieces: list[tuple[slice, slice]] = []
     for begin, end in itertools.pairwise(edges):
         low_s, high_s = tick_s[begin] - 0.5 * _OVERLAP_S, tick_s[end - 1] + 0.5 * _OVERLAP_S
-        found.append((slice(place(low_s), place(high_s)), slice(begin, end)))
-    return found
+        pieces.append((slice(tick_at(low_s), tick_at(high_s)), slice(begin, end)))
+    return pieces
 
 
-def _residual(
-    tick_s: Array, piece: slice, struts: list[_Strut], mobility: Array
+def _residual_forces(
+    tick_s: Array, piece: slice, struts: list[_StrutColumns], mobility: Array
 ) -> list[tuple[Array, Array]] | None:
-    """Residual force of each strut at a piece's ticks and its deviation; None where it is short."""
+    """Residual force of each strut at a piece's ticks and its deviation; None if it is short."""
     times_s = tick_s[piece]
     virtual_n = np.array([strut.virtual_n[piece] for strut in struts])
     means, variances = np.full((2, len(struts), len(times_s)), np.nan)
@@ -216,7 +226,7 @@ def _residual(
             return None
         innovation_m = strut.innovation_m[piece][fresh][first]
         free_m = free_error(times_s, -mobility[index] @ virtual_n, t_s, innovation_m)
-        # At ticks without a height the smoother knows what lies between its neighbours.
+        # The smoother also estimates the state at ticks without a height.
         all_s = np.union1d(t_s, times_s)
         known_m = np.full(len(all_s), np.nan)
         known_m[np.searchsorted(all_s, t_s)] = free_m

@@ -19,6 +19,7 @@ from typing import Any, cast
 import pyarrow as pa
 import yaml
 
+from can_dbc.atomic_file import write_whole
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.log.captures import Capture, Captures, Entry, Window
@@ -283,7 +284,7 @@ class RunLog:
         if self._aside is not None:
             name, content = self._aside
             with contextlib.suppress(OSError):
-                _write_whole(self.folder / name, content())
+                write_whole(self.folder / name, content())
 
     def _write_waiting(self) -> None:
         """Write what waits; what the disk does not take is kept, and tried again the next time."""
@@ -392,12 +393,4 @@ def _serialized(rows: StepRows) -> bytes:
 
 
 def _write_yaml(path: Path, content: dict[str, object]) -> None:
-    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
-    _write_whole(path, text.encode())
-
-
-def _write_whole(path: Path, content: bytes) -> None:
-    # Written beside and moved, so that a kill leaves the old or the new file, never half of one.
-    beside = path.with_suffix(".tmp")
-    beside.write_bytes(content)
-    beside.replace(path)
+    write_whole(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))

@@ -11,10 +11,11 @@ import numpy as np
 from matplotlib.figure import Figure as Drawing
 
 from rig.dyno.characterise import AtRest, Characteristics
-from rig.dyno.faults import Naming
-from rig.dyno.figures import SIDES, Step
+from rig.dyno.faults import MasterComparison
+from rig.dyno.figures import SIDES, DynoStep
+from rig.dyno.report import DamperReport
 from rig.dyno.stroke_force import ANGLES, Figure
-from rig.dyno.tolerance import Judged
+from rig.dyno.tolerance import PointVerdict
 from rig.pages.report.page import render, write_page
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers and in grey print.
@@ -32,24 +33,20 @@ _KINDS = {
 
 
 def write_characteristics_page(
-    found: Sequence[Characteristics],
-    path: Path,
-    points: Sequence[Sequence[Judged]] = (),
-    namings: Sequence[Naming | None] = (),
-    serial: str | None = None,
+    reports: Sequence[DamperReport], path: Path, serial: str | None = None
 ) -> None:
     """Write the page of one record, or of several laid over one another.
 
     Args:
-        found: The records.
+        reports: The records.
         path: New HTML file.
-        points: How each record stands in a band; empty without one.
-        namings: What each record is against a master; empty without one.
         serial: Serial number.
 
     Raises:
         InputError: The file cannot be written.
     """
+    found = [report.characteristics for report in reports]
+    points = [report.points for report in reports]
     text = render(
         "characteristics.html",
         names=[item.name for item in found],
@@ -58,19 +55,18 @@ def write_characteristics_page(
         picture="data:image/svg+xml;base64,"
         + base64.b64encode(draw(found, points)).decode("ascii"),
         serial=serial,
-        badge=_badge(points, namings),
+        badge=_badge(points, [report.against_master for report in reports]),
         records=[
-            _record(item) | {"points": of, "naming": naming}
-            for item, of, naming in zip(
-                found, points or [()] * len(found), namings or [None] * len(found), strict=True
-            )
+            _record(report.characteristics)
+            | {"points": report.points, "naming": report.against_master}
+            for report in reports
         ],
     )
     write_page(text, path)
 
 
 def _badge(
-    points: Sequence[Sequence[Judged]], namings: Sequence[Naming | None]
+    points: Sequence[Sequence[PointVerdict]], namings: Sequence[MasterComparison | None]
 ) -> tuple[str, str, str] | None:
     """Tone, sign and words of the whole verdict; None without a band and a master."""
     verdicts = {point.verdict for of in points for point in of}
@@ -84,7 +80,7 @@ def _badge(
     return ("good", "✓", "In tolerance") if verdicts == {"pass"} else ("part", "?", "Not proven")
 
 
-def draw(found: Sequence[Characteristics], points: Sequence[Sequence[Judged]] = ()) -> bytes:
+def draw(found: Sequence[Characteristics], points: Sequence[Sequence[PointVerdict]] = ()) -> bytes:
     """Peak force over peak velocity, force over velocity and force over displacement, as SVG."""
     style = {
         "axes.grid": True,
@@ -133,8 +129,8 @@ def _draw_peaks(axes: Any, item: Characteristics, colour: str) -> None:
     steps = sorted(item.steps, key=lambda step: step.peak_speed_m_per_s)
     for number, (side, marker) in enumerate((("compression", "o"), ("rebound", "s"))):
         sides = [(step.compression, step.rebound)[number] for step in steps]
-        speeds = [one.peak_velocity.value for one in sides]
-        figures = [one.force_at_peak_velocity for one in sides]
+        speeds = [one.peak_velocity_m_per_s.value for one in sides]
+        figures = [one.force_at_peak_velocity_n for one in sides]
         values = np.array([figure.value for figure in figures])
         errors = np.array([[f.value - f.low, f.high - f.value] for f in figures]).T
         label = f"{item.name}: {side}" if number == 0 else side
@@ -144,7 +140,7 @@ def _draw_peaks(axes: Any, item: Characteristics, colour: str) -> None:
         )  # fmt: skip
 
 
-def _draw_band(axes: Any, points: Sequence[Sequence[Judged]]) -> None:
+def _draw_band(axes: Any, points: Sequence[Sequence[PointVerdict]]) -> None:
     """The band that is allowed, of either side."""
     for side in SIDES:
         mine = [point for point in (points[0] if points else ()) if point.side == side]
@@ -161,9 +157,9 @@ def _draw_loops(
     for number, step in enumerate(item.steps):
         middle_m = step.middle_m
         if with_samples and number == len(item.steps) - 1:
-            every = max(1, len(item.height_m) // _MOST_SAMPLES)
+            every = max(1, len(item.record.height_m) // _MOST_SAMPLES)
             heights.plot(
-                1e3 * (item.height_m[::every] - middle_m), item.force_n[::every], ".",
+                1e3 * (item.record.height_m[::every] - middle_m), item.record.force_n[::every], ".",
                 color="#9aa5b1", markersize=1.5, zorder=1,
             )  # fmt: skip
         for place, stroke in enumerate(step.strokes):
@@ -183,8 +179,8 @@ def _headline(found: Sequence[Characteristics]) -> str:
         down, up = fastest.compression, fastest.rebound
         steps = f"{len(item.steps)} steps" if len(item.steps) > 1 else "one step"
         parts.append(
-            f"{item.name}: {steps}, {down.force_at_peak_velocity.value:.0f} N in compression and "
-            f"{up.force_at_peak_velocity.value:.0f} N in rebound at "
+            f"{item.name}: {steps}, {down.force_at_peak_velocity_n.value:.0f} N in compression and "
+            f"{up.force_at_peak_velocity_n.value:.0f} N in rebound at "
             f"{fastest.peak_speed_m_per_s:.3g} m/s."
         )
     return " ".join(parts)
@@ -196,9 +192,9 @@ def _record(item: Characteristics) -> dict[str, object]:
         {"kind": kind_words(kind), "cells": _cells(step, warm=warm)}
         for kind, step in zip(item.damper.kinds, item.steps, strict=True)
     ]
-    name = f"{item.name}, strut {item.strut}" if item.strut else item.name
+    name = f"{item.name}, strut {item.record.strut}" if item.record.strut else item.name
     return {
-        "name": f"{name} (force: {item.source})",
+        "name": f"{name} (force: {item.record.source})",
         "warm": warm,
         "rows": rows,
         "damper": damper_rows(item),
@@ -206,9 +202,9 @@ def _record(item: Characteristics) -> dict[str, object]:
     }
 
 
-def _cells(step: Step, *, warm: bool) -> list[str]:
+def _cells(step: DynoStep, *, warm: bool) -> list[str]:
     down, up = step.compression, step.rebound
-    speeds = dict.fromkeys(f"{side.peak_velocity.value:.3g}" for side in (down, up))
+    speeds = dict.fromkeys(f"{side.peak_velocity_m_per_s.value:.3g}" for side in (down, up))
     temperature = "—" if step.temperature_c is None else f"{step.temperature_c:.1f}"
     return [
         f"{step.cycles:g}",
@@ -216,10 +212,10 @@ def _cells(step: Step, *, warm: bool) -> list[str]:
         "—" if step.frequency_hz is None else f"{step.frequency_hz:.3f}",
         *([temperature] if warm else []),
         " / ".join(speeds),
-        with_half(down.force_at_peak_velocity),
-        with_half(up.force_at_peak_velocity),
-        with_half(step.energy_per_cycle),
-        with_half(step.equivalent_damping),
+        with_half(down.force_at_peak_velocity_n),
+        with_half(up.force_at_peak_velocity_n),
+        with_half(step.energy_per_cycle_j),
+        with_half(step.equivalent_damping_n_s_per_m),
     ]
 
 
@@ -232,16 +228,16 @@ def damper_rows(item: Characteristics) -> list[tuple[str, str, str, str]]:
     """Figures over all steps and at rest: name, value, interval and method."""
     damper = item.damper
     named = [
-        ("gas force", damper.gas_force, "N"),
-        ("gas spring rate", damper.gas_rate, "N/m"),
-        ("friction", damper.friction, "N"),
-        *[(f"knee, {side}", figure, "m/s") for side, figure in damper.knee.items()],
+        ("gas force", damper.gas_force_n, "N"),
+        ("gas spring rate", damper.gas_rate_n_per_m, "N/m"),
+        ("friction", damper.friction_n, "N"),
+        *[(f"knee, {side}", figure, "m/s") for side, figure in damper.knee_m_per_s.items()],
         ("rebound over compression", damper.asymmetry, ""),
         *[
             (f"change per kelvin, {side}", figure, "N/K")
-            for side, figure in damper.per_kelvin.items()
+            for side, figure in damper.force_per_kelvin_n_per_k.items()
         ],
-        *[(_place_of(hold), hold.force, "N") for hold in item.holds],
+        *[(_place_of(hold), hold.force_n, "N") for hold in item.holds],
     ]
     return [_row(name, figure, unit) for name, figure, unit in named if figure is not None]
 

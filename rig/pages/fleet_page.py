@@ -11,7 +11,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure as Drawing
 
 from rig.fleet.overview import Overview, Series
-from rig.fleet.sentences import alarms, name_of
+from rig.fleet.sentences import alarm_sentences, series_name
 from rig.pages.report.page import render, write_page
 
 _MOST = 12
@@ -36,14 +36,14 @@ def write_fleet_page(found: Overview, path: Path) -> None:
     text = render(
         "fleet.html",
         headline=found.words,
-        alarms=alarms(found),
+        alarms=alarm_sentences(found),
         verdicts=[verdict.replace("_", " ") for verdict in verdicts],
         benches=[
             (bench, sum(counts.values()), [_share(counts, verdict) for verdict in verdicts])
             for bench, counts in found.verdicts.items()
         ],
         failed=list(found.failed.items())[:10],
-        pictures=[(name_of(item), _picture(found, item)) for item in drawn[:_MOST]],
+        pictures=[(series_name(item), _picture(found, item)) for item in drawn[:_MOST]],
         left_out=max(0, len(drawn) - _MOST),
     )
     write_page(text, path)

@@ -14,6 +14,7 @@ from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
+from can_dbc.atomic_file import write_whole
 from can_dbc.errors import InputError
 from rig.bridge.bridge import Bridge
 from rig.log.reader import RUN_FILE, read_header
@@ -109,7 +110,7 @@ class Requests:
         for path in [self._folder / name for name in sorted(names) if name.endswith(".request")]:
             answer = self._answered(path)
             path.unlink()
-            _write(path.with_suffix(".answer"), answer)
+            write_whole(path.with_suffix(".answer"), json.dumps(answer))
 
     def _answered(self, path: Path) -> Answer:
         try:
@@ -160,7 +161,7 @@ def ask(folder: Path, content: Mapping[str, object], *, force: bool = False) -> 
     path = requests / f"{time.time_ns()}-{uuid.uuid4().hex}.request"
     answer = path.with_suffix(".answer")
     try:
-        _write(path, content)
+        write_whole(path, json.dumps(content))
         for _ in range(round(_ANSWER_S / 0.02)):
             if answer.exists():
                 content = cast("Answer", json.loads(answer.read_text("utf-8")))
@@ -189,9 +190,3 @@ def _refuse_errors(folder: Path, assignments: Assignments) -> None:
         raise InputError("set: expected keys and values") from error
     if wrong:
         raise InputError(f"set: {wrong[0].what}: {wrong[0].text} (--force sets it all the same)")
-
-
-def _write(path: Path, content: Mapping[str, object]) -> None:
-    beside = path.with_suffix(".tmp")
-    beside.write_text(json.dumps(content), "utf-8")
-    beside.replace(path)

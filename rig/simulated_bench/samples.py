@@ -1,13 +1,14 @@
-"""An applied force or an prescribed height from a CSV file."""
+"""An applied force or a prescribed height from a CSV file."""
 
-import csv
-import math
-from collections.abc import Iterator
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from can_dbc.errors import InputError
+from rig.files.delimited_text import read_csv_columns
 
 MAX_FILE_BYTES = 200_000_000
 """Largest file that is read."""
@@ -39,57 +40,29 @@ def read_samples(folder: Path, name: str, column: str) -> Samples:
         The samples.
 
     Raises:
-        ValueError: The file is outside the folder, missing, too large, or not such a table; one
+        InputError: The file is outside the folder, missing, too large, or not such a table; one
             line naming line, column and expectation.
     """
     path = (folder / name).resolve()
     if not path.is_relative_to(folder.resolve()):
-        raise ValueError(f"path = {name!r}, expected a file in the configuration's folder")
-    try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise ValueError(f"path = {name!r}, expected at most {MAX_FILE_BYTES} bytes")
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(_rows(csv.reader(file), name, (TIME_COLUMN, column)))
-    except OSError as error:
-        raise ValueError(f"path = {name!r} cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"path = {name!r}, expected CSV in UTF-8") from error
-    if len(rows) < 2:
-        raise ValueError(f"path = {name!r} has {len(rows)} samples, expected at least 2")
-    table = np.array(rows, dtype=np.float64)
-    steps_s = np.diff(table[:, 0])
+        raise InputError(f"path = {name!r}, expected a file in the configuration's folder")
+    where = f"path = {name!r}"
+    columns = (TIME_COLUMN, column)
+    values, lines = read_csv_columns(
+        path, where, MAX_FILE_BYTES, lambda header: _choose_columns(where, header, columns)
+    )
+    t_s = values[TIME_COLUMN]
+    if len(t_s) < 2:
+        raise InputError(f"{where} has {len(t_s)} samples, expected at least 2")
+    steps_s = np.diff(t_s)
     if not bool(np.all(steps_s > 0.0)):
-        line = int(np.argmin(steps_s > 0.0)) + 3
-        raise ValueError(f"path = {name!r}, line {line}: t_s does not increase")
-    return Samples(np.ascontiguousarray(table[:, 0]), np.ascontiguousarray(table[:, 1]))
+        line = lines[int(np.argmin(steps_s > 0.0)) + 1]
+        raise InputError(f"{where}: line {line}: t_s does not increase")
+    return Samples(t_s, values[column])
 
 
-def _rows(
-    reader: Iterator[list[str]], name: str, columns: tuple[str, str]
-) -> Iterator[tuple[float, float]]:
-    empty: list[str] = []
-    header = [cell.strip() for cell in next(reader, empty)]
+def _choose_columns(where: str, header: list[str], columns: Sequence[str]) -> Sequence[str]:
     for column in columns:
         if header.count(column) != 1:
-            raise ValueError(f"path = {name!r}, line 1: expected one column {column}")
-    where = [header.index(column) for column in columns]
-    for line, row in enumerate(reader, start=2):
-        if len(row) != len(header):
-            raise ValueError(f"path = {name!r}, line {line}: expected {len(header)} columns")
-        t_s, value = (
-            _number(row[index], name, line, column)
-            for index, column in zip(where, columns, strict=True)
-        )
-        yield t_s, value
-
-
-def _number(text: str, name: str, line: int, column: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(
-            f"path = {name!r}, line {line}: {column} = {text[:40]!r}, expected a finite number"
-        )
-    return value
+            raise InputError(f"{where}: line 1: expected one column {column}")
+    return columns

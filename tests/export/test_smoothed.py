@@ -14,7 +14,7 @@ from can_dbc.errors import InputError
 from rig.bridge.values import Mode
 from rig.cli.main import main
 from rig.formats import smoothed
-from rig.formats.smoothed import read_smoothed
+from rig.formats.smoothed import read_with_smoothed_forces
 from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan, plan_of_run
@@ -60,7 +60,7 @@ def errors(run: Path, truth_n, name: str, index: int = 0):
 
     The deviation that is stated is that of the error, within a factor.
     """
-    steps = read_smoothed(run, lambda _what, _share: None).steps
+    steps = read_with_smoothed_forces(run, lambda _what, _share: None).steps
     tick = np.rint(column(steps, "t_ns") * 1e-9 * RATE_HZ).astype(int)
     online, found, std = (
         column(steps, f"{name}.{key}")
@@ -102,7 +102,7 @@ def test_lost_heights_cost_what_the_deviation_says(tmp_path, observer):
     truth_n = bench_run(tmp_path, "reference", changed, loss_probability=0.2)
     modes = column(read_run(tmp_path / "run").steps, "mode")
     assert np.any(modes[500:] == Mode.HOLD)
-    steps = read_smoothed(tmp_path / "run", lambda _what, _share: None).steps
+    steps = read_with_smoothed_forces(tmp_path / "run", lambda _what, _share: None).steps
     found, std = (column(steps, f"strut.smoothed_force_{key}") for key in ("n", "std_n"))
     known = np.flatnonzero(np.isfinite(found))[500:]
     tick = np.rint(column(steps, "t_ns") * 1e-9 * RATE_HZ).astype(int)
@@ -151,7 +151,7 @@ def test_pieces_give_what_the_whole_gives(reference, monkeypatch):
 
 def test_every_tick_of_every_stretch_is_in_one_piece():
     tick_s = np.arange(200_000) / 1000.0
-    pieces = smoothed._pieces(tick_s, slice(1000, 150_000))
+    pieces = smoothed._split_long(tick_s, slice(1000, 150_000))
     used = np.concatenate([np.arange(inner.start, inner.stop) for _, inner in pieces])
     assert np.array_equal(used, np.arange(1000, 150_000))
     for piece, inner in pieces:
@@ -161,7 +161,7 @@ def test_every_tick_of_every_stretch_is_in_one_piece():
 
 def test_a_stretch_ends_where_ticks_were_missed():
     tick_s = np.concatenate([np.arange(1000), 1005 + np.arange(1000)]) / 1000.0
-    found = smoothed._unbroken(tick_s, slice(100, 1900), 1.5e-3)
+    found = smoothed._split_at_gaps(tick_s, slice(100, 1900), 1.5e-3)
     assert found == [slice(100, 1000), slice(1000, 1900)]
 
 
@@ -169,7 +169,7 @@ def test_heights_that_are_faster_than_the_ticks_are_refused(tmp_path):
     """The log has the last virtual force of a tick, and not those in between."""
     bench_run(tmp_path, "reference", {"rate_hz": 200, "observers": {"strut": KALMAN}})
     with pytest.raises(InputError, match=r"height strut: .* at most one height a tick"):
-        read_smoothed(tmp_path / "run", lambda _what, _share: None)
+        read_with_smoothed_forces(tmp_path / "run", lambda _what, _share: None)
 
 
 @pytest.mark.parametrize("kept_bytes", [0, 100])
@@ -230,4 +230,4 @@ def test_what_cannot_be_smoothed_is_refused(reference, tmp_path, monkeypatch, ca
     pitching = FullCar().model(tmp_path)
     found, ready = read_run(run), plan_of_run(run)
     with pytest.raises(InputError, match="straight guides"):
-        smoothed.smoothed_forces(found, replace(ready, model=pitching), lambda _what, _share: None)
+        smoothed.smooth_forces(found, replace(ready, model=pitching), lambda _what, _share: None)

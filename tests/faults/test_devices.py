@@ -7,13 +7,7 @@ import pytest
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.bridge.devices import (
-    Device,
-    fault,
-    initial_health,
-    update_by_alarm,
-    update_by_frame,
-)
+from rig.bridge.devices import Device, fault, initial_health, update_by_alarm, update_by_frame
 from rig.bridge.values import Mode
 from rig.plan.build import build_bridge
 from rig.plan.load import load_plan

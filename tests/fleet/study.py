@@ -17,10 +17,10 @@ from pathlib import Path
 import psutil
 
 from rig.fleet import store
-from rig.fleet.campaign import Model, Progress, campaign, model_of
+from rig.fleet.campaign import CampaignProgress, FleetModel, load_fleet_model, run_campaign
 from rig.fleet.executors import Engine, dask, processes
-from rig.fleet.one_run import Task, evaluated
-from rig.fleet.sources import Source, find_sources
+from rig.fleet.one_run import Task, evaluate_run
+from rig.fleet.sources import RunSource, find_sources
 from tests.fleet.cluster import cluster
 from tests.fleet.population import Piece, write_fleet, write_model
 
@@ -38,14 +38,14 @@ def scattered(_damper, _week, rng):
 
 def plain_loop(tasks: Sequence[Task]) -> float:
     """Diagnoses a second, one after another, after the first one, which imports and compiles."""
-    evaluated(tasks[0])
+    evaluate_run(tasks[0])
     begun = time.perf_counter()
     for task in tasks:
-        evaluated(task)
+        evaluate_run(task)
     return len(tasks) / (time.perf_counter() - begun)
 
 
-def single_rate(sources: Sequence[Source], model: Model) -> float:
+def single_rate(sources: Sequence[RunSource], model: FleetModel) -> float:
     """Diagnoses a second and core of plain loops, one on each core at once.
 
     A loop on one core while the other one rests is faster on a machine that is shared.
@@ -58,16 +58,20 @@ def single_rate(sources: Sequence[Source], model: Model) -> float:
 
 
 def through(
-    engine: Engine, sources: Sequence[Source], model: Model, out: Path, kill: psutil.Process | None
-) -> tuple[Progress, float]:
+    engine: Engine,
+    sources: Sequence[RunSource],
+    model: FleetModel,
+    out: Path,
+    kill: psutil.Process | None,
+) -> tuple[CampaignProgress, float]:
     """A campaign, and the CPU time of this process a run."""
 
-    def progress(now: Progress) -> None:
+    def progress(now: CampaignProgress) -> None:
         if kill is not None and now.done == len(sources) // 3 and kill.is_running():
             kill.kill()
 
     before = resource.getrusage(resource.RUSAGE_SELF)
-    end = campaign(sources, model, out, engine.make, engine.window, progress=progress)
+    end = run_campaign(sources, model, out, engine.make, engine.window, progress=progress)
     after = resource.getrusage(resource.RUSAGE_SELF)
     own_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return end, own_s / max(end.done, 1)
@@ -91,7 +95,7 @@ def main() -> None:
         folder = Path(name)
         weeks = -(-given.runs // DAMPERS)
         write_fleet(folder / "runs", DAMPERS, weeks, scattered, BENCHES, given.seed)
-        model = model_of(write_model(folder))
+        model = load_fleet_model(write_model(folder))
         sources = find_sources([str(folder / "runs")], PATTERN)[: given.runs]
         os.environ["OPENBLAS_NUM_THREADS"] = "1"
         alone = single_rate(sources, model)
@@ -118,7 +122,9 @@ def main() -> None:
         print(f"both stores hold the same: {first == second}; {runs} runs, {keys} different")
 
 
-def report(name: str, end: Progress, alone: float, own_s: float, scheduler_s: float) -> None:
+def report(
+    name: str, end: CampaignProgress, alone: float, own_s: float, scheduler_s: float
+) -> None:
     """A line of the table."""
     rate = end.done / end.elapsed_s / CORES
     shared_ms = 1e3 * (own_s + scheduler_s)

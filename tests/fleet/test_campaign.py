@@ -13,10 +13,10 @@ import pytest
 from can_dbc.errors import InputError
 from rig.fleet import campaign as campaigns
 from rig.fleet import store
-from rig.fleet.campaign import campaign, model_of
-from rig.fleet.one_run import Row, Task, evaluated
-from rig.fleet.overview import overview
-from rig.fleet.sources import Source, find_sources, shard_of
+from rig.fleet.campaign import load_fleet_model, run_campaign
+from rig.fleet.one_run import RunRow, Task, evaluate_run
+from rig.fleet.overview import read_overview
+from rig.fleet.sources import RunSource, find_sources, select_shard
 from tests.fleet.population import Piece, write_fleet, write_model, write_run
 
 PATTERN = "{bench}/{date}/{damper}"
@@ -35,7 +35,7 @@ def fleet(tmp_path_factory):
 
 
 def given(folder):
-    return model_of(folder / "model.yaml")
+    return load_fleet_model(folder / "model.yaml")
 
 
 def threads():
@@ -48,7 +48,7 @@ def rows(out, columns="source, bench, damper, date, verdict, error"):
 
 def test_every_run_is_a_row_with_its_values(fleet, tmp_path):
     sources = find_sources([str(fleet / "runs")], PATTERN)
-    end = campaign(sources, given(fleet), tmp_path / "store", threads, 4)
+    end = run_campaign(sources, given(fleet), tmp_path / "store", threads, 4)
     assert (end.done, end.failed, end.skipped) == (12, 0, 0)
     found = rows(tmp_path / "store")
     assert len(found) == 12
@@ -82,32 +82,32 @@ def test_a_fleet_that_was_ended_is_gone_on_with(fleet, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        campaign(sources, given(fleet), tmp_path, threads, 4, progress=stop)
+        run_campaign(sources, given(fleet), tmp_path, threads, 4, progress=stop)
     assert len(rows(tmp_path)) == stopped == 5
-    end = campaign(sources, given(fleet), tmp_path, threads, 4)
+    end = run_campaign(sources, given(fleet), tmp_path, threads, 4)
     assert (end.done, end.skipped) == (7, 5)
     assert len(rows(tmp_path)) == 12
-    assert campaign(sources, given(fleet), tmp_path, threads, 4).done == 0
+    assert run_campaign(sources, given(fleet), tmp_path, threads, 4).done == 0
 
 
 def test_shards_are_all_of_it_and_nothing_twice(fleet, tmp_path):
     sources = find_sources([str(fleet / "runs")], PATTERN)
-    parts = [shard_of(sources, k, 3) for k in (1, 2, 3)]
+    parts = [select_shard(sources, k, 3) for k in (1, 2, 3)]
     assert sorted(s.url for part in parts for s in part) == sorted(s.url for s in sources)
     for part in parts:
-        campaign(part, given(fleet), tmp_path, threads, 4)
+        run_campaign(part, given(fleet), tmp_path, threads, 4)
     assert len(rows(tmp_path)) == 12
 
 
 def test_another_model_is_another_evaluation(fleet, tmp_path):
     sources = find_sources([str(fleet / "runs")], PATTERN)[:4]
-    campaign(sources, given(fleet), tmp_path, threads, 4)
+    run_campaign(sources, given(fleet), tmp_path, threads, 4)
     file = tmp_path / "other.yaml"
     file.write_text((fleet / "model.yaml").read_text().replace("little_dyno", "other"))
-    other = model_of(file)
-    assert campaign(sources, other, tmp_path, threads, 4).done == len(sources)
+    other = load_fleet_model(file)
+    assert run_campaign(sources, other, tmp_path, threads, 4).done == len(sources)
     assert len(rows(tmp_path)) == 2 * len(sources)
-    found = overview(tmp_path)
+    found = read_overview(tmp_path)
     assert (found.runs, found.others) == (len(sources), len(sources))
     assert found.model.startswith("other ")
     assert {len(series.points) for series in found.series} == {len(sources)}
@@ -119,9 +119,9 @@ def test_a_copy_of_a_run_counts_once(fleet, tmp_path):
         (tmp_path / "runs" / f"{name}.csv").parent.mkdir(exist_ok=True)
         (tmp_path / "runs" / f"{name}.csv").write_bytes(first.read_bytes())
     sources = find_sources([str(tmp_path / "runs")])
-    campaign(sources, given(fleet), tmp_path / "store", threads, 4)
+    run_campaign(sources, given(fleet), tmp_path / "store", threads, 4)
     assert len(rows(tmp_path / "store")) == 1
-    assert campaign(sources, given(fleet), tmp_path / "store", threads, 4).done == 0
+    assert run_campaign(sources, given(fleet), tmp_path / "store", threads, 4).done == 0
 
 
 def test_bad_runs_are_rows_and_stop_nothing(fleet, tmp_path):
@@ -133,15 +133,16 @@ def test_bad_runs_are_rows_and_stop_nothing(fleet, tmp_path):
     (runs / "binary.csv").write_bytes(bytes(range(256)) * 20)
     (runs / "folder").mkdir()
     (runs / "folder" / "run.yaml").write_text("epoch_ns: not a number")
-    end = campaign(find_sources([str(runs)]), given(fleet), tmp_path / "store", threads, 4)
+    end = run_campaign(find_sources([str(runs)]), given(fleet), tmp_path / "store", threads, 4)
     assert (end.done, end.failed) == (5, 4)
     found = rows(tmp_path / "store")
     assert sum(not error for *_, error in found) == 1
     assert all("\n" not in error for *_, error in found)
     assert (
-        campaign(find_sources([str(runs)]), given(fleet), tmp_path / "store", threads, 4).done == 0
+        run_campaign(find_sources([str(runs)]), given(fleet), tmp_path / "store", threads, 4).done
+        == 0
     )
-    again = campaign(
+    again = run_campaign(
         find_sources([str(runs)]), given(fleet), tmp_path / "store", threads, 4, again=True
     )
     assert again.done == 4
@@ -153,7 +154,7 @@ def test_what_nobody_foresaw_is_an_error_of_its_run(fleet, monkeypatch):
 
     monkeypatch.setattr("rig.fleet.one_run.diagnose", broken)
     (source, *_) = find_sources([str(fleet / "runs")], PATTERN)
-    row = evaluated(Task(source, *given(fleet)))
+    row = evaluate_run(Task(source, *given(fleet)))
     assert row.error == "unexpected: ZeroDivisionError: by nobody"
 
 
@@ -163,7 +164,7 @@ def killed(task):
     if "poison" in task.source.url or ("once" in task.source.url and not mark.exists()):
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return Row(
+    return RunRow(
         task.source.url, task.source.url, task.source.url, "b", "d", "2026-01-05", "m", "h", "v",
         verdict="explained",
     )  # fmt: skip
@@ -176,14 +177,14 @@ def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path, monkeypatch):
     # Workers import `killed` from here, and not from a package of the name `tests` elsewhere.
     monkeypatch.syspath_prepend(Path(__file__).parents[2])
     names = [f"run_{k}" for k in range(12)] + ["poison", "once"]
-    sources = [Source(n, False, "b", "d", "2026-01-05", "2026-01-05", 1, "") for n in names]
-    model = model_of(write_model(tmp_path))._replace(folder=str(tmp_path / "mark"))
+    sources = [RunSource(n, False, "b", "d", "2026-01-05", "2026-01-05", 1, "") for n in names]
+    model = load_fleet_model(write_model(tmp_path))._replace(folder=str(tmp_path / "mark"))
     context = multiprocessing.get_context("spawn")
 
     def make():
         return ProcessPoolExecutor(2, mp_context=context)
 
-    end = campaign(sources, model, tmp_path / "store", make, 6)
+    end = run_campaign(sources, model, tmp_path / "store", make, 6)
     assert end.done == 14
     found = {source: error for source, *_, error in rows(tmp_path / "store")}
     assert set(found) == set(names)
@@ -200,7 +201,7 @@ def test_runs_on_object_storage_are_read_through_fsspec(fleet, tmp_path):
         assert [(s.url, s.bench, s.damper, s.date) for s in sources] == [
             ("memory:///lab/bench_9/2026-03-04/A77.csv", "bench_9", "A77", "2026-03-04")
         ]
-        end = campaign(sources, given(fleet), tmp_path, threads, 2)
+        end = run_campaign(sources, given(fleet), tmp_path, threads, 2)
         assert (end.done, end.failed) == (1, 0)
     finally:
         memory.rm("/lab", recursive=True)
@@ -246,7 +247,7 @@ def test_links_are_followed_and_odd_names_are_runs(fleet, tmp_path):
     (runs / os.fsdecode(b"d\xe4mpfer.CSV")).write_bytes(content)
     sources = find_sources([str(runs)])
     assert len(sources) == 5
-    end = campaign(shard_of(sources, 1, 1), given(fleet), tmp_path / "store", threads, 2)
+    end = run_campaign(select_shard(sources, 1, 1), given(fleet), tmp_path / "store", threads, 2)
     assert (end.done, end.failed) == (5, 0)
 
 
@@ -272,7 +273,7 @@ def test_what_is_ready_is_written_though_nothing_follows(fleet, tmp_path, monkey
 
     def look(now):
         if now.done == len(sources):
-            seen.append(len(store.keys(tmp_path)))
+            seen.append(len(store.read_keys(tmp_path)))
 
-    campaign(sources, given(fleet), tmp_path, lambda: Slow(2), 8, progress=look)
+    run_campaign(sources, given(fleet), tmp_path, lambda: Slow(2), 8, progress=look)
     assert seen[0] >= len(sources) - 1

@@ -4,7 +4,7 @@ import psutil
 import pytest
 
 from can_dbc.errors import InputError
-from rig.fleet.campaign import campaign, model_of
+from rig.fleet.campaign import load_fleet_model, run_campaign
 from rig.fleet.executors import dask, processes
 from rig.fleet.sources import find_sources
 from tests.fleet.cluster import cluster
@@ -16,7 +16,7 @@ from tests.fleet.study import PATTERN, content, scattered
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_processes_and_a_cluster_write_the_same_store(tmp_path):
     write_fleet(tmp_path / "runs", 12, 10, scattered)
-    model = model_of(write_model(tmp_path))
+    model = load_fleet_model(write_model(tmp_path))
     sources = find_sources([str(tmp_path / "runs")], PATTERN)
     with cluster(tmp_path, 4) as there:
         victim = psutil.Process(there.workers[0].pid)
@@ -27,11 +27,11 @@ def test_processes_and_a_cluster_write_the_same_store(tmp_path):
 
         out = tmp_path / "by_dask"
         with dask(there.address) as engine:
-            end = campaign(sources, model, out, engine.make, engine.window, progress=kill)
+            end = run_campaign(sources, model, out, engine.make, engine.window, progress=kill)
         assert not victim.is_running() or victim.status() == psutil.STATUS_ZOMBIE
         assert (end.done, end.failed) == (120, 0)
     engine = processes(2)
-    campaign(sources, model, tmp_path / "by_processes", engine.make, engine.window)
+    run_campaign(sources, model, tmp_path / "by_processes", engine.make, engine.window)
     assert content(tmp_path / "by_dask") == content(tmp_path / "by_processes")
 
 

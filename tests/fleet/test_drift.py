@@ -4,9 +4,9 @@ import datetime
 
 import pytest
 
-from rig.fleet.campaign import campaign, model_of
+from rig.fleet.campaign import load_fleet_model, run_campaign
 from rig.fleet.executors import processes
-from rig.fleet.overview import overview
+from rig.fleet.overview import read_overview
 from rig.fleet.sources import find_sources
 from tests.fleet.population import FIRST, Piece, write_fleet, write_model
 
@@ -25,12 +25,12 @@ def piece(damper, week, rng):
 @pytest.mark.long
 def test_a_seal_that_fails_in_week_30_is_dated_and_the_others_are_not_accused(tmp_path):
     write_fleet(tmp_path / "runs", DAMPERS, WEEKS, piece, seed=SEED)
-    model = model_of(write_model(tmp_path))
+    model = load_fleet_model(write_model(tmp_path))
     sources = find_sources([str(tmp_path / "runs")], "{bench}/{date}/{damper}")
     engine = processes(2)
-    end = campaign(sources, model, tmp_path / "store", engine.make, engine.window)
+    end = run_campaign(sources, model, tmp_path / "store", engine.make, engine.window)
     assert (end.done, end.failed) == (WEEKS * DAMPERS, 0)
-    found = overview(tmp_path / "store")
+    found = read_overview(tmp_path / "store")
     (item,) = [series for series in found.series if series.is_change]
     assert item.where.damper == f"A{WHICH}"
     assert item.quantity.parameter == "coulomb_force_n"

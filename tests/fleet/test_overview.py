@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rig.fleet import store
-from rig.fleet.one_run import Row, Value
-from rig.fleet.overview import date_of, overview
-from rig.fleet.sentences import alarms
+from rig.fleet.one_run import RunRow, RunValue
+from rig.fleet.overview import date_of, read_overview
+from rig.fleet.sentences import alarm_sentences
 from rig.pages.fleet_page import write_fleet_page
 from tests.fleet.population import FIRST
 
@@ -16,7 +16,7 @@ BENCHES, DAMPERS, WEEKS, JUMPS = 4, 5, 30, 16
 
 
 def value(effect, parameter, number):
-    return Value("model", "strut", effect, "friction", parameter, number, number - 1, number + 1)
+    return RunValue("model", "strut", effect, "friction", parameter, number, number - 1, number + 1)
 
 
 def rows(truth, seed=0):
@@ -30,7 +30,7 @@ def rows(truth, seed=0):
                 day = (FIRST + datetime.timedelta(weeks=week)).isoformat()
                 noise = 1.0 + 0.003 * rng.standard_normal(2)
                 key = f"{bench}-{damper}-{week}"
-                yield Row(
+                yield RunRow(
                     key, key, f"runs/{key}", f"bench {bench}", f"A{bench}{damper}", day, "m", "h",
                     "0.2.0", verdict="nothing_missing",
                     values=(
@@ -54,25 +54,25 @@ def failing(bench, damper, week):
 
 def test_where_nothing_happens_nothing_is_said(tmp_path):
     store.append(tmp_path, list(rows(as_new)))
-    found = overview(tmp_path)
-    assert alarms(found) == []
+    found = read_overview(tmp_path)
+    assert alarm_sentences(found) == []
     assert found.runs == BENCHES * DAMPERS * WEEKS
     assert found.verdicts["bench 0"] == {"nothing_missing": DAMPERS * WEEKS}
 
 
 def test_a_bench_that_jumps_is_named_and_none_of_its_dampers(tmp_path):
     store.append(tmp_path, list(rows(jumping)))
-    found = overview(tmp_path)
+    found = read_overview(tmp_path)
     (jump,) = found.jumps
     assert jump.bench == "bench 2"
     assert jump.factor == pytest.approx(1.08, abs=0.003)
     assert date_of(jump.change.day) == (FIRST + datetime.timedelta(weeks=JUMPS)).isoformat()
-    assert len(alarms(found)) == 1
+    assert len(alarm_sentences(found)) == 1
 
 
 def test_a_damper_that_fails_is_named_and_not_its_bench(tmp_path):
     store.append(tmp_path, list(rows(failing)))
-    found = overview(tmp_path)
+    found = read_overview(tmp_path)
     assert found.jumps == ()
     assert {s.where.damper for s in found.series if s.is_change} == {"A13"}
     assert {o.where.damper for o in found.outliers} <= {"A13"}

@@ -10,15 +10,17 @@ import pytest
 
 from can_dbc.errors import InputError
 from rig.fleet import store
-from rig.fleet.one_run import Row, Value
+from rig.fleet.one_run import RunRow, RunValue
 
 
 def row(number, *, bench="b", date="2026-01-05", error="", values=1):
     own = tuple(
-        Value("model", "strut", "coulomb_friction", "friction", f"p{k}", 1.0 * k, k - 1.0, k + 1.0)
+        RunValue(
+            "model", "strut", "coulomb_friction", "friction", f"p{k}", 1.0 * k, k - 1.0, k + 1.0
+        )
         for k in range(values)
     )
-    return Row(
+    return RunRow(
         f"key{number}", f"id{number}", f"runs/{number}", bench, "A1", date, "m", "hash", "0.2.0",
         verdict="" if error else "explained", error=error, samples=10, values=() if error else own,
     )  # fmt: skip
@@ -48,15 +50,15 @@ def test_a_run_that_failed_is_forgotten_when_it_succeeds(tmp_path):
     store.append(tmp_path, [row(1, error="unreadable")])
     assert store.query(tmp_path, "SELECT error FROM runs")[1] == [("unreadable",)]
     again = row(1)
-    store.append(tmp_path, [Row(**{**again.as_dict(), "key": "other", "values": again.values})])
+    store.append(tmp_path, [RunRow(**{**again.as_dict(), "key": "other", "values": again.values})])
     assert store.query(tmp_path, "SELECT key, error FROM runs")[1] == [("other", "")]
-    assert store.identities(tmp_path, with_failed=False) == {"id1"}
+    assert store.read_identities(tmp_path, with_failed=False) == {"id1"}
 
 
 def test_a_success_of_another_model_hides_no_failure(tmp_path):
     store.append(tmp_path, [row(1)])
     failed = row(1, error="unreadable").as_dict() | {"key": "k", "model_sha256": "other"}
-    store.append(tmp_path, [Row(**failed)])
+    store.append(tmp_path, [RunRow(**failed)])
     found = store.query(tmp_path, "SELECT error FROM runs ORDER BY error")[1]
     assert found == [("",), ("unreadable",)]
 
@@ -64,7 +66,7 @@ def test_a_success_of_another_model_hides_no_failure(tmp_path):
 def test_a_copy_under_another_bench_counts_once_with_its_values(tmp_path):
     store.append(tmp_path, [row(1, bench="b")])
     again = row(1, bench="c")
-    copy = Row(**{**again.as_dict(), "source": "elsewhere", "values": again.values})
+    copy = RunRow(**{**again.as_dict(), "source": "elsewhere", "values": again.values})
     store.append(tmp_path, [copy])
     assert store.query(tmp_path, "SELECT count(*) FROM runs")[1] == [(1,)]
     assert store.query(tmp_path, "SELECT count(*) FROM effects")[1] == [(1,)]
@@ -125,4 +127,4 @@ def test_what_is_no_store_is_said(tmp_path):
     with pytest.raises(InputError):
         store.query(tmp_path, "SELECT * FROM runs")
     with pytest.raises(InputError):
-        store.identities(tmp_path, with_failed=True)
+        store.read_identities(tmp_path, with_failed=True)

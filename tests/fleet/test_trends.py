@@ -7,11 +7,11 @@ import pytest
 
 from rig.fleet.trends import (
     LEVEL,
-    Point,
-    bench_jump,
-    change_point,
-    drift,
-    outliers,
+    DatedValue,
+    find_bench_jump,
+    find_change_point,
+    find_outliers,
+    fit_drift,
     without_step,
 )
 
@@ -20,7 +20,7 @@ WEEKS, DAMPERS, FAILS = 52, 40, 30
 
 def series(factor, scatter, rng):
     return [
-        Point(7.0 * week, 20.0 * factor(week) * (1.0 + scatter * rng.standard_normal()))
+        DatedValue(7.0 * week, 20.0 * factor(week) * (1.0 + scatter * rng.standard_normal()))
         for week in range(WEEKS)
     ]
 
@@ -28,7 +28,7 @@ def series(factor, scatter, rng):
 @pytest.mark.long
 def test_without_a_change_it_is_found_as_often_as_its_level_says():
     rng = np.random.default_rng(1)
-    p = np.array([change_point(series(lambda _: 1.0, 0.02, rng)).p for _ in range(1000)])
+    p = np.array([find_change_point(series(lambda _: 1.0, 0.02, rng)).p for _ in range(1000)])
     # Binomial: 1000 draws at 10 % and 1 %, four standard deviations.
     assert abs(np.mean(p < 0.1) - 0.1) < 4.0 * math.sqrt(0.09 / 1000)
     assert np.mean(p < 0.01) < 0.01 + 4.0 * math.sqrt(0.0099 / 1000)
@@ -40,8 +40,8 @@ def test_wear_is_a_drift_and_no_change():
     covered = 0
     for _ in range(DAMPERS):
         points = series(lambda week: 1.0 + 0.02 * week, 0.02, rng)
-        assert change_point(points).p > LEVEL / DAMPERS
-        line = drift(points)
+        assert find_change_point(points).p > LEVEL / DAMPERS
+        line = fit_drift(points)
         assert line.p < 1e-12
         covered += line.low < 0.02 * 20.0 / 7.0 < line.high
     assert covered >= 0.85 * DAMPERS
@@ -60,7 +60,7 @@ def test_a_seal_that_fails_is_dated_within_two_weeks(kind, factor, scatter):
     """In 95 of 100, and found in all; the seed of each is its number."""
     errors = []
     for seed in range(40):
-        change = change_point(series(factor, scatter, np.random.default_rng(seed)))
+        change = find_change_point(series(factor, scatter, np.random.default_rng(seed)))
         assert change.p < LEVEL / DAMPERS
         assert change.kind == kind
         errors.append(abs(change.day / 7.0 - FAILS))
@@ -74,16 +74,16 @@ def test_the_interval_of_a_date_covers_it():
         points = series(
             lambda week: 1.0 + 0.02 * max(0, week - FAILS), 0.02, np.random.default_rng(seed)
         )
-        change = change_point(points)
+        change = find_change_point(points)
         inside += change.low <= 7.0 * FAILS <= change.high
     assert inside / 300 > 0.89
 
 
 def test_short_and_still_series_have_no_change():
-    assert change_point([Point(float(k), 1.0) for k in range(9)]) is None
-    assert change_point([Point(3.0, 1.0 + k) for k in range(20)]) is None
-    assert drift([Point(1.0, 2.0), Point(2.0, 3.0)]) is None
-    assert change_point([Point(float(k), 5.0) for k in range(20)]).p > 0.9
+    assert find_change_point([DatedValue(float(k), 1.0) for k in range(9)]) is None
+    assert find_change_point([DatedValue(3.0, 1.0 + k) for k in range(20)]) is None
+    assert fit_drift([DatedValue(1.0, 2.0), DatedValue(2.0, 3.0)]) is None
+    assert find_change_point([DatedValue(float(k), 5.0) for k in range(20)]).p > 0.9
 
 
 @pytest.mark.long
@@ -92,7 +92,7 @@ def test_outliers_are_as_rare_as_their_level_where_there_are_none(members):
     rng = np.random.default_rng(3)
     fleets = 400
     alarms = sum(
-        bool(outliers({str(k): v for k, v in enumerate(rng.standard_normal(members))}, 0.05))
+        bool(find_outliers({str(k): v for k, v in enumerate(rng.standard_normal(members))}, 0.05))
         for _ in range(fleets)
     )
     assert alarms / fleets < 0.05 + 4.0 * math.sqrt(0.05 * 0.95 / fleets)
@@ -102,7 +102,7 @@ def test_two_bad_ones_do_not_hide_each_other():
     rng = np.random.default_rng(4)
     values = {f"A{k}": 20.0 + 0.3 * rng.standard_normal() for k in range(40)}
     values |= {"A3": 24.0, "A9": 25.0}
-    assert set(outliers(values, 0.01)) == {"A3", "A9"}
+    assert set(find_outliers(values, 0.01)) == {"A3", "A9"}
 
 
 def bench(jump, rng, *, dampers=10, own=None):
@@ -110,7 +110,7 @@ def bench(jump, rng, *, dampers=10, own=None):
     for damper in range(dampers):
         level = math.log(8000.0) + 0.05 * rng.standard_normal()
         found[f"A{damper}"] = [
-            Point(
+            DatedValue(
                 7.0 * week,
                 level
                 + (jump if week >= FAILS else 0.0)
@@ -124,16 +124,16 @@ def bench(jump, rng, *, dampers=10, own=None):
 
 def test_a_load_cell_that_jumps_is_the_benchs_and_not_its_dampers():
     series_of = bench(math.log(1.03), np.random.default_rng(5))
-    jump = bench_jump(series_of, LEVEL)
+    jump = find_bench_jump(series_of, LEVEL)
     assert jump is not None
     assert jump.day == 7.0 * FAILS
     assert math.exp(jump.after - jump.before) == pytest.approx(1.03, abs=0.003)
 
 
 def test_one_damper_that_changes_is_no_jump_of_its_bench():
-    assert bench_jump(bench(0.0, np.random.default_rng(6), own=3), LEVEL) is None
-    assert bench_jump(bench(0.0, np.random.default_rng(7)), LEVEL) is None
-    assert bench_jump({}, LEVEL) is None
+    assert find_bench_jump(bench(0.0, np.random.default_rng(6), own=3), LEVEL) is None
+    assert find_bench_jump(bench(0.0, np.random.default_rng(7)), LEVEL) is None
+    assert find_bench_jump({}, LEVEL) is None
 
 
 def test_a_jump_is_seen_beside_wear():
@@ -142,7 +142,7 @@ def test_a_jump_is_seen_beside_wear():
         name: [point._replace(value=point.value + 0.0003 * point.day) for point in points]
         for name, points in found.items()
     }
-    jump = bench_jump(worn, LEVEL)
+    jump = find_bench_jump(worn, LEVEL)
     assert jump is not None
     assert math.exp(jump.after - jump.before) == pytest.approx(1.03, abs=0.004)
 
@@ -163,7 +163,7 @@ def test_in_a_fleet_of_forty_only_the_failing_seal_is_accused(wear):
             def factor(week, fails=fails):
                 return 1.0 + wear * week + fails * max(0, week - FAILS)
 
-            change = change_point(series(factor, 0.01, rng))
+            change = find_change_point(series(factor, 0.01, rng))
             if damper == 5:
                 assert change.p < LEVEL / DAMPERS
                 assert abs(change.day / 7.0 - FAILS) <= 2.0
@@ -178,11 +178,11 @@ def test_a_slope_beside_a_step_of_the_bench_is_as_wide_as_it_is():
     covered = 0
     for _ in range(300):
         points = [
-            Point(
+            DatedValue(
                 7.0 * week, 20.0 + 0.01 * week + 0.5 * (week >= FAILS) + 0.2 * rng.standard_normal()
             )
             for week in range(WEEKS)
         ]
-        line = drift(without_step(points, 7.0 * FAILS), 7.0 * FAILS)
+        line = fit_drift(without_step(points, 7.0 * FAILS), 7.0 * FAILS)
         covered += line.low < 0.01 / 7.0 < line.high
     assert abs(covered / 300 - 0.95) < 4.0 * math.sqrt(0.05 * 0.95 / 300)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from dart_model.effects import CATALOGUE
 from rig.fmu.binaries import compile_for, this_system
 from rig.fmu.law_in_c import NoLawError, in_c
-from rig.fmu.source import shared
+from rig.fmu.source import read_common_source
 
 DOUBLES = ctypes.POINTER(ctypes.c_double)
 LAWS = sorted(CATALOGUE)
@@ -52,7 +52,7 @@ def _door(name: str, kind: str, extra: str, returned: str) -> str:
 def compiled():
     """All laws in one library."""
     text = '#include "switches.h"\n' + "\n".join(_exported(name) for name in LAWS)
-    sources = {"switches.h": shared("switches.h"), "laws.c": text}
+    sources = {"switches.h": read_common_source("switches.h"), "laws.c": text}
     system = this_system()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "laws"

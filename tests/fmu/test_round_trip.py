@@ -308,7 +308,7 @@ def test_an_import_that_fails_admits_nothing(tmp_path):
 @pytest.mark.parametrize(
     ("mapping", "line"),
     [
-        ("{height: height_m, velocity: height_m, force: force_n}", "stands for two things"),
+        ("{height: height_m, velocity: height_m, force: force_n}", "has two roles"),
         ("{height: -height_m, velocity: velocity_m_per_s, force: force_n}", "different signs"),
         ("{height: height_m, velocity: velocity_m_per_s}", "force and acceleration"),
         ("{height: height_m, speed: velocity_m_per_s, force: force_n}", "speed"),

@@ -91,18 +91,18 @@ def test_a_file_that_was_cut_is_not_read_in_part(tmp_path):
 
 def test_columns_of_other_lengths_and_texts_are_refused(tmp_path):
     (tmp_path / "a.tdms").write_bytes(tdms(COLUMNS | {"Load": FORCE_LBF[:30]}))
-    with pytest.raises(InputError, match="has 30 values, expected 50 as the time"):
+    with pytest.raises(InputError, match="has 30 values, expected 50, as many as times"):
         import_table(tmp_path / "a.tdms", mapping(tmp_path), tmp_path / "a.csv")
     book = openpyxl.Workbook()
     for row in (("Time", "Travel", "Load"), (0.0, 1.0, "n/a"), (1.0, 2.0, 3.0)):
         book.active.append(row)
     book.save(tmp_path / "a.xlsx")
-    with pytest.raises(InputError, match="strut_force: expected numbers in every row"):
+    with pytest.raises(InputError, match="row 1 under the names: strut_force is missing"):
         import_table(tmp_path / "a.xlsx", mapping(tmp_path), tmp_path / "b.csv")
 
 
 def test_a_worksheet_that_unpacks_to_more_than_memory_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("rig.formats.array_tables._MAX_BYTES", 100_000)
+    monkeypatch.setattr("rig.formats.named_columns._MAX_BYTES", 100_000)
     made = io.BytesIO()
     with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("xl/worksheets/sheet1.xml", bytes(1_000_000))

@@ -159,5 +159,5 @@ def test_channels_of_an_mf4_file_become_csv(tmp_path: Path) -> None:
     mapping_path.write_text(
         "height: {column: Weg, unit: cm}\nstrut_force: {column: Kraft, unit: kN}\n"
     )
-    with pytest.raises(InputError, match="the file says 'mm'"):
+    with pytest.raises(InputError, match="the file has 'mm'"):
         import_table(path, load_mapping(mapping_path), tmp_path / "out2.csv")

@@ -10,7 +10,7 @@ from can_dbc.errors import InputError
 from rig.cli.main import app
 from rig.formats.foreign_table import import_table
 from rig.formats.mapping import load_mapping
-from rig.formats.mts import mts_columns, mts_mapping
+from rig.formats.mts import mts_mapping, read_mts
 from tests.faults.test_fuzz_files import mangled
 from tests.imports.test_tables import rows
 
@@ -60,7 +60,7 @@ def test_the_command_and_a_mapping(tmp_path):
     given = [str(source), "--rebound", "positive", "--out", str(tmp_path / "a.csv")]
     ended = runner.invoke(app, ["import", *given])
     assert ended.exit_code == 0, ended.output
-    assert "sign turned" in " ".join(ended.output.split())
+    assert "sign reversed" in " ".join(ended.output.split())
     (tmp_path / "mapping.yaml").write_text(
         "time: {column: Running Time, unit: s}\n"
         "height: {column: Axial Displacement, unit: in, offset_m: 0.3}\n"
@@ -80,10 +80,10 @@ def test_the_command_and_a_mapping(tmp_path):
         ("MTS793|MPT|ENU|1|0|.|/|:|1|0|0|A\n", "export it that way"),
         ("MTS793|MPT|ENU|1|1|,|/|:|1|0|0|A\n", "both delimiter and decimal"),
         ("MTS793|MPT|ENU|1|2|.|\n", "holds no row"),
-        ("MTS793|MPT|ENU|1|2|.|\n1\t2\n", "no names stand before"),
+        ("MTS793|MPT|ENU|1|2|.|\n1\t2\n", "expected 0: a line of names before them"),
         ("MTS793|MPT|ENU|1|2|.|\na\tb\n1\t2\n", "a line of names and one of units"),
         ("MTS793|MPT|ENU|1|2|.|\na\tb\ns\tmm\n1\t2\t3\n", "3 numbers, expected 2"),
-        ("MTS793|MPT|ENU|1|2|.|\na\ta\ns\tmm\n1\t2\n", "stands twice"),
+        ("MTS793|MPT|ENU|1|2|.|\na\ta\ns\tmm\n1\t2\n", "occurs twice"),
         (
             "MTS793|MPT|ENU|1|2|.|\na\tb\ns\tmm\n1\t2\nc\td\ns\tmm\n3\t4\n",
             "expected the same columns in all",
@@ -92,7 +92,7 @@ def test_the_command_and_a_mapping(tmp_path):
 )
 def test_a_wrong_file_is_one_line(tmp_path, text, says):
     with pytest.raises(InputError) as refused:
-        mts_columns(written(tmp_path, text))
+        read_mts(written(tmp_path, text))
     assert says in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -124,7 +124,7 @@ def test_a_folder_is_imported_and_one_bad_file_stops_no_other(tmp_path):
     assert sorted(path.name for path in out.iterdir()) == ["a.csv", "c.csv"]
     again = runner.invoke(app, given)
     assert isinstance(again.exception, InputError)
-    assert "holds something" in str(again.exception)
+    assert "is not empty" in str(again.exception)
     written(source, content(), "a.txt")
     twice = runner.invoke(app, [*given[:-1], str(tmp_path / "other")])
     assert "two files are called a" in str(twice.exception)

@@ -67,7 +67,14 @@ def test_every_assumption_is_said(written: Written, tmp_path: Path) -> None:
     said = "\n".join(
         import_table(written("a.txt", GERMAN), mapping, tmp_path / "out.csv").assumptions
     )
-    for words in ("decimal sign ','", "sign turned", "kN", "missing in 1 of 3", "prescribed", "ms"):
+    for words in (
+        "decimal sign ','",
+        "sign reversed",
+        "kN",
+        "missing in 1 of 3",
+        "prescribed",
+        "ms",
+    ):
         assert words in said
 
 

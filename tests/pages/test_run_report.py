@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from can_dbc.errors import InputError
-from rig.formats.arrays import open_run
+from rig.formats.run_arrays import open_run
 from rig.pages import pdf as paper
 from rig.pages.run_report import write_run_report
 from rig.run.changes import change_line

@@ -156,7 +156,7 @@ def test_force_file_is_read_beside_the_configuration(tmp_path):
         ("t_s,force\n0,0\n1,1\n", "expected one column applied_force_n"),
         ("t_s,t_s,applied_force_n\n0,0,0\n", "expected one column t_s"),
         ("t_s,applied_force_n\n0,0\n", "at least 2"),
-        ("t_s,applied_force_n\n0,0\n1\n", "line 3: expected 2 columns"),
+        ("t_s,applied_force_n\n0,0\n1\n", "line 3: 1 values, expected 2"),
         ("t_s,applied_force_n\n0,0\n1,x\n", "line 3: applied_force_n = 'x'"),
         ("t_s,applied_force_n\n0,0\n1,nan\n", "line 3: applied_force_n = 'nan'"),
         ("t_s,applied_force_n\n0,0\n1,1\n1,2\n", "line 4: t_s does not increase"),

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rig.formats.foreign_table import import_table
-from rig.formats.mapping import Mapping
+from rig.formats.mapping import TableMapping
 
 
 class Part(NamedTuple):
@@ -21,7 +21,7 @@ class Part(NamedTuple):
     last: int
 
 
-def imported(source: Path, mapping: Mapping, part: Part | None, out: Path) -> Path:
+def imported(source: Path, mapping: TableMapping, part: Part | None, out: Path) -> Path:
     """A table, or a part of it, as a CSV file that a diagnosis reads."""
     if part is not None:
         rows = {"first_row": part.first, "rows": part.last - part.first}

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from can_dbc.errors import InputError
-from rig.formats.arrays import open_run
+from rig.formats.run_arrays import open_run
 from rig.pages.view import foxglove
 from rig.pages.view.foxglove import FoxgloveView, Playback
 from rig.run.changes import CHANGES_FILE, change_line

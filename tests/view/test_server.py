@@ -13,7 +13,7 @@ import yaml
 
 from can_dbc.errors import InputError
 from dart_model.spec import MODELS, load_model
-from rig.formats.arrays import open_run
+from rig.formats.run_arrays import open_run
 from rig.pages.view import visible_stretch as closely
 from rig.pages.view.server import HOST, ViewServer
 from tests.view.serving import COUNT, described, get, grown_old, make_run, serving, stretch

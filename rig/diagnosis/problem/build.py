@@ -6,14 +6,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.effects import Motion, effect
+from dart_model.effects import AMBIENT_C, Motion, effect
 from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.smoother import estimate_noise
 from rig.diagnosis.problem import linear_part, track
 from rig.diagnosis.problem.fmu_force import with_mockups
 from rig.diagnosis.problem.free_run import FreeRun, Run, run_of, system
 from rig.diagnosis.problem.grid import (
-    NO_TEMPERATURE_C,
     Grid,
     SmoothMotion,
     grid_of,
@@ -263,7 +262,7 @@ def _motions(
     spec: ModelSpec, grids: Sequence[Grid], tracks: Sequence[Track], measured_n: float
 ) -> tuple[Motion, ...]:
     warm = [grid.temperature_c for grid in grids if grid.has_temperature]
-    celsius = (NO_TEMPERATURE_C, NO_TEMPERATURE_C)
+    celsius = (AMBIENT_C, AMBIENT_C)
     if warm:
         celsius = (float(min(w.min() for w in warm)), float(max(w.max() for w in warm)))
     found: list[Motion] = []

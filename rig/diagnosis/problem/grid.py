@@ -9,15 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dart_model.effects import AMBIENT_C
 from rig.diagnosis.numerics.smoother import Noise, Smoothed, estimate_noise, smooth
 from rig.diagnosis.problem.problem import Track, block_numbers
 from rig.diagnosis.recording import Recording
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-
-NO_TEMPERATURE_C = 20.0
-"""Temperature of a recording that has none."""
 
 _OUTLIER = 10.0
 """Times the robust scale of fourth differences from which on a sample can be an outlier: of 1e6
@@ -89,7 +87,7 @@ def grid_of(recording: Recording) -> tuple[Grid, NDArray[np.int64]]:
         outliers += int(false.sum())
         column[false] = np.nan
     measured = np.all(np.isfinite(heights), axis=1)
-    temperature = np.full(len(t_s), NO_TEMPERATURE_C)
+    temperature = np.full(len(t_s), AMBIENT_C)
     if recording.temperature_c is not None:
         temperature = _smooth_temperature(recording.t_s, recording.temperature_c, t_s)
     grid = Grid(

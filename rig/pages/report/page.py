@@ -8,9 +8,10 @@ from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from can_dbc.atomic_file import write_whole
 from can_dbc.errors import InputError
 from dart_model.effects import FAMILY_WORDS, effect
-from rig.diagnosis.outcome import Diagnosis, Result, write_text
+from rig.diagnosis.outcome import Diagnosis, Result
 from rig.pages import charts
 from rig.pages.report import tables
 from rig.pages.report.figures import (
@@ -78,7 +79,7 @@ def write_page(text: str, path: Path) -> None:
         InputError: The file cannot be written.
     """
     try:
-        write_text(path, text)
+        write_whole(path, text)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
 

@@ -1,6 +1,6 @@
 """How often a fault of a damper is named right, over simulated dampers that scatter.
 
-    python -m tests.characteristics.population --dampers 300 --seed 2
+    python -m tests.dyno.population --dampers 300 --seed 2
 
 The dampers' equations are their own: a polytropic gas column, a law of damping with a sharp knee,
 oil whose stiffness rises with pressure, an eye with play as a contact.
@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rig.dyno.characterise import of_arrays
-from rig.dyno.faults import named
+from rig.dyno.characterise import ForceRecord, characterise_record
+from rig.dyno.faults import name_faults
 from rig.dyno.master import master_of
 
 RATE_HZ, AMPLITUDE_M, MIDDLE_M = 250.0, 0.025, 0.35
@@ -176,7 +176,9 @@ def with_play(damper, x, v, dt):
 
 
 def characterised(damper, seed):
-    return of_arrays(f"damper {seed}", *record(damper, np.random.default_rng(seed)))
+    return characterise_record(
+        ForceRecord(f"damper {seed}", *record(damper, np.random.default_rng(seed)))
+    )
 
 
 def one(job):
@@ -184,7 +186,7 @@ def one(job):
     fault, seed = job
     rng = np.random.default_rng(seed)
     damper = FAULTS[fault](Damper().scattered(rng), rng)
-    naming = named(characterised(damper, seed), MASTER, SCATTER)
+    naming = name_faults(characterised(damper, seed), MASTER, SCATTER)
     return fault, [item.name for item in naming.named], naming, damper
 
 

@@ -6,18 +6,14 @@ from typing import Any
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.log.reader import (
-    FRAMES_FILE,
-    STEPS_FILE,
-    RunFolder,
-)
+from rig.log.reader import FRAMES_FILE, STEPS_FILE, RunFolder
 
 _NOT_COPIED = (FRAMES_FILE, STEPS_FILE, "reserve.tmp")
 _LARGEST_FILE_BYTES = 64 * 1024 * 1024
 
 
 @dataclass(frozen=True)
-class Content:
+class RunContent:
     """All that a run holds.
 
     Attributes:
@@ -40,7 +36,7 @@ def channel_of(header: dict[str, object]) -> str:
             return "can0"
 
 
-def inside(name: str, source: Path) -> PurePosixPath:
+def path_inside(name: str, source: Path) -> PurePosixPath:
     """Path of one of a run's files in its folder.
 
     Raises:
@@ -52,16 +48,16 @@ def inside(name: str, source: Path) -> PurePosixPath:
     return path
 
 
-def content_of(found: RunFolder) -> Content:
-    """All that a run holds but its captures."""
-    logs = {path.name for path in found.frame_files}
+def read_content(run: RunFolder) -> RunContent:
+    """All that a run holds, except its captures."""
+    logs = {path.name for path in run.frame_files}
     files = {
-        path.relative_to(found.folder).as_posix(): path.read_bytes()
-        for path in sorted(found.folder.rglob("*"))
+        path.relative_to(run.folder).as_posix(): path.read_bytes()
+        for path in sorted(run.folder.rglob("*"))
         if path.is_file()
         and path.name not in (*_NOT_COPIED, *logs)
         and not path.name.startswith("steps.")
-        and path.relative_to(found.folder).parts[0] != "captures"
+        and path.relative_to(run.folder).parts[0] != "captures"
         and path.stat().st_size <= _LARGEST_FILE_BYTES
     }
-    return Content(files, list(found.frames()), found.steps)
+    return RunContent(files, list(run.frames()), run.steps)

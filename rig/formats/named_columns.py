@@ -1,7 +1,7 @@
-"""Reads the columns of a table that names them itself: a worksheet, a TDMS file, one of MTS.
+"""Reads the columns of a file that names them itself: a worksheet, a TDMS file, one of MTS.
 
-Columns are called by their names: a worksheet's by its first row, a TDMS channel's as `group/name`
-or by its name alone where that is the only one. Formulas, macros and objects are not looked at.
+A column's name is the first cell of a worksheet's column; of a TDMS channel `group/name`, or the
+name alone where only one group has it. Formulas, macros and objects are ignored.
 
 MATLAB's files are left out: scipy's reader of them crashes the process on some damaged ones.
 """
@@ -19,21 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
-from can_dbc.units import Dimension
-from rig.formats.mapping import Mapping as TableMapping
-from rig.formats.mapping import Output, unit_conversion
-from rig.formats.mts import is_mts, mts_columns
-from rig.formats.text_table import Array, Columns
+from rig.files.delimited_text import MAX_ROWS
+from rig.formats.mapping import ColumnName, OutputColumn, TableMapping
+from rig.formats.mts import is_mts, read_mts
+from rig.formats.text_table import Array, Columns, evenly_sampled, in_seconds
 
 _MAX_BYTES = 1_000_000_000
 """Largest file, and largest content of a worksheet: what memory holds."""
 
-_MAX_SAMPLES = 5_000_000
-"""Most rows, as of a text."""
 
-
-def array_columns(source: Path, mapping: TableMapping, outputs: Sequence[Output]) -> Columns:
-    """Times and readings of a table that is no text.
+def read_named_columns(
+    source: Path, mapping: TableMapping, outputs: Sequence[OutputColumn]
+) -> Columns:
+    """Times and readings of a file that names its columns.
 
     Args:
         source: File whose suffix is one of `READERS`.
@@ -47,39 +45,37 @@ def array_columns(source: Path, mapping: TableMapping, outputs: Sequence[Output]
     if time is None:
         raise InputError(f"{source}: the mapping has no time, expected time: {{column: ...}}")
     if time.date_format is not None:
-        raise InputError(f"{source}: time.date_format: is for texts, expected a column of numbers")
-    table = mts_columns(source)[0] if is_mts(source) else _read(source)
-    columns = [_column(source, table, output.key, output.place) for output in outputs]
-    said = [f"{len(table)} columns: {', '.join(list(table)[:12])}"]
-    first, count = mapping.table.first_row, len(columns[0])
-    if time.sampling_rate_hz is not None:
-        t_s = np.arange(count) / time.sampling_rate_hz
-        said.append(f"t_s from {time.sampling_rate_hz:.9g} rows a second, evenly, beginning at 0")
+        raise InputError(
+            f"{source}: time.date_format: applies to text tables, expected a column of numbers"
+        )
+    table = read_mts(source)[0] if is_mts(source) else _read_file(source)
+    columns = [_find_column(source, table, output.key, output.column) for output in outputs]
+    first = mapping.table.first_row
+    if time.column is None:
+        t_s, time_words = evenly_sampled(time, len(columns[0]))
     else:
-        unit = unit_conversion(time.unit or "", Dimension.TIME, "time")
-        t_s = unit.factor * _column(source, table, "time", time.column or "")
-        said.append(f"t_s = {unit.factor:.9g} * column {time.column!r} (read in {time.unit})")
+        t_s, time_words = in_seconds(time, _find_column(source, table, "time", time.column))
     for output, column in zip(outputs, columns, strict=True):
         if len(column) != len(t_s):
             raise InputError(
-                f"{source}: {output.key}.column = {output.place!r} has {len(column)} values, "
-                f"expected {len(t_s)} as the time"
+                f"{source}: {output.key}.column = {output.column!r} has {len(column)} values, "
+                f"expected {len(t_s)}, as many as times"
             )
     last = None if mapping.table.rows is None else first + mapping.table.rows
-    taken = slice(first, last)
-    t_s, columns = t_s[taken], [column[taken] for column in columns]
+    t_s, columns = t_s[first:last], [column[first:last] for column in columns]
     keys = [item.key for item in outputs[1:]]  # a height may be missing in a row
     for key, column in (("time", t_s), *zip(keys, columns[1:], strict=True)):
         wrong = np.flatnonzero(~np.isfinite(column))
         if len(wrong):
             raise InputError(
-                f"{source}: {key}: expected numbers in every row, found none in row "
-                f"{first + int(wrong[0]) + 1} under the names (table.first_row begins later)"
+                f"{source}: row {first + int(wrong[0]) + 1} under the names: {key} is missing, "
+                "expected a number (table.first_row begins later)"
             )
-    return t_s, columns, said
+    names = f"{len(table)} columns: {', '.join(list(table)[:12])}"
+    return t_s, columns, [names, time_words]
 
 
-def _read(source: Path) -> Mapping[str, Array]:
+def _read_file(source: Path) -> Mapping[str, Array]:
     """Columns of a file by their names."""
     try:
         if source.stat().st_size > _MAX_BYTES:
@@ -92,36 +88,36 @@ def _read(source: Path) -> Mapping[str, Array]:
         return read(content)
     except ImportError as error:
         raise InputError(
-            f"{source}: wants the package {error.name}: pip install 'rig[tables]'"
+            f"{source}: requires the package {error.name}: pip install 'rig[tables]'"
         ) from error
     except Exception as error:
-        # Foreign readers raise whatever they stumble on in a file that is cut or was made to harm.
+        # Foreign readers raise anything on a file that is cut or malicious.
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise InputError(f"{source}: is no such file, or is damaged: {reason}") from error
 
 
-def _column(source: Path, table: Mapping[str, Array], key: str, place: str | int) -> Array:
+def _find_column(source: Path, table: Mapping[str, Array], key: str, name: ColumnName) -> Array:
     names = list(table)
-    if isinstance(place, int):
-        if not 1 <= place <= len(names):
-            raise InputError(f"{source}: {key}.column = {place}: expected 1 to {len(names)}")
-        return table[names[place - 1]]
-    alike = [name for name in names if name == place or name.rpartition("/")[2] == place]
+    if isinstance(name, int):
+        if not 1 <= name <= len(names):
+            raise InputError(f"{source}: {key}.column = {name}: expected 1 to {len(names)}")
+        return table[names[name - 1]]
+    alike = [full for full in names if name in (full, full.rpartition("/")[2])]
     if len(alike) != 1:
-        what = f"there {len(alike)} times" if alike else "not there"
+        wrong = f"there {len(alike)} times" if alike else "not there"
         raise InputError(
-            f"{source}: {key}.column = {place!r} is {what}, expected one of "
+            f"{source}: {key}.column = {name!r} is {wrong}, expected one of "
             f"{', '.join(names[:20]) or 'no column at all'}"
         )
     column = table[alike[0]]
-    if not 2 <= len(column) <= _MAX_SAMPLES:
+    if not 2 <= len(column) <= MAX_ROWS:
         raise InputError(
-            f"{source}: column {place!r} has {len(column)} values, expected 2 to {_MAX_SAMPLES}"
+            f"{source}: column {name!r} has {len(column)} values, expected 2 to {MAX_ROWS}"
         )
     return column
 
 
-def _worksheet(content: bytes) -> Mapping[str, Array]:
+def _read_worksheet(content: bytes) -> Mapping[str, Array]:
     """The first worksheet, its first row the names; cells without a number are NaN."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         if sum(item.file_size for item in archive.infolist()) > _MAX_BYTES:
@@ -134,64 +130,66 @@ def _worksheet(content: bytes) -> Mapping[str, Array]:
     for row in rows:
         if all(cell is None for cell in row):
             continue
-        cells.append([_number(cell) for cell in row[: len(names)]])
-        if len(cells) > _MAX_SAMPLES:
-            raise ValueError(f"more than {_MAX_SAMPLES} rows")
+        cells.append([_cell_number(cell) for cell in row[: len(names)]])
+        if len(cells) > MAX_ROWS:
+            raise ValueError(f"more than {MAX_ROWS} rows")
     if not cells:
         raise ValueError("no rows of data under the names")
     twice = next((name for name in names if name and names.count(name) > 1), None)
     if twice is not None:
-        raise ValueError(f"two columns are called {twice}, expected names of their own")
+        raise ValueError(f"two columns are called {twice}, expected different names")
     width = len(names)
     table = np.array([row + [np.nan] * (width - len(row)) for row in cells])
-    return {name or f"column {place}": table[:, place - 1] for place, name in enumerate(names, 1)}
+    return {
+        name or f"column {number}": table[:, number - 1] for number, name in enumerate(names, 1)
+    }
 
 
-def _number(cell: object) -> float:
+def _cell_number(cell: object) -> float:
     is_number = isinstance(cell, int | float) and not isinstance(cell, bool)
     return float(cast("float", cell)) if is_number else float("nan")
 
 
-class _Heard(logging.Handler):
-    """Keeps the first message of a reader."""
+class _FirstMessage(logging.Handler):
+    """A handler that keeps the first message of a reader."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.first: str | None = None
+        self.text: str | None = None
 
     def emit(self, record: logging.LogRecord) -> None:
         """Keep a message, if it is the first."""
-        self.first = self.first or record.getMessage()
+        self.text = self.text or record.getMessage()
 
 
-def _tdms(content: bytes) -> Mapping[str, Array]:
+def _read_tdms(content: bytes) -> Mapping[str, Array]:
     """Channels of numbers, as `group/name`."""
     nptdms = cast("Any", importlib.import_module("nptdms"))
-    heard = _Heard()
+    warning = _FirstMessage()
     logs = [logging.getLogger(name) for name in logging.root.manager.loggerDict if "nptdms" in name]
-    # What the reader only warns of is a file that was cut: it is refused, and not read in part.
+    # The reader only warns of a file that was cut; it is refused here, not read in part.
     for log in logs:
-        log.handlers, log.propagate = [heard], False
+        log.handlers, log.propagate = [warning], False
     file = nptdms.TdmsFile.read(io.BytesIO(content))
-    if heard.first is not None:
-        raise ValueError(heard.first)
+    if warning.text is not None:
+        raise ValueError(warning.text)
     return {
         f"{group.name}/{channel.name}": numbers
         for group in file.groups()
         for channel in group.channels()
-        if (numbers := _numbers(channel[:])) is not None
+        if (numbers := _as_numbers(channel[:])) is not None
     }
 
 
-def _numbers(value: Any) -> Array | None:
-    """A vector of numbers; None of anything else."""
-    array: NDArray[Any] = np.asarray(value)
+def _as_numbers(values: object) -> Array | None:
+    """The values as a vector of numbers; None if they are anything else."""
+    array: NDArray[np.generic] = np.asarray(values)
     if array.dtype.kind not in "fiu" or array.size < 2 or array.size != max(array.shape):
         return None
     return np.array(array.ravel(), dtype=np.float64)
 
 
 READERS: Mapping[str, Callable[[bytes], Mapping[str, Array]]] = MappingProxyType(
-    {".xlsx": _worksheet, ".tdms": _tdms}
+    {".xlsx": _read_worksheet, ".tdms": _read_tdms}
 )
-"""Suffix -> what reads such a file."""
+"""Reader of a file's content, by the file's suffix."""

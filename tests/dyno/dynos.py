@@ -95,16 +95,16 @@ def found(step):
     """The figures of a step by the same names."""
     sides = step.compression, step.rebound
     return {
-        "peak velocity": step.rebound.peak_velocity,
-        "force at peak velocity": tuple(side.force_at_peak_velocity for side in sides),
-        "window": tuple(side.force_window for side in sides),
-        "peak": tuple(side.peak_force for side in sides),
-        "energy": step.energy_per_cycle,
-        "equivalent damping": step.equivalent_damping,
-        "spring rate": step.spring_rate,
-        "mean force": step.mean_force,
-        "half difference": step.half_difference,
-        "hysteresis at zero": step.hysteresis_at_zero,
+        "peak velocity": step.rebound.peak_velocity_m_per_s,
+        "force at peak velocity": tuple(side.force_at_peak_velocity_n for side in sides),
+        "window": tuple(side.force_window_n for side in sides),
+        "peak": tuple(side.peak_force_n for side in sides),
+        "energy": step.energy_per_cycle_j,
+        "equivalent damping": step.equivalent_damping_n_s_per_m,
+        "spring rate": step.spring_rate_n_per_m,
+        "mean force": step.mean_force_n,
+        "half difference": step.half_difference_n,
+        "hysteresis at zero": step.hysteresis_at_zero_n,
     }
 
 

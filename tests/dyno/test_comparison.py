@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 
 from can_dbc.errors import InputError
 from rig.cli.main import app
-from rig.dyno.characterise import of_arrays
-from rig.dyno.comparison import compared, over_dose
-from rig.dyno.tolerance import judged, load_tolerance
-from tests.characteristics.test_characteristics import written
+from rig.dyno.characterise import ForceRecord, characterise_record
+from rig.dyno.comparison import compare_dampers, trends_over_dose
+from rig.dyno.tolerance import evaluate_band, load_tolerance
+from tests.dyno.test_characteristics import written
 
 HEADER = "velocity_m_per_s,compression_low_n,compression_high_n,rebound_low_n,rebound_high_n"
 RATE_HZ = 200.0
@@ -40,13 +40,14 @@ def columns(seed, *, gas_n=200.0, friction_n=15.0, damping=1500.0):
 
 @cache
 def state(seed, **changed):
-    return of_arrays(f"state{seed}", *columns(seed, **changed))
+    return characterise_record(ForceRecord(f"state{seed}", *columns(seed, **changed)))
 
 
 def test_a_damper_does_not_differ_from_itself():
     """One comparison in twenty may claim anything at all: three of ten come once in a hundred."""
     claims = [
-        any(item.differs for item in compared(state(2 * k), state(2 * k + 1))) for k in range(10)
+        any(item.differs for item in compare_dampers(state(2 * k), state(2 * k + 1)))
+        for k in range(10)
     ]
     assert sum(claims) <= 2
 
@@ -65,7 +66,7 @@ def test_a_damper_does_not_differ_from_itself():
     ],
 )
 def test_what_was_changed_is_found_and_nothing_else(changed, name, by, untouched):
-    found = {item.name: item for item in compared(state(1), state(2, **changed))}
+    found = {item.figure: item for item in compare_dampers(state(1), state(2, **changed))}
     item = found[name]
     assert item.differs
     assert item.change.low <= by <= item.change.high
@@ -75,17 +76,17 @@ def test_what_was_changed_is_found_and_nothing_else(changed, name, by, untouched
 def test_over_a_dose():
     pressures = (2.0, 4.0, 6.0, 8.0)
     states = [state(k, gas_n=50.0 * bar) for k, bar in enumerate(pressures)]
-    trends = {item.name: item for item in over_dose(states, pressures)}
+    trends = {item.figure: item for item in trends_over_dose(states, pressures)}
     gas = trends["gas force"]
     assert gas.differs
     assert gas.is_straight
     assert gas.slope.low <= 50.0 <= gas.slope.high
     assert not trends["friction"].differs
     squared = [state(k, gas_n=10.0 * bar**2) for k, bar in enumerate(pressures)]
-    bent = {item.name: item for item in over_dose(squared, pressures)}["gas force"]
+    bent = {item.figure: item for item in trends_over_dose(squared, pressures)}["gas force"]
     assert not bent.is_straight
     with pytest.raises(InputError, match="at least three different ones"):
-        over_dose(states, (1.0, 1.0, 1.0, 1.0))
+        trends_over_dose(states, (1.0, 1.0, 1.0, 1.0))
 
 
 BAND = """
@@ -101,7 +102,7 @@ points:
 
 
 def judged_by(item, path):
-    return judged(item.steps, item.damper.kinds, load_tolerance(path))
+    return evaluate_band(item.steps, item.damper.kinds, load_tolerance(path))
 
 
 def test_points_pass_fail_or_stay_open(tmp_path):
@@ -134,7 +135,7 @@ def test_a_warm_up_is_judged_by_no_band(tmp_path):
     fastest_is_warm_up = [
         "warm_up" if step is item.steps[1] else "velocity_step" for step in item.steps
     ]
-    found = judged(item.steps, fastest_is_warm_up, load_tolerance(tmp_path / "band.yaml"))
+    found = evaluate_band(item.steps, fastest_is_warm_up, load_tolerance(tmp_path / "band.yaml"))
     assert found[0].verdict == "open"
 
 
@@ -175,7 +176,11 @@ def test_the_command_says_pass_or_fail(tmp_path):
         ("a.yaml", BAND.replace("350", "390"), "compression_low_n 390"),
         ("a.yaml", BAND.replace("0.2,", "true,"), "velocity_m_per_s"),
         ("a.csv", "v,f\n1,2\n", "expected the header"),
-        ("a.csv", f"{HEADER}\n0.1,350,380,x,50\n", "line 2: 0.1,350,380,x,50: expected numbers"),
+        (
+            "a.csv",
+            f"{HEADER}\n0.1,350,380,x,50\n",
+            "line 2: rebound_low_n = 'x', expected a number",
+        ),
         ("a.csv", f"{HEADER}\n", "holds no point"),
         ("a.csv", "", "expected the header"),
     ],

@@ -23,7 +23,7 @@ class Run:
         header: Content of `run.yaml`: configuration, versions, how it ended.
         t_s: Time of each tick, shape (N,).
         columns: Every column of the log by its name, which ends with its unit, shape (N,) each:
-            `strut.height_m`, `strut.force_n`, `applied_force_n`, ...; NaN where nothing came.
+            `strut.height_m`, `strut.force_n`, `applied_force_n`, ...; NaN where there is no value.
     """
 
     folder: Path
@@ -38,7 +38,7 @@ class Run:
             raise KeyError(f"{name}: expected one of {', '.join(self.columns)}") from None
 
     def to_pandas(self) -> Any:
-        """The columns as a DataFrame over `t_s`; wants the package pandas."""
+        """The columns as a DataFrame over `t_s`; requires the package pandas."""
         import pandas as pd  # noqa: PLC0415 - optional # pyright: ignore
 
         table: Any = pd
@@ -51,12 +51,12 @@ def open_run(folder: Path | str) -> Run:
     Raises:
         InputError: It is no run, or damaged.
     """
-    found = read_run(Path(folder))
-    steps = found.steps
+    run = read_run(Path(folder))
+    steps = run.steps
     columns = {
         name: np.asarray(steps.column(name).to_numpy(), dtype=np.float64)
         for name in steps.schema.names
         if name != "t_ns"
     }
     t_s = np.asarray(steps.column("t_ns").to_numpy() * 1e-9, dtype=np.float64)
-    return Run(found.folder, found.header, t_s, MappingProxyType(columns))
+    return Run(run.folder, run.header, t_s, MappingProxyType(columns))

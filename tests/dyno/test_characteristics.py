@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 from can_dbc.errors import InputError
 from rig.cli.main import app
-from rig.dyno.characterise import characterise, of_arrays
-from rig.dyno.strokes import blocks_of, holds_of, strokes_of
-from tests.characteristics.__main__ import coverage, study
-from tests.characteristics.dynos import Dyno, drawn
+from rig.dyno.characterise import ForceRecord, characterise, characterise_record
+from rig.dyno.strokes import find_blocks, find_holds, find_strokes
+from tests.dyno.__main__ import coverage, study
+from tests.dyno.dynos import Dyno, drawn
 
 RATE_HZ = 500.0
 
@@ -27,15 +27,15 @@ def test_intervals_hold_the_truth():
 
 def test_without_noise_the_closed_forms_are_met():
     dyno = Dyno("friction", 1.3, 0.02, 120.0, 6.4, 1e-6, 1e-12, 0.4)
-    [step] = of_arrays("exact", *dyno.record(np.random.default_rng(0))).steps
+    [step] = characterise_record(ForceRecord("exact", *dyno.record(np.random.default_rng(0)))).steps
     truth = dyno.truth()
-    assert step.rebound.peak_velocity.value == pytest.approx(dyno.speed, rel=1e-5)
-    assert step.energy_per_cycle.value == pytest.approx(truth["energy"], rel=1e-4)
-    assert step.compression.force_at_peak_velocity.value == pytest.approx(
+    assert step.rebound.peak_velocity_m_per_s.value == pytest.approx(dyno.speed, rel=1e-5)
+    assert step.energy_per_cycle_j.value == pytest.approx(truth["energy"], rel=1e-4)
+    assert step.compression.force_at_peak_velocity_n.value == pytest.approx(
         truth["force at peak velocity"][0], rel=1e-4
     )
-    assert step.spring_rate.value == pytest.approx(truth["spring rate"], rel=1e-4)
-    assert step.hysteresis_at_zero.value == pytest.approx(70.0, abs=0.05)
+    assert step.spring_rate_n_per_m.value == pytest.approx(truth["spring rate"], rel=1e-4)
+    assert step.hysteresis_at_zero_n.value == pytest.approx(70.0, abs=0.05)
     assert step.frequency_hz == pytest.approx(1.3, rel=1e-6)
     assert step.cycles == pytest.approx(6.0, abs=0.5)
 
@@ -75,7 +75,7 @@ def whole_test(seed=1, noise_n=2.0):
 
 @pytest.fixture(scope="module")
 def tested():
-    return of_arrays("whole", *whole_test())
+    return characterise_record(ForceRecord("whole", *whole_test()))
 
 
 def test_a_whole_test_is_divided_into_its_parts(tested):
@@ -85,7 +85,7 @@ def test_a_whole_test_is_divided_into_its_parts(tested):
     expected = (0.0785, 0.00151, 0.05, 0.1, 0.2, 0.4, 0.6, 0.0785)
     assert speeds == pytest.approx(expected, rel=0.01)
     [rest] = tested.holds
-    assert rest.force.low <= GAS_N <= rest.force.high
+    assert rest.force_n.low <= GAS_N <= rest.force_n.high
     assert rest.end_s == pytest.approx(1.5, abs=0.05)
 
 
@@ -93,22 +93,22 @@ def test_friction_and_gas_are_those_of_the_slow_cycle(tested):
     damper = tested.damper
     speed, warm = 0.00151, 1.0 + PER_KELVIN * (tested.steps[1].temperature_c - 25.0)
     bleed = 2600.0 * speed * warm
-    assert damper.friction.low <= FRICTION_N + 1.2 * bleed <= damper.friction.high
-    assert damper.gas_force.low <= GAS_N - 0.2 * bleed <= damper.gas_force.high
-    assert damper.gas_rate.low <= RATE <= damper.gas_rate.high
-    assert damper.friction.high - damper.friction.low < 4.0
+    assert damper.friction_n.low <= FRICTION_N + 1.2 * bleed <= damper.friction_n.high
+    assert damper.gas_force_n.low <= GAS_N - 0.2 * bleed <= damper.gas_force_n.high
+    assert damper.gas_rate_n_per_m.low <= RATE <= damper.gas_rate_n_per_m.high
+    assert damper.friction_n.high - damper.friction_n.low < 4.0
 
 
 def test_knee_asymmetry_and_temperature(tested):
     damper = tested.damper
     for side in ("compression", "rebound"):
-        knee = damper.knee[side]
+        knee = damper.knee_m_per_s[side]
         assert knee.low <= KNEE <= knee.high
         assert knee.high - knee.low < 0.15
     # At one speed the damping falls by 0.4 % per kelvin of what it is at 25 degrees.
     damping = 2600.0 * 0.0785
     for side, factor, sign in (("compression", 1.0, 1.0), ("rebound", 1.4, -1.0)):
-        figure, true = damper.per_kelvin[side], sign * factor * PER_KELVIN * damping
+        figure, true = damper.force_per_kelvin_n_per_k[side], sign * factor * PER_KELVIN * damping
         assert figure.low <= true <= figure.high
         assert abs(figure.high - figure.low) < 0.4 * abs(true)
     top = 2600.0 * KNEE + 500.0 * (0.6 - KNEE)
@@ -119,10 +119,10 @@ def test_knee_asymmetry_and_temperature(tested):
 
 def test_a_straight_damper_has_no_knee_and_a_cold_one_no_slope():
     dyno = Dyno("linear", 1.0, 0.02, 100.0, 8.0, 2.0, 2e-6, 0.0)
-    found = of_arrays("straight", *dyno.record(np.random.default_rng(2)))
-    assert found.damper.knee == {"compression": None, "rebound": None}
-    assert found.damper.per_kelvin == {"compression": None, "rebound": None}
-    assert found.damper.friction is None
+    found = characterise_record(ForceRecord("straight", *dyno.record(np.random.default_rng(2))))
+    assert found.damper.knee_m_per_s == {"compression": None, "rebound": None}
+    assert found.damper.force_per_kelvin_n_per_k == {"compression": None, "rebound": None}
+    assert found.damper.friction_n is None
     assert any("no knee" in note for note in found.damper.notes)
 
 
@@ -132,8 +132,8 @@ def test_a_straight_damper_has_no_knee_and_a_cold_one_no_slope():
 def test_noise_at_rest_is_no_stroke():
     rng = np.random.default_rng(4)
     t_s = np.arange(5000) / RATE_HZ
-    assert strokes_of(t_s, 0.3 + 1e-5 * rng.standard_normal(5000)) == []
-    assert strokes_of(t_s, np.full(5000, 0.3)) == []
+    assert find_strokes(t_s, 0.3 + 1e-5 * rng.standard_normal(5000)) == []
+    assert find_strokes(t_s, np.full(5000, 0.3)) == []
 
 
 def test_strokes_of_a_triangle():
@@ -143,10 +143,12 @@ def test_strokes_of_a_triangle():
     v = np.where(np.cos(2.0 * np.pi * 0.5 * t_s) > 0.0, 0.04, -0.04)
     rng = np.random.default_rng(5)
     force = 150.0 - 2000.0 * v + rng.standard_normal(6000)
-    [step] = of_arrays("triangle", t_s, 0.3 + x + 1e-6 * rng.standard_normal(6000), force).steps
+    [step] = characterise_record(
+        ForceRecord("triangle", t_s, 0.3 + x + 1e-6 * rng.standard_normal(6000), force)
+    ).steps
     assert step.frequency_hz is None
-    assert step.rebound.force_window.value == pytest.approx(70.0, abs=1.0)
-    assert step.energy_per_cycle.value == pytest.approx(2.0 * 80.0 * 0.04, rel=0.01)
+    assert step.rebound.force_window_n.value == pytest.approx(70.0, abs=1.0)
+    assert step.energy_per_cycle_j.value == pytest.approx(2.0 * 80.0 * 0.04, rel=0.01)
 
 
 def test_a_middle_that_wanders_does_not_bend_the_figures():
@@ -156,12 +158,14 @@ def test_a_middle_that_wanders_does_not_bend_the_figures():
     v = 0.02 * 2.0 * math.pi * np.cos(angle) + 2e-3
     rng = np.random.default_rng(11)
     force = 150.0 - 1000.0 * v + rng.standard_normal(6000)
-    found = of_arrays("wanders", t_s, 0.3 + x + 1e-6 * rng.standard_normal(6000), force)
+    found = characterise_record(
+        ForceRecord("wanders", t_s, 0.3 + x + 1e-6 * rng.standard_normal(6000), force)
+    )
     [step] = found.steps
     assert step.peak_speed_m_per_s == pytest.approx(0.1277, rel=0.01)
     assert step.amplitude_m == pytest.approx(0.02, rel=0.02)
-    assert step.rebound.force_at_peak_velocity.value == pytest.approx(150.0 - 127.7, abs=2.0)
-    assert step.energy_per_cycle.value == pytest.approx(
+    assert step.rebound.force_at_peak_velocity_n.value == pytest.approx(150.0 - 127.7, abs=2.0)
+    assert step.energy_per_cycle_j.value == pytest.approx(
         1000.0 * math.pi * 2.0 * math.pi * 0.02**2, rel=0.02
     )
 
@@ -170,7 +174,7 @@ def test_a_gap_is_no_rest():
     rng = np.random.default_rng(12)
     t_s, x, force = Dyno("linear", 1.0, 0.02, 200.0, 12.0, 1.0, 1e-6, 0.1).record(rng)
     keep = (t_s < 4.2) | (t_s > 6.5)
-    assert of_arrays("gap", t_s[keep], x[keep], force[keep]).holds == ()
+    assert characterise_record(ForceRecord("gap", t_s[keep], x[keep], force[keep])).holds == ()
 
 
 def test_two_amplitudes_are_two_steps():
@@ -178,9 +182,9 @@ def test_two_amplitudes_are_two_steps():
     first = Dyno("linear", 1.0, 0.02, 100.0, 5.0, 1.0, 1e-6, 0.0).record(rng)
     later = Dyno("linear", 1.0, 0.01, 100.0, 5.0, 1.0, 1e-6, 0.0).record(rng, begin_s=5.0)
     t_s, x, _ = (np.concatenate(pair) for pair in zip(first, later, strict=True))
-    blocks = blocks_of(strokes_of(t_s, x))
+    blocks = find_blocks(find_strokes(t_s, x))
     assert [round(1e3 * abs(block.strokes[1].rise_m)) for block in blocks] == [40, 20]
-    assert holds_of(t_s, x, blocks) == []
+    assert find_holds(t_s, x, blocks) == []
 
 
 # --- What may mislead ---------------------------------------------------------------------------
@@ -195,7 +199,7 @@ def test_gaps_few_samples_and_coarse_forces_are_said():
     t_s, x, force = Dyno("linear", 2.0, 0.02, 12.0, 12.0, 0.0, 1e-6, 0.1).record(rng)
     t_s = t_s.copy()
     t_s[60:] += 0.5  # twelve samples a cycle: half a second is a cycle, the motion goes on
-    said = of_arrays("bad", t_s, x, 50.0 * np.round(force / 50.0)).quality
+    said = characterise_record(ForceRecord("bad", t_s, x, 50.0 * np.round(force / 50.0))).quality
     assert any("gaps between samples, the longest 0.542 s at" in text for text in said)
     assert any("12.0 samples a cycle" in text for text in said)
 
@@ -205,11 +209,13 @@ def test_a_cell_that_drifts_is_said():
     rest = np.full(1000, 0.3)
     last_s = t_s[-1] + np.arange(1, 1001) / RATE_HZ
     noise = 2.0 * np.random.default_rng(10).standard_normal(1000)
-    said = of_arrays(
-        "drift",
-        np.concatenate([t_s, last_s]),
-        np.concatenate([x, rest]),
-        np.concatenate([force, GAS_N - 25.0 + noise]),
+    said = characterise_record(
+        ForceRecord(
+            "drift",
+            np.concatenate([t_s, last_s]),
+            np.concatenate([x, rest]),
+            np.concatenate([force, GAS_N - 25.0 + noise]),
+        )
     ).quality
     assert len(said) == 1
     assert "changed by -2" in said[0]
@@ -279,12 +285,12 @@ def test_hostile_records_end_in_figures_or_one_line(seed):
             case _:
                 x[first] += 0.1
     try:
-        found = of_arrays("hostile", t_s, x, force)
+        found = characterise_record(ForceRecord("hostile", t_s, x, force))
     except InputError as error:
         assert "\n" not in str(error)  # noqa: PT017 - one of two good ends
         return
     for step in found.steps:
-        assert math.isfinite(step.energy_per_cycle.value)
+        assert math.isfinite(step.energy_per_cycle_j.value)
 
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data" / "mr_damper"
@@ -296,11 +302,11 @@ def test_a_measured_damper(name, peak_n):
     """The mean stroke beside the extremes of the record itself, which noise makes larger."""
     t_s, x_mm, v_mm_per_s, force = np.loadtxt(DATA / f"{name}.txt").T[:4]
     t_s = np.linspace(t_s[0], t_s[-1], len(t_s))
-    found = of_arrays(name, t_s, 0.3 + 1e-3 * x_mm, -force)
+    found = characterise_record(ForceRecord(name, t_s, 0.3 + 1e-3 * x_mm, -force))
     [step] = found.steps
     largest = 1e-3 * float(np.percentile(np.abs(v_mm_per_s), 99.5))
     assert step.peak_speed_m_per_s == pytest.approx(largest, rel=0.01)
-    assert -step.rebound.peak_force.value == pytest.approx(peak_n, rel=0.03)
+    assert -step.rebound.peak_force_n.value == pytest.approx(peak_n, rel=0.03)
 
 
 def sine(frequency_hz, seconds, amplitude_m=0.02, rate_hz=500.0):
@@ -319,11 +325,11 @@ def test_strokes_that_ramp_up_and_down_are_of_no_step():
     swell = np.interp(t_s, (0.0, 1.0, 1.5, 10.5, 11.0, 12.0), (0.0, 0.7, 1.0, 1.0, 0.7, 0.0))
     height_m = 0.3 + swell * x_m
     force_n = 200.0 - 1500.0 * np.gradient(height_m, t_s)
-    (step,) = of_arrays("ramped", t_s, height_m, force_n).steps
+    (step,) = characterise_record(ForceRecord("ramped", t_s, height_m, force_n)).steps
     assert step.frequency_hz == pytest.approx(1.0, rel=1e-3)
     assert step.amplitude_m == pytest.approx(0.02, rel=1e-3)
     energy_j = math.pi * 1500.0 * 2.0 * math.pi * 0.02**2
-    assert step.energy_per_cycle.value == pytest.approx(energy_j, rel=2e-3)
+    assert step.energy_per_cycle_j.value == pytest.approx(energy_j, rel=2e-3)
 
 
 def test_a_motion_that_does_not_repeat_is_refused():
@@ -336,7 +342,7 @@ def test_a_motion_that_does_not_repeat_is_refused():
         height_m = 0.3 + 0.02 * x_m / np.std(x_m)
         force_n = -1500.0 * np.gradient(height_m, t_s)
         try:
-            said = of_arrays("random", t_s, height_m, force_n).quality
+            said = characterise_record(ForceRecord("random", t_s, height_m, force_n)).quality
             accepted += 1
             assert any("left out" in text for text in said)
         except InputError as error:
@@ -352,14 +358,14 @@ def test_a_speed_that_is_constant_has_its_force_at_mid_stroke():
     rng = np.random.default_rng(1)
     force_n = 200.0 - 2000.0 * x_m - 2000.0 * v - 20.0 * np.sign(v) + rng.normal(0.0, 2.0, len(v))
     height_m = 0.3 + x_m + 1e-6 * rng.standard_normal(len(v))
-    tested = of_arrays("triangle", t_s, height_m, force_n)
+    tested = characterise_record(ForceRecord("triangle", t_s, height_m, force_n))
     (step,) = tested.steps
     for side, truth_n in ((step.compression, 420.0), (step.rebound, -20.0)):
-        force = side.force_at_peak_velocity
+        force = side.force_at_peak_velocity_n
         assert force.low <= truth_n <= force.high
-        assert side.peak_velocity.value == pytest.approx(0.1, rel=0.01)
-    assert not any(tested.damper.knee.values())
-    assert any("one speed" in note for note in tested.damper.notes)
+        assert side.peak_velocity_m_per_s.value == pytest.approx(0.1, rel=0.01)
+    assert not any(tested.damper.knee_m_per_s.values())
+    assert any("single speed" in note for note in tested.damper.notes)
 
 
 def test_a_slow_stroke_is_no_rest():
@@ -368,27 +374,35 @@ def test_a_slow_stroke_is_no_rest():
     x_m = np.concatenate([rest, slow[1], rest, fast[1], rest])
     t_s = np.arange(len(x_m)) / 500.0
     v = np.gradient(x_m, t_s)
-    tested = of_arrays("slow", t_s, 0.3 + x_m, 200.0 - 2000.0 * x_m - 1500.0 * v)
+    tested = characterise_record(
+        ForceRecord("slow", t_s, 0.3 + x_m, 200.0 - 2000.0 * x_m - 1500.0 * v)
+    )
     assert [hold.height_m for hold in tested.holds] == pytest.approx([0.3] * 3, abs=2e-5)
     assert tested.holds[0].end_s == pytest.approx(2.0, abs=0.1)
 
 
 def test_a_strut_that_gives_energy_is_said():
     t_s, x_m, v = sine(2.0, 5.0)
-    said = of_arrays("wrong sign", t_s, 0.3 + x_m, 1500.0 * v + 10.0 * np.cos(40.0 * t_s)).quality
+    said = characterise_record(
+        ForceRecord("wrong sign", t_s, 0.3 + x_m, 1500.0 * v + 10.0 * np.cos(40.0 * t_s))
+    ).quality
     assert "gives energy" in said[0]
 
 
 def test_forces_that_no_machine_reaches_are_refused():
     t_s, x_m, v = sine(2.0, 5.0)
     with pytest.raises(InputError, match="expected at most 1e"):
-        of_arrays("huge", t_s, 0.3 + x_m, -1e155 * v)
+        characterise_record(ForceRecord("huge", t_s, 0.3 + x_m, -1e155 * v))
 
 
 def test_a_force_that_is_cut_off_is_said():
     t_s, x_m, v = sine(2.0, 5.0)
     force_n = -1500.0 * v
-    said = of_arrays("clipped", t_s, 0.3 + x_m, np.clip(force_n, -1e9, 250.0)).quality
-    assert "force stays at its largest value 250" in " ".join(said)
+    said = characterise_record(
+        ForceRecord("clipped", t_s, 0.3 + x_m, np.clip(force_n, -1e9, 250.0))
+    ).quality
+    assert "force stays at its highest value 250" in " ".join(said)
     coarse = np.round(force_n / 20.0) * 20.0  # flat tops of a step are none
-    assert "stays" not in " ".join(of_arrays("coarse", t_s, 0.3 + x_m, coarse).quality)
+    assert "stays" not in " ".join(
+        characterise_record(ForceRecord("coarse", t_s, 0.3 + x_m, coarse)).quality
+    )

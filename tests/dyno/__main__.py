@@ -1,12 +1,12 @@
-"""How often the 95 % intervals hold the truth: `python -m tests.characteristics [--cases N]`."""
+"""How often the 95 % intervals hold the truth: `python -m tests.dyno [--cases N]`."""
 
 import argparse
 from collections import defaultdict
 
 import numpy as np
 
-from rig.dyno.characterise import of_arrays
-from tests.characteristics.dynos import drawn, found
+from rig.dyno.characterise import ForceRecord, characterise_record
+from tests.dyno.dynos import drawn, found
 
 
 def study(cases, seed):
@@ -15,7 +15,7 @@ def study(cases, seed):
     hits = defaultdict(list)
     for _ in range(cases):
         dyno = drawn(rng)
-        [step] = of_arrays("drawn", *dyno.record(rng)).steps
+        [step] = characterise_record(ForceRecord("drawn", *dyno.record(rng))).steps
         figures = found(step)
         for name, truth in dyno.truth().items():
             pairs = zip(np.atleast_1d(truth), _each(figures[name]), strict=True)

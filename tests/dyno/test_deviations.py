@@ -9,10 +9,10 @@ from typer.testing import CliRunner
 
 from can_dbc.errors import InputError
 from rig.cli.main import app
-from rig.dyno.characterise import of_arrays
-from rig.dyno.faults import named
+from rig.dyno.characterise import ForceRecord, characterise_record
+from rig.dyno.faults import name_faults
 from rig.dyno.master import cycle_of, master_of, with_compliance, with_play
-from tests.characteristics.population import (
+from tests.dyno.population import (
     FAULTS,
     SCATTER,
     Damper,
@@ -21,8 +21,8 @@ from tests.characteristics.population import (
     replace,
     short,
 )
-from tests.characteristics.test_characteristics import written
-from tests.characteristics.test_comparison import state
+from tests.dyno.test_characteristics import written
+from tests.dyno.test_comparison import state
 
 
 @cache
@@ -35,7 +35,7 @@ def master():
 def test_a_fault_is_named(fault):
     rng = np.random.default_rng(7)
     damper = FAULTS[fault](Damper().scattered(rng), rng)
-    naming = named(characterised(damper, 7), master(), SCATTER)
+    naming = name_faults(characterised(damper, 7), master(), SCATTER)
     assert short([item.name for item in naming.named], naming.is_good) == fault
 
 
@@ -48,7 +48,7 @@ def test_a_fault_is_named(fault):
     ],
 )
 def test_its_size_is_told(changed, name, size):
-    naming = named(characterised(replace(Damper(), **changed), 3), master(), SCATTER)
+    naming = name_faults(characterised(replace(Damper(), **changed), 3), master(), SCATTER)
     (found,) = naming.named
     assert found.name == name
     assert found.size.value == pytest.approx(size, rel=0.15)
@@ -57,8 +57,8 @@ def test_its_size_is_told(changed, name, size):
 def test_without_scatter_a_small_change_is_one():
     """What another damper of the batch may have by chance, the same damper cannot."""
     weak = characterised(replace(Damper(), gas_n=200.0), 4)
-    assert named(weak, master(), SCATTER).is_good
-    (found,) = named(weak, master(), 0.001).named
+    assert name_faults(weak, master(), SCATTER).is_good
+    (found,) = name_faults(weak, master(), 0.001).named
     assert found.name == "gas pressure"
 
 
@@ -104,12 +104,12 @@ def test_the_command_names_it(tmp_path):
 
 def test_a_master_of_another_test_is_refused():
     with pytest.raises(InputError, match="expected the same test as the master's"):
-        named(characterised(Damper(), 1), master_of(state(1)), SCATTER)
+        name_faults(characterised(Damper(), 1), master_of(state(1)), SCATTER)
 
 
 def test_a_master_without_a_slow_step_is_refused():
     fast = state(1)
-    damper = fast.damper._replace(gas_force=None)
+    damper = fast.damper._replace(gas_force_n=None)
     with pytest.raises(InputError, match="5 mm/s or less"):
         master_of(type(fast)(**{**vars(fast), "damper": damper}))
 
@@ -118,14 +118,14 @@ def test_what_was_not_compared_does_not_pass():
     """A record without the fast steps says nothing of what is wrong there."""
     slow = characterised(Damper(), 5)
     part = type(slow)(**{**vars(slow), "steps": slow.steps[:4]})
-    naming = named(part, master(), SCATTER)
+    naming = name_faults(part, master(), SCATTER)
     assert naming.is_good
     assert not naming.passes
     assert "not compared: ±25 mm at 0.4 m/s" in naming.words()
 
 
 def test_a_size_beyond_all_that_are_tried_is_that_at_least():
-    naming = named(characterised(replace(Damper(), play_m=0.012), 3), master(), SCATTER)
+    naming = name_faults(characterised(replace(Damper(), play_m=0.012), 3), master(), SCATTER)
     found = naming.named[0].size if naming.named else None
     assert found is None or found.high == float("inf")
     assert not naming.passes
@@ -133,8 +133,8 @@ def test_a_size_beyond_all_that_are_tried_is_that_at_least():
 
 def test_a_force_of_the_wrong_sign_is_refused():
     t_s, height_m, force_n = record(Damper(), np.random.default_rng(1))
-    wrong = of_arrays("wrong", t_s, height_m, -force_n)
+    wrong = characterise_record(ForceRecord("wrong", t_s, height_m, -force_n))
     with pytest.raises(InputError, match="gives energy"):
         master_of(wrong)
     with pytest.raises(InputError, match="gives energy"):
-        named(wrong, master(), SCATTER)
+        name_faults(wrong, master(), SCATTER)

@@ -1,0 +1,99 @@
+"""`rig export`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from can_dbc.errors import InputError
+from rig.cli.output import console
+from rig.cli.progress import progress_bar
+
+EXAMPLES = (
+    "Examples: `rig export runs/7 --format mf4 --out run.mf4` · "
+    "`rig export runs/7 --format candump --out run.log` · "
+    "`rig export runs/7 --format csv --smoothed --out run.csv` · "
+    "`rig export out/corrected.yaml --fmu --out strut.fmu` · "
+    "`rig export out/corrected.yaml --fmu --bench --fmi 3.0 --out bench.fmu`"
+)
+
+
+def export_command(
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="Folder of a run; with --fmu a model file.")
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="PATH", help="New file; for Parquet a folder.")
+    ],
+    kind: Annotated[
+        str | None, typer.Option("--format", help="Of a run: mf4, parquet, csv or candump.")
+    ] = None,
+    smoothed: Annotated[
+        bool,
+        typer.Option(
+            "--smoothed",
+            help="With --format csv: also the forces smoothed over the whole run.",
+        ),
+    ] = False,
+    fmu: Annotated[
+        bool, typer.Option("--fmu", help="A strut of a model as a functional mock-up unit.")
+    ] = False,
+    fmi: Annotated[str, typer.Option("--fmi", help="With --fmu: 2.0 or 3.0.")] = "2.0",
+    strut: Annotated[
+        str | None, typer.Option("--strut", help="With --fmu: which strut, if there are several.")
+    ] = None,
+    bench: Annotated[
+        bool,
+        typer.Option("--bench", help="With --fmu: the whole bench, if one guided degree moves."),
+    ] = False,
+) -> None:
+    """Write a run or a model for other programs.
+
+    A run becomes MF4, Parquet, CSV or candump; a model, with --fmu, a functional mock-up unit for
+    Model Exchange and Co-Simulation, with its C sources and with binaries for Linux, Windows and
+    macOS.
+    """
+    if fmu == (kind is not None):
+        raise InputError("--format and --fmu: expected one of them")
+    if smoothed and kind != "csv":
+        raise InputError(
+            "--smoothed: expected --format csv with it: the other formats are read back as runs"
+        )
+    if fmu:
+        if bench and strut is not None:
+            raise InputError("--bench and --strut: expected one of them")
+        _export_model(source, out, fmi, strut, bench)
+        return
+    if bench or strut is not None:
+        raise InputError("--bench and --strut: expected --fmu with them")
+    for path in _export_run(source, kind or "", out, smoothed):
+        console.print(f"Written: {path}", markup=False)
+
+
+def _export_run(source: Path, kind: str, out: Path, smoothed: bool) -> list[Path]:
+    """Write a run in another format."""
+    from rig.formats.export import export_run
+
+    if not smoothed:
+        return export_run(source, kind, out)
+    from rig.formats.smoothed import read_with_smoothed_forces
+
+    with progress_bar() as bar:
+        return export_run(source, kind, out, lambda run: read_with_smoothed_forces(run, bar))
+
+
+def _export_model(source: Path, out: Path, fmi: str, strut: str | None, bench: bool) -> None:
+    """Write a model as an FMU."""
+    from dart_model.spec import load_model
+    from rig.fmu.export import export_fmu
+
+    spec = load_model(source)
+    with console.status("compiling") as status:
+        component = export_fmu(
+            spec, out, fmi, strut, bench, lambda target: status.update(f"{target} compiled")
+        )
+    console.print(component.meaning, markup=False)
+    for kind in ("input", "state", "output"):
+        names = [item.name for _, item in component.of(kind)]
+        console.print(f"{kind}s: {', '.join(names) or 'none'}", markup=False)
+    console.print(f"Written: {out}", markup=False)

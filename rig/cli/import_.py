@@ -1,0 +1,150 @@
+"""`rig import`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from can_dbc.errors import InputError
+from rig.cli.output import WRONG_INPUT, console
+from rig.cli.progress import progress_line
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rig.formats.import_report import ImportReport
+    from rig.formats.mapping import TableMapping
+
+EXAMPLES = (
+    "Examples: `rig import bench.txt --mapping bench.yaml --out bench.csv` · "
+    "`rig import specimen.dat --rebound positive --out dyno.csv` · "
+    "`rig import bus.blf --config rig.yaml --out runs/9` · `rig import run.mf4 --out runs/10` · "
+    "`rig import strut.fmu --fmu --mass-kg 10 --out model`"
+)
+
+
+def import_command(
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="Table or folder of tables, bus log, export.")
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="PATH", help="CSV file, or folder: of a run, of many.")
+    ],
+    mapping: Annotated[
+        Path | None,
+        typer.Option("--mapping", metavar="FILE", help="Columns and units of a foreign table."),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="FILE", help="Signals of a bus log, with its DBC."),
+    ] = None,
+    rebound: Annotated[
+        str | None,
+        typer.Option(
+            "--rebound",
+            metavar="SIGN",
+            help="positive or negative: sign of the force in rebound, for an MTS file without "
+            "--mapping, whose names and units are then its own.",
+        ),
+    ] = None,
+    fmu: Annotated[
+        bool,
+        typer.Option(
+            "--fmu",
+            help="SOURCE is an FMU, of which a model is made; --mapping gives the roles of its "
+            "variables, if they are not called as in an FMU of `rig export`.",
+        ),
+    ] = False,
+    mass_kg: Annotated[
+        float | None,
+        typer.Option("--mass-kg", metavar="KG", help="With --fmu: what a strut alone carries."),
+    ] = None,
+) -> None:
+    """Make a CSV of a foreign table, a run of a bus log or of an export, a model of an FMU.
+
+    A table (text, XLSX, TDMS, MF4, MTS) requires --mapping, or --rebound if it is of MTS; a bus log
+    (BLF, ASC, candump, TRC, MF4) requires --config; what `rig export` wrote requires neither. With
+    --fmu, SOURCE is a functional mock-up unit: a program, which from then on may run on this
+    machine.
+    """
+    if fmu:
+        if config is not None or rebound is not None:
+            raise InputError("--config and --rebound: expected none of them with --fmu")
+        _import_model(source, mapping, mass_kg, out)
+        return
+    if mass_kg is not None:
+        raise InputError("--mass-kg: expected --fmu with it")
+    if sum(option is not None for option in (mapping, config, rebound)) > 1:
+        raise InputError("--mapping, --config and --rebound: expected one of them")
+    if config is not None:
+        _import_bus_log(source, config, out)
+    elif mapping is not None or rebound is not None:
+        _import_tables(source, _mapping_finder(mapping, rebound or ""), out)
+    else:
+        from rig.formats.export import import_run
+
+        import_run(source, out)
+        console.print(f"Run: {out}", markup=False)
+
+
+def _import_model(source: Path, mapping: Path | None, mass_kg: float | None, out: Path) -> None:
+    """Make a model of an FMU."""
+    from rig.fmu.import_fmu import MODEL_FILE, import_fmu, variables_of
+
+    roles = import_fmu(source, mapping, mass_kg, out).struts[0].fmu
+    if roles is not None:
+        for role, variable in variables_of(roles).items():
+            console.print(f"{role}: {variable}", markup=False)
+        if roles.acceleration is not None:
+            console.print(f"mass: {roles.mass_kg:.6g} kg along the height, from the FMU")
+    console.print(f"Model: {out / MODEL_FILE}", markup=False)
+
+
+def _import_bus_log(source: Path, config: Path, out: Path) -> None:
+    from rig.formats.bus_log import import_log
+    from rig.plan.load import load_plan
+
+    with progress_line(None) as progress:
+        _print_report(import_log(source, load_plan(config), out, progress))
+
+
+def _mapping_finder(mapping: Path | None, rebound: str) -> "Callable[[Path], TableMapping]":
+    """The mapping of any file: the one that is given, or of an MTS file its own."""
+    if mapping is None:
+        from rig.formats.mts import mts_mapping
+
+        return lambda path: mts_mapping(path, rebound)
+    from rig.formats.mapping import load_mapping
+
+    loaded = load_mapping(mapping)
+    return lambda _: loaded
+
+
+def _import_tables(source: Path, find_mapping: "Callable[[Path], TableMapping]", out: Path) -> None:
+    """Import a table, or every table of a folder; exit code 2 if one of these is refused."""
+    from rig.formats.foreign_table import import_table
+    from rig.formats.table_folder import import_folder
+
+    if not source.is_dir():
+        _print_report(import_table(source, find_mapping(source), out))
+        return
+    refused = 0
+    for path, result in import_folder(source, find_mapping, out):
+        if isinstance(result, InputError):
+            refused += 1
+            console.print(f"refused: {result}", markup=False, style="red")
+        else:
+            console.print(f"{path.name}: {result.samples} samples, {result.out}", markup=False)
+    if refused:
+        console.print(f"{refused} refused, the others are in {out}", markup=False)
+        raise typer.Exit(WRONG_INPUT)
+
+
+def _print_report(report: "ImportReport") -> None:
+    console.print(
+        f"{report.samples} samples, {report.duration_s:.3f} s at {report.rate_hz:g} a second: "
+        f"{', '.join(report.columns)}"
+    )
+    for line in report.assumptions:
+        console.print(f"- {line}", markup=False)
+    console.print(f"Written: {report.out}", markup=False)

@@ -1,0 +1,126 @@
+"""A damper's record with its standing in a tolerance band and against a master."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from can_dbc.atomic_file import write_whole
+from can_dbc.errors import InputError
+from rig.dyno.characterise import SCHEMA, Characteristics, characterise
+from rig.dyno.faults import MasterComparison, name_faults
+from rig.dyno.master import master_of
+from rig.dyno.tolerance import PointVerdict, ToleranceBand, evaluate_band
+from rig.files.json_text import json_text
+
+CHARACTERISTICS_FILE = "characteristics.json"
+
+
+class Criteria(NamedTuple):
+    """What a damper has to keep to be good.
+
+    Attributes:
+        band: Tolerance band, if there is one.
+        master: Record of a good damper in the same test, if there is one.
+        scatter: Relative standard deviation of each property among good dampers.
+    """
+
+    band: ToleranceBand | None = None
+    master: Path | None = None
+    scatter: float = 0.03
+
+
+class Check(NamedTuple):
+    """One criterion that a damper passes or not."""
+
+    name: str
+    words: str
+    passes: bool
+
+
+class DamperReport(NamedTuple):
+    """One record.
+
+    Attributes:
+        characteristics: Its figures.
+        points: Its verdict at each point of the band; empty without a band.
+        against_master: Its comparison with the master; None without a master.
+    """
+
+    characteristics: Characteristics
+    points: Sequence[PointVerdict] = ()
+    against_master: MasterComparison | None = None
+
+    def checks(self) -> list[Check]:
+        """Every criterion, point by point."""
+        name, comparison = self.characteristics.name, self.against_master
+        checks = [
+            Check(
+                f"{name}: {point.side} at {point.velocity_m_per_s:g} m/s",
+                f"{point.verdict}: {point.words()}",
+                point.verdict == "pass",
+            )
+            for point in self.points
+        ]
+        if comparison is not None:
+            words = comparison.words()
+            checks.append(Check(f"{name}: against the master", words, comparison.passes))
+        return checks
+
+    def as_dict(self) -> dict[str, object]:
+        """For `characteristics.json`."""
+        return {
+            **self.characteristics.as_dict(),
+            "points": list(self.points),
+            "against_master": self.against_master,
+        }
+
+
+def evaluate_records(
+    paths: Sequence[Path], strut: str | None, criteria: Criteria
+) -> list[DamperReport]:
+    """Reports of several records.
+
+    Args:
+        paths: Folders of runs, or CSV files.
+        strut: Name of the strut; may be None where there is one.
+        criteria: Band and master, if any.
+
+    Raises:
+        InputError: A record cannot be characterised, or not be compared with the master.
+    """
+    records = [characterise(path, strut) for path in paths]
+    band = criteria.band
+    good = None if criteria.master is None else master_of(characterise(criteria.master, strut))
+    return [
+        DamperReport(
+            record,
+            () if band is None else evaluate_band(record.steps, record.damper.kinds, band),
+            None if good is None else name_faults(record, good, criteria.scatter),
+        )
+        for record in records
+    ]
+
+
+def content_of(
+    reports: Sequence[DamperReport], serial: str | None, band: ToleranceBand | None
+) -> dict[str, object]:
+    """Content of `characteristics.json`."""
+    return {
+        "schema": SCHEMA,
+        "serial": serial,
+        "tolerance": None if band is None else band.name,
+        "records": [report.as_dict() for report in reports],
+    }
+
+
+def write_content(content: dict[str, object], folder: Path) -> None:
+    """Write `characteristics.json` into a folder, which is made if it is missing.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(folder / CHARACTERISTICS_FILE, json_text(content))
+    except OSError as error:
+        raise InputError(f"--out {folder}: cannot be written: {error.strerror}") from error
