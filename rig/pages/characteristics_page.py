@@ -15,7 +15,7 @@ from rig.dyno.faults import Naming
 from rig.dyno.figures import SIDES, Step
 from rig.dyno.stroke_force import ANGLES, Figure
 from rig.dyno.tolerance import Judged
-from rig.pages.report.page import render, write_page
+from rig.pages.html import render_report, write_page
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers and in grey print.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#a3458f", "#56b4e9", "#7f6000")
@@ -50,7 +50,7 @@ def write_characteristics_page(
     Raises:
         InputError: The file cannot be written.
     """
-    text = render(
+    text = render_report(
         "characteristics.html",
         names=[item.name for item in found],
         headline=_headline(found),

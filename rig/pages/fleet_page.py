@@ -12,7 +12,7 @@ from matplotlib.figure import Figure as Drawing
 
 from rig.fleet.overview import Overview, Series
 from rig.fleet.sentences import alarms, name_of
-from rig.pages.report.page import render, write_page
+from rig.pages.html import render_report, write_page
 
 _MOST = 12
 """Series that are drawn, the surest first."""
@@ -33,7 +33,7 @@ def write_fleet_page(found: Overview, path: Path) -> None:
     drawn = [item for item in found.series if item.is_change]
     drawn.sort(key=lambda item: item.change.p if item.change else 1.0)
     drawn += [item for item in found.series if item.is_drift]
-    text = render(
+    text = render_report(
         "fleet.html",
         headline=found.words,
         alarms=alarms(found),

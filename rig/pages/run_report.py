@@ -1,16 +1,17 @@
 """The report of a run: what ran, how well, when and with which faults. One file, no network."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
 from can_dbc.errors import InputError
-from rig.log.follower import RunFollower, Window
+from rig.log.follower import RunFollower
 from rig.log.reader import read_header
-from rig.pages.report.figures import Curve, Panel, Plot, plot
-from rig.pages.report.page import render, write_page
+from rig.pages.html import render_report, write_page
+from rig.pages.plotted_quantities import TICK_CURVES, TICK_TIME, TIME, TIME_PLOTS, Origin
+from rig.pages.report.figures import LineStyle, Panel, Plot, plot
 from rig.run.changes import logged_changes
 from rig.run.timing import read_histograms
 
@@ -19,13 +20,15 @@ _POINTS = 1500
 
 _ALL_STEPS = 1_000_000_000
 
-_MEASURED = Curve("measured", "--measured", (), 2.4)
-_MODEL = Curve("model", "--after", (), 1.2)
-_CELL = Curve("load cell", "--measured", (), 2.4)
-_ESTIMATED = Curve("estimated", "--after", (), 1.2)
-_VIRTUAL = Curve("virtual force", "--before", (), 1.2)
-_INNOVATION = Curve("innovation", "--before", (), 1.2)
-_LATENESS, _WORK = Curve("lateness", "--before", (), 1.4), Curve("work", "--after", (), 1.4)
+_STYLES = {
+    Origin.MEASURED: ("--measured", 2.4),
+    Origin.MODEL: ("--after", 1.2),
+    Origin.ESTIMATED: ("--after", 1.2),
+    Origin.OBSERVER: ("--before", 1.2),
+}
+"""Colour and width in px of a line, by where its values come from."""
+
+_TICK_COLOURS = ("--before", "--after")
 
 _STATUS = {
     "done": ("good", "✓", "Ended in order"),
@@ -54,7 +57,7 @@ def write_run_report(folder: Path, path: Path) -> None:
     struts = list(cast("Mapping[str, Any]", config.get("observers", {})))
     ending = cast("Mapping[str, Any]", header.get("ending") or {})
     tone, sign, badge = _STATUS.get(str(ending.get("status")), _KILLED)
-    text = render(
+    text = render_report(
         "run.html",
         name=folder.resolve().name,
         changes=[(t_ns * 1e-9, assignments) for t_ns, assignments in logged_changes(folder)],
@@ -66,7 +69,7 @@ def write_run_report(folder: Path, path: Path) -> None:
         counts=_counts(ending),
         timing=_timing(ending) if header.get("granted") is not None else [],
         strut_plots=[
-            (strut, _plots(follower, strut, index, with_cell=len(struts) == 1))
+            (strut, _plots(follower, strut, index, is_only=len(struts) == 1))
             for index, strut in enumerate(struts)
         ],
         timing_plot=_timing_plot(folder),
@@ -134,45 +137,54 @@ def _timing(ending: Mapping[str, Any]) -> list[tuple[str, dict[str, float]]]:
     return [(name, timing[key]) for name, key in named if timing.get(key)]
 
 
-def _plots(follower: RunFollower, strut: str, number: int, *, with_cell: bool) -> list[Plot]:
-    # With several struts the log does not say whose force the cell measured.
-    names = ("measured_height_m", "height_m", "force_n", "virtual_force_n", "innovation_m")
-    columns = [f"{strut}.{name}" for name in names]
-    found = follower.window([*columns, "strut_force_n"], *follower.span_s, _POINTS)
-    measured, model, force, virtual, innovation, cell = found.values
-    of_cell = with_cell and bool(np.isfinite(cell).any())
-    forces = ([_CELL] if of_cell else []) + [_ESTIMATED]
-    panels = [
-        _panel(found, "height / mm", [_MEASURED, _MODEL], [measured * 1e3, model * 1e3]),
-        _panel(found, "strut force / N", forces, ([cell] if of_cell else []) + [force]),
-        _panel(found, "virtual force / N", [_VIRTUAL], [virtual]),
-        _panel(found, "innovation / mm", [_INNOVATION], [innovation * 1e3]),
-    ]
+def _plots(follower: RunFollower, strut: str, index: int, *, is_only: bool) -> list[Plot]:
+    """Plots of a strut over the time of a run; `is_only` if the model has no other strut."""
+    columns = [curve.column_of(strut) for item in TIME_PLOTS for curve in item.curves]
+    window = follower.window(columns, *follower.span_s, _POINTS)
+    values = dict(zip(columns, window.values, strict=True))
+    panels: list[Panel] = []
+    for item in TIME_PLOTS:
+        curves = [
+            (LineStyle(curve.label, colour, (), width), values[curve.column_of(strut)])
+            for curve in item.curves
+            for colour, width in [_STYLES[curve.origin]]
+            if curve.is_of_strut
+            or (is_only and bool(np.isfinite(values[curve.column_of(strut)]).any()))
+        ]
+        panels.append(
+            Panel(
+                "lines",
+                TIME.report_label,
+                item.quantity.report_label,
+                window.t_s,
+                [style for style, _ in curves],
+                [column * item.quantity.report_factor for _, column in curves],
+                {"gaps": True},
+            )
+        )
     caption = (
         "Thinned by minimum and maximum: no peak is lost. The virtual force is what the model "
         "lacks; the innovation is measured less predicted height."
     )
-    return [plot(f"run-{number}", "The run", caption, panels, 1)]
-
-
-def _panel(found: Window, label: str, curves: Sequence[Curve], values: Sequence[Any]) -> Panel:
-    return Panel("lines", "time / s", label, found.t_s, curves, values, {"gaps": True})
+    return [plot(f"run-{index}", "The run", caption, panels, 1)]
 
 
 def _timing_plot(folder: Path) -> Plot | None:
-    found = read_histograms(folder)
-    if found is None:
+    histograms = read_histograms(folder)
+    if histograms is None:
         return None
-    edges_us = np.maximum(np.array(found["edges_us"], np.float64), 0.5)
-    ticks = [np.array(found[name], np.float64) for name in ("lateness", "work")]
-    shown = [np.where(count > 0, count, np.nan) for count in ticks]
+    edges_us = np.maximum(np.array(histograms["edges_us"], np.float64), 0.5)
+    counts = [np.array(histograms[name], np.float64) for name in TICK_CURVES]
     panel = Panel(
         "lines",
-        "time / µs",
+        TICK_TIME.report_label,
         "ticks",
         edges_us,
-        (_LATENESS, _WORK),
-        shown,
+        [
+            LineStyle(name, colour, (), 1.4)
+            for name, colour in zip(TICK_CURVES, _TICK_COLOURS, strict=True)
+        ],
+        [np.where(count > 0, count, np.nan) for count in counts],
         {"log": True, "steps": True},
     )
     caption = "Ticks by lateness of their wake-up and by the time of their work."

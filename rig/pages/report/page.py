@@ -1,23 +1,18 @@
 """The page of a report."""
 
-import base64
-import hashlib
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-from can_dbc.errors import InputError
 from dart_model.effects import FAMILY_WORDS, effect
-from rig.diagnosis.outcome import Diagnosis, Result, write_text
-from rig.pages import charts
+from rig.diagnosis.outcome import Diagnosis, Result
+from rig.pages.html import render_report, write_page
 from rig.pages.report import tables
 from rig.pages.report.figures import (
     Plot,
+    corrected_residual_plot,
     curves,
     held_out_plot,
-    left_plot,
     residual_plot,
     surface_plot,
 )
@@ -25,7 +20,6 @@ from rig.pages.report.number_formats import percent
 from rig.pages.report.series import check_series
 from rig.pages.report.words import BLOCKS, is_prescribed, sentence
 
-_HERE = Path(__file__).parent
 _POINTS = 4000
 _POINTS_OF_ALL = 24_000
 _FEWEST_POINTS = 600
@@ -71,33 +65,6 @@ def write_report(result: Result, path: Path) -> None:
     write_page(page(result), path)
 
 
-def write_page(text: str, path: Path) -> None:
-    """Write a page, whole or not at all.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
-    try:
-        write_text(path, text)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
-
-
-def render(template: str, **content: object) -> str:
-    """A page from its template, with the scripts and styles of its charts."""
-    scripts = [path.read_text("utf-8") for path in (*charts.SCRIPTS, _HERE / "page.js")]
-    environment = Environment(
-        loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    return environment.get_template(template).render(
-        styles=[path.read_text("utf-8") for path in (*charts.STYLES, _HERE / "page.css")],
-        scripts=scripts,
-        script_hashes=[_hash(script) for script in scripts],
-        **content,
-    )
-
-
 def page(result: Result) -> str:
     """The page, the same for the same input.
 
@@ -109,7 +76,7 @@ def page(result: Result) -> str:
         check_series(series)
     struts = tuple(dict.fromkeys(item.strut for item in (*result.fitted, *result.held_out)))
     tone, sign, badge = _BADGES[found.verdict]
-    return render(
+    return render_report(
         "page.html",
         found=found,
         sentence=sentence(found, len(struts)),
@@ -160,11 +127,6 @@ def _is_corrected(found: Diagnosis) -> bool:
     return bool(found.linear or found.effects or found.existing)
 
 
-def _hash(script: str) -> str:
-    digest = hashlib.sha256(script.encode("utf-8")).digest()
-    return f"sha256-{base64.b64encode(digest).decode('ascii')}"
-
-
 def _plots(result: Result, struts: Sequence[str]) -> tuple[tuple[str, list[Plot]], ...]:
     points = max(min(_POINTS, _POINTS_OF_ALL // max(len(struts), 1)), _FEWEST_POINTS)
     corrected = _is_corrected(result.diagnosis)
@@ -180,7 +142,7 @@ def _plots(result: Result, struts: Sequence[str]) -> tuple[tuple[str, list[Plot]
         if fitted:
             plots.append(residual_plot(f"residual-{index}", fitted, shown, points))
             if corrected:
-                plots.append(left_plot(f"left-{index}", fitted, points))
+                plots.append(corrected_residual_plot(f"left-{index}", fitted, points))
             plots.append(surface_plot(f"surface-{index}", fitted, shown))
         groups.append((strut, [plot for plot in plots if plot is not None]))
     return tuple(groups)

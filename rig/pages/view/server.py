@@ -24,6 +24,7 @@ from rig.log.reader import MODEL_FILE
 from rig.pages import charts
 from rig.pages.view import visible_stretch as closely
 from rig.pages.view.diagnosis_job import Diagnosing
+from rig.pages.view.live_page import live_page
 from rig.pages.view.run_status import WatchedRun
 from rig.run.requests import ask
 from rig.run.timing import read_histograms
@@ -41,8 +42,8 @@ _HTTP_PORT = 80
 _HERE = Path(__file__).parent
 _STYLES, _SCRIPTS = (*charts.STYLES, _HERE / "page.css"), (*charts.SCRIPTS, _HERE / "page.js")
 
+_HTML = "text/html; charset=utf-8"
 _FILES: Mapping[str, tuple[Path, str]] = {
-    "/": (_HERE / "page.html", "text/html; charset=utf-8"),
     **{f"/{path.name}": (path, "text/css; charset=utf-8") for path in _STYLES},
     **{f"/{path.name}": (path, "text/javascript; charset=utf-8") for path in _SCRIPTS},
 }
@@ -143,6 +144,9 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer a question."""
         asked = urlsplit(self.path)
         if not self._is_asked_here():
+            return
+        if asked.path == "/":
+            self._send(HTTPStatus.OK, live_page().encode(), _HTML)
             return
         if asked.path in _FILES:
             path, kind = _FILES[asked.path]
@@ -352,7 +356,7 @@ def _report(view: ViewServer, question: _Question) -> Answer:
     folder = view.diagnoses[question.index(view)].report()
     if folder is None:
         raise _WrongQuestionError("no report of this run")
-    return (folder / REPORT_FILE).read_bytes(), "text/html; charset=utf-8", _REPORTS_POLICY
+    return (folder / REPORT_FILE).read_bytes(), _HTML, _REPORTS_POLICY
 
 
 _ANSWERS: Mapping[str, Callable[[ViewServer, _Question], Answer]] = {

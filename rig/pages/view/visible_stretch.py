@@ -13,6 +13,12 @@ from dart_model.plant.strut import Strut, struts_of
 from dart_model.spec import ModelSpec
 from rig.log.follower import RunFollower
 from rig.log.reader import FRAMES_FILE, LATEST_S, parse_frame, parts
+from rig.pages.plotted_quantities import (
+    ESTIMATED_FORCE,
+    LOAD_CELL,
+    MOTION_COLUMNS,
+    VIRTUAL_FORCE_CURVE,
+)
 
 Array = NDArray[np.float64]
 
@@ -49,14 +55,14 @@ def planes(
         with_cell: Whether the load cell is that strut's.
     """
     columns = follower.columns
-    force = _column(rows, columns, f"{strut}.force_n")
-    cell = _column(rows, columns, "strut_force_n")
-    found: dict[str, list[list[float]]] = {}
-    for name in ("velocity_m_per_s", "height_m"):
+    force = _column(rows, columns, ESTIMATED_FORCE.column_of(strut))
+    cell = _column(rows, columns, LOAD_CELL.column_of(strut))
+    points: dict[str, list[list[float]]] = {}
+    for name in MOTION_COLUMNS:
         motion = _column(rows, columns, f"{strut}.{name}")
-        found[f"{name}:estimated"] = _points(motion, force)
-        found[f"{name}:measured"] = _points(motion, cell) if with_cell else [[], []]
-    return found
+        points[f"{name}:{ESTIMATED_FORCE.origin}"] = _points(motion, force)
+        points[f"{name}:{LOAD_CELL.origin}"] = _points(motion, cell) if with_cell else [[], []]
+    return points
 
 
 def laws(
@@ -97,7 +103,7 @@ def spectrum(follower: RunFollower, rows: Array, strut: str) -> dict[str, list[f
     Reference: Welch, "The use of fast Fourier transform for the estimation of power spectra", IEEE
     Transactions on Audio and Electroacoustics 15 (1967).
     """
-    force = _column(rows, follower.columns, f"{strut}.virtual_force_n")
+    force = _column(rows, follower.columns, VIRTUAL_FORCE_CURVE.column_of(strut))
     valid = np.isfinite(force)
     if valid.sum() < 256:
         return {"frequency_hz": [], "density": []}
