@@ -71,7 +71,7 @@ def progress_bar() -> Generator[Callable[[str, float], None]]:
 
 
 def _plain_progress() -> Callable[[str, float], None]:
-    """Lines such as "  12 % reading", which `rig view` reads too; none for what is quick."""
+    """Lines such as "  12 % reading"; none for work that takes less than two seconds."""
     due_s = time.monotonic() + _PLAIN_PROGRESS_S
 
     def show(what: str, share: float) -> None:

@@ -337,7 +337,7 @@ async function readDiagnosis() {
   at("cancel").hidden = token === "" || !running;
   at("progress-of").hidden = !running;
   at("progress").value = found.share ?? 0;
-  at("doing").textContent = running ? `${Math.round(100 * found.share)} %, ${found.what}` : "";
+  at("doing").textContent = running ? `${Math.round(100 * found.share)} %, ${found.stage}` : "";
   const words = { done: `Verdict: ${found.verdict}.`, failed: `It failed: ${found.why}`, cancelled: "Cancelled." };
   if (found.state !== "none") at("outcome").textContent = words[found.state] ?? "";
   at("outcome").className = found.state === "failed" ? "bad" : "";

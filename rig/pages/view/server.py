@@ -23,7 +23,7 @@ from rig.diagnosis.outcome import REPORT_FILE
 from rig.log.reader import MODEL_FILE
 from rig.pages import charts
 from rig.pages.view import visible_stretch as closely
-from rig.pages.view.diagnosis_job import Diagnosing
+from rig.pages.view.diagnosis_job import DiagnosisJob
 from rig.pages.view.live_page import live_page
 from rig.pages.view.run_status import WatchedRun
 from rig.run.requests import ask
@@ -96,7 +96,7 @@ class ViewServer(ThreadingHTTPServer):
     ) -> None:
         self.token = token
         self.runs = tuple(WatchedRun(folder) for folder in folders)
-        self.diagnoses = tuple(Diagnosing(folder) for folder in folders)
+        self.diagnoses = tuple(DiagnosisJob(folder) for folder in folders)
         self.models = models
         try:
             super().__init__((HOST, port), _Handler)
@@ -353,7 +353,7 @@ def _diagnosis(view: ViewServer, question: _Question) -> Answer:
 
 
 def _report(view: ViewServer, question: _Question) -> Answer:
-    folder = view.diagnoses[question.index(view)].report()
+    folder = view.diagnoses[question.index(view)].newest_folder()
     if folder is None:
         raise _WrongQuestionError("no report of this run")
     return (folder / REPORT_FILE).read_bytes(), _HTML, _REPORTS_POLICY
