@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import ConfigFile, console, write_summary
 from rig.cli.progress import progress_line, stoppable
+from rig.cli.summary_file import write_summary
+from rig.cli.terminal import ConfigFile, console
 
 EXAMPLES = (
     "Examples: `rig bench my_bench.yaml --interface socketcan --channel vcan0` · "
@@ -53,7 +54,7 @@ def bench(
         bus, dbc = ready.config.bus.config(), ready.database.path
         authentication = load_authentication(ready)
     with stoppable() as stop, progress_line(duration_s) as progress:
-        sent = run_bench(
+        frames = run_bench(
             bench_config,
             bus,
             dbc,
@@ -62,6 +63,6 @@ def bench(
             stop=stop,
             progress=progress,
         )
-    console.print(f"Sent {sent} frames.")
+    console.print(f"Sent {frames} frames.")
     if out is not None:
-        write_summary(out, {"bench": bench_config.name, "frames": sent})
+        write_summary(out, {"bench": bench_config.name, "frames": frames})

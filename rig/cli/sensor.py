@@ -8,8 +8,8 @@ import typer
 from rich.markup import escape
 
 from can_dbc.errors import InputError
-from rig.cli.output import JsonFlag, console, print_json, table
 from rig.cli.progress import progress_bar
+from rig.cli.terminal import JsonFlag, console, print_json, table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""The report of a run: what ran, how well, when and with which faults. One file, no network."""
+"""The report of a run: configuration, timing, faults and curves. One file, no network."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +16,7 @@ from rig.run.changes import logged_changes
 from rig.run.timing import read_histograms
 
 _POINTS = 1500
-"""Buckets of a curve: two for each pixel of the page's width are not seen."""
+"""Buckets of a curve: about as many as the page has pixels in its width."""
 
 _ALL_STEPS = 1_000_000_000
 
@@ -46,7 +46,7 @@ def write_run_report(folder: Path, path: Path) -> None:
         path: File to write.
 
     Raises:
-        InputError: It is no run, or one without a tick, or the file cannot be written.
+        InputError: The folder holds no run, or a run without a tick, or the file cannot be written.
     """
     header = cast("Mapping[str, Any]", read_header(folder))
     follower = RunFollower(folder)
@@ -84,7 +84,7 @@ def _headline(header: Mapping[str, Any], follower: RunFollower, ending: Mapping[
     rate_hz = cast("Mapping[str, Any]", header.get("config", {})).get("rate_hz", "?")
     text = f"{end_s - begin_s:.1f} s at {rate_hz} Hz"
     if not ending:
-        return f"{text}; how it ended is not known."
+        return f"{text}; its end is not recorded."
     counts = dict(_counts(ending))
     missed = counts.pop("overruns", 0)
     faults = ", ".join(f"{count} {name}" for name, count in counts.items())
@@ -97,10 +97,10 @@ def _facts(
     config = cast("Mapping[str, Any]", header.get("config", {}))
     bus = cast("Mapping[str, Any]", config.get("bus", {}))
     begin_s, end_s = follower.span_s
-    begun = np.datetime64(int(header.get("epoch_ns", 0)), "ns").astype("datetime64[s]")
+    start = np.datetime64(int(header.get("epoch_ns", 0)), "ns").astype("datetime64[s]")
     is_real = header.get("granted") is not None
     facts = [
-        ("Begun", f"{str(begun).replace('T', ' ')} UTC" if is_real else "in simulated time"),
+        ("Start", f"{str(start).replace('T', ' ')} UTC" if is_real else "in simulated time"),
         ("Duration", f"{end_s - begin_s:.3f} s, {follower.steps} ticks"),
         ("Rate", f"{config.get('rate_hz', '?')} Hz"),
         ("Model", str(config.get("model", "?"))),
@@ -116,25 +116,25 @@ def _facts(
     if diverged:
         facts.append(("Diverged", f"strut {diverged['strut']} at {diverged['t_s']:.3f} s"))
     if header.get("forced"):
-        facts.append(("Forced", "errors of the check were passed over"))
+        facts.append(("Forced", "errors of the check were ignored"))
     return facts
 
 
 def _counts(ending: Mapping[str, Any]) -> list[tuple[str, int]]:
-    """What was counted, worst first; what never happened is left out."""
+    """Faults that occurred, with their counts, the most frequent first."""
     counts = cast("Mapping[str, int]", ending.get("counts") or {})
-    found = [
+    occurred = [
         (name.replace("_", " "), count)
         for name, count in counts.items()
         if count > 0 and name != "started"
     ]
-    return sorted(found, key=lambda item: -item[1])
+    return sorted(occurred, key=lambda item: -item[1])
 
 
 def _timing(ending: Mapping[str, Any]) -> list[tuple[str, dict[str, float]]]:
     timing = cast("Mapping[str, Any]", ending.get("timing") or {})
-    named = (("Lateness", "lateness_us"), ("Work", "work_us"))
-    return [(name, timing[key]) for name, key in named if timing.get(key)]
+    keys = {name: f"{name}_us" for name in TICK_CURVES}
+    return [(name.capitalize(), timing[key]) for name, key in keys.items() if timing.get(key)]
 
 
 def _plots(follower: RunFollower, strut: str, index: int, *, is_only: bool) -> list[Plot]:

@@ -1,4 +1,4 @@
-"""The tables of a report: text, ready to be shown."""
+"""Tables of a report, as texts."""
 
 import math
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from rig.pages.report.number_formats import (
 from rig.pages.report.words import LINEAR, difference, is_prescribed, linear_label, missing
 
 Row = tuple[str, ...]
-"""Cells of a row, ready to be shown."""
+"""Texts of the cells of a row."""
 
 
 class EffectTable(NamedTuple):
@@ -33,7 +33,7 @@ def errors(found: Diagnosis) -> tuple[Row, ...]:
     held_out, floor = found.held_out, found.noise_floor
     cell = "Strut force against the load cell"
     if is_prescribed(found):
-        # The residual force is then what the load cell shows beyond the model.
+        # The residual force is then the load cell's force less the model's.
         floor_n = floor.residual_force_rmse_n
         rows = ((f"{cell}, motion prescribed", held_out.strut_force_rmse_n, floor_n, "N"),)
     else:
@@ -50,7 +50,7 @@ def errors(found: Diagnosis) -> tuple[Row, ...]:
 
 
 def run_columns(found: Diagnosis) -> Row:
-    """What `run_cells` shows of each run, before and after."""
+    """Heads of the pairs of columns of `run_cells`."""
     return ("Height, free run", "Residual force", "Strut force")[2 * is_prescribed(found) :]
 
 
@@ -77,7 +77,7 @@ def linear(found: Diagnosis) -> tuple[Row, ...]:
 
 
 def effects(found: Diagnosis) -> tuple[EffectTable, ...]:
-    """Effects that are missing, with their parameters."""
+    """Missing effects, with their parameters."""
     tables: list[EffectTable] = []
     for item in missing(found):
         law = effect(item.name)
@@ -94,7 +94,7 @@ def existing(found: Diagnosis) -> tuple[EffectTable, ...]:
     tables: list[EffectTable] = []
     for item in found.existing:
         law = effect(item.name)
-        superfluous = "superfluous: the data are as well explained without it"
+        superfluous = "superfluous: without it, the data are explained as well"
         note = f"strut {item.strut}, {'refitted' if item.change == 'refitted' else superfluous}"
         tables.append(EffectTable(law, note, _parameters(law, item.parameters, item.nominal)))
     return tuple(tables)
@@ -119,8 +119,8 @@ def _parameters(
     return tuple(rows)
 
 
-def listed_excitations(family: str) -> str:
-    """What a recording must contain for the laws of a family to be seen."""
+def excitations(family: str) -> str:
+    """Excitation that a recording needs for the laws of a family to be visible."""
     texts = {law.excitation: None for law in CATALOGUE.values() if law.family == family}
     return "; ".join(texts) or "–"
 

@@ -1,4 +1,4 @@
-"""What was found, said as a test engineer would say it."""
+"""Sentences about a diagnosis, in the words of a test engineer."""
 
 import math
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ LINEAR = {
     "input_gain": ("input gain", ""),
     "free_length_m": ("free length", "m"),
 }
-"""What a linear correction may correct, in words, and its unit."""
+"""Name and unit of each parameter that a linear correction may change."""
 
 _AS_EFFECT = {
     "added_mass": "mass_kg",
@@ -36,15 +36,15 @@ _AS_EFFECT = {
 BLOCKS = "blocks of the recordings, spread over them, were held out"
 
 
-def listed(items: Sequence[str], last: str) -> str:
-    """Items with commas, and a word before the last one."""
+def join_words(items: Sequence[str], last: str) -> str:
+    """Items separated by commas, with a word before the last one."""
     if len(items) < 2:
         return "".join(items)
     return f"{', '.join(items[:-1])} {last} {items[-1]}"
 
 
 def missing(found: Diagnosis) -> tuple[FoundEffect, ...]:
-    """Effects that are missing, without those that stand among the linear corrections too."""
+    """Missing effects, without those that are also linear corrections."""
     linear = {(item.strut, item.parameter) for item in found.linear}
     return tuple(
         item for item in found.effects if (item.strut, _AS_EFFECT.get(item.name)) not in linear
@@ -57,7 +57,7 @@ def is_prescribed(found: Diagnosis) -> bool:
 
 
 def difference(item: LinearCorrection) -> str:
-    """How far a linear correction goes: in per cent, or in its unit where that means nothing."""
+    """Size of a linear correction: in per cent, or in its unit where a share has no meaning."""
     change = item.total.value - item.nominal
     if change == 0.0 or not math.isfinite(change):
         return "as in the file"
@@ -70,7 +70,7 @@ def difference(item: LinearCorrection) -> str:
 
 
 def linear_label(item: LinearCorrection) -> str:
-    """Name of what is corrected, with the height about which it is taken."""
+    """Name of the corrected parameter, with the height to which it refers."""
     name, _ = LINEAR[item.parameter]
     if item.about_height_m is None:
         return name
@@ -78,32 +78,32 @@ def linear_label(item: LinearCorrection) -> str:
 
 
 def sentence(found: Diagnosis, struts: int) -> str:
-    """What was found, in one sentence.
+    """The diagnosis in one sentence.
 
     Args:
         found: The diagnosis.
-        struts: Number of struts in the model; with one, its name is not said.
+        struts: Number of struts in the model; with one, its name is left out.
     """
     match found.verdict:
         case "nothing_missing":
             name, _, before, change = _error(found)
             if found.existing:
-                return f"Nothing is missing; with its own effects refitted, {name} goes {change}."
+                return f"Nothing is missing; with its effects refitted, {name} goes {change}."
             return f"Nothing is missing: with the nominal model {name} is {before}."
         case "explained":
             no_more = "" if missing(found) else "; nothing is missing"
             return f"{_finding(found, struts)}{no_more}: {_error_falls(found)}"
         case "partly_explained":
             return (
-                f"{_finding(found, struts)}, and there is something more that is not explained: "
+                f"{_finding(found, struts)}, and a part of the residual is not explained: "
                 f"{_error_falls(found)}"
             )
         case "ambiguous":
             others = [FAMILY_WORDS[item] for item in found.ambiguous_with]
-            rivals = listed(others, "or") or "another effect that fits as well"
+            rivals = join_words(others, "or") or "another effect that fits as well"
             return (
-                f"{_finding(found, struts)}, or else {rivals}; these recordings cannot tell "
-                f"them apart{_what_would_tell(found)}; {_error_falls(found, 'the former')}"
+                f"{_finding(found, struts)}, or else {rivals}; these recordings do not "
+                f"distinguish them{_excitation_hint(found)}; {_error_falls(found, 'the former')}"
             )
         case "not_explained":
             return _not_explained(found)
@@ -112,17 +112,17 @@ def sentence(found: Diagnosis, struts: int) -> str:
 def _finding(found: Diagnosis, struts: int) -> str:
     lacking = missing(found)
     if lacking:
-        effects = listed([_effect(item, struts) for item in lacking], "and")
-        return _one_interval(f"The model lacks {effects}{_besides(found, struts)}")
+        effects = join_words([_effect(item, struts) for item in lacking], "and")
+        return _one_interval(f"The model lacks {effects}{_corrections_clause(found, struts)}")
     parts: list[str] = []
     if found.linear:
-        corrections = listed([_linear(item, struts) for item in found.linear], "and")
+        corrections = join_words([_linear(item, struts) for item in found.linear], "and")
         parts.append(f"linear part is off: {corrections}")
     parts += [f"effect “{item.name}” is {item.change}" for item in found.existing]
     return _one_interval(f"The model's {'; its '.join(parts) or 'parameters are off'}")
 
 
-def _besides(found: Diagnosis, struts: int) -> str:
+def _corrections_clause(found: Diagnosis, struts: int) -> str:
     parts: list[str] = []
     if found.linear:
         offs = [
@@ -132,12 +132,12 @@ def _besides(found: Diagnosis, struts: int) -> str:
         parts.append(f"linear corrections ({', '.join(offs)})")
     if found.existing:
         changes = [f"“{item.name}” {item.change}" for item in found.existing]
-        parts.append(f"changes of its own effects ({', '.join(changes)})")
-    return f", besides {listed(parts, 'and')}" if parts else ""
+        parts.append(f"changes of its effects ({', '.join(changes)})")
+    return f", in addition to {join_words(parts, 'and')}" if parts else ""
 
 
 def _one_interval(text: str) -> str:
-    # Said once; the other brackets are then understood.
+    # The level is stated once; the other brackets are then understood.
     return text.replace("(95 %: ", "(95 % interval ", 1).replace("(95 %: ", "(")
 
 
@@ -166,8 +166,8 @@ def _linear(item: LinearCorrection, struts: int) -> str:
 
 
 def _error(found: Diagnosis) -> tuple[str, bool, str, str]:
-    """The error that a verdict is about: name, whether it falls, before, from before to after."""
-    # Height is what the corrected model is judged by; a prescribed motion leaves only the force.
+    """Error to which a verdict refers: name, whether it falls, before, from before to after."""
+    # The corrected model is evaluated by its height; with a prescribed motion there is only force.
     held_out, floor = found.held_out, found.noise_floor
     name, unit, figure = "free-run height error", "m", held_out.height_rmse_m
     floor_rms = floor.height_rmse_m
@@ -206,17 +206,17 @@ def _error_falls(found: Diagnosis, subject: str = "") -> str:
 def _or_else(found: Diagnosis) -> str:
     if not found.ambiguous_with:
         return ""
-    others = listed([FAMILY_WORDS[item] for item in found.ambiguous_with], "or")
-    return f"; it could also be {others}{_what_would_tell(found)}"
+    others = join_words([FAMILY_WORDS[item] for item in found.ambiguous_with], "or")
+    return f"; it could also be {others}{_excitation_hint(found)}"
 
 
-def _what_would_tell(found: Diagnosis) -> str:
-    # The excitation comes as a phrase or as a sentence; here it stands inside one.
+def _excitation_hint(found: Diagnosis) -> str:
+    # The excitation is a phrase or a sentence; here it is part of one.
     bare = (found.suggested_excitation or "").strip().rstrip(".")
     if not bare:
         return ""
     clause = bare if bare[1:2].isupper() else bare[:1].lower() + bare[1:]
-    return f" (what would tell: {clause})"
+    return f" (to distinguish them: {clause})"
 
 
 def _not_explained(found: Diagnosis) -> str:
@@ -225,7 +225,7 @@ def _not_explained(found: Diagnosis) -> str:
     corrected = found.effects or found.linear or found.existing
     if not (corrected and falls):
         return f"{start}: {name} is {before}{_or_else(found)}."
-    words = listed([effect(item.name).words for item in found.effects], "and")
+    words = join_words([effect(item.name).words for item in found.effects], "and")
     nearest = f"the nearest, {words or 'a correction of what it has'}, takes"
     if found.effects and found.effects[0].family == "restoring_surface":
         nearest = (

@@ -1,6 +1,6 @@
 "use strict";
-// The page asks for the stretch in sight, draws it, and asks again: a slow page only draws less
-// often. All that it shows comes from the server; it keeps no data but what is on the screen.
+// The page requests the visible stretch, draws it, and requests again: a slow page only draws less
+// often. All data come from the server; the page keeps only the data on the screen.
 
 const FRAME_MS = 48;
 const CLOSELY_MS = 1000;
@@ -20,7 +20,7 @@ let strut = "";
 const view = { begin: 0, end: 10, span: 10, follow: true };
 let changed = true;
 let drawnAt = 0;
-let askedCloselyFor = "";
+let evaluatedKey = "";
 
 async function ask(path, given = {}) {
   const answer = await fetch(`${path}?${new URLSearchParams(given)}`);
@@ -33,7 +33,7 @@ const columnsOf = (name) => [
   ...TABLE.state.columns,
 ];
 
-// Whether the server is asked for the newest steps, whatever their time.
+// Whether the newest steps are requested, at any time.
 const isFollowing = () => view.follow && runs.length === 1 && view.span !== null;
 
 // A stretch as plain lists: uPlot takes null for nothing.
@@ -88,7 +88,7 @@ function seriesOf(several) {
 let shown = {};
 
 function build() {
-  askedCloselyFor = "";
+  evaluatedKey = "";
   for (const chart of Object.values(charts)) chart.destroy();
   const several = runs.length > 1;
   shown = seriesOf(several);
@@ -153,9 +153,9 @@ function draw(found) {
   document.body.dataset.frames = Number(document.body.dataset.frames ?? 0) + 1;
 }
 
-async function lookClosely() {
+async function evaluateStretch() {
   const key = [view.begin, view.end, strut].join();
-  if (document.hidden || shape === "" || key === askedCloselyFor) return;
+  if (document.hidden || shape === "" || key === evaluatedKey) return;
   const given = { begin: view.begin, end: view.end, strut };
   const found = await Promise.all(runs.map(async (_run, run) => (await ask("closely", { run, ...given })).json()));
   for (const [id, { name }] of Object.entries(TABLE.planes.motions)) {
@@ -176,7 +176,7 @@ async function lookClosely() {
   }
   at("longest").textContent = found[0].longest_s;
   figures(found);
-  askedCloselyFor = key;
+  evaluatedKey = key;
 }
 
 function figures(found) {
@@ -203,7 +203,7 @@ function figures(found) {
   );
 }
 
-// --- Which stretch is in sight ---------------------------------------------------------------
+// --- The visible stretch ---------------------------------------------------------------------
 
 const last = () => Math.max(0, ...runs.map((run) => run.span_s[1]));
 
@@ -315,7 +315,7 @@ function offerDiagnosis() {
   offerHeldOut();
 }
 
-// Every other finished run may be held out: the model is judged on it and learns nothing from it.
+// Every other finished run may be held out: the model is evaluated on it, and not fitted to it.
 function offerHeldOut() {
   const others = [...at("diagnosed").options].filter((option) => Number(option.value) !== diagnosed());
   at("held-out").replaceChildren(...others.map((option) => {
@@ -361,14 +361,14 @@ at("cancel").addEventListener("click", () => demand("cancel", diagnosed(), {}));
 async function readRuns() {
   runs = await (await ask("runs")).json();
   const list = runs.map((run, i) => {
-    const place = document.createElement("div");
-    place.className = "run";
+    const entry = document.createElement("div");
+    entry.className = "run";
     const name = Object.assign(document.createElement("b"), { textContent: run.name, title: run.folder });
     const pill = Object.assign(document.createElement("span"), { textContent: run.state, title: run.words, className: `pill ${TONES[run.state] ?? "quiet"}` });
     const about = Object.assign(document.createElement("span"), { className: "quiet", textContent: [run.model, run.rate_hz ? `${run.rate_hz} Hz` : ""].filter(Boolean).join(", ") });
-    if (runs.length > 1) place.append(Object.assign(document.createElement("span"), { className: `swatch run${i % 4}` }));
-    place.append(name, pill, about);
-    return place;
+    if (runs.length > 1) entry.append(Object.assign(document.createElement("span"), { className: `swatch run${i % 4}` }));
+    entry.append(name, pill, about);
+    return entry;
   });
   at("runs").replaceChildren(...list);
   document.title = `${runs.map((run) => run.name).join(", ")} – rig view`;
@@ -410,7 +410,7 @@ async function frame() {
   draw(await Promise.all(runs.map((_run, index) => stretch(index, points))));
 }
 
-// One question after the other; what fails is asked again.
+// One request after the other; a request that fails is repeated.
 function every(period, action) {
   const once = async () => {
     const begin = performance.now();
@@ -429,7 +429,7 @@ function every(period, action) {
 
 function lost() {
   at("message").hidden = false;
-  at("message").textContent = "No answer from rig view: it has ended, or is busy. The page goes on when it answers.";
+  at("message").textContent = "No answer from rig view: it has ended, or is busy. The page continues when it answers.";
 }
 
 function keyboard(event) {
@@ -452,7 +452,7 @@ function theme(name) {
 at("span").addEventListener("change", newest);
 at("strut").addEventListener("change", () => {
   strut = at("strut").value;
-  askedCloselyFor = "";
+  evaluatedKey = "";
   update();
 });
 for (const [id, action] of Object.entries({
@@ -470,5 +470,5 @@ document.addEventListener("keydown", keyboard);
 theme(localStorage.getItem("theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
 every(RUNS_MS, readRuns);
 every(FRAME_MS, frame);
-every(CLOSELY_MS, lookClosely);
+every(CLOSELY_MS, evaluateStretch);
 every(RUNS_MS, readDiagnosis);
