@@ -165,7 +165,7 @@ def set_command(
     """
     from rig.bus.bus import BusConfig
     from rig.bus.canopen_network import CanOpenNetwork
-    from rig.sensors.canopen_set_up import restore
+    from rig.sensors.canopen_set_up import DeviceSettings, restore
     from rig.sensors.undo_file import configure_with_undo, read_undo
 
     config = BusConfig(interface, channel, bitrate)
@@ -185,9 +185,8 @@ def set_command(
     with closing(CanOpenNetwork(config)) as network:
         if new:
             _give_node_id(network, node_id)
-        changes = configure_with_undo(
-            network, node_id, undo, cycle_ms=cycle_ms, sync=sync, heartbeat_ms=heartbeat_ms
-        )
+        settings = DeviceSettings(cycle_ms, sync, heartbeat_ms)
+        changes = configure_with_undo(network, node_id, settings, undo)
     text = f"Node {node_id}: start requested; "
     if changes:
         text += f"{len(changes)} objects changed. `rig sensor set --restore {undo}` undoes it."

@@ -104,30 +104,18 @@ class TimePlot(NamedTuple):
     curves: tuple[LoggedCurve, ...]
 
 
+MEASURED_HEIGHT = LoggedCurve("measured_height_m", "measured", Origin.MEASURED)
+MODEL_HEIGHT = LoggedCurve("height_m", "model", Origin.MODEL)
 LOAD_CELL = LoggedCurve("strut_force_n", "load cell", Origin.MEASURED, is_of_strut=False)
 ESTIMATED_FORCE = LoggedCurve("force_n", "estimated", Origin.ESTIMATED)
 VIRTUAL_FORCE_CURVE = LoggedCurve("virtual_force_n", "virtual force", Origin.OBSERVER)
+INNOVATION_CURVE = LoggedCurve("innovation_m", "innovation", Origin.OBSERVER)
 
 TIME_PLOTS = (
-    TimePlot(
-        "height",
-        "Height",
-        HEIGHT,
-        HEIGHT,
-        (
-            LoggedCurve("measured_height_m", "measured", Origin.MEASURED),
-            LoggedCurve("height_m", "model", Origin.MODEL),
-        ),
-    ),
+    TimePlot("height", "Height", HEIGHT, HEIGHT, (MEASURED_HEIGHT, MODEL_HEIGHT)),
     TimePlot("force", "Strut force", STRUT_FORCE, FORCE, (LOAD_CELL, ESTIMATED_FORCE)),
     TimePlot("virtual", "Virtual force", VIRTUAL_FORCE, FORCE, (VIRTUAL_FORCE_CURVE,)),
-    TimePlot(
-        "innovation",
-        "Innovation",
-        INNOVATION,
-        INNOVATION,
-        (LoggedCurve("innovation_m", "innovation", Origin.OBSERVER),),
-    ),
+    TimePlot("innovation", "Innovation", INNOVATION, INNOVATION, (INNOVATION_CURVE,)),
 )
 
 MOTION_COLUMNS = {"velocity_m_per_s": VELOCITY, "height_m": HEIGHT}

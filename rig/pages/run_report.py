@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.log.follower import RunFollower
@@ -144,24 +145,15 @@ def _plots(follower: RunFollower, strut: str, index: int, *, is_only: bool) -> l
     values = dict(zip(columns, window.values, strict=True))
     panels: list[Panel] = []
     for item in TIME_PLOTS:
-        curves = [
-            (LineStyle(curve.label, colour, (), width), values[curve.column_of(strut)])
-            for curve in item.curves
-            for colour, width in [_STYLES[curve.origin]]
-            if curve.is_of_strut
-            or (is_only and bool(np.isfinite(values[curve.column_of(strut)]).any()))
-        ]
-        panels.append(
-            Panel(
-                "lines",
-                TIME.report_label,
-                item.quantity.report_label,
-                window.t_s,
-                [style for style, _ in curves],
-                [column * item.quantity.report_factor for _, column in curves],
-                {"gaps": True},
-            )
-        )
+        styles, curves = list[LineStyle](), list[NDArray[np.float64]]()
+        for curve in item.curves:
+            column = values[curve.column_of(strut)]
+            if curve.is_of_strut or (is_only and np.isfinite(column).any()):
+                colour, width = _STYLES[curve.origin]
+                styles.append(LineStyle(curve.label, colour, (), width))
+                curves.append(column * item.quantity.report_factor)
+        labels = TIME.report_label, item.quantity.report_label
+        panels.append(Panel("lines", *labels, window.t_s, styles, curves, {"gaps": True}))
     caption = (
         "Thinned by minimum and maximum: no peak is lost. The virtual force is what the model "
         "lacks; the innovation is measured less predicted height."
@@ -175,17 +167,9 @@ def _timing_plot(folder: Path) -> Plot | None:
         return None
     edges_us = np.maximum(np.array(histograms["edges_us"], np.float64), 0.5)
     counts = [np.array(histograms[name], np.float64) for name in TICK_CURVES]
-    panel = Panel(
-        "lines",
-        TICK_TIME.report_label,
-        "ticks",
-        edges_us,
-        [
-            LineStyle(name, colour, (), 1.4)
-            for name, colour in zip(TICK_CURVES, _TICK_COLOURS, strict=True)
-        ],
-        [np.where(count > 0, count, np.nan) for count in counts],
-        {"log": True, "steps": True},
-    )
+    styles = [LineStyle(*line, (), 1.4) for line in zip(TICK_CURVES, _TICK_COLOURS, strict=True)]
+    shown = [np.where(count > 0, count, np.nan) for count in counts]
+    options = {"log": True, "steps": True}
+    panel = Panel("lines", TICK_TIME.report_label, "ticks", edges_us, styles, shown, options)
     caption = "Ticks by lateness of their wake-up and by the time of their work."
     return plot("timing", "Timing", caption, [panel], 1)

@@ -7,7 +7,7 @@ Reference: CiA 301, 7.5.2: a PDO's communication record is changed while the PDO
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from can_dbc.errors import InputError
 from rig.bus.canopen_network import OPERATIONAL, PRE_OPERATIONAL, RefusedError
@@ -117,22 +117,27 @@ class DeviceWriter:
             raise RefusedError(f"{where}: holds {held} after {value} was written")
 
 
-def configure_device(
-    writer: DeviceWriter,
-    node_id: int,
-    *,
-    cycle_ms: int | None,
-    sync: bool,
-    heartbeat_ms: int | None,
-) -> None:
+class DeviceSettings(NamedTuple):
+    """Settings of a device for a run.
+
+    Attributes:
+        cycle_ms: Time between two frames of every PDO that is switched on; unchanged if None.
+        sync: Send at SYNC, which this device then produces, instead of by a timer.
+        heartbeat_ms: Time between two heartbeats; unchanged if None.
+    """
+
+    cycle_ms: int | None = None
+    sync: bool = False
+    heartbeat_ms: int | None = None
+
+
+def configure_device(writer: DeviceWriter, node_id: int, settings: DeviceSettings) -> None:
     """Set cycle and heartbeat of a device, and switch it to operational.
 
     Args:
         writer: Records the changes.
         node_id: The device.
-        cycle_ms: Time between two frames of every PDO that is switched on; unchanged if None.
-        sync: Send at SYNC, which this device then produces, instead of by a timer.
-        heartbeat_ms: Time between two heartbeats; unchanged if None.
+        settings: The settings.
 
     Raises:
         InputError: The device cannot do it.
@@ -142,16 +147,16 @@ def configure_device(
     if access.read(node_id, 0x1000) is None:
         raise InputError(f"node {node_id}: has no device type (1000h), expected a CANopen device")
     access.command(node_id, PRE_OPERATIONAL)
-    if heartbeat_ms is not None:
-        writer.set_value(node_id, HEARTBEAT, 0, heartbeat_ms)
-    if cycle_ms is not None:
+    if settings.heartbeat_ms is not None:
+        writer.set_value(node_id, HEARTBEAT, 0, settings.heartbeat_ms)
+    if settings.cycle_ms is not None:
         pdos = _active_pdos(access, node_id)
         if not pdos:
             raise InputError(f"node {node_id}: has no process data that is switched on")
         for pdo in pdos:
-            _set_cycle(writer, node_id, pdo, cycle_ms, sync=sync)
-        if sync:
-            _produce_sync(writer, node_id, cycle_ms)
+            _set_cycle(writer, node_id, pdo, settings.cycle_ms, sync=settings.sync)
+        if settings.sync:
+            _produce_sync(writer, node_id, settings.cycle_ms)
     access.command(node_id, OPERATIONAL)
 
 

@@ -115,6 +115,16 @@ class GroupMessage(NamedTuple):
     arbitration_id: int
     address: int
 
+    @property
+    def message_name(self) -> str:
+        """Name of the message in a DBC."""
+        return f"{self.group.name}_FROM_{self.address}"
+
+    @property
+    def node_name(self) -> str:
+        """Name of the sender in a DBC."""
+        return f"ADDRESS_{self.address}"
+
 
 def group_number(arbitration_id: int) -> int:
     """PGN of a 29-bit id, without the destination address that some groups have in it."""

@@ -21,8 +21,6 @@ from rig.sensors.j1939 import LARGEST_VALUE, AddressClaim, GroupMessage
 from rig.sensors.signal_locations import (
     SignalLocation,
     alarms,
-    group_message_name,
-    group_node_name,
     levels,
     locations,
     message_name,
@@ -99,7 +97,7 @@ def dbc_text(
     bridge = [item for item in own.messages if _BRIDGE in item.senders]
     _move_out_of_the_way(bridge, {key for key, is_extended in messages if not is_extended})
     names = [_BRIDGE, *[device.name for device in devices]]
-    names += sorted({group_node_name(item) for item in groups})
+    names += sorted({item.node_name for item in groups})
     database = Database(
         messages=[*messages.values(), *bridge],
         nodes=[Node(name, None) for name in names],
@@ -248,10 +246,10 @@ def _group_message(item: GroupMessage) -> Message:
     return Message(
         frame_id=item.arbitration_id,
         is_extended_frame=True,
-        name=group_message_name(item),
+        name=item.message_name,
         length=8,
         signals=signals,
-        senders=[group_node_name(item)],
+        senders=[item.node_name],
         cycle_time=_cycle_ms(item.group.cycle_s),
         protocol="j1939",
     )
@@ -297,10 +295,10 @@ def _devices_block(
     names = {claim.address: claim.name for claim in claims}
     messages = [item.message for item in used if item.node_id is None]
     lines += [
-        f"  {group_node_name(item)}: {{j1939_name: {names[item.address]:#018x}, "
+        f"  {item.node_name}: {{j1939_name: {names[item.address]:#018x}, "
         f"source_address: {item.address}}}"
         for item in groups
-        if item.address in names and group_message_name(item) in messages
+        if item.address in names and item.message_name in messages
     ]
     return ["devices:", *lines] if lines else []
 
@@ -319,5 +317,5 @@ def _cycle_s(
 ) -> float | None:
     """Time between two messages of a location; None where it is not known."""
     cycles_s = {message_name(device, pdo): pdo.cycle_s for device in devices for pdo in device.pdos}
-    cycles_s |= {group_message_name(item): item.group.cycle_s for item in groups}
+    cycles_s |= {item.message_name: item.group.cycle_s for item in groups}
     return cycles_s.get(location.message)

@@ -37,7 +37,7 @@ def locations(devices: Sequence[CanOpenDevice], dimension: Dimension) -> list[Si
 def levels(groups: Sequence[GroupMessage]) -> list[SignalLocation]:
     """Locations of levels that J1939 devices send."""
     return [
-        SignalLocation(group_message_name(item), parameter.name, None, None)
+        SignalLocation(item.message_name, parameter.name, None, None)
         for item in groups
         for parameter in item.group.parameters
         if parameter.unit == "mm"
@@ -74,13 +74,3 @@ def signal_names(pdo: Pdo) -> dict[MappedObject, str]:
 def message_name(device: CanOpenDevice, pdo: Pdo) -> str:
     """Name of a PDO's message in a DBC."""
     return f"{device.name}_TPDO{pdo.number}"
-
-
-def group_message_name(item: GroupMessage) -> str:
-    """Name of a J1939 message in a DBC."""
-    return f"{item.group.name}_FROM_{item.address}"
-
-
-def group_node_name(item: GroupMessage) -> str:
-    """Name of the sender of a J1939 message in a DBC."""
-    return f"ADDRESS_{item.address}"

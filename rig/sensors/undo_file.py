@@ -11,6 +11,7 @@ from can_dbc.errors import InputError
 from can_dbc.yaml_file import load_validated
 from rig.sensors.canopen_set_up import (
     SETTABLE,
+    DeviceSettings,
     DeviceWriter,
     ObjectAccess,
     ObjectChange,
@@ -44,23 +45,15 @@ class _File(BaseModel):
 
 
 def configure_with_undo(
-    access: ObjectAccess,
-    node_id: int,
-    undo: Path,
-    *,
-    cycle_ms: int | None,
-    sync: bool,
-    heartbeat_ms: int | None,
+    access: ObjectAccess, node_id: int, settings: DeviceSettings, undo: Path
 ) -> Sequence[ObjectChange]:
     """Configure a device, and write its changes into a file; returns the changes.
 
     Args:
         access: Bus of the device.
         node_id: The device.
+        settings: The settings.
         undo: New file; there is none after a call that changes nothing.
-        cycle_ms: As for `configure_device`.
-        sync: As for `configure_device`.
-        heartbeat_ms: As for `configure_device`.
 
     Raises:
         InputError: The file cannot be written, or the device cannot do it.
@@ -68,7 +61,7 @@ def configure_with_undo(
     writer = DeviceWriter(access)
     begin_undo(undo)
     try:
-        configure_device(writer, node_id, cycle_ms=cycle_ms, sync=sync, heartbeat_ms=heartbeat_ms)
+        configure_device(writer, node_id, settings)
     except InputError as error:
         changes = f"; {undo} holds the changes so far" if writer.changes else ""
         raise InputError(f"{error}; the device may still be pre-operational{changes}") from error
