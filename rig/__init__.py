@@ -1,12 +1,12 @@
 """Hardware-in-the-loop bridge over CAN between a shock-absorber bench and a DART model.
 
-What a script or a notebook needs:
+Functions for scripts and notebooks:
 
     import rig
 
     run = rig.open_run("runs/7")                       # arrays by column, with units in the names
-    found = rig.diagnose(["runs/7"], "bench.yaml", held_out=["test.csv"])
-    found.write("found")
+    outcome = rig.diagnose(["runs/7"], "bench.yaml", held_out=["test.csv"])
+    outcome.write("diagnosis")
 
 Each function imports what it needs when it is called: DART and numba take seconds.
 """
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dart_model.spec import ModelSpec
     from rig.diagnosis.recording import Recording
     from rig.formats.run_arrays import Run
-    from rig.pages.notebook import Found
+    from rig.pages.diagnosis_outcome import DiagnosisOutcome
 
 __all__ = ["diagnose", "load_model", "open_run", "read_csv"]
 
@@ -54,7 +54,7 @@ def read_csv(path: Path | str, struts: Sequence[str] | None = None) -> "Recordin
         struts: Names of the model's struts, where columns name them.
 
     Raises:
-        InputError: The file is no such table, or holds nothing that can be diagnosed.
+        InputError: The file is no such table, or none of its columns can be diagnosed.
     """
     from rig.diagnosis import recording
 
@@ -66,17 +66,17 @@ def diagnose(
     model: "Path | str | ModelSpec",
     held_out: Sequence["Path | str | Recording"] = (),
     progress: Callable[[str, float], None] = lambda _what, _share: None,
-) -> "Found":
-    """Trace what a model lacks to named effects, correct it, and judge it on held-out data.
+) -> "DiagnosisOutcome":
+    """Identify the effects that a model lacks, correct it, and evaluate it on held-out data.
 
     Args:
-        runs: Recordings, or folders of runs and CSV files, to learn from.
+        runs: Recordings, or folders of runs and CSV files, for search and fit.
         model: The nominal model, its file, or the name of a shipped one.
-        held_out: Recordings to judge on; without them, blocks spread over `runs` are held out.
-        progress: Called with what is being done and the share that is done.
+        held_out: Held-out recordings; without them, blocks spread over `runs` are held out.
+        progress: Called with the stage that is running and the share that is done.
 
     Returns:
-        What was found; it shows itself in a notebook.
+        The outcome; a notebook shows its tables.
 
     Raises:
         InputError: A recording or the model cannot be used.
@@ -84,7 +84,7 @@ def diagnose(
     from dart_model.spec import ModelSpec
     from rig.diagnosis import diagnose as diagnosis
     from rig.diagnosis.recording import Recording, read_recording
-    from rig.pages.notebook import Found
+    from rig.pages.diagnosis_outcome import DiagnosisOutcome
 
     spec = model if isinstance(model, ModelSpec) else load_model(model)
     struts = [strut.name for strut in spec.struts]
@@ -93,4 +93,4 @@ def diagnose(
         return given if isinstance(given, Recording) else read_recording(Path(given), struts)
 
     result = diagnosis.diagnose(spec, [*map(read, runs)], [*map(read, held_out)], progress)
-    return Found(result, spec)
+    return DiagnosisOutcome(result, spec)

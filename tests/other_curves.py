@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from rig.demo.cases import SETTLED_NS, compared
+from rig.demo.cases import SETTLED_NS, compare_with_bench
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.live import with_bench
@@ -69,7 +69,7 @@ def main() -> None:
                 Path(folder) / "run",
                 lockstep=True,
             )
-            (strut,) = compared(ended, ready, bench).struts
+            (strut,) = compare_with_bench(ended, ready, bench).struts
         figures = strut.figures(strut.observed)
         rows.append(
             (

@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import ConfigFile, console, write_summary
 from rig.cli.progress import progress_line, stoppable
+from rig.cli.summary_file import write_summary
+from rig.cli.terminal import ConfigFile, console
 
 EXAMPLES = (
     "Examples: `rig bench my_bench.yaml --interface socketcan --channel vcan0` · "
@@ -54,7 +55,7 @@ def bench(
         bus, dbc = plan.config.bus.config(), plan.database.path
         authentication = load_authentication(plan)
     with stoppable() as stop, progress_line(duration_s) as progress:
-        sent = run_bench(
+        frames = run_bench(
             bench_config,
             bus,
             dbc,
@@ -62,6 +63,6 @@ def bench(
             authentication=authentication,
             duration_s=duration_s,
         )
-    console.print(f"Sent {sent} frames.")
+    console.print(f"Sent {frames} frames.")
     if out is not None:
-        write_summary(out, {"bench": bench_config.name, "frames": sent})
+        write_summary(out, {"bench": bench_config.name, "frames": frames})

@@ -7,17 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.output import (
-    FAILED,
-    JsonFlag,
-    JUnitFile,
-    Outcome,
-    console,
-    print_json,
-    refuse_existing,
-    table,
-    write_junit,
-)
+from rig.cli.junit import JUnitFile, Outcome, refuse_existing, write_junit
+from rig.cli.terminal import FAILED, JsonFlag, console, print_json, table
 
 if TYPE_CHECKING:
     from rig.dyno.characterise import Characteristics

@@ -5,18 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.output import (
-    FAILED,
-    ConfigFile,
-    JsonFlag,
-    JUnitFile,
-    Outcome,
-    console,
-    print_json,
-    table,
-    write_junit,
-    write_summary,
-)
+from rig.cli.junit import JUnitFile, Outcome, write_junit
+from rig.cli.summary_file import write_summary
+from rig.cli.terminal import FAILED, ConfigFile, JsonFlag, console, print_json, table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

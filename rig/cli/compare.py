@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.output import JsonFlag, console, print_json, table
+from rig.cli.terminal import JsonFlag, console, print_json, table
 
 if TYPE_CHECKING:
     from rig.dyno.characterise import Characteristics

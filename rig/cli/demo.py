@@ -6,9 +6,9 @@ from typing import Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.output import JsonFlag, console, print_json
 from rig.cli.progress import progress_bar, status_line, stoppable
-from rig.cli.results import print_case, print_diagnosis, print_ended
+from rig.cli.result_tables import print_case, print_diagnosis, print_run
+from rig.cli.terminal import JsonFlag, console, print_json
 from rig.files.folders import free_folder, refuse_full
 
 STORY = "story"
@@ -27,7 +27,7 @@ def demo(
         ),
     ] = STORY,
     seed: Annotated[
-        int, typer.Option(min=0, help="Draws the effect that the story's bench carries.")
+        int, typer.Option(min=0, help="Selects the undeclared effect of the story's bench.")
     ] = 1,
     out: Annotated[
         Path | None,
@@ -43,55 +43,55 @@ def demo(
 ) -> None:
     """Run a simulated bench and the bridge on this machine, over virtual CAN.
 
-    The story: a bench with an effect that nobody declared, logged by the bridge, diagnosed,
-    corrected, and run again.
+    The story: a bench with an undeclared effect, logged by the bridge, diagnosed, corrected, and
+    run again.
     """
-    from rig.demo.cases import CASES, run_case
+    from rig.demo.cases import CASES, DemoOptions, run_case
 
     if case not in (STORY, *CASES):
         raise InputError(f"--case {case!r}: expected one of {', '.join((STORY, *CASES))}")
     out = out or free_folder(Path("rig-demo"))
     refuse_full(out)
     if case == STORY:
-        _tell(seed, out, lockstep=lockstep, duration_s=duration_s, as_json=as_json)
+        _run_story(seed, out, lockstep=lockstep, duration_s=duration_s, as_json=as_json)
         return
     with stoppable() as stop, status_line(duration_s) as watch:
-        done = run_case(case, out, lockstep=lockstep, duration_s=duration_s, stop=stop, watch=watch)
+        result = run_case(case, out, DemoOptions(lockstep, duration_s, stop, watch))
     if as_json:
-        print_json(done.summary())
+        print_json(result.summary())
         return
-    print_case(done)
-    print_ended(done.run, with_timing=not lockstep)
+    print_case(result)
+    print_run(result.run, with_timing=not lockstep)
     console.print(
         f"Written: {out}/summary.json, a picture of each strut, and the run {out}/run", markup=False
     )
 
 
-def _tell(seed: int, out: Path, *, lockstep: bool, duration_s: float | None, as_json: bool) -> None:
-    from rig.demo.story import tell
+def _run_story(
+    seed: int, out: Path, *, lockstep: bool, duration_s: float | None, as_json: bool
+) -> None:
+    from rig.demo.cases import DemoOptions
+    from rig.demo.story import run_story
 
     with stoppable() as stop, status_line(duration_s) as watch, progress_bar() as bar:
-        story = tell(
+        story = run_story(
             seed,
             out,
-            duration_s=duration_s,
-            lockstep=lockstep,
-            stop=stop,
+            DemoOptions(lockstep, duration_s, stop, watch),
             chapter=lambda text: None if as_json else console.print(f"- {text}"),
-            watch=watch,
             diagnosis_progress=bar,
         )
     if as_json:
         print_json(story.summary())
         return
-    print_ended(story.first_run, with_timing=not lockstep)
+    print_run(story.first_run, with_timing=not lockstep)
     print_diagnosis(story.diagnosis, struts=1)
     before, after = story.virtual_force_rms_n
     parameters = ", ".join(f"{key} {value:.4g}" for key, value in story.effect.parameters.items())
     console.print(
         f"On a fresh run the virtual force falls from {before:.2f} N to {after:.2f} N RMS.\n"
-        f"What the bench carried, and the diagnosis did not know: {story.effect.name} "
+        f"Effect of the bench, which the diagnosis did not know: {story.effect.name} "
         f"(family {story.family}): {parameters}.\n"
         f"Report: {out}/diagnosis/report.html\n"
-        f"See both runs: rig view {out}/fresh_before {out}/fresh_after"
+        f"Both runs in the browser: rig view {out}/fresh_before {out}/fresh_after"
     )

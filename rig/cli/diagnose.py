@@ -5,9 +5,10 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import JsonFlag, JUnitFile, console, refuse_existing, write_junit
+from rig.cli.junit import JUnitFile, refuse_existing, write_junit
 from rig.cli.progress import progress_bar
-from rig.cli.results import print_diagnosis, verdict
+from rig.cli.result_tables import diagnosis_check, print_diagnosis
+from rig.cli.terminal import JsonFlag, console
 
 EXAMPLES = "Example: `rig diagnose runs/7 --model bench.yaml --held-out runs/8 --out found`"
 
@@ -26,20 +27,20 @@ def diagnose(
         typer.Option("--held-out", metavar="RUN", help="Held-out run; once for each."),
     ] = None,
     pdf: Annotated[
-        bool, typer.Option("--pdf", help="Print the report too; wants Chromium, Chrome or Edge.")
+        bool, typer.Option("--pdf", help="Print the report too; requires Chromium, Chrome or Edge.")
     ] = False,
     as_json: JsonFlag = False,
     junit: JUnitFile = None,
 ) -> None:
-    """Trace what the model lacks to named effects, correct it, and judge it on other data."""
+    """Identify the effects that the model lacks, correct it, and evaluate it on other data."""
     from dart_model.spec import load_model, model_file
     from rig.diagnosis.files import diagnose_runs
     from rig.diagnosis.outcome import REPORT_FILE, to_json
-    from rig.pages.pdf import browser, print_page
+    from rig.pages.browser_print import find_browser, print_page
     from rig.pages.report import write_report
 
     if pdf:
-        browser()  # before a search that takes minutes, not after it
+        find_browser()  # before a search that takes minutes, not after it
     if junit is not None:
         refuse_existing(junit)
     spec = load_model(model_file(model, Path()))
@@ -49,7 +50,7 @@ def diagnose(
         if pdf:
             print_page(out / REPORT_FILE, out / "report.pdf")
     if junit is not None:
-        write_junit(junit, f"rig diagnose {spec.name}", verdict(result.diagnosis, spec))
+        write_junit(junit, f"rig diagnose {spec.name}", diagnosis_check(result.diagnosis, spec))
     if as_json:
         typer.echo(to_json(result.diagnosis), nl=False)
         return

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rig.cli.output import console
+from rig.cli.terminal import console
 
 EXAMPLES = "Example: `rig docs reference`, then open reference/index.html"
 
@@ -23,15 +23,15 @@ def docs(
     console.print(f"Written: {write_reference(folder, texts)}", markup=False)
 
 
-def _texts(parent: Any, before: str = "") -> Iterator[tuple[str, str]]:
-    """Name and help of every command, those of a group under their whole names."""
+def _texts(parent: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Name and help of every command; the name of a command in a group begins with the group's."""
     for name in parent.command.list_commands(parent):
         command = parent.command.get_command(parent, name)
         if hasattr(command, "list_commands"):
             group = command.make_context(name, [], parent=parent, resilient_parsing=True)
-            yield from _texts(group, f"{before}{name} ")
+            yield from _texts(group, f"{prefix}{name} ")
         else:
-            yield f"{before}{name}", _help(parent, name)
+            yield f"{prefix}{name}", _help(parent, name)
 
 
 def _help(parent: Any, name: str) -> str:

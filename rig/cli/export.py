@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.output import console
 from rig.cli.progress import progress_bar
+from rig.cli.terminal import console
 
 EXAMPLES = (
     "Examples: `rig export runs/7 --format mf4 --out run.mf4` · "

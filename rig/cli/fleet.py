@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from typer.core import TyperGroup
 
 from can_dbc.errors import InputError
-from rig.cli.output import FAILED, OK, JsonFlag, console, print_json, table
+from rig.cli.terminal import FAILED, OK, JsonFlag, console, print_json, table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator

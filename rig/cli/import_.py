@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.output import WRONG_INPUT, console
 from rig.cli.progress import progress_line
+from rig.cli.terminal import WRONG_INPUT, console
 
 if TYPE_CHECKING:
     from collections.abc import Callable

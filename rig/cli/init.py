@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.output import console
+from rig.cli.terminal import console
 
 EXAMPLES = "Example: `rig init --dbc my.dbc --out my.yaml`, then `rig check my.yaml`"
 
@@ -15,7 +15,9 @@ def init(
     dbc: Annotated[Path, typer.Option("--dbc", metavar="FILE", help="DBC of the bench's bus.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="New file beside the DBC; shown if absent."),
+        typer.Option(
+            "--out", metavar="FILE", help="New file in the DBC's folder; printed if absent."
+        ),
     ] = None,
 ) -> None:
     """Propose a configuration from a DBC: height, forces, temperature, and where to publish."""
@@ -29,7 +31,7 @@ def init(
     if out.exists():
         raise InputError(f"--out {out}: exists, expected a new file")
     if out.resolve().parent != dbc.resolve().parent:
-        raise InputError(f"--out {out}: expected a file beside {dbc}, which it names")
+        raise InputError(f"--out {out}: expected a file in the folder of {dbc}")
     try:
         out.write_text(text, "utf-8")
     except OSError as error:

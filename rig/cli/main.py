@@ -1,4 +1,4 @@
-"""The command line whole: every command, and what a wrong input or an interruption ends with."""
+"""The command line: every command, and the exit codes of wrong inputs and interruptions."""
 
 import platform
 import sys
@@ -30,12 +30,12 @@ from rig.cli import (
     view,
 )
 from rig.cli import set as set_
-from rig.cli.output import OK, WRONG_INPUT
+from rig.cli.terminal import OK, WRONG_INPUT
 
 __all__ = ["app", "main"]
 
 _GROUPS = ("sensor", "fleet")
-"""Names that stand for several commands."""
+"""Groups of commands."""
 
 app = typer.Typer(
     name="rig",
@@ -64,8 +64,8 @@ app.command("docs", epilog=docs.EXAMPLES)(docs.docs)
 app.command("report", epilog=report.EXAMPLES)(report.report)
 
 
-def _show_version(asked: bool) -> None:
-    if asked:
+def _show_version(is_requested: bool) -> None:
+    if is_requested:
         for name in ("rig", "dartpy", "python-can", "numpy"):
             typer.echo(f"{name} {version(name)}")
         typer.echo(f"Python {platform.python_version()}")
@@ -81,7 +81,7 @@ def _options(
             "--version",
             callback=_show_version,
             is_eager=True,
-            help="Versions of rig and what it stands on.",
+            help="Versions of rig and of the packages it uses.",
         ),
     ] = False,
 ) -> None:
@@ -89,10 +89,10 @@ def _options(
 
 
 _INTERRUPTED = 130
-"""What a shell expects of a program that Ctrl-C ended: 128 and the number of SIGINT."""
+"""Exit code of a program that Ctrl-C ended: 128 and the number of SIGINT."""
 
 
-# Typer carries click inside itself and names none of its own errors but this one.
+# Typer includes click and exports only this one of click's errors.
 _UsageError = cast(
     "type[typer.BadParameter]",
     next(base for base in typer.BadParameter.__mro__ if base.__name__ == "UsageError"),
@@ -112,7 +112,7 @@ def main() -> None:
             raise
         _refuse(f"{error.filename}: {error.strerror}")
     except (KeyboardInterrupt, typer.Abort):
-        _say("interrupted")
+        _print_error("interrupted")
         sys.exit(_INTERRUPTED)
     except _UsageError as error:
         _refuse(error.format_message())
@@ -121,11 +121,11 @@ def main() -> None:
 
 
 def _refuse(why: str) -> None:
-    _say(why)
+    _print_error(why)
     sys.exit(WRONG_INPUT)
 
 
-def _say(text: str) -> None:
+def _print_error(text: str) -> None:
     # A name from outside may hold line breaks and control characters.
     line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.splitlines()))
     Console(stderr=True).print(f"rig: {line}", style="red", markup=False, soft_wrap=True)

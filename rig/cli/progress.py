@@ -1,4 +1,4 @@
-"""A command that takes time: how far it is, and how it is asked to end."""
+"""Progress of a command that takes time, and its end by Ctrl-C or SIGTERM."""
 
 import contextlib
 import os
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 _PLAIN_EVERY_NS = 10_000_000_000
-"""Time between two lines where they cannot be written over: ten seconds."""
+"""Time between two lines on an output that is no terminal: ten seconds."""
 
 _PLAIN_PROGRESS_S = 2.0
 """Time between two lines of long work."""
@@ -29,8 +29,8 @@ _REFRESH_NS = 200_000_000
 """Five times a second: as fast as a person reads."""
 
 
-def _say(text: bytes) -> None:
-    """Write to standard error, where that neither waits nor fails: the loop itself calls it."""
+def _write(text: bytes) -> None:
+    """Write to standard error if that does not block: the loop of a run calls it."""
     with contextlib.suppress(OSError):
         if select.select((), (2,), (), 0.0)[1]:
             os.write(2, text)
@@ -38,30 +38,30 @@ def _say(text: bytes) -> None:
 
 @contextlib.contextmanager
 def stoppable() -> Generator[Callable[[], bool]]:
-    """Ctrl-C and SIGTERM ask the loop to end in order instead of breaking it off."""
-    asked = False
+    """Whether Ctrl-C or SIGTERM came, which then end a loop in order instead of aborting it."""
+    is_requested = False
 
-    def ask(_number: int, _frame: FrameType | None) -> None:
-        nonlocal asked
-        asked = True
+    def request(_number: int, _frame: FrameType | None) -> None:
+        nonlocal is_requested
+        is_requested = True
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {n: signal.signal(n, request) for n in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: asked
+        yield lambda: is_requested
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
 
 @contextlib.contextmanager
 def progress_bar() -> Generator[Callable[[str, float], None]]:
-    """A bar for the diagnosis, which has no tick to miss; plain lines where that cannot be."""
-    shown = Console(stderr=True)
-    if not shown.is_terminal:
+    """A bar for long work such as a diagnosis; plain lines on an output that is no terminal."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
         yield _plain_progress()
         return
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=shown, transient=True) as bars:
+    with Progress(*columns, console=console, transient=True) as bars:
         task = bars.add_task("diagnosis", total=1.0, visible=False)
 
         def show(what: str, share: float) -> None:
@@ -71,7 +71,7 @@ def progress_bar() -> Generator[Callable[[str, float], None]]:
 
 
 def _plain_progress() -> Callable[[str, float], None]:
-    """Lines such as "  12 % reading", which `rig view` reads too; none for what is quick."""
+    """Lines such as "  12 % reading"; none for work that takes less than two seconds."""
     due_s = time.monotonic() + _PLAIN_PROGRESS_S
 
     def show(what: str, share: float) -> None:
@@ -79,7 +79,7 @@ def _plain_progress() -> Callable[[str, float], None]:
         now_s = time.monotonic()
         if now_s >= due_s:
             due_s = now_s + _PLAIN_PROGRESS_S
-            _say(f"{100 * share:4.0f} % {what}\n".encode())
+            _write(f"{100 * share:4.0f} % {what}\n".encode())
 
     return show
 
@@ -88,9 +88,9 @@ def _plain_progress() -> Callable[[str, float], None]:
 def status_line(
     duration_s: float | None, channels: Sequence[str] = (), devices: Sequence[str] = ()
 ) -> Generator[Callable[["Look"], None]]:
-    """State, rate, lateness, force and losses of a run, in place, or lines where that cannot be.
+    """State, rate, lateness, force and losses of a run: one line that is rewritten on a terminal.
 
-    A single write, because the loop itself calls it.
+    Each update is a single write, because the loop of the run calls it.
 
     Args:
         duration_s: Length of the run; None if it has none.
@@ -110,38 +110,38 @@ def status_line(
         if not is_due:
             return
         due_ns = look.t_ns + (0 if is_terminal else _PLAIN_EVERY_NS)
-        # What is wrong stands first: a narrow terminal cuts the end.
+        # Faults first: a narrow terminal cuts the end.
         text = f"{look.t_ns * 1e-9:8.1f}{total} s  {look.output.mode.name:<7}"
-        # Since the last line: what the run keeps now.
+        # The rate since the last line.
         if look.t_ns > shown_ns and look.ticks > shown_ticks:
             text += f"  {(look.ticks - shown_ticks) / (look.t_ns - shown_ns) * 1e9:.0f} Hz"
         shown_ns, shown_ticks = look.t_ns, look.ticks
         text += f"  lost {look.counts.lost}"
         if look.counts.refused:
             text += f"  refused {look.counts.refused}"
-        text += _unused(look, channels, devices)
+        text += _excluded_sensors(look, channels, devices)
         if look.late_ns is not None:
             text += f"  missed {look.counts.overruns}  late ≤ {look.late_ns * 1e-6:.2f} ms"
-        # The largest force stands for all struts: a line is no table.
+        # Of several struts, the one with the largest force: there is one line.
         for strut in sorted(look.output.struts, key=lambda item: -abs(item.force_n))[:1]:
             text += f"  force {strut.force_n:+7.1f} N"
             text += f"  innovation {strut.innovation_m * 1e3:+7.3f} mm"
             text += f"  virtual {strut.virtual_force_n:+7.1f} N"
         if is_terminal:
             width = shutil.get_terminal_size().columns - 1
-            _say(f"\r{text[:width]:<{width}}".encode())
+            _write(f"\r{text[:width]:<{width}}".encode())
         else:
-            _say(f"{text.strip()}\n".encode())
+            _write(f"{text.strip()}\n".encode())
 
     try:
         yield show
     finally:
         if is_terminal:
-            _say(b"\r\x1b[K")
+            _write(b"\r\x1b[K")
 
 
-def _unused(look: "Look", channels: Sequence[str], devices: Sequence[str]) -> str:
-    """Devices and sensors that are not used now, and why."""
+def _excluded_sensors(look: "Look", channels: Sequence[str], devices: Sequence[str]) -> str:
+    """Devices with a fault, with its reason, and sensors that are left out."""
     text = "".join(f"  {devices[index]}: {why}" for index, why in look.device_faults)
     if look.output.left_out:
         text += f"  left out {', '.join(channels[index] for index in look.output.left_out)}"
@@ -150,19 +150,19 @@ def _unused(look: "Look", channels: Sequence[str], devices: Sequence[str]) -> st
 
 @contextlib.contextmanager
 def progress_line(duration_s: float | None) -> Generator[Callable[[int, "Mode"], None]]:
-    """One line that is rewritten; a single write, because the loop itself calls it."""
-    shown = sys.stderr.isatty()
+    """Time and mode of a run: a line on a terminal, in a single write from the loop of the run."""
+    is_terminal = sys.stderr.isatty()
     due_ns = 0
     total = "" if duration_s is None else f" of {duration_s:g} s"
 
     def show(t_ns: int, mode: "Mode") -> None:
         nonlocal due_ns
-        if shown and t_ns >= due_ns:
+        if is_terminal and t_ns >= due_ns:
             due_ns = t_ns + _REFRESH_NS
-            _say(f"\r{t_ns * 1e-9:9.1f} s{total}  {mode.name:<8}".encode())
+            _write(f"\r{t_ns * 1e-9:9.1f} s{total}  {mode.name:<8}".encode())
 
     try:
         yield show
     finally:
-        if shown:
-            _say(b"\r\x1b[K")
+        if is_terminal:
+            _write(b"\r\x1b[K")

@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import FAILED, JsonFlag, console, print_json, table, write_summary
 from rig.cli.progress import progress_line
+from rig.cli.summary_file import write_summary
+from rig.cli.terminal import FAILED, JsonFlag, console, print_json, table
 
 EXAMPLES = "Example: `rig replay rig-demo/run`"
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.output import console
+from rig.cli.terminal import console
 
 EXAMPLES = "Examples: `rig report runs/7` · `rig report runs/7 --out handed_over.html --pdf`"
 
@@ -18,16 +18,16 @@ def report(
         typer.Option("--out", metavar="FILE", help="File to write; RUN/report.html by default."),
     ] = None,
     pdf: Annotated[
-        bool, typer.Option("--pdf", help="Print it too; wants Chromium, Chrome or Edge.")
+        bool, typer.Option("--pdf", help="Print it too; requires Chromium, Chrome or Edge.")
     ] = False,
 ) -> None:
     """Write a page about a run: what ran, how well, timing, faults. One file, no network."""
-    from rig.pages.pdf import print_page
+    from rig.pages.browser_print import print_page
     from rig.pages.run_report import write_run_report
 
     path = out or run / "report.html"
     if path.suffix == ".pdf":
-        raise InputError(f"--out {path}: expected the name of the page; --pdf prints beside it")
+        raise InputError(f"--out {path}: expected the HTML page; --pdf also writes {path.stem}.pdf")
     paper = path.with_suffix(".pdf")
     for existing in (path, paper) if pdf else (path,):
         if existing.exists():

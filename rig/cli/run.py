@@ -10,10 +10,10 @@ import typer
 from rich.console import Console
 
 from can_dbc.errors import InputError
-from rig.cli.output import FAILED, JsonFlag, console
 from rig.cli.progress import status_line, stoppable
-from rig.cli.results import print_ended
+from rig.cli.result_tables import print_run
 from rig.cli.side_by_side import run_side_by_side
+from rig.cli.terminal import FAILED, JsonFlag, console
 from rig.files.folders import refuse_full
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ def _run_one(
     if as_json:
         typer.echo(text, nl=False)
     else:
-        print_ended(ended, with_timing=True)
+        print_run(ended, with_timing=True)
         console.print(f"Run: {folder}", markup=False)
     _refuse_bad_ends(plan, ended)
 

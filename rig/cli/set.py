@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.output import console
+from rig.cli.terminal import console
 
 EXAMPLES = (
     "Examples: `rig set runs/7 observers.strut.proportional_n_per_m=2e5` · "

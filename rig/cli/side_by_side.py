@@ -15,7 +15,7 @@ from typing import Any
 from rich.markup import escape
 
 from can_dbc.errors import InputError
-from rig.cli.output import FAILED, OK, WRONG_INPUT, console, print_json, table
+from rig.cli.terminal import FAILED, OK, WRONG_INPUT, console, print_json, table
 from rig.files.folders import refuse_full
 
 _PR_SET_PDEATHSIG = 1

@@ -1,17 +1,17 @@
 """`rig timing`."""
 
-from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from rig.cli.output import JsonFlag, console, print_json, table, write_summary
+from rig.cli.summary_file import write_summary
+from rig.cli.terminal import JsonFlag, console, print_json, table
 
 EXAMPLES = "Example: `rig run rig.yaml --trace --out runs/7`, then `rig timing runs/7`"
 
 _MOST_ROWS = 40
-"""Gaps that are shown one by one."""
+"""Gaps that are listed one by one."""
 
 
 def timing(
@@ -21,9 +21,9 @@ def timing(
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Say of each missed tick of a traced run in which part the time went, and who took it."""
+    """List the missed ticks of a traced run: the part that took longer, and the cause."""
     from rig.plan.load import plan_of_run
-    from rig.run.late_ticks import late_ticks
+    from rig.run.late_ticks import by_cause, late_ticks
     from rig.run.trace import read_trace
 
     plan = plan_of_run(folder)
@@ -38,18 +38,14 @@ def timing(
     elif not late:
         console.print("No tick was missed.")
     else:
-        one_by_one = table("time / s", "missed", "part", "longer by / ms", "cause", title="Gaps")
+        rows = table("time / s", "missed", "part", "longer by / ms", "cause", title="Gaps")
         for item in late[:_MOST_ROWS]:
             when, longer = f"{item.t_ns * 1e-9:.3f}", f"{item.excess_ns * 1e-6:.2f}"
-            one_by_one.add_row(when, str(item.missed), item.part, longer, item.cause.value)
-        console.print(one_by_one)
+            rows.add_row(when, str(item.missed), item.part, longer, item.cause.value)
+        console.print(rows)
         if len(late) > _MOST_ROWS:
             console.print(f"and {len(late) - _MOST_ROWS} more")
-        gaps, missed = Counter[str](), Counter[str]()
-        for item in late:
-            gaps[item.cause.value] += 1
-            missed[item.cause.value] += item.missed
         causes = table("cause", "gaps", "missed ticks", title="Causes")
-        for cause, count in gaps.most_common():
-            causes.add_row(cause, str(count), str(missed[cause]))
+        for cause, gaps, missed in by_cause(late):
+            causes.add_row(cause.value, str(gaps), str(missed))
         console.print(causes)

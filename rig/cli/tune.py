@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.output import ConfigFile, JsonFlag, console, print_json, table
 from rig.cli.progress import progress_bar
+from rig.cli.terminal import ConfigFile, JsonFlag, console, print_json, table
 
 if TYPE_CHECKING:
     from rig.tuning.gains import Aim

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.output import console
 from rig.cli.progress import stoppable
+from rig.cli.terminal import console
 
 EXAMPLES = (
     "Examples: `rig view runs/7` while it runs · `rig view before after --model corrected.yaml`"
@@ -17,8 +17,6 @@ EXAMPLES = (
 
 
 _PORT, _FOXGLOVE_PORT = 8321, 8765
-_PUBLISH_EVERY_S = 0.05
-"""Time between two rounds of what is published: twenty a second are smooth."""
 
 
 def view(
@@ -47,14 +45,15 @@ def view(
         ),
     ] = False,
     no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Open no browser, only say where the page is.")
+        bool,
+        typer.Option("--no-browser", help="Open no browser, only print the address of the page."),
     ] = False,
     foxglove: Annotated[
         bool,
         typer.Option(
             "--foxglove",
-            help="Publish the runs to Foxglove or Lichtblick in place of a page; wants the extra "
-            "of that name.",
+            help="Publish the runs to Foxglove or Lichtblick in place of a page; requires the "
+            "extra of that name.",
         ),
     ] = False,
 ) -> None:
@@ -66,17 +65,17 @@ def view(
 
     if foxglove:
         if control or model:
-            raise InputError("--foxglove: takes neither --control nor --model")
+            raise InputError("--foxglove: expected neither --control nor --model with it")
         _publish(runs, _FOXGLOVE_PORT if port is None else port)
         return
     models = {name: load_model(model_file(name, Path())) for name in model or ()}
     token = secrets.token_urlsafe(16) if control else None
     server = ViewServer(runs, models, _PORT if port is None else port, token)
-    server.serving()
-    # Behind the hash: a browser sends that to nobody.
+    server.start_thread()
+    # Behind the hash, which a browser never sends.
     address = server.address if token is None else f"{server.address}#{token}"
     console.print(f"{address} (on this machine only; Ctrl-C ends it)", soft_wrap=True)
-    # A browser's command line, with the token on it, is there for every user to read.
+    # Every user of the machine can read a browser's command line, and the token on it.
     if not no_browser and token is None:
         webbrowser.open(address)
     with stoppable() as stop:
@@ -87,8 +86,6 @@ def view(
 
 
 def _publish(runs: list[Path], port: int) -> None:
-    import time
-
     from rig.pages.view.foxglove import FoxgloveView
 
     with stoppable() as stop:
@@ -98,7 +95,4 @@ def _publish(runs: list[Path], port: int) -> None:
             "machine only, to whoever connects; Ctrl-C ends it)",
             soft_wrap=True,
         )
-        while not stop():
-            view.publish(time.monotonic_ns())
-            time.sleep(_PUBLISH_EVERY_S)
-        view.close()
+        view.publish_until(stop)

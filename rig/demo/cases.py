@@ -1,4 +1,4 @@
-"""Cases that come with the package: a bench, a bridge, and how far the model is from the bench."""
+"""Cases of the package: a bridge with a simulated bench, and the model's deviation from it."""
 
 import json
 from collections.abc import Callable
@@ -25,15 +25,42 @@ from rig.simulated_bench.schema import BenchConfig
 from rig.simulated_bench.trajectory import simulate
 
 SETTLED_NS = 500_000_000
-"""Figures are taken after this time."""
+"""Time after which figures are computed."""
 
 CASES = ("reference", "quarter_car", "dyno")
 """Names of the cases; each has a bridge and a bench among the package's configurations."""
 
 
 @dataclass(frozen=True)
+class DemoOptions:
+    """How the runs of a demo are made.
+
+    Attributes:
+        lockstep: Simulated time, as fast as the machine allows; otherwise real time.
+        duration_s: Length; that of the configuration if None.
+        stop: Called before each tick; whether to end.
+        watch: Called with the state of the run five times a second.
+    """
+
+    lockstep: bool
+    duration_s: float | None
+    stop: Callable[[], bool]
+    watch: Watch
+
+    def run(self, ready: Plan, bench: BenchConfig, folder: Path, *, lockstep: bool) -> Ended:
+        """Run a bridge with a simulated bench into a folder."""
+        return with_bench(
+            ready,
+            bench,
+            folder,
+            lockstep=lockstep,
+            control=RunControl(stop=self.stop, watch=self.watch),
+        )
+
+
+@dataclass(frozen=True)
 class Figures:
-    """How far a model is from the bench.
+    """Deviation of a model from the bench.
 
     Attributes:
         height_error_max_m: Largest error of the height.
@@ -81,18 +108,18 @@ class StrutCase:
 
 @dataclass(frozen=True)
 class Case:
-    """A case that was run.
+    """Result of a case.
 
     Attributes:
         run: The run.
-        struts: What each strut did.
+        struts: Bench and model, strut by strut.
     """
 
     run: Ended
     struts: tuple[StrutCase, ...]
 
     def summary(self) -> dict[str, object]:
-        """Every figure, for `summary.json`; at the top level those of the first strut."""
+        """Figures for `summary.json`; those of the first strut also stand at the top level."""
         by_strut = {
             strut.name: {
                 "defective": asdict(strut.figures(strut.defective)),
@@ -110,51 +137,34 @@ class Case:
         }
 
 
-def run_case(
-    name: str,
-    folder: Path,
-    *,
-    lockstep: bool,
-    duration_s: float | None,
-    stop: Callable[[], bool],
-    watch: Watch,
-) -> Case:
+def run_case(name: str, folder: Path, options: DemoOptions) -> Case:
     """Run a case into ``folder/run`` and write its summary and picture into `folder`.
 
     Args:
         name: One of `CASES`.
         folder: Where to write; absent or empty.
-        lockstep: Simulated time, as fast as the machine allows; otherwise real time.
-        duration_s: Length; the configuration's own if None.
-        stop: Asked before each tick whether to end.
-        watch: Given a look five times a second.
+        options: How to run it.
 
     Raises:
         InputError: The folder cannot be written.
     """
-    plan = load_plan(CONFIGS / f"{name}.yaml", duration_s=duration_s)
+    plan = load_plan(CONFIGS / f"{name}.yaml", duration_s=options.duration_s)
     bench = load_bench_config(CONFIGS / f"{name}_bench.yaml")
-    ended = with_bench(
-        plan,
-        bench,
-        folder / "run",
-        lockstep=lockstep,
-        control=RunControl(stop=stop, watch=watch),
-    )
-    case = compared(ended, plan, bench)
+    ended = options.run(plan, bench, folder / "run", lockstep=options.lockstep)
+    case = compare_with_bench(ended, plan, bench)
     (folder / "summary.json").write_text(json.dumps(case.summary(), indent=2) + "\n", "utf-8")
     for strut in case.struts:
         draw(strut, folder / f"{strut.name}.png")
     return case
 
 
-def compared(ended: Ended, plan: Plan, bench: BenchConfig) -> Case:
-    """A run with a simulated bench beside the bench's truth and the model alone."""
+def compare_with_bench(ended: Ended, plan: Plan, bench: BenchConfig) -> Case:
+    """Bench, model in free run and model with virtual force along a run with a simulated bench."""
     observed = read_run(ended.folder).steps
     t_ns = np.asarray(observed.column("t_ns").to_numpy(), dtype=np.int64)
     period_ns = plan.period_ns
     truth = simulate(bench, int(t_ns[-1]) + period_ns, period_ns)
-    model_alone = _alone(ended, plan, observed)
+    free_run = _free_run(ended, plan, observed)
     at = t_ns // period_ns
     struts = tuple(
         StrutCase(
@@ -166,7 +176,7 @@ def compared(ended: Ended, plan: Plan, bench: BenchConfig) -> Case:
                     for column in (truth.height_m, truth.velocity_m_per_s, truth.strut_force_n)
                 ]
             ),
-            model_alone[name],
+            free_run[name],
             _height_and_force(observed, name),
         )
         for index, name in enumerate(plan.config.observers)
@@ -174,18 +184,17 @@ def compared(ended: Ended, plan: Plan, bench: BenchConfig) -> Case:
     return Case(ended, struts)
 
 
-def _alone(ended: Ended, plan: Plan, observed: Any) -> dict[str, NDArray[np.float64]]:
+def _free_run(ended: Ended, plan: Plan, observed: Any) -> dict[str, NDArray[np.float64]]:
     """Height and force of every strut of the model without virtual force."""
     names = plan.strut_names
     if plan.is_prescribed:
-        # The motion is what it is; the model's own force is what the virtual force comes on top of.
+        # The motion is prescribed; the force of the model alone lacks the virtual force.
         virtual_n = {n: observed.column(f"{n}.virtual_force_n").to_numpy() for n in names}
         return {
             n: _height_and_force(observed, n) - np.outer(virtual_n[n], [0.0, 1.0]) for n in names
         }
-    without = {name: PiObserver(proportional_n_per_m=0.0, integral_n_per_m_s=0.0) for name in names}
-    config = plan.config.model_copy(update={"observers": without})
-    steps = replay(ended.folder, plan=plan.with_config(config)).steps
+    no_force = PiObserver(proportional_n_per_m=0.0, integral_n_per_m_s=0.0)
+    steps = replay(ended.folder, plan=plan.with_observers(dict.fromkeys(names, no_force))).steps
     return {name: _height_and_force(steps, name) for name in names}
 
 

@@ -1,4 +1,4 @@
-"""The whole story on one machine: an undeclared effect, found, named, corrected and tried again."""
+"""The whole method on one machine: an undeclared effect is diagnosed, corrected and run again."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -9,17 +9,14 @@ from typing import Any
 import numpy as np
 
 from dart_model.spec import load_model
-from rig.demo.cases import SETTLED_NS
+from rig.demo.cases import SETTLED_NS, DemoOptions
 from rig.diagnosis.files import diagnose_runs
 from rig.diagnosis.outcome import CORRECTED_FILE, REPORT_FILE, Diagnosis, to_json
 from rig.log.reader import read_run
 from rig.pages.report import write_report
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
-from rig.plan.plan import Plan
-from rig.run.live import with_bench
 from rig.run.logged_run import Ended
-from rig.run.loop import RunControl, Watch
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.schema import BenchConfig, Effect
 
@@ -46,12 +43,12 @@ _RANGES: Mapping[str, tuple[str, Mapping[str, tuple[float, float]]]] = {
 
 @dataclass(frozen=True)
 class Story:
-    """What happened.
+    """Result of the story.
 
     Attributes:
-        family: Family of the effect that the bench carried.
+        family: Family of the undeclared effect.
         effect: The effect, as the bench names it.
-        diagnosis: What the diagnosis found, without knowing it.
+        diagnosis: The diagnosis, which did not know it.
         virtual_force_rms_n: RMS of the virtual force on a fresh run, before and after.
         first_run: The run that was diagnosed.
     """
@@ -63,7 +60,7 @@ class Story:
     first_run: Ended
 
     def summary(self) -> dict[str, object]:
-        """Every figure, for `summary.json`."""
+        """Figures for `summary.json`."""
         before, after = self.virtual_force_rms_n
         return {
             "bench": {"family": self.family, **self.effect.model_dump(mode="json")},
@@ -74,27 +71,24 @@ class Story:
 
 
 def draw_effect(seed: int) -> tuple[str, Effect]:
-    """Family and effect that a seed gives the bench.
+    """Family and effect of the bench for a seed.
 
     Args:
         seed: Not negative.
     """
     random = np.random.default_rng(seed)
-    name = list(_RANGES)[seed % len(_RANGES)]  # so that neighbouring seeds plant other effects
+    name = list(_RANGES)[seed % len(_RANGES)]  # so that neighbouring seeds give different effects
     family, ranges = _RANGES[name]
     parameters = {key: float(random.uniform(low, high)) for key, (low, high) in ranges.items()}
     return family, Effect.model_validate({"name": name, "strut": _STRUT, "parameters": parameters})
 
 
-def tell(
+def run_story(
     seed: int,
     folder: Path,
+    options: DemoOptions,
     *,
-    duration_s: float | None,
-    lockstep: bool,
-    stop: Callable[[], bool],
     chapter: Callable[[str], None],
-    watch: Watch,
     diagnosis_progress: Callable[[str, float], None],
 ) -> Story:
     """Run the story into `folder`.
@@ -105,41 +99,29 @@ def tell(
     Args:
         seed: Draws the effect.
         folder: Where to write; absent or empty.
-        duration_s: Length of the runs; the configuration's own if None.
-        lockstep: Simulated time also for the first run.
-        stop: Asked before each tick whether to end.
-        chapter: Called with what comes next.
-        watch: Given a look five times a second.
-        diagnosis_progress: Called with the diagnosis's steps and how far they are.
+        options: How to run it; all runs but the first one are in lockstep in any case.
+        chapter: Called with the next part of the story.
+        diagnosis_progress: Called with the stage of the diagnosis and the share that is done.
 
     Raises:
         InputError: The folder cannot be written.
     """
     family, effect = draw_effect(seed)
-    plan = load_plan(CONFIGS / "story.yaml", duration_s=duration_s)
+    plan = load_plan(CONFIGS / "story.yaml", duration_s=options.duration_s)
     benches = [_bench(effect, excitation) for excitation in (1, 2, 3)]
 
-    def run(number: int, name: str, with_ready: Plan, in_lockstep: bool) -> Ended:
-        return with_bench(
-            with_ready,
-            benches[number],
-            folder / name,
-            lockstep=in_lockstep,
-            control=RunControl(stop=stop, watch=watch),
-        )
-
-    chapter("The bridge runs with a bench that carries an undeclared effect")
-    first = run(0, "run", plan, lockstep)
+    chapter("The bridge runs with a bench that has an undeclared effect")
+    first = options.run(plan, benches[0], folder / "run", lockstep=options.lockstep)
     chapter("A second run, with another excitation, is held out")
-    held_out = run(1, "held_out", plan, in_lockstep=True)
+    held_out = options.run(plan, benches[1], folder / "held_out", lockstep=True)
     chapter("The first run is diagnosed")
     out = folder / "diagnosis"
     result = diagnose_runs([first.folder], plan.model, [held_out.folder], out, diagnosis_progress)
     write_report(result, out / REPORT_FILE)
     chapter("A fresh run, with the model as it was and with the corrected one")
-    before = run(2, "fresh_before", plan, in_lockstep=True)
-    corrected = load_model(out / CORRECTED_FILE)
-    after = run(2, "fresh_after", plan.with_model(corrected), in_lockstep=True)
+    before = options.run(plan, benches[2], folder / "fresh_before", lockstep=True)
+    corrected = plan.with_model(load_model(out / CORRECTED_FILE))
+    after = options.run(corrected, benches[2], folder / "fresh_after", lockstep=True)
     story = Story(
         family,
         effect,

@@ -1,8 +1,9 @@
-"""The reference, made from the code: every effect, every key of a configuration, every command."""
+"""The reference, generated from the code: effects, keys of a configuration, commands."""
 
 import base64
 import inspect
 import io
+import re
 import types
 import typing
 from collections.abc import Iterator, Mapping
@@ -41,7 +42,7 @@ _MOTION = Motion(
     temperatures_c=(20.0, 80.0),
     tones=((3.0, 0.0),),
 )
-"""A motion from which each effect is drawn with the parameters that a search begins with."""
+"""Motion along which each effect is drawn, with the initial parameters of a search."""
 
 _STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;
@@ -65,7 +66,7 @@ def write_reference(folder: Path, commands: Mapping[str, str]) -> Path:
         commands: Help text of each command, by its name.
 
     Raises:
-        InputError: The folder cannot be written, or holds one already.
+        InputError: The folder cannot be written, or holds a reference.
     """
     path = folder / "index.html"
     if path.exists():
@@ -216,7 +217,7 @@ def _keys(model: type[Any], prefix: str = "") -> str:
 
 
 def _rows(model: type[Any], prefix: str) -> Iterator[tuple[str, str, str]]:
-    """Every key of a configuration, sections followed."""
+    """Key, default and meaning of every key of a configuration and of its sections."""
     meanings = _attributes(model)
     fields: Mapping[str, Any] = (
         model.model_fields if issubclass(model, BaseModel) else model.__pydantic_fields__
@@ -233,18 +234,18 @@ def _rows(model: type[Any], prefix: str) -> Iterator[tuple[str, str, str]]:
             rows = [row for section in sections for row in _rows(section, f"{prefix}{name}.")]
             yield from {row[0]: row for row in rows}.values()
         else:
-            shown = "required" if default is PydanticUndefined else _shown(default)
-            yield f"{prefix}{name}", shown, meaning
+            text = "required" if default is PydanticUndefined else _default_text(default)
+            yield f"{prefix}{name}", text, meaning
 
 
-def _shown(default: object) -> str:
+def _default_text(default: object) -> str:
     if default is None:
         return "none"
     return str(default) if isinstance(default, str | int | float | bool) else ""
 
 
 def _sections(annotation: Any) -> list[type[BaseModel]]:
-    """The sections that a key may hold, through unions, tuples and mappings."""
+    """Sections that a key may hold, also in unions, tuples and mappings."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     origin = typing.get_origin(annotation)
@@ -254,27 +255,13 @@ def _sections(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _attributes(model: type[Any]) -> dict[str, str]:
-    """What a docstring says under "Attributes", and those of what the class is made from."""
-    found: dict[str, str] = {}
+    """Meanings of the keys: sections "Attributes" in the docstrings of a class and its bases."""
+    meanings: dict[str, str] = {}
     for base in reversed(model.__mro__):
-        found |= _own_attributes(base)
-    return found
-
-
-def _own_attributes(model: type[Any]) -> dict[str, str]:
-    _, _, block = (inspect.getdoc(model) or "").partition("Attributes:\n")
-    found: dict[str, str] = {}
-    name = ""
-    for line in block.splitlines():
-        if not line.strip():
-            break
-        indent = len(line) - len(line.lstrip())
-        if indent <= 4 and ":" in line:
-            name, _, text = line.strip().partition(":")
-            found[name] = text.strip()
-        elif name:
-            found[name] += " " + line.strip()
-    return found
+        section = (inspect.getdoc(base) or "").partition("Attributes:\n")[2].partition("\n\n")[0]
+        for name, text in re.findall(r"^ {4}(\w+):(.*(?:\n {5,}.*)*)", section, re.MULTILINE):
+            meanings[name] = " ".join(text.split())
+    return meanings
 
 
 def _table(heads: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:

@@ -1,4 +1,4 @@
-"""Damper characteristics as a page: the plots that a damper engineer knows, and tables."""
+"""Page of damper characteristics: PVP, CVP and F-x plots, and tables."""
 
 import base64
 import io
@@ -16,7 +16,7 @@ from rig.dyno.figures import SIDES, DynoStep
 from rig.dyno.report import DamperReport
 from rig.dyno.stroke_force import ANGLES, Figure
 from rig.dyno.tolerance import PointVerdict
-from rig.pages.report.page import render, write_page
+from rig.pages.html import render_report, write_page
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers and in grey print.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#a3458f", "#56b4e9", "#7f6000")
@@ -35,7 +35,7 @@ _KINDS = {
 def write_characteristics_page(
     reports: Sequence[DamperReport], path: Path, serial: str | None = None
 ) -> None:
-    """Write the page of one record, or of several laid over one another.
+    """Write the page of one record, or of several superimposed.
 
     Args:
         reports: The records.
@@ -45,15 +45,15 @@ def write_characteristics_page(
     Raises:
         InputError: The file cannot be written.
     """
-    found = [report.characteristics for report in reports]
+    records = [report.characteristics for report in reports]
     points = [report.points for report in reports]
-    text = render(
+    text = render_report(
         "characteristics.html",
-        names=[item.name for item in found],
-        headline=_headline(found),
+        names=[item.name for item in records],
+        headline=_headline(records),
         signs=_SIGNS,
         picture="data:image/svg+xml;base64,"
-        + base64.b64encode(draw(found, points)).decode("ascii"),
+        + base64.b64encode(draw(records, points)).decode("ascii"),
         serial=serial,
         badge=_badge(points, [report.against_master for report in reports]),
         records=[
@@ -68,7 +68,7 @@ def write_characteristics_page(
 def _badge(
     points: Sequence[Sequence[PointVerdict]], namings: Sequence[MasterComparison | None]
 ) -> tuple[str, str, str] | None:
-    """Tone, sign and words of the whole verdict; None without a band and a master."""
+    """Tone, sign and words of the overall verdict; None without a band and a master."""
     verdicts = {point.verdict for of in points for point in of}
     against = [naming for naming in namings if naming is not None]
     if any(not naming.passes for naming in against) and "fail" not in verdicts:
@@ -80,7 +80,9 @@ def _badge(
     return ("good", "✓", "In tolerance") if verdicts == {"pass"} else ("part", "?", "Not proven")
 
 
-def draw(found: Sequence[Characteristics], points: Sequence[Sequence[PointVerdict]] = ()) -> bytes:
+def draw(
+    records: Sequence[Characteristics], points: Sequence[Sequence[PointVerdict]] = ()
+) -> bytes:
     """Peak force over peak velocity, force over velocity and force over displacement, as SVG."""
     style = {
         "axes.grid": True,
@@ -92,14 +94,14 @@ def draw(found: Sequence[Characteristics], points: Sequence[Sequence[PointVerdic
     with cast("Any", mpl).rc_context(style):
         figure = cast("Any", Drawing(figsize=(12.5, 4.4), layout="constrained"))
         peaks, velocities, heights = figure.subplots(1, 3)
-        for index, item in enumerate(found):
+        for index, item in enumerate(records):
             colour = _COLOURS[index % len(_COLOURS)]
             _draw_peaks(peaks, item, colour)
-            _draw_loops(velocities, heights, item, colour, with_samples=len(found) == 1)
+            _draw_loops(velocities, heights, item, colour, with_samples=len(records) == 1)
         _draw_band(peaks, points)
         for axes in (peaks, velocities, heights):
             axes.axhline(0.0, color="#52606d", linewidth=0.8)
-        fastest = max(step.peak_speed_m_per_s for item in found for step in item.steps)
+        fastest = max(step.peak_speed_m_per_s for item in records for step in item.steps)
         peaks.set_xlim(0.0, 1.08 * fastest)
         for axes in (peaks, velocities):
             axes.locator_params(axis="x", nbins=6)
@@ -120,17 +122,17 @@ def draw(found: Sequence[Characteristics], points: Sequence[Sequence[PointVerdic
             ylabel="force / N",
         )
         peaks.legend(fontsize="small")
-        made = io.BytesIO()
-        figure.savefig(made, format="svg", metadata={"Date": None})
-    return made.getvalue()
+        image = io.BytesIO()
+        figure.savefig(image, format="svg", metadata={"Date": None})
+    return image.getvalue()
 
 
 def _draw_peaks(axes: Any, item: Characteristics, colour: str) -> None:
     steps = sorted(item.steps, key=lambda step: step.peak_speed_m_per_s)
     for number, (side, marker) in enumerate((("compression", "o"), ("rebound", "s"))):
         sides = [(step.compression, step.rebound)[number] for step in steps]
-        speeds = [one.peak_velocity_m_per_s.value for one in sides]
-        figures = [one.force_at_peak_velocity_n for one in sides]
+        speeds = [each.peak_velocity_m_per_s.value for each in sides]
+        figures = [each.force_at_peak_velocity_n for each in sides]
         values = np.array([figure.value for figure in figures])
         errors = np.array([[f.value - f.low, f.high - f.value] for f in figures]).T
         label = f"{item.name}: {side}" if number == 0 else side
@@ -141,7 +143,7 @@ def _draw_peaks(axes: Any, item: Characteristics, colour: str) -> None:
 
 
 def _draw_band(axes: Any, points: Sequence[Sequence[PointVerdict]]) -> None:
-    """The band that is allowed, of either side."""
+    """Draw the tolerance band of each side."""
     for side in SIDES:
         mine = [point for point in (points[0] if points else ()) if point.side == side]
         if mine:
@@ -162,19 +164,19 @@ def _draw_loops(
                 1e3 * (item.record.height_m[::every] - middle_m), item.record.force_n[::every], ".",
                 color="#9aa5b1", markersize=1.5, zorder=1,
             )  # fmt: skip
-        for place, stroke in enumerate(step.strokes):
+        for index, stroke in enumerate(step.strokes):
             x_mm = 1e3 * (
                 stroke.middle_m - middle_m + stroke.sign * stroke.amplitude_m * np.sin(ANGLES)
             )
-            name = item.name if number == 0 and place == 0 else None
-            shown = {"color": colour, "linewidth": 1.3, "label": name}
-            velocities.plot(stroke.velocity_m_per_s, stroke.force_n, **shown)
-            heights.plot(x_mm, stroke.force_n, **shown)
+            name = item.name if number == 0 and index == 0 else None
+            style = {"color": colour, "linewidth": 1.3, "label": name}
+            velocities.plot(stroke.velocity_m_per_s, stroke.force_n, **style)
+            heights.plot(x_mm, stroke.force_n, **style)
 
 
-def _headline(found: Sequence[Characteristics]) -> str:
+def _headline(records: Sequence[Characteristics]) -> str:
     parts: list[str] = []
-    for item in found:
+    for item in records:
         fastest = max(item.steps, key=lambda step: step.peak_speed_m_per_s)
         down, up = fastest.compression, fastest.rebound
         steps = f"{len(item.steps)} steps" if len(item.steps) > 1 else "one step"
@@ -220,7 +222,7 @@ def _cells(step: DynoStep, *, warm: bool) -> list[str]:
 
 
 def kind_words(kind: str) -> str:
-    """A kind of step as it is called in a sentence."""
+    """Name of a kind of step in a sentence."""
     return _KINDS[kind]
 
 
@@ -237,12 +239,12 @@ def damper_rows(item: Characteristics) -> list[tuple[str, str, str, str]]:
             (f"change per kelvin, {side}", figure, "N/K")
             for side, figure in damper.force_per_kelvin_n_per_k.items()
         ],
-        *[(_place_of(hold), hold.force_n, "N") for hold in item.holds],
+        *[(_label_of(hold), hold.force_n, "N") for hold in item.holds],
     ]
     return [_row(name, figure, unit) for name, figure, unit in named if figure is not None]
 
 
-def _place_of(hold: AtRest) -> str:
+def _label_of(hold: AtRest) -> str:
     return f"force at rest, {1e3 * hold.height_m:.1f} mm, at {hold.begin_s:.1f} s"
 
 
@@ -253,7 +255,7 @@ def _row(name: str, figure: Figure, unit: str) -> tuple[str, str, str, str]:
 
 
 def with_half(figure: Figure) -> str:
-    """A figure with half of its interval, with the digits that this allows."""
+    """A figure with half of its interval, with the digits that the interval justifies."""
     half = 0.5 * (figure.high - figure.low)
     return f"{_digits(figure.value, figure)} ± {half:.2g}"
 

@@ -1,7 +1,8 @@
-"""A store of many runs as a page: what changed, with the series that show it."""
+"""Page of a store of many runs: changes and drifts, with the series that show them."""
 
 import base64
 import io
+from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
 from typing import Any, cast
@@ -12,55 +13,55 @@ from matplotlib.figure import Figure as Drawing
 
 from rig.fleet.overview import Overview, Series
 from rig.fleet.sentences import alarm_sentences, series_name
-from rig.pages.report.page import render, write_page
+from rig.pages.html import render_report, write_page
 
 _MOST = 12
-"""Series that are drawn, the surest first."""
+"""Series that are drawn, the most certain first."""
 
 _OTHERS_DRAWN = 60
-"""Other dampers that are drawn beside one."""
+"""Other dampers that are drawn for comparison."""
 
 _COLOUR, _CHANGED, _OTHERS = "#0072b2", "#d55e00", "#c8ced6"
 
 
-def write_fleet_page(found: Overview, path: Path) -> None:
+def write_fleet_page(overview: Overview, path: Path) -> None:
     """Write the page.
 
     Raises:
         InputError: The file cannot be written.
     """
-    verdicts = sorted({verdict for counts in found.verdicts.values() for verdict in counts})
-    drawn = [item for item in found.series if item.is_change]
+    verdicts = sorted({verdict for counts in overview.verdicts.values() for verdict in counts})
+    drawn = [item for item in overview.series if item.is_change]
     drawn.sort(key=lambda item: item.change.p if item.change else 1.0)
-    drawn += [item for item in found.series if item.is_drift]
-    text = render(
+    drawn += [item for item in overview.series if item.is_drift]
+    text = render_report(
         "fleet.html",
-        headline=found.words,
-        alarms=alarm_sentences(found),
+        headline=overview.words,
+        alarms=alarm_sentences(overview),
         verdicts=[verdict.replace("_", " ") for verdict in verdicts],
         benches=[
             (bench, sum(counts.values()), [_share(counts, verdict) for verdict in verdicts])
-            for bench, counts in found.verdicts.items()
+            for bench, counts in overview.verdicts.items()
         ],
-        failed=list(found.failed.items())[:10],
-        pictures=[(series_name(item), _picture(found, item)) for item in drawn[:_MOST]],
+        failed=list(overview.failed.items())[:10],
+        pictures=[(series_name(item), _picture(overview, item)) for item in drawn[:_MOST]],
         left_out=max(0, len(drawn) - _MOST),
     )
     write_page(text, path)
 
 
-def _share(counts: Any, verdict: str) -> str:
+def _share(counts: Mapping[str, int], verdict: str) -> str:
     count = counts.get(verdict, 0)
     return f"{count} ({100 * count / sum(counts.values()):.0f} %)" if count else "0"
 
 
-def _picture(found: Overview, item: Series) -> str:
-    """A series among those of the other dampers, as an SVG in a data URL."""
+def _picture(overview: Overview, item: Series) -> str:
+    """A series and those of the other dampers, as an SVG in a data URL."""
     style = {"axes.grid": True, "grid.alpha": 0.3, "svg.hashsalt": "rig", "font.size": 9}
     with cast("Any", mpl).rc_context(style):
         figure = cast("Any", Drawing(figsize=(9.0, 2.8), layout="constrained"))
         axes = figure.subplots()
-        others = [s for s in found.series if s.quantity == item.quantity and s is not item]
+        others = [s for s in overview.series if s.quantity == item.quantity and s is not item]
         others = others[:: -(-len(others) // _OTHERS_DRAWN)] if others else []
         for k, other in enumerate(others):
             label = "others" if k == 0 else None
@@ -80,9 +81,9 @@ def _picture(found: Overview, item: Series) -> str:
         axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
         axes.set_ylabel(item.quantity.parameter)
         axes.legend(fontsize="small", frameon=False, loc="upper left")
-        made = io.BytesIO()
-        figure.savefig(made, format="svg", metadata={"Date": None})
-    return "data:image/svg+xml;base64," + base64.b64encode(made.getvalue()).decode("ascii")
+        image = io.BytesIO()
+        figure.savefig(image, format="svg", metadata={"Date": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(image.getvalue()).decode("ascii")
 
 
 def _columns(item: Series) -> tuple[list[date], list[float]]:

@@ -1,31 +1,35 @@
-"""The report of a run: what ran, how well, when and with which faults. One file, no network."""
+"""The report of a run: configuration, timing, faults and curves. One file, no network."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
-from rig.log.follower import RunFollower, Window
+from rig.log.follower import RunFollower
 from rig.log.reader import read_header
-from rig.pages.report.figures import Curve, Panel, Plot, plot
-from rig.pages.report.page import render, write_page
+from rig.pages.html import render_report, write_page
+from rig.pages.plotted_quantities import TICK_CURVES, TICK_TIME, TIME, TIME_PLOTS, Origin
+from rig.pages.report.figures import LineStyle, Panel, Plot, plot
 from rig.run.changes import logged_changes
 from rig.run.timing import read_histograms
 
 _POINTS = 1500
-"""Buckets of a curve: two for each pixel of the page's width are not seen."""
+"""Buckets of a curve: about as many as the page has pixels in its width."""
 
 _ALL_STEPS = 1_000_000_000
 
-_MEASURED = Curve("measured", "--measured", (), 2.4)
-_MODEL = Curve("model", "--after", (), 1.2)
-_CELL = Curve("load cell", "--measured", (), 2.4)
-_ESTIMATED = Curve("estimated", "--after", (), 1.2)
-_VIRTUAL = Curve("virtual force", "--before", (), 1.2)
-_INNOVATION = Curve("innovation", "--before", (), 1.2)
-_LATENESS, _WORK = Curve("lateness", "--before", (), 1.4), Curve("work", "--after", (), 1.4)
+_STYLES = {
+    Origin.MEASURED: ("--measured", 2.4),
+    Origin.MODEL: ("--after", 1.2),
+    Origin.ESTIMATED: ("--after", 1.2),
+    Origin.OBSERVER: ("--before", 1.2),
+}
+"""Colour and width in px of a line, by where its values come from."""
+
+_TICK_COLOURS = ("--before", "--after")
 
 _STATUS = {
     "done": ("good", "✓", "Ended in order"),
@@ -43,7 +47,7 @@ def write_run_report(folder: Path, path: Path) -> None:
         path: File to write.
 
     Raises:
-        InputError: It is no run, or one without a tick, or the file cannot be written.
+        InputError: The folder holds no run, or a run without a tick, or the file cannot be written.
     """
     header = cast("Mapping[str, Any]", read_header(folder))
     follower = RunFollower(folder)
@@ -54,7 +58,7 @@ def write_run_report(folder: Path, path: Path) -> None:
     struts = list(cast("Mapping[str, Any]", config.get("observers", {})))
     ending = cast("Mapping[str, Any]", header.get("ending") or {})
     tone, sign, badge = _STATUS.get(str(ending.get("status")), _KILLED)
-    text = render(
+    text = render_report(
         "run.html",
         name=folder.resolve().name,
         changes=[(t_ns * 1e-9, assignments) for t_ns, assignments in logged_changes(folder)],
@@ -66,7 +70,7 @@ def write_run_report(folder: Path, path: Path) -> None:
         counts=_counts(ending),
         timing=_timing(ending) if header.get("granted") is not None else [],
         strut_plots=[
-            (strut, _plots(follower, strut, index, with_cell=len(struts) == 1))
+            (strut, _plots(follower, strut, index, is_only=len(struts) == 1))
             for index, strut in enumerate(struts)
         ],
         timing_plot=_timing_plot(folder),
@@ -81,7 +85,7 @@ def _headline(header: Mapping[str, Any], follower: RunFollower, ending: Mapping[
     rate_hz = cast("Mapping[str, Any]", header.get("config", {})).get("rate_hz", "?")
     text = f"{end_s - begin_s:.1f} s at {rate_hz} Hz"
     if not ending:
-        return f"{text}; how it ended is not known."
+        return f"{text}; its end is not recorded."
     counts = dict(_counts(ending))
     missed = counts.pop("overruns", 0)
     faults = ", ".join(f"{count} {name}" for name, count in counts.items())
@@ -94,10 +98,10 @@ def _facts(
     config = cast("Mapping[str, Any]", header.get("config", {}))
     bus = cast("Mapping[str, Any]", config.get("bus", {}))
     begin_s, end_s = follower.span_s
-    begun = np.datetime64(int(header.get("epoch_ns", 0)), "ns").astype("datetime64[s]")
+    start = np.datetime64(int(header.get("epoch_ns", 0)), "ns").astype("datetime64[s]")
     is_real = header.get("granted") is not None
     facts = [
-        ("Begun", f"{str(begun).replace('T', ' ')} UTC" if is_real else "in simulated time"),
+        ("Start", f"{str(start).replace('T', ' ')} UTC" if is_real else "in simulated time"),
         ("Duration", f"{end_s - begin_s:.3f} s, {follower.steps} ticks"),
         ("Rate", f"{config.get('rate_hz', '?')} Hz"),
         ("Model", str(config.get("model", "?"))),
@@ -113,67 +117,59 @@ def _facts(
     if diverged:
         facts.append(("Diverged", f"strut {diverged['strut']} at {diverged['t_s']:.3f} s"))
     if header.get("forced"):
-        facts.append(("Forced", "errors of the check were passed over"))
+        facts.append(("Forced", "errors of the check were ignored"))
     return facts
 
 
 def _counts(ending: Mapping[str, Any]) -> list[tuple[str, int]]:
-    """What was counted, worst first; what never happened is left out."""
+    """Faults that occurred, with their counts, the most frequent first."""
     counts = cast("Mapping[str, int]", ending.get("counts") or {})
-    found = [
+    occurred = [
         (name.replace("_", " "), count)
         for name, count in counts.items()
         if count > 0 and name != "started"
     ]
-    return sorted(found, key=lambda item: -item[1])
+    return sorted(occurred, key=lambda item: -item[1])
 
 
 def _timing(ending: Mapping[str, Any]) -> list[tuple[str, dict[str, float]]]:
     timing = cast("Mapping[str, Any]", ending.get("timing") or {})
-    named = (("Lateness", "lateness_us"), ("Work", "work_us"))
-    return [(name, timing[key]) for name, key in named if timing.get(key)]
+    keys = {name: f"{name}_us" for name in TICK_CURVES}
+    return [(name.capitalize(), timing[key]) for name, key in keys.items() if timing.get(key)]
 
 
-def _plots(follower: RunFollower, strut: str, number: int, *, with_cell: bool) -> list[Plot]:
-    # With several struts the log does not say whose force the cell measured.
-    names = ("measured_height_m", "height_m", "force_n", "virtual_force_n", "innovation_m")
-    columns = [f"{strut}.{name}" for name in names]
-    found = follower.window([*columns, "strut_force_n"], *follower.span_s, _POINTS)
-    measured, model, force, virtual, innovation, cell = found.values
-    of_cell = with_cell and bool(np.isfinite(cell).any())
-    forces = ([_CELL] if of_cell else []) + [_ESTIMATED]
-    panels = [
-        _panel(found, "height / mm", [_MEASURED, _MODEL], [measured * 1e3, model * 1e3]),
-        _panel(found, "strut force / N", forces, ([cell] if of_cell else []) + [force]),
-        _panel(found, "virtual force / N", [_VIRTUAL], [virtual]),
-        _panel(found, "innovation / mm", [_INNOVATION], [innovation * 1e3]),
-    ]
+def _plots(follower: RunFollower, strut: str, index: int, *, is_only: bool) -> list[Plot]:
+    """Plots of a strut over the time of a run; `is_only` if the model has no other strut."""
+    columns = [curve.column_of(strut) for item in TIME_PLOTS for curve in item.curves]
+    window = follower.window(columns, *follower.span_s, _POINTS)
+    values = dict(zip(columns, window.values, strict=True))
+    panels: list[Panel] = []
+    for item in TIME_PLOTS:
+        styles, curves = list[LineStyle](), list[NDArray[np.float64]]()
+        for curve in item.curves:
+            column = values[curve.column_of(strut)]
+            if curve.is_of_strut or (is_only and np.isfinite(column).any()):
+                colour, width = _STYLES[curve.origin]
+                styles.append(LineStyle(curve.label, colour, (), width))
+                curves.append(column * item.quantity.report_factor)
+        labels = TIME.report_label, item.quantity.report_label
+        panels.append(Panel("lines", *labels, window.t_s, styles, curves, {"gaps": True}))
     caption = (
         "Thinned by minimum and maximum: no peak is lost. The virtual force is what the model "
         "lacks; the innovation is measured less predicted height."
     )
-    return [plot(f"run-{number}", "The run", caption, panels, 1)]
-
-
-def _panel(found: Window, label: str, curves: Sequence[Curve], values: Sequence[Any]) -> Panel:
-    return Panel("lines", "time / s", label, found.t_s, curves, values, {"gaps": True})
+    return [plot(f"run-{index}", "The run", caption, panels, 1)]
 
 
 def _timing_plot(folder: Path) -> Plot | None:
-    found = read_histograms(folder)
-    if found is None:
+    histograms = read_histograms(folder)
+    if histograms is None:
         return None
-    edges_us = np.maximum(np.array(found["edges_us"], np.float64), 0.5)
-    ticks = [np.array(found[name], np.float64) for name in ("lateness", "work")]
-    shown = [np.where(count > 0, count, np.nan) for count in ticks]
-    panel = Panel(
-        "lines",
-        "time / µs",
-        "ticks",
-        edges_us,
-        (_LATENESS, _WORK),
-        shown,
-        {"log": True, "steps": True},
-    )
+    edges_us = np.maximum(np.array(histograms["edges_us"], np.float64), 0.5)
+    counts = [np.array(histograms[name], np.float64) for name in TICK_CURVES]
+    styles = [LineStyle(*line, (), 1.4) for line in zip(TICK_CURVES, _TICK_COLOURS, strict=True)]
+    shown = [np.where(count > 0, count, np.nan) for count in counts]
+    options = {"log": True, "steps": True}
+    panel = Panel("lines", TICK_TIME.report_label, "ticks", edges_us, styles, shown, options)
     caption = "Ticks by lateness of their wake-up and by the time of their work."
     return plot("timing", "Timing", caption, [panel], 1)

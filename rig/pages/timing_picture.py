@@ -20,10 +20,10 @@ _LEVELS = {"p50": ":", "p99": "-.", "p99_9": "--", "max": "-"}
 
 @dataclass(frozen=True)
 class Distribution:
-    """One histogram.
+    """Histogram of the ticks by a time.
 
     Attributes:
-        what: What it counts, for its axis.
+        what: The time, for its axis.
         ticks: Ticks in bins of 1 µs, shape (bins,).
         levels_us: Percentiles and maximum, in µs, by name.
     """
@@ -58,13 +58,13 @@ def draw_run(ended: Ended) -> Path:
 def draw_timing(
     path: Path, title: str, distributions: tuple[Distribution, ...], period_us: float
 ) -> None:
-    """Draw histograms one above the other, on logarithmic axes.
+    """Draw histograms in one column, on logarithmic axes.
 
     Args:
         path: PNG file.
-        title: What stands above.
-        distributions: What is drawn; those without a tick are left empty.
-        period_us: Time between two ticks, drawn as the limit that it is.
+        title: Title of the picture.
+        distributions: The histograms; one without a tick is left empty.
+        period_us: Time between two ticks, drawn as a limit.
 
     Raises:
         OSError: The file cannot be written.
@@ -76,13 +76,13 @@ def draw_timing(
     for axes, item in zip(every, distributions, strict=True):
         _draw(axes, item, period_us)
         axes.set_xlim(0.5, 1.3 * max(period_us, *largest_us))
-    every[-1].set_xlabel("time in µs (what took less than 1 µs stands left of 1)")
+    every[-1].set_xlabel("time in µs (times below 1 µs are left of 1)")
     figure.suptitle(title, fontsize="medium")
     figure.savefig(path, dpi=120)
 
 
 def _draw(axes: Any, item: Distribution, period_us: float) -> None:
-    edges, ticks = _coarser(item.ticks)
+    edges, ticks = _merge_bins(item.ticks)
     if ticks.any():
         axes.stairs(ticks, edges, fill=True, color="tab:blue", alpha=0.6)
     axes.set(xscale="log", yscale="log", ylabel="ticks", title=item.what)
@@ -102,11 +102,10 @@ def _readable(value_us: float) -> str:
     return f"{value_us:.0f} µs" if value_us < 10_000 else f"{value_us / 1000:.1f} ms"
 
 
-def _coarser(ticks: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Bins of one width on a logarithmic axis where 1 µs is finer; the first one is below 1 µs."""
+def _merge_bins(ticks: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Bins of equal width on a logarithmic axis, of 1 µs or more; the first one is below 1 µs."""
     decades = float(np.log10(len(ticks)))
-    places: NDArray[np.float64] = 10.0 ** np.arange(0.0, decades + 1e-9, 1 / _BINS_A_DECADE)
-    places = np.append(places, len(ticks))
-    edges = np.unique(np.rint(places))
+    steps: NDArray[np.float64] = 10.0 ** np.arange(0.0, decades + 1e-9, 1 / _BINS_A_DECADE)
+    edges = np.unique(np.rint(np.append(steps, len(ticks))))
     starts = np.concatenate([[0], edges[:-1]]).astype(np.intp)
     return np.concatenate([[0.5], edges]), np.add.reduceat(ticks, starts)

@@ -15,11 +15,11 @@ from rig.tuning.tune import TunedStrut
 _TOTAL, _NOISE, _LAG, _PAPER = "#1b1f24", "#0072b2", "#d55e00", "#a3458f"
 
 
-def draw_tuning(found: Sequence[TunedStrut], path: Path) -> None:
-    """Draw the error by noise, by lag and whole, with the choice and the published gains marked.
+def draw_tuning(tuned: Sequence[TunedStrut], path: Path) -> None:
+    """Draw the error by noise, by lag and in total, with the chosen and the published gains.
 
     Args:
-        found: The struts.
+        tuned: The struts.
         path: PNG file.
 
     Raises:
@@ -27,9 +27,9 @@ def draw_tuning(found: Sequence[TunedStrut], path: Path) -> None:
     """
     style = {"axes.grid": True, "grid.alpha": 0.3, "legend.frameon": False}
     with cast("Any", mpl).rc_context(style):
-        figure = cast("Any", Figure(figsize=(7.5, 4.2 * len(found)), layout="constrained"))
-        every = figure.subplots(len(found), 1, squeeze=False)[:, 0]
-        for axes, strut in zip(every, found, strict=True):
+        figure = cast("Any", Figure(figsize=(7.5, 4.2 * len(tuned)), layout="constrained"))
+        panels = figure.subplots(len(tuned), 1, squeeze=False)[:, 0]
+        for axes, strut in zip(panels, tuned, strict=True):
             _draw(axes, strut)
         try:
             figure.savefig(path, dpi=110)

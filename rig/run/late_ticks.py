@@ -1,5 +1,6 @@
 """Why ticks were missed, from the rows of a trace."""
 
+from collections import Counter
 from collections.abc import Sequence
 from enum import Enum
 from itertools import pairwise
@@ -62,6 +63,15 @@ class LateTick(NamedTuple):
     cause: Cause
     excess_ns: int
     end_ns: int
+
+
+def by_cause(late: Sequence[LateTick]) -> list[tuple[Cause, int, int]]:
+    """Cause, number of gaps and number of missed ticks, the most frequent cause first."""
+    gaps = Counter(item.cause for item in late)
+    return [
+        (cause, count, sum(item.missed for item in late if item.cause is cause))
+        for cause, count in gaps.most_common()
+    ]
 
 
 def late_ticks(rows: Sequence[Row], period_ns: int) -> list[LateTick]:

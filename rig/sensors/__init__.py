@@ -1,1 +1,1 @@
-"""Sensors on the bus without a DBC: found, described by their own objects, and set to work."""
+"""Sensors on a bus without a DBC: found, described by their own objects, and configured."""

@@ -1,4 +1,4 @@
-"""J1939 devices that send levels and pressures: who they are, and what their groups hold.
+"""J1939 devices that send levels and pressures: their names, and the content of their groups.
 
 References: SAE J1939-21 (identifiers), J1939-81 (address claim and NAME), J1939-71 (parameters).
 """
@@ -13,8 +13,8 @@ _NO_ADDRESS = 0xFE
 _DESTINATION_BELOW = 240
 
 
-class Claim(NamedTuple):
-    """A device that claims an address.
+class AddressClaim(NamedTuple):
+    """Claim of an address by a device.
 
     Attributes:
         address: Source address.
@@ -36,15 +36,15 @@ class Claim(NamedTuple):
 
     @property
     def identity(self) -> int:
-        """Identity number: its serial number as the maker counts."""
+        """Identity number, which the manufacturer gives each device."""
         return self.name & 0x1FFFFF
 
 
-class Parameter(NamedTuple):
+class GroupParameter(NamedTuple):
     """A value in a parameter group, two bytes, low one first.
 
     Attributes:
-        name: What a signal of it is called.
+        name: Name of its signal in a DBC.
         byte: Its first byte, from 0 on.
         scale: Value of one raw step.
         offset: Value of raw 0.
@@ -58,95 +58,105 @@ class Parameter(NamedTuple):
     unit: str
 
 
-class Group(NamedTuple):
+class ParameterGroup(NamedTuple):
     """A parameter group.
 
     Attributes:
         number: PGN.
-        name: What a message of it is called.
-        cycle_s: Time between two.
-        parameters: What it holds.
+        name: Name of its messages in a DBC.
+        cycle_s: Time between two messages.
+        parameters: Its parameters.
     """
 
     number: int
     name: str
     cycle_s: float
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[GroupParameter, ...]
 
 
 _CORNERS = ("FRONT_LEFT", "FRONT_RIGHT", "REAR_LEFT", "REAR_RIGHT")
 GROUPS = (
-    Group(
+    ParameterGroup(
         65112,
         "ASC4",
         0.1,
         tuple(
-            Parameter(f"BELLOW_PRESSURE_{corner}", 2 * place, 0.1, 0.0, "kPa")
-            for place, corner in enumerate(_CORNERS)
+            GroupParameter(f"BELLOW_PRESSURE_{corner}", 2 * index, 0.1, 0.0, "kPa")
+            for index, corner in enumerate(_CORNERS)
         ),
     ),
-    Group(
+    ParameterGroup(
         65113,
         "ASC3",
         0.1,
         tuple(
-            Parameter(f"RELATIVE_LEVEL_{corner}", 2 * place, 0.1, -3200.0, "mm")
-            for place, corner in enumerate(_CORNERS)
+            GroupParameter(f"RELATIVE_LEVEL_{corner}", 2 * index, 0.1, -3200.0, "mm")
+            for index, corner in enumerate(_CORNERS)
         ),
     ),
 )
-"""Groups of the air suspension control that J1939-71 gives a position or a pressure to. Sensors of
-their own makers send others (Proprietary B), whose layout only the maker knows."""
+"""Groups of the air suspension control that J1939-71 gives a position or a pressure to. Other
+sensors send groups of Proprietary B, whose layout only the manufacturer knows."""
 
 LARGEST_VALUE = 0xFAFF
 """Largest raw value of two bytes that is a value: above it are errors and "not available"."""
 
 
-class Spoken(NamedTuple):
-    """A known group that was heard.
+class GroupMessage(NamedTuple):
+    """A known group that a device sends.
 
     Attributes:
         group: The group.
         arbitration_id: Id of the last frame.
-        address: Address of who sent it.
+        address: Address of its sender.
     """
 
-    group: Group
+    group: ParameterGroup
     arbitration_id: int
     address: int
 
+    @property
+    def message_name(self) -> str:
+        """Name of the message in a DBC."""
+        return f"{self.group.name}_FROM_{self.address}"
+
+    @property
+    def node_name(self) -> str:
+        """Name of the sender in a DBC."""
+        return f"ADDRESS_{self.address}"
+
 
 def group_number(arbitration_id: int) -> int:
-    """PGN of a 29-bit id; of a group with a destination, without it."""
+    """PGN of a 29-bit id, without the destination address that some groups have in it."""
     pdu_format = arbitration_id >> 16 & 0xFF
     number = arbitration_id >> 8 & 0x3FFFF
     return number & 0x3FF00 if pdu_format < _DESTINATION_BELOW else number
 
 
-def claims(frames: Sequence[Frame]) -> tuple[Claim, ...]:
-    """Devices that claimed an address, the last claim of each NAME; of an address the lower NAME.
+def address_claims(frames: Sequence[Frame]) -> tuple[AddressClaim, ...]:
+    """Addresses and their owners: the last claim of each NAME, and the lower NAME of an address.
 
-    A device that could not get one claims the address 254, and has none.
+    A device that gets no address claims the address 254, which is left out.
     """
-    found: dict[int, int] = {}
+    addresses: dict[int, int] = {}
     for frame in frames:
         is_claim = frame.is_extended and group_number(frame.arbitration_id) == _CLAIM
         if is_claim and len(frame.data) == 8:
-            found[int.from_bytes(frame.data, "little")] = frame.arbitration_id & 0xFF
+            addresses[int.from_bytes(frame.data, "little")] = frame.arbitration_id & 0xFF
     owners: dict[int, int] = {}
-    for name, address in found.items():
+    for name, address in addresses.items():
         if address != _NO_ADDRESS:
             owners[address] = min(name, owners.get(address, name))
-    return tuple(sorted(Claim(address, name) for address, name in owners.items()))
+    return tuple(sorted(AddressClaim(address, name) for address, name in owners.items()))
 
 
-def spoken(frames: Sequence[Frame]) -> tuple[Spoken, ...]:
-    """Known groups that were heard, one for each sender."""
+def group_messages(frames: Sequence[Frame]) -> tuple[GroupMessage, ...]:
+    """Known groups among frames, one for each sender."""
     known = {group.number: group for group in GROUPS}
-    found: dict[tuple[int, int], Spoken] = {}
+    messages: dict[tuple[int, int], GroupMessage] = {}
     for frame in frames:
         number = group_number(frame.arbitration_id) if frame.is_extended else -1
         if number in known and len(frame.data) == 8:
             address = frame.arbitration_id & 0xFF
-            found[number, address] = Spoken(known[number], frame.arbitration_id, address)
-    return tuple(found[key] for key in sorted(found))
+            messages[number, address] = GroupMessage(known[number], frame.arbitration_id, address)
+    return tuple(messages[key] for key in sorted(messages))

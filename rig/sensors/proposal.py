@@ -1,9 +1,10 @@
-"""A DBC and a configuration for what was found on a bus."""
+"""A DBC and a configuration for the devices on a bus, to be read before they are used."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from math import ceil
-from typing import Any, NamedTuple, cast
+from pathlib import Path
+from typing import Any, cast
 
 import cantools.database
 from cantools.database.can import Database, Message, Node, Signal
@@ -13,8 +14,18 @@ from can_dbc.database import DEFAULT_DATABASE
 from can_dbc.errors import InputError
 from can_dbc.units import Dimension, si_conversion
 from rig.bus.bus import BusConfig
-from rig.sensors.canopen_description import Device, Mapped, Pdo
-from rig.sensors.j1939 import LARGEST_VALUE, Claim, Spoken
+from rig.sensors.bus_scan import BusSurvey
+from rig.sensors.canopen_device import CanOpenDevice, MappedObject, Pdo
+from rig.sensors.height_zero import HeightZero
+from rig.sensors.j1939 import LARGEST_VALUE, AddressClaim, GroupMessage
+from rig.sensors.signal_locations import (
+    SignalLocation,
+    alarms,
+    levels,
+    locations,
+    message_name,
+    signal_names,
+)
 
 DBC_NAME, CONFIG_NAME = "sensors.dbc", "rig.yaml"
 _BRIDGE = "RIG"
@@ -31,50 +42,44 @@ _MOST_MS = 65_535
 _STALE_CYCLES = 5
 
 
-class Origin(NamedTuple):
-    """Where the height of a position sensor begins, and which way it counts.
+def write_proposal(
+    folder: Path, survey: BusSurvey, bus: BusConfig, zero: HeightZero | None
+) -> tuple[Path, Path]:
+    """Write a DBC and a configuration for the devices on a bus; returns their files.
 
-    Attributes:
-        height_m: Height of the strut where the sensor reads `reading_m`.
-        reading_m: What it reads there.
-        is_reversed: Whether it counts up while the strut gets shorter.
+    Args:
+        folder: New folder.
+        survey: Devices on the bus.
+        bus: The bus.
+        zero: Zero of the first position sensor; heights are its readings if None.
+
+    Raises:
+        InputError: No device measures a length, two devices send under one id, or the folder cannot
+            be written.
     """
-
-    height_m: float
-    reading_m: float
-    is_reversed: bool
-
-
-class Place(NamedTuple):
-    """Where a quantity was found on the bus.
-
-    Attributes:
-        message: Name of the message.
-        signal: Name of the signal.
-        node_id: Node that sends it; None of J1939.
-        mapped: The object; None of J1939.
-    """
-
-    message: str
-    signal: str
-    node_id: int | None
-    mapped: Mapped | None
-
-
-def positions(devices: Sequence[Device]) -> list[Place]:
-    """Where CANopen devices send a length, the likeliest height first."""
-    return [item for item, dimension in _places(devices) if dimension is Dimension.LENGTH]
+    configuration = configuration_text(survey.devices, survey.groups, survey.claims, bus)
+    database = dbc_text(survey.devices, survey.groups, zero)
+    dbc_path, config_path = folder / DBC_NAME, folder / CONFIG_NAME
+    try:
+        folder.mkdir(parents=True)
+        dbc_path.write_text(database, "utf-8")
+        config_path.write_text(configuration, "utf-8")
+    except OSError as error:
+        raise InputError(f"--out {folder}: cannot be written: {error.strerror}") from error
+    return dbc_path, config_path
 
 
 def dbc_text(
-    devices: Sequence[Device], spoken: Sequence[Spoken], origin: Origin | None = None
+    devices: Sequence[CanOpenDevice],
+    groups: Sequence[GroupMessage],
+    zero: HeightZero | None = None,
 ) -> str:
-    """A DBC of what the devices send, with what the bridge publishes.
+    """A DBC of the devices' messages, with those that the bridge publishes.
 
     Args:
         devices: CANopen devices.
-        spoken: Known groups of J1939.
-        origin: Where the height of the first position begins; as the sensor counts if None.
+        groups: Known groups of J1939.
+        zero: Zero of the first position sensor; heights are its readings if None.
 
     Raises:
         InputError: Two devices send under one id.
@@ -82,22 +87,23 @@ def dbc_text(
     own = cast(
         "Any", cantools.database.load_file(DEFAULT_DATABASE, database_format="dbc")
     )  # with its attributes
-    height = next(iter(positions(devices)), None)
+    height = next(iter(locations(devices, Dimension.LENGTH)), None)
     messages: dict[tuple[int, bool], Message] = {}
     for device in devices:
         for pdo in device.pdos:
-            _put(messages, _message(device, pdo, height, origin))
-    for item in spoken:
-        _put(messages, _group_message(item))
+            _add_message(messages, _pdo_message(device, pdo, height, zero))
+    for item in groups:
+        _add_message(messages, _group_message(item))
     bridge = [item for item in own.messages if _BRIDGE in item.senders]
     _move_out_of_the_way(bridge, {key for key, is_extended in messages if not is_extended})
-    names = [_BRIDGE, *[device.name for device in devices], *sorted({_node(i) for i in spoken})]
-    made = Database(
+    names = [_BRIDGE, *[device.name for device in devices]]
+    names += sorted({item.node_name for item in groups})
+    database = Database(
         messages=[*messages.values(), *bridge],
         nodes=[Node(name, None) for name in names],
         dbc_specifics=own.dbc,
     )
-    return _marked(made.as_dbc_string(), [item.arbitration_id for item in spoken])
+    return _mark_j1939(database.as_dbc_string(), [item.arbitration_id for item in groups])
 
 
 def _move_out_of_the_way(bridge: Sequence[Message], taken: set[int]) -> None:
@@ -109,13 +115,13 @@ def _move_out_of_the_way(bridge: Sequence[Message], taken: set[int]) -> None:
             used.add(item.frame_id)
 
 
-def _marked(text: str, j1939_ids: Sequence[int]) -> str:
-    """A DBC with the messages of these ids marked as J1939."""
-    if not j1939_ids:
+def _mark_j1939(text: str, ids: Sequence[int]) -> str:
+    """Text of a DBC with the messages of these ids marked as J1939."""
+    if not ids:
         return text
     choices = ",".join(f'"{choice}"' for choice in _FORMATS)
     value = _FORMATS.index("J1939PG")
-    marks = [f'BA_ "{_FORMAT}" BO_ {key | _EXTENDED_IN_DBC} {value};' for key in j1939_ids]
+    marks = [f'BA_ "{_FORMAT}" BO_ {key | _EXTENDED_IN_DBC} {value};' for key in ids]
     added = {
         "BA_DEF_DEF_ ": [f'BA_DEF_ BO_ "{_FORMAT}" ENUM {choices};'],
         'BA_ "': [f'BA_DEF_DEF_ "{_FORMAT}" "{_FORMATS[0]}";', *marks],
@@ -129,93 +135,72 @@ def _marked(text: str, j1939_ids: Sequence[int]) -> str:
 
 
 def configuration_text(
-    devices: Sequence[Device],
-    spoken: Sequence[Spoken],
-    claims: Sequence[Claim],
+    devices: Sequence[CanOpenDevice],
+    groups: Sequence[GroupMessage],
+    claims: Sequence[AddressClaim],
     bus: BusConfig,
 ) -> str:
-    """A configuration that reads what was found: to be read before it runs.
+    """A configuration for the devices on a bus.
 
     Args:
         devices: CANopen devices.
-        spoken: Known groups of J1939.
+        groups: Known groups of J1939.
         claims: J1939 devices that claim an address.
-        bus: The bus they are on.
+        bus: The bus.
 
     Raises:
-        InputError: Nothing measures a length.
+        InputError: No device measures a length.
     """
-    heights = positions(devices)
-    levels = _levels(spoken)
-    forces = [item for item, dimension in _places(devices) if dimension is Dimension.FORCE]
-    warm = [item for item, dimension in _places(devices) if dimension is Dimension.TEMPERATURE]
-    if not (heights or levels):
-        raise InputError("nothing that was found measures a length, expected the height of a strut")
+    heights = [*locations(devices, Dimension.LENGTH), *levels(groups)]
+    if not heights:
+        raise InputError("no device on the bus measures a length, expected the height of a strut")
     rest = "" if bus.data_bitrate is None else f", data_bitrate: {bus.data_bitrate}"
+    channel = bus.channel if bus.channel.replace("_", "").isalnum() else json.dumps(bus.channel)
     lines = [
         "model: reference          # the bench's own model file",
         f"dbc: {DBC_NAME}",
-        f"bus: {{interface: {bus.interface}, channel: {_quoted(bus.channel)}, "
-        f"bitrate: {bus.bitrate}{rest}}}",
+        f"bus: {{interface: {bus.interface}, channel: {channel}, bitrate: {bus.bitrate}{rest}}}",
         "signals:",
-        _line("height", [*heights, *levels]),
     ]
-    used = [(heights or levels)[0]]
-    if forces:
-        lines.append(_line("load_cell_force", forces))
-        used.append(forces[0])
-    if warm:
-        lines.append(_line("temperature", warm))
-        used.append(warm[0])
-    lines += _devices_block(devices, spoken, claims, used)
-    slowest_s = max((_cycle_s(devices, spoken, item) or 0.0 for item in used[:1]), default=0.0)
-    if slowest_s * _STALE_CYCLES > 0.01:
-        stale_s = slowest_s * _STALE_CYCLES
+    used: list[SignalLocation] = []
+    for key, sources in (
+        ("height", heights),
+        ("load_cell_force", locations(devices, Dimension.FORCE)),
+        ("temperature", locations(devices, Dimension.TEMPERATURE)),
+    ):
+        if sources:
+            lines.append(_signal_line(key, sources))
+            used.append(sources[0])
+    lines += _devices_block(devices, groups, claims, used)
+    cycle_s = _cycle_s(devices, groups, heights[0]) or 0.0
+    if cycle_s * _STALE_CYCLES > 0.01:
+        stale_s = cycle_s * _STALE_CYCLES
         lines.append(
             f"supervision: {{stale_after_s: {stale_s:g}, safe_after_s: {max(0.5, 2 * stale_s):g}}}"
         )
-        lines.append(f"rate_hz: {min(1000.0, max(1.0, round(1 / slowest_s))):g}")
+        lines.append(f"rate_hz: {min(1000.0, max(1.0, round(1 / cycle_s))):g}")
     return "\n".join(lines) + "\n"
 
 
-def _places(devices: Sequence[Device]) -> Iterable[tuple[Place, Dimension | None]]:
-    for device in devices:
-        for pdo in device.pdos:
-            names = _names(pdo)
-            for item in pdo.mapped:
-                place = Place(_message_name(device, pdo), names[item], device.node_id, item)
-                yield place, item.meaning.dimension
-
-
-def _names(pdo: Pdo) -> dict[Mapped, str]:
-    """Names of the signals of a PDO, each once."""
-    names: dict[Mapped, str] = {}
-    for item in pdo.mapped:
-        name = item.meaning.name
-        names[item] = name if name not in names.values() else f"{name}_AT_{item.start}"
-    return names
-
-
-def _message_name(device: Device, pdo: Pdo) -> str:
-    return f"{device.name}_TPDO{pdo.number}"
-
-
-def _message(device: Device, pdo: Pdo, height: Place | None, origin: Origin | None) -> Message:
-    names = _names(pdo)
-    message_name = _message_name(device, pdo)
+def _pdo_message(
+    device: CanOpenDevice, pdo: Pdo, height: SignalLocation | None, zero: HeightZero | None
+) -> Message:
+    """Message of a PDO; the signal at `height` measures from the zero."""
+    names = signal_names(pdo)
+    name = message_name(device, pdo)
     signals: list[Signal] = []
     for item in pdo.mapped:
         scale, offset = item.meaning.scale, 0.0
-        if origin is not None and height == (message_name, names[item], device.node_id, item):
-            scale = -scale if origin.is_reversed else scale
-            reading_m = -origin.reading_m if origin.is_reversed else origin.reading_m
+        if zero is not None and height == (name, names[item], device.node_id, item):
+            scale = -scale if zero.is_reversed else scale
+            reading_m = -zero.reading_m if zero.is_reversed else zero.reading_m
             metre = si_conversion(item.meaning.unit, Dimension.LENGTH).factor
-            offset = (origin.height_m - reading_m) / metre
+            offset = (zero.height_m - reading_m) / metre
         signals.append(_signal(item, names[item], scale, offset))
     return Message(
         frame_id=pdo.arbitration_id,
         is_extended_frame=pdo.is_extended,
-        name=message_name,
+        name=name,
         length=pdo.length_bytes,
         signals=signals,
         senders=[device.name],
@@ -226,60 +211,56 @@ def _message(device: Device, pdo: Pdo, height: Place | None, origin: Origin | No
     )
 
 
-def _signal(item: Mapped, name: str, scale: float, offset: float) -> Signal:
-    found = item.meaning
-    conversion = BaseConversion.factory(scale=scale, offset=offset, is_float=found.is_float)
+def _signal(item: MappedObject, name: str, scale: float, offset: float) -> Signal:
+    meaning = item.meaning
+    conversion = BaseConversion.factory(scale=scale, offset=offset, is_float=meaning.is_float)
     return Signal(
         name=name,
         start=item.start,
         length=item.bits,
         byte_order="little_endian",
-        is_signed=found.is_signed and not found.is_float,
+        is_signed=meaning.is_signed and not meaning.is_float,
         conversion=conversion,
-        unit=found.unit or None,
+        unit=meaning.unit or None,
         receivers=[_BRIDGE],
-        comment=found.note or None,
+        comment=meaning.note or None,
     )
 
 
-def _node(item: Spoken) -> str:
-    return f"ADDRESS_{item.address}"
-
-
-def _group_message(item: Spoken) -> Message:
+def _group_message(item: GroupMessage) -> Message:
     signals = [
         Signal(
-            name=found.name,
-            start=8 * found.byte,
+            name=parameter.name,
+            start=8 * parameter.byte,
             length=16,
             byte_order="little_endian",
             is_signed=False,
-            conversion=BaseConversion.factory(scale=found.scale, offset=found.offset),
-            minimum=found.offset,
-            maximum=LARGEST_VALUE * found.scale + found.offset,
-            unit=found.unit,
+            conversion=BaseConversion.factory(scale=parameter.scale, offset=parameter.offset),
+            minimum=parameter.offset,
+            maximum=LARGEST_VALUE * parameter.scale + parameter.offset,
+            unit=parameter.unit,
             receivers=[_BRIDGE],
         )
-        for found in item.group.parameters
+        for parameter in item.group.parameters
     ]
     return Message(
         frame_id=item.arbitration_id,
         is_extended_frame=True,
-        name=f"{item.group.name}_FROM_{item.address}",
+        name=item.message_name,
         length=8,
         signals=signals,
-        senders=[_node(item)],
+        senders=[item.node_name],
         cycle_time=_cycle_ms(item.group.cycle_s),
         protocol="j1939",
     )
 
 
-def _put(messages: dict[tuple[int, bool], Message], message: Message) -> None:
+def _add_message(messages: dict[tuple[int, bool], Message], message: Message) -> None:
     other = messages.setdefault((message.frame_id, message.is_extended_frame), message)
     if other is not message:
         raise InputError(
             f"{other.name} and {message.name} have the same id {message.frame_id:#x}, expected "
-            "each device to send under ids of its own"
+            "different ids of different devices"
         )
 
 
@@ -290,17 +271,9 @@ def _cycle_ms(cycle_s: float | None) -> int | None:
     return min(max(1, ceil(cycle_s * 1e3 - 1e-6)), _MOST_MS)
 
 
-def _levels(spoken: Sequence[Spoken]) -> list[Place]:
-    return [
-        Place(f"{item.group.name}_FROM_{item.address}", found.name, None, None)
-        for item in spoken
-        for found in item.group.parameters
-        if found.unit == "mm"
-    ]
-
-
-def _line(key: str, found: Sequence[Place]) -> str:
-    best, *others = found
+def _signal_line(key: str, sources: Sequence[SignalLocation]) -> str:
+    """Entry under `signals` for the first source; a comment names the others."""
+    best, *others = sources
     text = f"  {key}: {{message: {best.message}, signal: {best.signal}}}"
     if others:
         text += f"   # or {', '.join(f'{item.message}.{item.signal}' for item in others[:4])}"
@@ -308,51 +281,41 @@ def _line(key: str, found: Sequence[Place]) -> str:
 
 
 def _devices_block(
-    devices: Sequence[Device],
-    spoken: Sequence[Spoken],
-    claims: Sequence[Claim],
-    used: Sequence[Place],
+    devices: Sequence[CanOpenDevice],
+    groups: Sequence[GroupMessage],
+    claims: Sequence[AddressClaim],
+    used: Sequence[SignalLocation],
 ) -> list[str]:
     nodes = {item.node_id for item in used}
     lines = [
-        f"  {device.name}: {json.dumps(_entry(device))}"
+        f"  {device.name}: {json.dumps(_device_entry(device))}"
         for device in devices
         if device.node_id in nodes
     ]
-    names: Mapping[int, int] = {claim.address: claim.name for claim in claims}
+    names = {claim.address: claim.name for claim in claims}
     messages = [item.message for item in used if item.node_id is None]
     lines += [
-        f"  {_node(item)}: {{j1939_name: {names[item.address]:#018x}, "
+        f"  {item.node_name}: {{j1939_name: {names[item.address]:#018x}, "
         f"source_address: {item.address}}}"
-        for item in spoken
-        if item.address in names and f"{item.group.name}_FROM_{item.address}" in messages
+        for item in groups
+        if item.address in names and item.message_name in messages
     ]
     return ["devices:", *lines] if lines else []
 
 
-def _entry(device: Device) -> dict[str, object]:
+def _device_entry(device: CanOpenDevice) -> dict[str, object]:
     """Entry of a device under `devices`."""
     entry: dict[str, object] = {"node_id": device.node_id, "emergency_id": device.emergency_id}
     if device.heartbeat_s:
         entry["heartbeat_s"] = round(_HEARTBEATS_MISSED * device.heartbeat_s, 4)  # up to 164 s
-    alarms = [
-        {"message": _message_name(device, pdo), "signal": names[item]}
-        for pdo in device.pdos
-        for names in [_names(pdo)]
-        for item in pdo.mapped
-        if item.meaning.is_alarm
-    ]
-    return entry | ({"alarms": alarms} if alarms else {})
+    signals = [{"message": item.message, "signal": item.signal} for item in alarms(device)]
+    return entry | ({"alarms": signals} if signals else {})
 
 
-def _cycle_s(devices: Sequence[Device], spoken: Sequence[Spoken], place: Place) -> float | None:
-    for device in devices:
-        for pdo in device.pdos:
-            if _message_name(device, pdo) == place.message:
-                return pdo.cycle_s
-    groups = {f"{item.group.name}_FROM_{item.address}": item.group.cycle_s for item in spoken}
-    return groups.get(place.message)
-
-
-def _quoted(text: str) -> str:
-    return text if text.replace("_", "").isalnum() else json.dumps(text)
+def _cycle_s(
+    devices: Sequence[CanOpenDevice], groups: Sequence[GroupMessage], location: SignalLocation
+) -> float | None:
+    """Time between two messages of a location; None where it is not known."""
+    cycles_s = {message_name(device, pdo): pdo.cycle_s for device in devices for pdo in device.pdos}
+    cycles_s |= {item.message_name: item.group.cycle_s for item in groups}
+    return cycles_s.get(location.message)

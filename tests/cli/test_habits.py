@@ -10,8 +10,8 @@ import pytest
 from rig.bridge.report import Counts
 from rig.bridge.values import Mode, StepOutput, StrutOutput
 from rig.cli.main import main
-from rig.cli.output import console, table
 from rig.cli.progress import status_line
+from rig.cli.terminal import console, table
 from rig.plan.config import CONFIGS
 from rig.run.loop import Look
 from tests.view.serving import make_run
@@ -156,7 +156,7 @@ def test_without_a_terminal_the_status_is_a_line_every_ten_seconds(capfd):
 
 def test_a_line_says_the_rate_that_was_kept(monkeypatch):
     said = []
-    monkeypatch.setattr("rig.cli.progress._say", lambda text: said.append(text.decode()))
+    monkeypatch.setattr("rig.cli.progress._write", lambda text: said.append(text.decode()))
     with status_line(60.0) as watch:
         for second in (10.0, 20.0):
             watch(look(second))
@@ -174,4 +174,4 @@ def test_a_case_as_json(monkeypatch, capsys, tmp_path):
 
 def test_foxglove_takes_no_control(monkeypatch, capsys, tmp_path):
     assert rig(monkeypatch, "view", tmp_path, "--foxglove", "--control") == 2
-    assert "--foxglove: takes neither --control nor --model" in capsys.readouterr().err
+    assert "--foxglove: expected neither --control nor --model" in capsys.readouterr().err

@@ -10,7 +10,8 @@ from can_dbc.errors import InputError
 from dart_model.plant import DartPlant
 from dart_model.plant.admitted_programs import require_admitted
 from dart_model.spec import MODELS, EffectSpec, load_model
-from rig.demo.story import draw_effect, tell
+from rig.demo.cases import DemoOptions
+from rig.demo.story import draw_effect, run_story
 from rig.diagnosis.files import diagnose_runs
 from rig.fmu.component import bench_component, strut_component
 from rig.fmu.export import export_fmu
@@ -68,14 +69,11 @@ def imported(folder, component, spec, version, mass_kg=None):
 def test_a_corrected_model_comes_back_as_an_fmu(tmp_path, version):
     """A bench with an effect that nobody declared is diagnosed; the corrected model becomes an FMU,
     and the FMU the model: the virtual force is what noise alone leaves."""
-    story = tell(
+    story = run_story(
         SEED,
         tmp_path / "story",
-        duration_s=DURATION_S,
-        lockstep=True,
-        stop=lambda: False,
+        DemoOptions(True, DURATION_S, stop=lambda: False, watch=lambda *_: None),
         chapter=lambda _: None,
-        watch=lambda *_: None,
         diagnosis_progress=lambda _what, _share: None,
     )
     before_n, after_n = story.virtual_force_rms_n

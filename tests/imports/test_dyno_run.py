@@ -8,7 +8,7 @@ import pytest
 
 from can_dbc.errors import InputError
 from dart_model.spec import load_model
-from rig.demo.cases import run_case
+from rig.demo.cases import DemoOptions, run_case
 from rig.diagnosis.files import diagnose_runs
 from rig.diagnosis.recording import read_recording
 from rig.plan.check import check
@@ -154,10 +154,7 @@ def test_the_case_that_comes_with_the_package_tells_how_far_the_model_is(tmp_pat
     case = run_case(
         "dyno",
         tmp_path / "case",
-        lockstep=True,
-        duration_s=1.5,
-        stop=lambda: False,
-        watch=lambda _look: None,
+        DemoOptions(True, 1.5, stop=lambda: False, watch=lambda _look: None),
     )
     (strut,) = case.struts
     alone, observed = strut.figures(strut.defective), strut.figures(strut.observed)

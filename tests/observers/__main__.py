@@ -19,7 +19,7 @@ import yaml
 from can_dbc.database import DEFAULT_DATABASE
 from rig.closed_loop.loop import Rhythm
 from rig.closed_loop.strut_response import strut_responses
-from rig.demo.cases import compared
+from rig.demo.cases import compare_with_bench
 from rig.log.reader import read_run
 from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
@@ -111,7 +111,7 @@ def reference(folder, seed, noise_m, step_m, latency_ns=0, observers=None, delay
     """A run of 20 s through CAN; returns its case."""
     ready, bench = prepared(folder, seed, noise_m, step_m, latency_ns, observers, delay_s)
     ended = with_bench(ready, bench, folder / "run", lockstep=True)
-    return compared(ended, ready, bench).struts[0]
+    return compare_with_bench(ended, ready, bench).struts[0]
 
 
 def prepared(folder, seed, noise_m, step_m, latency_ns=0, observers=None, delay_s=0.0):

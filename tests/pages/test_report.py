@@ -188,7 +188,7 @@ class Reader(HTMLParser):
         ),
         (
             found("partly_explained", height=BeforeAfter(2.31e-3, 1e-4)),
-            ["dry friction", "something more that is not explained", "10 times the noise floor"],
+            ["dry friction", "a part of the residual is not explained", "10 times the noise floor"],
         ),
         (
             found(
@@ -196,9 +196,9 @@ class Reader(HTMLParser):
             ),
             [
                 "linear stiffness, stiffness −117 N/m",
-                "not bounded by these data",
+                "not identifiable from these data",
                 "or else another damping or another inertia",
-                "cannot tell them apart (what would tell: a run with two sines)",
+                "do not distinguish them (to distinguish them: a run with two sines)",
                 "2.31 mm to 10.4 µm",
             ],
         ),
@@ -225,7 +225,8 @@ class Reader(HTMLParser):
             found("explained", (FRICTION,), linear=(SOFTER, PRELOAD)),
             [
                 "The model lacks dry friction (Coulomb)",
-                "besides linear corrections (stiffness 13 % below the file's, preload 12.3 N above",
+                "in addition to linear corrections (stiffness 13 % below the file's, "
+                "preload 12.3 N above",
                 "with these corrections the RMS free-run height error",
             ],
         ),
@@ -258,7 +259,7 @@ def test_page_has_every_part() -> None:
     for part in (
         "Before and after, on held-out data",
         "Noise floor",
-        "What is missing",
+        "Missing effects",
         "sliding friction",
         "Armstrong-Hélouvry",
         "What else it could be",
@@ -269,7 +270,7 @@ def test_page_has_every_part() -> None:
         "Ranking of the rejected candidates",
         "explains less on held-out blocks",
         "the motion cannot show it",
-        "What was assumed",
+        "Assumptions",
         "With the nominal model, the residual is not white by the test; "
         "with the corrected model, the residual is white by the test.",
     ):
@@ -282,13 +283,14 @@ def test_page_has_every_part() -> None:
 def test_linear_corrections_stand_apart_from_what_is_missing() -> None:
     corrections = (SOFTER, PRELOAD, DAMPING, MASS, GAIN)
     text = shown(report(found(linear=corrections))).replace("\u00a0", " ")
-    linear, missing = text.split("Linear part", 1)[1].split("What is missing", 1)
+    linear, missing = text.split("Linear part", 1)[1].split("Missing effects", 1)
     for part in (
         "stiffness about mid-stroke (0.38 m)",
         "900 N/m 783 N/m 771 to 795 N/m 13 % below the file's",
         "preload about mid-stroke (0.38 m)",
         "0 N 12.30 N 11.90 to 12.70 N 12.3 N above the file's",
-        "damping damping_n_s_per_m 20.0 N·s/m 23.1 N·s/m not bounded by these data 16 % above",
+        "damping damping_n_s_per_m 20.0 N·s/m 23.1 N·s/m not identifiable from these data "
+        "16 % above",
         "9.500 to 9.600 kg 4.5 % below the file's",
         "input gain",
         "1.040 to 1.060 5.0 % above the file's",
@@ -301,10 +303,10 @@ def test_linear_corrections_stand_apart_from_what_is_missing() -> None:
 def test_a_linear_correction_is_not_listed_as_missing_too() -> None:
     text = shown(report(found("explained", (STIFFNESS,), linear=(SOFTER,))))
     assert "Linear part" in text
-    assert "What is missing" not in text
+    assert "Missing effects" not in text
     elsewhere = replace(SOFTER, strut="other")
     text = shown(report(found("explained", (STIFFNESS,), linear=(elsewhere,))))
-    assert "What is missing" in text
+    assert "Missing effects" in text
 
 
 def test_effects_of_the_nominal_model_that_the_data_change_are_listed() -> None:
@@ -323,10 +325,10 @@ def test_effects_of_the_nominal_model_that_the_data_change_are_listed() -> None:
     listed = text.split("Effects of the nominal model that the data change")[1]
     assert "strut strut, refitted" in listed
     assert "10.0 N 12.08 N 11.83 to 12.36 N" in listed
-    assert "superfluous: the data are as well explained without it" in listed
+    assert "superfluous: without it, the data are explained as well" in listed
     said = sentence(diagnosis, 1)
     assert "effect “coulomb_friction” is refitted; its effect “bump_stop” is superfluous" in said
-    assert "changes of its own effects (“coulomb_friction” refitted" in sentence(
+    assert "changes of its effects (“coulomb_friction” refitted" in sentence(
         replace(found(), existing=existing), 1
     )
 
@@ -490,10 +492,10 @@ def test_a_value_has_the_digits_that_its_interval_allows() -> None:
 @pytest.mark.parametrize(
     ("low", "high", "said"),
     [
-        (None, None, "not bounded by these data"),
-        (math.nan, math.inf, "not bounded by these data"),
-        (771.0, None, "above 771 N/m, upper end not bounded by these data"),
-        (None, 795.0, "below 795 N/m, lower end not bounded by these data"),
+        (None, None, "not identifiable from these data"),
+        (math.nan, math.inf, "not identifiable from these data"),
+        (771.0, None, "above 771 N/m, upper end not identifiable from these data"),
+        (None, 795.0, "below 795 N/m, lower end not identifiable from these data"),
     ],
 )
 def test_an_interval_without_an_end_says_so(

@@ -11,7 +11,7 @@ import yaml
 
 from can_dbc.errors import InputError
 from rig.formats.run_arrays import open_run
-from rig.pages import pdf as paper
+from rig.pages import browser_print
 from rig.pages.run_report import write_run_report
 from rig.run.changes import change_line
 from tests.view.serving import make_run
@@ -84,14 +84,14 @@ def test_what_is_no_run_is_one_line(run, tmp_path, what):
 
 
 def test_without_a_browser_nothing_is_printed(tmp_path, monkeypatch):
-    monkeypatch.setattr(paper.shutil, "which", lambda _name: None)
+    monkeypatch.setattr(browser_print.shutil, "which", lambda _name: None)
     with pytest.raises(InputError, match="expected Chromium, Chrome or Edge"):
-        paper.print_page(tmp_path / "page.html", tmp_path / "page.pdf")
+        browser_print.print_page(tmp_path / "page.html", tmp_path / "page.pdf")
 
 
 def test_a_browser_prints_it(run, tmp_path):
-    if not any(shutil.which(name) for name in paper._BROWSERS):
+    if not any(shutil.which(name) for name in browser_print._BROWSERS):
         pytest.skip("no Chromium, Chrome or Edge on this machine")
     written(run, tmp_path)
-    paper.print_page(tmp_path / "report.html", tmp_path / "report.pdf")
+    browser_print.print_page(tmp_path / "report.html", tmp_path / "report.pdf")
     assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF-")

@@ -59,16 +59,16 @@ def test_a_diagnosis_shows_itself_and_is_written(tmp_path):
         path.write_text("t_s,height_m,applied_force_n\n" + rows + "\n")
         paths.append(path)
     shares = []
-    found = rig.diagnose(
+    outcome = rig.diagnose(
         [rig.read_csv(paths[0])], "reference", [paths[1]], lambda _what, share: shares.append(share)
     )
-    assert found.diagnosis.verdict == "explained"
-    assert [effect.family for effect in found.diagnosis.effects] == ["nonlinear_stiffness"]
-    assert str(found).startswith("explained: ")
-    html = found._repr_html_()
+    assert outcome.diagnosis.verdict == "explained"
+    assert [effect.family for effect in outcome.diagnosis.effects] == ["nonlinear_stiffness"]
+    assert str(outcome).startswith("explained: ")
+    html = outcome._repr_html_()
     assert "<table>" in html
     assert "cubic_stiffness" in html
-    found.write(tmp_path / "found")
+    outcome.write(tmp_path / "found")
     assert {path.name for path in (tmp_path / "found").iterdir()} == {
         "diagnosis.json", "corrected.yaml", "report.html"
     }  # fmt: skip

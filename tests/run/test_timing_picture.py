@@ -5,16 +5,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.pages.timing_picture import Distribution, _coarser, draw_timing
+from rig.pages.timing_picture import Distribution, _merge_bins, draw_timing
 
 BINS = 20_000
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @given(us=st.lists(st.integers(0, BINS - 1), max_size=100))
-def test_coarser_bins_hold_every_tick_at_its_place(us):
+def test_merge_bins_bins_hold_every_tick_at_its_place(us):
     fine = np.bincount(np.array(us, dtype=np.intp), minlength=BINS)
-    edges, ticks = _coarser(fine)
+    edges, ticks = _merge_bins(fine)
     assert ticks.sum() == len(us)
     assert edges[-1] == BINS
     for value in us:

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.output import JsonFlag, console, print_json, table
 from rig.cli.progress import progress_bar
+from rig.cli.terminal import JsonFlag, console, print_json, table
 from tests.scoreboard.run import run_scoreboard
 
 

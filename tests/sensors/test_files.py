@@ -8,9 +8,9 @@ from typer.testing import CliRunner
 from can_dbc.database import load_database
 from can_dbc.errors import InputError
 from rig.cli.main import app
-from rig.sensors.canopen_description import described
-from rig.sensors.eds import EdsObjects
-from rig.sensors.undo import read_undo
+from rig.sensors.canopen_device import describe_device
+from rig.sensors.eds_file import EdsObjects
+from rig.sensors.undo_file import read_undo
 
 
 def variable(section, kind, value="", access="ro"):
@@ -60,7 +60,7 @@ def eds(tmp_path):
 
 
 def test_a_sensor_that_is_not_there_is_described_by_its_file(eds):
-    device = described(EdsObjects(eds, 7), 7)
+    device = describe_device(EdsObjects(eds, 7), 7)
     assert (device.emergency_id, device.heartbeat_s) == (0x87, 0.2)
     (pdo,) = device.pdos
     assert (pdo.arbitration_id, pdo.cycle_s) == (0x187, 0.004)
@@ -123,7 +123,7 @@ def try_mutations(folder, count, seed):
         path.write_bytes(mutated(rng, EDS))
         refused = None
         try:
-            device = described(EdsObjects(path, 7), 7)
+            device = describe_device(EdsObjects(path, 7), 7)
             described_so_far += device is not None
         except InputError as error:
             refused = str(error)

@@ -14,7 +14,7 @@ from rig.bridge.values import Mode
 from rig.bus.bus import BusConfig
 from rig.plan.build import build_bridge
 from rig.plan.load import load_plan
-from rig.sensors.j1939 import Claim, claims, group_number, spoken
+from rig.sensors.j1939 import AddressClaim, address_claims, group_messages, group_number
 from rig.sensors.proposal import configuration_text, dbc_text
 from tests.faults.trial import height_of
 
@@ -36,7 +36,7 @@ def levels(address, height_m, t_ns=0):
 def test_a_name_is_taken_apart():
     # SAE J1939-81: identity 21 bits, manufacturer 11, instances 8, function 8, ...
     name = 0x12345 | 0x155 << 21 | 0x2E << 40 | 1 << 63
-    (found,) = claims([claim(0x80, name)])
+    (found,) = address_claims([claim(0x80, name)])
     assert (found.address, found.identity, found.manufacturer, found.function) == (
         0x80,
         0x12345,
@@ -46,8 +46,8 @@ def test_a_name_is_taken_apart():
 
 
 def test_the_last_claim_of_a_name_counts():
-    assert claims([claim(0x80), claim(0x81)]) == (Claim(0x81, NAME),)
-    assert claims([claim(0xFE)]) == ()
+    assert address_claims([claim(0x80), claim(0x81)]) == (AddressClaim(0x81, NAME),)
+    assert address_claims([claim(0xFE)]) == ()
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_group_numbers(arbitration_id, number):
 def ready(tmp_path):
     """A bridge to a level sensor at address 32."""
     heard = [claim(0x20), levels(0x20, 0.4)]
-    found, known = spoken(heard), claims(heard)
+    found, known = group_messages(heard), address_claims(heard)
     (tmp_path / "sensors.dbc").write_text(dbc_text((), found))
     (tmp_path / "rig.yaml").write_text(configuration_text((), found, known, BUS))
     return load_plan(tmp_path / "rig.yaml")
@@ -146,6 +146,6 @@ def test_a_float_that_is_no_number_is_refused(tmp_path, value):
 
 def test_who_lost_an_address_has_none():
     low, high = 5, 9
-    told = [claim(32, low), claim(32, high), claim(32, low), claim(0xFE, high)]
-    assert claims(told) == (Claim(32, low),)
-    assert claims([claim(32, high), claim(32, low)]) == (Claim(32, low),)
+    frames = [claim(32, low), claim(32, high), claim(32, low), claim(0xFE, high)]
+    assert address_claims(frames) == (AddressClaim(32, low),)
+    assert address_claims([claim(32, high), claim(32, low)]) == (AddressClaim(32, low),)

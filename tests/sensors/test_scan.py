@@ -18,11 +18,12 @@ from rig.bus.canopen_network import CanOpenNetwork
 from rig.cli.main import app
 from rig.plan.check import check
 from rig.plan.load import load_plan
-from rig.sensors.canopen_description import described
-from rig.sensors.proposal import Origin, dbc_text
-from rig.sensors.scan import scan
-from rig.sensors.set_up import Setting, restore, set_to_work
-from rig.sensors.undo import read_undo, write_undo
+from rig.sensors.bus_scan import scan
+from rig.sensors.canopen_device import describe_device
+from rig.sensors.canopen_set_up import DeviceSettings, DeviceWriter, configure_device, restore
+from rig.sensors.height_zero import HeightZero
+from rig.sensors.proposal import dbc_text
+from rig.sensors.undo_file import read_undo, write_undo
 from tests.sensors.peer import KILONEWTON, amplifier, encoder, with_timer
 
 NO_REMOTE_REQUEST = 1 << 30
@@ -147,14 +148,14 @@ def test_a_timer_of_its_own_is_set_and_put_back(bus, network, tmp_path):
     node = encoder(bus(), 5)
     with_timer(node, 10)
     objects = node.object_dictionary
-    setting = Setting(network)
-    set_to_work(setting, 5, cycle_ms=2, sync=False, heartbeat_ms=100)
+    setting = DeviceWriter(network)
+    configure_device(setting, 5, DeviceSettings(cycle_ms=2, heartbeat_ms=100))
     assert objects.read(0x1800, 5) == 2
     assert objects.read(0x1017, 0) == 100
     assert objects.read(0x1800, 1) & ~NO_REMOTE_REQUEST == 0x185
     network.listen(0.05)
     assert node.nmt.state == 5
-    write_undo(tmp_path / "before.yaml", setting.changed)
+    write_undo(tmp_path / "before.yaml", setting.changes)
     restore(network, read_undo(tmp_path / "before.yaml"))
     assert objects.read(0x1800, 5) == 10
     assert objects.read(0x1017, 0) == 0
@@ -164,10 +165,10 @@ def test_a_timer_of_its_own_is_set_and_put_back(bus, network, tmp_path):
 
 def test_an_encoder_without_an_event_timer_has_its_own(bus, network):
     node = encoder(bus(), 5, cycle_ms=10)
-    setting = Setting(network)
-    set_to_work(setting, 5, cycle_ms=3, sync=False, heartbeat_ms=None)
+    setting = DeviceWriter(network)
+    configure_device(setting, 5, DeviceSettings(cycle_ms=3))
     assert node.object_dictionary.read(0x6200, 0) == 3
-    assert [(item.index, item.before) for item in setting.changed] == [(0x6200, "0a00")]
+    assert [(item.index, item.before) for item in setting.changes] == [(0x6200, "0a00")]
 
 
 def test_a_device_without_a_node_id_is_given_one(bus, network):
@@ -215,7 +216,7 @@ def encoder_with(mapping, **changed):
     }
     for place, (index, subindex, bits) in enumerate(mapping, 1):
         objects[0x1A00, place] = (index << 16 | subindex << 8 | bits, 4)
-    return described(Listed(objects), 5)
+    return describe_device(Listed(objects), 5)
 
 
 def test_a_mapping_that_cannot_be_read_is_said():
@@ -252,14 +253,14 @@ def test_a_height_now_is_one_in_any_unit(unit, digits):
         (0x6131, 1): (unit, 4),
         (0x6132, 1): (digits, 1),
     }
-    device = described(Listed(objects), 5)
+    device = describe_device(Listed(objects), 5)
     mapped = device.pdos[0].mapped[0]
     metre = si_conversion(mapped.meaning.unit, Dimension.LENGTH).factor
     raw = round(0.25 / (metre * mapped.meaning.scale))
     (made,) = [
         message
         for message in cantools.database.load_string(
-            dbc_text([device], (), Origin(0.412, 0.25, is_reversed=False))
+            dbc_text([device], (), HeightZero(0.412, 0.25, is_reversed=False))
         ).messages
         if message.name == "NODE_5_TPDO1"
     ]
@@ -274,7 +275,7 @@ def test_a_real_of_no_size_is_no_number():
         (0x1A00, 0): (1, 1),
         (0x1A00, 1): (0x61300110, 4),
     }
-    device = described(Listed(objects), 5)
+    device = describe_device(Listed(objects), 5)
     assert not device.pdos[0].mapped[0].meaning.is_float
     assert "NODE_5_TPDO1" in dbc_text([device], ())
 
@@ -286,7 +287,7 @@ def test_the_bridge_gives_way_to_a_sensor_with_one_of_its_ids():
         (0x1A00, 0): (1, 1),
         (0x1A00, 1): (0x60040020, 4),
     }
-    text = dbc_text([described(Listed(objects), 5)], ())
+    text = dbc_text([describe_device(Listed(objects), 5)], ())
     by_name = {item.name: item for item in cantools.database.load_string(text).messages}
     assert by_name["NODE_5_TPDO1"].frame_id == 0x110
     assert by_name["RIG_ESTIMATE"].frame_id not in (0x110, 0x111)

@@ -27,7 +27,7 @@ def make_run(folder, count=COUNT):
 def serving(*folders, models=None, token=None):
     """A server on a free port."""
     server = ViewServer(folders, models or {}, 0, token)
-    thread = server.serving()
+    thread = server.start_thread()
     try:
         yield server
     finally:

@@ -3,6 +3,7 @@
 import copy
 import http.client
 import json
+import re
 import shutil
 import socket
 from types import SimpleNamespace
@@ -42,6 +43,18 @@ def test_the_page_is_whole_and_needs_no_other_host(server):
     for name in ("uPlot.iife.js", "uPlot.min.css", "charts.js", "page.js", "page.css"):
         assert name.encode() in page
         assert get(server, f"/{name}")[0] == 200 or name == "charts.css"
+
+
+def test_the_columns_of_its_plots_are_the_log_s(server):
+    _, _, page = get(server, "/")
+    table = json.loads(re.search(r'id="table">(.*?)</script>', page.decode())[1])
+    names = [
+        f"{STRUT}.{curve['column']}" if curve["is_of_strut"] else curve["column"]
+        for curve in table["curves"]
+    ]
+    # A bench that sends no force of a load cell has no such column.
+    plotted = {*names, *table["state"]["columns"]} - {"strut_force_n"}
+    assert plotted <= set(described(server)[0]["columns"])
 
 
 def test_it_listens_on_loopback_only(server):

@@ -48,18 +48,18 @@ const Charts = (() => {
     value: (_u, v) => `${number(v)}${item.unit ? ` ${item.unit}` : ""}`,
   });
 
-  const width = (place) => Math.max(200, Math.floor(place.clientWidth));
-  const height = (place) => parseInt(getComputedStyle(place).getPropertyValue("--height"), 10);
+  const width = (element) => Math.max(200, Math.floor(element.clientWidth));
+  const height = (element) => parseInt(getComputedStyle(element).getPropertyValue("--height"), 10);
 
-  const sizeOf = (place) => ({ width: width(place), height: height(place) });
+  const sizeOf = (element) => ({ width: width(element), height: height(element) });
 
-  // A chart follows the width of its place, at the height that the place's style names; its legend
+  // A chart follows the width of its element, at the height in the element’s style; its legend
   // stands below.
-  const fitted = (place, chart) => {
+  const followWidth = (element, chart) => {
     const observer = new ResizeObserver(() => {
-      if (chart.width !== width(place) && !matchMedia("print").matches) chart.setSize(sizeOf(place));
+      if (chart.width !== width(element) && !matchMedia("print").matches) chart.setSize(sizeOf(element));
     });
-    observer.observe(place);
+    observer.observe(element);
     return () => {
       observer.disconnect();
       chart.destroy();
@@ -92,11 +92,11 @@ const Charts = (() => {
   };
 
   // Lines over a common axis. `onSelect` is given the ends of a stretch that was drawn.
-  function lines(place, spec) {
+  function lines(element, spec) {
     const chart = new uPlot(
       {
-        width: width(place),
-        height: height(place),
+        width: width(element),
+        height: height(element),
         padding: [8, 12, 0, 0],
         cursor: {
           sync: spec.sync ? { key: spec.sync } : undefined,
@@ -132,16 +132,16 @@ const Charts = (() => {
         },
       },
       [[], ...spec.series.map(() => [])],
-      place,
+      element,
     );
-    place.querySelector(".u-series").classList.add("abscissa");
+    element.querySelector(".u-series").classList.add("abscissa");
     spec.named?.forEach((isNamed, i) => {
-      place.querySelectorAll(".u-series")[i + 1].hidden = !isNamed;
+      element.querySelectorAll(".u-series")[i + 1].hidden = !isNamed;
     });
     if (spec.onReset) chart.over.addEventListener("dblclick", spec.onReset);
     return {
       chart,
-      destroy: fitted(place, chart),
+      destroy: followWidth(element, chart),
       set(data, begin, end) {
         chart.batch(() => {
           chart.setData(data, begin === undefined);
@@ -209,14 +209,14 @@ const Charts = (() => {
     return [low - margin, high + margin];
   };
 
-  // Points and curves in a plane; every series has abscissae of its own.
-  function plane(place, spec) {
+  // Points and curves in a plane; every series has its own abscissae.
+  function plane(element, spec) {
     let data = spec.series.map(() => [[], []]);
     const chart = new uPlot(
       {
         mode: 2,
-        width: width(place),
-        height: height(place),
+        width: width(element),
+        height: height(element),
         padding: [8, 12, 0, 0],
         cursor: { drag: { x: false, y: false }, points: { show: false } },
         legend: { live: false },
@@ -239,18 +239,18 @@ const Charts = (() => {
         ],
       },
       [null, ...data],
-      place,
+      element,
     );
     return {
       chart,
-      destroy: fitted(place, chart),
+      destroy: followWidth(element, chart),
       set(pairs) {
         data = pairs;
         // In this mode uPlot counts the points of the data before: without any it draws nothing.
         chart.setData([null, ...pairs], false);
         chart.setData([null, ...pairs]);
-        // What is not there needs no place in the legend.
-        place.querySelectorAll(".u-series").forEach((entry, i) => {
+        // An empty series has no entry in the legend.
+        element.querySelectorAll(".u-series").forEach((entry, i) => {
           entry.hidden = pairs[i][0].length === 0;
         });
       },
@@ -267,7 +267,7 @@ const Charts = (() => {
   };
 
   // Cells of a plane by their middles; `z` row by row, null where there is nothing.
-  function cells(place, spec, xs, ys, z) {
+  function cells(element, spec, xs, ys, z) {
     const half = (list) => 0.5 * (list[1] - list[0]);
     const [dx, dy] = [half(xs), half(ys)];
     const fill = (u) => {
@@ -283,8 +283,8 @@ const Charts = (() => {
     };
     const chart = new uPlot(
       {
-        width: width(place),
-        height: height(place),
+        width: width(element),
+        height: height(element),
         title: spec.title,
         padding: [8, 12, 0, 0],
         cursor: { drag: { x: false, y: false }, points: { show: false } },
@@ -298,9 +298,9 @@ const Charts = (() => {
         series: [{}, { show: false }],
       },
       [xs, xs.map(() => null)],
-      place,
+      element,
     );
-    return { chart, destroy: fitted(place, chart), redraw: () => chart.redraw(false, true) };
+    return { chart, destroy: followWidth(element, chart), redraw: () => chart.redraw(false, true) };
   }
 
   const steps = uPlot.paths.stepped({ align: 1 });

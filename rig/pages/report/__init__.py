@@ -1,4 +1,4 @@
-"""The report: one page, without network, that says what was found and shows why."""
+"""The report of a diagnosis: one page without network, with the result and its evidence."""
 
 from rig.pages.report.page import page, write_report
 from rig.pages.report.words import sentence

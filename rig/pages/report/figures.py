@@ -1,4 +1,4 @@
-"""The plots of a report: panels of lines, points and cells, as the page's script draws them."""
+"""Plots of a report: panels of lines, points and cells, as the page's script draws them."""
 
 import base64
 import json
@@ -9,6 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rig.diagnosis.outcome import Array, FittedSeries, HeldOutSeries, NoiseFloor
+from rig.pages.plotted_quantities import (
+    FREQUENCY,
+    HEIGHT,
+    RESIDUAL_DENSITY,
+    RESIDUAL_FORCE,
+    STRUT_FORCE,
+    TIME,
+    VELOCITY,
+)
 from rig.pages.report.series import Joined, cloud, envelope, excerpt, join, spectrum, surface
 
 _LONGEST_MARK = 60
@@ -18,8 +27,8 @@ _FLOOR_BAND = f"grey: ±{_WIDE_SIGMA:.0f} × noise floor"
 _DECADES = 5.0
 
 
-class Curve(NamedTuple):
-    """What is shown, and how where it lies beside what was measured.
+class LineStyle(NamedTuple):
+    """Name and look of a line.
 
     Attributes:
         name: Its name in the legend.
@@ -36,10 +45,10 @@ class Curve(NamedTuple):
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers and in grey print.
 _BOTH = (
-    Curve("before: nominal model", "--before", (), 1.6),
-    Curve("after: corrected model", "--after", (4, 3), 1.6),
+    LineStyle("before: nominal model", "--before", (), 1.6),
+    LineStyle("after: corrected model", "--after", (4, 3), 1.6),
 )
-_MEASURED = Curve("measured", "--measured", (), 3.2)
+_MEASURED = LineStyle("measured", "--measured", (), 3.2)
 
 
 class Panel(NamedTuple):
@@ -47,12 +56,12 @@ class Panel(NamedTuple):
 
     Attributes:
         kind: ``lines`` over a common abscissa, ``points`` in a plane, or ``cells`` of one.
-        x_label: What the abscissa is, with its unit.
-        y_label: The same of the ordinate.
+        x_label: Label of the abscissa, with its unit.
+        y_label: Label of the ordinate, with its unit.
         x: The common abscissa, shape (N,); that of the cells' middles for ``cells``.
-        curves: How each is shown.
+        curves: Style of each line.
         values: Ordinates of each curve, shape (N,); the cells' values, row by row, for ``cells``.
-        extra: What else the page's script is given: `title`, `reach` of a grey band about zero,
+        extra: Further options of the page's script: `title`, `reach` of a grey band about zero,
             `marks` where recordings begin, `log` for both axes, `y_range`, `gaps` that are bridged,
             `steps` of a histogram, and `largest` and `y` of the cells.
     """
@@ -61,7 +70,7 @@ class Panel(NamedTuple):
     x_label: str
     y_label: str
     x: Array
-    curves: Sequence[Curve]
+    curves: Sequence[LineStyle]
     values: Sequence[Array]
     extra: dict[str, Any]
 
@@ -72,10 +81,10 @@ class Plot(NamedTuple):
     Attributes:
         key: Unique name in the page.
         title: Heading.
-        caption: What is seen, and how it is read.
+        caption: What the plot shows, and how it is read.
         panels: Labels of the panels.
-        columns: How many panels stand beside one another.
-        json: What the page's script draws, safe inside a script element.
+        columns: Number of panels in a row.
+        json: Input of the page's script, safe inside a script element.
     """
 
     key: str
@@ -86,13 +95,13 @@ class Plot(NamedTuple):
     json: str
 
 
-def curves(*, corrected: bool) -> tuple[Curve, ...]:
-    """What is shown: before and after, or the nominal model where nothing was corrected."""
+def curves(*, corrected: bool) -> tuple[LineStyle, ...]:
+    """Lines before and after, or of the nominal model alone where nothing was corrected."""
     return _BOTH if corrected else _BOTH[:1]
 
 
 def residual_plot(
-    key: str, series: Sequence[FittedSeries], shown: Sequence[Curve], points: int
+    key: str, series: Sequence[FittedSeries], shown: Sequence[LineStyle], points: int
 ) -> Plot:
     """Residual force against height, velocity, time and frequency.
 
@@ -104,7 +113,7 @@ def residual_plot(
     """
     joined = _residuals(series)
     over_time = _over_time(
-        joined, list(joined.values.T[2:4]), shown, points, "residual force / N", _reach_n(joined)
+        joined, joined.values.T[2:4], shown, points, RESIDUAL_FORCE.report_label, _reach_n(joined)
     )
     panels = [*_clouds(joined, shown, points), over_time, *_spectra(series, shown)]
     caption = (
@@ -116,34 +125,36 @@ def residual_plot(
     return plot(key, "Residual force", caption, panels, 2)
 
 
-def left_plot(key: str, series: Sequence[FittedSeries], points: int) -> Plot:
+def corrected_residual_plot(key: str, series: Sequence[FittedSeries], points: int) -> Plot:
     """Residual force of the corrected model against height and velocity, at its own scale."""
     panels = _clouds(_residuals(series), _BOTH, points, first=1)
     caption = (
-        "The residual force after the correction, at its own scale: a pattern here is something "
-        f"that is still missing, an even band is noise ({_SMOOTHED_BAND})."
+        "The residual force after the correction, at its own scale: a pattern here is a force that "
+        f"is still missing, an even band is noise ({_SMOOTHED_BAND})."
     )
     return plot(key, "Residual force of the corrected model", caption, panels, 2)
 
 
-def surface_plot(key: str, series: Sequence[FittedSeries], shown: Sequence[Curve]) -> Plot | None:
+def surface_plot(
+    key: str, series: Sequence[FittedSeries], shown: Sequence[LineStyle]
+) -> Plot | None:
     """Restoring-force surface, or None if nothing moves."""
-    found = surface(series)
-    if found is None:
+    mean = surface(series)
+    if mean is None:
         return None
-    forces = (found.before_n, found.after_n)[: len(shown)]
+    forces = (mean.before_n, mean.after_n)[: len(shown)]
     largest = max(_largest(force) for force in forces) or 1.0
     panels = [
         Panel(
             "cells",
-            "height / mm",
-            "velocity / (m/s)",
-            found.height_m * 1e3,
+            HEIGHT.report_label,
+            VELOCITY.report_label,
+            mean.height_m * HEIGHT.report_factor,
             (curve,),
             (force.ravel(),),
             {
                 "title": curve.name,
-                "y": _packed(found.velocity_m_per_s),
+                "y": _base64_floats(mean.velocity_m_per_s),
                 "largest": largest,
             },
         )
@@ -151,8 +162,8 @@ def surface_plot(key: str, series: Sequence[FittedSeries], shown: Sequence[Curve
     ]
     caption = (
         f"Mean residual force over height and velocity: blue pushes the bodies apart, up to "
-        f"{largest:.3g} N, red pulls them together. A cell is left empty where it holds fewer than "
-        f"{found.least_count} samples: there the recordings say nothing."
+        f"{largest:.3g} N, red pulls them together. A cell is empty where it holds fewer than "
+        f"{mean.least_count} samples: the recordings hardly reach it."
     )
     return plot(key, "Restoring-force surface", caption, panels, len(shown))
 
@@ -161,7 +172,7 @@ def held_out_plot(
     key: str,
     series: Sequence[HeldOutSeries],
     floor: NoiseFloor,
-    shown: Sequence[Curve],
+    shown: Sequence[LineStyle],
     points: int,
 ) -> Plot:
     """Held-out heights of a free run, or forces along a prescribed motion, and their errors.
@@ -174,9 +185,9 @@ def held_out_plot(
         points: Points of a line.
     """
     of_force = series[0].unit == "N"
-    scale, unit, reach = 1e3, "height / mm", floor.height_rmse_m
-    if of_force:
-        scale, unit, reach = 1.0, "strut force / N", floor.residual_force_rmse_n
+    quantity = STRUT_FORCE if of_force else HEIGHT
+    reach = floor.residual_force_rmse_n if of_force else floor.height_rmse_m
+    scale, label = quantity.report_factor, quantity.report_label
     worst = max(series, key=lambda item: _largest(item.before - item.measured))
     part = excerpt(worst)
     # An envelope is of a series over time, and would tear a loop.
@@ -187,19 +198,19 @@ def held_out_plot(
     panels: list[Panel] = []
     if of_force:
         against = [
-            ("velocity / (m/s)", worst.velocity_m_per_s),
-            ("height / mm", 1e3 * worst.height_m),
+            (VELOCITY.report_label, worst.velocity_m_per_s),
+            (HEIGHT.report_label, HEIGHT.report_factor * worst.height_m),
         ]
-        panels += [Panel("loops", title, unit, x[thin], both, values, {}) for title, x in against]
-    panels.append(Panel("lines", "time / s", unit, worst.t_s[thin], both, values, {}))
+        panels += [Panel("loops", title, label, x[thin], both, values, {}) for title, x in against]
+    panels.append(Panel("lines", TIME.report_label, label, worst.t_s[thin], both, values, {}))
     errors = [
         scale * np.column_stack([run.before - run.measured, run.after - run.measured])
         for run in series
     ]
-    joined, title = join(series, errors), unit.replace(" /", " error /")
+    joined, title = join(series, errors), label.replace(" /", " error /")
     for first in range(len(shown)):
-        # The last panel shows the last curve alone, at its own scale, where it can be judged.
-        columns = list(joined.values.T[first : len(shown)])
+        # The last panel shows the last curve alone, at a scale at which it can be read.
+        columns = joined.values.T[first : len(shown)]
         wide = _WIDE_SIGMA * scale * reach
         panels.append(_over_time(joined, columns, shown[first:], points, title, wide))
     what = (
@@ -221,7 +232,8 @@ def _residuals(series: Sequence[FittedSeries]) -> Joined:
     columns: list[Array] = []
     for run in series:
         residuals = run.residual_before_n, run.residual_after_n, run.residual_std_n
-        columns.append(np.column_stack([run.height_m * 1e3, run.velocity_m_per_s, *residuals]))
+        height = run.height_m * HEIGHT.report_factor
+        columns.append(np.column_stack([height, run.velocity_m_per_s, *residuals]))
     return join(series, columns)
 
 
@@ -230,42 +242,41 @@ def _reach_n(joined: Joined) -> float:
     return _WIDE_SIGMA * float(np.median(finite)) if len(finite) else 0.0
 
 
-def _clouds(joined: Joined, shown: Sequence[Curve], points: int, *, first: int = 0) -> list[Panel]:
+def _clouds(
+    joined: Joined, shown: Sequence[LineStyle], points: int, *, first: int = 0
+) -> list[Panel]:
     there = np.flatnonzero(np.all(np.isfinite(joined.values[:, :4]), axis=1))
     panels: list[Panel] = []
-    for column, title in enumerate(("height / mm", "velocity / (m/s)")):
+    for column, quantity in enumerate((HEIGHT, VELOCITY)):
         against = joined.values[:, column]
         kept = there[cloud(against[there], joined.values[there, 2:4], points // 2)]
         values = [joined.values[kept, 2 + index] for index in range(first, len(shown))]
         extra = {"reach": _finite(_reach_n(joined))}
-        panels.append(
-            Panel(
-                "points", title, "residual force / N", against[kept], shown[first:], values, extra
-            )
-        )
+        labels = quantity.report_label, RESIDUAL_FORCE.report_label
+        panels.append(Panel("points", *labels, against[kept], shown[first:], values, extra))
     return panels
 
 
-def _spectra(series: Sequence[FittedSeries], shown: Sequence[Curve]) -> list[Panel]:
-    found = spectrum(series)
-    if found is None:
+def _spectra(series: Sequence[FittedSeries], shown: Sequence[LineStyle]) -> list[Panel]:
+    mean = spectrum(series)
+    if mean is None:
         return []
-    densities = (found.before_n_per_sqrt_hz, found.after_n_per_sqrt_hz)[: len(shown)]
+    densities = (mean.before_n_per_sqrt_hz, mean.after_n_per_sqrt_hz)[: len(shown)]
     extra: dict[str, Any] = {"log": True}
     highest = max(_largest(density) for density in densities)
     if highest > 0.0:
         # Far below the peak, a smoothed residual only shows the smoother's own roll-off.
         top = math.log10(highest) + 0.3
         extra["y_range"] = [10.0 ** (top - _DECADES), 10.0**top]
-    label = "residual force / (N/√Hz)"
+    labels = FREQUENCY.report_label, RESIDUAL_DENSITY.report_label
     thin = [_thin(curve) for curve in shown]
-    return [Panel("lines", "frequency / Hz", label, found.frequency_hz, thin, densities, extra)]
+    return [Panel("lines", *labels, mean.frequency_hz, thin, densities, extra)]
 
 
 def _over_time(
     joined: Joined,
-    columns: Sequence[Array],
-    shown: Sequence[Curve],
+    columns: Sequence[Array] | Array,
+    shown: Sequence[LineStyle],
     points: int,
     label: str,
     reach: float,
@@ -284,7 +295,7 @@ def _over_time(
         ]
     return Panel(
         "lines",
-        f"time / s{' (one after another)' if several else ''}",
+        f"{TIME.report_label}{' (one after another)' if several else ''}",
         label,
         joined.t_s[kept],
         [_thin(curve) for curve in shown],
@@ -293,8 +304,8 @@ def _over_time(
     )
 
 
-def _thin(curve: Curve) -> Curve:
-    return curve._replace(dash=(), width=1.1)
+def _thin(style: LineStyle) -> LineStyle:
+    return style._replace(dash=(), width=1.1)
 
 
 def _finite(reach: float) -> float:
@@ -306,13 +317,13 @@ def _largest(values: Array) -> float:
     return float(np.max(finite)) if len(finite) else 0.0
 
 
-def _packed(values: Array) -> str:
+def _base64_floats(values: Array) -> str:
     # Half the bytes, and still far more digits than a screen has pixels.
     return base64.b64encode(values.astype("<f4").tobytes()).decode("ascii")
 
 
 def plot(key: str, title: str, caption: str, panels: Sequence[Panel], columns: int) -> Plot:
-    """A figure of panels, `columns` of them beside one another."""
+    """A figure of panels, `columns` of them in a row."""
     drawn = [
         {
             "kind": panel.kind,
@@ -320,7 +331,7 @@ def plot(key: str, title: str, caption: str, panels: Sequence[Panel], columns: i
             "yLabel": panel.y_label,
             "x": base64.b64encode(panel.x.astype("<f8").tobytes()).decode("ascii"),
             "curves": [curve._asdict() for curve in panel.curves],
-            "values": [_packed(values) for values in panel.values],
+            "values": [_base64_floats(values) for values in panel.values],
             **panel.extra,
         }
         for panel in panels

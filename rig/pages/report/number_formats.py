@@ -1,4 +1,4 @@
-"""Numbers as an engineer writes them: unit, prefix, and no more digits than are known."""
+"""Numbers as an engineer writes them: unit, prefix, and no more digits than are certain."""
 
 import math
 
@@ -8,14 +8,14 @@ from rig.diagnosis.outcome import BeforeAfter, Estimate
 _THIN_SPACE = "\u202f"
 _NO_BREAK = "\u00a0"
 _MINUS = "\u2212"
-_UNBOUNDED = "not bounded by these data"
+_NOT_IDENTIFIABLE = "not identifiable from these data"
 _PREFIXES = ((1.0, 1.0, ""), (1e-3, 1e3, "m"), (0.0, 1e6, "µ"))
 _OF_UNIT = str.maketrans({"·": "_", "²": "2", "³": "3", "°": "", "^": "", ".": "_"})
 _SPELLED = {"coulomb": "Coulomb", "stribeck": "Stribeck"}
 
 
 def number(value: float, decimals: int) -> str:
-    """A number with so many decimals (negative: rounded before the point) and thin spaces."""
+    """A number with thin spaces; with negative `decimals` it is rounded before the point."""
     text = f"{round(value, decimals):,.{max(decimals, 0)}f}".replace(",", _THIN_SPACE)
     return text.replace("-", _MINUS)
 
@@ -26,7 +26,7 @@ def decimals_of(uncertainty: float) -> int:
 
 
 def scale_of(largest: float, unit: str) -> tuple[float, str]:
-    """Factor and unit in which a value is best read; only lengths and times have prefixes."""
+    """Factor and unit in which to show a value; only lengths and times have prefixes."""
     if unit not in {"m", "s"} or largest == 0.0:
         return 1.0, unit
     factor, prefix = next(
@@ -40,13 +40,13 @@ def quantity(value: float, unit: str) -> str:
     if not math.isfinite(value):
         return "–"
     factor, name = scale_of(abs(value), unit)
-    shown = value * factor
-    if shown == 0.0:
+    scaled = value * factor
+    if scaled == 0.0:
         return _with_unit("0", unit)
-    if not 1e-3 <= abs(shown) < 1e7:
-        return _with_unit(f"{shown:.2e}".replace("-", _MINUS), name)
-    decimals = 2 - math.floor(math.log10(abs(shown)))
-    return _with_unit(number(shown, decimals), name)
+    if not 1e-3 <= abs(scaled) < 1e7:
+        return _with_unit(f"{scaled:.2e}".replace("-", _MINUS), name)
+    decimals = 2 - math.floor(math.log10(abs(scaled)))
+    return _with_unit(number(scaled, decimals), name)
 
 
 def _with_unit(text: str, unit: str) -> str:
@@ -54,19 +54,22 @@ def _with_unit(text: str, unit: str) -> str:
 
 
 def value_and_interval(estimate: Estimate, unit: str) -> tuple[str, str]:
-    """Value and 95 % interval with the digits that the interval allows."""
+    """Value and 95 % interval with the digits that the interval justifies."""
     plain = quantity(estimate.value, unit)
     low, high = (math.nan if end is None else end for end in (estimate.low, estimate.high))
     if math.isfinite(low) != math.isfinite(high):
         is_low = math.isfinite(low)
         side, end = ("above", "upper") if is_low else ("below", "lower")
-        return plain, f"{side} {quantity(low if is_low else high, unit)}, {end} end {_UNBOUNDED}"
+        return (
+            plain,
+            f"{side} {quantity(low if is_low else high, unit)}, {end} end {_NOT_IDENTIFIABLE}",
+        )
     if not (math.isfinite(low) and low < high):
-        return plain, _UNBOUNDED
+        return plain, _NOT_IDENTIFIABLE
     factor, name = scale_of(abs(estimate.value), unit)
     # A value far smaller than its interval keeps its digits too, or it would be shown as zero.
-    known = 0.5 * (high - low)
-    decimals = decimals_of(min(known, abs(estimate.value) or known) * factor)
+    half = 0.5 * (high - low)
+    decimals = decimals_of(min(half, abs(estimate.value) or half) * factor)
     if not -7 < decimals < 7:
         return plain, f"{quantity(low, unit)} to {quantity(high, unit)}"
     value, low_text, high_text = (number(x * factor, decimals) for x in (estimate.value, low, high))
@@ -74,7 +77,7 @@ def value_and_interval(estimate: Estimate, unit: str) -> tuple[str, str]:
 
 
 def ratio(value: float, reference: float) -> str:
-    """How many times the reference; a dash where that has no meaning."""
+    """Value over a reference; a dash where that has no meaning."""
     if not (reference > 0.0 and math.isfinite(value)):
         return "–"
     return f"{times(value / reference)}{_NO_BREAK}×"
@@ -90,14 +93,14 @@ def times(factor: float) -> str:
 
 
 def change(figure: BeforeAfter) -> str:
-    """Change from before to after in per cent."""
+    """Change from before to after, in per cent."""
     if not (figure.before > 0.0 and math.isfinite(figure.after)):
         return "–"
-    left = figure.after / figure.before
-    # Whole per cent, but near -100 % as many decimals as tell how much is left.
-    decimals = -math.floor(math.log10(100.0 * left)) if 0.0 < left < 0.05 else 0
-    sign = "+" if left > 1.0 else ""
-    return f"{sign}{number(100.0 * (left - 1.0), min(max(decimals, 0), 4))}{_NO_BREAK}%"
+    share = figure.after / figure.before
+    # Whole per cent, but near -100 % as many decimals as show the remaining share.
+    decimals = -math.floor(math.log10(100.0 * share)) if 0.0 < share < 0.05 else 0
+    sign = "+" if share > 1.0 else ""
+    return f"{sign}{number(100.0 * (share - 1.0), min(max(decimals, 0), 4))}{_NO_BREAK}%"
 
 
 def percent(share: float | None, decimals: int) -> str:
@@ -108,7 +111,7 @@ def percent(share: float | None, decimals: int) -> str:
 
 
 def label(parameter: Parameter) -> str:
-    """Name of a parameter in words, its unit taken off."""
+    """Name of a parameter in words, without its unit."""
     unit = parameter.unit.lower().translate(_OF_UNIT)
     unit = "per_" + unit[2:] if unit.startswith("1/") else unit.replace("/", "_per_")
     stem = parameter.name.removesuffix(f"_{unit}") if unit else parameter.name

@@ -8,36 +8,36 @@ const drawnPanels = [];
 // Paper is narrower than the window: charts are drawn again at the width of its columns.
 const PAPER = { whole: 690, half: 335, height: 205, low: 165 };
 
-function draw(place, panel) {
+function draw(element, panel) {
   const x = unpacked(panel.x, Float64Array);
   const values = panel.values.map((text) => unpacked(text));
   const series = panel.curves.map((curve) => ({ ...curve, label: curve.name, dash: curve.dash.length ? curve.dash : undefined, dots: panel.kind === "points", spanGaps: panel.gaps, paths: panel.steps ? Charts.steps : undefined }));
   const [name, unit] = panel.xLabel.split(" / ");
   const spec = { ...panel, series, xName: name, xUnit: unit };
-  if (panel.kind === "cells") return Charts.cells(place, spec, x, unpacked(panel.y), values[0]);
+  if (panel.kind === "cells") return Charts.cells(element, spec, x, unpacked(panel.y), values[0]);
   if (panel.kind === "lines") {
-    const chart = Charts.lines(place, { ...spec, logX: panel.log, logY: panel.log, rangeY: panel.y_range });
+    const chart = Charts.lines(element, { ...spec, logX: panel.log, logY: panel.log, rangeY: panel.y_range });
     chart.set([x, ...values]);
     return chart;
   }
-  const chart = Charts.plane(place, spec);
+  const chart = Charts.plane(element, spec);
   chart.set(values.map((y) => [x, y]));
   return chart;
 }
 
 for (const data of document.querySelectorAll("script[data-plot]")) {
-  const places = document.getElementById(data.dataset.plot).querySelectorAll(".chart");
-  const half = places[0].parentElement.classList.contains("panels2");
-  JSON.parse(data.textContent).forEach((panel, i) => drawnPanels.push({ half, place: places[i], ...draw(places[i], panel) }));
+  const elements = document.getElementById(data.dataset.plot).querySelectorAll(".chart");
+  const half = elements[0].parentElement.classList.contains("panels2");
+  JSON.parse(data.textContent).forEach((panel, i) => drawnPanels.push({ half, element: elements[i], ...draw(elements[i], panel) }));
 }
 window.addEventListener("beforeprint", () => {
-  for (const { chart, half, place } of drawnPanels) {
-    const height = place.classList.contains("low") ? PAPER.low : PAPER.height;
+  for (const { chart, half, element } of drawnPanels) {
+    const height = element.classList.contains("low") ? PAPER.low : PAPER.height;
     chart.setSize({ width: half ? PAPER.half : PAPER.whole, height });
   }
 });
 window.addEventListener("afterprint", () => {
-  for (const { chart, place } of drawnPanels) chart.setSize(Charts.sizeOf(place));
+  for (const { chart, element } of drawnPanels) chart.setSize(Charts.sizeOf(element));
 });
 // A table that is wider than the screen is scrolled by keyboard too.
 for (const table of document.querySelectorAll("main table")) {

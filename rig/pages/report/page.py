@@ -1,24 +1,18 @@
-"""The page of a report."""
+"""The page of a diagnosis."""
 
-import base64
-import hashlib
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-from can_dbc.atomic_file import write_whole
-from can_dbc.errors import InputError
 from dart_model.effects import FAMILY_WORDS, effect
 from rig.diagnosis.outcome import Diagnosis, Result
-from rig.pages import charts
+from rig.pages.html import render_report, write_page
 from rig.pages.report import tables
 from rig.pages.report.figures import (
     Plot,
+    corrected_residual_plot,
     curves,
     held_out_plot,
-    left_plot,
     residual_plot,
     surface_plot,
 )
@@ -26,7 +20,6 @@ from rig.pages.report.number_formats import percent
 from rig.pages.report.series import check_series
 from rig.pages.report.words import BLOCKS, is_prescribed, sentence
 
-_HERE = Path(__file__).parent
 _POINTS = 4000
 _POINTS_OF_ALL = 24_000
 _FEWEST_POINTS = 600
@@ -42,13 +35,13 @@ _BADGES = {
 _ASSUMPTIONS = (
     "Height is the length of the strut; forces are positive where they push its two bodies apart.",
     "Gravity is that of the nominal model; a constant force shows as preload.",
-    "Spring, damper and effect act between the same two bodies, so only their sum can be seen: a "
-    "share is given to one of them because of the law it follows.",
-    "The sensors' noise is estimated from the data and taken as white; the noise floor is what it, "
-    "and the applied force's, would leave.",
-    "95 % intervals hold if the law that is named is the right one.",
-    "Held-out data took no part in the search, only their initial states are fitted. Laws without "
-    "which they are at the noise floor are taken back.",
+    "Spring, damper and effect act between the same two bodies, so only their sum is observable: a "
+    "share is attributed to one of them because of the law that it follows.",
+    "The noise of the sensors is estimated from the data and assumed to be white; the noise floor "
+    "is the RMS that this noise, with that of the applied force, causes with a right model.",
+    "95 % intervals hold if the named law is the right one.",
+    "Held-out data took no part in the search; only their initial states are fitted. Laws without "
+    "which the error on them is at the noise floor are removed.",
 )
 _SPLITS = {
     "runs": "Whole recordings were held out; they took no part in search and fit.",
@@ -63,8 +56,8 @@ def write_report(result: Result, path: Path) -> None:
     """Write the page as one file that needs no network.
 
     Args:
-        result: What it shows.
-        path: File to write; it is replaced at once, never left half written.
+        result: The result of the diagnosis.
+        path: File to write; it is replaced in one step, never left half written.
 
     Raises:
         InputError: The file cannot be written.
@@ -72,104 +65,72 @@ def write_report(result: Result, path: Path) -> None:
     write_page(page(result), path)
 
 
-def write_page(text: str, path: Path) -> None:
-    """Write a page, whole or not at all.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
-    try:
-        write_whole(path, text)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
-
-
-def render(template: str, **content: object) -> str:
-    """A page from its template, with the scripts and styles of its charts."""
-    scripts = [path.read_text("utf-8") for path in (*charts.SCRIPTS, _HERE / "page.js")]
-    environment = Environment(
-        loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    return environment.get_template(template).render(
-        styles=[path.read_text("utf-8") for path in (*charts.STYLES, _HERE / "page.css")],
-        scripts=scripts,
-        script_hashes=[_hash(script) for script in scripts],
-        **content,
-    )
-
-
 def page(result: Result) -> str:
-    """The page, the same for the same input.
+    """Text of the page, the same for the same input.
 
     Raises:
         ValueError: The series of `result` do not fit together.
     """
-    found = result.diagnosis
+    diagnosis = result.diagnosis
     for series in (*result.fitted, *result.held_out):
         check_series(series)
     struts = tuple(dict.fromkeys(item.strut for item in (*result.fitted, *result.held_out)))
-    tone, sign, badge = _BADGES[found.verdict]
-    return render(
+    tone, sign, badge = _BADGES[diagnosis.verdict]
+    return render_report(
         "page.html",
-        found=found,
-        sentence=sentence(found, len(struts)),
+        diagnosis=diagnosis,
+        sentence=sentence(diagnosis, len(struts)),
         tone=tone,
         sign=sign,
         badge=badge,
-        held_out=_held_out(found),
+        held_out=_held_out(diagnosis),
         struts=struts,
-        errors=tables.errors(found),
-        white=_white(found),
-        run_columns=tables.run_columns(found),
+        errors=tables.errors(diagnosis),
+        white=_white(diagnosis),
+        run_columns=tables.run_columns(diagnosis),
         run_cells=tables.run_cells,
-        linear=tables.linear(found),
-        effects=tables.effects(found),
-        existing=tables.existing(found),
-        nearest=next((item for item in found.rejected if item.left is not None), None),
+        linear=tables.linear(diagnosis),
+        effects=tables.effects(diagnosis),
+        existing=tables.existing(diagnosis),
+        nearest=next((item for item in diagnosis.rejected if item.left is not None), None),
         strut_plots=_plots(result, struts),
-        assumptions=_ASSUMPTIONS + (() if is_prescribed(found) else _OF_A_FREE_RUN),
+        assumptions=_ASSUMPTIONS + (() if is_prescribed(diagnosis) else _OF_A_FREE_RUN),
         capital=tables.capital,
         effect=effect,
         families=FAMILY_WORDS,
-        excitations=tables.listed_excitations,
+        excitations=tables.excitations,
         percent=percent,
         sources=result.sources,
-        split=_SPLITS[found.held_out.source],
+        split=_SPLITS[diagnosis.held_out.source],
         versions=[f"{name} {version(name)}" for name in _PACKAGES],
     )
 
 
-def _held_out(found: Diagnosis) -> str:
-    if found.held_out.source == "blocks":
+def _held_out(diagnosis: Diagnosis) -> str:
+    if diagnosis.held_out.source == "blocks":
         return BLOCKS
-    return ", ".join(run.run for run in found.held_out.runs) or "–"
+    return ", ".join(run.run for run in diagnosis.held_out.runs) or "–"
 
 
-def _white(found: Diagnosis) -> str:
-    white = found.residual_white
+def _white(diagnosis: Diagnosis) -> str:
+    white = diagnosis.residual_white
     text = (
         f"With the nominal model, the residual is {'' if white.before else 'not '}white by the test"
     )
-    if not _is_corrected(found):
+    if not _has_corrections(diagnosis):
         return f"{text}."
     after = f"the residual is {'' if white.after else 'not '}white by the test"
     return f"{text}; with the corrected model, {after}."
 
 
-def _is_corrected(found: Diagnosis) -> bool:
-    return bool(found.linear or found.effects or found.existing)
-
-
-def _hash(script: str) -> str:
-    digest = hashlib.sha256(script.encode("utf-8")).digest()
-    return f"sha256-{base64.b64encode(digest).decode('ascii')}"
+def _has_corrections(diagnosis: Diagnosis) -> bool:
+    return bool(diagnosis.linear or diagnosis.effects or diagnosis.existing)
 
 
 def _plots(result: Result, struts: Sequence[str]) -> tuple[tuple[str, list[Plot]], ...]:
     points = max(min(_POINTS, _POINTS_OF_ALL // max(len(struts), 1)), _FEWEST_POINTS)
-    corrected = _is_corrected(result.diagnosis)
-    shown = curves(corrected=corrected)
+    corrected = _has_corrections(result.diagnosis)
+    styles = curves(corrected=corrected)
     floor = result.diagnosis.noise_floor
     groups: list[tuple[str, list[Plot]]] = []
     for index, strut in enumerate(struts):
@@ -177,11 +138,11 @@ def _plots(result: Result, struts: Sequence[str]) -> tuple[tuple[str, list[Plot]
         held_out = [item for item in result.held_out if item.strut == strut]
         plots: list[Plot | None] = []
         if held_out:
-            plots.append(held_out_plot(f"held-out-{index}", held_out, floor, shown, points))
+            plots.append(held_out_plot(f"held-out-{index}", held_out, floor, styles, points))
         if fitted:
-            plots.append(residual_plot(f"residual-{index}", fitted, shown, points))
+            plots.append(residual_plot(f"residual-{index}", fitted, styles, points))
             if corrected:
-                plots.append(left_plot(f"left-{index}", fitted, points))
-            plots.append(surface_plot(f"surface-{index}", fitted, shown))
+                plots.append(corrected_residual_plot(f"left-{index}", fitted, points))
+            plots.append(surface_plot(f"surface-{index}", fitted, styles))
         groups.append((strut, [plot for plot in plots if plot is not None]))
     return tuple(groups)

@@ -1,4 +1,4 @@
-"""Long series made short enough to show, and what is computed from them.
+"""Long series thinned for display, and their spectra and surfaces.
 
 References:
     Welch, The use of fast Fourier transform for the estimation of power spectra, IEEE Trans.
@@ -28,7 +28,7 @@ _LEAST_EXCERPT_S = 1.0
 
 
 class Joined(NamedTuple):
-    """Recordings laid one after another, with a row of NaN between two; columns (N, columns)."""
+    """Recordings one after another, with a row of NaN between two; columns (N, columns)."""
 
     t_s: Array
     values: Array
@@ -56,10 +56,10 @@ class Surface(NamedTuple):
 
 
 def check_series(series: FittedSeries | HeldOutSeries) -> None:
-    """Check that the arrays of a series belong together.
+    """Check that the arrays of a series fit together.
 
     Raises:
-        ValueError: Times do not increase, or an array is not as long as they are.
+        ValueError: Times do not increase, or an array has another length than they.
     """
     where, shape = f"recording {series.run!r}, strut {series.strut!r}", series.t_s.shape
     if len(shape) != 1 or shape[0] < 2 or not bool(np.all(np.diff(series.t_s) > 0)):
@@ -71,7 +71,7 @@ def check_series(series: FittedSeries | HeldOutSeries) -> None:
 
 
 def join(series: Sequence[FittedSeries | HeldOutSeries], columns: Sequence[Array]) -> Joined:
-    """Lay recordings one after another; a single one keeps its own times.
+    """Recordings one after another; a single one keeps its times.
 
     Args:
         series: The recordings.
@@ -115,7 +115,7 @@ def envelope(values: Array, limit: int) -> Indices:
 
 
 def cloud(against: Array, values: Array, limit: int) -> Indices:
-    """Indices of about `limit` points of a scatter: spread evenly, and every extreme.
+    """Indices of about `limit` points of a scatter plot: evenly spread, and every extreme.
 
     Args:
         against: Abscissa, shape (N,).
@@ -128,14 +128,16 @@ def cloud(against: Array, values: Array, limit: int) -> Indices:
     # Steps of a sequence with low discrepancy do not beat with a periodic excitation.
     spread = np.floor(np.arange(limit // 2) * 0.6180339887498949 % 1.0 * count).astype(np.intp)
     order = np.argsort(against, kind="stable")
-    kept = [order[envelope(column[order], limit // (2 * values.shape[1]))] for column in values.T]
-    return np.unique(np.concatenate([spread, *kept]))
+    extremes = [
+        order[envelope(column[order], limit // (2 * values.shape[1]))] for column in values.T
+    ]
+    return np.unique(np.concatenate([spread, *extremes]))
 
 
 def spectrum(series: Sequence[FittedSeries]) -> Spectrum | None:
     """Welch spectra of the residual, averaged over recordings; None if all are too short."""
     step_s = max(float(np.median(np.diff(item.t_s))) for item in series)
-    runs = [_resampled(item, step_s) for item in series]
+    runs = [_resample(item, step_s) for item in series]
     runs = [run for run in runs if len(run) >= _SHORTEST_SEGMENT]
     if not runs:
         return None
@@ -143,17 +145,17 @@ def spectrum(series: Sequence[FittedSeries]) -> Spectrum | None:
     size = min(max(max(len(run) for run in runs) // _SEGMENTS, _SHORTEST_SEGMENT), shortest)
     size = min(size, _LONGEST_SEGMENT)
     # A constant part is the preload, which the other panels show; here it would leak.
-    found = [
+    densities = [
         cast("Any", signal).welch(run, 1.0 / step_s, nperseg=size, axis=0, detrend="constant")
         for run in runs
     ]
     weights = [len(run) for run in runs]
-    mean: Array = np.average([density for _, density in found], axis=0, weights=weights)
+    mean: Array = np.average([density for _, density in densities], axis=0, weights=weights)
     amplitude = np.sqrt(mean[1:])
-    return Spectrum(found[0][0][1:], amplitude[:, 0], amplitude[:, 1])
+    return Spectrum(densities[0][0][1:], amplitude[:, 0], amplitude[:, 1])
 
 
-def _resampled(item: FittedSeries, step_s: float) -> Array:
+def _resample(item: FittedSeries, step_s: float) -> Array:
     residuals = np.column_stack([item.residual_before_n, item.residual_after_n])
     there = np.all(np.isfinite(residuals), axis=1)
     if np.count_nonzero(there) < 2:
@@ -204,7 +206,7 @@ def _period_s(series: HeldOutSeries) -> float:
     if np.count_nonzero(there) < 2:
         return 0.0
     deviation = series.height_m[there] - np.mean(series.height_m[there])
-    # A crossing counts only after a real swing, so that noise about the mean does not.
+    # A crossing counts only after a swing of this size, so that noise about the mean does not.
     swing = 0.3 * float(np.std(deviation))
     side = np.sign(deviation[np.abs(deviation) > swing])
     crossings = int(np.count_nonzero(np.diff(side)))

@@ -1,4 +1,4 @@
-"""The tables of a report: text, ready to be shown."""
+"""Tables of a report, as texts."""
 
 import math
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from rig.pages.report.number_formats import (
 from rig.pages.report.words import LINEAR, difference, is_prescribed, linear_label, missing
 
 Row = tuple[str, ...]
-"""Cells of a row, ready to be shown."""
+"""Texts of the cells of a row."""
 
 
 class EffectTable(NamedTuple):
@@ -28,12 +28,12 @@ class EffectTable(NamedTuple):
     rows: tuple[Row, ...]
 
 
-def errors(found: Diagnosis) -> tuple[Row, ...]:
+def errors(diagnosis: Diagnosis) -> tuple[Row, ...]:
     """Name, before, after, change, noise floor and ratio of each error that was measured."""
-    held_out, floor = found.held_out, found.noise_floor
+    held_out, floor = diagnosis.held_out, diagnosis.noise_floor
     cell = "Strut force against the load cell"
-    if is_prescribed(found):
-        # The residual force is then what the load cell shows beyond the model.
+    if is_prescribed(diagnosis):
+        # The residual force is then the load cell's force less the model's.
         floor_n = floor.residual_force_rmse_n
         rows = ((f"{cell}, motion prescribed", held_out.strut_force_rmse_n, floor_n, "N"),)
     else:
@@ -49,9 +49,9 @@ def errors(found: Diagnosis) -> tuple[Row, ...]:
     )
 
 
-def run_columns(found: Diagnosis) -> Row:
-    """What `run_cells` shows of each run, before and after."""
-    return ("Height, free run", "Residual force", "Strut force")[2 * is_prescribed(found) :]
+def run_columns(diagnosis: Diagnosis) -> Row:
+    """Heads of the pairs of columns of `run_cells`."""
+    return ("Height, free run", "Residual force", "Strut force")[2 * is_prescribed(diagnosis) :]
 
 
 def run_cells(run: RunFigures, columns: int) -> Row:
@@ -66,20 +66,20 @@ def _pair(figure: BeforeAfter | None, unit: str) -> tuple[str, str]:
     return quantity(figure.before, unit), quantity(figure.after, unit)
 
 
-def linear(found: Diagnosis) -> tuple[Row, ...]:
+def linear(diagnosis: Diagnosis) -> tuple[Row, ...]:
     """Name, key, strut, nominal, value, interval and difference of each linear correction."""
     rows: list[Row] = []
-    for item in found.linear:
+    for item in diagnosis.linear:
         unit = LINEAR[item.parameter][1]
         values = quantity(item.nominal, unit), *value_and_interval(item.total, unit)
         rows.append((linear_label(item), item.parameter, item.strut, *values, difference(item)))
     return tuple(rows)
 
 
-def effects(found: Diagnosis) -> tuple[EffectTable, ...]:
-    """Effects that are missing, with their parameters."""
+def effects(diagnosis: Diagnosis) -> tuple[EffectTable, ...]:
+    """Missing effects, with their parameters."""
     tables: list[EffectTable] = []
-    for item in missing(found):
+    for item in missing(diagnosis):
         law = effect(item.name)
         note = (
             f"family {item.family}, strut {item.strut}, {quantity(item.force_rms_n, 'N')} RMS, "
@@ -89,12 +89,12 @@ def effects(found: Diagnosis) -> tuple[EffectTable, ...]:
     return tuple(tables)
 
 
-def existing(found: Diagnosis) -> tuple[EffectTable, ...]:
+def existing(diagnosis: Diagnosis) -> tuple[EffectTable, ...]:
     """Effects of the nominal model that the data change."""
     tables: list[EffectTable] = []
-    for item in found.existing:
+    for item in diagnosis.existing:
         law = effect(item.name)
-        superfluous = "superfluous: the data are as well explained without it"
+        superfluous = "superfluous: without it, the data are explained as well"
         note = f"strut {item.strut}, {'refitted' if item.change == 'refitted' else superfluous}"
         tables.append(EffectTable(law, note, _parameters(law, item.parameters, item.nominal)))
     return tuple(tables)
@@ -119,8 +119,8 @@ def _parameters(
     return tuple(rows)
 
 
-def listed_excitations(family: str) -> str:
-    """What a recording must contain for the laws of a family to be seen."""
+def excitations(family: str) -> str:
+    """Excitation that a recording needs for the laws of a family to be visible."""
     texts = {law.excitation: None for law in CATALOGUE.values() if law.family == family}
     return "; ".join(texts) or "–"
 

@@ -1,4 +1,4 @@
-"""What was found, said as a test engineer would say it."""
+"""Sentences about a diagnosis, in the words of a test engineer."""
 
 import math
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ LINEAR = {
     "input_gain": ("input gain", ""),
     "free_length_m": ("free length", "m"),
 }
-"""What a linear correction may correct, in words, and its unit."""
+"""Name and unit of each parameter that a linear correction may change."""
 
 _AS_EFFECT = {
     "added_mass": "mass_kg",
@@ -36,28 +36,28 @@ _AS_EFFECT = {
 BLOCKS = "blocks of the recordings, spread over them, were held out"
 
 
-def listed(items: Sequence[str], last: str) -> str:
-    """Items with commas, and a word before the last one."""
+def join_words(items: Sequence[str], last: str) -> str:
+    """Items separated by commas, with a word before the last one."""
     if len(items) < 2:
         return "".join(items)
     return f"{', '.join(items[:-1])} {last} {items[-1]}"
 
 
-def missing(found: Diagnosis) -> tuple[FoundEffect, ...]:
-    """Effects that are missing, without those that stand among the linear corrections too."""
-    linear = {(item.strut, item.parameter) for item in found.linear}
+def missing(diagnosis: Diagnosis) -> tuple[FoundEffect, ...]:
+    """Missing effects, without those that are also linear corrections."""
+    linear = {(item.strut, item.parameter) for item in diagnosis.linear}
     return tuple(
-        item for item in found.effects if (item.strut, _AS_EFFECT.get(item.name)) not in linear
+        item for item in diagnosis.effects if (item.strut, _AS_EFFECT.get(item.name)) not in linear
     )
 
 
-def is_prescribed(found: Diagnosis) -> bool:
+def is_prescribed(diagnosis: Diagnosis) -> bool:
     """Whether the motion is prescribed, so that there is no height error."""
-    return not math.isfinite(found.held_out.height_rmse_m.before)
+    return not math.isfinite(diagnosis.held_out.height_rmse_m.before)
 
 
 def difference(item: LinearCorrection) -> str:
-    """How far a linear correction goes: in per cent, or in its unit where that means nothing."""
+    """Size of a linear correction: in per cent, or in its unit where a share has no meaning."""
     change = item.total.value - item.nominal
     if change == 0.0 or not math.isfinite(change):
         return "as in the file"
@@ -70,74 +70,75 @@ def difference(item: LinearCorrection) -> str:
 
 
 def linear_label(item: LinearCorrection) -> str:
-    """Name of what is corrected, with the height about which it is taken."""
+    """Name of the corrected parameter, with the height to which it refers."""
     name, _ = LINEAR[item.parameter]
     if item.about_height_m is None:
         return name
     return f"{name} about mid-stroke ({number(item.about_height_m, 2)}\u00a0m)"
 
 
-def sentence(found: Diagnosis, struts: int) -> str:
-    """What was found, in one sentence.
+def sentence(diagnosis: Diagnosis, struts: int) -> str:
+    """The diagnosis in one sentence.
 
     Args:
-        found: The diagnosis.
-        struts: Number of struts in the model; with one, its name is not said.
+        diagnosis: The diagnosis.
+        struts: Number of struts in the model; with one, its name is left out.
     """
-    match found.verdict:
+    match diagnosis.verdict:
         case "nothing_missing":
-            name, _, before, change = _error(found)
-            if found.existing:
-                return f"Nothing is missing; with its own effects refitted, {name} goes {change}."
+            name, _, before, change = _error(diagnosis)
+            if diagnosis.existing:
+                return f"Nothing is missing; with its effects refitted, {name} goes {change}."
             return f"Nothing is missing: with the nominal model {name} is {before}."
         case "explained":
-            no_more = "" if missing(found) else "; nothing is missing"
-            return f"{_finding(found, struts)}{no_more}: {_error_falls(found)}"
+            no_more = "" if missing(diagnosis) else "; nothing is missing"
+            return f"{_finding(diagnosis, struts)}{no_more}: {_error_falls(diagnosis)}"
         case "partly_explained":
             return (
-                f"{_finding(found, struts)}, and there is something more that is not explained: "
-                f"{_error_falls(found)}"
+                f"{_finding(diagnosis, struts)}, and a part of the residual is not explained: "
+                f"{_error_falls(diagnosis)}"
             )
         case "ambiguous":
-            others = [FAMILY_WORDS[item] for item in found.ambiguous_with]
-            rivals = listed(others, "or") or "another effect that fits as well"
+            others = [FAMILY_WORDS[item] for item in diagnosis.ambiguous_with]
+            rivals = join_words(others, "or") or "another effect that fits as well"
+            hint, error = _excitation_hint(diagnosis), _error_falls(diagnosis, "the former")
             return (
-                f"{_finding(found, struts)}, or else {rivals}; these recordings cannot tell "
-                f"them apart{_what_would_tell(found)}; {_error_falls(found, 'the former')}"
+                f"{_finding(diagnosis, struts)}, or else {rivals}; these recordings do not "
+                f"distinguish them{hint}; {error}"
             )
         case "not_explained":
-            return _not_explained(found)
+            return _not_explained(diagnosis)
 
 
-def _finding(found: Diagnosis, struts: int) -> str:
-    lacking = missing(found)
+def _finding(diagnosis: Diagnosis, struts: int) -> str:
+    lacking = missing(diagnosis)
     if lacking:
-        effects = listed([_effect(item, struts) for item in lacking], "and")
-        return _one_interval(f"The model lacks {effects}{_besides(found, struts)}")
+        effects = join_words([_effect(item, struts) for item in lacking], "and")
+        return _one_interval(f"The model lacks {effects}{_corrections_clause(diagnosis, struts)}")
     parts: list[str] = []
-    if found.linear:
-        corrections = listed([_linear(item, struts) for item in found.linear], "and")
+    if diagnosis.linear:
+        corrections = join_words([_linear(item, struts) for item in diagnosis.linear], "and")
         parts.append(f"linear part is off: {corrections}")
-    parts += [f"effect “{item.name}” is {item.change}" for item in found.existing]
+    parts += [f"effect “{item.name}” is {item.change}" for item in diagnosis.existing]
     return _one_interval(f"The model's {'; its '.join(parts) or 'parameters are off'}")
 
 
-def _besides(found: Diagnosis, struts: int) -> str:
+def _corrections_clause(diagnosis: Diagnosis, struts: int) -> str:
     parts: list[str] = []
-    if found.linear:
+    if diagnosis.linear:
         offs = [
             f"{LINEAR[item.parameter][0]} {difference(item)}{_where(item.strut, struts)}"
-            for item in found.linear
+            for item in diagnosis.linear
         ]
         parts.append(f"linear corrections ({', '.join(offs)})")
-    if found.existing:
-        changes = [f"“{item.name}” {item.change}" for item in found.existing]
-        parts.append(f"changes of its own effects ({', '.join(changes)})")
-    return f", besides {listed(parts, 'and')}" if parts else ""
+    if diagnosis.existing:
+        changes = [f"“{item.name}” {item.change}" for item in diagnosis.existing]
+        parts.append(f"changes of its effects ({', '.join(changes)})")
+    return f", in addition to {join_words(parts, 'and')}" if parts else ""
 
 
 def _one_interval(text: str) -> str:
-    # Said once; the other brackets are then understood.
+    # The level is stated once; the other brackets are then understood.
     return text.replace("(95 %: ", "(95 % interval ", 1).replace("(95 %: ", "(")
 
 
@@ -165,13 +166,13 @@ def _linear(item: LinearCorrection, struts: int) -> str:
     return f"{name} {difference(item)}{where}, {value} (95 %: {interval})"
 
 
-def _error(found: Diagnosis) -> tuple[str, bool, str, str]:
-    """The error that a verdict is about: name, whether it falls, before, from before to after."""
-    # Height is what the corrected model is judged by; a prescribed motion leaves only the force.
-    held_out, floor = found.held_out, found.noise_floor
+def _error(diagnosis: Diagnosis) -> tuple[str, bool, str, str]:
+    """Error to which a verdict refers: name, whether it falls, before, from before to after."""
+    # The corrected model is evaluated by its height; a prescribed motion leaves only the force.
+    held_out, floor = diagnosis.held_out, diagnosis.noise_floor
     name, unit, figure = "free-run height error", "m", held_out.height_rmse_m
     floor_rms = floor.height_rmse_m
-    if is_prescribed(found):
+    if is_prescribed(diagnosis):
         name, unit, figure = "residual force", "N", held_out.residual_force_rmse_n
         floor_rms = floor.residual_force_rmse_n
     before, after = quantity(figure.before, unit), quantity(figure.after, unit)
@@ -191,44 +192,44 @@ def _against_floor(value: float, floor: float, unit: str) -> str:
     return f"{times(value / floor)} times the noise floor of {quantity(floor, unit)}"
 
 
-def _error_falls(found: Diagnosis, subject: str = "") -> str:
-    name, falls, _, change = _error(found)
-    corrections = len(found.linear) + len(found.existing)
-    single = len(missing(found)) + corrections == 1
+def _error_falls(diagnosis: Diagnosis, subject: str = "") -> str:
+    name, falls, _, change = _error(diagnosis)
+    corrections = len(diagnosis.linear) + len(diagnosis.existing)
+    single = len(missing(diagnosis)) + corrections == 1
     if corrections:
         plain = "this correction" if single else "these corrections"
     else:
         plain = "it" if single else "them"
-    goes, or_else = "falls" if falls else "goes", "" if subject else _or_else(found)
+    goes, or_else = "falls" if falls else "goes", "" if subject else _or_else(diagnosis)
     return f"with {subject or plain} {name} {goes} {change}{or_else}."
 
 
-def _or_else(found: Diagnosis) -> str:
-    if not found.ambiguous_with:
+def _or_else(diagnosis: Diagnosis) -> str:
+    if not diagnosis.ambiguous_with:
         return ""
-    others = listed([FAMILY_WORDS[item] for item in found.ambiguous_with], "or")
-    return f"; it could also be {others}{_what_would_tell(found)}"
+    others = join_words([FAMILY_WORDS[item] for item in diagnosis.ambiguous_with], "or")
+    return f"; it could also be {others}{_excitation_hint(diagnosis)}"
 
 
-def _what_would_tell(found: Diagnosis) -> str:
-    # The excitation comes as a phrase or as a sentence; here it stands inside one.
-    bare = (found.suggested_excitation or "").strip().rstrip(".")
+def _excitation_hint(diagnosis: Diagnosis) -> str:
+    # The excitation is a phrase or a sentence; here it is part of one.
+    bare = (diagnosis.suggested_excitation or "").strip().rstrip(".")
     if not bare:
         return ""
     clause = bare if bare[1:2].isupper() else bare[:1].lower() + bare[1:]
-    return f" (what would tell: {clause})"
+    return f" (to distinguish them: {clause})"
 
 
-def _not_explained(found: Diagnosis) -> str:
+def _not_explained(diagnosis: Diagnosis) -> str:
     start = "The model lacks a force that no law in the catalogue describes"
-    name, falls, before, change = _error(found)
-    corrected = found.effects or found.linear or found.existing
+    name, falls, before, change = _error(diagnosis)
+    corrected = diagnosis.effects or diagnosis.linear or diagnosis.existing
     if not (corrected and falls):
-        return f"{start}: {name} is {before}{_or_else(found)}."
-    words = listed([effect(item.name).words for item in found.effects], "and")
+        return f"{start}: {name} is {before}{_or_else(diagnosis)}."
+    words = join_words([effect(item.name).words for item in diagnosis.effects], "and")
     nearest = f"the nearest, {words or 'a correction of what it has'}, takes"
-    if found.effects and found.effects[0].family == "restoring_surface":
+    if diagnosis.effects and diagnosis.effects[0].family == "restoring_surface":
         nearest = (
             "a table of force over height and velocity, which names no cause, is offered and takes"
         )
-    return f"{start}: {nearest} {name} {change}{_or_else(found)}."
+    return f"{start}: {nearest} {name} {change}{_or_else(diagnosis)}."

@@ -1,13 +1,14 @@
-"""Publishes runs through Foxglove's SDK, for whoever has layouts of their own there.
+"""Publishes runs through Foxglove's SDK, for layouts in Foxglove or Lichtblick.
 
-Steps go out as JSON, a topic a run, with their time after the epoch of the first run, so that
-finished runs lie over one another. The protocol knows no token: nothing can be changed through it,
-and whatever page a browser of this machine has open may connect and read.
+Steps are published as JSON, one topic a run, with their time after the epoch of the first run, so
+that finished runs are superimposed. The protocol has no token: a client can change nothing, and any
+page in a browser of this machine may connect and read.
 """
 
 import importlib
 import math
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -23,23 +24,29 @@ from rig.run.changes import logged_changes
 HOST = "127.0.0.1"
 
 _STEPS_AT_ONCE = 20_000
-"""Steps that are published in one go: half a second's work."""
+"""Steps that are published in one call: half a second's work."""
 
 _BACKLOG = 2 * _STEPS_AT_ONCE
-"""Messages that wait for a slow client before the oldest are dropped."""
+"""Messages that are queued for a slow client before the oldest are dropped."""
+
+_PUBLISH_EVERY_S = 0.05
+"""Time between two calls of `publish`: twenty a second are smooth."""
+
+_PLAYBACK_DELAY_NS = 200_000_000
+"""Time from the first subscription to the beginning of the playback."""
 
 _PARAMETERS_EVERY_NS = 1_000_000_000
-"""Time between two looks at what `rig set` changed: one a second."""
+"""Time between two checks for changes by `rig set`: a second."""
 
 
 class Playback(NamedTuple):
-    """How finished runs are played.
+    """State of the playback of finished runs.
 
     Attributes:
         position_ns: Time after the runs' beginning, at `since_ns`.
         since_ns: Time of the clock.
         speed: Time of the runs over the clock's.
-        is_playing: Whether it goes on.
+        is_playing: Whether it is running.
     """
 
     position_ns: int
@@ -48,16 +55,16 @@ class Playback(NamedTuple):
     is_playing: bool = False
 
     def at(self, now_ns: int, end_ns: int) -> "Playback":
-        """Where it stands later; it stops at the end."""
+        """The state at a later time; it stops at the end."""
         position_ns = self.position_ns
         if self.is_playing:
             position_ns += round((now_ns - self.since_ns) * self.speed)
-        goes_on = self.is_playing and position_ns < end_ns
-        return Playback(min(position_ns, end_ns), now_ns, self.speed, goes_on)
+        is_playing = self.is_playing and position_ns < end_ns
+        return Playback(min(position_ns, end_ns), now_ns, self.speed, is_playing)
 
 
 class Topic:
-    """A run, and how far it has been published.
+    """A run, and the number of its steps that have been published.
 
     Args:
         run: The run.
@@ -68,30 +75,30 @@ class Topic:
     def __init__(self, run: WatchedRun, name: str, new_channel: Callable[..., Any]) -> None:
         self.run, self.name, self._new_channel = run, name, new_channel
         self._channel: Any = None
-        self._places: tuple[tuple[str, ...], ...] = ()
+        self._paths: tuple[tuple[str, ...], ...] = ()
         self._published = 0
 
     @property
     def epoch_ns(self) -> int | None:
         """Epoch of the run; None before it has begun."""
-        found = self.run.header.get("epoch_ns")
-        return None if found is None else int(found)
+        epoch_ns = self.run.header.get("epoch_ns")
+        return None if epoch_ns is None else int(epoch_ns)
 
     @property
     def is_subscribed(self) -> bool:
-        """Whether somebody takes what is published."""
+        """Whether a client has subscribed."""
         return self._channel is not None and bool(self._channel.has_sinks())
 
     def read(self) -> str:
-        """Take in what has been written, and say in what state the run is."""
+        """Read new steps; returns the state of the run."""
         self.run.update()
         if self._channel is None and self.run.follower.columns:
-            self._places = tuple(tuple(name.split(".")) for name in self.run.follower.columns)
-            self._channel = self._new_channel(f"/{self.name}", schema=_schema(self._places))
+            self._paths = tuple(tuple(name.split(".")) for name in self.run.follower.columns)
+            self._channel = self._new_channel(f"/{self.name}", schema=_schema(self._paths))
         return self.run.state()[0]
 
     def publish(self, epoch_ns: int, until_ns: int | None) -> None:
-        """Publish what has not been: up to a time of the run, or all that is there."""
+        """Publish the steps that have not been: up to a time of the run, or all."""
         follower = self.run.follower
         end = min(follower.steps, self._published + _STEPS_AT_ONCE)
         if self._channel is None or end <= self._published:
@@ -102,38 +109,34 @@ class Topic:
         if until_ns is not None:
             rows = rows[rows[:, 0] <= until_ns]
         for row in rows:
-            self._channel.log(_message(self._places, row), log_time=epoch_ns + int(row[0]))
+            self._channel.log(_message(self._paths, row), log_time=epoch_ns + int(row[0]))
         self._published += len(rows)
 
     def seek(self, t_ns: int) -> None:
-        """Go on from a time."""
+        """Continue from a time."""
         follower = self.run.follower
         begin, end = follower.between(t_ns * 1e-9, t_ns * 1e-9)
         rows = follower.rows(begin, end)
         self._published = begin + int(np.searchsorted(rows[:, 0], t_ns))
 
     def skip(self) -> None:
-        """Publish nothing of what is there already: nobody has asked for it."""
+        """Leave out all steps so far, for which there was no subscriber."""
         self._published = self.run.follower.steps
 
     def parameters(self) -> dict[str, object]:
-        """Numbers and words of the configuration, with what was changed meanwhile."""
-        found = dict(_flat(self.name, self.run.header.get("config", {})))
-        for _, changed in logged_changes(self.run.folder):
-            found |= {f"{self.name}.{key}": value for key, value in changed.items()}
-        return found
-
-
-_SETTLED_NS = 200_000_000
-"""Time from the first subscription to the beginning of the playback."""
+        """Numbers and texts of the configuration, with the changes during the run."""
+        parameters = dict(_flat(self.name, self.run.header.get("config", {})))
+        for _, changes in logged_changes(self.run.folder):
+            parameters |= {f"{self.name}.{key}": value for key, value in changes.items()}
+        return parameters
 
 
 class FoxgloveView:
     """A server of Foxglove's protocol, on loopback.
 
-    Runs that have ended when it starts are played from their beginning once somebody has
-    subscribed, and a client may pause, seek and change the speed. If any of them is still written,
-    steps are published as they come.
+    Runs that have ended when it starts are played from their beginning after the first
+    subscription, and a client may pause, seek and change the speed. If one of them is still being
+    written, new steps are published at once.
 
     Args:
         folders: Folders of runs.
@@ -152,7 +155,7 @@ class FoxgloveView:
             Topic(WatchedRun(folder), name, channel)
             for folder, name in zip(folders, names, strict=True)
         ]
-        states = [_whole(topic) for topic in self._topics]
+        states = [_read_all(topic) for topic in self._topics]
         for topic, state in zip(self._topics, states, strict=True):
             if state == "unreadable":
                 raise InputError(topic.run.state()[1])
@@ -163,7 +166,7 @@ class FoxgloveView:
         self._end_ns = round(1e9 * max(topic.run.follower.span_s[1] for topic in self._topics))
         self._playback = Playback(0, 0)
         self._has_begun = False
-        self._asked_ns: int | None = None
+        self._subscribed_ns: int | None = None
         self._lock = threading.Lock()
         epoch_ns = self._epoch_ns()
         span = None if self._is_live or epoch_ns is None else (epoch_ns, epoch_ns + self._end_ns)
@@ -180,19 +183,26 @@ class FoxgloveView:
             )
         except RuntimeError as error:
             raise InputError(f"--port {port}: {error}, expected a port that is free") from error
-        self._told, self._told_ns = self._all_parameters(), 0
+        self._parameters, self._parameters_ns = self._all_parameters(), 0
 
     @property
     def address(self) -> str:
-        """Where a client connects to."""
+        """Address to which a client connects."""
         return f"ws://{HOST}:{self._server.port}"
 
     def close(self) -> None:
         """End the server."""
         self._server.stop()
 
+    def publish_until(self, stop: Callable[[], bool]) -> None:
+        """Publish until `stop` returns true, then end the server."""
+        while not stop():
+            self.publish(time.monotonic_ns())
+            time.sleep(_PUBLISH_EVERY_S)
+        self.close()
+
     def play(self, request: Any) -> Any:
-        """Do what a client asks of the playback; called by a thread of the SDK."""
+        """Carry out a client's request to the playback; a thread of the SDK calls it."""
         with self._lock:
             epoch_ns, before = cast("int", self._epoch_ns()), self._playback
             position_ns = before.position_ns
@@ -212,12 +222,15 @@ class FoxgloveView:
 
     def parameters(self, names: Sequence[str]) -> list[Any]:
         """Parameters by name, or all of them."""
-        found = self._all_parameters()
-        wanted = {name: found[name] for name in names or found if name in found}
-        return [self._sdk.Parameter(name, value=value) for name, value in wanted.items()]
+        values = self._all_parameters()
+        return [
+            self._sdk.Parameter(name, value=values[name])
+            for name in names or values
+            if name in values
+        ]
 
     def publish(self, now_ns: int) -> None:
-        """Publish what is due.
+        """Publish the steps and parameters that are due.
 
         Args:
             now_ns: Time of a clock that never jumps.
@@ -234,7 +247,7 @@ class FoxgloveView:
                     topic.publish(epoch_ns, None)
                 else:
                     topic.skip()
-            self._tell_parameters(now_ns)
+            self._publish_parameters(now_ns)
         else:
             with self._lock:
                 self._play(now_ns, epoch_ns)
@@ -248,12 +261,15 @@ class FoxgloveView:
     def _play(self, now_ns: int, epoch_ns: int) -> None:
         before = self._playback
         if not self._has_begun:
-            if self._asked_ns is None and any(topic.is_subscribed for topic in self._topics):
-                self._asked_ns = now_ns
-            # A client subscribes to its topics one after another: none is to miss the beginning.
-            self._has_begun = self._asked_ns is not None and now_ns - self._asked_ns >= _SETTLED_NS
+            if self._subscribed_ns is None and any(topic.is_subscribed for topic in self._topics):
+                self._subscribed_ns = now_ns
+            # A client subscribes to its topics one after another, and needs the beginning of each.
+            self._has_begun = (
+                self._subscribed_ns is not None
+                and now_ns - self._subscribed_ns >= _PLAYBACK_DELAY_NS
+            )
             self._playback = Playback(0, now_ns, is_playing=self._has_begun)
-        if not self._playback.since_ns:  # asked for before the first round
+        if not self._playback.since_ns:  # requested before the first call
             self._playback = self._playback._replace(since_ns=now_ns)
         self._playback = self._playback.at(now_ns, self._end_ns)
         for topic in self._topics:
@@ -272,27 +288,27 @@ class FoxgloveView:
             request_id=request,
         )
 
-    def _tell_parameters(self, now_ns: int) -> None:
-        """Tell what `rig set` changed, once a second."""
-        if now_ns - self._told_ns < _PARAMETERS_EVERY_NS:
+    def _publish_parameters(self, now_ns: int) -> None:
+        """Publish the changes by `rig set`, once a second."""
+        if now_ns - self._parameters_ns < _PARAMETERS_EVERY_NS:
             return
-        self._told_ns = now_ns
+        self._parameters_ns = now_ns
         now = self._all_parameters()
-        other = {key: value for key, value in now.items() if self._told.get(key) != value}
+        other = {key: value for key, value in now.items() if self._parameters.get(key) != value}
         if other:
             self._server.publish_parameter_values(self.parameters(list(other)))
-        self._told = now
+        self._parameters = now
 
 
 def _listener(sdk: Any, view: FoxgloveView) -> Any:
-    """What the SDK calls, from threads of its own."""
+    """Callbacks for the SDK, whose threads call them."""
 
     class Listener(sdk.websocket.ServerListener):
         def on_get_parameters(self, _client: Any, names: list[str], _id: str | None = None) -> Any:
             return view.parameters(names)
 
         def on_set_parameters(self, _client: Any, given: list[Any], _id: str | None = None) -> Any:
-            # Whoever may connect may not change anything: they get what is.
+            # A client cannot change anything: it gets the current values.
             return view.parameters([parameter.name for parameter in given])
 
         def on_playback_control_request(self, request: Any) -> Any:
@@ -307,7 +323,7 @@ def _sdk() -> Any:
         importlib.import_module("foxglove.websocket")
     except ImportError as error:
         raise InputError(
-            "--foxglove wants the package foxglove-sdk: pip install 'rig[foxglove]'"
+            "--foxglove requires the package foxglove-sdk: pip install 'rig[foxglove]'"
         ) from error
     foxglove.set_log_level("ERROR")
     return foxglove
@@ -315,42 +331,42 @@ def _sdk() -> Any:
 
 def _names(folders: Sequence[Path]) -> list[str]:
     """Names of the folders, with a number where two have the same."""
-    found: list[str] = []
+    names: list[str] = []
     for folder in folders:
         name = folder.absolute().name
-        same = sum(other.absolute().name == name for other in folders[: len(found)])
-        found.append(f"{name}-{same + 1}" if same else name)
-    return found
+        same = sum(other.absolute().name == name for other in folders[: len(names)])
+        names.append(f"{name}-{same + 1}" if same else name)
+    return names
 
 
-def _whole(topic: Topic) -> str:
-    """Read a run as far as it goes, and say in what state it is."""
+def _read_all(topic: Topic) -> str:
+    """Read all steps of a run; returns its state."""
     while (state := topic.read()) == "reading":
         pass
     return state
 
 
-def _schema(places: Sequence[Sequence[str]]) -> dict[str, Any]:
+def _schema(paths: Sequence[Sequence[str]]) -> dict[str, Any]:
     root: dict[str, Any] = {"type": "object", "title": "rig.Step", "properties": {}}
-    for place in places:
-        within = root
-        for name in place[:-1]:
+    for path in paths:
+        node = root
+        for name in path[:-1]:
             empty: dict[str, Any] = {"type": "object", "properties": {}}
-            within = within["properties"].setdefault(name, empty)
-        within["properties"][place[-1]] = {"type": "number"}
+            node = node["properties"].setdefault(name, empty)
+        node["properties"][path[-1]] = {"type": "number"}
     return root
 
 
-def _message(places: Sequence[Sequence[str]], row: NDArray[np.float64]) -> dict[str, Any]:
-    """A step; what has no value is left out, because JSON has no NaN."""
+def _message(paths: Sequence[Sequence[str]], row: NDArray[np.float64]) -> dict[str, Any]:
+    """A step, without columns that are NaN, which JSON does not have."""
     root: dict[str, Any] = {}
-    for place, value in zip(places, row.tolist(), strict=True):
+    for path, value in zip(paths, row.tolist(), strict=True):
         if not math.isfinite(value):
             continue
-        within = root
-        for name in place[:-1]:
-            within = within.setdefault(name, {})
-        within[place[-1]] = value
+        node = root
+        for name in path[:-1]:
+            node = node.setdefault(name, {})
+        node[path[-1]] = value
     return root
 
 
@@ -361,4 +377,4 @@ def _flat(key: str, value: object) -> list[tuple[str, object]]:
         items = enumerate(cast("list[object]", value))
     else:
         return [] if value is None else [(key, value)]
-    return [found for name, item in items for found in _flat(f"{key}.{name}", item)]
+    return [pair for name, item in items for pair in _flat(f"{key}.{name}", item)]

@@ -1,17 +1,17 @@
 "use strict";
-// The page asks for the stretch in sight, draws it, and asks again: a slow page only draws less
-// often. All that it shows comes from the server; it keeps no data but what is on the screen.
+// The page requests the visible stretch, draws it, and requests again: a slow page only draws less
+// often. All data come from the server; the page keeps only the data on the screen.
 
 const FRAME_MS = 48;
 const CLOSELY_MS = 1000;
 const RUNS_MS = 1000;
 const HIDDEN_MS = 1000;
 const COLOURS = ["--model", "--second", "--third", "--fourth"];
-const LEVELS = ["missed ticks", "log fault", "bus fault", "WAITING", "RUNNING", "HOLD", "SAFE"];
-const FIRST_MODE = 2; // WAITING is mode 1 and the fourth level
 const TONES = { live: "good", done: "good", safe: "bad", failed: "bad", killed: "warn", reading: "quiet", absent: "quiet", empty: "warn", unreadable: "bad" };
 
 const at = (id) => document.getElementById(id);
+// The server's table of plots: columns, labels and units.
+const TABLE = JSON.parse(at("table").textContent);
 const charts = {};
 let runs = [];
 let shape = ""; // what the charts were made for
@@ -20,7 +20,7 @@ let strut = "";
 const view = { begin: 0, end: 10, span: 10, follow: true };
 let changed = true;
 let drawnAt = 0;
-let askedCloselyFor = "";
+let evaluatedKey = "";
 
 async function ask(path, given = {}) {
   const answer = await fetch(`${path}?${new URLSearchParams(given)}`);
@@ -29,11 +29,11 @@ async function ask(path, given = {}) {
 }
 
 const columnsOf = (name) => [
-  `${name}.height_m`, `${name}.measured_height_m`, `${name}.force_n`, "strut_force_n",
-  `${name}.virtual_force_n`, `${name}.innovation_m`, "mode", "overruns", "bus_fault", "log_fault",
+  ...TABLE.curves.map((curve) => (curve.is_of_strut ? `${name}.${curve.column}` : curve.column)),
+  ...TABLE.state.columns,
 ];
 
-// Whether the server is asked for the newest steps, whatever their time.
+// Whether the newest steps are requested, at any time.
 const isFollowing = () => view.follow && runs.length === 1 && view.span !== null;
 
 // A stretch as plain lists: uPlot takes null for nothing.
@@ -59,71 +59,70 @@ async function stretch(index, points) {
   return { head, t, lists };
 }
 
-// What each chart over time shows of a run: which columns, and how.
+// A label, with its run's name where there are several.
+const named = (index, text) => (runs.length > 1 ? `${runs[index].name}: ${text}` : text);
+
+// Series of each chart over time.
 function seriesOf(several) {
-  const named = (index, text) => (several ? `${runs[index].name}: ${text}` : text);
   const measured = (index) => (several ? COLOURS[index % 4] : "--measured");
   const thin = several ? { dash: [4, 4], width: 1 } : { width: 2 };
-  const found = { height: [], force: [], virtual: [], innovation: [], state: [] };
+  const series = { state: [] };
+  for (const key of Object.keys(TABLE.labels)) series[key] = [];
+  const [first, ...faults] = TABLE.state.columns.map((_name, i) => TABLE.curves.length + i);
   runs.forEach((run, index) => {
     const own = { run: index, colour: COLOURS[index % 4], spanGaps: several };
-    found.height.push({ column: 1, label: named(index, "measured"), unit: "m", ...own, ...thin, colour: measured(index), spanGaps: true });
-    found.height.push({ column: 0, label: named(index, "model"), unit: "m", ...own });
-    // With several struts the log does not say whose force the cell measured.
-    if (run.columns.includes("strut_force_n") && run.struts.length === 1) {
-      found.force.push({ column: 3, label: named(index, "load cell"), unit: "N", ...own, ...thin, colour: measured(index), spanGaps: true });
-    }
-    found.force.push({ column: 2, label: named(index, "estimated"), unit: "N", ...own });
-    found.virtual.push({ column: 4, label: named(index, "virtual force"), unit: "N", ...own });
-    found.innovation.push({ column: 5, label: named(index, "innovation"), unit: "m", ...own });
-    found.state.push({ column: 6, label: named(index, "state"), width: 3, paths: Charts.steps, ...own, level: (v) => v + FIRST_MODE });
-    const mark = (column, level) => ({ run: index, column, label: "", width: 0, points: true, colour: several ? own.colour : "--bad", level: (v) => (v > 0 ? level : null) });
-    found.state.push(mark(8, 2), mark(9, 1), mark(7, 0));
+    TABLE.curves.forEach((curve, column) => {
+      // A column that the bench has once is that of a strut only if the model has one strut.
+      if (!curve.is_of_strut && !(run.struts.length === 1 && run.columns.includes(curve.column))) return;
+      const style = curve.origin === "measured" ? { ...thin, colour: measured(index), spanGaps: true } : {};
+      series[curve.plot].push({ column, label: named(index, curve.label), unit: curve.unit, ...own, ...style });
+    });
+    series.state.push({ column: first, label: named(index, "state"), width: 3, paths: Charts.steps, ...own, level: (v) => v + TABLE.state.first_mode_level });
+    faults.forEach((column, level) => series.state.push({
+      run: index, column, label: "", width: 0, points: true, colour: several ? own.colour : "--bad", level: (v) => (v > 0 ? level : null),
+    }));
   });
-  return found;
+  return series;
 }
 
 let shown = {};
 
 function build() {
-  askedCloselyFor = "";
+  evaluatedKey = "";
   for (const chart of Object.values(charts)) chart.destroy();
   const several = runs.length > 1;
   shown = seriesOf(several);
-  const common = { sync: "t", xLabel: "time / s", xUnit: "s", onSelect: look, onReset: newest };
+  const common = { sync: "t", xLabel: TABLE.time, xUnit: TABLE.time_unit, onSelect: look, onReset: newest };
   const over = (id, yLabel, more = {}) => {
     charts[id] = Charts.lines(at(id), { ...common, yLabel, series: shown[id], ...more });
   };
-  over("height", "height / m");
-  over("force", "force / N");
-  over("virtual", "force / N");
-  over("innovation", "innovation / m");
+  for (const [id, label] of Object.entries(TABLE.labels)) over(id, label);
+  const { levels } = TABLE.state;
   over("state", "", {
-    rangeY: [-0.5, 6.5],
-    yValues: (_u, ticks) => ticks.map((v) => LEVELS[v] ?? ""),
-    yAxis: { splits: () => [0, 1, 2, 3, 4, 5, 6], size: 90, labelSize: 0 },
+    rangeY: [-0.5, levels.length - 0.5],
+    yValues: (_u, ticks) => ticks.map((v) => levels[v] ?? ""),
+    yAxis: { splits: () => levels.map((_name, i) => i), size: 90, labelSize: 0 },
     named: shown.state.map((item) => item.label !== ""),
   });
   const laws = several ? runs.map((run, i) => ({ label: `${run.name}: law`, colour: COLOURS[i % 4], dash: [8, 4] })) : [{ label: "model’s law", colour: "--model" }];
+  const { planes, spectrum, ticks } = TABLE;
   const points = runs.flatMap((run, i) => [
-    { label: several ? run.name : "estimated", colour: several ? COLOURS[i % 4] : "--second", dots: true },
-    { label: several ? `${run.name}: load cell` : "load cell", colour: "--measured", dots: true },
+    { label: several ? run.name : planes.estimated, colour: several ? COLOURS[i % 4] : "--second", dots: true },
+    { label: named(i, planes.measured), colour: "--measured", dots: true },
   ]);
-  for (const [id, label] of [["velocity", "velocity / (m/s)"], ["height", "height / m"]]) {
-    charts[`plane-${id}`] = Charts.plane(at(`plane-${id}`), {
-      xLabel: label, yLabel: "force / N", series: [...points, ...laws, { label: "other models", colour: "--third", dash: [3, 3] }],
+  for (const { name, label } of Object.values(planes.motions)) {
+    charts[`plane-${name}`] = Charts.plane(at(`plane-${name}`), {
+      xLabel: label, yLabel: planes.force, series: [...points, ...laws, { label: "other models", colour: "--third", dash: [3, 3] }],
     });
   }
+  const { frequency } = spectrum;
   charts.spectrum = Charts.lines(at("spectrum"), {
-    xLabel: "frequency / Hz", xName: "frequency", xUnit: "Hz", yLabel: "N / √Hz", logX: true, logY: true,
-    series: runs.map((run, i) => ({ label: several ? run.name : "virtual force", unit: "N/√Hz", colour: COLOURS[i % 4], spanGaps: true })),
+    xLabel: frequency.label, xName: frequency.name, xUnit: frequency.unit, yLabel: "N / √Hz", logX: true, logY: true,
+    series: runs.map((run, i) => ({ label: several ? run.name : spectrum.label, unit: "N/√Hz", colour: COLOURS[i % 4], spanGaps: true })),
   });
   charts.timing = Charts.lines(at("timing"), {
-    xLabel: "time / µs", xName: "from", xUnit: "µs", yLabel: "ticks", logX: true, logY: true,
-    series: [
-      { label: "lateness", colour: "--second", paths: Charts.steps },
-      { label: "work", colour: "--model", paths: Charts.steps },
-    ],
+    xLabel: ticks.time, xName: "from", xUnit: ticks.time_unit, yLabel: "ticks", logX: true, logY: true,
+    series: ticks.curves.map((label, i) => ({ label, colour: ["--second", "--model"][i], paths: Charts.steps })),
   });
 }
 
@@ -154,18 +153,18 @@ function draw(found) {
   document.body.dataset.frames = Number(document.body.dataset.frames ?? 0) + 1;
 }
 
-async function lookClosely() {
+async function evaluateStretch() {
   const key = [view.begin, view.end, strut].join();
-  if (document.hidden || shape === "" || key === askedCloselyFor) return;
+  if (document.hidden || shape === "" || key === evaluatedKey) return;
   const given = { begin: view.begin, end: view.end, strut };
   const found = await Promise.all(runs.map(async (_run, run) => (await ask("closely", { run, ...given })).json()));
-  for (const id of ["velocity_m_per_s", "height_m"]) {
+  for (const [id, { name }] of Object.entries(TABLE.planes.motions)) {
     const points = found.flatMap((item) => [item.planes[`${id}:estimated`], item.planes[`${id}:measured`]]);
     const own = found.map((item) => item.laws.model?.[id] ?? [[], []]);
-    const others = Object.entries(found[0].laws).filter(([name]) => name !== "model").map(([, law]) => law[id]);
+    const others = Object.entries(found[0].laws).filter(([other]) => other !== "model").map(([, law]) => law[id]);
     // One line for all others, with a gap between two.
     const joined = others.reduce(([xs, ys], [x, y]) => [[...xs, NaN, ...x], [...ys, NaN, ...y]], [[], []]);
-    charts[id === "height_m" ? "plane-height" : "plane-velocity"].set([...points, ...own, joined]);
+    charts[`plane-${name}`].set([...points, ...own, joined]);
   }
   const spectra = found.map((item) => [item.spectrum.frequency_hz, item.spectrum.density]);
   charts.spectrum.set(spectra.length === 1 ? spectra[0] : uPlot.join(spectra));
@@ -173,11 +172,11 @@ async function lookClosely() {
   at("timing").closest("section").hidden = !timing;
   if (timing) {
     const some = (list) => list.map((v) => (v > 0 ? v : null));
-    charts.timing.set([timing.edges_us.map((v) => Math.max(v, 0.5)), some(timing.lateness), some(timing.work)]);
+    charts.timing.set([timing.edges_us.map((v) => Math.max(v, 0.5)), ...TABLE.ticks.curves.map((name) => some(timing[name]))]);
   }
   at("longest").textContent = found[0].longest_s;
   figures(found);
-  askedCloselyFor = key;
+  evaluatedKey = key;
 }
 
 function figures(found) {
@@ -204,7 +203,7 @@ function figures(found) {
   );
 }
 
-// --- Which stretch is in sight ---------------------------------------------------------------
+// --- The visible stretch ---------------------------------------------------------------------
 
 const last = () => Math.max(0, ...runs.map((run) => run.span_s[1]));
 
@@ -316,7 +315,7 @@ function offerDiagnosis() {
   offerHeldOut();
 }
 
-// Every other finished run may be held out: the model is judged on it and learns nothing from it.
+// Every other finished run may be held out: the model is evaluated on it, and not fitted to it.
 function offerHeldOut() {
   const others = [...at("diagnosed").options].filter((option) => Number(option.value) !== diagnosed());
   at("held-out").replaceChildren(...others.map((option) => {
@@ -338,7 +337,7 @@ async function readDiagnosis() {
   at("cancel").hidden = token === "" || !running;
   at("progress-of").hidden = !running;
   at("progress").value = found.share ?? 0;
-  at("doing").textContent = running ? `${Math.round(100 * found.share)} %, ${found.what}` : "";
+  at("doing").textContent = running ? `${Math.round(100 * found.share)} %, ${found.stage}` : "";
   const words = { done: `Verdict: ${found.verdict}.`, failed: `It failed: ${found.why}`, cancelled: "Cancelled." };
   if (found.state !== "none") at("outcome").textContent = words[found.state] ?? "";
   at("outcome").className = found.state === "failed" ? "bad" : "";
@@ -362,14 +361,14 @@ at("cancel").addEventListener("click", () => demand("cancel", diagnosed(), {}));
 async function readRuns() {
   runs = await (await ask("runs")).json();
   const list = runs.map((run, i) => {
-    const place = document.createElement("div");
-    place.className = "run";
+    const entry = document.createElement("div");
+    entry.className = "run";
     const name = Object.assign(document.createElement("b"), { textContent: run.name, title: run.folder });
     const pill = Object.assign(document.createElement("span"), { textContent: run.state, title: run.words, className: `pill ${TONES[run.state] ?? "quiet"}` });
     const about = Object.assign(document.createElement("span"), { className: "quiet", textContent: [run.model, run.rate_hz ? `${run.rate_hz} Hz` : ""].filter(Boolean).join(", ") });
-    if (runs.length > 1) place.append(Object.assign(document.createElement("span"), { className: `swatch run${i % 4}` }));
-    place.append(name, pill, about);
-    return place;
+    if (runs.length > 1) entry.append(Object.assign(document.createElement("span"), { className: `swatch run${i % 4}` }));
+    entry.append(name, pill, about);
+    return entry;
   });
   at("runs").replaceChildren(...list);
   document.title = `${runs.map((run) => run.name).join(", ")} – rig view`;
@@ -411,7 +410,7 @@ async function frame() {
   draw(await Promise.all(runs.map((_run, index) => stretch(index, points))));
 }
 
-// One question after the other; what fails is asked again.
+// One request after the other; a request that fails is repeated.
 function every(period, action) {
   const once = async () => {
     const begin = performance.now();
@@ -430,7 +429,7 @@ function every(period, action) {
 
 function lost() {
   at("message").hidden = false;
-  at("message").textContent = "No answer from rig view: it has ended, or is busy. The page goes on when it answers.";
+  at("message").textContent = "No answer from rig view: it has ended, or is busy. The page continues when it answers.";
 }
 
 function keyboard(event) {
@@ -453,7 +452,7 @@ function theme(name) {
 at("span").addEventListener("change", newest);
 at("strut").addEventListener("change", () => {
   strut = at("strut").value;
-  askedCloselyFor = "";
+  evaluatedKey = "";
   update();
 });
 for (const [id, action] of Object.entries({
@@ -471,5 +470,5 @@ document.addEventListener("keydown", keyboard);
 theme(localStorage.getItem("theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
 every(RUNS_MS, readRuns);
 every(FRAME_MS, frame);
-every(CLOSELY_MS, lookClosely);
+every(CLOSELY_MS, evaluateStretch);
 every(RUNS_MS, readDiagnosis);

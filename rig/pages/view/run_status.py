@@ -1,4 +1,4 @@
-"""What is known of a run's folder, whatever state it is in."""
+"""State of a run's folder: content, progress and end of the run."""
 
 import contextlib
 import threading
@@ -15,14 +15,14 @@ from rig.log.follower import RunFollower
 from rig.log.reader import DBC_FILE, MODEL_FILE, RUN_FILE, read_header
 
 _SILENT_S = 2.0
-"""Time after which a run that nobody ended and nobody writes has been killed."""
+"""Time without a write after which a run without an ending counts as killed."""
 
 _MUCH_BYTES = 10_000_000
-"""Bytes that are still to be read from which on the page says so."""
+"""Unread bytes above which the page shows the state `reading`."""
 
 _STEPS_AT_ONCE = 400_000
-"""Steps that one answer takes in: a tenth of a second's work, so that the page shows how far it
-is."""
+"""Steps that are read for one answer: a tenth of a second's work, so that the page shows the
+progress."""
 
 
 class WatchedRun:
@@ -36,66 +36,66 @@ class WatchedRun:
         self.folder = folder
         self.follower = RunFollower(folder)
         self.lock = threading.Lock()
-        """Held by whoever uses the follower."""
+        """Guards the follower."""
         self.header: Mapping[str, Any] = {}
-        """Content of `run.yaml`; empty before it is there."""
+        """Content of `run.yaml`; empty before it exists."""
         self.model: ModelSpec | None = None
-        """The model that ran, once its copy is there."""
+        """The model that ran; None before its copy exists."""
         self.frame_times_s: Mapping[tuple[int, bool], float] = {}
         """Time that a frame occupies the bus, by identifier and whether that is extended."""
         self._stamp = -1.0
         self._epoch_ns: object = None
-        self._wrong: str | None = None
+        self._error: str | None = None
 
     def update(self) -> None:
-        """Take in what has been written since the last time."""
+        """Read what has been written since the last call."""
         path = self.folder / RUN_FILE
         try:
             stamp = path.stat().st_mtime
         except OSError:
             return
         if stamp != self._stamp:
-            self._stamp, self._wrong = stamp, None
+            self._stamp, self._error = stamp, None
             try:
                 header = read_header(self.folder)
                 if self.follower.is_another or header["epoch_ns"] != self._epoch_ns:
-                    self._begin_anew()
+                    self._reset()
                 self.header, self._epoch_ns = header, header["epoch_ns"]
                 self._read_copies()
             except InputError as error:
-                self._wrong = str(error)
-        if self._wrong is None:
+                self._error = str(error)
+        if self._error is None:
             self.follower.update(_STEPS_AT_ONCE)
 
-    def _begin_anew(self) -> None:
-        """Forget what was known: the folder holds another run."""
+    def _reset(self) -> None:
+        """Forget the former run: the folder holds another one."""
         self.follower, self.model, self.frame_times_s = RunFollower(self.folder), None, {}
 
     def state(self) -> tuple[str, str]:
         """A word for the state of the run, and a sentence about it."""
-        if self._wrong is not None:
-            return "unreadable", self._wrong
+        if self._error is not None:
+            return "unreadable", self._error
         if not self.header:
             return self._without_header()
         if self.follower.unread_bytes > _MUCH_BYTES:
             return "reading", f"Reading: {self.follower.share_read:.0%}"
         if "ending" in self.header or "capture" in self.header:
-            return self._ended()
+            return self._end_state()
         if self._age_s() < _SILENT_S:
             return "live", "Being written."
         return "killed", (
-            "Not written any more, and nobody ended it: it was killed. "
-            f"`rig replay {self.folder}` computes what is missing from the frames."
+            "No longer written, and without an ending: it was killed. "
+            f"`rig replay {self.folder}` computes the missing steps from its frames."
         )
 
     def _without_header(self) -> tuple[str, str]:
         if not self.folder.exists():
-            return "absent", f"{self.folder}: no such folder yet; it is shown once it is there."
+            return "absent", f"{self.folder}: no such folder yet; it is shown once it exists."
         if not self.folder.is_dir():
             return "unreadable", f"{self.folder}: is no folder, expected a run"
         return "absent", f"{self.folder}: holds no run yet; it is shown once it does."
 
-    def _ended(self) -> tuple[str, str]:
+    def _end_state(self) -> tuple[str, str]:
         capture = cast("Mapping[str, Any] | None", self.header.get("capture"))
         if capture is not None:
             return "done", f"A window around a fault: {capture.get('why')}."
@@ -106,11 +106,11 @@ class WatchedRun:
         return status, words.get(status, f"Ended: {status}.")
 
     def _age_s(self) -> float:
-        """Time since something was last written."""
+        """Time since the last write to a file of the run."""
         stamps = [0.0]
-        with contextlib.suppress(OSError):  # somebody may delete it meanwhile
-            written = (".log", ".arrow", ".yaml")
-            entries = [entry for entry in self.folder.iterdir() if entry.suffix in written]
+        with contextlib.suppress(OSError):  # the folder may be deleted meanwhile
+            endings = (".log", ".arrow", ".yaml")
+            entries = [entry for entry in self.folder.iterdir() if entry.suffix in endings]
             stamps += [entry.stat().st_mtime for entry in entries]
         return time.time() - max(stamps)
 

@@ -1,7 +1,7 @@
-"""Answers the page: on loopback only, each question by itself, in a thread of its own.
+"""Server of the live page: on loopback only, one thread a request.
 
-A page asks for a stretch when it has drawn the last one, so that a stalled one slows nobody, and
-one that lost its connection only asks again. The server keeps no state of a page.
+A page requests a stretch when it has drawn the last one, so that a stalled page slows no other, and
+a page that lost its connection repeats its request. The server keeps no state of a page.
 """
 
 import json
@@ -22,8 +22,9 @@ from dart_model.spec import ModelSpec
 from rig.diagnosis.outcome import REPORT_FILE
 from rig.log.reader import MODEL_FILE
 from rig.pages import charts
-from rig.pages.view import visible_stretch as closely
-from rig.pages.view.diagnosis_job import Diagnosing
+from rig.pages.view import visible_stretch
+from rig.pages.view.diagnosis_job import DiagnosisJob
+from rig.pages.view.live_page import live_page
 from rig.pages.view.run_status import WatchedRun
 from rig.run.requests import ask
 from rig.run.timing import read_histograms
@@ -31,18 +32,18 @@ from rig.run.timing import read_histograms
 HOST = "127.0.0.1"
 
 _MOST_POINTS, _MOST_COLUMNS = 4000, 64
-"""Of one answer: a wide screen, and several times what the page asks for; it bounds the memory."""
+"""Limits of one answer, which bound its memory: several times what the page requests."""
 
-_MOST_ASKED_BYTES = 10_000
-"""Of one change: hundreds of keys."""
+_MOST_REQUEST_BYTES = 10_000
+"""Limit of one change: hundreds of keys."""
 
 _HTTP_PORT = 80
-"""Which a browser leaves out of the host's name."""
+"""Port that a browser leaves out of the host's name."""
 _HERE = Path(__file__).parent
 _STYLES, _SCRIPTS = (*charts.STYLES, _HERE / "page.css"), (*charts.SCRIPTS, _HERE / "page.js")
 
+_HTML = "text/html; charset=utf-8"
 _FILES: Mapping[str, tuple[Path, str]] = {
-    "/": (_HERE / "page.html", "text/html; charset=utf-8"),
     **{f"/{path.name}": (path, "text/css; charset=utf-8") for path in _STYLES},
     **{f"/{path.name}": (path, "text/javascript; charset=utf-8") for path in _SCRIPTS},
 }
@@ -54,7 +55,7 @@ _POLICY: dict[str, str] = {
 }
 
 _REPORTS_POLICY = {
-    # It brings its own script; in an origin of its own that reads nothing of the page.
+    # A report holds its script; sandboxed without an origin, it reads nothing of the page.
     "Content-Security-Policy": "sandbox allow-scripts allow-popups; default-src 'none'; "
     "script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'",
@@ -67,8 +68,8 @@ _HEADERS = {
 }
 
 
-class _WrongQuestionError(Exception):
-    """A question that has no answer; its text is for whoever asked."""
+class _RequestError(Exception):
+    """A request that cannot be answered; its text goes to the page."""
 
 
 class ViewServer(ThreadingHTTPServer):
@@ -76,9 +77,9 @@ class ViewServer(ThreadingHTTPServer):
 
     Args:
         folders: Folders of runs.
-        models: Models whose laws are drawn beside those of the runs, by file or name.
+        models: Further models whose laws are drawn, by file or name.
         port: Port on loopback; 0 for a free one.
-        token: What a page must know to change a run; None lets nobody change one.
+        token: Secret that allows a page to change a run; with None no page can.
 
     Raises:
         InputError: The port is taken.
@@ -95,7 +96,7 @@ class ViewServer(ThreadingHTTPServer):
     ) -> None:
         self.token = token
         self.runs = tuple(WatchedRun(folder) for folder in folders)
-        self.diagnoses = tuple(Diagnosing(folder) for folder in folders)
+        self.diagnoses = tuple(DiagnosisJob(folder) for folder in folders)
         self.models = models
         try:
             super().__init__((HOST, port), _Handler)
@@ -106,21 +107,21 @@ class ViewServer(ThreadingHTTPServer):
 
     @property
     def address(self) -> str:
-        """Where a browser finds the page."""
+        """Address of the page."""
         return f"http://{HOST}:{self.server_address[1]}/"
 
     def server_close(self) -> None:
-        """End; nobody waits for a diagnosis any more."""
+        """End the server and its diagnoses."""
         super().server_close()
         for diagnosis in getattr(self, "diagnoses", ()):
             diagnosis.cancel()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that went away in the middle of an answer is no news."""
+        """Report an error, unless a browser closed its connection during an answer."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
 
-    def serving(self) -> threading.Thread:
+    def start_thread(self) -> threading.Thread:
         """Serve in a thread, until `shutdown`."""
         thread = threading.Thread(target=self.serve_forever, args=(0.1,), name="view", daemon=True)
         thread.start()
@@ -137,61 +138,65 @@ class _Handler(BaseHTTPRequestHandler):
         return cast("ViewServer", self.server)
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - the base's name
-        """Nothing: twenty questions a second are no news."""
+        """Print nothing: a page makes twenty requests a second."""
 
     def do_GET(self) -> None:
-        """Answer a question."""
-        asked = urlsplit(self.path)
-        if not self._is_asked_here():
+        """Answer a request."""
+        url = urlsplit(self.path)
+        if not self._check_host():
             return
-        if asked.path in _FILES:
-            path, kind = _FILES[asked.path]
+        if url.path == "/":
+            self._send(HTTPStatus.OK, live_page().encode(), _HTML)
+            return
+        if url.path in _FILES:
+            path, kind = _FILES[url.path]
             self._send(HTTPStatus.OK, path.read_bytes(), kind)
             return
-        answer = _ANSWERS.get(asked.path)
+        answer = _ANSWERS.get(url.path)
         if answer is None:
             self._send(HTTPStatus.NOT_FOUND, b"no such page", "text/plain")
             return
         try:
-            content, kind, policy = answer(self._view, _Question(asked.query))
-        except _WrongQuestionError as error:
+            content, kind, policy = answer(self._view, _Query(url.query))
+        except _RequestError as error:
             self._send(HTTPStatus.BAD_REQUEST, str(error).encode(), "text/plain; charset=utf-8")
         except (OSError, ValueError, ArithmeticError) as error:
-            # A run's files may go while they are read; the other runs are still to be seen.
+            # The files of a run may be deleted while they are read; the other runs remain visible.
             why = f"{type(error).__name__}: {error}"
             self._send(HTTPStatus.INTERNAL_SERVER_ERROR, why.encode(), "text/plain; charset=utf-8")
         else:
             self._send(HTTPStatus.OK, content, kind, policy)
 
     def do_POST(self) -> None:
-        """Do what is asked, for a page that knows the token."""
-        if not self._is_asked_here():
+        """Carry out an action, for a page that has the token."""
+        if not self._check_host():
             return
-        token, given = self._view.token, self.headers.get("X-Rig-Token", "")
-        if token is None or not secrets.compare_digest(token.encode(), given.encode()):
+        token, sent = self._view.token, self.headers.get("X-Rig-Token", "")
+        if token is None or not secrets.compare_digest(token.encode(), sent.encode()):
             self._send(HTTPStatus.FORBIDDEN, b"read only", "text/plain")
             return
-        asked = urlsplit(self.path)
-        action = _ACTIONS.get(asked.path)
+        url = urlsplit(self.path)
+        action = _ACTIONS.get(url.path)
         if action is None:
             self._send(HTTPStatus.NOT_FOUND, b"no such action", "text/plain")
             return
         length = self.headers.get("Content-Length", "")
-        if not (length.isascii() and length.isdecimal()) or int(length) > _MOST_ASKED_BYTES:
+        if not (length.isascii() and length.isdecimal()) or int(length) > _MOST_REQUEST_BYTES:
             self._send(HTTPStatus.BAD_REQUEST, b"too long", "text/plain")
             return
         try:
-            given: Any = json.loads(self.rfile.read(int(length)))
-            content = action(self._view, _Question(asked.query), dict(given))
+            body = json.loads(self.rfile.read(int(length)))
+            content = action(self._view, _Query(url.query), dict(body))
         except InputError as error:
-            content = {"error": str(error)}  # what the run says no to is an answer too
-        except (_WrongQuestionError, OSError, ValueError, TypeError, RecursionError) as error:
+            content = {"error": str(error)}  # a refused change is an answer too
+        except (_RequestError, OSError, ValueError, TypeError, RecursionError) as error:
             self._send(HTTPStatus.BAD_REQUEST, str(error).encode(), "text/plain; charset=utf-8")
             return
         self._send(HTTPStatus.OK, *_json(content))
 
-    def _is_asked_here(self) -> bool:
-        # A page of another site must not read through a name that it points at this machine.
+    def _check_host(self) -> bool:
+        """Whether the request is for this server and comes from its page; if not, refuse it."""
+        # A page of another site could point a host name of its own at this machine.
         port = self._view.server_address[1]
         hosts = [f"{name}:{port}" for name in (HOST, "localhost")]
         hosts += [HOST, "localhost"] if port == _HTTP_PORT else []
@@ -208,7 +213,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))
         if status is not HTTPStatus.OK:
-            # What was not read of a question must not be taken for the next one.
+            # The unread rest of a request must not be taken for the next one.
             self.send_header("Connection", "close")
         for name, value in (policy | _HEADERS).items():
             self.send_header(name, value)
@@ -216,14 +221,14 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
 
-class _Question:
-    """What a page asks for, by name."""
+class _Query:
+    """Arguments of a request, by name."""
 
     def __init__(self, query: str) -> None:
-        self._given = parse_qs(query)
+        self._values = parse_qs(query)
 
     def text(self, name: str) -> str:
-        return self._given.get(name, [""])[0]
+        return self._values.get(name, [""])[0]
 
     def number(self, name: str) -> float:
         try:
@@ -231,7 +236,7 @@ class _Question:
         except ValueError:
             value = float("nan")
         if not np.isfinite(value):
-            raise _WrongQuestionError(f"{name}: {self.text(name)!r}: expected a number")
+            raise _RequestError(f"{name}: {self.text(name)!r}: expected a number")
         return value
 
     def index(self, view: ViewServer) -> int:
@@ -243,30 +248,30 @@ class _Question:
     def stretch(self) -> tuple[float, float]:
         begin_s, end_s = self.number("begin"), self.number("end")
         if not begin_s < end_s:
-            raise _WrongQuestionError(f"begin: {begin_s:g}: expected less than end")
+            raise _RequestError(f"begin: {begin_s:g}: expected less than end")
         return begin_s, end_s
 
 
 def _index(view: ViewServer, number: object) -> int:
     if number not in range(len(view.runs)):
-        shown = f"{number:g}" if isinstance(number, float) else repr(number)
-        raise _WrongQuestionError(f"run: {shown}: expected 0 to {len(view.runs) - 1}")
+        text = f"{number:g}" if isinstance(number, float) else repr(number)
+        raise _RequestError(f"run: {text}: expected 0 to {len(view.runs) - 1}")
     return int(cast("float", number))
 
 
 Answer = tuple[bytes, str, dict[str, str]]
 
 
-def _json(content: Any) -> Answer:
-    # No number that JSON does not have gets here: what is not finite is None or was left out.
+def _json(content: object) -> Answer:
+    # Numbers that are not finite, which JSON does not have, are None or left out before.
     return json.dumps(content, allow_nan=False).encode(), "application/json", _POLICY
 
 
-def _runs(view: ViewServer, _question: _Question) -> Answer:
-    return _json([_described(view, run) for run in view.runs])
+def _runs(view: ViewServer, _query: _Query) -> Answer:
+    return _json([_describe_run(view, run) for run in view.runs])
 
 
-def _described(view: ViewServer, run: WatchedRun) -> dict[str, Any]:
+def _describe_run(view: ViewServer, run: WatchedRun) -> dict[str, Any]:
     with run.lock:
         run.update()
         state, words = run.state()
@@ -292,51 +297,51 @@ def _described(view: ViewServer, run: WatchedRun) -> dict[str, Any]:
         }
 
 
-def _stretch(view: ViewServer, question: _Question) -> Answer:
-    """Columns of a stretch: a head in JSON, then times in doubles and columns in floats.
+def _stretch(view: ViewServer, query: _Query) -> Answer:
+    """Columns of a stretch: a head in JSON, then times as doubles and columns as floats.
 
     With `follow` the stretch ends with the newest step.
     """
-    run = question.run(view)
-    begin_s, end_s = question.stretch()
-    points = int(min(max(question.number("points"), 1), _MOST_POINTS))
-    names = [name for name in question.text("columns").split(",") if name][:_MOST_COLUMNS]
+    run = query.run(view)
+    begin_s, end_s = query.stretch()
+    points = int(min(max(query.number("points"), 1), _MOST_POINTS))
+    names = [name for name in query.text("columns").split(",") if name][:_MOST_COLUMNS]
     with run.lock:
         run.update()
-        if question.text("follow"):
+        if query.text("follow"):
             begin_s, end_s = run.follower.span_s[1] - (end_s - begin_s), run.follower.span_s[1]
-        found = run.follower.window(names, begin_s, end_s, points)
+        window = run.follower.window(names, begin_s, end_s, points)
         head = {
             "span_s": run.follower.span_s,
             "state": run.state()[0],
             "begin_s": begin_s,
             "end_s": end_s,
-            "count": len(found.t_s),
-            "steps": found.steps,
+            "count": len(window.t_s),
+            "steps": window.steps,
         }
     text = json.dumps(head).encode()
     text += b" " * (-(len(text) + 4) % 8)
-    columns = found.values.astype(np.float32).tobytes()
-    content = len(text).to_bytes(4, "little") + text + found.t_s.tobytes() + columns
+    columns = window.values.astype(np.float32).tobytes()
+    content = len(text).to_bytes(4, "little") + text + window.t_s.tobytes() + columns
     return content, "application/octet-stream", _POLICY
 
 
-def _closely(view: ViewServer, question: _Question) -> Answer:
-    run = question.run(view)
-    begin_s, end_s = question.stretch()
-    strut = question.text("strut")
+def _closely(view: ViewServer, query: _Query) -> Answer:
+    run = query.run(view)
+    begin_s, end_s = query.stretch()
+    strut = query.text("strut")
     with run.lock:
-        rows = closely.rows_between(run.follower, begin_s, end_s)
+        rows = visible_stretch.rows_between(run.follower, begin_s, end_s)
         # With several struts the log does not say whose force the cell measured.
         is_only = run.model is not None and len(run.model.struts) == 1
         models = {"model": run.model} if run.model is not None else {}
         return _json(
             {
-                "longest_s": closely.LONGEST_S,
-                "planes": closely.planes(run.follower, rows, strut, with_cell=is_only),
-                "laws": closely.laws({**models, **view.models}, run.follower, rows, strut),
-                "spectrum": closely.spectrum(run.follower, rows, strut),
-                "bus": closely.bus_load(
+                "longest_s": visible_stretch.LONGEST_S,
+                "planes": visible_stretch.planes(run.follower, rows, strut, with_cell=is_only),
+                "laws": visible_stretch.laws({**models, **view.models}, run.follower, rows, strut),
+                "spectrum": visible_stretch.spectrum(run.follower, rows, strut),
+                "bus": visible_stretch.bus_load(
                     run.folder, run.header.get("epoch_ns", 0), run.frame_times_s, end_s
                 ),
                 "timing": read_histograms(run.folder),
@@ -344,18 +349,18 @@ def _closely(view: ViewServer, question: _Question) -> Answer:
         )
 
 
-def _diagnosis(view: ViewServer, question: _Question) -> Answer:
-    return _json(view.diagnoses[question.index(view)].state())
+def _diagnosis(view: ViewServer, query: _Query) -> Answer:
+    return _json(view.diagnoses[query.index(view)].state())
 
 
-def _report(view: ViewServer, question: _Question) -> Answer:
-    folder = view.diagnoses[question.index(view)].report()
+def _report(view: ViewServer, query: _Query) -> Answer:
+    folder = view.diagnoses[query.index(view)].newest_folder()
     if folder is None:
-        raise _WrongQuestionError("no report of this run")
-    return (folder / REPORT_FILE).read_bytes(), "text/html; charset=utf-8", _REPORTS_POLICY
+        raise _RequestError("no report of this run")
+    return (folder / REPORT_FILE).read_bytes(), _HTML, _REPORTS_POLICY
 
 
-_ANSWERS: Mapping[str, Callable[[ViewServer, _Question], Answer]] = {
+_ANSWERS: Mapping[str, Callable[[ViewServer, _Query], Answer]] = {
     "/runs": _runs,
     "/stretch": _stretch,
     "/closely": _closely,
@@ -363,17 +368,17 @@ _ANSWERS: Mapping[str, Callable[[ViewServer, _Question], Answer]] = {
     "/report": _report,
 }
 
-_Given = dict[str, Any]
+_Body = dict[str, Any]
 
 
-def _set(view: ViewServer, question: _Question, given: _Given) -> Mapping[str, Any]:
-    return ask(question.run(view).folder, given)
+def _set(view: ViewServer, query: _Query, body: _Body) -> Mapping[str, Any]:
+    return ask(query.run(view).folder, body)
 
 
-def _diagnose(view: ViewServer, question: _Question, given: _Given) -> Mapping[str, Any]:
-    """Start a diagnosis; `held_out` are numbers of runs, `model` one of the view's or empty."""
-    index = question.index(view)
-    others = [_index(view, number) for number in given.get("held_out", [])]
+def _diagnose(view: ViewServer, query: _Query, body: _Body) -> Mapping[str, Any]:
+    """Start a diagnosis; `held_out` are indices of runs, `model` one of the view's or empty."""
+    index = query.index(view)
+    others = [_index(view, number) for number in body.get("held_out", [])]
     states = {i: _state(view.runs[i]) for i in range(len(view.runs))}
     for i in (index, *others):
         if states[i] in ("absent", "empty", "live", "reading", "unreadable"):
@@ -381,9 +386,9 @@ def _diagnose(view: ViewServer, question: _Question, given: _Given) -> Mapping[s
                 f"{view.runs[i].folder}: is {states[i]}, expected a run that has ended"
             )
     if "live" in states.values():
-        raise InputError("a run goes on: a diagnosis beside it could make its ticks late")
-    model = given.get("model") or str(view.runs[index].folder / MODEL_FILE)
-    if given.get("model") and model not in view.models:
+        raise InputError("a run is live: a diagnosis at the same time could make its ticks late")
+    model = body.get("model") or str(view.runs[index].folder / MODEL_FILE)
+    if body.get("model") and model not in view.models:
         raise InputError(f"model: {model}: expected one that `rig view` was given")
     view.diagnoses[index].start(model, [view.runs[i].folder for i in others])
     return view.diagnoses[index].state()
@@ -395,13 +400,13 @@ def _state(run: WatchedRun) -> str:
         return run.state()[0]
 
 
-def _cancel(view: ViewServer, question: _Question, _given: _Given) -> Mapping[str, Any]:
-    diagnosis = view.diagnoses[question.index(view)]
+def _cancel(view: ViewServer, query: _Query, _body: _Body) -> Mapping[str, Any]:
+    diagnosis = view.diagnoses[query.index(view)]
     diagnosis.cancel()
     return diagnosis.state()
 
 
-_ACTIONS: Mapping[str, Callable[[ViewServer, _Question, _Given], Mapping[str, Any]]] = {
+_ACTIONS: Mapping[str, Callable[[ViewServer, _Query, _Body], Mapping[str, Any]]] = {
     "/set": _set,
     "/diagnose": _diagnose,
     "/cancel": _cancel,

@@ -1,4 +1,4 @@
-"""What is computed of the stretch of a run that is in sight."""
+"""Curves and figures of the visible stretch of a run."""
 
 import contextlib
 from collections.abc import Mapping, Sequence
@@ -9,25 +9,33 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from dart_model.effects import AMBIENT_C
 from dart_model.plant.strut import Strut, struts_of
 from dart_model.spec import ModelSpec
+from rig.channels.quantities import TEMPERATURE
 from rig.log.follower import RunFollower
 from rig.log.reader import FRAMES_FILE, LATEST_S, parse_frame, parts
+from rig.pages.plotted_quantities import (
+    ESTIMATED_FORCE,
+    LOAD_CELL,
+    MOTION_COLUMNS,
+    VIRTUAL_FORCE_CURVE,
+)
 
 Array = NDArray[np.float64]
 
 LONGEST_S = 60.0
-"""Only the end of a longer stretch is looked at closely."""
+"""Length of the end of a stretch that is evaluated; a longer one is cut."""
 
 _ACROSS, _UP = 240, 160
-"""Cells of the plane in which points are drawn: of those in one cell one is enough."""
+"""Cells of the plane in which points are drawn, one point a cell."""
 
 _LINE_POINTS = 81
 """Points of a law's curve: a few pixels apart in a chart."""
 
 _SPECTRUM_POINTS = 4096
 _LINES_READ = 60_000
-"""Bytes of the frames' log from which the bus load is taken."""
+"""Bytes of the frames' log from which the bus load is computed."""
 
 
 def rows_between(follower: RunFollower, begin_s: float, end_s: float) -> Array:
@@ -40,7 +48,7 @@ def rows_between(follower: RunFollower, begin_s: float, end_s: float) -> Array:
 def planes(
     follower: RunFollower, rows: Array, strut: str, *, with_cell: bool
 ) -> dict[str, list[list[float]]]:
-    """Force over velocity and over height: points of what was estimated, and of the load cell.
+    """Points of force over velocity and over height: of the estimate, and of the load cell.
 
     Args:
         follower: The run.
@@ -49,22 +57,22 @@ def planes(
         with_cell: Whether the load cell is that strut's.
     """
     columns = follower.columns
-    force = _column(rows, columns, f"{strut}.force_n")
-    cell = _column(rows, columns, "strut_force_n")
-    found: dict[str, list[list[float]]] = {}
-    for name in ("velocity_m_per_s", "height_m"):
+    force = _column(rows, columns, ESTIMATED_FORCE.column_of(strut))
+    cell = _column(rows, columns, LOAD_CELL.column_of(strut))
+    points: dict[str, list[list[float]]] = {}
+    for name in MOTION_COLUMNS:
         motion = _column(rows, columns, f"{strut}.{name}")
-        found[f"{name}:estimated"] = _points(motion, force)
-        found[f"{name}:measured"] = _points(motion, cell) if with_cell else [[], []]
-    return found
+        points[f"{name}:{ESTIMATED_FORCE.origin}"] = _points(motion, force)
+        points[f"{name}:{LOAD_CELL.origin}"] = _points(motion, cell) if with_cell else [[], []]
+    return points
 
 
 def laws(
     models: Mapping[str, ModelSpec], follower: RunFollower, rows: Array, strut: str
-) -> dict[str, Any]:
-    """The law of each model that has the strut: over velocity amid the stroke, over height at rest.
+) -> dict[str, dict[str, list[list[float]]]]:
+    """The force of each model that has the strut, with internal states of zero.
 
-    Internal states are zero.
+    Over height it is the force at rest, over velocity the force at mid-stroke.
     """
     columns = follower.columns
     height = _range(_column(rows, columns, f"{strut}.height_m"))
@@ -72,23 +80,23 @@ def laws(
     if height is None or velocity is None:
         return {}
     middle = 0.5 * (height[0] + height[1])
-    warm = _column(rows, columns, "temperature_c")
-    warm_c = float(np.nanmean(warm)) if np.isfinite(warm).any() else 20.0
+    measured_c = _column(rows, columns, TEMPERATURE.column)
+    mean_c = float(np.nanmean(measured_c)) if np.isfinite(measured_c).any() else AMBIENT_C
     heights = np.linspace(*height, _LINE_POINTS)
     velocities = np.linspace(*velocity, _LINE_POINTS)
-    found: dict[str, Any] = {}
+    curves: dict[str, dict[str, list[list[float]]]] = {}
     for name, spec in models.items():
         struts = struts_of(spec)
         law = next((item for item in struts if item.name == strut), None)
         if law is not None:
             rest = [0.0] * sum(item.states for item in struts)
             still, amid = np.zeros(_LINE_POINTS), np.full(_LINE_POINTS, middle)
-            with contextlib.suppress(ArithmeticError, ValueError):  # outside of where it holds
-                found[name] = {
-                    "height_m": _line(law, rest, heights, still, heights, warm_c),
-                    "velocity_m_per_s": _line(law, rest, amid, velocities, velocities, warm_c),
+            with contextlib.suppress(ArithmeticError, ValueError):  # outside the law's domain
+                curves[name] = {
+                    "height_m": _line(law, rest, heights, still, heights, mean_c),
+                    "velocity_m_per_s": _line(law, rest, amid, velocities, velocities, mean_c),
                 }
-    return found
+    return curves
 
 
 def spectrum(follower: RunFollower, rows: Array, strut: str) -> dict[str, list[float]]:
@@ -97,7 +105,7 @@ def spectrum(follower: RunFollower, rows: Array, strut: str) -> dict[str, list[f
     Reference: Welch, "The use of fast Fourier transform for the estimation of power spectra", IEEE
     Transactions on Audio and Electroacoustics 15 (1967).
     """
-    force = _column(rows, follower.columns, f"{strut}.virtual_force_n")
+    force = _column(rows, follower.columns, VIRTUAL_FORCE_CURVE.column_of(strut))
     valid = np.isfinite(force)
     if valid.sum() < 256:
         return {"frequency_hz": [], "density": []}
@@ -120,9 +128,9 @@ def bus_load(
     frame_times_s: Mapping[tuple[int, bool], float],
     end_s: float,
 ) -> dict[str, float]:
-    """Frames a second in the log, and the share of the bus that they take, before a time.
+    """Frame rate in the log and bus load by these frames, before a time.
 
-    Frames that the bridge neither takes nor sends are not in the log, and not counted.
+    Frames that the bridge neither reads nor sends are not in the log, and not counted.
     """
     count, busy_s, first_ns, last_ns = 0, 0.0, 0, 0
     for line in _lines_before(folder, epoch_ns, round(end_s * 1e9)):
@@ -180,7 +188,7 @@ def _range(values: Array) -> tuple[float, float] | None:
 
 
 def _points(x: Array, y: Array) -> list[list[float]]:
-    """One point of each cell of the plane that has any."""
+    """One point of each cell of the plane that is not empty."""
     both = np.isfinite(x) & np.isfinite(y)
     x, y = x[both], y[both]
     if not len(x):
@@ -201,15 +209,15 @@ def _line(
     heights: Array,
     velocities: Array,
     along: Array,
-    warm_c: float,
+    temperature_c: float,
 ) -> list[list[float]]:
     force = [
-        law.force_n(float(h), float(v), rest, 0.0, 0.0, warm_c, list(rest))
+        law.force_n(float(h), float(v), rest, 0.0, 0.0, temperature_c, list(rest))
         for h, v in zip(heights, velocities, strict=True)
     ]
     return [_numbers(along), _numbers(np.array(force))]
 
 
 def _numbers(values: Array) -> list[float]:
-    """Six digits, which is more than a screen shows."""
+    """Values rounded to six digits, which is more than a screen shows."""
     return [float(f"{value:.6g}") for value in values]

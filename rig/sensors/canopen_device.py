@@ -1,14 +1,14 @@
 """A CANopen device as its own objects describe it.
 
 Reference: CiA 301, "CANopen application layer and communication profile": 1000h device type, 1018h
-identity, 1014h emergency, 1017h heartbeat, 1800h and 1A00h process data objects that are sent.
+identity, 1014h emergency, 1017h heartbeat, 1800h and 1A00h transmitted process data objects.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rig.sensors.objects import Objects, number, text
-from rig.sensors.profiles import ENCODER, MEASURING_DEVICE, Meaning, meaning
+from rig.sensors.canopen_objects import CanOpenObjects, number, text
+from rig.sensors.canopen_profiles import ENCODER, MEASURING_DEVICE, Meaning, meaning
 
 COMMUNICATION, MAPPING = 0x1800, 0x1A00
 COB_ID, TRANSMISSION, INHIBIT, EVENT = 1, 2, 3, 5
@@ -30,15 +30,15 @@ _PROFILES = {ENCODER: "encoder (CiA 406)", MEASURING_DEVICE: "measuring device (
 
 
 @dataclass(frozen=True)
-class Mapped:
+class MappedObject:
     """An object in the frame of a PDO.
 
     Attributes:
         index: Index of the object.
         subindex: Its subindex.
         start: Its lowest bit in the frame.
-        bits: How many it has.
-        meaning: What it means.
+        bits: Number of its bits.
+        meaning: Its meaning.
     """
 
     index: int
@@ -57,9 +57,9 @@ class Pdo:
         arbitration_id: Id of its frames.
         is_extended: Whether the id has 29 bits.
         transmission: Transmission type.
-        cycle_s: Time between two frames; None where the device does not tell.
-        mapped: What stands in it.
-        note: What of its mapping cannot be read, empty if nothing.
+        cycle_s: Time between two frames; None where the device does not report it.
+        mapped: Objects in its frame.
+        note: Entry of its mapping that cannot be read, empty if none.
     """
 
     number: int
@@ -67,7 +67,7 @@ class Pdo:
     is_extended: bool
     transmission: int
     cycle_s: float | None
-    mapped: tuple[Mapped, ...]
+    mapped: tuple[MappedObject, ...]
     note: str = ""
 
     @property
@@ -77,18 +77,18 @@ class Pdo:
 
 
 @dataclass(frozen=True)
-class Device:
-    """A device as it describes itself.
+class CanOpenDevice:
+    """A CANopen device as it describes itself.
 
     Attributes:
         node_id: CANopen node id.
         device_type: Content of 1000h.
-        label: What its maker calls it.
-        identity: Vendor, product, revision and serial number, as far as they are told.
+        label: Name that its manufacturer gives it.
+        identity: Vendor, product, revision and serial number; None for one that it does not report.
         heartbeat_s: Time between two heartbeats; 0 for none.
         emergency_id: Arbitration id of its emergency frames.
-        pdos: What it sends.
-        notes: What its reader should know.
+        pdos: Process data objects that it sends.
+        notes: Remarks for the reader of a scan.
     """
 
     node_id: int
@@ -107,13 +107,13 @@ class Device:
 
     @property
     def kind(self) -> str:
-        """What it is, by its profile."""
+        """Kind of device, by its profile."""
         profile = self.device_type & 0xFFFF
         return _PROFILES.get(profile, f"CiA {profile}" if profile else "of no profile")
 
 
-def described(objects: Objects, node_id: int) -> Device | None:
-    """A device by its objects.
+def describe_device(objects: CanOpenObjects, node_id: int) -> CanOpenDevice | None:
+    """Description of a device by its objects.
 
     Args:
         objects: Its objects.
@@ -135,14 +135,14 @@ def described(objects: Objects, node_id: int) -> Device | None:
         if item.meaning.note
     ]
     if not pdos:
-        notes.append("it sends no process data that is switched on (1800h and after)")
+        notes.append("no process data object is switched on (1800h and following)")
     notes += [f"TPDO {pdo.number}: {pdo.note}" for pdo in pdos if pdo.note]
     notes += [
-        f"TPDO {pdo.number} tells no cycle: its frames are only expected when something changes"
+        f"TPDO {pdo.number}: the device reports no cycle, so frames are expected at changes only"
         for pdo in pdos
         if pdo.cycle_s is None
     ]
-    return Device(
+    return CanOpenDevice(
         node_id=node_id,
         device_type=device_type,
         label=text(objects, 0x1008),
@@ -158,60 +158,63 @@ def _eleven_bits(cob_id: int | None) -> int:
     return 0 if cob_id is None or cob_id & OFF else cob_id & 0x7FF
 
 
-def _pdos(objects: Objects, device_type: int) -> Iterator[Pdo]:
-    """What it sends, as far as it is switched on and holds anything."""
-    for place in range(_MOST_PDOS):
-        cob_id = number(objects, COMMUNICATION + place, COB_ID)
+def _pdos(objects: CanOpenObjects, device_type: int) -> Iterator[Pdo]:
+    """Process data objects that are switched on and not empty."""
+    for index in range(_MOST_PDOS):
+        cob_id = number(objects, COMMUNICATION + index, COB_ID)
         if cob_id is None or cob_id & OFF:
             continue
-        mapped, note = _mapped(objects, device_type, MAPPING + place)
+        mapped, note = _read_mapping(objects, device_type, MAPPING + index)
         if not mapped and not note:
             continue
         is_extended = bool(cob_id & EXTENDED)
-        transmission = number(objects, COMMUNICATION + place, TRANSMISSION) or 0
+        transmission = number(objects, COMMUNICATION + index, TRANSMISSION) or 0
         yield Pdo(
-            number=place + 1,
+            number=index + 1,
             arbitration_id=cob_id & (0x1FFFFFFF if is_extended else 0x7FF),
             is_extended=is_extended,
             transmission=transmission,
-            cycle_s=_cycle_s(objects, device_type, place, transmission),
+            cycle_s=_cycle_s(objects, device_type, index, transmission),
             mapped=mapped,
             note=note,
         )
 
 
-def _mapped(objects: Objects, device_type: int, index: int) -> tuple[tuple[Mapped, ...], str]:
-    """What is mapped, and what of it cannot be read."""
-    made: list[Mapped] = []
+def _read_mapping(
+    objects: CanOpenObjects, device_type: int, index: int
+) -> tuple[tuple[MappedObject, ...], str]:
+    """Mapped objects, and a note on an entry that cannot be read."""
+    mapped: list[MappedObject] = []
     start = 0
-    for place in range(1, min(number(objects, index) or 0, _MOST_MAPPED) + 1):
-        entry = number(objects, index, place)
+    for subindex in range(1, min(number(objects, index) or 0, _MOST_MAPPED) + 1):
+        entry = number(objects, index, subindex)
         bits = 0 if entry is None else entry & 0xFF
         if entry is None or bits == 0 or start + bits > 64:
             what = "cannot be read" if entry is None else f"has {bits} bits from bit {start} on"
-            return tuple(made), f"entry {place} {what}: it and what follows are left out"
-        found, subindex = entry >> 16, entry >> 8 & 0xFF
-        if found > _LAST_DUMMY:
-            means = meaning(objects, device_type, found, subindex)
-            if means.is_float and bits not in _FLOAT_BITS:
-                note = f"a REAL of {bits} bits, which is none"
-                means = Meaning(means.name, note=note)
-            made.append(Mapped(found, subindex, start, bits, means))
+            return tuple(mapped), f"entry {subindex} {what}: this and later entries are left out"
+        target, target_subindex = entry >> 16, entry >> 8 & 0xFF
+        if target > _LAST_DUMMY:
+            known = meaning(objects, device_type, target, target_subindex)
+            if known.is_float and bits not in _FLOAT_BITS:
+                known = Meaning(known.name, note=f"a REAL of {bits} bits, expected 32 or 64")
+            mapped.append(MappedObject(target, target_subindex, start, bits, known))
         start += bits
-    return tuple(made), ""
+    return tuple(mapped), ""
 
 
-def _cycle_s(objects: Objects, device_type: int, place: int, transmission: int) -> float | None:
-    """Time between two frames as the objects tell it."""
+def _cycle_s(
+    objects: CanOpenObjects, device_type: int, index: int, transmission: int
+) -> float | None:
+    """Time between two frames of the PDO at `index` (0: TPDO 1), as the objects report it."""
     if transmission not in BY_ITSELF:
         # Type 0 waits for a change and SYNC, types above 240 for a request.
         is_cyclic = 0 < transmission <= LAST_SYNCHRONOUS
         period_us = number(objects, SYNC_PERIOD) if is_cyclic else None
         return transmission * period_us * 1e-6 if period_us else None
-    event_ms = number(objects, COMMUNICATION + place, EVENT)
-    if not event_ms and place == 0 and device_type & 0xFFFF == ENCODER:
+    event_ms = number(objects, COMMUNICATION + index, EVENT)
+    if not event_ms and index == 0 and device_type & 0xFFFF == ENCODER:
         event_ms = number(objects, CYCLE)
     if not event_ms:
         return None
-    inhibit = number(objects, COMMUNICATION + place, INHIBIT) or 0
+    inhibit = number(objects, COMMUNICATION + index, INHIBIT) or 0
     return max(event_ms * 1e-3, inhibit * INHIBIT_UNIT_S)

@@ -1,4 +1,4 @@
-"""A page on paper: printed by the browser that is there."""
+"""Prints a page to PDF with an installed browser."""
 
 import os
 import shutil
@@ -20,35 +20,35 @@ _BROWSERS = (
 )
 
 _LONGEST_S = 120.0
-"""Time after which a browser that prints nothing is taken for stuck; it takes seconds."""
+"""Time after which a browser that prints nothing is ended; printing takes seconds."""
 
 
-def browser() -> str:
-    """The browser that prints.
+def find_browser() -> str:
+    """Program of a browser that can print.
 
     Raises:
-        InputError: There is none.
+        InputError: None is installed.
     """
-    found = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
-    if found is None:
+    program = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
+    if program is None:
         raise InputError("--pdf: expected Chromium, Chrome or Edge on this machine to print with")
-    return found
+    return program
 
 
 def print_page(page: Path, pdf: Path) -> None:
-    """Print a page that needs no network.
+    """Print a page, which needs no network, to PDF.
 
     Args:
         page: HTML file.
         pdf: File to write.
 
     Raises:
-        InputError: There is no browser, it fails, or the file cannot be written.
+        InputError: No browser is installed, it fails, or the file cannot be written.
     """
-    program = browser()
-    # Its children may still write into it when it is gone.
-    place = tempfile.TemporaryDirectory(prefix="rig-print-", ignore_cleanup_errors=True)
-    with place as profile:
+    program = find_browser()
+    # Child processes of the browser may still write into it after the browser has ended.
+    folder = tempfile.TemporaryDirectory(prefix="rig-print-", ignore_cleanup_errors=True)
+    with folder as profile:
         command = [
             program,
             "--headless",
@@ -62,10 +62,10 @@ def print_page(page: Path, pdf: Path) -> None:
             page.absolute().as_uri(),
         ]
         try:
-            ended = subprocess.run(command, capture_output=True, timeout=_LONGEST_S, check=False)  # noqa: S603 - a browser, and a page of ours
+            process = subprocess.run(command, capture_output=True, timeout=_LONGEST_S, check=False)  # noqa: S603 - a browser, and a page of ours
         except (OSError, subprocess.TimeoutExpired) as error:
             raise InputError(f"{pdf}: {program} did not print it: {error}") from error
-    if ended.returncode != 0 or not pdf.exists():
-        said = ended.stderr.decode("utf-8", "replace").strip().splitlines()
-        why = said[-1][:200] if said else f"exit code {ended.returncode}"
+    if process.returncode != 0 or not pdf.exists():
+        lines = process.stderr.decode("utf-8", "replace").strip().splitlines()
+        why = lines[-1][:200] if lines else f"exit code {process.returncode}"
         raise InputError(f"{pdf}: {program} did not print it: {why}")

@@ -1,4 +1,4 @@
-"""What devices held before they were set, in a file, so that it can be put back."""
+"""File of the contents that devices had before a change, from which the change is undone."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +9,14 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import load_validated
-from rig.sensors.set_up import SETTABLE, Changed
+from rig.sensors.canopen_set_up import (
+    SETTABLE,
+    DeviceSettings,
+    DeviceWriter,
+    ObjectAccess,
+    ObjectChange,
+    configure_device,
+)
 
 _SCHEMA = 1
 _HEX = r"^([0-9a-f]{2}){1,8}$"
@@ -37,8 +44,37 @@ class _File(BaseModel):
     changes: Annotated[tuple[_Entry, ...], Field(max_length=1000)]
 
 
-def write_undo(path: Path, changes: Sequence[Changed]) -> None:
-    """Write what was held before, over what was begun.
+def configure_with_undo(
+    access: ObjectAccess, node_id: int, settings: DeviceSettings, undo: Path
+) -> Sequence[ObjectChange]:
+    """Configure a device, and write its changes into a file; returns the changes.
+
+    Args:
+        access: Bus of the device.
+        node_id: The device.
+        settings: The settings.
+        undo: New file; there is none after a call that changes nothing.
+
+    Raises:
+        InputError: The file cannot be written, or the device cannot do it.
+    """
+    writer = DeviceWriter(access)
+    begin_undo(undo)
+    try:
+        configure_device(writer, node_id, settings)
+    except InputError as error:
+        changes = f"; {undo} holds the changes so far" if writer.changes else ""
+        raise InputError(f"{error}; the device may still be pre-operational{changes}") from error
+    finally:
+        if writer.changes:
+            write_undo(undo, writer.changes)
+        else:
+            undo.unlink(missing_ok=True)
+    return writer.changes
+
+
+def write_undo(path: Path, changes: Sequence[ObjectChange]) -> None:
+    """Write the contents before changes, over what `begin_undo` made.
 
     Raises:
         InputError: The file cannot be written.
@@ -60,7 +96,7 @@ def write_undo(path: Path, changes: Sequence[Changed]) -> None:
 
 
 def begin_undo(path: Path) -> None:
-    """Make the file before anything is changed, to know that it can be written.
+    """Create the file before any change, so that a file that cannot be written prevents it.
 
     Raises:
         InputError: The file exists, or cannot be written.
@@ -75,11 +111,11 @@ def begin_undo(path: Path) -> None:
         raise InputError(f"--before {path}: cannot be written: {error.strerror}") from error
 
 
-def read_undo(path: Path) -> list[Changed]:
-    """What was held before.
+def read_undo(path: Path) -> list[ObjectChange]:
+    """Changes from a file of `write_undo`.
 
     Raises:
         InputError: The file cannot be read, or is none of this kind.
     """
-    found = load_validated(_File, path)
-    return [Changed(item.node_id, item.index, item.subindex, item.before) for item in found.changes]
+    entries = load_validated(_File, path).changes
+    return [ObjectChange(item.node_id, item.index, item.subindex, item.before) for item in entries]

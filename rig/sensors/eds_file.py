@@ -1,4 +1,4 @@
-"""Objects from an EDS or DCF file, where the sensor is not there.
+"""Objects of a sensor that is not on the bus, from its EDS or DCF file.
 
 Reference: CiA 306, "Electronic data sheet specification for CANopen".
 """
@@ -32,27 +32,27 @@ class EdsObjects:
     """
 
     def __init__(self, path: Path, node_id: int) -> None:
-        self._objects = _imported(path, node_id)
+        self._objects = _read_objects(path, node_id)
 
     def read(self, index: int, subindex: int = 0) -> bytes | None:
         """Default value of an object, or None where there is none."""
-        found = self._variable(index, subindex)
-        if found is None:
+        variable = self._variable(index, subindex)
+        if variable is None:
             return None
-        value = found.default if found.value is None else found.value
+        value = variable.default if variable.value is None else variable.value
         if value is None:
             return None
         if isinstance(value, str):
             return value.encode("latin-1", "replace")
         try:
-            return bytes(found.encode_raw(value))
+            return bytes(variable.encode_raw(value))
         except (struct.error, ValueError, TypeError, OverflowError):
             return None
 
     def is_signed(self, index: int, subindex: int) -> bool | None:
         """Whether an object is a signed integer."""
-        found = self._variable(index, subindex)
-        return None if found is None else found.data_type in _SIGNED
+        variable = self._variable(index, subindex)
+        return None if variable is None else variable.data_type in _SIGNED
 
     def _variable(self, index: int, subindex: int) -> Any:
         try:
@@ -63,15 +63,15 @@ class EdsObjects:
 
 
 class _Text(io.StringIO):
-    """A text with the name of its file, which tells its format."""
+    """Text of a file with the name of the file, whose ending determines its format."""
 
     def __init__(self, text: str, name: str) -> None:
         super().__init__(text)
         self.name = name.lower()
 
 
-def _decoded(path: Path) -> str:
-    """Text of a file, in UTF-8 or, as many makers write, Windows-1252."""
+def _read_text(path: Path) -> str:
+    """Text of a file in UTF-8 or, as many manufacturers write, in Windows-1252."""
     content = path.read_bytes()
     try:
         return content.decode("utf-8-sig")
@@ -79,7 +79,7 @@ def _decoded(path: Path) -> str:
         return content.decode("cp1252")
 
 
-def _imported(path: Path, node_id: int) -> Any:
+def _read_objects(path: Path, node_id: int) -> Any:
     if path.suffix.lower() not in _ENDINGS:
         raise InputError(f"{path}: expected a file .eds or .dcf")
     try:
@@ -94,7 +94,7 @@ def _imported(path: Path, node_id: int) -> Any:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of how it logs
-            objects = canopen.import_od(_Text(_decoded(path), path.name), node_id)
+            objects = canopen.import_od(_Text(_read_text(path), path.name), node_id)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except (

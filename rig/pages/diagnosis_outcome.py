@@ -1,4 +1,4 @@
-"""A diagnosis as a value that shows itself in a notebook."""
+"""Outcome of a diagnosis as a value, with its tables in a notebook."""
 
 from dataclasses import dataclass
 from html import escape
@@ -12,12 +12,12 @@ _HEADINGS = ("on held-out data", "before", "after", "change", "noise floor", "ra
 
 
 @dataclass(frozen=True)
-class Found:
-    """What a diagnosis found.
+class DiagnosisOutcome:
+    """Outcome of a diagnosis.
 
     Attributes:
-        result: All of it, with the series that a report draws.
-        nominal: The model it was held against.
+        result: The whole result, with the series that a report draws.
+        nominal: The nominal model.
     """
 
     result: Result
@@ -29,7 +29,7 @@ class Found:
         return self.result.diagnosis
 
     @property
-    def corrected(self) -> ModelSpec:
+    def corrected_model(self) -> ModelSpec:
         """The corrected model."""
         return self.result.corrected
 
@@ -47,18 +47,20 @@ class Found:
         return f"{self.diagnosis.verdict}: {sentence(self.diagnosis, len(self.nominal.struts))}"
 
     def _repr_html_(self) -> str:
-        found = self.diagnosis
+        diagnosis = self.diagnosis
         rows = [
             _row("td", (table.law.name, name, value, interval))
-            for table in tables.effects(found)
+            for table in tables.effects(diagnosis)
             for name, _, value, interval, _, _ in table.rows
         ]
         rows += [
             _row("td", (name, "", value, low))
-            for name, _, _, _, value, low, _ in tables.linear(found)
+            for name, _, _, _, value, low, _ in tables.linear(diagnosis)
         ]
         effects = _row("th", ("effect", "parameter", "value", "95 % interval")) + "".join(rows)
-        errors = _row("th", _HEADINGS) + "".join(_row("td", row) for row in tables.errors(found))
+        errors = _row("th", _HEADINGS) + "".join(
+            _row("td", row) for row in tables.errors(diagnosis)
+        )
         return f"<p>{escape(str(self))}</p><table>{effects}</table><table>{errors}</table>"
 
 

@@ -1,23 +1,14 @@
-"""Where commands print and write, and the exit codes they end with."""
+"""Results of a check as JUnit XML, for a CI server."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
 from xml.etree import ElementTree
 
 import typer
-from rich.console import Console
-from rich.table import Column, Table
 
 from can_dbc.errors import InputError
-from rig.files.json_text import json_text
 
-OK, FAILED, WRONG_INPUT = 0, 1, 2
-ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file.")]
-console = Console()
-
-JsonFlag = Annotated[bool, typer.Option("--json", help="Print the same as JSON, and nothing else.")]
 JUnitFile = Annotated[
     Path | None,
     typer.Option("--junit", metavar="FILE", help="Write it as JUnit XML too, for a CI server."),
@@ -25,27 +16,17 @@ JUnitFile = Annotated[
 
 
 class Outcome(NamedTuple):
-    """One line of a check, for a CI server.
+    """One line of a check.
 
     Attributes:
-        what: What was checked.
-        text: What was found.
+        what: Name of the check.
+        text: Its result.
         failed: Whether that is a failure.
     """
 
     what: str
     text: str
     failed: bool
-
-
-def table(*heads: str, title: str | None = None) -> Table:
-    """A table whose cells are folded, and never cut."""
-    return Table(*(Column(head, overflow="fold") for head in heads), title=title)
-
-
-def print_json(content: object) -> None:
-    """Print as JSON; numbers that are not finite become null."""
-    typer.echo(json_text(content), nl=False)
 
 
 def refuse_existing(path: Path) -> None:
@@ -77,19 +58,3 @@ def write_junit(path: Path, suite: str, outcomes: Sequence[Outcome]) -> None:
         ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
     except OSError as error:
         raise InputError(f"--junit {path}: cannot be written: {error.strerror}") from error
-
-
-def write_summary(folder: Path, summary: dict[str, object]) -> None:
-    """Write `summary.json`.
-
-    Raises:
-        InputError: The folder cannot be written, or holds a run or another summary.
-    """
-    for name in ("run.yaml", "summary.json"):
-        if (folder / name).exists():
-            raise InputError(f"--out {folder}: holds {name}, expected a folder without one")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
-    except OSError as error:
-        raise InputError(f"--out {folder}: cannot be written: {error.strerror}") from error

@@ -1,17 +1,17 @@
-"""What an object that a device maps into its PDOs means: name, number format, scale and unit.
+"""Meaning of an object that a device maps into its PDOs: name, number format, scale and unit.
 
 References: CiA 406, "Device profile for encoders" (6004h position, 6005h measuring step, 6030h
 speed, 6503h alarms); CiA 404, "Device profile for measuring devices and closed-loop controllers"
-(6130h process value, 6131h unit, 6132h decimal digits, 6150h status), as manuals of devices print
-them.
+(6130h process value, 6131h unit, 6132h decimal digits, 6150h status), as printed in manuals of
+devices.
 """
 
 from dataclasses import dataclass
 
 from can_dbc.errors import DatabaseError
 from can_dbc.units import Dimension, si_conversion
-from rig.sensors.objects import Objects, number
-from rig.sensors.units import unit_name
+from rig.sensors.canopen_objects import CanOpenObjects, number
+from rig.sensors.canopen_units import unit_name
 
 ENCODER, MEASURING_DEVICE = 406, 404
 _LINEAR = (0x08, 0x0A)
@@ -40,16 +40,16 @@ _BY_UNIT = {"Pa": "PRESSURE", "bar": "PRESSURE", "psi": "PRESSURE"}
 
 @dataclass(frozen=True)
 class Meaning:
-    """What an object means.
+    """Meaning of an object.
 
     Attributes:
-        name: What a signal of it is called.
+        name: Name of its signal in a DBC.
         is_signed: Whether it is a signed integer.
         is_float: Whether it is a REAL32 or REAL64.
         scale: Physical value of one raw step, in `unit`.
         unit: Unit as a DBC has it, empty if not known.
-        is_alarm: Whether it is zero as long as nothing is wrong.
-        note: What its reader should know, empty if nothing.
+        is_alarm: Whether a value other than zero reports a fault.
+        note: Remark for the reader of a scan, empty if none.
     """
 
     name: str
@@ -62,12 +62,12 @@ class Meaning:
 
     @property
     def dimension(self) -> Dimension | None:
-        """What it measures, as far as this project has a use for it."""
+        """Measured dimension; None for one that this project does not use."""
         return _dimension(self.unit)
 
 
-def meaning(objects: Objects, device_type: int, index: int, subindex: int) -> Meaning:
-    """What an object that is mapped into a PDO means.
+def meaning(objects: CanOpenObjects, device_type: int, index: int, subindex: int) -> Meaning:
+    """Meaning of an object that is mapped into a PDO.
 
     Args:
         objects: The device's objects.
@@ -76,17 +76,17 @@ def meaning(objects: Objects, device_type: int, index: int, subindex: int) -> Me
         subindex: Its subindex.
     """
     profile = device_type & 0xFFFF
-    found = None
+    known = None
     if profile == ENCODER:
-        found = _of_encoder(objects, device_type >> 16, index, subindex)
+        known = _encoder_meaning(objects, device_type >> 16, index, subindex)
     elif profile == MEASURING_DEVICE:
-        found = _of_channel(objects, index, subindex)
-    if found is None:
-        found = Meaning(f"X{index:04X}_{subindex}", bool(objects.is_signed(index, subindex)))
-    return found
+        known = _channel_meaning(objects, index, subindex)
+    return known or Meaning(f"X{index:04X}_{subindex}", bool(objects.is_signed(index, subindex)))
 
 
-def _of_encoder(objects: Objects, kind: int, index: int, subindex: int) -> Meaning | None:
+def _encoder_meaning(
+    objects: CanOpenObjects, kind: int, index: int, subindex: int
+) -> Meaning | None:
     ending = f"_{subindex}" if subindex > 1 else ""
     known = objects.is_signed(index, subindex)
     if index in _POSITIONS and kind in _LINEAR:
@@ -95,7 +95,7 @@ def _of_encoder(objects: Objects, kind: int, index: int, subindex: int) -> Meani
         return _angle(objects, f"POSITION{ending}", is_signed=bool(known))
     if index == _SPEED:
         step = number(objects, _STEPS, 2) if kind in _LINEAR else None
-        return _speed(f"SPEED{ending}", step)
+        return _speed_meaning(f"SPEED{ending}", step)
     if index == _ACCELERATION:
         return Meaning(f"ACCELERATION{ending}", True, note="its unit is not known")
     if index in (_ALARMS, _WARNINGS):
@@ -104,34 +104,34 @@ def _of_encoder(objects: Objects, kind: int, index: int, subindex: int) -> Meani
     return None
 
 
-def _position(objects: Objects, name: str, *, is_signed: bool) -> Meaning:
+def _position(objects: CanOpenObjects, name: str, *, is_signed: bool) -> Meaning:
     step = number(objects, _STEPS, 1) or number(objects, _STEP_OF_DISPLAY)
     if step:
         return Meaning(name, is_signed, scale=step * _NM, unit="mm")
-    return Meaning(name, is_signed, note="the device tells no measuring step (6005h)")
+    return Meaning(name, is_signed, note="the device reports no measuring step (6005h)")
 
 
-def _angle(objects: Objects, name: str, *, is_signed: bool) -> Meaning:
-    note = "an angle: no height without the circumference of what the rope runs on"
+def _angle(objects: CanOpenObjects, name: str, *, is_signed: bool) -> Meaning:
+    note = "an angle: it gives a height only with the circumference of the drum"
     steps = number(objects, _STEPS_PER_TURN) or number(objects, _STEP_OF_DISPLAY)
     if steps:
         return Meaning(name, is_signed, scale=1.0 / steps, unit="turn", note=note)
     return Meaning(name, is_signed, note=note)
 
 
-def _speed(name: str, step: int | None) -> Meaning:
+def _speed_meaning(name: str, step: int | None) -> Meaning:
     if step:
         return Meaning(name, True, scale=step * _SPEED_STEP_MM_PER_S, unit="mm/s")
-    return Meaning(name, True, note="the device tells no step of speed (6005h.2)")
+    return Meaning(name, True, note="the device reports no speed step (6005h.2)")
 
 
-def _of_channel(objects: Objects, index: int, subindex: int) -> Meaning | None:
+def _channel_meaning(objects: CanOpenObjects, index: int, subindex: int) -> Meaning | None:
     ending = f"_{subindex}"
     is_float = index & 0xF000 == _REAL
     if index == _STATUS:
         return Meaning(f"STATUS{ending}", is_alarm=True)
     if index in _FIELD_VALUES:
-        note = "an input as it comes, before scaling: its unit is not told"
+        note = "a raw input before scaling: the device does not report its unit"
         return Meaning(f"INPUT{ending}", not is_float, is_float, note=note)
     if index not in _PROCESS_VALUES:
         return None
@@ -139,8 +139,8 @@ def _of_channel(objects: Objects, index: int, subindex: int) -> Meaning | None:
     code = number(objects, _UNIT, subindex)
     unit = None if code is None else unit_name(code)
     if unit is None or digits > 9:
-        told = "tells no unit (6131h)" if code is None else f"has the unit code {code:#010x}"
-        note = f"the device {told}: write the unit into the DBC"
+        why = "reports no unit (6131h)" if code is None else f"reports unit code {code:#010x}"
+        note = f"the device {why}: write the unit into the DBC"
         return Meaning(f"VALUE{ending}", not is_float, is_float, note=note)
     note = "a mass, taken for the force of its weight" if unit.endswith("gf") else ""
     name = f"{_channel_name(unit)}{ending}"

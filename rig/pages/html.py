@@ -1,0 +1,62 @@
+"""HTML pages from their templates, and their files."""
+
+import base64
+import hashlib
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from can_dbc.atomic_file import write_whole
+from can_dbc.errors import InputError
+from rig.pages import charts
+
+_HERE = Path(__file__).parent
+_TEMPLATES = Environment(
+    loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
+    trim_blocks=True, lstrip_blocks=True,
+)  # fmt: skip
+
+
+def render(template: str, **content: object) -> str:
+    """Text of a page.
+
+    Args:
+        template: File of the template, below the folder of this module.
+        content: Variables of the template.
+    """
+    return _TEMPLATES.get_template(template).render(**content)
+
+
+def render_report(template: str, **content: object) -> str:
+    """Text of a report: a page that holds the scripts and styles of its charts.
+
+    Args:
+        template: File of the template in the folder ``report``.
+        content: Variables of the template.
+    """
+    report = _HERE / "report"
+    scripts = [path.read_text("utf-8") for path in (*charts.SCRIPTS, report / "page.js")]
+    return render(
+        f"report/{template}",
+        styles=[path.read_text("utf-8") for path in (*charts.STYLES, report / "page.css")],
+        scripts=scripts,
+        script_hashes=[_hash(script) for script in scripts],
+        **content,
+    )
+
+
+def write_page(text: str, path: Path) -> None:
+    """Write a page, whole or not at all.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    try:
+        write_whole(path, text)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _hash(script: str) -> str:
+    digest = hashlib.sha256(script.encode("utf-8")).digest()
+    return f"sha256-{base64.b64encode(digest).decode('ascii')}"

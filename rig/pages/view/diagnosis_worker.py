@@ -1,0 +1,83 @@
+"""The process in which the live page has a run diagnosed."""
+
+import contextlib
+import os
+import signal
+import sys
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import NamedTuple
+
+from can_dbc.errors import InputError
+from rig.diagnosis.outcome import REPORT_FILE
+
+_NICENESS = 19
+"""The lowest priority: everything else on the machine goes first."""
+
+
+class DiagnosisOrder(NamedTuple):
+    """What to diagnose.
+
+    Attributes:
+        run: Folder of the run.
+        model: File or name of the nominal model.
+        held_out: Folders of the held-out runs.
+        out: Folder to write into.
+    """
+
+    run: Path
+    model: str
+    held_out: tuple[Path, ...]
+    out: Path
+
+
+class DiagnosisProgress(NamedTuple):
+    """Progress of a diagnosis: the stage that is running, and the share that is done."""
+
+    stage: str
+    share: float
+
+
+class DiagnosisFailure(NamedTuple):
+    """Reason for which a diagnosis ended without a result."""
+
+    reason: str
+
+
+def run_diagnosis(order: DiagnosisOrder, reports: Connection) -> None:
+    """Diagnose a run, and write the results and their report.
+
+    Args:
+        order: What to diagnose.
+        reports: Takes a `DiagnosisProgress` for each step, and a `DiagnosisFailure` at the end of a
+            diagnosis that fails.
+    """
+    # Imported here: the server, which imports this module, needs none of it.
+    from dart_model.spec import load_model, model_file
+    from rig.diagnosis.files import diagnose_runs
+    from rig.pages.report import write_report
+
+    # Ctrl-C in the terminal reaches this process too; the server ends it in order.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
+
+    def send(message: DiagnosisProgress | DiagnosisFailure) -> None:
+        with contextlib.suppress(OSError):  # a server that was killed reads no longer
+            reports.send(message)
+
+    try:
+        result = diagnose_runs(
+            [order.run],
+            load_model(model_file(order.model, Path())),
+            order.held_out,
+            order.out,
+            lambda stage, share: send(DiagnosisProgress(stage, share)),
+        )
+        write_report(result, order.out / REPORT_FILE)
+    except (InputError, OSError) as error:
+        send(DiagnosisFailure(str(error)))
+        sys.exit(1)
+    except Exception as error:
+        send(DiagnosisFailure(f"{type(error).__name__}: {error}"))
+        raise

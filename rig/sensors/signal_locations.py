@@ -1,0 +1,76 @@
+"""Messages and signals in which the devices on a bus send what they measure."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from can_dbc.units import Dimension
+from rig.sensors.canopen_device import CanOpenDevice, MappedObject, Pdo
+from rig.sensors.j1939 import GroupMessage
+
+
+class SignalLocation(NamedTuple):
+    """Location of a measured quantity on the bus.
+
+    Attributes:
+        message: Name of the message.
+        signal: Name of the signal.
+        node_id: Node that sends it; None for J1939.
+        mapped: The object; None for J1939.
+    """
+
+    message: str
+    signal: str
+    node_id: int | None
+    mapped: MappedObject | None
+
+
+def locations(devices: Sequence[CanOpenDevice], dimension: Dimension) -> list[SignalLocation]:
+    """Locations of a dimension that CANopen devices send, in the order of devices and objects."""
+    return [
+        SignalLocation(message_name(device, pdo), names[item], device.node_id, item)
+        for device, pdo, names in _pdos(devices)
+        for item in pdo.mapped
+        if item.meaning.dimension is dimension
+    ]
+
+
+def levels(groups: Sequence[GroupMessage]) -> list[SignalLocation]:
+    """Locations of levels that J1939 devices send."""
+    return [
+        SignalLocation(item.message_name, parameter.name, None, None)
+        for item in groups
+        for parameter in item.group.parameters
+        if parameter.unit == "mm"
+    ]
+
+
+def alarms(device: CanOpenDevice) -> list[SignalLocation]:
+    """Locations of the alarms of a device."""
+    return [
+        SignalLocation(message_name(device, pdo), names[item], device.node_id, item)
+        for _, pdo, names in _pdos([device])
+        for item in pdo.mapped
+        if item.meaning.is_alarm
+    ]
+
+
+def _pdos(
+    devices: Sequence[CanOpenDevice],
+) -> Iterator[tuple[CanOpenDevice, Pdo, dict[MappedObject, str]]]:
+    for device in devices:
+        for pdo in device.pdos:
+            yield device, pdo, signal_names(pdo)
+
+
+def signal_names(pdo: Pdo) -> dict[MappedObject, str]:
+    """Names of the signals of a PDO, each once."""
+    names: dict[MappedObject, str] = {}
+    for item in pdo.mapped:
+        name = item.meaning.name
+        names[item] = name if name not in names.values() else f"{name}_AT_{item.start}"
+    return names
+
+
+def message_name(device: CanOpenDevice, pdo: Pdo) -> str:
+    """Name of a PDO's message in a DBC."""
+    return f"{device.name}_TPDO{pdo.number}"
