@@ -20,7 +20,7 @@ from rig.run.live import with_bench
 from rig.run.logged_run import Ended
 from rig.run.loop import Watch
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.schema import BenchConfig, Effect
+from rig.simulated_bench.schema import BenchConfig, UndeclaredEffect
 
 _STRUT = "strut"
 _RANGES: Mapping[str, tuple[str, Mapping[str, tuple[float, float]]]] = {
@@ -56,7 +56,7 @@ class Story:
     """
 
     family: str
-    effect: Effect
+    effect: UndeclaredEffect
     diagnosis: Diagnosis
     virtual_force_rms_n: tuple[float, float]
     first_run: Ended
@@ -72,7 +72,7 @@ class Story:
         }
 
 
-def draw_effect(seed: int) -> tuple[str, Effect]:
+def draw_effect(seed: int) -> tuple[str, UndeclaredEffect]:
     """Family and effect that a seed gives the bench.
 
     Args:
@@ -82,7 +82,9 @@ def draw_effect(seed: int) -> tuple[str, Effect]:
     name = list(_RANGES)[seed % len(_RANGES)]  # so that neighbouring seeds plant other effects
     family, ranges = _RANGES[name]
     parameters = {key: float(random.uniform(low, high)) for key, (low, high) in ranges.items()}
-    return family, Effect.model_validate({"name": name, "strut": _STRUT, "parameters": parameters})
+    return family, UndeclaredEffect.model_validate(
+        {"name": name, "strut": _STRUT, "parameters": parameters}
+    )
 
 
 def tell(
@@ -151,7 +153,7 @@ def tell(
     return story
 
 
-def _bench(effect: Effect, excitation: int) -> BenchConfig:
+def _bench(effect: UndeclaredEffect, excitation: int) -> BenchConfig:
     bench = load_bench_config(CONFIGS / "story_bench.yaml")
     components = tuple(
         component.model_copy(update={"seed": excitation})

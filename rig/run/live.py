@@ -21,8 +21,8 @@ from rig.run.logged_run import Ended, logged, on_signal
 from rig.run.loop import Progress, Watch, unnoted, unwatched
 from rig.run.ports import BenchOnBus, BusPort
 from rig.run.trace import Trace
+from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.schema import BenchConfig
-from rig.simulated_bench.simulated import Bench
 
 _BENCH_PORTION_NS = 20_000_000
 """Simulated time after which the bench looks at its bus, while it catches up."""
@@ -150,10 +150,10 @@ def with_bench(
         BusError: The bus cannot be opened.
     """
     bridge = build_bridge(ready)
-    bench = Bench(bench_config, ready.database)
+    bench = SimulatedBench(bench_config, ready.database)
     if not lockstep:
         # What is loaded at a bench's first use would hold the first ticks up.
-        Bench(bench_config, ready.database).update(_BENCH_PORTION_NS)
+        SimulatedBench(bench_config, ready.database).update(_BENCH_PORTION_NS)
     with contextlib.ExitStack() as stack:
         granted, clock = None, VirtualClock()
         if not lockstep:
@@ -211,7 +211,7 @@ def run_bench(
         BusError: The bus cannot be opened.
         DatabaseError: The DBC is wrong.
     """
-    bench = Bench(bench_config, load_database(dbc or DEFAULT_DATABASE))
+    bench = SimulatedBench(bench_config, load_database(dbc or DEFAULT_DATABASE))
     end_ns = None if duration_s is None else round(duration_s * 1e9)
     sent, due_ns = 0, 0
     clock = RealClock()

@@ -12,7 +12,7 @@ from rig.log.writer import RunLog
 from rig.machine.clock import Clock
 from rig.run.loop import Port
 from rig.run.timing import Timing
-from rig.simulated_bench.simulated import Bench
+from rig.simulated_bench.bench import SimulatedBench
 
 _NO_CONDITIONS = Conditions()
 _CATCHING_UP = 4
@@ -96,7 +96,11 @@ class BenchOnBus:
     """
 
     def __init__(
-        self, bench: Bench, bench_bus: Bus, port: BusPort, authenticator: Authenticator | None
+        self,
+        bench: SimulatedBench,
+        bench_bus: Bus,
+        port: BusPort,
+        authenticator: Authenticator | None,
     ) -> None:
         self._bench = bench
         self._bench_bus = bench_bus

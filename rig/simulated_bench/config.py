@@ -1,4 +1,4 @@
-"""The bench's configuration: from YAML to validated values, or one line that says what is wrong."""
+"""The bench's configuration: from YAML to validated values."""
 
 from pathlib import Path
 

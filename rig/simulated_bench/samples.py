@@ -1,4 +1,4 @@
-"""An applied force or an prescribed height from a CSV file."""
+"""An applied force or a prescribed height from a CSV file."""
 
 import csv
 import math

@@ -12,8 +12,8 @@ from rig.bridge.messages import Conditions, Counts
 from rig.plan.assembly import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.setup import load_setup
+from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.simulated import Bench
 
 MS = 1_000_000
 BEGIN_NS = 300 * MS
@@ -65,7 +65,9 @@ class Trial:
         named = config.model_validate(config.model_dump() | {"devices": devices or {}})
         self.ready = ready.model_copy(update={"config": named})
         self.bridge: Bridge = build_bridge(self.ready)
-        self.bench = Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), ready.database)
+        self.bench = SimulatedBench(
+            load_bench_config(CONFIGS / "reference_bench.yaml"), ready.database
+        )
         self.state: BridgeState = self.bridge.init(0)
         self.ticks: list[Tick] = []
 

@@ -22,7 +22,7 @@ from rig.plan.setup import load_setup
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.schema import Effect
+from rig.simulated_bench.schema import UndeclaredEffect
 from tests.fmu.driver import written
 from tests.fmu.specimens import with_effects
 
@@ -104,8 +104,8 @@ def test_a_defective_fmu_is_run_replayed_checked_and_diagnosed(tmp_path):
     nominal = load_model(MODELS / "bench.yaml")
     spec = nominal.with_effects("strut", [EffectSpec(name="maxwell", parameters=own)])
     effects = (
-        Effect.model_validate({"name": "maxwell", "strut": "strut", "parameters": own}),
-        Effect.model_validate(
+        UndeclaredEffect.model_validate({"name": "maxwell", "strut": "strut", "parameters": own}),
+        UndeclaredEffect.model_validate(
             {"name": "quadratic_damping", "strut": "strut", "parameters": lacking}
         ),
     )

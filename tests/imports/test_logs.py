@@ -19,8 +19,8 @@ from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
 from rig.plan.setup import Setup, load_setup
 from rig.run.replay import replay
+from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.simulated import Bench
 
 EPOCH_S = 1_700_000_000.0
 
@@ -32,7 +32,7 @@ def ready() -> Setup:
 
 @pytest.fixture(scope="module")
 def frames(ready: Setup) -> list[Frame]:
-    bench = Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), ready.database)
+    bench = SimulatedBench(load_bench_config(CONFIGS / "reference_bench.yaml"), ready.database)
     return bench.update(500_000_000)[0]
 
 

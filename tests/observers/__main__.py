@@ -27,8 +27,8 @@ from rig.plan.config import CONFIGS
 from rig.plan.setup import load_setup
 from rig.run import live
 from rig.run.live import with_bench
+from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.simulated import Bench as SimulatedBench
 from rig.simulated_bench.trajectory import simulate
 from rig.tuning.expectation import Expectation, followed, residual, spectrum
 from rig.tuning.gains import Aim, Bench, expected, gain_margin, paper, tuned
@@ -237,7 +237,7 @@ def moving_table(seeds):
                 folder = Path(temporary) / "case"
                 _, bench = prepared(folder, seed, 20e-6, 15e-6, observers=observers)
                 ready = load_setup(folder / "rig.yaml", duration_s=8.0)
-                live.Bench = bench_class
+                live.SimulatedBench = bench_class
                 ended = with_bench(
                     ready, bench, folder / "run", lockstep=lockstep, stop=lambda: False
                 )
