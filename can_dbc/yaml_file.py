@@ -9,7 +9,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
-from can_dbc.errors import InputError
+from can_dbc.errors import FileError
 
 _MAX_BYTES = 4 * 1024 * 1024
 """Largest file; a model with a thousand struts has a tenth of it."""
@@ -74,19 +74,19 @@ def read_text(path: Path, max_bytes: int = _MAX_BYTES) -> str:
         max_bytes: Largest size that is read.
 
     Raises:
-        InputError: The file is missing, unreadable, too large or not UTF-8.
+        FileError: The file is missing, unreadable, too large or not UTF-8.
     """
     try:
         with path.open("rb") as file:
             data = file.read(max_bytes + 1)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        raise FileError(f"{path}: cannot be read: {error.strerror}") from error
     if len(data) > max_bytes:
-        raise InputError(f"{path}: larger than {max_bytes} bytes, expected a smaller file")
+        raise FileError(f"{path}: larger than {max_bytes} bytes, expected a smaller file")
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.start} is not UTF-8, expected text") from error
+        raise FileError(f"{path}: byte {error.start} is not UTF-8, expected text") from error
 
 
 def parse_mapping(text: str, source: str) -> dict[str, object]:
@@ -97,24 +97,24 @@ def parse_mapping(text: str, source: str) -> dict[str, object]:
         source: What to call the text in an error, usually its path.
 
     Raises:
-        InputError: The text is no YAML, or no mapping.
+        FileError: The text is no YAML, or no mapping.
     """
     try:
         data = cast("object", yaml.load(text, _PlainLoader))  # noqa: S506 - it is a SafeLoader
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = f" line {mark.line + 1}" if mark else ""
-        raise InputError(f"{source}:{where} is no valid YAML: {error.problem}") from error
+        raise FileError(f"{source}:{where} is no valid YAML: {error.problem}") from error
     except (*_NO_YAML, RecursionError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{source}: is no valid YAML: {reason}") from error
+        raise FileError(f"{source}: is no valid YAML: {reason}") from error
     if not isinstance(data, dict):
         found = "nothing" if data is None else type(data).__name__
-        raise InputError(f"{source}: expected keys and values at the top level, found {found}")
+        raise FileError(f"{source}: expected keys and values at the top level, found {found}")
     mapping = cast("dict[object, object]", data)
     for key in mapping:
         if not isinstance(key, str):
-            raise InputError(f"{source}: key {key!r}: expected a name")
+            raise FileError(f"{source}: key {key!r}: expected a name")
     return cast("dict[str, object]", mapping)
 
 
@@ -128,19 +128,19 @@ def validated(model: type[_Model], data: object, source: str, context: object = 
         context: What the model's own checks are given.
 
     Raises:
-        InputError: With the first error's key, value and expectation, and how many more there are.
+        FileError: With the first error's key, value and expectation, and how many more there are.
     """
     try:
         return model.model_validate(data, context=context)
     except ValidationError as error:
-        raise InputError(_one_line(error, model, source)) from error
+        raise FileError(_one_line(error, model, source)) from error
 
 
 def load_validated(model: type[_Model], path: Path, context: object = None) -> _Model:
     """The file at `path` as a frozen `model`; `context` as of `validated`.
 
     Raises:
-        InputError: One line that names file, key, value and what was expected.
+        FileError: One line that names file, key, value and what was expected.
     """
     return validated(model, parse_mapping(read_text(path), str(path)), str(path), context)
 

@@ -32,13 +32,13 @@ def package() -> Any:
     """The package `canopen`.
 
     Raises:
-        InputError: It is not installed.
+        BusError: It is not installed.
     """
     logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what it says, it also raises
     try:
         return importlib.import_module("canopen")
     except ImportError:
-        raise InputError(
+        raise BusError(
             "the package canopen is not installed, expected `pip install 'rig[sensors]'`"
         ) from None
 
@@ -56,7 +56,7 @@ class CanOpenNetwork:
 
     Raises:
         BusError: The interface cannot be opened.
-        InputError: The package is not installed.
+        BusError: The package is not installed.
     """
 
     def __init__(self, config: BusConfig, *, listen_only: bool = False) -> None:

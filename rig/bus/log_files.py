@@ -19,6 +19,11 @@ _TEXT = MappingProxyType(
 )
 _BINARY = MappingProxyType({".blf": can.BLFReader, ".mf4": can.MF4Reader})
 
+
+class BusLogError(InputError):
+    """A bus log cannot be read; one line: file, reason."""
+
+
 LOG_SUFFIXES = (*_TEXT, *_BINARY)
 """Kinds of logs that are read."""
 
@@ -51,15 +56,15 @@ def read_log(path: Path) -> Iterator[tuple[int, Frame]]:
         to 0.24 us in our days), and the frame, stamped with the time since the first one.
 
     Raises:
-        InputError: The file is of no such kind, cannot be read, is damaged, or wants a package that
-            is not installed.
+        BusLogError: The file is of no such kind, cannot be read, is damaged, or requires a package
+            that is not installed.
     """
     if path.suffix.lower() not in LOG_SUFFIXES:
-        raise InputError(
+        raise BusLogError(
             f"{path}: expected a log with one of the endings {', '.join(LOG_SUFFIXES)}"
         )
     if not path.is_file():
-        raise InputError(f"{path}: cannot be read: no such file")
+        raise BusLogError(f"{path}: cannot be read: no such file")
     damaged, first_ns = _damaged(path), None
     try:
         # Opened here and not by the reader, which leaves a damaged file open.
@@ -72,7 +77,7 @@ def read_log(path: Path) -> Iterator[tuple[int, Frame]]:
                 yield at_ns, _frame(message, at_ns - first_ns)
     except damaged as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise InputError(f"{path}: is no such log, or is damaged: {reason}") from error
+        raise BusLogError(f"{path}: is no such log, or is damaged: {reason}") from error
 
 
 def _opened(path: Path) -> Any:
@@ -93,7 +98,7 @@ def _damaged(path: Path) -> tuple[type[Exception], ...]:
     try:
         errors = cast("Any", importlib.import_module("asammdf.blocks.utils"))
     except ImportError as error:
-        raise InputError(f"{path}: wants the package asammdf: pip install 'rig[mf4]'") from error
+        raise BusLogError(f"{path}: wants the package asammdf: pip install 'rig[mf4]'") from error
     return (*_DAMAGED, cast("type[Exception]", errors.MdfException))
 
 

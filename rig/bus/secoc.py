@@ -31,6 +31,10 @@ _KEY_BYTES = 16
 _LARGEST_KEY_FILE = 1000
 
 
+class AuthenticationError(InputError):
+    """A key cannot be used, or the package that computes the CMAC is not installed."""
+
+
 @dataclass(frozen=True)
 class Authentication:
     """How frames are authenticated.
@@ -57,16 +61,16 @@ def read_key(path: Path) -> bytes:
     """Key of a file that holds 32 hexadecimal digits.
 
     Raises:
-        InputError: The file cannot be read, or holds no such key; what it holds is not said.
+        FileError: The file cannot be read.
+        AuthenticationError: It contains no such key. The message does not show its content.
     """
+    text = read_text(path, _LARGEST_KEY_FILE)
     try:
-        key = bytes.fromhex(read_text(path, _LARGEST_KEY_FILE))
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
+        key = bytes.fromhex(text)
+    except ValueError:
         key = b""
     if len(key) != _KEY_BYTES:
-        raise InputError(f"{path}: expected a key of {2 * _KEY_BYTES} hexadecimal digits")
+        raise AuthenticationError(f"{path}: expected a key of {2 * _KEY_BYTES} hexadecimal digits")
     return key
 
 
@@ -74,13 +78,13 @@ def cmac(key: bytes) -> Callable[[bytes], bytes]:
     """AES-CMAC under a key: message -> 16 bytes.
 
     Raises:
-        InputError: The package that computes it is not installed.
+        AuthenticationError: The package that computes it is not installed.
     """
     try:
         module = cast("Any", importlib.import_module("cryptography.hazmat.primitives.cmac"))
         ciphers = cast("Any", importlib.import_module("cryptography.hazmat.primitives.ciphers"))
     except ImportError as error:
-        raise InputError(
+        raise AuthenticationError(
             "authentication: wants the package cryptography: pip install 'rig[secoc]'"
         ) from error
     keyed = module.CMAC(ciphers.algorithms.AES(key))
@@ -108,7 +112,7 @@ class Authenticator:
         epoch_ns: Unix time of the run's start, to which the frames' times are relative.
 
     Raises:
-        InputError: The package that computes the CMAC is not installed.
+        AuthenticationError: The package that computes the CMAC is not installed.
     """
 
     def __init__(self, how: Authentication, epoch_ns: int) -> None:

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from can_dbc.errors import InputError
 from can_dbc.frame import Frame
+from rig.log.errors import LogError
 from rig.log.reader import LATEST_S, parse_frame
 
 _BLOCK_BYTES = 2 * 1024 * 1024
@@ -88,7 +88,7 @@ def received_frames(paths: Sequence[Path], epoch_ns: int) -> FrameColumns:
         epoch_ns: Unix time of the run's start.
 
     Raises:
-        InputError: The file cannot be read, or a line of it is no frame.
+        LogError: The file cannot be read, or a line of it is no frame.
     """
     parts = [
         _block(text, first_line, epoch_ns, path)
@@ -122,7 +122,7 @@ def _whole_lines(path: Path) -> Iterator[tuple[bytes, int]]:
                     yield whole, number
                     number += whole.count(b"\n")
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 def _columns(count: int, width: int) -> FrameColumns:
@@ -221,7 +221,7 @@ def _read_line(line: str, row: int, epoch_ns: int, place: str, found: FrameColum
     try:
         frame, direction = parse_frame(line, epoch_ns)
     except (ValueError, IndexError) as error:
-        raise InputError(
+        raise LogError(
             f"{place}: {line.strip()[:60]!r}: expected a line such as "
             "'(1.000000000) can0 100#0102 R'"
         ) from error

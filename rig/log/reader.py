@@ -17,9 +17,9 @@ from typing import Any, cast
 
 import pyarrow as pa
 
-from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from can_dbc.yaml_file import parse_mapping, read_text
+from rig.log.errors import LogError
 from rig.log.steps import step_schema
 
 _TAIL_BYTES = 4096
@@ -106,14 +106,14 @@ class RunFolder:
         """Every frame with its direction, in the order of the log.
 
         Raises:
-            InputError: A line other than the last, which a kill may have cut, is no frame.
+            LogError: A line other than the last, which a kill may have cut, is no frame.
         """
         for path in self.frame_files:
             try:
                 with path.open(encoding="ascii", errors="replace") as file:
                     yield from self._parsed(file, path)
             except OSError as error:
-                raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+                raise LogError(f"{path}: cannot be read: {error.strerror}") from error
 
     def _parsed(self, lines: Iterator[str], path: Path) -> Iterator[tuple[Frame, str]]:
         for number, line in enumerate(lines, start=1):
@@ -122,7 +122,7 @@ class RunFolder:
             except (ValueError, IndexError) as error:
                 if not line.endswith("\n"):
                     return
-                raise InputError(
+                raise LogError(
                     f"{path}: line {number}: {line.strip()[:60]!r}: expected a line such as "
                     "'(1.000000000) can0 100#0102 R'"
                 ) from error
@@ -144,13 +144,13 @@ def read_run(folder: Path) -> RunFolder:
     """Open a run's folder, whole or cut off by a kill.
 
     Raises:
-        InputError: It is no run, or a file of it is damaged beyond its end.
+        LogError: It is no run, or a file of it is damaged beyond its end.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: is no folder, expected a run")
+        raise LogError(f"{folder}: is no folder, expected a run")
     for name in (RUN_FILE, FRAMES_FILE, STEPS_FILE):
         if not (folder / name).is_file():
-            raise InputError(f"{folder}: {name} is missing, expected a run")
+            raise LogError(f"{folder}: {name} is missing, expected a run")
     header = read_header(folder)
     epoch_ns = cast("int", header["epoch_ns"])
     return RunFolder(folder, header, _read_steps(parts(folder, STEPS_FILE)), epoch_ns)
@@ -160,18 +160,18 @@ def read_header(folder: Path) -> dict[str, object]:
     """Content of a run's `run.yaml`.
 
     Raises:
-        InputError: It is no run's, or one of another version.
+        LogError: It is no run's, or one of another version.
     """
     path = folder / RUN_FILE
     header = parse_mapping(read_text(path, 64 * 1024 * 1024), str(path))
     schema = header.get("schema")
     if schema != RUN_SCHEMA:
-        raise InputError(
+        raise LogError(
             f"{path}: schema: {str(schema)[:40]}: expected {RUN_SCHEMA}, a run of this version"
         )
     epoch_ns = header.get("epoch_ns")
     if not isinstance(epoch_ns, int) or not 0 <= epoch_ns < LATEST_S * 1_000_000_000:
-        raise InputError(f"{path}: epoch_ns: {str(epoch_ns)[:40]}: expected a Unix time in ns")
+        raise LogError(f"{path}: epoch_ns: {str(epoch_ns)[:40]}: expected a Unix time in ns")
     return header
 
 
@@ -179,7 +179,7 @@ def changed_files(folder: Path) -> list[str]:
     """Names of a run's files that are not those it ran with, by their hashes in `run.yaml`.
 
     Raises:
-        InputError: A file cannot be read.
+        LogError: A file cannot be read.
     """
     recorded = read_run(folder).header.get("files_sha256")
     if not isinstance(recorded, dict):
@@ -190,7 +190,7 @@ def changed_files(folder: Path) -> list[str]:
         try:
             found = hashlib.sha256(path.read_bytes()).hexdigest()
         except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+            raise LogError(f"{path}: cannot be read: {error.strerror}") from error
         if found != expected:
             changed.append(path.name)
     return changed
@@ -200,7 +200,7 @@ def last_frame_ns(folder: Path, epoch_ns: int) -> int:
     """Time of the last whole line of a run's `frames.log`, -1 if there is none.
 
     Raises:
-        InputError: The file cannot be read.
+        LogError: The file cannot be read.
     """
     for path in reversed(parts(folder, FRAMES_FILE)):
         try:
@@ -208,7 +208,7 @@ def last_frame_ns(folder: Path, epoch_ns: int) -> int:
                 file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
                 lines = file.read().split(b"\n")[:-1]
         except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+            raise LogError(f"{path}: cannot be read: {error.strerror}") from error
         for line in reversed(lines):
             with contextlib.suppress(ValueError, IndexError):
                 return parse_frame(line.decode("ascii", "replace"), epoch_ns)[0].t_ns
@@ -220,7 +220,7 @@ def _read_steps(paths: list[Path]) -> Any:
     first = tables[0]
     for path, table in zip(paths, tables, strict=True):
         if table.num_rows and table.schema != first.schema:
-            raise InputError(f"{path}: its columns are not those of {paths[0].name}")
+            raise LogError(f"{path}: its columns are not those of {paths[0].name}")
     return _pa.concat_tables([first, *[table for table in tables[1:] if table.num_rows]])
 
 
@@ -239,11 +239,11 @@ def _read_part(path: Path) -> Any:
             table.validate(full=True)
             _check_columns(table, path)
             return table
-    except InputError:
+    except LogError:
         raise
     except (_pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: is no Arrow stream of steps: {reason}") from error
+        raise LogError(f"{path}: is no Arrow stream of steps: {reason}") from error
 
 
 def _check_columns(table: Any, path: Path) -> None:
@@ -251,13 +251,13 @@ def _check_columns(table: Any, path: Path) -> None:
     for number, column in enumerate(table.schema):
         expected = common[number] if number < len(common) else _pa.field(column.name, _pa.float64())
         if (column.name, column.type) != (expected.name, expected.type):
-            raise InputError(
+            raise LogError(
                 f"{path}: column {number + 1} is {str(column)[:60]!r}, expected '{expected}'"
             )
         if table.column(number).null_count:
-            raise InputError(f"{path}: column {column.name[:60]!r} has gaps, expected none")
+            raise LogError(f"{path}: column {column.name[:60]!r} has gaps, expected none")
     if table.num_columns < len(common):
-        raise InputError(f"{path}: expected columns {', '.join(common.names)} at least")
+        raise LogError(f"{path}: expected columns {', '.join(common.names)} at least")
 
 
 def _schema_bytes(head: bytes) -> int:

@@ -19,9 +19,9 @@ from typing import Any, cast
 import pyarrow as pa
 import yaml
 
-from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.log.captures import Capture, Captures, Entry, Window
+from rig.log.errors import LogError
 from rig.log.reader import (
     DBC_FILE,
     END_OF_STREAM,
@@ -134,7 +134,7 @@ class RunLog:
         aside: Name and content of a file that is written anew once a second, if any.
 
     Raises:
-        InputError: The folder cannot be created, or holds another run.
+        LogError: The folder cannot be created, or holds another run.
     """
 
     def __init__(
@@ -175,12 +175,12 @@ class RunLog:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if (folder / RUN_FILE).exists():
-                raise InputError(f"{folder}: holds a run already, expected an empty folder")
+                raise LogError(f"{folder}: holds a run already, expected an empty folder")
             _write_yaml(folder / RUN_FILE, header)
             (folder / _RESERVE_FILE).write_bytes(bytes(_RESERVE_BYTES))
             self._part = _Part(folder, 0, self._rows.schema, 0)
         except OSError as error:
-            raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
+            raise LogError(f"{folder}: cannot be written: {error.strerror}") from error
         self._waiting: deque[Entry] = deque()
         self._notes: deque[tuple[str, str]] = deque()
         self._noted: dict[str, WholeFile] = {}

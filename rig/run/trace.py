@@ -12,10 +12,10 @@ from typing import Any, NamedTuple, cast
 
 import pyarrow as pa
 
-from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.bridge.bridge import TickResult
 from rig.bridge.messages import Conditions
+from rig.log.errors import LogError
 from rig.log.steps import Step
 from rig.machine.clock import Clock, WrappedClock
 from rig.run.loop import Port, Sink
@@ -223,16 +223,16 @@ def read_trace(folder: Path) -> list[Row]:
     """The rows of a run's trace.
 
     Raises:
-        InputError: The run has none, or it is damaged.
+        LogError: The run has none, or it is damaged.
     """
     path = folder / TRACE_FILE
     if not path.is_file():
-        raise InputError(f"{path}: no such file, expected a run made with --trace")
+        raise LogError(f"{path}: no such file, expected a run made with --trace")
     try:
         with _pa.memory_map(str(path)) as source:
             table = _pa.ipc.open_file(source).read_all()
             columns = [table.column(name).to_pylist() for name in Row._fields]
     except (_pa.ArrowException, OSError, KeyError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: is no trace: {reason}") from error
+        raise LogError(f"{path}: is no trace: {reason}") from error
     return [Row(*values) for values in zip(*columns, strict=True)]
