@@ -6,11 +6,8 @@ from typing import Any
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.log.reader import (
-    FRAMES_FILE,
-    STEPS_FILE,
-    RunFolder,
-)
+from rig.log.file_names import CAPTURES_FOLDER, FRAMES_FILE, STEPS_FILE
+from rig.log.reader import RunFolder
 
 _NOT_COPIED = (FRAMES_FILE, STEPS_FILE, "reserve.tmp")
 _LARGEST_FILE_BYTES = 64 * 1024 * 1024
@@ -61,7 +58,7 @@ def content_of(found: RunFolder) -> Content:
         if path.is_file()
         and path.name not in (*_NOT_COPIED, *logs)
         and not path.name.startswith("steps.")
-        and path.relative_to(found.folder).parts[0] != "captures"
+        and path.relative_to(found.folder).parts[0] != CAPTURES_FOLDER
         and path.stat().st_size <= _LARGEST_FILE_BYTES
     }
     return Content(files, list(found.frames()), found.steps)

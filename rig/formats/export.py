@@ -25,14 +25,9 @@ from rig.files.folders import refuse_full
 from rig.formats.content import channel_of, inside
 from rig.formats.mf4 import from_mf4, to_mf4
 from rig.formats.parquet import from_parquet, to_parquet
-from rig.log.reader import (
-    FRAMES_FILE,
-    RUN_FILE,
-    STEPS_FILE,
-    RunFolder,
-    format_frame,
-    read_run,
-)
+from rig.log.candump import format_frame
+from rig.log.file_names import FRAMES_FILE, RUN_FILE, STEPS_FILE
+from rig.log.reader import RunFolder, read_run
 
 _pa = cast("Any", pa)
 _csv = cast("Any", pyarrow.csv)

@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 
 from can_dbc.errors import InputError
-from rig.log.follower import RunFollower, Window
+from rig.log.follower import RunFollower, Stretch
 from rig.log.reader import read_header
 from rig.pages.report.figures import Curve, Panel, Plot, plot
 from rig.pages.report.page import render, write_page
@@ -155,7 +155,7 @@ def _plots(follower: RunFollower, strut: str, number: int, *, with_cell: bool) -
     return [plot(f"run-{number}", "The run", caption, panels, 1)]
 
 
-def _panel(found: Window, label: str, curves: Sequence[Curve], values: Sequence[Any]) -> Panel:
+def _panel(found: Stretch, label: str, curves: Sequence[Curve], values: Sequence[Any]) -> Panel:
     return Panel("lines", "time / s", label, found.t_s, curves, values, {"gaps": True})
 
 

@@ -23,8 +23,8 @@ from rig.bridge.messages import STATUS, STRUT, TIMING, Publication
 from rig.bridge.supervisor import Action, Limit, Supervision, Watched
 from rig.bus.bus import BusConfig
 from rig.bus.secoc import Authentication
-from rig.log.captures import Window
-from rig.log.writer import Rotation
+from rig.log.captures import CaptureWindow
+from rig.log.rotation import Rotation
 from rig.observers import DEFAULT_KIND, OBSERVERS
 from rig.plan.quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, OTHERS, Quantity
 
@@ -467,12 +467,12 @@ class LogConfig(_Frozen):
         time_ns = None if self.rotate_s is None else round(self.rotate_s * 1e9)
         return Rotation(self.rotate_bytes, time_ns)
 
-    def window(self) -> Window | None:
+    def window(self) -> CaptureWindow | None:
         """As the log takes it; None captures nothing."""
         if self.most_captures == 0:
             return None
         before_ns, after_ns = round(self.capture_before_s * 1e9), round(self.capture_after_s * 1e9)
-        return Window(before_ns, after_ns, self.most_captures)
+        return CaptureWindow(before_ns, after_ns, self.most_captures)
 
 
 class RunConfig(_Frozen):

@@ -12,7 +12,8 @@ from can_dbc.yaml_file import load_validated, validated
 from dart_model.spec import ModelSpec, load_model, model_file
 from rig.bridge.messages import ESTIMATE, KINEMATICS, STATUS, UNCERTAINTY, Publication
 from rig.bus.secoc import FD_LENGTHS, Authentication, read_key
-from rig.log.reader import DBC_FILE, MODEL_FILE, RUN_FILE, read_header
+from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
+from rig.log.reader import read_header
 from rig.observers.kalman import KalmanObserver
 from rig.observers.none import NoObserver
 from rig.observers.pi import PiObserver

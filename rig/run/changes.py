@@ -13,11 +13,9 @@ from typing import Any, cast
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import parse_mapping, read_text, validated
 from rig.bridge.bridge import Bridge
+from rig.log.file_names import CHANGES_FILE
 from rig.plan.config import RunConfig
 from rig.plan.setup import Setup
-
-CHANGES_FILE = "changes.jsonl"
-"""Changes of a run in its folder: one a line, with the time of the first tick that had it."""
 
 CHANGEABLE = ("observers", "supervision")
 """Sections of the configuration that can be changed while a run goes on."""
@@ -116,7 +114,7 @@ def changed_bridge(bridge: Bridge, ready: Setup) -> Bridge:
 
 
 def change_line(t_ns: int, assignments: Assignments) -> str:
-    """A line of `CHANGES_FILE`."""
+    """A line of `CHANGES_FILE`: a change, with the time of the first tick that had it."""
     return json.dumps({"t_ns": t_ns, "set": assignments}) + "\n"
 
 

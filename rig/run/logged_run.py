@@ -20,14 +20,15 @@ from rig.bridge.contract import Mode
 from rig.bridge.log_columns import Record, columns
 from rig.bus.link import LinkFigures
 from rig.files.folders import refuse_full
-from rig.log.reader import DBC_FILE, MODEL_FILE, RUN_SCHEMA
+from rig.log.file_names import CHANGES_FILE, DBC_FILE, HISTOGRAMS_FILE, MODEL_FILE
+from rig.log.reader import RUN_SCHEMA
 from rig.log.steps import Step
-from rig.log.writer import RunLog
+from rig.log.writer import LogOptions, RunWriter
 from rig.machine.clock import Clock, OccupiedClock
 from rig.machine.realtime import Granted
 from rig.plan.assembly import sensors
 from rig.plan.setup import Setup
-from rig.run.changes import CHANGES_FILE, Changes, unchanged
+from rig.run.changes import Changes, unchanged
 from rig.run.loop import (
     SHOWN_EVERY_NS,
     Look,
@@ -42,7 +43,7 @@ from rig.run.loop import (
 )
 from rig.run.ports import InformedPort
 from rig.run.requests import Requests
-from rig.run.timing import HISTOGRAMS_FILE, Timing
+from rig.run.timing import Timing
 from rig.run.trace import Trace
 
 _MOST_REPORTS = 1000
@@ -120,6 +121,13 @@ def _copy_inputs(ready: Setup, folder: Path) -> None:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
 
 
+def _loop_priority(ready: Setup, granted: Granted | None) -> int | None:
+    """Real-time priority of a loop that waits for a clock, 0 for none; None of any other."""
+    if granted is None:
+        return None
+    return ready.config.realtime.fifo_priority if granted.fifo else 0
+
+
 def logged(
     ready: Setup,
     bridge: Bridge,
@@ -167,19 +175,19 @@ def logged(
     header |= {"forced": [dict(finding) for finding in forced]} if forced else {}
     timing, further = Timing.empty(), sensors(ready)
     record = Record(config.signals.measured, len(further))
-    priority = config.realtime.fifo_priority if granted is not None and granted.fifo else 0
-    log = RunLog(
+    priority = _loop_priority(ready, granted)
+    log = RunWriter(
         folder,
         header,
         columns(list(config.observers), config.signals.measured, further),
-        clock.epoch_ns,
         config.bus.channel,
-        paced=granted is not None,
-        priority=priority,
-        rotation=config.log.rotation(),
-        window=config.log.window(),
-        capture_name=_capture_name,
-        aside=None if granted is None else (HISTOGRAMS_FILE, timing.histograms),
+        priority,
+        LogOptions(
+            config.log.rotation(),
+            config.log.window(),
+            _capture_name,
+            None if granted is None else (HISTOGRAMS_FILE, timing.histograms),
+        ),
     )
     count = None if config.duration_s is None else _ticks(config.duration_s, config.rate_hz)
     ticks, shown_ns, status = 0, 0, "failed"
@@ -214,7 +222,7 @@ def logged(
             changes: Changes = unchanged
             if acknowledge is not None:
                 note = partial(log.note, CHANGES_FILE)
-                requests = Requests(folder, ready, bridge, acknowledge, note, priority)
+                requests = Requests(folder, ready, bridge, acknowledge, note, priority or 0)
                 around.enter_context(requests.served())
                 changes = requests.changes
             state = run(bridge, state, due, source, keep, record, changes)

@@ -8,7 +8,7 @@ from rig.bridge.messages import NO_TIMING, Conditions, Levels, TimingFigures
 from rig.bus.bus import Bus
 from rig.bus.link import Link
 from rig.bus.secoc import Authenticator
-from rig.log.writer import RunLog
+from rig.log.writer import RunWriter
 from rig.machine.clock import Clock
 from rig.run.loop import Port
 from rig.run.timing import Timing
@@ -53,7 +53,7 @@ class BusPort:
 class InformedPort:
     """A port whose conditions hold the state of the log too, and how well the rate is kept."""
 
-    def __init__(self, port: Port, log: RunLog, timing: Timing) -> None:
+    def __init__(self, port: Port, log: RunWriter, timing: Timing) -> None:
         self._port = port
         self._log = log
         self._timing = timing

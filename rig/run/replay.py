@@ -17,7 +17,7 @@ from can_dbc.frame import Frame
 from rig.bridge.bridge import TickResult
 from rig.bridge.log_columns import Record, columns
 from rig.bridge.messages import Conditions
-from rig.log.frame_columns import FrameColumns, received_frames
+from rig.log.frame_columns import FrameColumns, read_frame_columns
 from rig.log.reader import RunFolder, last_frame_ns, read_run
 from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step, StepRows
 from rig.plan.assembly import build_bridge, sensors
@@ -100,7 +100,7 @@ def replay(
     found, own = setup_of_run(folder)
     ready = ready or own
     bridge = build_bridge(ready, sending=False)
-    frames = received_frames(found.frame_files, found.epoch_ns)
+    frames = read_frame_columns(found.frame_files, found.epoch_ns)
     ticks = _ticks(found, frames, ready.config.period_ns)
     config = ready.config
     further = sensors(ready)

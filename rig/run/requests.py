@@ -16,7 +16,8 @@ from typing import Any, cast
 
 from can_dbc.errors import InputError
 from rig.bridge.bridge import Bridge
-from rig.log.reader import RUN_FILE, read_header
+from rig.log.file_names import RUN_FILE
+from rig.log.reader import read_header
 from rig.machine.realtime import follow
 from rig.plan.check import errors
 from rig.plan.setup import Setup, setup_of_folder

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.log.file_names import HISTOGRAMS_FILE
+
 BINS = 20_000
 """Histograms have bins of 1 µs; the last one takes all that is longer than 20 ms."""
-
-HISTOGRAMS_FILE = "timing.json"
-"""Histograms of a run's ticks, in its folder, once a second."""
 
 _EDGES = np.unique(np.geomspace(1, BINS, 96).astype(np.intp) - 1)
 """First bins of those in the file: as wide as they are read, and few enough for a live run."""

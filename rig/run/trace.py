@@ -16,12 +16,10 @@ from can_dbc.frame import Frame
 from rig.bridge.bridge import TickResult
 from rig.bridge.messages import Conditions
 from rig.log.errors import LogError
+from rig.log.file_names import TRACE_FILE
 from rig.log.steps import Step
 from rig.machine.clock import Clock, WrappedClock
 from rig.run.loop import Port, Sink
-
-TRACE_FILE = "trace.arrow"
-"""Its name in the folder of a run."""
 
 _MOST_ROWS = 200_000
 """Rows kept; a run that is late at every tick would fill the memory."""

@@ -12,7 +12,7 @@ from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.bus.link import Link
 from rig.bus.secoc import Authentication, Authenticator, cmac, read_key
-from rig.log.reader import STEPS_FILE
+from rig.log.file_names import STEPS_FILE
 from rig.plan.check import Severity, check
 from rig.plan.config import CONFIGS
 from rig.plan.setup import load_setup

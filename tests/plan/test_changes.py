@@ -6,11 +6,11 @@ import threading
 import pytest
 
 from can_dbc.errors import InputError
+from rig.log.file_names import CHANGES_FILE
 from rig.plan.assembly import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.setup import load_setup
 from rig.run.changes import (
-    CHANGES_FILE,
     change_line,
     logged_changes,
     parse_assignments,

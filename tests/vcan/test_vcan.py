@@ -17,7 +17,8 @@ from can_dbc.frame import Frame
 from can_dbc.protection import check_crc
 from rig.bridge.contract import Mode
 from rig.bus.bus import Bus, BusConfig
-from rig.log.reader import RunFolder, parse_frame, read_run
+from rig.log.candump import parse_frame
+from rig.log.reader import RunFolder, read_run
 from rig.plan.assembly import build_bridge
 from rig.plan.setup import load_setup
 from rig.run.replay import replay

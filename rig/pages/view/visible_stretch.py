@@ -11,8 +11,9 @@ from scipy import signal
 
 from dart_model.plant.strut import Strut, struts_of
 from dart_model.spec import ModelSpec
+from rig.log.candump import LATEST_S, parse_frame
+from rig.log.file_names import FRAMES_FILE, parts
 from rig.log.follower import RunFollower
-from rig.log.reader import FRAMES_FILE, LATEST_S, parse_frame, parts
 
 Array = NDArray[np.float64]
 
