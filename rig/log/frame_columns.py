@@ -92,7 +92,7 @@ def read_frame_columns(paths: Sequence[Path], epoch_ns: int) -> FrameColumns:
         _read_block(text, first_line, epoch_ns, path)
         for path in paths
         for text, first_line in _whole_lines(path)
-    ] or [_empty(0)]
+    ] or [_empty(0, 0)]
     width = max(part.payload.shape[1] for part in parts)
     *others, payloads = cast("Any", zip(*parts, strict=True))
     padded = [np.pad(payload, ((0, 0), (0, width - payload.shape[1]))) for payload in payloads]
@@ -115,10 +115,10 @@ def _whole_lines(path: Path) -> Iterator[tuple[bytes, int]]:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def _empty(count: int) -> FrameColumns:
+def _empty(count: int, width: int) -> FrameColumns:
     integers = np.zeros((3, count), dtype=np.int64)
     flags = np.zeros((3, count), dtype=np.bool_)
-    payload = np.zeros((count, _MOST_FD_DIGITS // 2), dtype=np.uint8)
+    payload = np.zeros((count, width), dtype=np.uint8)
     return FrameColumns(
         integers[0], integers[1], flags[0], flags[1], integers[2], flags[2], payload
     )
@@ -128,7 +128,7 @@ def _read_block(text: bytes, first_line: int, epoch_ns: int, path: Path) -> Fram
     lines = _pc.split_pattern(_pa.array([text], _pa.binary()), b"\n")[0].values[:-1]
     numbers = np.flatnonzero(_numpy(_pc.invert(_pc.ends_with(lines, b"T"))))
     lines = lines.take(_pa.array(numbers))
-    columns = _empty(len(numbers))
+    columns = _empty(len(numbers), _MOST_FD_DIGITS // 2)
     groups = _pc.extract_regex(lines, _LINE)
     is_read = _numpy(groups.is_valid()).copy()
     rows = np.flatnonzero(is_read)
