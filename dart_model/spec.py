@@ -22,7 +22,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from can_dbc.yaml_file import Finite, NotNegative, Positive, parse_mapping, read_text, validated
+from can_dbc.yaml_file import Finite, NotNegative, Positive, parse_mapping, read_text, validate
 from dart_model.effects import CATALOGUE, effect
 from dart_model.errors import ModelError
 
@@ -336,7 +336,7 @@ def parse_model(text: str, source: str, folder: Path = Path()) -> ModelSpec:
     Raises:
         InputError: One line that names file, key, value and what was expected.
     """
-    spec = validated(ModelSpec, parse_mapping(text, source), source)
+    spec = validate(ModelSpec, parse_mapping(text, source), source)
     return spec.model_copy(update={"folder": folder})
 
 

@@ -39,7 +39,7 @@ def withdraw(content: bytes) -> None:
     _write([item for item in _admitted() if item != found])
 
 
-def require_admitted(content: bytes, path: Path) -> None:
+def require_admission(content: bytes, path: Path) -> None:
     """Refuse a program that this user never let run.
 
     Args:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from dart_model.errors import ModelError
-from dart_model.plant.admitted_programs import require_admitted
+from dart_model.plant.admitted_programs import require_admission
 from dart_model.spec import FmuSpec
 
 _MOST_ITERATIONS = 20
@@ -53,7 +53,7 @@ class MockUp:
     def __init__(self, spec: FmuSpec, folder: Path, gravity_m_per_s2: float) -> None:
         path = folder / spec.file
         content = read_program(path)
-        require_admitted(content, path)
+        require_admission(content, path)
         self._unit = _Unit(content, path, spec)
         self.name = f"FMU {spec.file}"
         self.state_scales = self._unit.nominals
@@ -92,7 +92,7 @@ class _Unit:
     """An FMU with its variables by what they are to a strut."""
 
     def __init__(self, content: bytes, path: Path, spec: FmuSpec) -> None:
-        description = described(content, path)
+        description = read_description(content, path)
         variables = {item.name: item for item in description.modelVariables}
         states = [item.variable.derivative.name for item in description.derivatives]
         _refuse_unfit(path, description, spec, variables)
@@ -272,7 +272,7 @@ def read_program(path: Path) -> bytes:
         raise ModelError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def described(content: bytes, path: Path) -> Any:
+def read_description(content: bytes, path: Path) -> Any:
     """What an FMU says of itself, as FMPy reads it; nothing of it is executed.
 
     Args:

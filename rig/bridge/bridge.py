@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from can_dbc.addressing import Directory, Filter
 from can_dbc.frame import Frame
-from can_dbc.protection import INITIAL, SequenceState, Verdict
+from can_dbc.protection import INITIAL, FrameStatus, SequenceState
 from rig.bridge.contract import (
     NO_OTHERS,
     Core,
@@ -262,14 +262,14 @@ class Bridge:
         heights, others = self._no_heights.copy(), list(NO_OTHERS)
         readings: list[Reading] = []
         for frame in frames:
-            place = self.directory.place(frame.arbitration_id, frame.is_extended)
+            place = self.directory.index_of(frame.arbitration_id, frame.is_extended)
             if place is None or frame.is_error:
                 healths = self._told(healths, frame)
                 ledger = self._foreign(ledger, frame)
                 continue
             incoming = self.incoming[place]
             sequences[place], verdict, values = incoming.read(sequences[place], frame)
-            if verdict is not Verdict.OK:
+            if verdict is not FrameStatus.OK:
                 ledger = self._judged(ledger, place, frame.t_ns, verdict, sequences[place])
             if incoming.device is not None:
                 healths, ledger, values = self._from_device(healths, ledger, frame, place, values)
@@ -321,11 +321,11 @@ class Bridge:
         return replace(ledger, counts=counts._replace(second_sender=counts.second_sender + 1))
 
     def _judged(
-        self, ledger: Ledger, place: int, t_ns: int, verdict: Verdict, sequence: SequenceState
+        self, ledger: Ledger, place: int, t_ns: int, verdict: FrameStatus, sequence: SequenceState
     ) -> Ledger:
         """After a frame that did not simply follow the one before."""
         counts = _counted(ledger.counts, verdict, sequence)
-        if verdict is not Verdict.OUT_OF_SEQUENCE:
+        if verdict is not FrameStatus.OUT_OF_SEQUENCE:
             return replace(ledger, counts=counts)
         strays, rival = self._stray(ledger.strays, place, t_ns)
         counts = counts._replace(second_sender=counts.second_sender + rival)
@@ -500,20 +500,20 @@ def _next_due_ns(due_ns: int, t_ns: int, period_ns: int) -> int:
 
 
 _CAUSES = {
-    Verdict.WRONG_CRC: "wrong_crc",
-    Verdict.WRONG_LENGTH: "wrong_length",
-    Verdict.REPEATED: "repeated",
-    Verdict.OUT_OF_SEQUENCE: "out_of_sequence",
-    Verdict.MASQUERADE: "masquerade",
-    Verdict.NO_VALUE: "no_value",
+    FrameStatus.WRONG_CRC: "wrong_crc",
+    FrameStatus.WRONG_LENGTH: "wrong_length",
+    FrameStatus.REPEATED: "repeated",
+    FrameStatus.OUT_OF_SEQUENCE: "out_of_sequence",
+    FrameStatus.MASQUERADE: "masquerade",
+    FrameStatus.NO_VALUE: "no_value",
 }
-"""Verdict of a refused frame -> what counts it."""
+"""FrameStatus of a refused frame -> what counts it."""
 
 
-def _counted(counts: Counts, verdict: Verdict, sequence: SequenceState) -> Counts:
-    if verdict is Verdict.FIRST:
+def _counted(counts: Counts, verdict: FrameStatus, sequence: SequenceState) -> Counts:
+    if verdict is FrameStatus.FIRST:
         return counts._replace(started=counts.started + 1)
-    if verdict.accepted:
+    if verdict.is_accepted:
         return counts._replace(lost=counts.lost + sequence.lost)
     cause = _CAUSES[verdict]
     return counts._replace(**{"refused": counts.refused + 1, cause: getattr(counts, cause) + 1})

@@ -11,7 +11,7 @@ from msgspec import Struct
 from can_dbc.codec import Decoder, compile_decoder, compile_encoder, si_range
 from can_dbc.database import Message
 from can_dbc.frame import Frame
-from can_dbc.protection import SequenceState, Verdict, compile_checker, compile_protector
+from can_dbc.protection import FrameStatus, SequenceState, compile_checker, compile_protector
 from can_dbc.units import Dimension
 from rig.bridge.contract import Mode, StepOutput
 from rig.plan.quantities import HEIGHT, PLACES, Quantity
@@ -91,7 +91,9 @@ class AlarmTarget(Struct, frozen=True, gc=False):
     alarm: int
 
 
-Reader = Callable[[SequenceState, Frame], tuple[SequenceState, Verdict, tuple[float, ...] | None]]
+Reader = Callable[
+    [SequenceState, Frame], tuple[SequenceState, FrameStatus, tuple[float, ...] | None]
+]
 """What is remembered of a message's counter, and a frame of it -> the same after the frame, what
 the frame is, and its values in SI; None where there are none to be used."""
 
@@ -440,25 +442,25 @@ def _of_values(read: Reader, are_values: _Check) -> Reader:
 
     def checked(
         sequence: SequenceState, frame: Frame
-    ) -> tuple[SequenceState, Verdict, tuple[float, ...] | None]:
+    ) -> tuple[SequenceState, FrameStatus, tuple[float, ...] | None]:
         sequence, verdict, values = read(sequence, frame)
         if values is None or are_values(values):
             return sequence, verdict, values
-        return sequence, Verdict.NO_VALUE, None
+        return sequence, FrameStatus.NO_VALUE, None
 
     return checked
 
 
 def _reader(message: Message, decode: Decoder) -> Reader:
-    length, ok = message.length_bytes, Verdict.OK
+    length, ok = message.length_bytes, FrameStatus.OK
 
     def read_unprotected(
         sequence: SequenceState, frame: Frame
-    ) -> tuple[SequenceState, Verdict, tuple[float, ...] | None]:
+    ) -> tuple[SequenceState, FrameStatus, tuple[float, ...] | None]:
         values = decode(frame.data)
         # A multiplexed frame without these signals is no fault, a short one is.
         is_short = values is None and len(frame.data) != length
-        return sequence, Verdict.WRONG_LENGTH if is_short else ok, values
+        return sequence, FrameStatus.WRONG_LENGTH if is_short else ok, values
 
     if message.protection is None:
         return read_unprotected
@@ -466,10 +468,10 @@ def _reader(message: Message, decode: Decoder) -> Reader:
 
     def read(
         sequence: SequenceState, frame: Frame
-    ) -> tuple[SequenceState, Verdict, tuple[float, ...] | None]:
+    ) -> tuple[SequenceState, FrameStatus, tuple[float, ...] | None]:
         data = frame.data
         sequence, verdict = check(sequence, data, frame.t_ns)
-        return sequence, verdict, decode(data) if verdict is ok or verdict.accepted else None
+        return sequence, verdict, decode(data) if verdict is ok or verdict.is_accepted else None
 
     return read
 

@@ -22,12 +22,12 @@ def timing(
     as_json: JsonFlag = False,
 ) -> None:
     """Say of each missed tick of a traced run in which part the time went, and who took it."""
-    from rig.run.late_ticks import late_ticks
+    from rig.run.late_ticks import find_late_ticks
     from rig.run.replay import setup_of_run
     from rig.run.trace import read_trace
 
     _, ready = setup_of_run(folder)
-    late = late_ticks(read_trace(folder), ready.config.period_ns)
+    late = find_late_ticks(read_trace(folder), ready.config.period_ns)
     summary: dict[str, object] = {
         "late": [{**item._asdict(), "cause": item.cause.name.lower()} for item in late]
     }

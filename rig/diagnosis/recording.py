@@ -314,7 +314,7 @@ def _payloads(found: RunFolder, ready: Setup) -> _Payloads:
     times: list[list[int]] = [[] for _ in messages]
     data: list[list[bytes]] = [[] for _ in messages]
     for frame, direction in found.frames():
-        place = directory.place(frame.arbitration_id, frame.is_extended)
+        place = directory.index_of(frame.arbitration_id, frame.is_extended)
         if place is None or direction != "R" or frame.is_error:
             continue
         if len(frame.data) == messages[place].length_bytes:

@@ -12,7 +12,7 @@ from typing import Annotated, Literal, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.errors import InputError
-from can_dbc.yaml_file import load_validated, read_text, validated
+from can_dbc.yaml_file import load_yaml, read_text, validate
 from rig.dyno.figures import Step
 from rig.dyno.stroke_force import Figure
 
@@ -115,7 +115,7 @@ def load_tolerance(path: Path) -> Tolerance:
         InputError: One line that names file, key, value and what was expected.
     """
     if path.suffix.lower() != ".csv":
-        return load_validated(Tolerance, path)
+        return load_yaml(Tolerance, path)
     text = read_text(path).removeprefix("\ufeff")  # as spreadsheets begin a file
     rows = list(csv.reader(text.splitlines()))
     while rows and not any(cell.strip() for cell in rows[-1]):
@@ -129,7 +129,7 @@ def load_tolerance(path: Path) -> Tolerance:
         points.append(dict(zip(_COLUMNS, _numbers(path, number, row), strict=True)))
     if not points:
         raise InputError(f"{path}: holds no point, expected rows under the header")
-    return validated(Tolerance, {"name": path.stem, "points": points}, str(path))
+    return validate(Tolerance, {"name": path.stem, "points": points}, str(path))
 
 
 def _numbers(path: Path, line: int, row: Sequence[str]) -> list[float]:

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from can_dbc.errors import InputError
-from can_dbc.yaml_file import parse_mapping, read_text, validated
+from can_dbc.yaml_file import parse_mapping, read_text, validate
 from dart_model.plant import DartPlant
 from dart_model.plant.admitted_programs import admit, withdraw
-from dart_model.plant.fmu import MockUp, described, read_program
+from dart_model.plant.fmu import MockUp, read_description, read_program
 from dart_model.spec import FmuSpec, ModelSpec, dump_model
 from rig.files.folders import refuse_full
 
@@ -41,7 +41,7 @@ def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: P
     """
     refuse_full(out)
     content = read_program(source)
-    description = described(content, source)
+    description = read_description(content, source)
     roles = _named(description, source) if mapping is None else _mapped(mapping)
     _refuse_contradictions(roles, mapping or source)
     if roles.force is not None and mass_kg is None:
@@ -68,7 +68,7 @@ def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: P
 
 def _mapped(mapping: Path) -> FmuSpec:
     given = parse_mapping(read_text(mapping), str(mapping))
-    return validated(FmuSpec, {**given, "file": FMU_FILE}, str(mapping))
+    return validate(FmuSpec, {**given, "file": FMU_FILE}, str(mapping))
 
 
 def _refuse_contradictions(roles: FmuSpec, source: Path) -> None:
@@ -94,14 +94,14 @@ def _named(description: Any, source: Path) -> FmuSpec:
     further = {"temperature": there("temperature_c"), "applied_force": there("applied_force_n")}
     if there("height_m") and there("velocity_m_per_s") and causality.get("force_n") == "output":
         own = {"height": "height_m", "velocity": "velocity_m_per_s", "force": "force_n"}
-        return validated(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
+        return validate(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
     rates = {item.variable.derivative.name: item.variable.name for item in description.derivatives}
     found = [name.removesuffix("height_m") for name in rates if name.endswith(".height_m")]
     for prefix in found:
         height, velocity = f"{prefix}height_m", f"{prefix}velocity_m_per_s"
         if velocity in rates and further["applied_force"]:
             own = {"height": height, "velocity": velocity, "acceleration": rates[velocity]}
-            return validated(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
+            return validate(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
     names = ", ".join(n for n, kind in causality.items() if kind in ("input", "output"))
     raise InputError(
         f"{source}: its variables are not named as ours, expected --mapping FILE that says which "
@@ -163,7 +163,7 @@ def _model(
         "skeleton": {"bodies": [body]},
         "struts": [strut],
     }
-    return validated(ModelSpec, spec, str(source)).model_copy(update={"folder": folder})
+    return validate(ModelSpec, spec, str(source)).model_copy(update={"folder": folder})
 
 
 def _start_m(description: Any, height: str) -> float:

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict
 
 from can_dbc.database import DEFAULT_DATABASE, Database, Message, load_database
 from can_dbc.errors import DatabaseError, InputError
-from can_dbc.yaml_file import load_validated, validated
+from can_dbc.yaml_file import load_yaml, validate
 from dart_model.spec import ModelSpec, load_model, model_file
 from rig.bridge.messages import ESTIMATE, KINEMATICS, STATUS, UNCERTAINTY, Publication
 from rig.bus.secoc import FD_LENGTHS, Authentication, read_key
@@ -60,7 +60,7 @@ def load_setup(path: Path, *, model: str | None = None, duration_s: float | None
         InputError: One line that names file, key, value and what was expected.
         DatabaseError: The same, of the DBC.
     """
-    config = load_validated(RunConfig, path)
+    config = load_yaml(RunConfig, path)
     if duration_s is not None:
         if not 0.0 < duration_s < float("inf"):
             raise InputError(f"--duration-s {duration_s}: expected a finite number above zero")
@@ -93,7 +93,7 @@ def setup_of_folder(folder: Path) -> Setup:
         DatabaseError: Its DBC is.
     """
     source = folder / RUN_FILE
-    config = validated(RunConfig, read_header(folder).get("config"), f"{source}: config")
+    config = validate(RunConfig, read_header(folder).get("config"), f"{source}: config")
     model, database = load_model(folder / MODEL_FILE), load_database(folder / DBC_FILE)
     return put_together(config, source, model, database)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from can_dbc.errors import InputError
-from can_dbc.yaml_file import parse_mapping, read_text, validated
+from can_dbc.yaml_file import parse_mapping, read_text, validate
 from rig.bridge.bridge import Bridge
 from rig.log.file_names import CHANGES_FILE
 from rig.plan.config import RunConfig
@@ -68,7 +68,7 @@ def reassigned(ready: Setup, assignments: Assignments, source: str) -> Setup:
                 f"{' or '.join(CHANGEABLE)}"
             )
         _assign(content[section], names, value, source, key)
-    config = validated(RunConfig, content, source)
+    config = validate(RunConfig, content, source)
     for name, observer in config.observers.items():
         before = ready.config.observers[name]
         if getattr(observer, "filter", None) != getattr(before, "filter", None):

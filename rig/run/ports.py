@@ -38,10 +38,10 @@ class BusPort:
         """Frames that have come since the last tick."""
         link = self.link
         frames = link.receive(t_ns)
-        if link.fault is None and not self._acknowledged and link.refused == self._refused:
+        if link.fault is None and not self._acknowledged and link.unauthenticated == self._refused:
             return frames, _NO_CONDITIONS
-        bus_fault = link.fault is not None or link.refused > self._refused
-        self._refused = link.refused
+        bus_fault = link.fault is not None or link.unauthenticated > self._refused
+        self._refused = link.unauthenticated
         acknowledged, self._acknowledged = self._acknowledged, False
         return frames, Conditions(acknowledged=acknowledged, bus_fault=bus_fault)
 
@@ -104,7 +104,7 @@ class BenchOnBus:
     ) -> None:
         self._bench = bench
         self._bench_bus = bench_bus
-        self._secured = None if authenticator is None else authenticator.secured
+        self._secured = None if authenticator is None else authenticator.secure
         self._port = port
         self._sent_ns = -1
         self.send = port.send

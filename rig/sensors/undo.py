@@ -8,7 +8,7 @@ import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from can_dbc.errors import InputError
-from can_dbc.yaml_file import load_validated
+from can_dbc.yaml_file import load_yaml
 from rig.sensors.set_up import SETTABLE, Changed
 
 _SCHEMA = 1
@@ -81,5 +81,5 @@ def read_undo(path: Path) -> list[Changed]:
     Raises:
         InputError: The file cannot be read, or is none of this kind.
     """
-    found = load_validated(_File, path)
+    found = load_yaml(_File, path)
     return [Changed(item.node_id, item.index, item.subindex, item.before) for item in found.changes]

@@ -8,7 +8,7 @@ import pytest
 
 from can_dbc.errors import InputError
 from dart_model.plant import DartPlant
-from dart_model.plant.admitted_programs import require_admitted
+from dart_model.plant.admitted_programs import require_admission
 from dart_model.spec import MODELS, EffectSpec, load_model
 from rig.demo.story import draw_effect, tell
 from rig.diagnosis.files import diagnose_runs
@@ -304,7 +304,7 @@ def test_an_import_that_fails_admits_nothing(tmp_path):
     with pytest.raises(InputError):
         import_fmu(path, mapping, 10.0, tmp_path / "out")
     with pytest.raises(InputError, match="not imported on this machine"):
-        require_admitted(path.read_bytes(), path)
+        require_admission(path.read_bytes(), path)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from can_dbc.codec import compile_decoder
 from can_dbc.database import DEFAULT_DATABASE, DatabaseError, load_database
-from can_dbc.protection import INITIAL, Verdict, check_crc, compile_checker, read_counter
+from can_dbc.protection import INITIAL, FrameStatus, check_crc, compile_checker, read_counter
 from can_dbc.units import Dimension
 from rig.simulated_bench.bench import RECORDS_KEPT, SimulatedBench
 from rig.simulated_bench.schema import BenchConfigError
@@ -86,7 +86,7 @@ def test_every_frame_passes_its_check(database):
     for frame in _frames(_config(), database, 100 * MS_NS):
         state, verdict = compile_checker(protection)(state, frame.data, frame.t_ns)
         verdicts.append(verdict)
-    assert verdicts == [Verdict.FIRST] + [Verdict.OK] * 100
+    assert verdicts == [FrameStatus.FIRST] + [FrameStatus.OK] * 100
 
 
 def test_counter_goes_on_over_lost_frames(database):
