@@ -1,7 +1,7 @@
-"""Which message a frame is of, by its arbitration id.
+"""Message of a frame, by its arbitration id.
 
-A message of J1939 is known by its parameter group: priority and source address of a frame may be
-others than in the DBC, and the destination too where the group has one.
+A message of J1939 is identified by its parameter group: priority and source address of a frame may
+differ from the DBC, and so may the destination where the group has one.
 
 Reference: SAE J1939-21, "Data Link Layer", 5.1: the fields of an identifier.
 """
@@ -30,7 +30,7 @@ def group_mask(arbitration_id: int) -> int:
 
 @dataclass(frozen=True)
 class Filter:
-    """Identifiers that are let in: those with ``id & mask == arbitration_id & mask``.
+    """Accepted identifiers: those with ``id & mask == arbitration_id & mask``.
 
     Attributes:
         arbitration_id: An identifier.
@@ -46,34 +46,33 @@ class Filter:
 class Directory:
     """Messages by the identifiers of their frames.
 
-    A group that several of the messages belong to says nothing: these are known by their whole
-    identifiers.
+    Where several messages share a group, they are identified by their whole identifiers.
 
     Args:
-        messages: Messages; their places in this sequence are what is looked up.
+        messages: Messages, which are looked up by their index in this sequence.
     """
 
     def __init__(self, messages: Iterable[Message]) -> None:
         listed = list(messages)
-        self._exact = {message.key: place for place, message in enumerate(listed)}
+        self._exact = {message.key: index for index, message in enumerate(listed)}
         groups = {
-            place: (message.arbitration_id & group_mask(message.arbitration_id))
-            for place, message in enumerate(listed)
+            index: (message.arbitration_id & group_mask(message.arbitration_id))
+            for index, message in enumerate(listed)
             if message.is_j1939
         }
         often = Counter(groups.values())
-        self._groups = {group: place for place, group in groups.items() if often[group] == 1}
+        self._groups = {group: index for index, group in groups.items() if often[group] == 1}
         self.filters = tuple(
-            _filter(message, place in self._groups.values()) for place, message in enumerate(listed)
+            _filter(message, index in self._groups.values()) for index, message in enumerate(listed)
         )
-        """What lets the frames of all messages in."""
+        """Filters that accept the frames of all messages."""
 
-    def place(self, arbitration_id: int, is_extended: bool) -> int | None:
-        """Place of the message that a frame is of; None if it is of no one."""
-        found = self._exact.get((arbitration_id, is_extended))
-        if found is None and is_extended and self._groups:
+    def index_of(self, arbitration_id: int, is_extended: bool) -> int | None:
+        """Index of a frame's message; None if it belongs to none."""
+        index = self._exact.get((arbitration_id, is_extended))
+        if index is None and is_extended and self._groups:
             return self._groups.get(arbitration_id & group_mask(arbitration_id))
-        return found
+        return index
 
 
 def _filter(message: Message, is_group: bool) -> Filter:

@@ -1,4 +1,4 @@
-"""Which frames of a whole log simply follow the one before: the frequent case, for all at once."""
+"""Frames of a whole log that follow the one before: the frequent case, for all at once."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,8 @@ def in_sequence(
 ) -> NDArray[np.bool_]:
     """Whether each frame is intact, and next in sequence and in time of an intact one.
 
-    `protection.check` calls such a frame OK wherever it accepted the one before. It says nothing
-    of other frames: they need `check`.
+    `protection.check` calls such a frame OK wherever it accepted the one before. Other
+    frames need `check`.
 
     Args:
         payloads: Payloads of one message in the order of reception, shape (n, its length or more).

@@ -32,7 +32,7 @@ or "not available" (SAE J1939-71, 5.1.3)."""
 
 
 class _Field(NamedTuple):
-    """Where the raw value of a signal stands and what it means.
+    """Position and meaning of a signal's raw value.
 
     Attributes:
         name: Name of the signal.
@@ -119,7 +119,7 @@ def compile_encoder(
             a multiplexer that is itself among the signals, or a range that holds no raw value.
     """
     fields = _fields(message, signal_names, dimensions)
-    base = _selected(message, signal_names)
+    base = _base_payload(message, signal_names)
     slots = tuple(_slot(message, field) for field in fields)
     return _join_encoder(slots, base, message.length_bytes)
 
@@ -139,7 +139,7 @@ def si_range(message: Message, signal_name: str, dimension: Dimension) -> tuple[
 
 
 def si_step(message: Message, signal_name: str, dimension: Dimension) -> float:
-    """Step of an integer signal in SI; of a float, what it resolves is not known: zero.
+    """Step of an integer signal in SI; of a float, whose resolution is unknown, zero.
 
     Raises:
         DatabaseError: As for `compile_decoder`.
@@ -206,15 +206,15 @@ def _fields(
 
 
 def _field(message: Message, signal: Signal, dimension: Dimension) -> _Field:
-    place = f"{message.path}: message {message.name}: signal {signal.name}"
+    where = f"{message.path}: message {message.name}: signal {signal.name}"
     if signal.length_bits > _RAW_BITS_MAX:
-        raise DatabaseError(f"{place}: {signal.length_bits} bits, expected at most 64")
+        raise DatabaseError(f"{where}: {signal.length_bits} bits, expected at most 64")
     if signal.is_float and signal.length_bits not in _FLOAT_FORMATS:
-        raise DatabaseError(f"{place}: float of {signal.length_bits} bits, expected 32 or 64")
+        raise DatabaseError(f"{where}: float of {signal.length_bits} bits, expected 32 or 64")
     try:
         unit = si_conversion(signal.unit, dimension)
     except DatabaseError as error:
-        raise DatabaseError(f"{place}: {error}") from None
+        raise DatabaseError(f"{where}: {error}") from None
     raw = _raw_field(message, signal)
     field = raw._replace(
         float_format=_FLOAT_FORMATS[signal.length_bits] if signal.is_float else "",
@@ -227,14 +227,14 @@ def _field(message: Message, signal: Signal, dimension: Dimension) -> _Field:
     largest = abs(field.scale) * 2.0**64 + abs(field.offset)
     if field.scale == 0.0 or not math.isfinite(largest):
         raise DatabaseError(
-            f"{place}: scale {signal.scale}, offset {signal.offset}, expected a scale other than 0"
+            f"{where}: scale {signal.scale}, offset {signal.offset}, expected a scale other than 0"
             " and numbers of ordinary size"
         )
     return field
 
 
 def _raw_field(message: Message, signal: Signal) -> _Field:
-    """Place of a signal's bits; scaling left at identity."""
+    """Position of a signal's bits, with a scaling of identity."""
     if signal.is_big_endian:
         # The DBC numbers bits upwards in a byte and bytes as they are sent; the start is the
         # highest bit, from where the value runs downwards.
@@ -258,7 +258,7 @@ def _raw_field(message: Message, signal: Signal) -> _Field:
 
 
 def _conditions(message: Message, signal: Signal) -> tuple[_Condition, ...]:
-    """What has to be selected for a signal to be in a frame, along nested multiplexers."""
+    """Multiplexer values under which a signal is in a frame, along nested multiplexers."""
     conditions: list[_Condition] = []
     seen = {signal.name}
     while signal.multiplexer is not None:
@@ -275,13 +275,15 @@ def _conditions(message: Message, signal: Signal) -> tuple[_Condition, ...]:
 
 
 def _all_conditions(message: Message, signal_names: Sequence[str]) -> tuple[_Condition, ...]:
-    found: dict[str, _Condition] = {}
+    conditions: dict[str, _Condition] = {}
     for name in signal_names:
         for condition in _conditions(message, message.signal(name)):
             selector = condition.selector
-            known = found.get(selector.name, condition)
-            found[selector.name] = _Condition(selector, known.raw_values & condition.raw_values)
-    return tuple(found.values())
+            known = conditions.get(selector.name, condition)
+            conditions[selector.name] = known._replace(
+                raw_values=known.raw_values & condition.raw_values
+            )
+    return tuple(conditions.values())
 
 
 # ------------------------------------------------------------------------------------ one frame
@@ -392,9 +394,9 @@ def _integer_holder(field: _Field, low: int, high: int) -> _Holder:
 
     def hold(steps: float) -> tuple[int, bool]:
         if math.isfinite(steps):
-            wanted = round(steps)
-            held = min(max(wanted, low), high)
-            return held & mask, held != wanted
+            nearest = round(steps)
+            held = min(max(nearest, low), high)
+            return held & mask, held != nearest
         return (unknown if math.isnan(steps) else low if steps < low else high) & mask, True
 
     return hold
@@ -472,20 +474,20 @@ def _join_encoder(slots: tuple[_Slot, ...], base: int, length: int) -> Encoder:
     return encode
 
 
-def _selected(message: Message, signal_names: Sequence[str]) -> int:
+def _base_payload(message: Message, signal_names: Sequence[str]) -> int:
     """Payload, as a little-endian integer, in which only the needed multiplexers are set."""
-    place = f"{message.path}: message {message.name}"
+    where = f"{message.path}: message {message.name}"
     joined = 0
     for selector, raw_values in _all_conditions(message, signal_names):
         allowed = [raw for raw in raw_values if 0 <= raw <= selector.mask]
         if not allowed:
             raise DatabaseError(
-                f"{place}: signals {list(signal_names)} are never in one frame "
+                f"{where}: signals {list(signal_names)} are never in one frame "
                 f"(multiplexer {selector.name})"
             )
         if selector.name in signal_names:
             raise DatabaseError(
-                f"{place}: multiplexer {selector.name} is set by the signals that it selects, "
+                f"{where}: multiplexer {selector.name} is set by the signals that it selects, "
                 "expected only these"
             )
         placed = min(allowed) << selector.shift

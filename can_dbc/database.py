@@ -175,20 +175,20 @@ def load_database(path: Path) -> Database:
     content = _read(path)
     parsed = _parse(path, _decode(path, content))
     messages = [_message(path, message) for message in parsed]
-    _refuse_twins(path, messages)
+    _refuse_duplicates(path, messages)
     return Database(
         path=path,
         sha256=hashlib.sha256(content).hexdigest(),
-        messages=MappingProxyType({m.name: m for m in _know_each_other(messages)}),
+        messages=MappingProxyType({m.name: m for m in _with_foreign_identities(messages)}),
     )
 
 
 def _near(name: str, names: Iterable[str]) -> str:
     known = list(names)
     folded = {entry.casefold(): entry for entry in known}
-    found = difflib.get_close_matches(name.casefold(), folded, n=3, cutoff=0.5)
-    if found:
-        return "did you mean " + " or ".join(folded[entry] for entry in found) + "?"
+    matches = difflib.get_close_matches(name.casefold(), folded, n=3, cutoff=0.5)
+    if matches:
+        return "did you mean " + " or ".join(folded[entry] for entry in matches) + "?"
     return "expected one of " + ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
 
 
@@ -268,17 +268,17 @@ def _parse(path: Path, text: str) -> list[CantoolsMessage]:
 
 
 def _message(path: Path, message: CantoolsMessage) -> Message:
-    place = f"{path}: message {message.name}"
+    where = f"{path}: message {message.name}"
     is_extended = bool(message.is_extended_frame)
     id_max = _EXTENDED_ID_MAX if is_extended else _STANDARD_ID_MAX
     if not 0 <= message.frame_id <= id_max:
-        raise DatabaseError(f"{place}: id {message.frame_id:#x}, expected at most {id_max:#x}")
-    signals = {signal.name: _signal(place, signal) for signal in message.signals}
+        raise DatabaseError(f"{where}: id {message.frame_id:#x}, expected at most {id_max:#x}")
+    signals = {signal.name: _signal(where, signal) for signal in message.signals}
     if len(signals) != len(message.signals):
-        raise DatabaseError(f"{place}: a signal name is given twice")
+        raise DatabaseError(f"{where}: a signal name is given twice")
     for signal in signals.values():
-        _check_fit(place, signal, message.length)
-    cycle_time_ns = _cycle_time_ns(place, message)
+        _check_fit(where, signal, message.length)
+    cycle_time_ns = _cycle_time_ns(where, message)
     return Message(
         path=path,
         name=message.name,
@@ -290,11 +290,11 @@ def _message(path: Path, message: CantoolsMessage) -> Message:
         cycle_time_ns=cycle_time_ns,
         sender=message.senders[0] if message.senders else None,
         signals=MappingProxyType(signals),
-        protection=_protection(place, message, signals, cycle_time_ns),
+        protection=_protection(where, message, signals, cycle_time_ns),
     )
 
 
-def _signal(place: str, signal: CantoolsSignal) -> Signal:
+def _signal(where: str, signal: CantoolsSignal) -> Signal:
     return Signal(
         name=signal.name,
         start=signal.start,
@@ -302,10 +302,10 @@ def _signal(place: str, signal: CantoolsSignal) -> Signal:
         is_big_endian=signal.byte_order == "big_endian",
         is_signed=bool(signal.is_signed),
         is_float=bool(signal.is_float),
-        scale=_number(place, signal.name, "scale", signal.scale),
-        offset=_number(place, signal.name, "offset", signal.offset),
-        minimum=_bound(place, signal.name, "minimum", signal.minimum),
-        maximum=_bound(place, signal.name, "maximum", signal.maximum),
+        scale=_number(where, signal.name, "scale", signal.scale),
+        offset=_number(where, signal.name, "offset", signal.offset),
+        minimum=_bound(where, signal.name, "minimum", signal.minimum),
+        maximum=_bound(where, signal.name, "maximum", signal.maximum),
         unit=signal.unit or "",
         choices=MappingProxyType(
             {int(raw): str(name) for raw, name in (signal.choices or {}).items()}
@@ -316,40 +316,40 @@ def _signal(place: str, signal: CantoolsSignal) -> Signal:
     )
 
 
-def _number(place: str, signal: str, what: str, value: float) -> float:
+def _number(where: str, signal: str, what: str, value: float) -> float:
     try:
         number = float(value)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        raise DatabaseError(f"{place}: signal {signal}: {what} {number}, expected a finite number")
+        raise DatabaseError(f"{where}: signal {signal}: {what} {number}, expected a finite number")
     return number
 
 
-def _bound(place: str, signal: str, what: str, value: float | None) -> float | None:
-    return None if value is None else _number(place, signal, what, value)
+def _bound(where: str, signal: str, what: str, value: float | None) -> float | None:
+    return None if value is None else _number(where, signal, what, value)
 
 
-def _check_fit(place: str, signal: Signal, length_bytes: int) -> None:
+def _check_fit(where: str, signal: Signal, length_bytes: int) -> None:
     # cantools checks only signals that it reaches through their multiplexers.
     byte, bit = divmod(signal.start, 8)
     first = 8 * byte + 7 - bit if signal.is_big_endian else signal.start
     if first + signal.length_bits > 8 * length_bytes:
-        raise DatabaseError(f"{place}: signal {signal.name}: does not fit in {length_bytes} bytes")
+        raise DatabaseError(f"{where}: signal {signal.name}: does not fit in {length_bytes} bytes")
 
 
 def _attribute(message: CantoolsMessage, name: str) -> str | int | float | None:
     specifics = message.dbc
     if specifics is None:
         return None
-    found = specifics.attributes.get(name)
-    if found is not None:
-        return cast("str | int | float | None", found.value)
+    attribute = specifics.attributes.get(name)
+    if attribute is not None:
+        return cast("str | int | float | None", attribute.value)
     definition = specifics.attribute_definitions.get(name)
     return None if definition is None else cast("str | None", definition.default_value)
 
 
-def _cycle_time_ns(place: str, message: CantoolsMessage) -> int | None:
+def _cycle_time_ns(where: str, message: CantoolsMessage) -> int | None:
     value = _attribute(message, "GenMsgCycleTime")
     if value is None or value == "":
         return None
@@ -359,12 +359,12 @@ def _cycle_time_ns(place: str, message: CantoolsMessage) -> int | None:
     except (ValueError, OverflowError):
         cycle_ns = -1
     if cycle_ns < 0:
-        raise DatabaseError(f"{place}: GenMsgCycleTime {value!r}, expected ms, 0 or more")
+        raise DatabaseError(f"{where}: GenMsgCycleTime {value!r}, expected ms, 0 or more")
     return cycle_ns or None
 
 
 def _protection(
-    place: str, message: CantoolsMessage, signals: Mapping[str, Signal], cycle_time_ns: int | None
+    where: str, message: CantoolsMessage, signals: Mapping[str, Signal], cycle_time_ns: int | None
 ) -> Protection | None:
     value = str(_attribute(message, "E2EProfile") or "").strip()
     if value.casefold() in {"", "none"}:
@@ -372,27 +372,27 @@ def _protection(
     names = {profile.value: profile for profile in Profile}
     if value not in names:
         supported = ", ".join(names)
-        raise DatabaseError(f"{place}: E2EProfile {value!r}, supported are {supported}")
+        raise DatabaseError(f"{where}: E2EProfile {value!r}, supported are {supported}")
     profile = names[value]
     crc_signal = str(_attribute(message, "E2ECrcSignal") or "CRC")
     counter_signal = str(_attribute(message, "E2ECounterSignal") or "COUNTER")
-    _check_place(place, signals, "E2ECrcSignal", crc_signal, (0, 8))
-    _check_place(place, signals, "E2ECounterSignal", counter_signal, (8, 4))
+    _check_position(where, signals, "E2ECrcSignal", crc_signal, (0, 8))
+    _check_position(where, signals, "E2ECounterSignal", counter_signal, (8, 4))
     return Protection(
-        identity=Identity(profile, _data_ids(place, message, profile)),
+        identity=Identity(profile, _data_ids(where, message, profile)),
         length_bytes=message.length,
         crc_signal=crc_signal,
         counter_signal=counter_signal,
         counter_modulus=profile.counter_modulus,
-        max_delta_counter=_max_delta(place, message, profile),
+        max_delta_counter=_max_delta(where, message, profile),
         cycle_time_ns=cycle_time_ns,
         silence_ns=profile.counter_modulus * cycle_time_ns if cycle_time_ns else NEVER_NS,
         foreign=(),
     )
 
 
-def _check_place(
-    place: str,
+def _check_position(
+    where: str,
     signals: Mapping[str, Signal],
     attribute: str,
     name: str,
@@ -400,39 +400,39 @@ def _check_place(
 ) -> None:
     signal = signals.get(name)
     if signal is None:
-        raise DatabaseError(f"{place}: {attribute} {name!r}: the message has no such signal")
+        raise DatabaseError(f"{where}: {attribute} {name!r}: the message has no such signal")
     first, length = bits
     start = first + length - 1 if signal.is_big_endian else first
     if (signal.start, signal.length_bits) != (start, length) or signal.multiplexer is not None:
         raise DatabaseError(
-            f"{place}: {attribute} {name!r}: expected {length} bits from bit {first} on, "
+            f"{where}: {attribute} {name!r}: expected {length} bits from bit {first} on, "
             "as profiles P01 and P02 have it"
         )
 
 
-def _data_ids(place: str, message: CantoolsMessage, profile: Profile) -> bytes:
+def _data_ids(where: str, message: CantoolsMessage, profile: Profile) -> bytes:
     text = str(_attribute(message, "E2EDataIds") or "").strip()
     expected = f"expected {profile.data_id_bytes} bytes in hex for {profile.value}"
     try:
         data_ids = bytes.fromhex(text)
     except ValueError:
-        raise DatabaseError(f"{place}: E2EDataIds {text[:80]!r}, {expected}") from None
+        raise DatabaseError(f"{where}: E2EDataIds {text[:80]!r}, {expected}") from None
     if len(data_ids) != profile.data_id_bytes:
-        raise DatabaseError(f"{place}: E2EDataIds {text[:80]!r}, {expected}")
+        raise DatabaseError(f"{where}: E2EDataIds {text[:80]!r}, {expected}")
     return data_ids
 
 
-def _max_delta(place: str, message: CantoolsMessage, profile: Profile) -> int:
+def _max_delta(where: str, message: CantoolsMessage, profile: Profile) -> int:
     value = _attribute(message, "E2EMaxDeltaCounter")
     if value is None or value == "":
         return _MAX_DELTA_DEFAULT
     limit = profile.counter_modulus - 1
     if not isinstance(value, int) or not 1 <= value <= limit:
-        raise DatabaseError(f"{place}: E2EMaxDeltaCounter {value!r}, expected 1 to {limit}")
+        raise DatabaseError(f"{where}: E2EMaxDeltaCounter {value!r}, expected 1 to {limit}")
     return value
 
 
-def _refuse_twins(path: Path, messages: list[Message]) -> None:
+def _refuse_duplicates(path: Path, messages: list[Message]) -> None:
     names: dict[str, str] = {}
     ids: dict[tuple[bool, int], str] = {}
     identities: dict[Identity, str] = {}
@@ -455,7 +455,7 @@ def _refuse_twins(path: Path, messages: list[Message]) -> None:
             )
 
 
-def _know_each_other(messages: list[Message]) -> list[Message]:
+def _with_foreign_identities(messages: list[Message]) -> list[Message]:
     """Give every protection the identities of the others, to recognise their frames."""
     identities = [m.protection.identity for m in messages if m.protection is not None]
     return [

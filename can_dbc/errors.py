@@ -1,4 +1,4 @@
-"""Errors of inputs: the base class of the whole project, and that of this package."""
+"""Errors of inputs: the base class of the whole project, and those of this package."""
 
 
 class InputError(ValueError):
@@ -12,3 +12,7 @@ class InputError(ValueError):
 
 class DatabaseError(InputError):
     """A DBC file, or a signal requested of it, is wrong."""
+
+
+class FileError(InputError):
+    """A text or YAML file cannot be read, or its content does not fit the schema."""

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 
 class Profile(Enum):
-    """A layout of counter and CRC; the value is what the DBC attribute `E2EProfile` says.
+    """A layout of counter and CRC; the value is that of the DBC attribute `E2EProfile`.
 
     Both have the CRC in byte 0 and the counter in the low nibble of byte 1. P01 (variant 1A) has
     one 16-bit data id, polynomial 0x1D and counts 0 to 14; P02 has one 8-bit data id for each
@@ -44,7 +44,7 @@ class Profile(Enum):
 
 
 class Identity(Struct, frozen=True, gc=False):
-    """What the CRC of a message covers beside its payload.
+    """What the CRC of a message covers besides its payload.
 
     Attributes:
         profile: Layout and polynomial.
@@ -87,8 +87,8 @@ NEVER_NS = 2**63 - 1
 """A time that no run reaches, in ns."""
 
 
-class Verdict(Enum):
-    """What a frame is; only the first three may be used, the others are refused whole."""
+class FrameStatus(Enum):
+    """E2E status of a frame; only the first three may be used, the others are refused whole."""
 
     OK = "ok"
     FIRST = "first"
@@ -101,22 +101,22 @@ class Verdict(Enum):
     NO_VALUE = "no_value"
 
     @property
-    def accepted(self) -> bool:
+    def is_accepted(self) -> bool:
         """Whether the frame's values may be used."""
         return self in _ACCEPTED
 
 
-_ACCEPTED = frozenset({Verdict.OK, Verdict.FIRST, Verdict.LOST})
+_ACCEPTED = frozenset({FrameStatus.OK, FrameStatus.FIRST, FrameStatus.LOST})
 
 # Looking up a member of an enum costs as much as the CRC of a frame.
-_OK, _WRONG_LENGTH = Verdict.OK, Verdict.WRONG_LENGTH
+_OK, _WRONG_LENGTH = FrameStatus.OK, FrameStatus.WRONG_LENGTH
 
 RESYNC_FRAMES = 2
 """Frames in a row, after an out-of-sequence one, that make a restarted sequence believable."""
 
 
 class SequenceState(Struct, frozen=True, gc=False):
-    """What a receiver remembers of one message.
+    """State of the sequence check of one message.
 
     Attributes:
         counter: Counter of the last accepted frame, -1 before the first.
@@ -147,9 +147,9 @@ def check_crc(data: bytes | bytearray, protection: Protection) -> bool:
     return len(data) == protection.length_bytes and crc.check(data, crc.identity)
 
 
-Checker = Callable[[SequenceState, bytes | bytearray, int], tuple[SequenceState, Verdict]]
-"""What is remembered of a message (`INITIAL` at first), payload, time of reception in ns -> the
-same after the frame, and what the frame is."""
+Checker = Callable[[SequenceState, bytes | bytearray, int], tuple[SequenceState, FrameStatus]]
+"""State of the check (`INITIAL` at first), payload, time of reception in ns -> the state after the
+frame, and the frame's status."""
 
 Protector = Callable[[bytes | bytearray, int], bytes]
 """Payload, and number of the frame (any integer of at least 0; it is sent modulo the profile's
@@ -157,7 +157,7 @@ number of counter values) -> the payload to send. Raises `ValueError` for anothe
 
 
 def compile_protector(protection: Protection) -> Protector:
-    """Build what puts counter and CRC into the frames of a message."""
+    """Build the function that writes counter and CRC into the frames of a message."""
     length, modulus = protection.length_bytes, protection.counter_modulus
     _, put_crc, identity = _crc(protection.identity)
 
@@ -174,13 +174,13 @@ def compile_protector(protection: Protection) -> Protector:
 
 
 def compile_checker(protection: Protection) -> Checker:
-    """Build what judges the frames of a message, one by one.
+    """Build the check of the frames of a message, one by one.
 
     A counter that went up by 1 to `max_delta_counter` (more where more cycle times have passed
     since the last frame) is accepted, with the number of lost frames in the new state. After a
-    silence as long as the counter's full round the counter alone cannot say how many were lost;
-    then the time says it. A counter that went backwards is refused. A sender that started anew
-    is believed when `RESYNC_FRAMES` further frames came in sequence.
+    silence as long as the counter's full round the counter alone does not determine how many were
+    lost; then the time does. A counter that went backwards is refused. A restarted sender is
+    accepted when `RESYNC_FRAMES` further frames came in sequence.
 
     A corrupted frame may by chance carry the CRC of another message; it is then called
     MASQUERADE and not WRONG_CRC. Both are refused.
@@ -193,7 +193,7 @@ def compile_checker(protection: Protection) -> Checker:
 
     def check(
         state: SequenceState, data: bytes | bytearray, t_ns: int
-    ) -> tuple[SequenceState, Verdict]:
+    ) -> tuple[SequenceState, FrameStatus]:
         if len(data) != length:
             return state, _WRONG_LENGTH
         if not crc_fits(data, identity):
@@ -202,7 +202,7 @@ def compile_checker(protection: Protection) -> Checker:
         # The frequent case first: next in sequence and in time.
         if counter == following[state.counter] and t_ns - state.t_ns < silence_ns:
             return SequenceState(counter, t_ns), _OK
-        return _judge_sequence(state, counter, t_ns, protection)
+        return _check_sequence(state, counter, t_ns, protection)
 
     return check
 
@@ -232,7 +232,7 @@ def check_crc_log(data: NDArray[np.uint8], protection: Protection) -> NDArray[np
 
 
 class _Crc(NamedTuple):
-    """What a profile does with a frame and a message's identity."""
+    """CRC functions of a profile, and a message's identity in their form."""
 
     check: Callable[[bytes | bytearray, Any], bool]
     put: Callable[[bytearray, Any], object]
@@ -250,38 +250,38 @@ def _p01_check(data: bytes | bytearray, data_id: int) -> bool:
     return e2e_p01_check(bytearray(data), data_id)
 
 
-def _wrong_crc(data: bytes | bytearray, foreign: Sequence[_Crc]) -> Verdict:
+def _wrong_crc(data: bytes | bytearray, foreign: Sequence[_Crc]) -> FrameStatus:
     if any(crc.check(data, crc.identity) for crc in foreign):
-        return Verdict.MASQUERADE
-    return Verdict.WRONG_CRC
+        return FrameStatus.MASQUERADE
+    return FrameStatus.WRONG_CRC
 
 
-def _judge_sequence(
+def _check_sequence(
     state: SequenceState, counter: int, t_ns: int, protection: Protection
-) -> tuple[SequenceState, Verdict]:
+) -> tuple[SequenceState, FrameStatus]:
     modulus = protection.counter_modulus
     if state.counter < 0:
-        return SequenceState(counter, t_ns), Verdict.FIRST
+        return SequenceState(counter, t_ns), FrameStatus.FIRST
     delta = (counter - state.counter) % modulus
     cycles = _cycles_since(state.t_ns, t_ns, protection)
     silent = cycles >= modulus
     if delta == 0 and not silent:
-        return replace(state, t_ns=t_ns, lost=0), Verdict.REPEATED
+        return replace(state, t_ns=t_ns, lost=0), FrameStatus.REPEATED
     if not silent and delta > max(protection.max_delta_counter, cycles + 1):
         return _resynchronise(state, counter, t_ns, modulus)
     lost = _lost_in_silence(delta, cycles, modulus) if silent else delta - 1
-    return SequenceState(counter, t_ns, lost), Verdict.LOST if lost else _OK
+    return SequenceState(counter, t_ns, lost), FrameStatus.LOST if lost else _OK
 
 
 def _resynchronise(
     state: SequenceState, counter: int, t_ns: int, modulus: int
-) -> tuple[SequenceState, Verdict]:
+) -> tuple[SequenceState, FrameStatus]:
     follows = state.candidate >= 0 and (counter - state.candidate) % modulus == 1
     run = state.run + 1 if follows else 0
     if run >= RESYNC_FRAMES:
-        return SequenceState(counter, t_ns), Verdict.FIRST
+        return SequenceState(counter, t_ns), FrameStatus.FIRST
     refused = SequenceState(state.counter, t_ns, candidate=counter, run=run)
-    return refused, Verdict.OUT_OF_SEQUENCE
+    return refused, FrameStatus.OUT_OF_SEQUENCE
 
 
 def _cycles_since(last_ns: int, t_ns: int, protection: Protection) -> int:

@@ -75,7 +75,7 @@ def si_conversion(unit: str, dimension: Dimension) -> SiConversion:
         return IDENTITY
     expected = f"expected {dimension.name.lower()} in a unit such as {dimension.value}"
     if not text:
-        raise DatabaseError(f"no unit: say the unit in the DBC, {expected}")
+        raise DatabaseError(f"no unit: give the unit in the DBC, {expected}")
     text = _SPELLINGS.get((dimension, text), text)
     if len(text) > _UNIT_LENGTH_MAX or _UNIT.fullmatch(text) is None:
         raise DatabaseError(f"unit {unit!r} is not understood, {expected}")
@@ -88,7 +88,7 @@ def si_conversion(unit: str, dimension: Dimension) -> SiConversion:
         raise DatabaseError(f"unit {unit!r} is of another dimension, {expected}") from None
     except (pint.PintError, tokenize.TokenError, ArithmeticError, TypeError, ValueError):
         raise DatabaseError(f"unit {unit!r} is not known, {expected}") from None
-    except AssertionError:  # how pint refuses products of logarithmic units
+    except AssertionError:  # raised by pint for products of logarithmic units
         raise DatabaseError(f"unit {unit!r} is logarithmic, {expected}") from None
     if not math.isclose(probe, 100.0 * factor + offset, rel_tol=1e-9):
         raise DatabaseError(f"unit {unit!r} is not linear, {expected}")

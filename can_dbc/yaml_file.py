@@ -9,7 +9,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
-from can_dbc.errors import InputError
+from can_dbc.errors import FileError
 
 _MAX_BYTES = 4 * 1024 * 1024
 """Largest file; a model with a thousand struts has a tenth of it."""
@@ -30,7 +30,7 @@ NotNegative = Annotated[Finite, Field(ge=0)]
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """`SafeLoader` that refuses what a configuration never needs and a mistake or an attack has."""
+    """`SafeLoader` that refuses what only a mistake or an attack contains."""
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         events = cast("Any", self)  # untyped in the stubs
@@ -74,19 +74,19 @@ def read_text(path: Path, max_bytes: int = _MAX_BYTES) -> str:
         max_bytes: Largest size that is read.
 
     Raises:
-        InputError: The file is missing, unreadable, too large or not UTF-8.
+        FileError: The file is missing, unreadable, too large or not UTF-8.
     """
     try:
         with path.open("rb") as file:
             data = file.read(max_bytes + 1)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        raise FileError(f"{path}: cannot be read: {error.strerror}") from error
     if len(data) > max_bytes:
-        raise InputError(f"{path}: larger than {max_bytes} bytes, expected a smaller file")
+        raise FileError(f"{path}: larger than {max_bytes} bytes, expected a smaller file")
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.start} is not UTF-8, expected text") from error
+        raise FileError(f"{path}: byte {error.start} is not UTF-8, expected text") from error
 
 
 def parse_mapping(text: str, source: str) -> dict[str, object]:
@@ -97,56 +97,56 @@ def parse_mapping(text: str, source: str) -> dict[str, object]:
         source: What to call the text in an error, usually its path.
 
     Raises:
-        InputError: The text is no YAML, or no mapping.
+        FileError: The text is no YAML, or no mapping.
     """
     try:
         data = cast("object", yaml.load(text, _PlainLoader))  # noqa: S506 - it is a SafeLoader
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = f" line {mark.line + 1}" if mark else ""
-        raise InputError(f"{source}:{where} is no valid YAML: {error.problem}") from error
+        raise FileError(f"{source}:{where} is no valid YAML: {error.problem}") from error
     except (*_NO_YAML, RecursionError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{source}: is no valid YAML: {reason}") from error
+        raise FileError(f"{source}: is no valid YAML: {reason}") from error
     if not isinstance(data, dict):
-        found = "nothing" if data is None else type(data).__name__
-        raise InputError(f"{source}: expected keys and values at the top level, found {found}")
+        kind = "nothing" if data is None else type(data).__name__
+        raise FileError(f"{source}: expected keys and values at the top level, not {kind}")
     mapping = cast("dict[object, object]", data)
     for key in mapping:
         if not isinstance(key, str):
-            raise InputError(f"{source}: key {key!r}: expected a name")
+            raise FileError(f"{source}: key {key!r}: expected a name")
     return cast("dict[str, object]", mapping)
 
 
-def validated(model: type[_Model], data: object, source: str, context: object = None) -> _Model:
+def validate(model: type[_Model], data: object, source: str, context: object = None) -> _Model:
     """`data` as a frozen `model`.
 
     Args:
-        model: What the data are to be.
+        model: Class of the values.
         data: Keys and values.
         source: What to call them in an error, usually the path of their file.
-        context: What the model's own checks are given.
+        context: Argument of the model's own checks.
 
     Raises:
-        InputError: With the first error's key, value and expectation, and how many more there are.
+        FileError: With the first error's key, value and expectation, and how many more there are.
     """
     try:
         return model.model_validate(data, context=context)
     except ValidationError as error:
-        raise InputError(_one_line(error, model, source)) from error
+        raise FileError(_one_line(error, model, source)) from error
 
 
-def load_validated(model: type[_Model], path: Path, context: object = None) -> _Model:
+def load_yaml(model: type[_Model], path: Path, context: object = None) -> _Model:
     """The file at `path` as a frozen `model`; `context` as of `validated`.
 
     Raises:
-        InputError: One line that names file, key, value and what was expected.
+        FileError: One line that names file, key, value and what was expected.
     """
-    return validated(model, parse_mapping(read_text(path), str(path)), str(path), context)
+    return validate(model, parse_mapping(read_text(path), str(path)), str(path), context)
 
 
 _NO_MAPPING = ("dict_type", "model_type", "model_attributes_type", "dataclass_type")
-"""pydantic's names for a value where keys and values are wanted."""
+"""pydantic's names for a value where keys and values are expected."""
 
 
 def _one_line(error: ValidationError, model: type[BaseModel], source: str) -> str:
@@ -155,7 +155,7 @@ def _one_line(error: ValidationError, model: type[BaseModel], source: str) -> st
     deepest = max(len(item["loc"]) for item in errors)
     errors = [item for item in errors if item["type"] != "too_short" or len(item["loc"]) == deepest]
     first = max(errors, key=lambda item: (len(item["loc"]), item["type"] == "extra_forbidden"))
-    # Parts in angle brackets are not keys: they tell apart what may stand under one.
+    # Parts in angle brackets are not keys: they distinguish the kinds of value under one.
     parts = [part for part in first["loc"] if part != "" and not str(part).startswith("<")]
     key = ".".join(str(part) for part in parts) or "top level"
     more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
@@ -197,14 +197,14 @@ def _keys(schema: _Schema, path: Sequence[int | str]) -> list[str]:
             values = node.get("additionalProperties")
             below.append(None if isinstance(values, bool) else values)
         # A part that is no key is the tag of one of several choices.
-        nodes = [node for node in below if node] or _tagged(schema, nodes, part)
-    found: list[str] = []
+        nodes = [node for node in below if node] or _choices_of_tag(schema, nodes, part)
+    keys: list[str] = []
     for node in _alternatives(schema, nodes):
-        found += node.get("properties", {})
-    return list(dict.fromkeys(found))
+        keys += node.get("properties", {})
+    return list(dict.fromkeys(keys))
 
 
-def _tagged(schema: _Schema, nodes: Iterable[_Schema], tag: int | str) -> list[_Schema]:
+def _choices_of_tag(schema: _Schema, nodes: Iterable[_Schema], tag: int | str) -> list[_Schema]:
     """Choices among nodes that have a key whose only value is `tag`."""
     return [
         node

@@ -22,9 +22,9 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from can_dbc.errors import InputError
-from can_dbc.yaml_file import Finite, NotNegative, Positive, parse_mapping, read_text, validated
+from can_dbc.yaml_file import Finite, NotNegative, Positive, parse_mapping, read_text, validate
 from dart_model.effects import CATALOGUE, effect
+from dart_model.errors import ModelError
 
 MODELS = Path(__file__).parent / "models"
 """Folder of the models that come with the package."""
@@ -310,13 +310,13 @@ class ModelSpec(_Frozen):
         """The strut called `name`.
 
         Raises:
-            InputError: There is none.
+            ModelError: There is none.
         """
         for strut in self.struts:
             if strut.name == name:
                 return strut
         choices = ", ".join(strut.name for strut in self.struts)
-        raise InputError(f"model {self.name}: strut {name!r}: expected one of {choices}")
+        raise ModelError(f"model {self.name}: strut {name!r}: expected one of {choices}")
 
     def with_effects(self, strut_name: str, effects: Iterable[EffectSpec]) -> "ModelSpec":
         """The same model with `effects` as all the effects of one strut."""
@@ -334,9 +334,9 @@ def parse_model(text: str, source: str, folder: Path = Path()) -> ModelSpec:
         folder: Where a skeleton file is looked for.
 
     Raises:
-        InputError: One line that names file, key, value and what was expected.
+        ModelError: One line that names file, key, value and what was expected.
     """
-    spec = validated(ModelSpec, parse_mapping(text, source), source)
+    spec = validate(ModelSpec, parse_mapping(text, source), source)
     return spec.model_copy(update={"folder": folder})
 
 
@@ -348,20 +348,20 @@ def model_file(name: str, folder: Path) -> Path:
         folder: The folder.
 
     Raises:
-        InputError: There is neither.
+        ModelError: There is neither.
     """
     for path in (folder / name, MODELS / f"{name}.yaml"):
         if path.is_file():
             return path
     choices = ", ".join(sorted(path.stem for path in MODELS.glob("*.yaml")))
-    raise InputError(f"model {name!r}: expected a file in {folder}, or one of {choices}")
+    raise ModelError(f"model {name!r}: expected a file in {folder}, or one of {choices}")
 
 
 def load_model(path: Path) -> ModelSpec:
     """Model from a YAML file.
 
     Raises:
-        InputError: One line that names file, key, value and what was expected.
+        ModelError: One line that names file, key, value and what was expected.
     """
     return parse_model(read_text(path), str(path), path.parent)
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from rig.log.reader import read_run
-from rig.log.writer import RunLog
+from rig.log.writer import RunWriter
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.live import with_bench
@@ -29,7 +29,7 @@ _COUNTS = struct.Struct("<qq")
 
 def run(folder: Path, counts: mmap.mmap) -> None:
     """Run the reference case until killed; what was received is counted before it is logged."""
-    add, total = RunLog.add, [0, 0]
+    add, total = RunWriter.add, [0, 0]
 
     def counted(self, received, sent, step):
         total[0] += len(received)
@@ -37,7 +37,7 @@ def run(folder: Path, counts: mmap.mmap) -> None:
         counts[: _COUNTS.size] = _COUNTS.pack(*total)
         add(self, received, sent, step)
 
-    RunLog.add = counted
+    RunWriter.add = counted
     with_bench(
         load_plan(CONFIGS / "reference.yaml", duration_s=60.0),
         load_bench_config(CONFIGS / "reference_bench.yaml"),

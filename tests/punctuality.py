@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from rig.plan.load import plan_of_run
-from rig.run.late_ticks import late_ticks
+from rig.run.late_ticks import find_late_ticks
 from rig.run.trace import read_trace
 
 
@@ -26,7 +26,7 @@ def missed(folder: Path, seconds: float, *, bare: bool, busy: float) -> tuple[in
     command += ["--seconds", str(seconds), "--busy", str(busy)]
     subprocess.run(command, check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     where = folder if bare else folder / "run"
-    late = late_ticks(read_trace(where), 1_000_000 if bare else _period_ns(where))
+    late = find_late_ticks(read_trace(where), 1_000_000 if bare else _period_ns(where))
     causes = Counter[str]()
     for item in late:
         causes[f"{item.part}: {item.cause.value}"] += item.missed

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from can_dbc.codec import decode_log
 from can_dbc.database import load_database
 from can_dbc.units import Dimension
-from rig.log.frame_columns import received_frames
-from rig.log.reader import DBC_FILE, FRAMES_FILE, RUN_FILE, STEPS_FILE, parts
+from rig.log.file_names import DBC_FILE, FRAMES_FILE, RUN_FILE, STEPS_FILE, parts
+from rig.log.frame_columns import read_frame_columns
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.live import with_bench
@@ -37,7 +37,7 @@ SETTLING = 1000
 
 def load_cell(folder: Path, part: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Times and forces of the load cell in one part of the log."""
-    frames = received_frames([parts(folder, FRAMES_FILE)[part]], 0)
+    frames = read_frame_columns([parts(folder, FRAMES_FILE)[part]], 0)
     message = load_database(folder / DBC_FILE).message("BENCH_AUXILIARY")
     of_cell = frames.arbitration_id == message.arbitration_id
     payload = np.ascontiguousarray(frames.payload[of_cell][:, : message.length_bytes])

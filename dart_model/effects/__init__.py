@@ -4,7 +4,6 @@ import difflib
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from can_dbc.errors import InputError
 from dart_model.effects import (
     backlash,
     damping,
@@ -37,6 +36,7 @@ from dart_model.effects.law import (
     Start,
     Writable,
 )
+from dart_model.errors import ModelError
 
 __all__ = [
     "AMBIENT_C",
@@ -142,7 +142,7 @@ FAMILY_WORDS: Mapping[str, str] = MappingProxyType(
 """Every family of effects as a phrase with its article."""
 
 
-class UnknownEffectError(InputError):
+class UnknownEffectError(ModelError):
     """There is no effect of that name."""
 
     def __init__(self, name: str) -> None:

@@ -19,8 +19,8 @@ from typing import Any, cast
 import numpy as np
 from scipy.linalg import null_space  # pyright: ignore[reportUnknownVariableType]
 
-from can_dbc.errors import InputError
 from dart_model.effects import AMBIENT_C
+from dart_model.errors import ModelError
 from dart_model.plant.backend import ManyCoordinates, OneCoordinate
 from dart_model.plant.fmu import MockUp
 from dart_model.plant.geometry import Array, Geometry, Jacobians, sample_positions
@@ -72,7 +72,7 @@ class DartPlant:
         spec: The model.
 
     Raises:
-        InputError: A skeleton file is wrong, a body that a strut names is not in it, no joint moves
+        ModelError: A skeleton file is wrong, a body that a strut names is not in it, no joint moves
             a strut, an effect has no value, or the bench is too stiff to be simulated.
     """
 
@@ -127,7 +127,7 @@ class DartPlant:
             t_s: Time.
 
         Raises:
-            InputError: The joints cannot reach the heights.
+            ModelError: The joints cannot reach the heights.
         """
         q = self._geometry.reaching(np.asarray(heights_m, np.float64), np.zeros(self.coordinates))
         v = np.zeros(self.coordinates)
@@ -272,7 +272,7 @@ class DartPlant:
         exact_s = min(exact_step_s(_linearised(*bench, linear)) for bench in benches)
         if exact_s < SHORTEST_STEP_S:
             fastest_hz = 1.0 / (2.0 * np.pi * exact_s)
-            raise InputError(
+            raise ModelError(
                 f"model {self.spec.name}: its masses, stiffnesses and dampings ask for steps of "
                 f"{exact_s:.1g} s ({fastest_hz:.1g} Hz), expected a bench that {SHORTEST_STEP_S} s "
                 "are short enough for"

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from can_dbc.atomic_file import write_whole
-from can_dbc.errors import InputError
+from dart_model.errors import ModelError
 
 
 def admit(content: bytes) -> bool:
@@ -19,7 +19,7 @@ def admit(content: bytes) -> bool:
         Whether it could not before.
 
     Raises:
-        InputError: The user's settings cannot be read or written.
+        ModelError: The user's settings cannot be read or written.
     """
     found = _fingerprint(content)
     admitted = _admitted()
@@ -33,13 +33,13 @@ def withdraw(content: bytes) -> None:
     """Let a program run no more.
 
     Raises:
-        InputError: The user's settings cannot be read or written.
+        ModelError: The user's settings cannot be read or written.
     """
     found = _fingerprint(content)
     _write([item for item in _admitted() if item != found])
 
 
-def require_admitted(content: bytes, path: Path) -> None:
+def require_admission(content: bytes, path: Path) -> None:
     """Refuse a program that this user never let run.
 
     Args:
@@ -47,10 +47,10 @@ def require_admitted(content: bytes, path: Path) -> None:
         path: What to call it.
 
     Raises:
-        InputError: It was not, or the user's settings cannot be read.
+        ModelError: It was not, or the user's settings cannot be read.
     """
     if _fingerprint(content) not in _admitted():
-        raise InputError(
+        raise ModelError(
             f"{path}: a program that was not imported on this machine, expected `rig import "
             f"{path.name} --fmu` first, by someone who trusts it"
         )
@@ -66,7 +66,7 @@ def _write(fingerprints: Sequence[str]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, "".join(f"{item}\n" for item in fingerprints))
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+        raise ModelError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def _admitted() -> list[str]:
@@ -75,7 +75,7 @@ def _admitted() -> list[str]:
     except FileNotFoundError:
         return []
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{_list()}: cannot be read ({error})") from error
+        raise ModelError(f"{_list()}: cannot be read ({error})") from error
     return text.split()
 
 

@@ -20,8 +20,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from can_dbc.errors import InputError
-from dart_model.plant.admitted_programs import require_admitted
+from dart_model.errors import ModelError
+from dart_model.plant.admitted_programs import require_admission
 from dart_model.spec import FmuSpec
 
 _MOST_ITERATIONS = 20
@@ -47,13 +47,13 @@ class MockUp:
         state_scales: Usual size of each internal state: a continuous state less its start.
 
     Raises:
-        InputError: This user never imported the file, or it does not offer what the strut needs.
+        ModelError: This user never imported the file, or it does not offer what the strut needs.
     """
 
     def __init__(self, spec: FmuSpec, folder: Path, gravity_m_per_s2: float) -> None:
         path = folder / spec.file
         content = read_program(path)
-        require_admitted(content, path)
+        require_admission(content, path)
         self._unit = _Unit(content, path, spec)
         self.name = f"FMU {spec.file}"
         self.state_scales = self._unit.nominals
@@ -92,7 +92,7 @@ class _Unit:
     """An FMU with its variables by what they are to a strut."""
 
     def __init__(self, content: bytes, path: Path, spec: FmuSpec) -> None:
-        description = described(content, path)
+        description = read_description(content, path)
         variables = {item.name: item for item in description.modelVariables}
         states = [item.variable.derivative.name for item in description.derivatives]
         _refuse_unfit(path, description, spec, variables)
@@ -108,7 +108,7 @@ class _Unit:
             elif variables[plain].causality == "input":
                 self._inputs.append(_Placed(variables[plain].valueReference, sign, role))
             else:
-                raise InputError(f"{path}: {plain}: expected an input or a state of the FMU")
+                raise ModelError(f"{path}: {plain}: expected an input or a state of the FMU")
         self._moving = moving
         self._sign, plain = _signed(spec.force or spec.acceleration or "")
         self._output = [variables[plain].valueReference]
@@ -264,15 +264,15 @@ def read_program(path: Path) -> bytes:
     """An FMU's bytes, read once: what is checked is what runs.
 
     Raises:
-        InputError: It cannot be read.
+        ModelError: It cannot be read.
     """
     try:
         return path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        raise ModelError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def described(content: bytes, path: Path) -> Any:
+def read_description(content: bytes, path: Path) -> Any:
     """What an FMU says of itself, as FMPy reads it; nothing of it is executed.
 
     Args:
@@ -280,10 +280,10 @@ def described(content: bytes, path: Path) -> Any:
         path: What to call it.
 
     Raises:
-        InputError: It is no FMU, or FMPy is not installed.
+        ModelError: It is no FMU, or FMPy is not installed.
     """
     if importlib.util.find_spec("fmpy") is None:
-        raise InputError("the package fmpy is not installed, expected `pip install 'rig[fmu]'`")
+        raise ModelError("the package fmpy is not installed, expected `pip install 'rig[fmu]'`")
     import fmpy
 
     reader: Any = fmpy
@@ -291,9 +291,9 @@ def described(content: bytes, path: Path) -> Any:
         found = reader.read_model_description(io.BytesIO(content))
     except Exception as error:  # of any library that a hostile archive may upset
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: is no FMU of FMI 2.0 or 3.0 ({reason[:200]})") from error
+        raise ModelError(f"{path}: is no FMU of FMI 2.0 or 3.0 ({reason[:200]})") from error
     if any(item.variable.derivative is None for item in found.derivatives):
-        raise InputError(f"{path}: a derivative of nothing, expected the state that it is of")
+        raise ModelError(f"{path}: a derivative of nothing, expected the state that it is of")
     return found
 
 
@@ -303,14 +303,14 @@ def _refuse_unfit(
     """Refuse an FMU that cannot be part of a strut, in words."""
     exchange = description.modelExchange
     if description.fmiVersion not in ("2.0", "3.0"):
-        raise InputError(f"{path}: FMI {description.fmiVersion}: expected 2.0 or 3.0")
+        raise ModelError(f"{path}: FMI {description.fmiVersion}: expected 2.0 or 3.0")
     if exchange is None:
-        raise InputError(
+        raise ModelError(
             f"{path}: offers Co-Simulation alone, whose states cannot be put back between the "
             "stages of a step: expected an FMU with Model Exchange"
         )
     if exchange.canBeInstantiatedOnlyOncePerProcess or exchange.needsExecutionTool:
-        raise InputError(
+        raise ModelError(
             f"{path}: can be instantiated only once, or needs the tool that made it: expected an "
             "FMU that stands alone"
         )
@@ -320,7 +320,7 @@ def _refuse_unfit(
         if item.variability == "discrete" and item.causality in ("local", "output")
     ]
     if remembers:
-        raise InputError(
+        raise ModelError(
             f"{path}: {remembers[0]}: a discrete variable, which a replay could not put back: "
             "expected an FMU that remembers continuous states alone"
         )
@@ -339,14 +339,14 @@ def _refuse_unfit(
         plain = name if key.startswith("parameters ") else _signed(name)[1]
         if plain not in variables:
             there = [n for n, v in variables.items() if v.causality in ("input", "output")]
-            raise InputError(
+            raise ModelError(
                 f"{path}: {key}: no variable {plain!r}, expected one such as "
                 f"{', '.join(there)[:300]}"
             )
         if variables[plain].type not in ("Real", "Float64") or variables[plain].dimensions:
-            raise InputError(f"{path}: {key}: {plain}: expected a single real number")
+            raise ModelError(f"{path}: {key}: {plain}: expected a single real number")
         if key.startswith("parameters ") and variables[plain].causality != "parameter":
-            raise InputError(f"{path}: {key}: expected a parameter of the FMU")
+            raise ModelError(f"{path}: {key}: expected a parameter of the FMU")
 
 
 def _started(
@@ -378,7 +378,7 @@ def _started(
         calls.begin()
     except Exception as error:  # FMPy raises its base class
         shutil.rmtree(folder, ignore_errors=True)
-        raise InputError(f"{path}: does not start ({'; '.join([str(error), *said])})") from error
+        raise ModelError(f"{path}: does not start ({'; '.join([str(error), *said])})") from error
     return calls
 
 

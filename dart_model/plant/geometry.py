@@ -6,7 +6,7 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from can_dbc.errors import InputError
+from dart_model.errors import ModelError
 from dart_model.plant.skeleton import Skeleton
 from dart_model.spec import WORLD, ModelSpec, StrutSpec
 
@@ -89,7 +89,7 @@ class Geometry:
             every call.
 
     Raises:
-        InputError: No joint lets the ends of a strut move.
+        ModelError: No joint lets the ends of a strut move.
     """
 
     def __init__(self, spec: ModelSpec, skeleton: Skeleton) -> None:
@@ -183,7 +183,7 @@ class Geometry:
             near: Where to begin, shape (n,).
 
         Raises:
-            InputError: The joints cannot reach the heights.
+            ModelError: The joints cannot reach the heights.
         """
         q, given = near, np.isfinite(heights_m)
         for _ in range(_NEWTON_STEPS):
@@ -198,7 +198,7 @@ class Geometry:
         allowed_m = _OUT_OF_REACH_M if np.sum(given) <= len(q) else _DISAGREEMENT_M
         reached = self.at(q).heights_m(q)[given]
         if not np.allclose(reached, heights_m[given], rtol=0.0, atol=allowed_m):
-            raise InputError(
+            raise ModelError(
                 f"model {self._spec.name}: heights {heights_m.tolist()} m: out of the joints' reach"
             )
         return q
@@ -245,7 +245,7 @@ def _guide(model: str, strut: StrutSpec, columns: Array) -> Array:
     """
     left, singular, _ = np.linalg.svd(columns)
     if singular[0] < 1e-9:
-        raise InputError(
+        raise ModelError(
             f"model {model}: strut {strut.name}: no joint lets {strut.between[0]} and "
             f"{strut.between[1]} move, expected one that does"
         )

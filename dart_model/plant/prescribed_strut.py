@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from can_dbc.errors import InputError
+from dart_model.errors import ModelError
 from dart_model.plant.integrator import grown
 from dart_model.plant.strut import struts_of
 from dart_model.spec import ModelSpec
@@ -38,12 +38,12 @@ class PrescribedStrut:
         spec: The model.
 
     Raises:
-        InputError: It has more than one strut.
+        ModelError: It has more than one strut.
     """
 
     def __init__(self, spec: ModelSpec) -> None:
         if len(spec.struts) != 1:
-            raise InputError(
+            raise ModelError(
                 f"model {spec.name}: {len(spec.struts)} struts, expected one for a motion that "
                 "is prescribed"
             )

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple, cast
 import dartpy
 import numpy as np
 
-from can_dbc.errors import InputError
 from dart_model.effects import effect
+from dart_model.errors import ModelError
 from dart_model.spec import WORLD, BodySpec, FileSkeleton, InlineSkeleton, ModelSpec
 
 # dartpy ships no types: it is untyped in this package, and nowhere else.
@@ -41,7 +41,7 @@ def build(spec: ModelSpec) -> Skeleton:
     """The skeleton of a model, with its gravity and with the masses that effects add.
 
     Raises:
-        InputError: A skeleton file is wrong, a body that the model names is not in it, no joint
+        ModelError: A skeleton file is wrong, a body that the model names is not in it, no joint
             moves, or an effect leaves a body no mass.
     """
     if isinstance(spec.skeleton, FileSkeleton):
@@ -52,12 +52,12 @@ def build(spec: ModelSpec) -> Skeleton:
     for strut in spec.struts:
         for end in strut.between:
             if end != WORLD and end not in bodies:
-                raise InputError(
+                raise ModelError(
                     f"model {spec.name}: strut {strut.name}: between {end!r}: expected one of "
                     f"{', '.join([WORLD, *bodies])}"
                 )
     if int(dart.getNumDofs()) == 0:
-        raise InputError(f"model {spec.name}: skeleton has no joint that moves, expected one")
+        raise ModelError(f"model {spec.name}: skeleton has no joint that moves, expected one")
     dart.setGravity([0.0, 0.0, -spec.gravity_m_per_s2])
     dart.setTimeStep(_INSTANT_S)
     _add_masses(spec, bodies)
@@ -73,7 +73,7 @@ def _add_masses(spec: ModelSpec, bodies: dict[str, Any]) -> None:
             end = strut.between[1] if strut.between[1] != WORLD else strut.between[0]
             mass = float(bodies[end].getMass()) + item.values()[0]
             if mass <= 0.0:
-                raise InputError(
+                raise ModelError(
                     f"model {spec.name}: strut {strut.name}: effect {item.name} leaves {end} "
                     f"a mass of {mass} kg, expected more than zero"
                 )
@@ -85,7 +85,7 @@ def _pushed_body(spec: ModelSpec, bodies: dict[str, Any]) -> str:
     if name == WORLD:
         name = spec.struts[-1].between[0]
     if name not in bodies:
-        raise InputError(
+        raise ModelError(
             f"model {spec.name}: applied_force_body {name!r}: expected one of {', '.join(bodies)}"
         )
     return name
@@ -127,17 +127,17 @@ def _joint(body: BodySpec, skeleton: Any) -> tuple[Callable[..., Any], Any]:
 def _read_skeleton(spec: FileSkeleton, folder: Path) -> Any:
     path = (folder / spec.file).resolve()
     if not path.is_file():
-        raise InputError(f"{path}: skeleton.file: no such file, expected URDF, SDF, SKEL or MJCF")
+        raise ModelError(f"{path}: skeleton.file: no such file, expected URDF, SDF, SKEL or MJCF")
     suffix = path.suffix.lower()
     if suffix not in _PARSERS:
-        raise InputError(f"{path}: suffix {suffix!r}: expected {', '.join(_PARSERS)}")
+        raise ModelError(f"{path}: suffix {suffix!r}: expected {', '.join(_PARSERS)}")
     try:
         skeleton = _PARSERS[suffix](str(path))
     except RuntimeError as error:
         reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: DART cannot read it: {reason}") from error
+        raise ModelError(f"{path}: DART cannot read it: {reason}") from error
     if skeleton is None:
-        raise InputError(f"{path}: DART finds no skeleton in it, expected a valid {suffix} file")
+        raise ModelError(f"{path}: DART finds no skeleton in it, expected a valid {suffix} file")
     if suffix in _MJCF:
         _refuse_bodies_without_shape(skeleton, path)
     return skeleton
@@ -184,6 +184,6 @@ def _refuse_bodies_without_shape(skeleton: Any, path: Path) -> None:
     """DART's MJCF parser gives a body without a geom 1 kg, whatever its inertial says."""
     for body in skeleton.getBodyNodes():
         if int(body.getNumShapeNodes()) == 0:
-            raise InputError(
+            raise ModelError(
                 f"{path}: body {body.getName()}: no geom, expected one: DART reads no mass without"
             )

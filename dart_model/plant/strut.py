@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from can_dbc.errors import InputError
 from dart_model.effects import AMBIENT_C, Effect, effect
+from dart_model.errors import ModelError
 from dart_model.plant.fmu import MockUp
 from dart_model.spec import ModelSpec, StrutSpec
 
@@ -106,7 +106,7 @@ class Strut:
         """Largest stiffness (N/m) and damping (N·s/m) with effects, where a bench can get to.
 
         Raises:
-            InputError: The parameters of an effect give its law no value.
+            ModelError: The parameters of an effect give its law no value.
         """
         if not self._laws:
             return self._stiffness, self._damping
@@ -125,14 +125,14 @@ class Strut:
             ]
         except (ArithmeticError, ValueError) as error:
             names = ", ".join(law.effect.name for law in self._laws)
-            raise InputError(
+            raise ModelError(
                 f"strut {self.name}: effects {names}: no force with these parameters ({error})"
             ) from error
         # An FMU may refuse what lies outside its range.
         slopes = np.abs(np.diff(by_height) / np.diff(heights))
         rates = np.abs(np.diff(by_velocity) / np.diff(velocities))
         if not (np.any(np.isfinite(slopes)) and np.any(np.isfinite(rates))):
-            raise InputError(f"strut {self.name}: gives no force about its free length")
+            raise ModelError(f"strut {self.name}: gives no force about its free length")
         stiffness, damping = float(np.nanmax(slopes)), float(np.nanmax(rates))
         return max(self._stiffness, stiffness), max(self._damping, damping)
 

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 
 from can_dbc.addressing import Directory
 from can_dbc.frame import Frame
-from can_dbc.protection import INITIAL, SequenceState, Verdict
+from can_dbc.protection import INITIAL, FrameStatus, SequenceState
 from rig.bridge.devices import (
     CLAIM,
     CLAIM_MASK,
@@ -38,7 +38,7 @@ from rig.bridge.limits import Action, Limit, Plausibility, judge_height
 from rig.bridge.report import Counts
 
 # Looking up a member of an enum costs as much as the CRC of a frame.
-_OK = Verdict.OK
+_OK = FrameStatus.OK
 
 SECOND_SENDER_FRAMES = 12
 """Frames out of sequence in close succession that only a second sender explains: a restarted sender
@@ -144,7 +144,7 @@ class Gates:
         self._limits = tuple(limit for limit in limits if limit.value.is_measured)
         self._struts = struts
         self._gates = [self._gates_of(item) for item in incoming]
-        self._index_of = self.directory.place
+        self._index_of = self.directory.index_of
 
     def init(self, t_ns: int) -> tuple[tuple[SequenceState, ...], GateMemory]:
         """Counter states and memory before the first tick."""
@@ -173,9 +173,9 @@ class Gates:
                 self._receive_other(reception, frame)
                 continue
             incoming = self.incoming[index]
-            sequences[index], verdict, values = incoming.read(sequences[index], frame)
-            if verdict is not _OK:
-                self._count(reception, index, frame.t_ns, verdict)
+            sequences[index], status, values = incoming.read(sequences[index], frame)
+            if status is not _OK:
+                self._count(reception, index, frame.t_ns, status)
             if values is not None and (gates := self._gates[index]):
                 values = _pass(gates, reception, frame, values)
             if values is not None:
@@ -203,15 +203,15 @@ class Gates:
             health = update_by_frame(self._devices[index], healths[index], frame)
             reception.set_health(index, health)
 
-    def _count(self, reception: Reception, index: int, t_ns: int, verdict: Verdict) -> None:
+    def _count(self, reception: Reception, index: int, t_ns: int, status: FrameStatus) -> None:
         """Count a frame that did not simply follow the one before."""
-        if verdict is Verdict.FIRST:
+        if status is FrameStatus.FIRST:
             reception.count(started=1)
-        elif verdict.accepted:
+        elif status.is_accepted:
             reception.count(lost=reception.sequences[index].lost)
         else:
-            reception.refuse(verdict.value)
-        if verdict is Verdict.OUT_OF_SEQUENCE:
+            reception.refuse(status.value)
+        if status is FrameStatus.OUT_OF_SEQUENCE:
             self._count_stray(reception, index, t_ns)
 
     def _count_stray(self, reception: Reception, index: int, t_ns: int) -> None:

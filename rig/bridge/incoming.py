@@ -8,15 +8,15 @@ from typing import NamedTuple
 from can_dbc.codec import Decoder, compile_decoder, si_range
 from can_dbc.database import Message
 from can_dbc.frame import Frame
-from can_dbc.protection import SequenceState, Verdict, compile_checker
+from can_dbc.protection import FrameStatus, SequenceState, compile_checker
 from can_dbc.units import Dimension
 from rig.channels.channel import Channel, Role
 
 Values = tuple[float, ...]
 """Values of a frame in SI, in the order of the message's signals that are read."""
 
-Reading = tuple[SequenceState, Verdict, Values | None]
-"""State of the message's counter after a frame, the frame's verdict, and its values; None where
+Reading = tuple[SequenceState, FrameStatus, Values | None]
+"""State of the message's counter after a frame, the frame's status, and its values; None where
 there are none to be used."""
 
 Reader = Callable[[SequenceState, Frame], Reading]
@@ -187,22 +187,22 @@ def _with_check(read: Reader, are_values: _Check) -> Reader:
     """A reader that refuses frames without values; most messages cannot hold such."""
 
     def read_checked(sequence: SequenceState, frame: Frame) -> Reading:
-        sequence, verdict, values = read(sequence, frame)
+        sequence, status, values = read(sequence, frame)
         if values is None or are_values(values):
-            return sequence, verdict, values
-        return sequence, Verdict.NO_VALUE, None
+            return sequence, status, values
+        return sequence, FrameStatus.NO_VALUE, None
 
     return read_checked
 
 
 def _compile_reader(message: Message, decode: Decoder) -> Reader:
-    length, ok = message.length_bytes, Verdict.OK
+    length, ok = message.length_bytes, FrameStatus.OK
 
     def read_unprotected(sequence: SequenceState, frame: Frame) -> Reading:
         values = decode(frame.data)
         # A multiplexed frame without these signals is no fault, a short one is.
         is_short = values is None and len(frame.data) != length
-        return sequence, Verdict.WRONG_LENGTH if is_short else ok, values
+        return sequence, FrameStatus.WRONG_LENGTH if is_short else ok, values
 
     if message.protection is None:
         return read_unprotected
@@ -210,7 +210,7 @@ def _compile_reader(message: Message, decode: Decoder) -> Reader:
 
     def read(sequence: SequenceState, frame: Frame) -> Reading:
         data = frame.data
-        sequence, verdict = check(sequence, data, frame.t_ns)
-        return sequence, verdict, decode(data) if verdict is ok or verdict.accepted else None
+        sequence, status = check(sequence, data, frame.t_ns)
+        return sequence, status, decode(data) if status is ok or status.is_accepted else None
 
     return read

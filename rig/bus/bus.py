@@ -1,4 +1,4 @@
-"""CAN through python-can, whatever the interface: frames as values, faults as errors of our own."""
+"""CAN through python-can, whatever the interface: frames as values, faults as `BusError`."""
 
 import contextlib
 import errno
@@ -14,14 +14,14 @@ from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 
 FRAMES_A_MS = 64
-"""Bound on the frames read per ms since the last tick, so that a flood holds no tick up. No bus
-reaches it (CAN FD at 1 and 8 Mbit/s carries a third); what is beyond waits."""
+"""Bound on the frames read per ms since the last tick, so that a flood delays no tick. No bus
+reaches it (CAN FD at 1 and 8 Mbit/s carries a third); further frames wait."""
 
 _QUEUE_BYTES, _SO_RCVBUFFORCE = 4_000_000, 33
 """Some 5 000 frames wait for a tick that is late; more than usual is granted to root alone."""
 
 _MOST_KNOWN = 10_000
-"""Identifiers that are remembered as let in or not; a flood of others must fill no memory."""
+"""Identifiers remembered as accepted or not; a flood of others must not fill the memory."""
 
 _LISTEN_ONLY_OPTIONS: dict[str, dict[str, Any]] = {
     "pcan": {"state": can.BusState.PASSIVE},
@@ -64,9 +64,9 @@ class Bus:
 
     Args:
         config: How to open it.
-        filters: The only frames that are let in, beside error frames; None lets all in.
-        listen_only: Send nothing. Most interfaces swallow such a request silently, so it is kept
-            here: the interface's way of sending is not even looked up.
+        filters: The only frames that are accepted, besides error frames; None accepts all.
+        listen_only: Send nothing. Most interfaces ignore such a request silently, so it is
+            enforced here: the method of sending is not even looked up.
         epoch_ns: Unix time of the run's start; time stamps are given relative to it.
 
     Raises:
@@ -84,8 +84,8 @@ class Bus:
         self._filters = None if filters is None else frozenset(filters)
         self._known: dict[tuple[int, bool], bool] = {}
         self.epoch_ns = epoch_ns
-        """Unix time that stamps are relative to; to be set anew when the system's clock was."""
-        self._bus = opened(config, self._filters, listen_only=listen_only)
+        """Unix time that stamps are relative to; to be updated when the system's clock was set."""
+        self._bus = open_bus(config, self._filters, listen_only=listen_only)
         self._receive = self._bus.recv
         self._send = None if listen_only else self._bus.send
 
@@ -105,13 +105,13 @@ class Bus:
                 message = receive(0)
                 if message is None:
                     break
-                if message.is_error_frame or self._lets_in(message):
+                if message.is_error_frame or self._accepts(message):
                     frames.append(self._frame(message))
         except (can.CanError, OSError, ValueError) as error:
             raise BusError(f"receiving failed: {error}") from error
         return frames
 
-    def _lets_in(self, message: can.Message) -> bool:
+    def _accepts(self, message: can.Message) -> bool:
         if self._filters is None:
             return True
         key = (message.arbitration_id, message.is_extended_id)
@@ -162,7 +162,7 @@ class Bus:
         try:
             self._send(message)
         except (can.CanError, OSError, ValueError) as error:
-            raise _sending_failed(error) from error
+            raise _sending_error(error) from error
 
     def close(self) -> None:
         """Close the interface; an interface that is gone already is closed."""
@@ -180,22 +180,22 @@ def _widen(connection: socket.socket) -> None:
         connection.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _QUEUE_BYTES)
 
 
-def _sending_failed(error: Exception) -> BusError:
+def _sending_error(error: Exception) -> BusError:
     code = getattr(error, "error_code", None) or getattr(error, "errno", None)
     text = " ".join(str(error).split())
     full = code == errno.ENOBUFS or "buffer full" in text.lower()
     return (BusFullError if full else BusError)(f"sending failed: {text}")
 
 
-def opened(
-    config: BusConfig, wanted: frozenset[Filter] | None = None, *, listen_only: bool = False
+def open_bus(
+    config: BusConfig, filters: frozenset[Filter] | None = None, *, listen_only: bool = False
 ) -> can.BusABC:
-    """python-can's bus, for what needs more of it than `Bus` gives.
+    """python-can's open bus, for callers that need more of it than `Bus` offers.
 
     Args:
         config: How to open it.
-        wanted: The only frames that are let in, where the interface can choose; None: all.
-        listen_only: Whether the controller is to keep silent, where it can.
+        filters: The only frames that are accepted, where the interface filters; None: all.
+        listen_only: Whether the controller is to stay silent, where the interface supports that.
 
     Raises:
         BusError: The interface cannot be opened.
@@ -209,32 +209,25 @@ def opened(
     if config.data_bitrate is not None:
         options.setdefault("fd", True)
         options.setdefault("data_bitrate", config.data_bitrate)
-    filters = None
-    if wanted is not None and config.interface == "socketcan":
+    kernel_filters = None
+    if filters is not None and config.interface == "socketcan":
         # The kernel's filters let error frames pass. python-can's own, which stand in for them at
         # other interfaces, do not, and end a poll at the first foreign frame.
-        filters = [
+        kernel_filters = [
             {"can_id": item.arbitration_id, "can_mask": item.mask, "extended": item.is_extended}
-            for item in sorted(wanted, key=lambda item: item.arbitration_id)
+            for item in sorted(filters, key=lambda item: item.arbitration_id)
         ]
     try:
         bus: can.BusABC = cast("Any", can.Bus)(
             interface=config.interface,
             channel=config.channel,
             bitrate=config.bitrate,
-            can_filters=filters,
+            can_filters=kernel_filters,
             **options,
         )
         if config.interface == "socketcan":
             _widen(cast("Any", bus).socket)
-    except (
-        can.CanError,
-        OSError,
-        ValueError,
-        TypeError,
-        ImportError,
-        NotImplementedError,
-    ) as error:
+    except _OPENING_ERRORS as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise BusError(
             f"bus.interface {config.interface!r}, bus.channel {config.channel!r}: "

@@ -1,6 +1,6 @@
-"""A bus with CANopen devices on it, through the package `canopen`: to configure, not to run.
+"""A bus with CANopen devices, through the package `canopen`: for configuration, not for a run.
 
-The package reads in a thread of its own and drops frames at rate, so that frames of a run never go
+The package reads in a thread and drops frames at a high rate, so the frames of a run never pass
 through it.
 """
 
@@ -15,7 +15,7 @@ import can
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.bus.bus import BusConfig, BusError, opened
+from rig.bus.bus import BusConfig, BusError, open_bus
 
 _SDO_REQUEST, _SDO_ANSWER = 0x600, 0x580
 _ANSWER_WITHIN_S = 0.5
@@ -32,19 +32,19 @@ def package() -> Any:
     """The package `canopen`.
 
     Raises:
-        InputError: It is not installed.
+        BusError: It is not installed.
     """
-    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what it says, it also raises
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # what it logs, it also raises
     try:
         return importlib.import_module("canopen")
     except ImportError:
-        raise InputError(
+        raise BusError(
             "the package canopen is not installed, expected `pip install 'rig[sensors]'`"
         ) from None
 
 
 class RefusedError(InputError):
-    """A device refuses to be read or written so."""
+    """A device refuses an access."""
 
 
 class CanOpenNetwork:
@@ -56,7 +56,7 @@ class CanOpenNetwork:
 
     Raises:
         BusError: The interface cannot be opened.
-        InputError: The package is not installed.
+        BusError: The package is not installed.
     """
 
     def __init__(self, config: BusConfig, *, listen_only: bool = False) -> None:
@@ -64,11 +64,11 @@ class CanOpenNetwork:
         self._aborted: type[Exception] = self._package.SdoAbortedError
         self._failed: type[Exception] = self._package.SdoCommunicationError
         self.listens_only = listen_only
-        self.heard: list[Frame] = []
-        """Frames that came, in order, the first ones of very many."""
-        self._bus = opened(config, listen_only=listen_only)
+        self.received: list[Frame] = []
+        """Received frames in their order, the first ones of very many."""
+        self._bus = open_bus(config, listen_only=listen_only)
         self._network: Any = self._package.Network(self._bus)
-        self._network.listeners = [_Ear(self._network, self.heard)]
+        self._network.listeners = [_Listener(self._network, self.received)]
         self._network.NOTIFIER_CYCLE = 0.1
         self._network.connect()
         self._clients: dict[int, Any] = {}
@@ -85,16 +85,16 @@ class CanOpenNetwork:
         time.sleep(seconds)
 
     def search(self) -> None:
-        """Ask every node id for its device type; who answers shows in `heard`."""
+        """Ask every node id for its device type; answers appear in `received`."""
         for node_id in range(1, _LAST_NODE + 1):
             self._send(_SDO_REQUEST + node_id, b"\x40\x00\x10\x00\x00\x00\x00\x00")
 
     def ask_for_addresses(self) -> None:
         """Ask every J1939 device for its address claim, from the address of those without one."""
-        self._put(can.Message(arbitration_id=0x18EAFFFE, data=b"\x00\xee\x00"))
+        self._transmit(can.Message(arbitration_id=0x18EAFFFE, data=b"\x00\xee\x00"))
 
     def read(self, node_id: int, index: int, subindex: int = 0) -> bytes | None:
-        """Content of an object; None where the device says that it has none, or none to read.
+        """Content of an object; None where the device reports that it has none, or none to read.
 
         Raises:
             BusError: The device does not answer, or the bus fails.
@@ -113,20 +113,20 @@ class CanOpenNetwork:
             RefusedError: The device refuses it.
             BusError: The device does not answer, or the bus fails.
         """
-        place = f"node {node_id}, object {index:04X}h.{subindex}"
+        where = f"node {node_id}, object {index:04X}h.{subindex}"
         try:
             self._client(node_id).download(index, subindex, content)
         except self._aborted as error:
-            raise RefusedError(f"{place}: the device refuses {content.hex()}: {error}") from error
+            raise RefusedError(f"{where}: the device refuses {content.hex()}: {error}") from error
         except (self._failed, can.CanError, OSError, struct.error) as error:
-            raise BusError(f"{place}: no answer: {error}") from error
+            raise BusError(f"{where}: no answer: {error}") from error
 
     def command(self, node_id: int, command: int) -> None:
         """Send a command of network management; there is no answer to it."""
         self._send(0x000, bytes((command, node_id)))
 
-    def unconfigured(self) -> Sequence[int] | None:
-        """Identity of a device without a node id, found by LSS fast scan; None if there is none.
+    def find_unconfigured(self) -> Sequence[int] | None:
+        """Identity of a device without a node id, by LSS fast scan; None if there is none.
 
         It takes some 15 s where there is one, and a tenth of a second where there is none.
         """
@@ -139,7 +139,7 @@ class CanOpenNetwork:
         return cast("Sequence[int]", identity) if is_there else None
 
     def give_node_id(self, node_id: int) -> None:
-        """Give the device that `unconfigured` found a node id, until it is switched off.
+        """Set the node id of the device of `find_unconfigured`, until it is switched off.
 
         Raises:
             BusError: It does not take it.
@@ -149,11 +149,11 @@ class CanOpenNetwork:
         try:
             lss.configure_node_id(node_id)
             lss.send_switch_state_global(lss.WAITING_STATE)
-        except Exception as error:  # the package has errors of its own here, and struct's
+        except Exception as error:  # the package raises errors of many classes here
             raise BusError(f"the device does not take node id {node_id}: {error}") from error
 
     def _client(self, node_id: int) -> Any:
-        """What reads and writes the objects of a node."""
+        """Client that reads and writes the objects of a node."""
         client = self._clients.get(node_id)
         if client is None:
             request, answer = _SDO_REQUEST + node_id, _SDO_ANSWER + node_id
@@ -166,33 +166,33 @@ class CanOpenNetwork:
         return client
 
     def _send(self, arbitration_id: int, data: bytes) -> None:
-        self._put(can.Message(arbitration_id=arbitration_id, is_extended_id=False, data=data))
+        self._transmit(can.Message(arbitration_id=arbitration_id, is_extended_id=False, data=data))
 
-    def _put(self, message: can.Message) -> None:
+    def _transmit(self, message: can.Message) -> None:
         if self.listens_only:
-            raise BusError("sending failed: the bus is only listened to")
+            raise BusError("sending failed: the bus is opened to listen only")
         try:
             self._bus.send(message, timeout=1.0)
         except (can.CanError, OSError, ValueError) as error:
             raise BusError(f"sending failed: {error}") from error
 
 
-class _Ear(can.Listener):
-    """Keeps what comes, and hands on what can be CANopen: never J1939's ids of 29 bits."""
+class _Listener(can.Listener):
+    """Keeps received frames, and passes on what can be CANopen: never J1939's ids of 29 bits."""
 
-    def __init__(self, network: Any, heard: list[Frame]) -> None:
+    def __init__(self, network: Any, received: list[Frame]) -> None:
         self._network = network
-        self._heard = heard
+        self._received = received
 
     def on_message_received(self, msg: can.Message) -> None:
-        """Keep a frame and hand it on."""
+        """Keep a frame and pass it on."""
         if msg.is_error_frame or msg.is_remote_frame:
             return
-        if len(self._heard) < _MOST_FRAMES:
+        if len(self._received) < _MOST_FRAMES:
             t_ns, data = round(msg.timestamp * 1e9), bytes(msg.data)
-            self._heard.append(Frame(t_ns, msg.arbitration_id, data, msg.is_extended_id))
+            self._received.append(Frame(t_ns, msg.arbitration_id, data, msg.is_extended_id))
         if not msg.is_extended_id:
             self._network.notify(msg.arbitration_id, msg.data, msg.timestamp)
 
     def stop(self) -> None:
-        """Nothing is held."""
+        """Release nothing: there is nothing to release."""

@@ -1,7 +1,7 @@
-"""What the error frames of a CAN controller say of its state.
+"""State of a CAN controller, from its error frames.
 
 python-can reports a state for few interfaces (SocketCAN's is always "active"), but SocketCAN passes
-on what the controller says of itself, as frames with a payload of their own.
+on the state that the controller reports, in the payload of error frames.
 
 Reference: Linux kernel, include/uapi/linux/can/error.h; ISO 11898-1, fault confinement.
 """
@@ -31,11 +31,11 @@ def state_after(state: Controller, frame: Frame) -> Controller:
 
     Args:
         state: State before it.
-        frame: An error frame, or one of the bus, which only a controller that is on it receives.
+        frame: An error frame, or one of the bus, which no controller receives while it is bus-off.
 
     Returns:
-        The new state; an error frame that says nothing of it (a bit error, a lost arbitration)
-        leaves it as it was.
+        The new state; an error frame that does not report it (a bit error, a lost arbitration)
+        leaves it unchanged.
     """
     if not frame.is_error:
         return Controller.ACTIVE if state is Controller.BUS_OFF else state

@@ -1,4 +1,4 @@
-"""A bus that may go away and come back while the run goes on."""
+"""A bus that may disappear and return during a run."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -13,25 +13,25 @@ from rig.bus.controller import Controller, state_after
 from rig.bus.secoc import Authenticator
 
 FIRST_PAUSE_NS = 50_000_000
-"""Pause before an interface that has gone is opened again; doubled at every failure."""
+"""Pause before a lost interface is opened again; doubled at every failure."""
 
 LONGEST_PAUSE_NS = 1_000_000_000
 
 SENDING_FAILED_NS = 500_000_000
-"""How long every frame may fail to be sent before the interface is opened anew."""
+"""Time in which every frame may fail to be sent before the interface is opened again."""
 
 _MOST_GAPS = 1000
 _WALL_CLOCK_SET_NS = 2_000_000
-"""A stamp this far from the tick that reads it makes one look at the system's clock again."""
+"""Deviation of a stamp from the tick that reads it from which the system's clock is checked."""
 
 
 class Gap(NamedTuple):
     """A time without a bus.
 
     Attributes:
-        from_ns: Tick that found it gone.
-        to_ns: Tick that found it back; None if it stayed away.
-        why: What the interface said.
+        from_ns: Tick at which it was lost.
+        to_ns: Tick at which it was back; None if it never was.
+        why: Error of the interface.
     """
 
     from_ns: int
@@ -41,17 +41,17 @@ class Gap(NamedTuple):
 
 @dataclass
 class LinkFigures:
-    """What became of a bus during a run.
+    """Faults of a bus during a run.
 
     Attributes:
         error_frames: Error frames received.
-        warnings: Times the controller came to its warning limit.
+        warnings: Times the controller reached its warning limit.
         passive: Times it became error-passive.
         bus_off: Times it went bus-off.
         unsent: Frames that could not be sent.
         clock_steps: Times the system's clock was set.
         unauthentic: Frames refused because no fresh value fits their authenticator.
-        replayed: Frames refused because one as new had come already.
+        replayed: Frames refused because their freshness value is not newer than the last one.
         gaps: Times without an interface, at most the first 1000.
     """
 
@@ -88,16 +88,16 @@ def _seconds(t_ns: int | None) -> float | None:
 
 
 class Link:
-    """An open bus, and how it is got back when it has gone.
+    """An open bus that is opened again when it is lost.
 
-    Opening may take seconds at some interfaces, so a thread does it; a tick only looks whether it
+    Opening takes seconds at some interfaces, so a thread does it, and a tick only checks whether it
     is done.
 
     Args:
-        open_bus: Opens the bus; called at once, and again whenever it has gone.
+        open_bus: Opens the bus; called at once, and again whenever it was lost.
         epoch_now_ns: Unix time of the run's start by the system's clock as it is set now.
-        executor: Runs `open_bus` when it has gone; a thread of its own by default.
-        authenticator: Secures what is sent, and lets in what is authentic; None does neither.
+        executor: Runs `open_bus` when it was lost; a new thread by default.
+        authenticator: Secures sent frames and accepts authentic ones alone; None does neither.
 
     Raises:
         BusError: The bus cannot be opened at the start.
@@ -112,7 +112,7 @@ class Link:
     ) -> None:
         self.figures = LinkFigures()
         self.fault: str | None = None
-        """What is wrong now; None while all is well."""
+        """Present fault; None if there is none."""
         self._open_bus = open_bus
         self._epoch_now_ns = epoch_now_ns
         self._authenticator = authenticator
@@ -127,43 +127,43 @@ class Link:
         self._unsent_since_ns: int | None = None
 
     def receive(self, t_ns: int) -> Sequence[Frame]:
-        """Frames that have come since the last tick, none while the bus is away.
+        """Frames received since the last tick, none while the bus is lost.
 
-        A frame's time is that of its arrival: after the last tick and at the latest at this one.
+        A frame's time is that of its arrival: after the last tick, and at the latest at this one.
         """
-        bus = self._bus or self._reopened(t_ns)
+        bus = self._bus or self._reopen(t_ns)
         if bus is None:
             self._last_ns = t_ns
             return ()
         try:
             frames = bus.receive(t_ns - self._last_ns)
         except BusError as error:
-            self._gone(t_ns, str(error))
+            self._lose(t_ns, str(error))
             frames = []
         else:
             if self._pause_ns != FIRST_PAUSE_NS:
-                self._back(t_ns)
+                self._end_gap(t_ns)
         last_ns, self._last_ns = self._last_ns, t_ns
         for index, frame in enumerate(frames):
             if not last_ns < frame.t_ns <= t_ns:
                 frames[index] = replace(frame, t_ns=self._arrival_ns(frame.t_ns, last_ns, t_ns))
             if frame.is_error or self._controller:
-                self._judge(frame)
-        return frames if self._authenticator is None else self._authentic(frames)
+                self._update_controller(frame)
+        return frames if self._authenticator is None else self._authenticate(frames)
 
     def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
         """Send; returns the frames that were sent."""
         bus = self._bus
         if bus is None or bus.listens_only:
             return ()
-        secured = None if self._authenticator is None else self._authenticator.secured
+        secured = None if self._authenticator is None else self._authenticator.secure
         done = 0
         try:
             for frame in frames:
                 bus.send(frame if secured is None else secured(frame))
                 done += 1
         except BusError as error:
-            self._unsent(frames[done:], error)
+            self._record_unsent(frames[done:], error)
             return frames[:done]
         if self._unsent_since_ns is not None and frames:
             self._unsent_since_ns = None
@@ -171,43 +171,43 @@ class Link:
         return frames
 
     @property
-    def refused(self) -> int:
+    def unauthenticated(self) -> int:
         """Frames refused so far because they are not authentic or not new."""
         return self.figures.unauthentic + self.figures.replayed
 
     def close(self) -> None:
         """Close the bus."""
         if self._opening is not None:
-            self._opening.add_done_callback(_close_opened)
+            self._opening.add_done_callback(_close_late)
         self._executor.shutdown(wait=False, cancel_futures=True)
         if self._bus is not None:
             self._bus.close()
 
-    def _authentic(self, frames: Sequence[Frame]) -> Sequence[Frame]:
+    def _authenticate(self, frames: Sequence[Frame]) -> Sequence[Frame]:
         authenticator, figures = self._authenticator, self.figures
         if authenticator is None:
             return frames
-        accepted = authenticator.accepted(frames)
+        accepted = authenticator.authenticate(frames)
         figures.unauthentic, figures.replayed = authenticator.unauthentic, authenticator.replayed
         return accepted
 
     def _arrival_ns(self, stamp_ns: int, last_ns: int, t_ns: int) -> int:
-        """A time in the tick for a stamp outside of it."""
+        """Time within the tick for a stamp outside of it."""
         if t_ns < stamp_ns < t_ns + _WALL_CLOCK_SET_NS:
             return t_ns
         epoch_ns = self._epoch_now_ns()
         step_ns = epoch_ns - self._epoch_ns
         if abs(step_ns) > _WALL_CLOCK_SET_NS:
-            # Somebody set the system's clock, which stamps the frames; the run's clock goes on.
+            # The system's clock, which stamps the frames, was set; the run's clock was not.
             self.figures.clock_steps += 1
             self._epoch_ns = epoch_ns
             if self._bus is not None:
                 self._bus.epoch_ns = epoch_ns
             stamp_ns -= step_ns
-        # What is read now has come since the last tick, or stood in the queue behind a flood.
+        # A frame read now arrived since the last tick, or waited in the queue behind a flood.
         return min(max(stamp_ns, last_ns + 1), t_ns)
 
-    def _judge(self, frame: Frame) -> None:
+    def _update_controller(self, frame: Frame) -> None:
         before, self._controller = self._controller, state_after(self._controller, frame)
         figures = self.figures
         figures.error_frames += frame.is_error
@@ -222,7 +222,7 @@ class Link:
         faulty = self._controller >= Controller.PASSIVE
         self.fault = f"the controller is {self._controller.name}" if faulty else None
 
-    def _unsent(self, frames: Sequence[Frame], error: BusError) -> None:
+    def _record_unsent(self, frames: Sequence[Frame], error: BusError) -> None:
         self.figures.unsent += len(frames)
         self.fault = str(error)
         if self._unsent_since_ns is None:
@@ -231,9 +231,9 @@ class Link:
             not isinstance(error, BusFullError)
             and self._last_ns - self._unsent_since_ns > SENDING_FAILED_NS
         ):
-            self._gone(self._last_ns, str(error))
+            self._lose(self._last_ns, str(error))
 
-    def _gone(self, t_ns: int, why: str) -> None:
+    def _lose(self, t_ns: int, why: str) -> None:
         if self._bus is not None:
             self._bus.close()
             self._bus = None
@@ -244,8 +244,8 @@ class Link:
         self._retry_ns = t_ns + self._pause_ns
         self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
 
-    def _reopened(self, t_ns: int) -> Bus | None:
-        """The bus, if it could be opened; it is back only when a tick has read from it."""
+    def _reopen(self, t_ns: int) -> Bus | None:
+        """The bus, if it could be opened; the gap ends only when a tick has read from it."""
         if self._opening is None:
             if t_ns >= self._retry_ns:
                 self._opening = self._executor.submit(self._open_bus)
@@ -260,10 +260,10 @@ class Link:
             return self._bus
         if not isinstance(error, BusError):
             raise error
-        self._gone(t_ns, str(error))
+        self._lose(t_ns, str(error))
         return None
 
-    def _back(self, t_ns: int) -> None:
+    def _end_gap(self, t_ns: int) -> None:
         gaps = self.figures.gaps
         if gaps and gaps[-1].to_ns is None:
             gaps[-1] = gaps[-1]._replace(to_ns=t_ns)
@@ -273,7 +273,7 @@ class Link:
         self.fault = None
 
 
-def _close_opened(opening: Future[Bus]) -> None:
-    """Close a bus that came when nobody waited for it any more."""
+def _close_late(opening: Future[Bus]) -> None:
+    """Close a bus that was opened after the link was closed."""
     if not opening.cancelled() and opening.exception() is None:
         opening.result().close()

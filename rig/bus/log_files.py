@@ -19,11 +19,16 @@ _TEXT = MappingProxyType(
 )
 _BINARY = MappingProxyType({".blf": can.BLFReader, ".mf4": can.MF4Reader})
 
+
+class BusLogError(InputError):
+    """A bus log cannot be read; one line: file, reason."""
+
+
 LOG_SUFFIXES = (*_TEXT, *_BINARY)
 """Kinds of logs that are read."""
 
 # What the readers raise on a damaged file depends on the format and is documented nowhere.
-_DAMAGED: tuple[type[Exception], ...] = (
+_READER_ERRORS: tuple[type[Exception], ...] = (
     can.CanError,
     BLFParseError,
     OSError,
@@ -47,35 +52,35 @@ def read_log(path: Path) -> Iterator[tuple[int, Frame]]:
         path: File with one of `LOG_SUFFIXES`.
 
     Yields:
-        Unix time of each frame in ns, as exactly as the file and python-can have it (a float in s,
-        to 0.24 us in our days), and the frame, stamped with the time since the first one.
+        Unix time of each frame in ns, as exact as the file and python-can (a float in s, to
+        0.24 us today), and the frame, stamped with the time since the first one.
 
     Raises:
-        InputError: The file is of no such kind, cannot be read, is damaged, or wants a package that
-            is not installed.
+        BusLogError: The file is of no such kind, cannot be read, is damaged, or requires a package
+            that is not installed.
     """
     if path.suffix.lower() not in LOG_SUFFIXES:
-        raise InputError(
+        raise BusLogError(
             f"{path}: expected a log with one of the endings {', '.join(LOG_SUFFIXES)}"
         )
     if not path.is_file():
-        raise InputError(f"{path}: cannot be read: no such file")
-    damaged, first_ns = _damaged(path), None
+        raise BusLogError(f"{path}: cannot be read: no such file")
+    errors, first_ns = _reader_errors(path), None
     try:
         # Opened here and not by the reader, which leaves a damaged file open.
-        with _opened(path) as file:
+        with _open(path) as file:
             for message in _messages(path, file):
                 if message.is_error_frame or message.is_remote_frame:
                     continue
                 at_ns = round(message.timestamp * 1e9)
                 first_ns = at_ns if first_ns is None else first_ns
                 yield at_ns, _frame(message, at_ns - first_ns)
-    except damaged as error:
+    except errors as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise InputError(f"{path}: is no such log, or is damaged: {reason}") from error
+        raise BusLogError(f"{path}: is not such a log, or is damaged: {reason}") from error
 
 
-def _opened(path: Path) -> Any:
+def _open(path: Path) -> Any:
     if path.suffix.lower() in _TEXT:
         return path.open(encoding="utf-8", errors="replace")
     return path.open("rb")
@@ -86,15 +91,17 @@ def _messages(path: Path, file: Any) -> Iterable[can.Message]:
     return cast("Iterable[can.Message]", reader(file))
 
 
-def _damaged(path: Path) -> tuple[type[Exception], ...]:
-    """What the reader of a file may raise when it is damaged."""
+def _reader_errors(path: Path) -> tuple[type[Exception], ...]:
+    """Errors that the reader of a file may raise when the file is damaged."""
     if path.suffix.lower() != ".mf4":
-        return _DAMAGED
+        return _READER_ERRORS
     try:
-        errors = cast("Any", importlib.import_module("asammdf.blocks.utils"))
+        module = cast("Any", importlib.import_module("asammdf.blocks.utils"))
     except ImportError as error:
-        raise InputError(f"{path}: wants the package asammdf: pip install 'rig[mf4]'") from error
-    return (*_DAMAGED, cast("type[Exception]", errors.MdfException))
+        raise BusLogError(
+            f"{path}: requires the package asammdf: pip install 'rig[mf4]'"
+        ) from error
+    return (*_READER_ERRORS, cast("type[Exception]", module.MdfException))
 
 
 def _frame(message: can.Message, t_ns: int) -> Frame:

@@ -3,7 +3,7 @@
 Behind the payload stand the low bits of a freshness value and the high bits of a CMAC (AES-128)
 over data id, payload and whole freshness value. The freshness value is the sender's Unix time in
 units of 0.1 ms, and more than the last one in any case: it needs no memory across restarts, and a
-frame that was sent before is refused. What was refused does not get any further.
+repeated frame is refused. A refused frame reaches no decoder.
 
 References: AUTOSAR, "Specification of Secure Onboard Communication" (profile 1, 24Bit-CMAC-8Bit-FV,
 is the default); RFC 4493, "The AES-CMAC Algorithm".
@@ -31,12 +31,16 @@ _KEY_BYTES = 16
 _LARGEST_KEY_FILE = 1000
 
 
+class AuthenticationError(InputError):
+    """A key cannot be used, or the package that computes the CMAC is not installed."""
+
+
 @dataclass(frozen=True)
 class Authentication:
     """How frames are authenticated.
 
     Attributes:
-        key: 16 bytes; it stands in no log and no error.
+        key: 16 bytes; no log and no error contains it.
         freshness_bytes: Length of the freshness value's part in a frame.
         mac_bytes: Length of the CMAC's part.
         tolerance_ns: How far the clocks of two senders may be apart.
@@ -49,24 +53,24 @@ class Authentication:
 
     @property
     def trailer_bytes(self) -> int:
-        """How much longer a frame becomes."""
+        """Bytes added to a frame."""
         return self.freshness_bytes + self.mac_bytes
 
 
 def read_key(path: Path) -> bytes:
-    """Key of a file that holds 32 hexadecimal digits.
+    """Key from a file of 32 hexadecimal digits.
 
     Raises:
-        InputError: The file cannot be read, or holds no such key; what it holds is not said.
+        FileError: The file cannot be read.
+        AuthenticationError: It contains no such key. The message does not show its content.
     """
+    text = read_text(path, _LARGEST_KEY_FILE)
     try:
-        key = bytes.fromhex(read_text(path, _LARGEST_KEY_FILE))
-    except ValueError as error:
-        if isinstance(error, InputError):
-            raise
+        key = bytes.fromhex(text)
+    except ValueError:
         key = b""
     if len(key) != _KEY_BYTES:
-        raise InputError(f"{path}: expected a key of {2 * _KEY_BYTES} hexadecimal digits")
+        raise AuthenticationError(f"{path}: expected a key of {2 * _KEY_BYTES} hexadecimal digits")
     return key
 
 
@@ -74,14 +78,14 @@ def cmac(key: bytes) -> Callable[[bytes], bytes]:
     """AES-CMAC under a key: message -> 16 bytes.
 
     Raises:
-        InputError: The package that computes it is not installed.
+        AuthenticationError: The package that computes it is not installed.
     """
     try:
         module = cast("Any", importlib.import_module("cryptography.hazmat.primitives.cmac"))
         ciphers = cast("Any", importlib.import_module("cryptography.hazmat.primitives.ciphers"))
     except ImportError as error:
-        raise InputError(
-            "authentication: wants the package cryptography: pip install 'rig[secoc]'"
+        raise AuthenticationError(
+            "authentication: requires the package cryptography: pip install 'rig[secoc]'"
         ) from error
     keyed = module.CMAC(ciphers.algorithms.AES(key))
 
@@ -93,82 +97,82 @@ def cmac(key: bytes) -> Callable[[bytes], bytes]:
     return compute
 
 
-class _Heard(NamedTuple):
-    """Freshness value of the last frame that was accepted under an id, and when it came."""
+class _Received(NamedTuple):
+    """Freshness value of the last frame that was accepted under an id, and its time."""
 
     freshness: int
     t_ns: int
 
 
 class Authenticator:
-    """Secures what one side of a bus sends, and accepts what is authentic and new.
+    """Secures the frames that one side of a bus sends, and accepts authentic and new ones alone.
 
     Args:
         how: Key and lengths.
         epoch_ns: Unix time of the run's start, to which the frames' times are relative.
 
     Raises:
-        InputError: The package that computes the CMAC is not installed.
+        AuthenticationError: The package that computes the CMAC is not installed.
     """
 
     def __init__(self, how: Authentication, epoch_ns: int) -> None:
         self.unauthentic = 0
         """Frames refused because no fresh value fits their CMAC."""
         self.replayed = 0
-        """Frames refused because one as new had come already."""
+        """Frames refused because their freshness value is not newer than the last one."""
         self._how = how
         self._epoch_ns = epoch_ns
         self._cmac = cmac(how.key)
         self._sent: dict[int, int] = {}
-        self._heard: dict[int, _Heard] = {}
+        self._received: dict[int, _Received] = {}
 
-    def secured(self, frame: Frame) -> Frame:
+    def secure(self, frame: Frame) -> Frame:
         """The frame with freshness value and CMAC behind its payload."""
         identifier = frame.arbitration_id
         freshness = max(self._time(frame.t_ns), self._sent.get(identifier, -1) + 1)
         self._sent[identifier] = freshness
-        trailer = self._low(freshness) + self._authenticator(frame, frame.data, freshness)
+        trailer = self._low(freshness) + self._mac(frame, frame.data, freshness)
         return replace(frame, data=frame.data + trailer, is_fd=True, bitrate_switch=True)
 
-    def accepted(self, frames: Sequence[Frame]) -> list[Frame]:
-        """The frames that are authentic and new, without what secured them; error frames pass."""
-        found: list[Frame] = []
+    def authenticate(self, frames: Sequence[Frame]) -> list[Frame]:
+        """The frames that are authentic and new, without their trailer; error frames pass."""
+        accepted: list[Frame] = []
         for frame in frames:
             if frame.is_error:
-                found.append(frame)
+                accepted.append(frame)
                 continue
-            payload = self._authentic(frame)
+            payload = self._verified_payload(frame)
             if payload is not None:
-                found.append(replace(frame, data=payload))
-        return found
+                accepted.append(replace(frame, data=payload))
+        return accepted
 
     @property
-    def refused(self) -> int:
-        """Frames refused."""
+    def unauthenticated(self) -> int:
+        """Frames refused: unauthentic and replayed ones."""
         return self.unauthentic + self.replayed
 
-    def _authentic(self, frame: Frame) -> bytes | None:
-        """Payload of a frame that is accepted."""
+    def _verified_payload(self, frame: Frame) -> bytes | None:
+        """Payload of a frame without its trailer; None if it is refused."""
         how = self._how
         end = len(frame.data) - how.trailer_bytes
         payload, trailer = frame.data[: max(end, 0)], frame.data[max(end, 0) :]
         low, received = trailer[: how.freshness_bytes], trailer[how.freshness_bytes :]
-        last = self._heard.get(frame.arbitration_id)
+        last = self._received.get(frame.arbitration_id)
         for freshness in self._possible(last, frame.t_ns, low) if end >= 0 else ():
-            if hmac.compare_digest(self._authenticator(frame, payload, freshness), received):
+            if hmac.compare_digest(self._mac(frame, payload, freshness), received):
                 if last is not None and freshness <= last.freshness:
                     self.replayed += 1
                     return None
-                self._heard[frame.arbitration_id] = _Heard(freshness, frame.t_ns)
+                self._received[frame.arbitration_id] = _Received(freshness, frame.t_ns)
                 return payload
         self.unauthentic += 1
         return None
 
-    def _possible(self, last: _Heard | None, t_ns: int, low: bytes) -> Iterator[int]:
+    def _possible(self, last: _Received | None, t_ns: int, low: bytes) -> Iterator[int]:
         """Whole freshness values that a frame may have, the likeliest first.
 
-        Before the first frame the own clock says which; then the sender's, which goes on from the
-        last frame.
+        They lie about the own clock before the first frame, then about the sender's clock, which
+        runs on from the last frame.
         """
         modulus = 1 << 8 * self._how.freshness_bytes
         if last is None:
@@ -190,7 +194,7 @@ class Authenticator:
         count = self._how.freshness_bytes
         return freshness.to_bytes(_FRESHNESS_BYTES, "big")[_FRESHNESS_BYTES - count :]
 
-    def _authenticator(self, frame: Frame, payload: bytes, freshness: int) -> bytes:
+    def _mac(self, frame: Frame, payload: bytes, freshness: int) -> bytes:
         data_id = frame.arbitration_id.to_bytes(2, "big")
         whole = data_id + payload + freshness.to_bytes(_FRESHNESS_BYTES, "big")
         return self._cmac(whole)[: self._how.mac_bytes]

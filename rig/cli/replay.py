@@ -20,7 +20,7 @@ def replay_command(
     as_json: JsonFlag = False,
 ) -> None:
     """Compute a run again from its frames and compare it with its log, bit for bit."""
-    from rig.log.reader import changed_files
+    from rig.log.reader import find_changed_files
     from rig.run.replay import replay
 
     with progress_line(None) as progress:
@@ -33,7 +33,7 @@ def replay_command(
         "refused_frames": result.refused_frames,
     }
     missing = result.logged - result.steps.num_rows
-    changed = changed_files(folder)
+    changed = find_changed_files(folder)
     if out is not None:
         write_summary(out, summary)
     if as_json:

@@ -196,7 +196,7 @@ def set_command(
 
 
 def _give_node_id(network: "CanOpenNetwork", node_id: int) -> None:
-    identity = network.unconfigured()
+    identity = network.find_unconfigured()
     if identity is None:
         raise InputError("--new: no device without a node id answers")
     network.give_node_id(node_id)

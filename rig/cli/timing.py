@@ -23,11 +23,11 @@ def timing(
 ) -> None:
     """List the missed ticks of a traced run: the part that took longer, and the cause."""
     from rig.plan.load import plan_of_run
-    from rig.run.late_ticks import by_cause, late_ticks
+    from rig.run.late_ticks import by_cause, find_late_ticks
     from rig.run.trace import read_trace
 
     plan = plan_of_run(folder)
-    late = late_ticks(read_trace(folder), plan.period_ns)
+    late = find_late_ticks(read_trace(folder), plan.period_ns)
     summary: dict[str, object] = {
         "late": [{**item._asdict(), "cause": item.cause.name.lower()} for item in late]
     }

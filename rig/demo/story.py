@@ -18,7 +18,7 @@ from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.logged_run import Ended
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.schema import BenchConfig, Effect
+from rig.simulated_bench.schema import BenchConfig, UndeclaredEffect
 
 _STRUT = "strut"
 _RANGES: Mapping[str, tuple[str, Mapping[str, tuple[float, float]]]] = {
@@ -54,7 +54,7 @@ class Story:
     """
 
     family: str
-    effect: Effect
+    effect: UndeclaredEffect
     diagnosis: Diagnosis
     virtual_force_rms_n: tuple[float, float]
     first_run: Ended
@@ -70,7 +70,7 @@ class Story:
         }
 
 
-def draw_effect(seed: int) -> tuple[str, Effect]:
+def draw_effect(seed: int) -> tuple[str, UndeclaredEffect]:
     """Family and effect of the bench for a seed.
 
     Args:
@@ -80,7 +80,9 @@ def draw_effect(seed: int) -> tuple[str, Effect]:
     name = list(_RANGES)[seed % len(_RANGES)]  # so that neighbouring seeds give different effects
     family, ranges = _RANGES[name]
     parameters = {key: float(random.uniform(low, high)) for key, (low, high) in ranges.items()}
-    return family, Effect.model_validate({"name": name, "strut": _STRUT, "parameters": parameters})
+    return family, UndeclaredEffect.model_validate(
+        {"name": name, "strut": _STRUT, "parameters": parameters}
+    )
 
 
 def run_story(
@@ -133,7 +135,7 @@ def run_story(
     return story
 
 
-def _bench(effect: Effect, excitation: int) -> BenchConfig:
+def _bench(effect: UndeclaredEffect, excitation: int) -> BenchConfig:
     bench = load_bench_config(CONFIGS / "story_bench.yaml")
     components = tuple(
         component.model_copy(update={"seed": excitation})

@@ -19,7 +19,7 @@ from rig.diagnosis.outcome import (
 )
 from rig.diagnosis.progress import Progress
 from rig.diagnosis.recording import read_recording
-from rig.log.reader import RUN_FILE, STEPS_FILE, parts
+from rig.log.file_names import RUN_FILE, STEPS_FILE, parts
 
 
 def diagnose_runs(

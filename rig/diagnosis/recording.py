@@ -262,7 +262,7 @@ def _payloads(run: RunFolder, plan: Plan) -> _Payloads:
     times: list[list[int]] = [[] for _ in messages]
     data: list[list[bytes]] = [[] for _ in messages]
     for frame, direction in run.frames():
-        index = directory.place(frame.arbitration_id, frame.is_extended)
+        index = directory.index_of(frame.arbitration_id, frame.is_extended)
         if index is None or direction != "R" or frame.is_error:
             continue
         if len(frame.data) == messages[index].length_bytes:

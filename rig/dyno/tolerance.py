@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.errors import InputError
-from can_dbc.yaml_file import load_validated, validated
+from can_dbc.yaml_file import load_yaml, validate
 from rig.dyno.figures import DynoStep
 from rig.dyno.stroke_force import Figure
 from rig.files.delimited_text import read_csv_columns
@@ -114,7 +114,7 @@ def load_tolerance(path: Path) -> ToleranceBand:
         InputError: One line that names file, key, value and what was expected.
     """
     if path.suffix.lower() != ".csv":
-        return load_validated(ToleranceBand, path)
+        return load_yaml(ToleranceBand, path)
     columns, _ = read_csv_columns(
         path, str(path), _MAX_BYTES, lambda header: _check_header(path, header)
     )
@@ -124,7 +124,7 @@ def load_tolerance(path: Path) -> ToleranceBand:
     ]
     if not points:
         raise InputError(f"{path}: holds no point, expected rows under the header")
-    return validated(ToleranceBand, {"name": path.stem, "points": points}, str(path))
+    return validate(ToleranceBand, {"name": path.stem, "points": points}, str(path))
 
 
 def _check_header(path: Path, header: Sequence[str]) -> Sequence[str]:

@@ -27,7 +27,7 @@ from rig.diagnosis.recording import Recording, read_recording
 from rig.diagnosis.refit import refitted
 from rig.dyno.characterise import characterise
 from rig.fleet.sources import RunSource, printable
-from rig.log.reader import RUN_FILE
+from rig.log.file_names import RUN_FILE
 
 _PIECE = 1 << 20
 

@@ -13,7 +13,7 @@ from typing import Any
 from fsspec.core import url_to_fs
 
 from can_dbc.errors import InputError
-from rig.log.reader import RUN_FILE
+from rig.log.file_names import RUN_FILE
 
 FIELDS = ("bench", "damper", "date")
 """What a pattern may name."""

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from can_dbc.errors import InputError
-from can_dbc.yaml_file import parse_mapping, read_text, validated
+from can_dbc.yaml_file import parse_mapping, read_text, validate
 from dart_model.effects import AMBIENT_C
 from dart_model.plant import DartPlant
 from dart_model.plant.admitted_programs import admit, withdraw
-from dart_model.plant.fmu import MockUp, described, read_program
+from dart_model.plant.fmu import MockUp, read_description, read_program
 from dart_model.spec import FmuSpec, ModelSpec, dump_model
 from rig.files.folders import refuse_full
 
@@ -44,7 +44,7 @@ def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: P
         raise InputError(f"--mass-kg {mass_kg}: expected a mass")
     refuse_full(out)
     content = read_program(source)
-    description = described(content, source)
+    description = read_description(content, source)
     roles = _roles_by_name(description, source) if mapping is None else _read_roles(mapping)
     _refuse_contradictions(roles, mapping or source)
     if roles.force is not None and mass_kg is None:
@@ -71,7 +71,7 @@ def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: P
 
 def _read_roles(mapping: Path) -> FmuSpec:
     roles = parse_mapping(read_text(mapping), str(mapping))
-    return validated(FmuSpec, {**roles, "file": FMU_FILE}, str(mapping))
+    return validate(FmuSpec, {**roles, "file": FMU_FILE}, str(mapping))
 
 
 def variables_of(roles: FmuSpec) -> dict[str, str]:
@@ -109,14 +109,14 @@ def _roles_by_name(description: Any, source: Path) -> FmuSpec:
         and causality.get("force_n") == "output"
     ):
         own = {"height": "height_m", "velocity": "velocity_m_per_s", "force": "force_n"}
-        return validated(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
+        return validate(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
     rates = {item.variable.derivative.name: item.variable.name for item in description.derivatives}
     prefixes = [name.removesuffix("height_m") for name in rates if name.endswith(".height_m")]
     for prefix in prefixes:
         height, velocity = f"{prefix}height_m", f"{prefix}velocity_m_per_s"
         if velocity in rates and further["applied_force"]:
             own = {"height": height, "velocity": velocity, "acceleration": rates[velocity]}
-            return validated(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
+            return validate(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
     names = ", ".join(n for n, kind in causality.items() if kind in ("input", "output"))
     raise InputError(
         f"{source}: its variables have other names than those of `rig export`, expected --mapping "
@@ -179,7 +179,7 @@ def _model(
         "skeleton": {"bodies": [body]},
         "struts": [strut],
     }
-    return validated(ModelSpec, spec, str(source)).model_copy(update={"folder": folder})
+    return validate(ModelSpec, spec, str(source)).model_copy(update={"folder": folder})
 
 
 def _start_m(description: Any, height: str) -> float:

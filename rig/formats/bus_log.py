@@ -59,7 +59,7 @@ class _LogPort:
 
     def _next(self) -> Frame | None:
         for _, frame in self._frames:
-            if self._directory.place(frame.arbitration_id, frame.is_extended) is not None:
+            if self._directory.index_of(frame.arbitration_id, frame.is_extended) is not None:
                 if self.received and frame.t_ns - self.last_ns > _LONGEST_GAP_NS:
                     gap_s = (frame.t_ns - self.last_ns) * 1e-9
                     raise InputError(

@@ -26,14 +26,9 @@ from rig.formats.mf4 import read_mf4, write_mf4
 from rig.formats.mts import is_mts
 from rig.formats.parquet import read_parquet, write_parquet
 from rig.formats.run_content import channel_of, path_inside
-from rig.log.reader import (
-    FRAMES_FILE,
-    RUN_FILE,
-    STEPS_FILE,
-    RunFolder,
-    format_frame,
-    read_run,
-)
+from rig.log.candump import format_frame
+from rig.log.file_names import FRAMES_FILE, RUN_FILE, STEPS_FILE
+from rig.log.reader import RunFolder, read_run
 
 _pa = cast("Any", pa)
 _csv = cast("Any", pyarrow.csv)

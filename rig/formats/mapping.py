@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.errors import DatabaseError, InputError
 from can_dbc.units import Dimension, SiConversion, si_conversion
-from can_dbc.yaml_file import load_validated
+from can_dbc.yaml_file import load_yaml
 
 Text = Annotated[str, Field(min_length=1, max_length=200)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -155,7 +155,7 @@ def load_mapping(path: Path) -> TableMapping:
     Raises:
         InputError: One line that names file, key, value and what was expected.
     """
-    mapping = load_validated(TableMapping, path)
+    mapping = load_yaml(TableMapping, path)
     try:
         output_columns(mapping)
     except InputError as error:

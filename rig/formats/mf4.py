@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.formats.run_content import RunContent, read_content
-from rig.log.reader import DBC_FILE, MODEL_FILE, RUN_FILE, RunFolder
+from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
+from rig.log.reader import RunFolder
 
 _pa = cast("Any", pa)
 _CAN, _STEPS = "CAN_DataFrame", "steps"

@@ -11,7 +11,8 @@ from msgspec.structs import astuple
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.formats.run_content import RunContent, read_content
-from rig.log.reader import RUN_FILE, RunFolder
+from rig.log.file_names import RUN_FILE
+from rig.log.reader import RunFolder
 
 _STEPS_PARQUET, _FRAMES_PARQUET = "steps.parquet", "frames.parquet"
 _KEY = b"rig.run"

@@ -6,7 +6,8 @@ from typing import Any
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.log.reader import FRAMES_FILE, STEPS_FILE, RunFolder
+from rig.log.file_names import FRAMES_FILE, STEPS_FILE
+from rig.log.reader import RunFolder
 
 _NOT_COPIED = (FRAMES_FILE, STEPS_FILE, "reserve.tmp")
 _LARGEST_FILE_BYTES = 64 * 1024 * 1024

@@ -1,4 +1,4 @@
-"""Windows of a run around its faults, each kept apart as a run folder of its own."""
+"""Windows of a run around its faults, each written as a run folder."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ from rig.log.steps import BUS_FAULT, LOG_FAULT, Step
 
 
 class Entry(NamedTuple):
-    """What a tick received, sent and computed."""
+    """Frames and record of a tick."""
 
     received: Sequence[Frame]
     sent: Sequence[Frame]
@@ -18,13 +18,13 @@ class Entry(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Window:
-    """What is captured around a trigger.
+class CaptureWindow:
+    """Time captured around a trigger.
 
     Attributes:
         before_ns: Time before it.
         after_ns: Time after it.
-        most: Captures of one run; later triggers are passed over.
+        most: Most captures of one run; later triggers are ignored.
     """
 
     before_ns: int
@@ -55,14 +55,14 @@ class Captures:
     tick before, or one given with `trigger`. A trigger within a window does not lengthen it.
 
     Args:
-        window: What is captured.
-        capture_name: Whether a change from one mode to another is a trigger, and its name if so.
+        window: Time captured.
+        capture_name: Name of the capture that a change from one mode to another triggers, if any.
         finished: Called with every finished window.
     """
 
     def __init__(
         self,
-        window: Window,
+        window: CaptureWindow,
         capture_name: Callable[[int, int], str | None],
         finished: Callable[[Capture], None],
     ) -> None:
@@ -72,7 +72,7 @@ class Captures:
         self._before: deque[Entry] = deque()
         self._open: Capture | None = None
         self._count = 0
-        self._asked: str | None = None
+        self._requested: str | None = None
         self._mode = 0
         self._flags = 0
 
@@ -82,12 +82,12 @@ class Captures:
         Args:
             why: One word, for the folder's name.
         """
-        self._asked = why
+        self._requested = why
 
     def take(self, entry: Entry) -> None:
-        """Look at a tick."""
+        """Take over a tick, and report a window that it ends."""
         step = entry.step
-        why = self._why(step)
+        why = self._find_trigger(step)
         self._mode, self._flags = step.mode, step.flags
         oldest_ns = step.t_ns - self._window.before_ns
         while self._before and self._before[0].step.t_ns < oldest_ns:
@@ -107,11 +107,11 @@ class Captures:
             capture, self._open = self._open, None
             self._finished(capture)
 
-    def _why(self, step: Step) -> str | None:
-        asked, self._asked = self._asked, None
+    def _find_trigger(self, step: Step) -> str | None:
+        requested, self._requested = self._requested, None
         began = step.flags & ~self._flags
-        if asked is not None:
-            return asked
+        if requested is not None:
+            return requested
         if began & BUS_FAULT:
             return "bus"
         if began & LOG_FAULT:

@@ -16,8 +16,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from rig.log.reader import END_OF_STREAM, STEPS_FILE, part_name
-from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, step_schema
+from rig.log.file_names import STEPS_FILE, part_name
+from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, END_OF_STREAM, LOG_FAULT, step_schema
 
 Array = NDArray[np.float64]
 _pa = cast("Any", pa)
@@ -38,7 +38,7 @@ _AT_ONCE = 1024
 """Batches that are turned into numbers in one go, which bounds the memory for it."""
 
 
-class Window(NamedTuple):
+class Stretch(NamedTuple):
     """A stretch of a run.
 
     Attributes:
@@ -112,7 +112,7 @@ class RunFollower:
         while self.steps < end and (batches := self._written()):
             self._add(_matrix(_pa.Table.from_batches(batches)))
 
-    def window(self, names: Sequence[str], begin_s: float, end_s: float, points: int) -> Window:
+    def window(self, names: Sequence[str], begin_s: float, end_s: float, points: int) -> Stretch:
         """A stretch of the run.
 
         Args:
@@ -129,7 +129,7 @@ class RunFollower:
             rows = self.rows(begin, end)
             rows = rows[(rows[:, 0] >= begin_ns) & (rows[:, 0] <= end_ns)]
             if len(rows) <= 2 * points:
-                return Window(rows[:, 0] * 1e-9, _chosen(rows, columns), len(rows))
+                return Stretch(rows[:, 0] * 1e-9, _chosen(rows, columns), len(rows))
             values = _chosen(rows, columns)
             return _thinned(rows[:, 0], values, values, points, len(rows))
         least, largest = self._least.rows[first:last], self._largest.rows[first:last]
@@ -283,7 +283,7 @@ def _chosen(rows: Array, columns: Sequence[int]) -> Array:
     return found
 
 
-def _thinned(t_ns: Array, least: Array, largest: Array, points: int, steps: int) -> Window:
+def _thinned(t_ns: Array, least: Array, largest: Array, points: int, steps: int) -> Stretch:
     """Least and largest values of some buckets, one after the other."""
     edges = np.linspace(0, len(t_ns), min(points, len(t_ns)) + 1).astype(np.intp)[:-1]
     low = np.fmin.reduceat(least, edges, axis=1)
@@ -295,4 +295,4 @@ def _thinned(t_ns: Array, least: Array, largest: Array, points: int, steps: int)
     falls = np.diff(low + high, axis=1, append=np.nan) < 0.0
     low, high = np.where(falls, high, low), np.where(falls, low, high)
     values = np.stack([low, high], axis=2).reshape(len(low), -1)
-    return Window(t_s, values, steps)
+    return Stretch(t_s, values, steps)

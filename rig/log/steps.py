@@ -1,4 +1,4 @@
-"""What is logged of each tick, and its columns in `steps.arrow`."""
+"""The record of a tick, and its columns in `steps.arrow`."""
 
 import struct
 from collections.abc import Sequence
@@ -11,11 +11,14 @@ from msgspec import Struct
 ACKNOWLEDGED, BUS_FAULT, LOG_FAULT = 1, 2, 4
 """Bits of `Step.flags`."""
 
+END_OF_STREAM = b"\xff\xff\xff\xff\0\0\0\0"
+"""Last bytes of an Arrow stream that was closed."""
+
 _pa = cast("Any", pa)
 
 
 class Step(Struct, frozen=True, gc=False):
-    """What is logged of one tick.
+    """The record of one tick.
 
     Attributes:
         t_ns: Time of the tick.
@@ -23,7 +26,7 @@ class Step(Struct, frozen=True, gc=False):
         received: Frames received, so that a replay gives each tick the same ones.
         mode: State of the bridge.
         flags: Bit 0 acknowledged, bit 1 bus fault, bit 2 log fault.
-        numbers: What was measured and published, as the log's further columns are named.
+        numbers: Measured and published values, as the log's further columns are named.
     """
 
     t_ns: int
@@ -95,6 +98,6 @@ class StepRows:
         return _pa.RecordBatch.from_arrays(arrays, schema=self.schema)
 
     def clear(self) -> None:
-        """Begin anew."""
+        """Remove all steps."""
         self._rows = bytearray()
         self.count = 0

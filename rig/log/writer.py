@@ -1,6 +1,6 @@
 """Writes the folder of a run while it runs, so that it can be read after a kill.
 
-A thread of its own writes, so that a slow disk does not delay a tick. Frames are written
+A thread writes, so that a slow disk does not delay a tick. Frames are written
 unbuffered, at most 10 ms after they came (20 ms while no tick comes); steps are flushed in batches.
 While the disk takes nothing, ticks wait in memory, and what does not fit there is counted.
 """
@@ -12,7 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,19 +20,12 @@ import pyarrow as pa
 import yaml
 
 from can_dbc.atomic_file import write_whole
-from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.log.captures import Capture, Captures, Entry, Window
-from rig.log.reader import (
-    DBC_FILE,
-    END_OF_STREAM,
-    FRAMES_FILE,
-    MODEL_FILE,
-    RUN_FILE,
-    STEPS_FILE,
-    format_frame,
-    part_name,
-)
+from rig.log.candump import format_frame
+from rig.log.captures import Capture, Captures, CaptureWindow, Entry
+from rig.log.errors import LogError
+from rig.log.file_names import CAPTURES_FOLDER, DBC_FILE, MODEL_FILE, RUN_FILE
+from rig.log.rotation import Part, Rotation
 from rig.log.steps import Step, StepRows
 from rig.log.whole_file import WholeFile
 from rig.machine.realtime import follow
@@ -47,8 +40,8 @@ _MOST_AT_ONCE = 40
 """Ticks taken over in one go, for the same reason."""
 
 _GIVEN_WAY_S = 5e-5
-"""Pause after each go. Less would not do: a thread that lets go of the interpreter and wants it
-back at once has it again before the one that waits is awake."""
+"""Pause after each go. A shorter one has no effect: a thread that requests the interpreter again at
+once gets it before the waiting one is awake."""
 
 WAKE_NS = 10_000_000
 """Time of the run after which the writing thread is woken for what was handed over."""
@@ -62,8 +55,8 @@ MOST_WAITING = 120_000
 MANY_WAITING = 2_000
 """Ticks waiting that are a fault."""
 
-_ASIDE_EVERY_S = 1.0
-"""Time between two writings of the file beside the log."""
+_SIDE_FILE_EVERY_S = 1.0
+"""Time between two writings of the side file."""
 
 _CLOSING_S = 30.0
 """How long the end of a run waits for a slow disk."""
@@ -75,67 +68,37 @@ _pa = cast("Any", pa)
 
 
 @dataclass(frozen=True)
-class Rotation:
-    """When a run is continued in further files; None for never.
+class LogOptions:
+    """What is written besides frames and steps, and when the files are continued in others.
 
     Attributes:
-        size_bytes: Size of frames and steps together.
-        time_ns: Time of the run that they span.
+        rotation: When the files are continued.
+        window: Time captured around faults; None captures nothing.
+        capture_name: Name of the capture that a change from one mode to another triggers, if any.
+        side_file: Name and content of a file that is rewritten once a second, if any.
     """
 
-    size_bytes: int | None = None
-    time_ns: int | None = None
+    rotation: Rotation = field(default_factory=Rotation)
+    window: CaptureWindow | None = None
+    capture_name: Callable[[int, int], str | None] = lambda _before, _now: None
+    side_file: tuple[str, Callable[[], bytes]] | None = None
 
 
-class _Part:
-    """The two files that are written now."""
-
-    def __init__(self, folder: Path, number: int, schema: Any, begin_ns: int) -> None:
-        self.number = number
-        self.begin_ns = begin_ns
-        self.frames = WholeFile(folder / part_name(FRAMES_FILE, number))
-        try:
-            self.steps = WholeFile(folder / part_name(STEPS_FILE, number))
-            try:
-                self.steps.append(schema.serialize().to_pybytes())
-            except OSError:
-                self.steps.close()
-                raise
-        except OSError:
-            self.frames.close()
-            raise
-
-    @property
-    def size(self) -> int:
-        return self.frames.size + self.steps.size
-
-    def close(self) -> None:
-        try:
-            self.steps.append(END_OF_STREAM)
-        finally:
-            self.steps.close()
-            self.frames.close()
-
-
-class RunLog:
+class RunWriter:
     """Writer of a run's folder.
 
     Args:
         folder: Folder to create; it must be empty or absent.
-        header: What is known before the first tick, for `run.yaml`.
+        header: What is known before the first tick, for `run.yaml`; its `epoch_ns` is the Unix time
+            of the run's start.
         columns: Names of the numbers of each step.
-        epoch_ns: Unix time of the run's start.
         channel: Name of the bus in `frames.log`.
-        paced: The run waits for a clock, so a thread of its own writes; otherwise the run waits for
-            the disk.
-        priority: Real-time priority of the loop, which the thread follows; 0 for none.
-        rotation: When the files are continued in others.
-        window: What is captured around faults; None captures nothing.
-        capture_name: Whether a change of mode is a trigger of a capture, and its name if so.
-        aside: Name and content of a file that is written anew once a second, if any.
+        loop_priority: Real-time priority of a loop that waits for a clock (0 for none): a thread
+            writes, just below it. None: no thread writes, and the caller waits for the disk.
+        options: What else is written.
 
     Raises:
-        InputError: The folder cannot be created, or holds another run.
+        LogError: The folder cannot be created, or holds another run.
     """
 
     def __init__(
@@ -143,68 +106,65 @@ class RunLog:
         folder: Path,
         header: dict[str, object],
         columns: Sequence[str],
-        epoch_ns: int,
         channel: str,
-        *,
-        paced: bool,
-        priority: int = 0,
-        rotation: Rotation = Rotation(),
-        window: Window | None = None,
-        capture_name: Callable[[int, int], str | None] = lambda _before, _now: None,
-        aside: tuple[str, Callable[[], bytes]] | None = None,
+        loop_priority: int | None,
+        options: LogOptions,
     ) -> None:
         self.folder = folder
         self.fault: str | None = None
-        """What is wrong with the disk now, if anything; the run goes on."""
+        """Fault of the disk now, if any; the run continues."""
         self.trouble: str | None = None
-        """What was wrong with it first, if ever anything was."""
+        """First fault of the disk, if there was one."""
         self.dropped = 0
         """Ticks that the disk did not take."""
         self.is_busy = False
         """Whether ticks are being written now."""
         self._header = header
-        self._epoch_ns = epoch_ns
-        # A line of the log has no place for blanks or anything beyond ASCII.
+        self._epoch_ns = cast("int", header["epoch_ns"])
+        # A line of the log holds no blanks in its parts, nor anything beyond ASCII.
         self._channel = re.sub(r"[^!-~]", "_", channel)
         self._columns = tuple(columns)
-        self._aside = aside
+        self._side_file = options.side_file
         self._rows = StepRows(columns)
-        self._rotation = rotation
+        self._rotation = options.rotation
         self._captures = (
-            None if window is None else Captures(window, capture_name, self._write_capture)
+            None
+            if options.window is None
+            else Captures(options.window, options.capture_name, self._write_capture)
         )
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if (folder / RUN_FILE).exists():
-                raise InputError(f"{folder}: holds a run already, expected an empty folder")
+                raise LogError(f"{folder}: contains a run already, expected an empty folder")
             _write_yaml(folder / RUN_FILE, header)
             (folder / _RESERVE_FILE).write_bytes(bytes(_RESERVE_BYTES))
-            self._part = _Part(folder, 0, self._rows.schema, 0)
+            self._part = Part(folder, 0, self._rows.schema, 0)
         except OSError as error:
-            raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
+            raise LogError(f"{folder}: cannot be written: {error.strerror}") from error
         self._waiting: deque[Entry] = deque()
         self._notes: deque[tuple[str, str]] = deque()
         self._noted: dict[str, WholeFile] = {}
         self._lines = b""
-        self._priority = priority
         self._closing = threading.Event()
         self._wake = threading.Event()
         self._woken_ns = 0
-        self._thread = threading.Thread(target=self._write_until_closed, name="run-log")
-        self._paced = paced
-        if paced:
+        self._thread = threading.Thread(
+            target=self._run_thread, args=(loop_priority or 0,), name="run-log"
+        )
+        self._has_thread = loop_priority is not None
+        if self._has_thread:
             self._thread.start()
 
     def add(self, received: Sequence[Frame], sent: Sequence[Frame], step: Step) -> None:
         """Hand over what a tick received, sent and computed."""
         waiting = len(self._waiting)
         if waiting >= MANY_WAITING:
-            self._failed("the disk is too slow")
+            self._set_fault("the disk is too slow")
             if waiting >= MOST_WAITING:
                 self.dropped += 1
                 return
         self._waiting.append(Entry(received, sent, step))
-        if not self._paced:
+        if not self._has_thread:
             self._write_waiting()
         elif step.t_ns - self._woken_ns >= WAKE_NS:
             # Woken by the end of a tick's work, and not by a timer, which would as often go off in
@@ -234,10 +194,10 @@ class RunLog:
         """
         self._closing.set()
         self._wake.set()
-        if self._paced:
+        if self._has_thread:
             self._thread.join(_CLOSING_S)
         if self._thread.is_alive():
-            self._failed("the disk is too slow")
+            self._set_fault("the disk is too slow")
         else:
             self._finish()
         self.dropped += len(self._waiting) + self._rows.count
@@ -246,11 +206,11 @@ class RunLog:
         try:
             _write_yaml(self.folder / RUN_FILE, {**self._header, **ending()})
         except OSError as error:
-            self._failed(str(error.strerror))
+            self._set_fault(str(error.strerror))
 
     def _finish(self) -> None:
         self._write_waiting()
-        self._write_aside()
+        self._write_side_file()
         if self._captures is not None:
             self._captures.finish()
         try:
@@ -261,28 +221,28 @@ class RunLog:
                 for file in self._noted.values():
                     file.close()
         except OSError as error:
-            self._failed(str(error.strerror))
+            self._set_fault(str(error.strerror))
 
-    def _failed(self, why: str) -> None:
+    def _set_fault(self, why: str) -> None:
         self.fault = why
         if self.trouble is None:
             self.trouble = why
 
-    def _write_until_closed(self) -> None:
-        follow(self._priority)
-        due_s = time.monotonic() + _ASIDE_EVERY_S
+    def _run_thread(self, loop_priority: int) -> None:
+        follow(loop_priority)
+        due_s = time.monotonic() + _SIDE_FILE_EVERY_S
         while not self._closing.is_set():
             self._wake.wait(_LONGEST_PAUSE_S)
             self._wake.clear()
             self._write_waiting()
             if time.monotonic() >= due_s:
-                due_s += _ASIDE_EVERY_S
-                self._write_aside()
+                due_s += _SIDE_FILE_EVERY_S
+                self._write_side_file()
 
-    def _write_aside(self) -> None:
-        """Write the file beside the log; where it fails, the next one takes its place."""
-        if self._aside is not None:
-            name, content = self._aside
+    def _write_side_file(self) -> None:
+        """Write the side file; a failure is made up for by the next writing."""
+        if self._side_file is not None:
+            name, content = self._side_file
             with contextlib.suppress(OSError):
                 write_whole(self.folder / name, content())
 
@@ -302,7 +262,7 @@ class RunLog:
                 self._give_way()
                 self._flush_if_due()
         except OSError as error:
-            self._failed(str(error.strerror))
+            self._set_fault(str(error.strerror))
         else:
             self.fault = None
         finally:
@@ -318,7 +278,7 @@ class RunLog:
 
     def _give_way(self) -> None:
         """Let the loop have the interpreter, if it waits for it."""
-        if self._paced:
+        if self._has_thread:
             time.sleep(_GIVEN_WAY_S)
 
     def _take(self, count: int) -> None:
@@ -351,7 +311,7 @@ class RunLog:
 
     def _flush(self) -> None:
         if self._rows.count:
-            self._part.steps.append(_serialized(self._rows))
+            self._part.steps.append(_serialize(self._rows))
             self._rows.clear()
 
     def _rotate(self, now_ns: int) -> None:
@@ -360,23 +320,23 @@ class RunLog:
         is_full = limit.size_bytes is not None and part.size >= limit.size_bytes
         is_long = limit.time_ns is not None and now_ns - part.begin_ns >= limit.time_ns
         if is_full or is_long:
-            self._part = _Part(self.folder, part.number + 1, self._rows.schema, now_ns)
+            self._part = Part(self.folder, part.number + 1, self._rows.schema, now_ns)
             part.close()
 
     def _write_capture(self, capture: Capture) -> None:
-        folder = self.folder / "captures" / f"{capture.number:03d}_{capture.why}"
+        folder = self.folder / CAPTURES_FOLDER / f"{capture.number:03d}_{capture.why}"
         header = {**self._header, "capture": {"why": capture.why, "t_s": capture.t_ns * 1e-9}}
         rows = StepRows(self._columns)
         try:
             folder.mkdir(parents=True)
-            part = _Part(folder, 0, rows.schema, 0)
+            part = Part(folder, 0, rows.schema, 0)
             for first in range(0, len(capture.entries), _MOST_AT_ONCE):
                 lines: list[str] = []
                 for entry in capture.entries[first : first + _MOST_AT_ONCE]:
                     rows.append(entry.step)
                     lines += self._lines_of(entry)
                 part.frames.append("".join(lines).encode("ascii"))
-                part.steps.append(_serialized(rows))
+                part.steps.append(_serialize(rows))
                 rows.clear()
                 self._give_way()
             part.close()
@@ -385,10 +345,10 @@ class RunLog:
                     shutil.copyfile(self.folder / name, folder / name)
             _write_yaml(folder / RUN_FILE, header)
         except OSError as error:
-            self._failed(f"capture {folder.name}: {error.strerror}")
+            self._set_fault(f"capture {folder.name}: {error.strerror}")
 
 
-def _serialized(rows: StepRows) -> bytes:
+def _serialize(rows: StepRows) -> bytes:
     return bytes(rows.batch().serialize())
 
 

@@ -14,7 +14,7 @@ class Clock(Protocol):
         ...
 
     def epoch_now_ns(self) -> int:
-        """The same by the system's clock as it is set now: it differs after the clock was set."""
+        """Unix time of the run's start by the system's clock as it is set now."""
         ...
 
     def now_ns(self) -> int:
@@ -31,7 +31,7 @@ class RealClock:
 
     Args:
         spin_ns: How long before a deadline to stop sleeping and spin. Only a thread with a
-            real-time priority may spin: any other is punished for it by the scheduler.
+            real-time priority may spin: any other loses priority at the scheduler.
     """
 
     def __init__(self, spin_ns: int = 0) -> None:
@@ -48,7 +48,7 @@ class RealClock:
         return time.monotonic_ns() - self._start_ns
 
     def wait_until(self, t_ns: int) -> int:
-        """Sleep (on Linux against an absolute deadline), then spin if asked to."""
+        """Sleep (on Linux against an absolute deadline), then spin if configured."""
         now = self.now_ns()
         if t_ns - now > self._spin_ns:
             time.sleep((t_ns - now - self._spin_ns) * 1e-9)
@@ -67,7 +67,7 @@ class VirtualClock:
         self._now_ns = 0
 
     def epoch_now_ns(self) -> int:
-        """The same: nobody sets a simulated clock."""
+        """The same: a simulated clock is never set."""
         return self.epoch_ns
 
     def now_ns(self) -> int:
@@ -81,7 +81,7 @@ class VirtualClock:
 
 
 class WrappedClock:
-    """A clock that does something of its own around the waits of another.
+    """A clock that adds to the waits of another.
 
     Args:
         clock: The other clock.
@@ -109,7 +109,7 @@ class WrappedClock:
 
 
 class OccupiedClock(WrappedClock):
-    """A clock whose waits begin with something to do, which then takes time that is waited anyway.
+    """A clock whose waits begin with work, which so takes time that would be spent waiting.
 
     Args:
         clock: The clock.
@@ -121,6 +121,6 @@ class OccupiedClock(WrappedClock):
         self._occupation = occupation
 
     def wait_until(self, t_ns: int) -> int:
-        """Do what there is to do, then wait."""
+        """Work, then wait."""
         self._occupation(t_ns)
         return super().wait_until(t_ns)

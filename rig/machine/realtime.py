@@ -1,7 +1,7 @@
-"""What a fixed rate asks of the machine: priority, memory, core, timer and garbage collection.
+"""Requests of a fixed rate to the machine: priority, memory, core, timer and garbage collection.
 
-Everything is asked for and nothing is needed: what the machine refuses is written down, and the run
-goes on without it.
+Everything is requested and nothing is required: what the machine refuses is recorded, and the run
+continues without it.
 """
 
 import contextlib
@@ -19,15 +19,15 @@ _PR_SET_THP_DISABLE = 41
 """Number of the request in linux/prctl.h, which the C library's wrapper takes as it is."""
 
 _SWITCH_INTERVAL_S = 1e-4
-"""How long another thread (the log's) may hold the interpreter when the loop wants it."""
+"""Longest time for which another thread (the log's) holds the interpreter while the loop waits."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked for.
+    """Real-time conditions that are requested.
 
     Attributes:
-        fifo_priority: Priority under SCHED_FIFO; 0 asks for none.
+        fifo_priority: Priority under SCHED_FIFO; 0 requests none.
         lock_memory: Keep all pages in memory.
         cpu: Core for the loop; None leaves the choice to the scheduler.
         freeze_garbage: No garbage collection during the run.
@@ -41,7 +41,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Granted:
-    """What the machine granted.
+    """Real-time conditions that the machine granted.
 
     Attributes:
         fifo: SCHED_FIFO.
@@ -66,13 +66,13 @@ class Granted:
 
 @contextlib.contextmanager
 def realtime(request: Request) -> Generator[Granted]:
-    """Ask for it, and give it back at the end.
+    """Context with real-time conditions, which are released at its end.
 
     Args:
-        request: What is asked for.
+        request: Requested conditions.
 
     Yields:
-        What was granted.
+        Granted conditions.
     """
     libc = ctypes.CDLL(ctypes.util.find_library("c"), use_errno=True)
     affinity = os.sched_getaffinity(0)
@@ -81,7 +81,7 @@ def realtime(request: Request) -> Generator[Granted]:
     granted = Granted(
         fifo=_fifo(request.fifo_priority),
         locked_memory=request.lock_memory and libc.mlockall(_MCL_CURRENT_AND_FUTURE) == 0,
-        cpu=_pinned(request.cpu),
+        cpu=_pin(request.cpu),
         timer_slack=libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0) == 0,
         small_pages=libc.prctl(_PR_SET_THP_DISABLE, 1, 0, 0, 0) == 0,
         frozen_garbage=request.freeze_garbage,
@@ -132,7 +132,7 @@ def _fifo(priority: int) -> bool:
     return True
 
 
-def _pinned(cpu: int | None) -> int | None:
+def _pin(cpu: int | None) -> int | None:
     if cpu is None:
         return None
     try:

@@ -32,8 +32,8 @@ from rig.channels.quantities import (
     Noise,
     Quantity,
 )
-from rig.log.captures import Window
-from rig.log.writer import Rotation
+from rig.log.captures import CaptureWindow
+from rig.log.rotation import Rotation
 from rig.observers import DEFAULT_KIND, OBSERVERS
 from rig.observers.protocol import AnyObserver
 
@@ -322,12 +322,12 @@ class LogConfig(_Frozen):
         time_ns = None if self.rotate_s is None else round(self.rotate_s * 1e9)
         return Rotation(self.rotate_bytes, time_ns)
 
-    def window(self) -> Window | None:
+    def window(self) -> CaptureWindow | None:
         """As the log takes it; None captures nothing."""
         if self.most_captures == 0:
             return None
         before_ns, after_ns = round(self.capture_before_s * 1e9), round(self.capture_after_s * 1e9)
-        return Window(before_ns, after_ns, self.most_captures)
+        return CaptureWindow(before_ns, after_ns, self.most_captures)
 
 
 class RunConfig(_Frozen):

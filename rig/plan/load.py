@@ -4,10 +4,11 @@ from pathlib import Path
 
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.errors import InputError
-from can_dbc.yaml_file import load_validated, validated
+from can_dbc.yaml_file import load_yaml, validate
 from dart_model.spec import load_model, model_file
 from rig.bus.secoc import Authentication, read_key
-from rig.log.reader import DBC_FILE, MODEL_FILE, RUN_FILE, read_header
+from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
+from rig.log.reader import read_header
 from rig.plan.config import RunConfig
 from rig.plan.plan import Plan, resolve
 
@@ -24,7 +25,7 @@ def load_plan(path: Path, *, model: str | None = None, duration_s: float | None 
         InputError: One line that names file, key, value and what was expected.
         DatabaseError: The same, of the DBC.
     """
-    config = load_validated(RunConfig, path)
+    config = load_yaml(RunConfig, path)
     if duration_s is not None:
         if not 0.0 < duration_s < float("inf"):
             raise InputError(f"--duration-s {duration_s}: expected a finite number above zero")
@@ -42,7 +43,7 @@ def plan_of_run(folder: Path) -> Plan:
         DatabaseError: Its DBC is.
     """
     source = folder / RUN_FILE
-    config = validated(RunConfig, read_header(folder).get("config"), f"{source}: config")
+    config = validate(RunConfig, read_header(folder).get("config"), f"{source}: config")
     model, database = load_model(folder / MODEL_FILE), load_database(folder / DBC_FILE)
     return resolve(config, source, model, database)
 

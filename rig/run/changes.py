@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import Any, cast
 
 from can_dbc.errors import InputError
-from can_dbc.yaml_file import parse_mapping, read_text, validated
+from can_dbc.yaml_file import parse_mapping, read_text, validate
 from rig.bridge.bridge import Bridge
+from rig.log.file_names import CHANGES_FILE
 from rig.plan.config import RunConfig
 from rig.plan.plan import Plan
-
-CHANGES_FILE = "changes.jsonl"
-"""Changes of a run in its folder: one a line, with the time of the first tick that had it."""
 
 CHANGEABLE = ("observers", "supervision")
 """Sections of the configuration that can be changed while a run goes on."""
@@ -70,7 +68,7 @@ def assign(plan: Plan, assignments: Assignments, source: str) -> Plan:
                 f"{' or '.join(CHANGEABLE)}"
             )
         _assign(content[section], names, value, source, key)
-    config = validated(RunConfig, content, source)
+    config = validate(RunConfig, content, source)
     for name, observer in config.observers.items():
         before = plan.config.observers[name]
         if not observer.can_continue(before):
@@ -110,7 +108,7 @@ def bridge_with_settings(bridge: Bridge, plan: Plan) -> Bridge:
 
 
 def change_line(t_ns: int, assignments: Assignments) -> str:
-    """A line of `CHANGES_FILE`."""
+    """A line of `CHANGES_FILE`: a change, with the time of the first tick that had it."""
     return json.dumps({"t_ns": t_ns, "set": assignments}) + "\n"
 
 

@@ -1,4 +1,4 @@
-"""Why ticks were missed, from the rows of a trace."""
+"""Causes of missed ticks, from the rows of a trace."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -7,13 +7,13 @@ from itertools import pairwise
 from statistics import median
 from typing import NamedTuple
 
-from rig.run.trace import Row
+from rig.run.trace import TraceRow
 
 _MANY_FAULTS = 50
 """Mapping this many pages takes some 20 to 50 µs, which a tick may not notice."""
 
 _OWN_SHARE = 10.0
-"""Times its usual duration up to which a part that nobody interrupted is the loop's own work: cold
+"""Times its usual duration up to which a part without an interruption is the loop's own work: cold
 caches make four of it."""
 
 _MOSTLY = 0.5
@@ -31,7 +31,7 @@ _LEAST_IN_PHASE = 4
 
 
 class Cause(Enum):
-    """Who took the time, as far as the kernel accounts for it."""
+    """Cause of lost time, as far as the kernel accounts for it."""
 
     QUOTA = "the host's CPU quota: gaps end in phase with periods of 100 ms"
     HOST = "the host ran something else: as much time was stolen in the run"
@@ -41,20 +41,20 @@ class Cause(Enum):
     FAULTS = "pages were mapped"
     KERNEL = "the kernel took the core"
     OWN = "the loop's own work"
-    UNACCOUNTED = "nobody accounts for it: an interrupt, or a host that pauses the machine"
+    UNACCOUNTED = "not accounted for: an interrupt, or a host that pauses the machine"
 
 
 class LateTick(NamedTuple):
-    """Ticks that were missed on end, and why.
+    """Consecutive missed ticks, and their cause.
 
     Attributes:
         t_ns: When the first of them was due.
-        missed: How many.
+        missed: Their number.
         part: Where the time went: receive, compute, send, log, between (what the loop does before
             it waits) or wait.
-        cause: Who took it.
+        cause: Cause of the loss.
         excess_ns: How much longer the part took than usual.
-        end_ns: When the loop went on.
+        end_ns: When the loop resumed.
     """
 
     t_ns: int
@@ -74,7 +74,7 @@ def by_cause(late: Sequence[LateTick]) -> list[tuple[Cause, int, int]]:
     ]
 
 
-def late_ticks(rows: Sequence[Row], period_ns: int) -> list[LateTick]:
+def find_late_ticks(rows: Sequence[TraceRow], period_ns: int) -> list[LateTick]:
     """Every gap in which ticks were missed.
 
     Args:
@@ -90,7 +90,7 @@ def late_ticks(rows: Sequence[Row], period_ns: int) -> list[LateTick]:
     ]
     usual = {part: median([parts[part] for parts in on_time] or [0]) for part in _PARTS}
     late = [
-        _explained(before, row, period_ns, usual)
+        _explain(before, row, period_ns, usual)
         for before, row in pairs
         if row.woke_ns - row.deadline_ns >= period_ns
     ]
@@ -100,7 +100,7 @@ def late_ticks(rows: Sequence[Row], period_ns: int) -> list[LateTick]:
 _PARTS = ("receive", "compute", "send", "log", "between", "wait")
 
 
-def _parts(before: Row, row: Row) -> dict[str, int]:
+def _parts(before: TraceRow, row: TraceRow) -> dict[str, int]:
     """Durations in ns from one wake-up to the next; of the wait what is beyond the deadline."""
     return {
         "receive": before.received_ns - before.woke_ns,
@@ -112,7 +112,7 @@ def _parts(before: Row, row: Row) -> dict[str, int]:
     }
 
 
-def _explained(before: Row, row: Row, period_ns: int, usual: dict[str, float]) -> LateTick:
+def _explain(before: TraceRow, row: TraceRow, period_ns: int, usual: dict[str, float]) -> LateTick:
     parts = _parts(before, row)
     part = max(parts, key=lambda name: parts[name] - usual[name])
     excess_ns = round(parts[part] - usual[part])
@@ -123,7 +123,7 @@ def _explained(before: Row, row: Row, period_ns: int, usual: dict[str, float]) -
     return LateTick(row.deadline_ns, missed, part, cause, excess_ns, row.woke_ns)
 
 
-def _cause(before: Row, row: Row, excess_ns: int, *, is_wait: bool, own: bool) -> Cause:
+def _cause(before: TraceRow, row: TraceRow, excess_ns: int, *, is_wait: bool, own: bool) -> Cause:
     """The first account of the guest's kernel that explains the excess; the surest come first."""
     switched = row.voluntary - before.voluntary
     accounts = (
@@ -139,21 +139,21 @@ def _cause(before: Row, row: Row, excess_ns: int, *, is_wait: bool, own: bool) -
 
 
 def _by_host(late: list[LateTick], stolen_ns: int) -> list[LateTick]:
-    """What nobody in the guest accounts for, put down to the host where that shows.
+    """The gaps, with the host as cause of unaccounted ones where its stolen time shows it.
 
     Stolen time is counted in steps of 10 ms, which no single gap is as long as.
     """
     unaccounted = [item for item in late if item.cause is Cause.UNACCOUNTED]
     in_phase = _in_phase(unaccounted)
-    left_ns = sum(item.excess_ns for item in unaccounted if item not in in_phase)
+    rest_ns = sum(item.excess_ns for item in unaccounted if item not in in_phase)
     stolen_ns -= sum(item.excess_ns for item in in_phase)
-    rest = Cause.HOST if left_ns and stolen_ns >= _MOSTLY * left_ns else Cause.UNACCOUNTED
+    rest = Cause.HOST if rest_ns and stolen_ns >= _MOSTLY * rest_ns else Cause.UNACCOUNTED
     causes = {item: Cause.QUOTA if item in in_phase else rest for item in unaccounted}
     return [item._replace(cause=causes.get(item, item.cause)) for item in late]
 
 
 def _in_phase(late: Sequence[LateTick]) -> list[LateTick]:
-    """The largest group of gaps that end at one phase of the quota's period, if it is no chance."""
+    """Largest group of gaps that end at one phase of the quota's period, if it is significant."""
     groups = [
         [
             other

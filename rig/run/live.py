@@ -23,8 +23,8 @@ from rig.run.logged_run import Ended, Endpoint, on_signal, run_logged
 from rig.run.loop import RunControl
 from rig.run.ports import BenchOnBus, BusPort
 from rig.run.trace import Trace
+from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.schema import BenchConfig
-from rig.simulated_bench.simulated import Bench
 
 _DEFAULT_CONTROL = RunControl()
 
@@ -130,10 +130,10 @@ def with_bench(
         BusError: The bus cannot be opened.
     """
     bridge = build_bridge(plan)
-    bench = Bench(bench_config, plan.database)
+    bench = SimulatedBench(bench_config, plan.database)
     if not lockstep:
         # What is loaded at a bench's first use would delay the first ticks.
-        Bench(bench_config, plan.database).update(_BENCH_PORTION_NS)
+        SimulatedBench(bench_config, plan.database).update(_BENCH_PORTION_NS)
     with contextlib.ExitStack() as stack:
         granted, clock = None, VirtualClock()
         if not lockstep:
@@ -182,7 +182,7 @@ def run_bench(
         BusError: The bus cannot be opened.
         DatabaseError: The DBC is wrong.
     """
-    bench = Bench(bench_config, load_database(dbc or DEFAULT_DATABASE))
+    bench = SimulatedBench(bench_config, load_database(dbc or DEFAULT_DATABASE))
     end_ns = None if duration_s is None else round(duration_s * 1e9)
     sent, due_ns = 0, 0
     clock = RealClock()

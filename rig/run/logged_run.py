@@ -20,17 +20,18 @@ from rig.bridge.log_columns import LogColumns
 from rig.bridge.values import Mode
 from rig.bus.link import LinkFigures
 from rig.files.folders import refuse_full
-from rig.log.reader import DBC_FILE, MODEL_FILE, RUN_SCHEMA
+from rig.log.file_names import CHANGES_FILE, DBC_FILE, HISTOGRAMS_FILE, MODEL_FILE
+from rig.log.reader import RUN_SCHEMA
 from rig.log.steps import Step
-from rig.log.writer import RunLog
+from rig.log.writer import LogOptions, RunWriter
 from rig.machine.clock import Clock, OccupiedClock
 from rig.machine.realtime import Granted
 from rig.plan.plan import Plan
-from rig.run.changes import CHANGES_FILE, Changes, no_changes
+from rig.run.changes import Changes, no_changes
 from rig.run.loop import SHOWN_EVERY_NS, Look, Port, RunControl, Sink, regular_ticks, run
 from rig.run.ports import InformedPort
 from rig.run.requests import Requests
-from rig.run.timing import HISTOGRAMS_FILE, Timing
+from rig.run.timing import Timing
 from rig.run.trace import Trace
 
 _MOST_REPORTS = 1000
@@ -158,18 +159,18 @@ class _LoggedRun:
         self._timing = Timing.empty()
         self._columns = LogColumns(plan.strut_names, plan.channels)
         self._priority = config.realtime.fifo_priority if granted and granted.fifo else 0
-        self._log = RunLog(
+        self._log = RunWriter(
             folder,
             _header(plan, endpoint.clock.epoch_ns, granted, folder) | _notes(control),
             self._columns.names,
-            endpoint.clock.epoch_ns,
             config.bus.channel,
-            paced=granted is not None,
-            priority=self._priority,
-            rotation=config.log.rotation(),
-            window=config.log.window(),
-            capture_name=_capture_name,
-            aside=None if granted is None else (HISTOGRAMS_FILE, self._timing.histograms),
+            None if granted is None else self._priority,
+            LogOptions(
+                config.log.rotation(),
+                config.log.window(),
+                _capture_name,
+                None if granted is None else (HISTOGRAMS_FILE, self._timing.histograms),
+            ),
         )
         self._reports = _FaultReports([device.name for device in plan.devices])
         self._state = bridge.init(0)

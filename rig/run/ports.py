@@ -8,11 +8,11 @@ from rig.bridge.report import NO_TIMING, Conditions, Levels, TimingFigures
 from rig.bus.bus import Bus
 from rig.bus.link import Link
 from rig.bus.secoc import Authenticator
-from rig.log.writer import RunLog
+from rig.log.writer import RunWriter
 from rig.machine.clock import Clock
 from rig.run.loop import Port
 from rig.run.timing import Timing
-from rig.simulated_bench.simulated import Bench
+from rig.simulated_bench.bench import SimulatedBench
 
 _NO_CONDITIONS = Conditions()
 _CATCHING_UP = 4
@@ -38,10 +38,10 @@ class BusPort:
         """Frames that have come since the last tick."""
         link = self.link
         frames = link.receive(t_ns)
-        if link.fault is None and not self._acknowledged and link.refused == self._refused:
+        if link.fault is None and not self._acknowledged and link.unauthenticated == self._refused:
             return frames, _NO_CONDITIONS
-        bus_fault = link.fault is not None or link.refused > self._refused
-        self._refused = link.refused
+        bus_fault = link.fault is not None or link.unauthenticated > self._refused
+        self._refused = link.unauthenticated
         acknowledged, self._acknowledged = self._acknowledged, False
         return frames, Conditions(acknowledged=acknowledged, bus_fault=bus_fault)
 
@@ -53,7 +53,7 @@ class BusPort:
 class InformedPort:
     """A port whose conditions hold the state of the log too, and how well the rate is kept."""
 
-    def __init__(self, port: Port, log: RunLog, timing: Timing) -> None:
+    def __init__(self, port: Port, log: RunWriter, timing: Timing) -> None:
         self._port = port
         self._log = log
         self._timing = timing
@@ -96,11 +96,15 @@ class BenchOnBus:
     """
 
     def __init__(
-        self, bench: Bench, bench_bus: Bus, port: BusPort, authenticator: Authenticator | None
+        self,
+        bench: SimulatedBench,
+        bench_bus: Bus,
+        port: BusPort,
+        authenticator: Authenticator | None,
     ) -> None:
         self._bench = bench
         self._bench_bus = bench_bus
-        self._secured = None if authenticator is None else authenticator.secured
+        self._secured = None if authenticator is None else authenticator.secure
         self._port = port
         self._sent_ns = -1
         self.send = port.send

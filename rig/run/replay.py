@@ -17,7 +17,7 @@ from can_dbc.frame import Frame
 from rig.bridge.bridge import TickResult
 from rig.bridge.log_columns import LogColumns
 from rig.bridge.report import Conditions
-from rig.log.frame_columns import FrameColumns, received_frames
+from rig.log.frame_columns import FrameColumns, read_frame_columns
 from rig.log.reader import RunFolder, last_frame_ns, read_run
 from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step, StepRows
 from rig.plan.build import build_bridge
@@ -89,7 +89,7 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
     run_folder, own = read_run(folder), plan_of_run(folder)
     plan = plan or own
     bridge = build_bridge(plan, sending=False)
-    frames = received_frames(run_folder.frame_files, run_folder.epoch_ns)
+    frames = read_frame_columns(run_folder.frame_files, run_folder.epoch_ns)
     ticks = _ticks(run_folder, frames, plan.period_ns)
     columns = LogColumns(plan.strut_names, plan.channels)
     rows = StepRows(columns.names)

@@ -17,18 +17,13 @@ from typing import Any, cast
 from can_dbc.atomic_file import write_whole
 from can_dbc.errors import InputError
 from rig.bridge.bridge import Bridge
-from rig.log.reader import RUN_FILE, read_header
+from rig.log.file_names import RUN_FILE
+from rig.log.reader import read_header
 from rig.machine.realtime import follow
 from rig.plan.check import errors
 from rig.plan.load import plan_of_run
 from rig.plan.plan import Plan
-from rig.run.changes import (
-    Assignments,
-    assign,
-    bridge_with_settings,
-    change_line,
-    logged_changes,
-)
+from rig.run.changes import Assignments, assign, bridge_with_settings, change_line, logged_changes
 
 _FOLDER = "requests"
 _LOOK_S = 0.1

@@ -1,19 +1,18 @@
-"""How well the rate of a run was kept."""
+"""Punctuality of a run's ticks."""
 
 import contextlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rig.log.file_names import HISTOGRAMS_FILE
+
 BINS = 20_000
 """Histograms have bins of 1 µs; the last one takes all that is longer than 20 ms."""
-
-HISTOGRAMS_FILE = "timing.json"
-"""Histograms of a run's ticks, in its folder, once a second."""
 
 _EDGES = np.unique(np.geomspace(1, BINS, 96).astype(np.intp) - 1)
 """First bins of those in the file: as wide as they are read, and few enough for a live run."""
@@ -21,7 +20,7 @@ _EDGES = np.unique(np.geomspace(1, BINS, 96).astype(np.intp) - 1)
 
 @dataclass(frozen=True)
 class Timing:
-    """How well the rate was kept; histograms have bins of 1 µs.
+    """Punctuality of the ticks; histograms have bins of 1 µs.
 
     Attributes:
         lateness: Ticks by lateness of the wake-up.
@@ -35,7 +34,7 @@ class Timing:
 
     @staticmethod
     def empty() -> "Timing":
-        """Before the first tick; written in place from then on."""
+        """Timing before the first tick; its arrays are written from then on."""
         bins = np.zeros((2, BINS), dtype=np.int64)
         return Timing(bins[0], bins[1], np.zeros(3, dtype=np.int64))
 
@@ -67,7 +66,7 @@ class Timing:
 
 
 def _percentiles(histogram: NDArray[np.int64], largest_ns: int) -> dict[str, float]:
-    # A live run asks for this between two ticks.
+    # A live run computes this between two ticks.
     cumulated = np.cumsum(histogram[: largest_ns // 1000 + 1])
     total = int(cumulated[-1])
     if total == 0:
@@ -82,6 +81,6 @@ def _percentiles(histogram: NDArray[np.int64], largest_ns: int) -> dict[str, flo
 def read_histograms(folder: Path) -> dict[str, Any] | None:
     """Content of a run's `HISTOGRAMS_FILE`; None if it has none."""
     with contextlib.suppress(OSError, ValueError):
-        found: Any = json.loads((folder / HISTOGRAMS_FILE).read_text("utf-8"))
-        return found if isinstance(found, dict) else None  # pyright: ignore[reportUnknownVariableType]
+        content: object = json.loads((folder / HISTOGRAMS_FILE).read_text("utf-8"))
+        return cast("dict[str, Any]", content) if isinstance(content, dict) else None
     return None

@@ -1,27 +1,25 @@
-"""What became of the time around late ticks: the parts of a tick, and the kernel's account.
+"""Parts of late ticks, and the kernel's account of them.
 
-Nothing of this runs unless it is asked for: clock, port and sink of a run are wrapped then.
+Nothing of this runs unless it is requested: clock, port and sink of a run are wrapped then.
 """
 
 import contextlib
 import os
 import resource
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, Protocol, cast
 
 import pyarrow as pa
 
-from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.bridge.bridge import TickResult
 from rig.bridge.report import Conditions
+from rig.log.errors import LogError
+from rig.log.file_names import TRACE_FILE
 from rig.log.steps import Step
 from rig.machine.clock import Clock, WrappedClock
 from rig.run.loop import Port, Sink
-
-TRACE_FILE = "trace.arrow"
-"""Its name in the folder of a run."""
 
 _MOST_ROWS = 200_000
 """Rows kept; a run that is late at every tick would fill the memory."""
@@ -30,7 +28,7 @@ _LATE_SHARE = 0.5
 """Share of a period from which on a tick that is late, or works, is kept with the one before."""
 
 _TYPICAL_ROWS = 1000
-"""Ticks at the beginning that are kept whatever they did: what is usual."""
+"""Ticks at the beginning that are always kept, as the usual case."""
 
 _MARKS = 7
 """Times in a row."""
@@ -38,13 +36,13 @@ _MARKS = 7
 _pa = cast("Any", pa)
 
 
-class Row(NamedTuple):
+class TraceRow(NamedTuple):
     """One tick; times on the run's clock in ns, counters since the thread's start.
 
     Attributes:
         deadline_ns: When it was due.
-        asleep_ns: When the loop began to wait for it, with nothing left to do.
-        woke_ns: When the loop went on.
+        asleep_ns: When the loop began to wait for it.
+        woke_ns: When the loop resumed.
         received_ns: When its frames were read.
         computed_ns: When the bridge was done.
         sent_ns: When its frames were sent.
@@ -56,7 +54,7 @@ class Row(NamedTuple):
         run_delay_ns: Time in which the loop could have run and another thread did.
         steal_ns: Time in which the host did not run this machine, of all cores; as last read, which
             is at the beginning and at ticks that are late.
-        log_busy: Whether the log's thread was at work when the loop went on.
+        log_busy: Whether the log's thread was busy when the loop resumed.
     """
 
     deadline_ns: int
@@ -75,6 +73,11 @@ class Row(NamedTuple):
     log_busy: int
 
 
+class _Busy(Protocol):
+    @property
+    def is_busy(self) -> bool: ...
+
+
 class Trace:
     """Keeps the rows of ticks that were late.
 
@@ -83,16 +86,16 @@ class Trace:
     """
 
     def __init__(self, period_ns: int) -> None:
-        self.rows: list[Row] = []
+        self.rows: list[TraceRow] = []
         self._late_ns = round(_LATE_SHARE * period_ns)
         self._seen = 0
-        self._before: Row | None = None
+        self._before: TraceRow | None = None
         self._marks: list[int] = []
         self._counters: tuple[int, ...] = ()
-        self._now: Any = None
-        self._log: Any = None
-        self._schedstat = _opened("/proc/thread-self/schedstat")
-        self._stat = _opened("/proc/stat")
+        self._now: Callable[[], int] = lambda: 0
+        self._log: _Busy | None = None
+        self._schedstat = _open("/proc/thread-self/schedstat")
+        self._stat = _open("/proc/stat")
         self._steal_ns = self._read_steal_ns()
 
     def clock(self, clock: Clock) -> Clock:
@@ -100,22 +103,27 @@ class Trace:
         self._now = clock.now_ns
         return _TracedClock(clock, self)
 
-    def port(self, port: Port, log: Any) -> Port:
-        """The port, with marks; `log` has an attribute `is_busy`."""
+    def port(self, port: Port, log: _Busy) -> Port:
+        """The port, with marks.
+
+        Args:
+            port: The port.
+            log: The run's log.
+        """
         self._log = log
         return _TracedPort(port, self)
 
     def sink(self, sink: Sink) -> Sink:
         """The sink, with a mark after it."""
 
-        def traced(
+        def sink_and_mark(
             received: Sequence[Frame], sent: Sequence[Frame], result: TickResult, step: Step
         ) -> None:
             sink(received, sent, result, step)
             self.mark()
             self._finish()
 
-        return traced
+        return sink_and_mark
 
     def begin(self, deadline_ns: int, asleep_ns: int, woke_ns: int) -> None:
         """A tick, after its wait."""
@@ -130,7 +138,7 @@ class Trace:
             used.ru_majflt,
             self._read_run_delay_ns(),
             self._steal_ns,
-            int(getattr(self._log, "is_busy", False)),
+            int(self._log is not None and self._log.is_busy),
         )
 
     def mark(self) -> None:
@@ -149,9 +157,9 @@ class Trace:
         Raises:
             OSError: It cannot be written.
         """
-        columns = list(zip(*self.rows, strict=True)) or [()] * len(Row._fields)
+        columns = list(zip(*self.rows, strict=True)) or [()] * len(TraceRow._fields)
         arrays = [_pa.array(column, type=_pa.int64()) for column in columns]
-        table = _pa.Table.from_arrays(arrays, names=list(Row._fields))
+        table = _pa.Table.from_arrays(arrays, names=list(TraceRow._fields))
         with (
             _pa.OSFile(str(folder / TRACE_FILE), "wb") as file,
             _pa.ipc.new_file(file, table.schema) as writer,
@@ -162,7 +170,7 @@ class Trace:
                 os.close(descriptor)
 
     def _finish(self) -> None:
-        row = Row(*self._marks, *self._counters)
+        row = TraceRow(*self._marks, *self._counters)
         late = row.woke_ns - row.deadline_ns > self._late_ns
         worked = row.logged_ns - row.woke_ns > self._late_ns
         self._seen += 1
@@ -184,7 +192,7 @@ class Trace:
         return jiffies * (1_000_000_000 // os.sysconf("SC_CLK_TCK"))
 
 
-def _opened(path: str) -> int | None:
+def _open(path: str) -> int | None:
     with contextlib.suppress(OSError):
         return os.open(path, os.O_RDONLY)
     return None
@@ -219,20 +227,20 @@ class _TracedPort:
         return sent
 
 
-def read_trace(folder: Path) -> list[Row]:
+def read_trace(folder: Path) -> list[TraceRow]:
     """The rows of a run's trace.
 
     Raises:
-        InputError: The run has none, or it is damaged.
+        LogError: The run has none, or it is damaged.
     """
     path = folder / TRACE_FILE
     if not path.is_file():
-        raise InputError(f"{path}: no such file, expected a run made with --trace")
+        raise LogError(f"{path}: no such file, expected a run made with --trace")
     try:
         with _pa.memory_map(str(path)) as source:
             table = _pa.ipc.open_file(source).read_all()
-            columns = [table.column(name).to_pylist() for name in Row._fields]
+            columns = [table.column(name).to_pylist() for name in TraceRow._fields]
     except (_pa.ArrowException, OSError, KeyError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: is no trace: {reason}") from error
-    return [Row(*values) for values in zip(*columns, strict=True)]
+        raise LogError(f"{path}: is not a trace: {reason}") from error
+    return [TraceRow(*values) for values in zip(*columns, strict=True)]

@@ -114,18 +114,18 @@ def scan(network: CanOpenNetwork, listen_s: float, *, progress: Progress) -> Bus
     """
     progress("listening", 0.0)
     network.listen(listen_s)
-    traffic = traffic_by_id(network.heard)
+    traffic = traffic_by_id(network.received)
     unconfigured = None
     if not network.listens_only:
         progress("requesting the device type of every node id", 0.2)
         network.search()
         network.listen(_ANSWERS_WITHIN_S)
-        if any(frame.is_extended for frame in network.heard):
+        if any(frame.is_extended for frame in network.received):
             network.ask_for_addresses()
             network.listen(_CLAIMS_WITHIN_S)
         progress("searching for a device without a node id", 0.4)
-        unconfigured = network.unconfigured()
-    frames = list(network.heard)
+        unconfigured = network.find_unconfigured()
+    frames = list(network.received)
     nodes = _nodes(frames)
     devices: list[CanOpenDevice] = []
     for index, node_id in enumerate(nodes if not network.listens_only else ()):

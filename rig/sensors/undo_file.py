@@ -8,7 +8,7 @@ import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from can_dbc.errors import InputError
-from can_dbc.yaml_file import load_validated
+from can_dbc.yaml_file import load_yaml
 from rig.sensors.canopen_set_up import (
     SETTABLE,
     DeviceSettings,
@@ -117,5 +117,5 @@ def read_undo(path: Path) -> list[ObjectChange]:
     Raises:
         InputError: The file cannot be read, or is none of this kind.
     """
-    entries = load_validated(_File, path).changes
+    entries = load_yaml(_File, path).changes
     return [ObjectChange(item.node_id, item.index, item.subindex, item.before) for item in entries]

@@ -7,38 +7,40 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from scipy import interpolate, optimize
 
-from rig.simulated_bench.effects import EFFECT_KINDS, PARAMETER_COUNT, parameter_values
-from rig.simulated_bench.equations_of_motion import (
-    GIVEN,
+from rig.simulated_bench.compilation import Floats
+from rig.simulated_bench.curves import Curves
+from rig.simulated_bench.drive import (
     SINE_COLUMNS,
     SWEEP_COLUMNS,
-    Applied,
-    Curves,
-    Drive,
+    BenchDrive,
+    DrivenForce,
+    DrivenHeight,
+)
+from rig.simulated_bench.effects import EFFECT_KINDS, PARAMETER_COUNT, parameter_values
+from rig.simulated_bench.equations_of_motion import (
+    INPUTS,
+    BenchMechanics,
     Effects,
-    Floats,
-    Law,
-    Mechanics,
-    Prescribed,
     Thermal,
     derivatives,
-    give,
+    write_inputs,
 )
+from rig.simulated_bench.laws import LawCode
 from rig.simulated_bench.schema import (
     WORLD,
     AppliedForce,
     BenchConfig,
     BenchConfigError,
-    Effect,
     ForceFile,
     HeightFile,
     HeightMultisine,
     HeightSine,
     HeightSweep,
     Multisine,
-    PrescribedMotion,
     Sine,
+    StrutMotion,
     Sweep,
+    UndeclaredEffect,
 )
 
 EQUILIBRIUM_TOLERANCE_M_PER_S2 = 1e-9
@@ -50,12 +52,12 @@ class Assembly(NamedTuple):
 
     Attributes:
         mechanics: Its equations of motion.
-        drive: What drives it.
+        drive: Its applied force and prescribed motion.
         start: State at time zero, shape (states,).
     """
 
-    mechanics: Mechanics
-    drive: Drive
+    mechanics: BenchMechanics
+    drive: BenchDrive
     start: Floats
 
 
@@ -69,26 +71,27 @@ def assemble(config: BenchConfig) -> Assembly:
         The bench ready to run.
 
     Raises:
-        BenchConfigError: It has no static equilibrium to start from, or a body has no mass left.
+        BenchConfigError: It has no static equilibrium to start from, or an effect leaves a body no
+            mass.
     """
     mechanics = _mechanics(config)
-    drive = Drive(
-        _applied(config.applied_force, config.undeclared_effects),
-        _prescribed(config.prescribed_motion),
+    drive = BenchDrive(
+        _force_arrays(config.applied_force, config.undeclared_effects),
+        _height_arrays(config.prescribed_motion),
     )
     return Assembly(mechanics, drive, _start(config, mechanics, drive))
 
 
-def _mechanics(config: BenchConfig) -> Mechanics:
+def _mechanics(config: BenchConfig) -> BenchMechanics:
     uppers = [strut.between[1] for strut in config.struts]
     lowers = [strut.between[0] for strut in config.struts]
     thermal = config.temperature
-    return Mechanics(
+    return BenchMechanics(
         gravity_m_per_s2=config.gravity_m_per_s2,
         mass_kg=_masses(config, uppers),
         lower=np.array([-1 if name == WORLD else uppers.index(name) for name in lowers]),
         driven=uppers.index(config.applied_force.body or uppers[0]),
-        prescribed=_prescribed_strut(config),
+        prescribed=_index_of_height_arrays(config),
         free_length_m=np.array([strut.free_length_m for strut in config.struts]),
         springs=_curves([(s.spring.height_m, s.spring.force_n) for s in config.struts]),
         dampers=_curves([(s.damper.velocity_m_per_s, s.damper.force_n) for s in config.struts]),
@@ -101,7 +104,7 @@ def _mechanics(config: BenchConfig) -> Mechanics:
     )
 
 
-def _prescribed_strut(config: BenchConfig) -> int:
+def _index_of_height_arrays(config: BenchConfig) -> int:
     if config.prescribed_motion is None:
         return -1
     return [strut.name for strut in config.struts].index(config.prescribed_motion.strut)
@@ -111,7 +114,7 @@ def _masses(config: BenchConfig, uppers: list[str]) -> Floats:
     by_name = {mass.name: mass.mass_kg for mass in config.masses}
     mass_kg = np.array([by_name[name] for name in uppers], dtype=np.float64)
     for index, effect in enumerate(config.undeclared_effects):
-        if EFFECT_KINDS[effect.name].law == Law.ADDED_MASS:
+        if EFFECT_KINDS[effect.name].law == LawCode.ADDED_MASS:
             body = _strut_index(config, effect)
             mass_kg[body] += parameter_values(effect.name, effect.parameters)[0]
             if mass_kg[body] <= 0.0:
@@ -122,7 +125,7 @@ def _masses(config: BenchConfig, uppers: list[str]) -> Floats:
     return mass_kg
 
 
-def _strut_index(config: BenchConfig, effect: Effect) -> int:
+def _strut_index(config: BenchConfig, effect: UndeclaredEffect) -> int:
     return [strut.name for strut in config.struts].index(effect.strut)
 
 
@@ -140,7 +143,7 @@ def _segments(at: Floats, force_n: Floats) -> Floats:
     return np.column_stack([at[:-1], np.diff(at), cubic])
 
 
-def _applied(force: AppliedForce, effects: tuple[Effect, ...]) -> Applied:
+def _force_arrays(force: AppliedForce, effects: tuple[UndeclaredEffect, ...]) -> DrivenForce:
     sines: list[tuple[float, ...]] = []
     sweeps: list[tuple[float, ...]] = []
     files = [part.samples for part in force.components if isinstance(part, ForceFile)]
@@ -151,9 +154,9 @@ def _applied(force: AppliedForce, effects: tuple[Effect, ...]) -> Applied:
             sines.extend(_multisine(part, part.rms_n))
         elif isinstance(part, Sweep):
             sweeps.append(_sweep(part, part.amplitude_n))
-    return Applied(
-        gain=math.prod(_values(effects, Law.INPUT_GAIN)),
-        delay_s=math.fsum(_values(effects, Law.DELAY)),
+    return DrivenForce(
+        gain=math.prod(_values(effects, LawCode.INPUT_GAIN)),
+        delay_s=math.fsum(_values(effects, LawCode.DELAY)),
         sines=_rows(sines, SINE_COLUMNS),
         sweeps=_rows(sweeps, SWEEP_COLUMNS),
         file_first=np.cumsum([0, *(len(samples.t_s) for samples in files)]),
@@ -162,7 +165,7 @@ def _applied(force: AppliedForce, effects: tuple[Effect, ...]) -> Applied:
     )
 
 
-def _prescribed(motion: PrescribedMotion | None) -> Prescribed:
+def _height_arrays(motion: StrutMotion | None) -> DrivenHeight:
     sines: list[tuple[float, ...]] = []
     sweeps: list[tuple[float, ...]] = []
     files: list[Floats] = []
@@ -175,7 +178,7 @@ def _prescribed(motion: PrescribedMotion | None) -> Prescribed:
             sweeps.append(_sweep(part, part.amplitude_m))
         else:
             files.append(_spline(part))
-    return Prescribed(
+    return DrivenHeight(
         mean_height_m=0.0 if motion is None else motion.mean_height_m,
         sines=_rows(sines, SINE_COLUMNS),
         sweeps=_rows(sweeps, SWEEP_COLUMNS),
@@ -211,7 +214,7 @@ def _multisine(part: Multisine | HeightMultisine, rms: float) -> list[tuple[floa
     ]
 
 
-def _values(effects: tuple[Effect, ...], law: Law) -> list[float]:
+def _values(effects: tuple[UndeclaredEffect, ...], law: LawCode) -> list[float]:
     return [
         parameter_values(effect.name, effect.parameters)[0]
         for effect in effects
@@ -229,30 +232,30 @@ def _effects(config: BenchConfig) -> Effects:
     first_state = 2 * len(config.struts) + 1
     states = np.cumsum([first_state, *(kind.states for kind in kinds)])
     struts = [_strut_index(config, effect) for effect in acting]
-    places = [[int(kind.law) for kind in kinds], struts, states[:-1]]
-    return Effects(np.array(places, dtype=np.int64).T.copy(), parameters)
+    indices = [[int(kind.law) for kind in kinds], struts, states[:-1]]
+    return Effects(np.array(indices, dtype=np.int64).T.copy(), parameters)
 
 
-def _start(config: BenchConfig, mechanics: Mechanics, drive: Drive) -> Floats:
+def _start(config: BenchConfig, mechanics: BenchMechanics, drive: BenchDrive) -> Floats:
     n = len(config.struts)
     states = 2 * n + 1 + sum(EFFECT_KINDS[e.name].states for e in config.undeclared_effects)
     y = np.zeros(states)
     y[2 * n] = config.temperature.initial_c
     for (law, _, state), values in zip(*mechanics.effects, strict=True):
-        if law == Law.HIDDEN_MASS:
+        if law == LawCode.HIDDEN_MASS:
             mass_kg, stiffness_n_per_m = values[0], values[1]
             y[state] = -mass_kg * mechanics.gravity_m_per_s2 / stiffness_n_per_m
     heights_m = [strut.initial_height_m for strut in config.struts]
-    at_start = np.zeros(GIVEN)
+    at_start = np.zeros(INPUTS)
     if mechanics.prescribed >= 0:
-        give(mechanics, drive, 0.0, at_start)
+        write_inputs(mechanics, drive, 0.0, at_start)
         heights_m[mechanics.prescribed] = float(at_start[1])
     at_start[[0, 2]] = 0.0  # the others rest before it starts
     y[:n] = _positions(mechanics, _heights(mechanics, y, heights_m, at_start))
     return y
 
 
-def _positions(mechanics: Mechanics, heights_m: Floats) -> Floats:
+def _positions(mechanics: BenchMechanics, heights_m: Floats) -> Floats:
     positions_m = np.array(heights_m, dtype=np.float64)
     for i, lower in enumerate(mechanics.lower):
         if lower >= 0:
@@ -261,9 +264,9 @@ def _positions(mechanics: Mechanics, heights_m: Floats) -> Floats:
 
 
 def _heights(
-    mechanics: Mechanics, y: Floats, given: Sequence[float | None], at_start: Floats
+    mechanics: BenchMechanics, y: Floats, given: Sequence[float | None], at_start: Floats
 ) -> Floats:
-    """Heights at the start: those given, and those at which the other bodies rest, shape (n,)."""
+    """Heights at the start: those inputs, and those at which the other bodies rest, shape (n,)."""
     n = len(given)
     free = [i for i in range(n) if given[i] is None]
     heights_m = np.array(
@@ -283,14 +286,14 @@ def _heights(
         derivatives(mechanics, 0.0, at_start, state, rates)
         return rates[n : 2 * n][free]
 
-    found = _root(accelerations, heights_m[free])
-    left = float(np.max(np.abs(accelerations(found))))
-    if not left <= EQUILIBRIUM_TOLERANCE_M_PER_S2:
+    resting_m = _root(accelerations, heights_m[free])
+    residual_m_per_s2 = float(np.max(np.abs(accelerations(resting_m))))
+    if not residual_m_per_s2 <= EQUILIBRIUM_TOLERANCE_M_PER_S2:
         raise BenchConfigError(
             f"struts.{free[0]}.initial_height_m is missing and there is no static equilibrium "
             "to start from, expected a height"
         )
-    heights_m[free] = found
+    heights_m[free] = resting_m
     return heights_m
 
 

@@ -1,8 +1,8 @@
-"""The bench's configuration: from YAML to validated values, or one line that says what is wrong."""
+"""The bench's configuration: from YAML to validated values."""
 
 from pathlib import Path
 
-from can_dbc.yaml_file import load_validated
+from can_dbc.yaml_file import load_yaml
 from rig.simulated_bench.assembly import assemble
 from rig.simulated_bench.schema import BenchConfig, BenchConfigError
 
@@ -22,7 +22,7 @@ def load_bench_config(path: Path) -> BenchConfig:
         InputError: The file cannot be read or does not describe a bench; one line naming file,
             key, value and expectation.
     """
-    config = load_validated(BenchConfig, path, context=path.parent)
+    config = load_yaml(BenchConfig, path, context=path.parent)
     try:
         assemble(config)
     except BenchConfigError as error:

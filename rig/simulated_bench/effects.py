@@ -1,6 +1,6 @@
 """The undeclared effects a bench can carry: their names, parameters and bounds.
 
-The laws themselves are in `rig.simulated_bench.equations_of_motion`. The order of the parameters
+The laws themselves are in `rig.simulated_bench.laws`. The order of the parameters
 here is the order in which a law reads them.
 """
 
@@ -8,13 +8,13 @@ import math
 from types import MappingProxyType
 from typing import NamedTuple
 
-from rig.simulated_bench.equations_of_motion import Law
+from rig.simulated_bench.laws import LawCode
 
 POSITIVE_FLOOR = 1e-300
 """Smallest value of a parameter that has to be positive."""
 
 
-class Parameter(NamedTuple):
+class EffectParameter(NamedTuple):
     """One parameter of a law.
 
     Attributes:
@@ -31,7 +31,7 @@ class Parameter(NamedTuple):
 
 
 class EffectKind(NamedTuple):
-    """What the bench knows of one kind of effect.
+    """One kind of effect.
 
     Attributes:
         law: Code of the law.
@@ -39,117 +39,127 @@ class EffectKind(NamedTuple):
         states: Number of internal states of the law.
     """
 
-    law: Law
-    parameters: tuple[Parameter, ...]
+    law: LawCode
+    parameters: tuple[EffectParameter, ...]
     states: int = 0
 
 
-def _positive(name: str, default: float | None = None) -> Parameter:
-    return Parameter(name, low=POSITIVE_FLOOR, default=default)
+def _positive(name: str, default: float | None = None) -> EffectParameter:
+    return EffectParameter(name, low=POSITIVE_FLOOR, default=default)
 
 
-def _not_negative(name: str, default: float | None = None) -> Parameter:
-    return Parameter(name, low=0.0, default=default)
+def _not_negative(name: str, default: float | None = None) -> EffectParameter:
+    return EffectParameter(name, low=0.0, default=default)
 
 
 EFFECT_KINDS: MappingProxyType[str, EffectKind] = MappingProxyType(
     {
-        "preload": EffectKind(Law.PRELOAD, (Parameter("force_n"),)),
-        "linear_stiffness": EffectKind(Law.LINEAR_STIFFNESS, (Parameter("stiffness_n_per_m"),)),
-        "quadratic_stiffness": EffectKind(
-            Law.QUADRATIC_STIFFNESS, (Parameter("stiffness_n_per_m2"),)
+        "preload": EffectKind(LawCode.PRELOAD, (EffectParameter("force_n"),)),
+        "linear_stiffness": EffectKind(
+            LawCode.LINEAR_STIFFNESS, (EffectParameter("stiffness_n_per_m"),)
         ),
-        "cubic_stiffness": EffectKind(Law.CUBIC_STIFFNESS, (Parameter("stiffness_n_per_m3"),)),
+        "quadratic_stiffness": EffectKind(
+            LawCode.QUADRATIC_STIFFNESS, (EffectParameter("stiffness_n_per_m2"),)
+        ),
+        "cubic_stiffness": EffectKind(
+            LawCode.CUBIC_STIFFNESS, (EffectParameter("stiffness_n_per_m3"),)
+        ),
         "progressive_stiffness": EffectKind(
-            Law.PROGRESSIVE_STIFFNESS, (Parameter("force_n"), _positive("length_m"))
+            LawCode.PROGRESSIVE_STIFFNESS, (EffectParameter("force_n"), _positive("length_m"))
         ),
         "gas_spring": EffectKind(
-            Law.GAS_SPRING,
+            LawCode.GAS_SPRING,
             (
-                Parameter("charge_force_n"),
+                EffectParameter("charge_force_n"),
                 _positive("gas_length_m"),
-                Parameter("polytropic_exponent", low=1.0, high=3.0, default=1.3),
+                EffectParameter("polytropic_exponent", low=1.0, high=3.0, default=1.3),
             ),
         ),
         "bump_stop": EffectKind(
-            Law.BUMP_STOP,
+            LawCode.BUMP_STOP,
             (
-                Parameter("contact_height_m"),
+                EffectParameter("contact_height_m"),
                 _positive("contact_stiffness_n_per_m1_5"),
                 _not_negative("dissipation_s_per_m", 0.0),
             ),
         ),
         "rebound_stop": EffectKind(
-            Law.REBOUND_STOP,
+            LawCode.REBOUND_STOP,
             (
-                Parameter("contact_height_m"),
+                EffectParameter("contact_height_m"),
                 _positive("contact_stiffness_n_per_m1_5"),
                 _not_negative("dissipation_s_per_m", 0.0),
             ),
         ),
         "backlash": EffectKind(
-            Law.BACKLASH,
+            LawCode.BACKLASH,
             (
-                Parameter("centre_height_m"),
+                EffectParameter("centre_height_m"),
                 _not_negative("gap_m"),
                 _positive("stiffness_n_per_m"),
             ),
         ),
-        "linear_damping": EffectKind(Law.LINEAR_DAMPING, (Parameter("damping_n_s_per_m"),)),
-        "quadratic_damping": EffectKind(Law.QUADRATIC_DAMPING, (Parameter("damping_n_s2_per_m2"),)),
+        "linear_damping": EffectKind(
+            LawCode.LINEAR_DAMPING, (EffectParameter("damping_n_s_per_m"),)
+        ),
+        "quadratic_damping": EffectKind(
+            LawCode.QUADRATIC_DAMPING, (EffectParameter("damping_n_s2_per_m2"),)
+        ),
         "asymmetric_damping": EffectKind(
-            Law.ASYMMETRIC_DAMPING,
-            (Parameter("compression_n_s_per_m"), Parameter("rebound_n_s_per_m")),
+            LawCode.ASYMMETRIC_DAMPING,
+            (EffectParameter("compression_n_s_per_m"), EffectParameter("rebound_n_s_per_m")),
         ),
         "digressive_damping": EffectKind(
-            Law.DIGRESSIVE_DAMPING,
-            (Parameter("damping_n_s_per_m"), _positive("knee_velocity_m_per_s")),
+            LawCode.DIGRESSIVE_DAMPING,
+            (EffectParameter("damping_n_s_per_m"), _positive("knee_velocity_m_per_s")),
         ),
         "position_dependent_damping": EffectKind(
-            Law.POSITION_DEPENDENT_DAMPING,
-            (Parameter("damping_n_s_per_m"), _positive("length_m")),
+            LawCode.POSITION_DEPENDENT_DAMPING,
+            (EffectParameter("damping_n_s_per_m"), _positive("length_m")),
         ),
         "friction": EffectKind(
-            Law.FRICTION,
+            LawCode.FRICTION,
             (
                 _positive("coulomb_force_n"),
                 _positive("presliding_m", 2e-4),
-                Parameter("static_to_coulomb", low=1.0, high=10.0, default=1.0),
+                EffectParameter("static_to_coulomb", low=1.0, high=10.0, default=1.0),
                 _positive("stribeck_velocity_m_per_s", 0.05),
                 _not_negative("bristle_damping_n_s_per_m", 0.0),
             ),
             states=1,
         ),
         "bouc_wen": EffectKind(
-            Law.BOUC_WEN,
+            LawCode.BOUC_WEN,
             (
                 _positive("stiffness_n_per_m"),
                 _positive("yield_m"),
-                Parameter("exponent", low=1.0, high=20.0, default=1.0),
-                Parameter("shape", low=0.5, high=1.0, default=0.5),
+                EffectParameter("exponent", low=1.0, high=20.0, default=1.0),
+                EffectParameter("shape", low=0.5, high=1.0, default=0.5),
             ),
             states=1,
         ),
         "maxwell": EffectKind(
-            Law.MAXWELL, (_positive("stiffness_n_per_m"), _positive("relaxation_time_s")), states=1
+            LawCode.MAXWELL,
+            (_positive("stiffness_n_per_m"), _positive("relaxation_time_s")),
+            states=1,
         ),
         "periodic_force": EffectKind(
-            Law.PERIODIC_FORCE,
+            LawCode.PERIODIC_FORCE,
             (
-                Parameter("amplitude_n"),
+                EffectParameter("amplitude_n"),
                 _positive("frequency_hz"),
-                Parameter("phase_rad", default=0.0),
+                EffectParameter("phase_rad", default=0.0),
             ),
         ),
         "temperature_fade": EffectKind(
-            Law.TEMPERATURE_FADE,
-            (Parameter("fraction_per_k"), Parameter("reference_c", default=20.0)),
+            LawCode.TEMPERATURE_FADE,
+            (EffectParameter("fraction_per_k"), EffectParameter("reference_c", default=20.0)),
         ),
         "time_fade": EffectKind(
-            Law.TIME_FADE, (_not_negative("final_fraction"), _positive("time_constant_s"))
+            LawCode.TIME_FADE, (_not_negative("final_fraction"), _positive("time_constant_s"))
         ),
         "hidden_mass": EffectKind(
-            Law.HIDDEN_MASS,
+            LawCode.HIDDEN_MASS,
             (
                 _positive("mass_kg"),
                 _positive("stiffness_n_per_m"),
@@ -157,9 +167,9 @@ EFFECT_KINDS: MappingProxyType[str, EffectKind] = MappingProxyType(
             ),
             states=2,
         ),
-        "added_mass": EffectKind(Law.ADDED_MASS, (Parameter("mass_kg"),)),
-        "input_gain": EffectKind(Law.INPUT_GAIN, (Parameter("gain"),)),
-        "delay": EffectKind(Law.DELAY, (Parameter("delay_s", low=0.0, high=1.0),)),
+        "added_mass": EffectKind(LawCode.ADDED_MASS, (EffectParameter("mass_kg"),)),
+        "input_gain": EffectKind(LawCode.INPUT_GAIN, (EffectParameter("gain"),)),
+        "delay": EffectKind(LawCode.DELAY, (EffectParameter("delay_s", low=0.0, high=1.0),)),
     }
 )
 """Every kind of effect by its name in the configuration."""
@@ -169,7 +179,7 @@ PARAMETER_COUNT = max(len(kind.parameters) for kind in EFFECT_KINDS.values())
 
 
 def parameter_error(name: str, given: dict[str, float]) -> str | None:
-    """Say what is wrong with an effect's parameters.
+    """First error in an effect's parameters.
 
     Args:
         name: Name of the effect, one of `EFFECT_KINDS`.
@@ -194,7 +204,7 @@ def parameter_error(name: str, given: dict[str, float]) -> str | None:
 
 
 def parameter_values(name: str, given: dict[str, float]) -> tuple[float, ...]:
-    """Give an effect's parameters in the order in which its law reads them.
+    """An effect's parameters in the order in which its law reads them.
 
     Args:
         name: Name of the effect, one of `EFFECT_KINDS`.

@@ -1,4 +1,4 @@
-"""What a bench's configuration may say: frozen, validated values.
+"""The schema of a bench's configuration: frozen, validated values.
 
 Lengths are in m, forces in N, positive as in the rest of the project: a strut force pushes its two
 bodies apart, an applied force points upwards, a height is the length of a strut.
@@ -84,13 +84,13 @@ class DamperCurve(_Section):
         return self
 
 
-class Strut(_Section):
+class BenchStrut(_Section):
     """A spring and a damper between two bodies, or between the world and a body.
 
     Attributes:
         name: Name of the strut.
         between: Lower and upper body. Every body is the upper body of exactly one strut.
-        free_length_m: Height at which the laws of undeclared effects see no deflection, in m.
+        free_length_m: Height from which the laws of undeclared effects count the deflection, in m.
         spring: Spring curve.
         damper: Damper curve.
         initial_height_m: Height at the start in m; the static equilibrium if none is given.
@@ -259,11 +259,11 @@ HeightComponent = Annotated[
 ]
 
 
-class PrescribedMotion(_Section):
+class StrutMotion(_Section):
     """A motion that a strut is forced through, whatever force it takes: a damper dyno.
 
     Attributes:
-        strut: Strut whose height is prescribed.
+        strut: BenchStrut whose height is prescribed.
         mean_height_m: Height about which the components move, in m.
         components: Motions that add up.
     """
@@ -289,12 +289,12 @@ class Temperature(_Section):
     cooling_time_s: Positive | None = None
 
 
-class Effect(_Section):
-    """An effect that the bench has and no model declares.
+class UndeclaredEffect(_Section):
+    """An effect of the bench that no model declares.
 
     Attributes:
         name: One of `rig.simulated_bench.effects.EFFECT_KINDS`.
-        strut: Strut in which it acts, or whose upper body it changes.
+        strut: BenchStrut in which it acts, or whose upper body it changes.
         parameters: Values by parameter name.
     """
 
@@ -343,7 +343,7 @@ class Thermometer(_Section):
 
 
 class Transmission(_Section):
-    """One message of the bench: what it carries and how it travels.
+    """One message of the bench: its sensors, delay and loss.
 
     Attributes:
         message: Name of the message in the bus's database.
@@ -387,7 +387,7 @@ class BenchConfig(_Section):
         applied_force: The force that drives the bench, if any.
         prescribed_motion: The motion that drives a strut, if any.
         temperature: The damper's temperature.
-        undeclared_effects: What the bench has and no model declares.
+        undeclared_effects: Effects of the bench that no model declares.
         transmissions: Messages that the bench sends.
         seed: Seed of noise, jitter and loss.
         step_ns: Longest step of the integrator.
@@ -396,11 +396,13 @@ class BenchConfig(_Section):
     name: Name
     gravity_m_per_s2: NotNegative = 9.81
     masses: Annotated[tuple[Mass, ...], Field(strict=False, min_length=1, max_length=20)]
-    struts: Annotated[tuple[Strut, ...], Field(strict=False, min_length=1, max_length=20)]
+    struts: Annotated[tuple[BenchStrut, ...], Field(strict=False, min_length=1, max_length=20)]
     applied_force: AppliedForce = AppliedForce()
-    prescribed_motion: PrescribedMotion | None = None
+    prescribed_motion: StrutMotion | None = None
     temperature: Temperature = Temperature()
-    undeclared_effects: Annotated[tuple[Effect, ...], Field(strict=False, max_length=50)] = ()
+    undeclared_effects: Annotated[
+        tuple[UndeclaredEffect, ...], Field(strict=False, max_length=50)
+    ] = ()
     transmissions: Annotated[tuple[Transmission, ...], Field(strict=False, max_length=50)] = ()
     seed: Seed = 0
     step_ns: Annotated[int, Field(ge=1_000, le=10_000_000)] = 100_000
@@ -414,7 +416,7 @@ class BenchConfig(_Section):
             _check_known("applied_force.body", self.applied_force.body, masses)
         if self.prescribed_motion is not None:
             _check_known("prescribed_motion.strut", self.prescribed_motion.strut, struts)
-            _check_prescribed(self.prescribed_motion.strut, self.struts, self.undeclared_effects)
+            _check_strut_motion(self.prescribed_motion.strut, self.struts, self.undeclared_effects)
         for index, effect in enumerate(self.undeclared_effects):
             _check_known(f"undeclared_effects.{index}.strut", effect.strut, struts)
         for index, sent in enumerate(self.transmissions):
@@ -447,7 +449,9 @@ def _check_known(key: str, name: str, known: list[str]) -> None:
 _UNSEEN_IN_PRESCRIBED_MOTION = ("added_mass", "hidden_mass")
 
 
-def _check_prescribed(name: str, struts: tuple[Strut, ...], effects: tuple[Effect, ...]) -> None:
+def _check_strut_motion(
+    name: str, struts: tuple[BenchStrut, ...], effects: tuple[UndeclaredEffect, ...]
+) -> None:
     strut = next(strut for strut in struts if strut.name == name)
     if strut.initial_height_m is not None:
         raise ValueError(
@@ -461,7 +465,7 @@ def _check_prescribed(name: str, struts: tuple[Strut, ...], effects: tuple[Effec
             )
 
 
-def _check_tree(struts: tuple[Strut, ...], masses: list[str]) -> None:
+def _check_tree(struts: tuple[BenchStrut, ...], masses: list[str]) -> None:
     carried: list[str] = []
     for index, strut in enumerate(struts):
         lower, upper = strut.between
@@ -469,5 +473,5 @@ def _check_tree(struts: tuple[Strut, ...], masses: list[str]) -> None:
         _check_known(f"struts.{index}.between.1", upper, [m for m in masses if m not in carried])
         carried.append(upper)
     if len(carried) < len(masses):
-        left = next(mass for mass in masses if mass not in carried)
-        raise ValueError(f"struts: expected one that carries {left}")
+        loose = next(mass for mass in masses if mass not in carried)
+        raise ValueError(f"struts: expected one that carries {loose}")

@@ -5,14 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rig.simulated_bench.assembly import Assembly, assemble
-from rig.simulated_bench.equations_of_motion import (
-    RECORD_COLUMNS,
-    RECORD_EXTRA,
-    Floats,
-    Integers,
-    Span,
-    advance,
-)
+from rig.simulated_bench.compilation import Floats, Integers
+from rig.simulated_bench.equations_of_motion import RECORD_COLUMNS, RECORD_EXTRA
+from rig.simulated_bench.integrator import Span, advance
 from rig.simulated_bench.schema import BenchConfig, BenchConfigError
 
 NANOSECONDS = 1e-9
@@ -20,11 +15,11 @@ NANOSECONDS = 1e-9
 
 
 class BenchDivergedError(BenchConfigError):
-    """The equations of motion left the finite numbers: the step is too long for this bench."""
+    """The motion is no longer finite: the step is too long for this bench."""
 
 
-class Motion(NamedTuple):
-    """Where the bench is.
+class BenchState(NamedTuple):
+    """State of the bench between two calls.
 
     Attributes:
         records: Number of records so far; the state is at the time of the next one.
@@ -35,7 +30,7 @@ class Motion(NamedTuple):
     y: Floats
 
 
-class Trajectory(NamedTuple):
+class BenchTrajectory(NamedTuple):
     """The motion of a bench on a regular grid of times; row k is at `t_ns[k]`.
 
     Attributes:
@@ -58,7 +53,7 @@ class Trajectory(NamedTuple):
     temperature_c: Floats
 
 
-class Grid(NamedTuple):
+class RecordGrid(NamedTuple):
     """Times of the records.
 
     Attributes:
@@ -70,23 +65,25 @@ class Grid(NamedTuple):
     step_s: float
 
 
-def regular_grid(config: BenchConfig, period_ns: int) -> Grid:
+def regular_grid(config: BenchConfig, period_ns: int) -> RecordGrid:
     """Divide a period into steps no longer than the configured one."""
     substeps = -(-period_ns // config.step_ns)
-    return Grid(substeps, period_ns * NANOSECONDS / substeps)
+    return RecordGrid(substeps, period_ns * NANOSECONDS / substeps)
 
 
-def advanced(assembly: Assembly, grid: Grid, motion: Motion, count: int) -> tuple[Motion, Floats]:
+def advance_records(
+    assembly: Assembly, grid: RecordGrid, motion: BenchState, count: int
+) -> tuple[BenchState, Floats]:
     """Advance the bench.
 
     Args:
         assembly: The bench.
         grid: Times of the records.
-        motion: Where the bench is.
+        motion: Its state.
         count: Number of records to make.
 
     Returns:
-        Where the bench is then, and the records, shape (count, columns); see
+        Its state after them, and the records, shape (count, columns); see
         `rig.simulated_bench.equations_of_motion.observe`.
 
     Raises:
@@ -102,14 +99,13 @@ def advanced(assembly: Assembly, grid: Grid, motion: Motion, count: int) -> tupl
             f"the motion is not finite after {motion.records * grid.substeps * grid.step_s:g} s, "
             "expected a shorter step_ns or curves that do not drive the bench"
         )
-    return Motion(motion.records + count, y), records
+    return BenchState(motion.records + count, y), records
 
 
-def simulate(config: BenchConfig, duration_ns: int, period_ns: int = 1_000_000) -> Trajectory:
+def simulate(config: BenchConfig, duration_ns: int, period_ns: int = 1_000_000) -> BenchTrajectory:
     """Run a bench from its start, without sensors and bus.
 
-    The motion at a time does not depend on how it is asked for: a `Bench` with the same grid goes
-    through the same values bit for bit.
+    A `SimulatedBench` with the same grid goes through the same values bit for bit.
 
     Args:
         config: The bench.
@@ -125,11 +121,11 @@ def simulate(config: BenchConfig, duration_ns: int, period_ns: int = 1_000_000) 
     """
     assembly = assemble(config)
     count = duration_ns // period_ns + 1
-    _, records = advanced(
-        assembly, regular_grid(config, period_ns), Motion(0, assembly.start), count
+    _, records = advance_records(
+        assembly, regular_grid(config, period_ns), BenchState(0, assembly.start), count
     )
     extra = RECORD_COLUMNS * len(config.struts)
-    return Trajectory(
+    return BenchTrajectory(
         t_ns=np.arange(count, dtype=np.int64) * period_ns,
         height_m=records[:, 0:extra:RECORD_COLUMNS],
         velocity_m_per_s=records[:, 1:extra:RECORD_COLUMNS],

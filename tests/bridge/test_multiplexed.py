@@ -2,7 +2,7 @@
 
 from can_dbc.database import load_database
 from can_dbc.frame import Frame
-from can_dbc.protection import SequenceState, Verdict
+from can_dbc.protection import FrameStatus, SequenceState
 from rig.bridge.incoming import HeightDelivery, compile_incoming
 from rig.channels.channel import Channel, Role
 from rig.channels.quantities import HEIGHT
@@ -33,7 +33,7 @@ def test_a_frame_of_another_page_is_no_fault_and_a_short_one_is(tmp_path):
     without = bytes([2, 7, 0]) + bytes(5)
     found = verdicts(tmp_path, with_height, without, with_height[:2])
     assert found == [
-        (Verdict.OK, (0.421,)),
-        (Verdict.OK, None),
-        (Verdict.WRONG_LENGTH, None),
+        (FrameStatus.OK, (0.421,)),
+        (FrameStatus.OK, None),
+        (FrameStatus.WRONG_LENGTH, None),
     ]

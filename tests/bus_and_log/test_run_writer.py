@@ -9,12 +9,14 @@ import yaml
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.log.captures import Window
-from rig.log.frame_columns import received_frames
-from rig.log.reader import RUN_FILE, RUN_SCHEMA, read_run
+from rig.log.captures import CaptureWindow
+from rig.log.file_names import RUN_FILE
+from rig.log.frame_columns import read_frame_columns
+from rig.log.reader import RUN_SCHEMA, read_run
+from rig.log.rotation import Rotation
 from rig.log.steps import BUS_FAULT, Step
 from rig.log.whole_file import WholeFile
-from rig.log.writer import MANY_WAITING, Rotation, RunLog
+from rig.log.writer import MANY_WAITING, LogOptions, RunWriter
 
 MS = 1_000_000
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -35,7 +37,8 @@ def tick(index, **options):
 
 def open_log(folder, *, paced=False, **options):
     header = {"schema": RUN_SCHEMA, "epoch_ns": EPOCH_NS}
-    return RunLog(folder, header, COLUMNS, EPOCH_NS, "can0", paced=paced, **options)
+    options = LogOptions(**options)
+    return RunWriter(folder, header, COLUMNS, "can0", 0 if paced else None, options)
 
 
 def ending():
@@ -50,7 +53,7 @@ def assert_holds(folder, first, last):
     ]
     assert list(found.frames()) == expected
     assert found.steps.column("t_ns").to_pylist() == [i * MS for i in range(first, last)]
-    columns = received_frames(found.frame_files, found.epoch_ns)
+    columns = read_frame_columns(found.frame_files, found.epoch_ns)
     assert columns.t_ns.tolist() == [i * MS for i in range(first, last)]
 
 
@@ -208,7 +211,7 @@ def captured(folder):
 def test_a_window_around_a_fault_is_a_run_of_its_own(tmp_path):
     log = open_log(
         tmp_path / "run",
-        window=Window(100 * MS, 50 * MS, 10),
+        window=CaptureWindow(100 * MS, 50 * MS, 10),
         capture_name=lambda before, now: "hold" if now == HOLD != before else None,
     )
     for index in range(1000):
@@ -221,7 +224,7 @@ def test_a_window_around_a_fault_is_a_run_of_its_own(tmp_path):
 
 
 def test_a_users_trigger_a_bus_fault_and_no_more_windows_than_asked_for(tmp_path):
-    log = open_log(tmp_path / "run", window=Window(10 * MS, 10 * MS, 2))
+    log = open_log(tmp_path / "run", window=CaptureWindow(10 * MS, 10 * MS, 2))
     for index in range(500):
         if index == 100:
             log.trigger("user")
@@ -232,7 +235,7 @@ def test_a_users_trigger_a_bus_fault_and_no_more_windows_than_asked_for(tmp_path
 
 
 def test_a_run_that_ends_within_a_window_keeps_what_there_is(tmp_path):
-    log = open_log(tmp_path / "run", window=Window(10 * MS, 1000 * MS, 2))
+    log = open_log(tmp_path / "run", window=CaptureWindow(10 * MS, 1000 * MS, 2))
     log.add(*tick(0))
     log.trigger("user")
     log.add(*tick(1))

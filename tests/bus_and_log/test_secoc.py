@@ -12,7 +12,7 @@ from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.bus.link import Link
 from rig.bus.secoc import Authentication, Authenticator, cmac, read_key
-from rig.log.reader import STEPS_FILE
+from rig.log.file_names import STEPS_FILE
 from rig.plan.check import Severity, check
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
@@ -51,7 +51,7 @@ def test_vectors_of_rfc_4493(length, expected):
 def sender(epoch_ns: int = EPOCH_NS) -> Callable[[int, bytes], Frame]:
     """Secures a payload at a time."""
     authenticator = Authenticator(PROFILE_1, epoch_ns)
-    return lambda t_ns, data: authenticator.secured(Frame(t_ns, 0x100, data))
+    return lambda t_ns, data: authenticator.secure(Frame(t_ns, 0x100, data))
 
 
 def receiver(epoch_ns: int = EPOCH_NS) -> Authenticator:
@@ -59,7 +59,7 @@ def receiver(epoch_ns: int = EPOCH_NS) -> Authenticator:
 
 
 def payloads(authenticator, frames):
-    return [frame.data for frame in authenticator.accepted(frames)]
+    return [frame.data for frame in authenticator.authenticate(frames)]
 
 
 @given(
@@ -91,19 +91,21 @@ def test_another_key_another_id_and_another_length_are_refused():
     heard = receiver()
     other = Authenticator(Authentication(bytes(16), 1, 3, 100 * MS), EPOCH_NS)
     frame = sender()(0, bytes(8))
-    assert heard.accepted([other.secured(Frame(0, 0x100, bytes(8)))]) == []
-    assert heard.accepted([replace(frame, arbitration_id=0x101)]) == []
-    assert heard.accepted([replace(frame, data=frame.data[:length]) for length in range(12)]) == []
-    assert heard.accepted([Frame(0, 0x100, bytes(8))]) == []
+    assert heard.authenticate([other.secure(Frame(0, 0x100, bytes(8)))]) == []
+    assert heard.authenticate([replace(frame, arbitration_id=0x101)]) == []
+    assert (
+        heard.authenticate([replace(frame, data=frame.data[:length]) for length in range(12)]) == []
+    )
+    assert heard.authenticate([Frame(0, 0x100, bytes(8))]) == []
     assert heard.unauthentic == 15
 
 
 def test_a_frame_is_accepted_once():
     send, heard = sender(), receiver()
     frames = [send(k * MS, bytes([k] * 8)) for k in range(50)]
-    assert len(heard.accepted(frames)) == 50
+    assert len(heard.authenticate(frames)) == 50
     again = [replace(frame, t_ns=frame.t_ns + 50 * MS) for frame in frames]
-    assert heard.accepted(again) == []
+    assert heard.authenticate(again) == []
     assert heard.replayed == 50
 
 
@@ -111,36 +113,36 @@ def test_a_recording_is_refused_also_after_a_restart():
     send = sender()
     frames = [send(k * MS, bytes(8)) for k in range(100)]
     later = receiver(EPOCH_NS + S)
-    assert later.accepted(frames) == []
+    assert later.authenticate(frames) == []
     assert later.unauthentic == 100
 
 
 def test_an_overtaken_frame_is_refused():
     send, heard = sender(), receiver()
     first, second = send(0, bytes(8)), send(MS, bytes(8))
-    assert len(heard.accepted([second, first])) == 1
+    assert len(heard.authenticate([second, first])) == 1
     assert heard.replayed == 1
 
 
 def test_a_sender_that_was_restarted_is_believed_at_once():
     heard = receiver()
     send = sender()
-    assert len(heard.accepted([send(k * MS, bytes(8)) for k in range(500)])) == 500
+    assert len(heard.authenticate([send(k * MS, bytes(8)) for k in range(500)])) == 500
     # The new one counts from its own start, 3 s later, and its clock is 20 ms ahead.
     again = sender(EPOCH_NS + 3 * S + 20 * MS)
     frames = [replace(again(k * MS, bytes(8)), t_ns=3 * S + k * MS) for k in range(500)]
-    assert len(heard.accepted(frames)) == 500
+    assert len(heard.authenticate(frames)) == 500
 
 
 @pytest.mark.parametrize(("offset_ms", "accepted"), [(-99, 5), (99, 5), (-140, 0), (140, 0)])
 def test_clocks_may_be_apart_by_the_tolerance(offset_ms, accepted):
     send, heard = sender(EPOCH_NS + offset_ms * MS), receiver()
-    assert len(heard.accepted([send(k * MS, bytes(8)) for k in range(5)])) == accepted
+    assert len(heard.authenticate([send(k * MS, bytes(8)) for k in range(5)])) == accepted
 
 
 def test_more_frames_than_the_clock_has_steps_are_each_newer_than_the_last():
     send, heard = sender(), receiver()
-    assert len(heard.accepted([send(0, bytes(8)) for _ in range(100)])) == 100
+    assert len(heard.authenticate([send(0, bytes(8)) for _ in range(100)])) == 100
 
 
 class Wire:

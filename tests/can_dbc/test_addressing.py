@@ -44,12 +44,12 @@ def two(tmp_path_factory):
 
 @given(priority=st.integers(0, 7), source=st.integers(0, 255))
 def test_a_broadcast_group_is_known_from_any_source(two, priority, source):
-    assert two.place(priority << 26 | 0x00FEF100 | source, True) == 0
+    assert two.index_of(priority << 26 | 0x00FEF100 | source, True) == 0
 
 
 @given(priority=st.integers(0, 7), source=st.integers(0, 255), destination=st.integers(0, 255))
 def test_a_directed_group_is_known_for_any_destination(two, priority, source, destination):
-    assert two.place(priority << 26 | 0x00EF0000 | destination << 8 | source, True) == 1
+    assert two.index_of(priority << 26 | 0x00EF0000 | destination << 8 | source, True) == 1
 
 
 @given(number=st.integers(0, 0x1FFFFFFF))
@@ -57,30 +57,30 @@ def test_a_frame_of_another_group_is_nobodys(two, number):
     same = any(
         number & group_mask(number) == own & group_mask(own) for own in (BROADCAST, DIRECTED)
     )
-    assert (two.place(number, True) is not None) is same
-    assert two.place(number & 0x7FF, False) is None
+    assert (two.index_of(number, True) is not None) is same
+    assert two.index_of(number & 0x7FF, False) is None
 
 
 def test_without_j1939_the_whole_identifier_counts(tmp_path):
     plain = Directory(messages(tmp_path, [BROADCAST], j1939=False))
-    assert plain.place(BROADCAST, True) == 0
-    assert plain.place(BROADCAST + 1, True) is None
+    assert plain.index_of(BROADCAST, True) == 0
+    assert plain.index_of(BROADCAST + 1, True) is None
 
 
 def test_a_group_of_several_messages_says_nothing(tmp_path):
     shared = Directory(messages(tmp_path, [BROADCAST, BROADCAST - 4]))
-    assert [shared.place(number, True) for number in (BROADCAST, BROADCAST - 4)] == [0, 1]
-    assert shared.place(BROADCAST - 1, True) is None
+    assert [shared.index_of(number, True) for number in (BROADCAST, BROADCAST - 4)] == [0, 1]
+    assert shared.index_of(BROADCAST - 1, True) is None
     assert {item.mask for item in shared.filters} == {0x1FFFFFFF}
 
 
 @given(number=st.integers(0, 0x1FFFFFFF))
 def test_filters_let_in_what_has_a_place(two, number):
     let_in = any(number & f.mask == f.arbitration_id & f.mask for f in two.filters)
-    assert let_in is (two.place(number, True) is not None)
+    assert let_in is (two.index_of(number, True) is not None)
 
 
 def test_the_byte_behind_a_format_is_a_destination_or_part_of_the_group(two):
     """SAE J1939-21: PDU formats from 240 on have a group extension there, others a destination."""
-    assert two.place(BROADCAST ^ 0x0100, True) is None
-    assert two.place(DIRECTED ^ 0x0100, True) == 1
+    assert two.index_of(BROADCAST ^ 0x0100, True) is None
+    assert two.index_of(DIRECTED ^ 0x0100, True) == 1

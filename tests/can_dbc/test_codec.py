@@ -331,7 +331,7 @@ BO_ 8 ODD: 10 BENCH
     ("message", "signal", "dimension", "words"),
     [
         ("M", "LOAD", Dimension.LENGTH, ["signal LOAD", "'lbf'", "length"]),
-        ("M", "BARE", Dimension.FORCE, ["signal BARE", "say the unit in the DBC"]),
+        ("M", "BARE", Dimension.FORCE, ["signal BARE", "give the unit in the DBC"]),
         ("M", "FLAT", Dimension.FORCE, ["signal FLAT", "scale 0"]),
         ("M", "EMPTY", Dimension.FORCE, ["signal EMPTY", "no raw value"]),
         ("M", "TRAVLE", Dimension.LENGTH, ["no signal 'TRAVLE'", "did you mean TRAVEL"]),

@@ -15,9 +15,9 @@ from can_dbc.database import Database, load_database
 from can_dbc.protection import (
     INITIAL,
     RESYNC_FRAMES,
+    FrameStatus,
     Protection,
     SequenceState,
-    Verdict,
     check_crc,
     check_crc_log,
     compile_checker,
@@ -56,9 +56,9 @@ def frame(counter: int, protection: Protection, fill: int = 0x5A) -> bytes:
 
 def judge(
     frames: Iterable[tuple[float, int]], protection: Protection, state: SequenceState = INITIAL
-) -> tuple[SequenceState, list[Verdict]]:
+) -> tuple[SequenceState, list[FrameStatus]]:
     """Check frames given as (time in ms, number)."""
-    verdicts: list[Verdict] = []
+    verdicts: list[FrameStatus] = []
     check = compile_checker(protection)
     for t_ms, number in frames:
         state, verdict = check(state, frame(number, protection), round(t_ms * MS))
@@ -95,8 +95,8 @@ def test_a_refused_frame_leaves_no_trace(protection: Protection) -> None:
         damaged[bit // 8] ^= 1 << bit % 8
         after, verdict = compile_checker(protection)(state, damaged, MS)
         assert after == state
-        assert verdict in {Verdict.WRONG_CRC, Verdict.MASQUERADE}
-        assert not verdict.accepted
+        assert verdict in {FrameStatus.WRONG_CRC, FrameStatus.MASQUERADE}
+        assert not verdict.is_accepted
 
 
 @pytest.mark.parametrize("profile", ["protection", "first_profile"])
@@ -137,13 +137,13 @@ def test_another_messages_frame_is_a_masquerade(rig: Database) -> None:
             for counter in range(16):
                 sent = frame(counter, other.protection)
                 _, verdict = compile_checker(message.protection)(INITIAL, sent, 0)
-                assert verdict is Verdict.MASQUERADE
+                assert verdict is FrameStatus.MASQUERADE
 
 
 def test_wrong_length(protection: Protection) -> None:
     for length in (0, 1, 7, 9, 64):
         state, verdict = compile_checker(protection)(INITIAL, bytes(length), 0)
-        assert (state, verdict) == (INITIAL, Verdict.WRONG_LENGTH)
+        assert (state, verdict) == (INITIAL, FrameStatus.WRONG_LENGTH)
         assert not check_crc(bytes(length), protection)
     with pytest.raises(ValueError, match="7 bytes, expected 8"):
         compile_protector(protection)(bytes(7), 0)
@@ -151,14 +151,14 @@ def test_wrong_length(protection: Protection) -> None:
 
 def test_frames_in_sequence(protection: Protection) -> None:
     _, verdicts = judge(((t, t) for t in range(40)), protection)
-    assert verdicts == [Verdict.FIRST] + [Verdict.OK] * 39
+    assert verdicts == [FrameStatus.FIRST] + [FrameStatus.OK] * 39
 
 
 def test_jitter_changes_nothing(protection: Protection) -> None:
     _, verdicts = judge(((t + 0.9 * (t % 2), t) for t in range(40)), protection)
-    assert verdicts == [Verdict.FIRST] + [Verdict.OK] * 39
+    assert verdicts == [FrameStatus.FIRST] + [FrameStatus.OK] * 39
     _, verdicts = judge(((5.0, t) for t in range(40)), protection)
-    assert verdicts == [Verdict.FIRST] + [Verdict.OK] * 39
+    assert verdicts == [FrameStatus.FIRST] + [FrameStatus.OK] * 39
 
 
 @pytest.mark.parametrize("missing", range(1, 60))
@@ -166,10 +166,10 @@ def test_lost_frames_are_counted(protection: Protection, missing: int) -> None:
     state, _ = judge(((t, t) for t in range(5)), protection)
     late = 5 + missing
     state, verdicts = judge([(late + 0.3, late)], protection, state)
-    assert verdicts == [Verdict.LOST]
+    assert verdicts == [FrameStatus.LOST]
     assert state.lost == missing
     state, verdicts = judge([(late + 1, late + 1)], protection, state)
-    assert (verdicts, state.lost) == ([Verdict.OK], 0)
+    assert (verdicts, state.lost) == ([FrameStatus.OK], 0)
 
 
 def test_lost_frames_without_a_cycle_time(write_dbc: Callable[..., Path]) -> None:
@@ -184,19 +184,19 @@ def test_lost_frames_without_a_cycle_time(write_dbc: Callable[..., Path]) -> Non
     state, _ = judge([(0, 0)], protection)
     for missing in range(1, 7):
         after, verdicts = judge([(1000, missing + 1)], protection, state)
-        assert (verdicts, after.lost) == ([Verdict.LOST], missing)
+        assert (verdicts, after.lost) == ([FrameStatus.LOST], missing)
     _, verdicts = judge([(1000, 8)], protection, state)
-    assert verdicts == [Verdict.OUT_OF_SEQUENCE]
+    assert verdicts == [FrameStatus.OUT_OF_SEQUENCE]
 
 
 def test_repeated_frames(protection: Protection) -> None:
     frames = [(t, t) for t in range(3)] + [(t, 2) for t in range(3, 60)] + [(60, 3), (61, 4)]
     state, verdicts = judge(frames, protection)
     assert verdicts == [
-        Verdict.FIRST,
-        *[Verdict.OK] * 2,
-        *[Verdict.REPEATED] * 57,
-        *[Verdict.OK] * 2,
+        FrameStatus.FIRST,
+        *[FrameStatus.OK] * 2,
+        *[FrameStatus.REPEATED] * 57,
+        *[FrameStatus.OK] * 2,
     ]
     assert state.counter == 4
 
@@ -205,12 +205,12 @@ def test_two_frames_that_swap_places(protection: Protection) -> None:
     numbers = [0, 1, 3, 2, 4, 5]
     _, verdicts = judge(enumerate(numbers), protection)
     assert verdicts == [
-        Verdict.FIRST,
-        Verdict.OK,
-        Verdict.LOST,
-        Verdict.OUT_OF_SEQUENCE,
-        Verdict.OK,
-        Verdict.OK,
+        FrameStatus.FIRST,
+        FrameStatus.OK,
+        FrameStatus.LOST,
+        FrameStatus.OUT_OF_SEQUENCE,
+        FrameStatus.OK,
+        FrameStatus.OK,
     ]
 
 
@@ -222,11 +222,11 @@ def test_a_sender_that_starts_anew_is_believed_after_some_frames(
     start = 19 + 16 - back
     frames = [(20 + i, start + i) for i in range(6)]
     _, verdicts = judge(frames, protection, state)
-    refused = [Verdict.OUT_OF_SEQUENCE] * RESYNC_FRAMES
+    refused = [FrameStatus.OUT_OF_SEQUENCE] * RESYNC_FRAMES
     if back > RESYNC_FRAMES:
-        assert verdicts == [*refused, Verdict.FIRST, *[Verdict.OK] * 3]
+        assert verdicts == [*refused, FrameStatus.FIRST, *[FrameStatus.OK] * 3]
     else:  # it catches up with the old sequence first
-        assert verdicts[-3:] == [Verdict.OK] * 3
+        assert verdicts[-3:] == [FrameStatus.OK] * 3
 
 
 @given(
@@ -255,7 +255,7 @@ def test_accepted_and_lost_frames_add_up(
             if event == "corrupt":
                 data[bit // 8] ^= 1 << bit % 8
             state, verdict = compile_checker(protection)(state, data, t_ns)
-        if verdict.accepted:
+        if verdict.is_accepted:
             assert event != "corrupt"
             accepted.append(number - 1)
             lost += state.lost
@@ -268,10 +268,10 @@ def test_first_profile_counts_to_fourteen(first_profile: Protection) -> None:
     assert read_counter(frame(14, first_profile)) == 14
     assert read_counter(frame(15, first_profile)) == 0
     _, verdicts = judge(((t, t) for t in range(40)), first_profile)
-    assert verdicts == [Verdict.FIRST] + [Verdict.OK] * 39
+    assert verdicts == [FrameStatus.FIRST] + [FrameStatus.OK] * 39
     damaged = bytearray(frame(3, first_profile))
     damaged[4] ^= 1
-    assert compile_checker(first_profile)(INITIAL, damaged, 0)[1] is Verdict.WRONG_CRC
+    assert compile_checker(first_profile)(INITIAL, damaged, 0)[1] is FrameStatus.WRONG_CRC
 
 
 def test_a_counter_that_the_first_profile_does_not_have_is_refused(
@@ -282,7 +282,7 @@ def test_a_counter_that_the_first_profile_does_not_have_is_refused(
     e2e_p01_protect(forged, 0x1234, increment_counter=False)
     assert read_counter(forged) == 15
     state, verdict = compile_checker(first_profile)(INITIAL, forged, 0)
-    assert verdict is Verdict.WRONG_CRC
+    assert verdict is FrameStatus.WRONG_CRC
     assert state == INITIAL
     assert not check_crc(bytes(forged), first_profile)
     assert not check_crc_log(np.frombuffer(forged, np.uint8)[None, :], first_profile)[0]

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from can_dbc.bulk_check import in_sequence
 from can_dbc.database import DEFAULT_DATABASE, load_database
-from can_dbc.protection import INITIAL, Verdict, compile_checker, compile_protector
+from can_dbc.protection import INITIAL, FrameStatus, compile_checker, compile_protector
 
 MESSAGE = load_database(DEFAULT_DATABASE).message("BENCH_MEASUREMENT")
 
@@ -30,7 +30,7 @@ def test_the_frequent_case_is_judged_as_frame_by_frame(steps):
     payloads = np.zeros((count, length + 2), dtype=np.uint8)
     lengths = np.full(count, length)
     t_ns = np.zeros(count, dtype=np.int64)
-    verdicts: list[Verdict] = []
+    verdicts: list[FrameStatus] = []
     state, counter, now_ns = INITIAL, 0, 10**9
     for index, (step, cycles, fault) in enumerate(steps):
         counter += step
@@ -45,9 +45,9 @@ def test_the_frequent_case_is_judged_as_frame_by_frame(steps):
     follows = in_sequence(payloads, lengths, t_ns, protection)
     assert not follows[:1].any()
     for index in range(1, count):
-        if verdicts[index - 1].accepted:
-            next_one = steps[index][0] == 1 and verdicts[index] is Verdict.OK
-            assert not follows[index] or verdicts[index] is Verdict.OK
+        if verdicts[index - 1].is_accepted:
+            next_one = steps[index][0] == 1 and verdicts[index] is FrameStatus.OK
+            assert not follows[index] or verdicts[index] is FrameStatus.OK
             assert follows[index] or not next_one or t_ns[index] - t_ns[index - 1] > 0
         if steps[index][0] == 1 and steps[index][2] == steps[index - 1][2] == "":
             assert follows[index] == (t_ns[index] - t_ns[index - 1] < protection.silence_ns)

@@ -48,7 +48,7 @@ def test_value_becomes_si(unit: str, dimension: Dimension, value: float, si: flo
         ("degC", Dimension.LENGTH, ["another dimension", "length"]),
         ("smoots per fortnight?", Dimension.VELOCITY, ["not understood", "velocity"]),
         ("furl", Dimension.LENGTH, ["not known", "length"]),
-        ("", Dimension.LENGTH, ["say the unit in the DBC"]),
+        ("", Dimension.LENGTH, ["give the unit in the DBC"]),
         ("dB", Dimension.NUMBER, ["not linear"]),
         ("m**9", Dimension.LENGTH, ["not understood"]),
         ("9**9**9**9", Dimension.LENGTH, ["not understood"]),

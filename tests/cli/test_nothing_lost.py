@@ -7,7 +7,7 @@ import pytest
 
 from rig.cli.main import main
 from rig.formats import export as exported
-from rig.log.reader import changed_files, read_run
+from rig.log.reader import find_changed_files, read_run
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from tests.run.listed import ListPort, bench_frames, live
@@ -74,10 +74,10 @@ def test_an_export_that_fails_leaves_nothing_under_its_name(run, tmp_path, monke
 
 
 def test_a_file_that_is_not_the_one_that_ran_is_named(run, monkeypatch, capsys):
-    assert changed_files(run) == []
+    assert find_changed_files(run) == []
     model = run / "model.yaml"
     model.write_text(model.read_text() + "# by hand\n")
-    assert changed_files(run) == ["model.yaml"]
+    assert find_changed_files(run) == ["model.yaml"]
     assert rig(monkeypatch, "replay", run) == 0
     assert "model.yaml is not the one that ran" in capsys.readouterr().out
 

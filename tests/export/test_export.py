@@ -12,7 +12,8 @@ from msgspec.structs import astuple
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.formats.export import FORMATS, export_run, import_run
-from rig.log.reader import parse_frame, read_run
+from rig.log.candump import parse_frame
+from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.live import with_bench

@@ -11,7 +11,7 @@ import pytest
 from msgspec.structs import replace
 
 from can_dbc.codec import compile_decoder
-from can_dbc.protection import Verdict, check_crc
+from can_dbc.protection import FrameStatus, check_crc
 from can_dbc.units import Dimension
 from tests.faults.trial import Trial
 
@@ -77,8 +77,8 @@ def test_mutated_frames():
     frames, counts = fuzz(3000, seed=1)
     assert frames > 13_000
     # The package's DBC has neither floats nor J1939: whatever passes the CRC holds values.
-    possible = [verdict for verdict in Verdict if verdict is not Verdict.NO_VALUE]
-    causes = [verdict.value for verdict in possible if not verdict.accepted]
+    possible = [verdict for verdict in FrameStatus if verdict is not FrameStatus.NO_VALUE]
+    causes = [verdict.value for verdict in possible if not verdict.is_accepted]
     assert all(getattr(counts, cause) > 0 for cause in causes)
     assert sum(getattr(counts, cause) for cause in causes) == counts.refused
 

@@ -15,7 +15,7 @@ import rig.plan.load
 from can_dbc.errors import DatabaseError, InputError
 from rig.diagnosis.recording import RecordingError, read_csv
 from rig.formats.mapping import load_mapping
-from rig.log.reader import DBC_FILE, FRAMES_FILE, MODEL_FILE, RUN_FILE, STEPS_FILE
+from rig.log.file_names import DBC_FILE, FRAMES_FILE, MODEL_FILE, RUN_FILE, STEPS_FILE
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.replay import replay

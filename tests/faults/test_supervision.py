@@ -7,7 +7,7 @@ from can_dbc.codec import compile_decoder
 from can_dbc.errors import InputError
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
-from can_dbc.yaml_file import load_validated
+from can_dbc.yaml_file import load_yaml
 from rig.bridge.limits import Action, Limit, LimitedValue, judge_height
 from rig.bridge.report import Conditions
 from rig.bridge.supervisor import TRANSITIONS, Event, next_mode
@@ -174,7 +174,7 @@ def test_a_wrong_row_is_one_line_that_names_it(tmp_path, row, expected):
     path = tmp_path / "rig.yaml"
     path.write_text(f"{text}\nsupervision: {{limits: [{{{cells}}}]}}\n")
     with pytest.raises(InputError, match=expected) as caught:
-        load_validated(RunConfig, path)
+        load_yaml(RunConfig, path)
     assert str(caught.value).startswith(f"{path}: supervision.limits.0")
     assert "\n" not in str(caught.value)
 

@@ -13,8 +13,8 @@ from rig.channels.channel import Sample
 from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
+from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.simulated import Bench
 
 MS = 1_000_000
 BEGIN_NS = 300 * MS
@@ -71,7 +71,9 @@ class Trial:
         config = ready.config.model_validate(content | {"devices": devices or {}})
         self.ready = ready.with_config(config)
         self.bridge: Bridge = build_bridge(self.ready)
-        self.bench = Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), ready.database)
+        self.bench = SimulatedBench(
+            load_bench_config(CONFIGS / "reference_bench.yaml"), ready.database
+        )
         self.state: BridgeState = self.bridge.init(0)
         self.ticks: list[Tick] = []
 

@@ -8,7 +8,7 @@ import pytest
 
 from can_dbc.errors import InputError
 from dart_model.plant import DartPlant
-from dart_model.plant.admitted_programs import require_admitted
+from dart_model.plant.admitted_programs import require_admission
 from dart_model.spec import MODELS, EffectSpec, load_model
 from rig.demo.cases import DemoOptions
 from rig.demo.story import draw_effect, run_story
@@ -23,7 +23,7 @@ from rig.plan.load import load_plan
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.schema import Effect
+from rig.simulated_bench.schema import UndeclaredEffect
 from tests.fmu.driver import written
 from tests.fmu.specimens import with_effects
 
@@ -100,8 +100,8 @@ def test_a_defective_fmu_is_run_replayed_checked_and_diagnosed(tmp_path):
     nominal = load_model(MODELS / "bench.yaml")
     spec = nominal.with_effects("strut", [EffectSpec(name="maxwell", parameters=own)])
     effects = (
-        Effect.model_validate({"name": "maxwell", "strut": "strut", "parameters": own}),
-        Effect.model_validate(
+        UndeclaredEffect.model_validate({"name": "maxwell", "strut": "strut", "parameters": own}),
+        UndeclaredEffect.model_validate(
             {"name": "quadratic_damping", "strut": "strut", "parameters": lacking}
         ),
     )
@@ -300,7 +300,7 @@ def test_an_import_that_fails_admits_nothing(tmp_path):
     with pytest.raises(InputError):
         import_fmu(path, mapping, 10.0, tmp_path / "out")
     with pytest.raises(InputError, match="not imported on this machine"):
-        require_admitted(path.read_bytes(), path)
+        require_admission(path.read_bytes(), path)
 
 
 @pytest.mark.parametrize(

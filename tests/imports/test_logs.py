@@ -20,8 +20,8 @@ from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.plan.plan import Plan
 from rig.run.replay import replay
+from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.simulated import Bench
 
 EPOCH_S = 1_700_000_000.0
 
@@ -33,7 +33,7 @@ def ready() -> Plan:
 
 @pytest.fixture(scope="module")
 def frames(ready: Plan) -> list[Frame]:
-    bench = Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), ready.database)
+    bench = SimulatedBench(load_bench_config(CONFIGS / "reference_bench.yaml"), ready.database)
     return bench.update(500_000_000)[0]
 
 

@@ -28,8 +28,8 @@ from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run import live
 from rig.run.live import with_bench
+from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.simulated import Bench as SimulatedBench
 from rig.simulated_bench.trajectory import simulate
 from rig.tuning.expectation import Expectation, longest_stretch, residual_force, spectrum
 from rig.tuning.gains import Aim, TuningProblem, expect_error, gain_margin, tune_observer
@@ -240,7 +240,7 @@ def moving_table(seeds):
                 folder = Path(temporary) / "case"
                 _, bench = prepared(folder, seed, 20e-6, 15e-6, observers=observers)
                 ready = load_plan(folder / "rig.yaml", duration_s=8.0)
-                live.Bench = bench_class
+                live.SimulatedBench = bench_class
                 ended = with_bench(ready, bench, folder / "run", lockstep=lockstep)
                 steps = open_steps(ended.folder)
             t_ns, force_n = (steps.column(key).to_numpy() for key in ("t_ns", f"{STRUT}.force_n"))

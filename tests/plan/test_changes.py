@@ -6,16 +6,11 @@ import threading
 import pytest
 
 from can_dbc.errors import InputError
+from rig.log.file_names import CHANGES_FILE
 from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
-from rig.run.changes import (
-    CHANGES_FILE,
-    assign,
-    change_line,
-    logged_changes,
-    parse_assignments,
-)
+from rig.run.changes import assign, change_line, logged_changes, parse_assignments
 from rig.run.replay import replay
 from rig.run.requests import Requests, ask
 from tests.view.serving import make_run

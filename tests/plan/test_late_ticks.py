@@ -6,8 +6,8 @@ import pytest
 
 from can_dbc.errors import InputError
 from rig.machine.clock import VirtualClock
-from rig.run.late_ticks import Cause, late_ticks
-from rig.run.trace import Row, Trace, read_trace
+from rig.run.late_ticks import Cause, find_late_ticks
+from rig.run.trace import Trace, TraceRow, read_trace
 
 MS = 1_000_000
 
@@ -31,7 +31,7 @@ def rows(late, *, ticks=400, stolen_ns=0):
         marks = [woke + part for part in (8_000, 30_000, 40_000, 45_000)]
         steal_ns = stolen_ns if tick > ticks // 2 else 0
         log_busy = story.get("log_busy", 0)
-        row = Row(
+        row = TraceRow(
             deadline, asleep, woke, *marks, **counters, run_delay_ns=run_delay_ns,
             steal_ns=steal_ns, log_busy=log_busy,
         )  # fmt: skip
@@ -53,7 +53,7 @@ def rows(late, *, ticks=400, stolen_ns=0):
     ],
 )
 def test_each_account_is_told_from_the_others(story, part, cause):
-    (found,) = late_ticks(rows({100: story}), MS)
+    (found,) = find_late_ticks(rows({100: story}), MS)
     assert (found.part, found.cause) == (part, cause)
     assert found.t_ns == 100 * MS
     assert found.missed in (3, 4)
@@ -62,15 +62,15 @@ def test_each_account_is_told_from_the_others(story, part, cause):
 
 
 def test_a_trace_in_which_nothing_was_late_has_no_gaps():
-    assert late_ticks(rows({}), MS) == []
-    assert late_ticks([], MS) == []
+    assert find_late_ticks(rows({}), MS) == []
+    assert find_late_ticks([], MS) == []
 
 
 def test_gaps_in_phase_with_a_tenth_of_a_second_are_the_hosts_quota():
     ends_ms = (50, 150, 250, 350)
     late = {end - 2: {"overslept_ns": 2 * MS + 300 * k} for k, end in enumerate(ends_ms)}
     late[203] = {"overslept_ns": 3 * MS}
-    found = late_ticks(rows(late), MS)
+    found = find_late_ticks(rows(late), MS)
     assert [item.cause for item in found] == [
         Cause.QUOTA, Cause.QUOTA, Cause.UNACCOUNTED, Cause.QUOTA, Cause.QUOTA
     ]  # fmt: skip
@@ -81,14 +81,14 @@ def test_gaps_at_random_times_are_not_put_down_to_a_quota():
     wrong = 0
     for _ in range(200):
         ticks = random.sample(range(10, 1990, 6), 8)
-        found = late_ticks(rows({k: {"overslept_ns": 2 * MS} for k in ticks}, ticks=2000), MS)
+        found = find_late_ticks(rows({k: {"overslept_ns": 2 * MS} for k in ticks}, ticks=2000), MS)
         wrong += any(item.cause is Cause.QUOTA for item in found)
     assert wrong < 20
 
 
 def test_what_was_stolen_as_long_as_nobody_accounts_for_is_the_hosts():
     late = {k: {"overslept_ns": 2 * MS} for k in (31, 77, 140, 263)}
-    causes = {item.cause for item in late_ticks(rows(late, stolen_ns=10 * MS), MS)}
+    causes = {item.cause for item in find_late_ticks(rows(late, stolen_ns=10 * MS), MS)}
     assert causes == {Cause.HOST}
 
 
@@ -113,12 +113,12 @@ def test_a_run_without_a_trace_is_told_in_one_line(tmp_path):
     with pytest.raises(InputError, match="expected a run made with --trace"):
         read_trace(tmp_path)
     (tmp_path / "trace.arrow").write_bytes(b"no arrow")
-    with pytest.raises(InputError, match="is no trace"):
+    with pytest.raises(InputError, match="is not a trace"):
         read_trace(tmp_path)
 
 
 def test_a_run_without_a_tick_on_time_has_its_gaps_all_the_same():
     late = {k: {"overslept_ns": 3 * MS} for k in range(1, 60, 4)}
-    found = late_ticks(rows(late, ticks=60), MS)
+    found = find_late_ticks(rows(late, ticks=60), MS)
     assert len(found) == 14
     assert {item.part for item in found} == {"wait"}

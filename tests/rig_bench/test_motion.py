@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 from rig.simulated_bench.assembly import assemble
-from rig.simulated_bench.equations_of_motion import curve_force
+from rig.simulated_bench.curves import curve_force
 from rig.simulated_bench.schema import BenchConfig, BenchConfigError
 from rig.simulated_bench.trajectory import BenchDivergedError, simulate
 from tests.rig_bench.linear_bench import (

@@ -11,9 +11,9 @@ from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.errors import InputError
 from can_dbc.units import Dimension
 from rig.plan.config import CONFIGS
+from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.schema import BenchConfig
-from rig.simulated_bench.simulated import Bench
 from rig.simulated_bench.trajectory import simulate
 from tests.rig_bench.linear_bench import linear_strut
 
@@ -217,7 +217,7 @@ def test_the_shipped_dyno_sends_height_and_cell_in_one_frame() -> None:
     database = load_database(DEFAULT_DATABASE)
     message = database.message("DYNO_MEASUREMENT")
     config = load_bench_config(CONFIGS / "dyno_bench.yaml")
-    frames, _ = Bench(config, database).update(SECOND_NS)
+    frames, _ = SimulatedBench(config, database).update(SECOND_NS)
     decode = compile_decoder(
         message, ["HEIGHT", "STRUT_FORCE"], [Dimension.LENGTH, Dimension.FORCE]
     )

@@ -13,9 +13,9 @@ from scipy.linalg import expm
 
 import rig
 from can_dbc.database import DEFAULT_DATABASE, load_database
+from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.simulated import Bench
-from rig.simulated_bench.trajectory import Trajectory, simulate
+from rig.simulated_bench.trajectory import BenchTrajectory, simulate
 
 CONFIGS = Path(rig.__file__).parent / "configs"
 PERIOD_S = 1e-3
@@ -52,7 +52,7 @@ def _discrete(model: LinearModel) -> tuple[np.ndarray, np.ndarray]:
     return step[: 2 * n, : 2 * n], step[: 2 * n, 2 * n :]
 
 
-def _observe(model: LinearModel, truth: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+def _observe(model: LinearModel, truth: BenchTrajectory) -> tuple[np.ndarray, np.ndarray]:
     """Model heights and estimated strut forces at each sample, shapes (samples, struts)."""
     n = len(model.mass_kg)
     free, driving = _discrete(model)
@@ -111,7 +111,9 @@ def test_quarter_car_observers_follow_both_struts():
 
 @pytest.mark.parametrize("name", ["reference_bench", "quarter_car_bench"])
 def test_shipped_bench_fits_the_default_bus(name):
-    bench = Bench(load_bench_config(CONFIGS / f"{name}.yaml"), load_database(DEFAULT_DATABASE))
+    bench = SimulatedBench(
+        load_bench_config(CONFIGS / f"{name}.yaml"), load_database(DEFAULT_DATABASE)
+    )
     frames, _ = bench.update(100_000_000)
     assert len(frames) > 100
     assert bench.saturated_frames == 0

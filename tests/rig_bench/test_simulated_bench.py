@@ -8,10 +8,10 @@ from msgspec.structs import replace
 
 from can_dbc.codec import compile_decoder
 from can_dbc.database import DEFAULT_DATABASE, DatabaseError, load_database
-from can_dbc.protection import INITIAL, Verdict, check_crc, compile_checker, read_counter
+from can_dbc.protection import INITIAL, FrameStatus, check_crc, compile_checker, read_counter
 from can_dbc.units import Dimension
+from rig.simulated_bench.bench import RECORDS_KEPT, SimulatedBench
 from rig.simulated_bench.schema import BenchConfigError
-from rig.simulated_bench.simulated import RECORDS_KEPT, Bench
 from rig.simulated_bench.trajectory import simulate
 from tests.rig_bench.linear_bench import linear_bench
 
@@ -37,7 +37,7 @@ def _config(*, auxiliary=False, components=(SINE,), seed=1, height=HEIGHT, force
 
 
 def _frames(config, database, until_ns, **start):
-    return Bench(config, database, **start).update(until_ns)[0]
+    return SimulatedBench(config, database, **start).update(until_ns)[0]
 
 
 def _measured(frames, database):
@@ -86,7 +86,7 @@ def test_every_frame_passes_its_check(database):
     for frame in _frames(_config(), database, 100 * MS_NS):
         state, verdict = compile_checker(protection)(state, frame.data, frame.t_ns)
         verdicts.append(verdict)
-    assert verdicts == [Verdict.FIRST] + [Verdict.OK] * 100
+    assert verdicts == [FrameStatus.FIRST] + [FrameStatus.OK] * 100
 
 
 def test_counter_goes_on_over_lost_frames(database):
@@ -106,7 +106,7 @@ def test_share_of_lost_frames(database):
 
 
 def test_all_frames_can_be_lost(database):
-    bench = Bench(_config(loss_probability=1.0), database)
+    bench = SimulatedBench(_config(loss_probability=1.0), database)
     assert bench.update(10 * MS_NS) == ([], 11 * MS_NS)
 
 
@@ -167,7 +167,7 @@ def test_frames_do_not_depend_on_when_they_are_asked_for(database):
         loss_probability=0.05,
     )
     at_once = _frames(config, database, SECOND_NS)
-    bench, piecewise, now_ns = Bench(config, database), [], 0
+    bench, piecewise, now_ns = SimulatedBench(config, database), [], 0
     while now_ns <= SECOND_NS:
         frames, due_ns = bench.update(now_ns)
         piecewise += frames
@@ -180,7 +180,7 @@ def test_frames_do_not_depend_on_when_they_are_asked_for(database):
 
 def test_next_due_time_is_never_late(database):
     config = _config(latency_ns=300_000, jitter_ns=900_000)
-    bench, due_ns = Bench(config, database), 0
+    bench, due_ns = SimulatedBench(config, database), 0
     for _ in range(2000):
         frames, next_ns = bench.update(due_ns)
         # Nothing was due before: whatever comes is stamped with the time announced.
@@ -203,12 +203,15 @@ def test_start_time_shifts_the_stamps(database):
     shifted = _frames(_config(), database, start_ns + 20 * MS_NS, start_ns=start_ns)
     plain = _frames(_config(), database, 20 * MS_NS)
     assert shifted == [replace(frame, t_ns=frame.t_ns + start_ns) for frame in plain]
-    assert Bench(_config(), database, start_ns=start_ns).update(start_ns - 1) == ([], start_ns)
+    assert SimulatedBench(_config(), database, start_ns=start_ns).update(start_ns - 1) == (
+        [],
+        start_ns,
+    )
 
 
 def test_truth_is_the_motion_bit_for_bit(database):
     config = _config(auxiliary=True)
-    bench = Bench(config, database, start_ns=7)
+    bench = SimulatedBench(config, database, start_ns=7)
     motion = simulate(config, SECOND_NS)
     for k in range(0, 1001, 37):
         truth = bench.truth(7 + k * MS_NS)
@@ -224,7 +227,7 @@ def test_truth_is_the_motion_bit_for_bit(database):
 
 def test_truth_between_samples_is_interpolated(database):
     config = _config()
-    bench = Bench(config, database)
+    bench = SimulatedBench(config, database)
     fine = simulate(config, 300 * MS_NS, period_ns=100_000)
     for k in range(1, 3000, 7):
         truth = bench.truth(k * 100_000)
@@ -233,18 +236,18 @@ def test_truth_between_samples_is_interpolated(database):
 
 
 def test_truth_that_is_gone_is_refused(database):
-    bench = Bench(_config(), database)
+    bench = SimulatedBench(_config(), database)
     bench.truth((RECORDS_KEPT + 100) * MS_NS)
     with pytest.raises(ValueError, match="expected at least"):
         bench.truth(0)
     with pytest.raises(ValueError, match="expected at least"):
-        Bench(_config(), database).truth(-1)
+        SimulatedBench(_config(), database).truth(-1)
 
 
 def test_value_beyond_its_range_is_held_and_counted(database):
     sine = SINE | {"amplitude_n": 8000.0}
     config = _config(components=(sine,), height=None)
-    bench = Bench(config, database)
+    bench = SimulatedBench(config, database)
     frames, _ = bench.update(SECOND_NS)
     message = database.message("BENCH_MEASUREMENT")
     decode = compile_decoder(message, ("APPLIED_FORCE",), (Dimension.FORCE,))
@@ -281,5 +284,5 @@ def test_value_beyond_its_range_is_held_and_counted(database):
 )
 def test_what_does_not_fit_the_bus_is_said_in_one_line(database, sent, error, line):
     with pytest.raises(error, match=line) as raised:
-        Bench(linear_bench(transmissions=sent), database)
+        SimulatedBench(linear_bench(transmissions=sent), database)
     assert "\n" not in str(raised.value)

@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import find_peaks
 
 from rig.simulated_bench.effects import EFFECT_KINDS
-from rig.simulated_bench.trajectory import Trajectory, simulate
+from rig.simulated_bench.trajectory import BenchTrajectory, simulate
 from tests.rig_bench.linear_bench import (
     DAMPING_N_S_PER_M,
     FREE_LENGTH_M,
@@ -24,19 +24,21 @@ SINE = {"kind": "sine", "amplitude_n": 40.0, "frequency_hz": 2.0}
 
 def _run(
     *effects: dict[str, dict[str, float]], seconds: float = 5.0, drive=SINE, **more
-) -> Trajectory:
+) -> BenchTrajectory:
     config = linear_bench(components=(drive,), effects=effects, **more)
     return simulate(config, round(seconds * SECOND_NS))
 
 
-def _extra_force_n(trajectory: Trajectory) -> np.ndarray:
+def _extra_force_n(trajectory: BenchTrajectory) -> np.ndarray:
     """Force beyond that of the linear spring and damper, shape (records,)."""
     linear_n = -STIFFNESS_N_PER_M * (trajectory.height_m - FREE_LENGTH_M)
     linear_n -= DAMPING_N_S_PER_M * trajectory.velocity_m_per_s
     return (trajectory.strut_force_n - linear_n)[:, 0]
 
 
-def _follows(trajectory: Trajectory, law: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
+def _follows(
+    trajectory: BenchTrajectory, law: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> None:
     """Check that the extra force is a law of deflection and rate of height."""
     deflection_m = trajectory.height_m[:, 0] - FREE_LENGTH_M
     velocity_m_per_s = trajectory.velocity_m_per_s[:, 0]

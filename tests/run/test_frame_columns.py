@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.log.frame_columns import FrameColumns, received_frames
-from rig.log.reader import format_frame, parse_frame
+from rig.log.candump import format_frame, parse_frame
+from rig.log.frame_columns import FrameColumns, read_frame_columns
 
 EPOCH_NS = 1_700_000_000_123_456_789
 LENGTHS = [*range(9), 12, 16, 20, 24, 32, 48, 64]
@@ -53,7 +53,7 @@ def test_columns_are_the_received_frames_in_their_order(drawn, tmp_path_factory)
     lines = [format_frame(frame, EPOCH_NS, "can0", direction) for frame, direction in drawn]
     path.write_text("".join(lines), "ascii")
     received = [frame for frame, direction in drawn if direction == "R"]
-    assert rows(received_frames([path], EPOCH_NS)) == expected(received)
+    assert rows(read_frame_columns([path], EPOCH_NS)) == expected(received)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_columns_are_the_received_frames_in_their_order(drawn, tmp_path_factory)
 def test_lines_of_other_programs_are_read_as_parse_frame_reads_them(line, tmp_path):
     path = tmp_path / "frames.log"
     path.write_text(line + "\n", "ascii")
-    assert rows(received_frames([path], 0)) == expected([parse_frame(line, 0)[0]])
+    assert rows(read_frame_columns([path], 0)) == expected([parse_frame(line, 0)[0]])
 
 
 @given(text=st.text("(01.)9 can#AF RT\n", max_size=60), data=st.data())
@@ -83,10 +83,10 @@ def test_any_text_is_read_as_lines_are_or_refused(text, data, tmp_path_factory):
         parsed = [parse_frame(line, 0) for line in lines if not line.endswith("T")]
     except (ValueError, IndexError):
         with pytest.raises(InputError, match=r"frames\.log: line \d+: .*expected a line"):
-            received_frames([path], 0)
+            read_frame_columns([path], 0)
     else:
         found = [frame for frame, direction in parsed if direction == "R"]
-        assert rows(received_frames([path], 0)) == expected(found)
+        assert rows(read_frame_columns([path], 0)) == expected(found)
 
 
 def test_a_line_that_is_no_frame_is_named(tmp_path):
@@ -94,19 +94,19 @@ def test_a_line_that_is_no_frame_is_named(tmp_path):
     good = "(1.000000000) can0 100#0102 R\n"
     path.write_text(good * 3 + "rubbish\n" + good, "ascii")
     with pytest.raises(InputError, match=r"frames\.log: line 4: 'rubbish': expected a line such"):
-        received_frames([path], 0)
+        read_frame_columns([path], 0)
 
 
 def test_a_last_line_without_an_end_is_left_out(tmp_path):
     path = tmp_path / "frames.log"
     good = "(1.000000000) can0 100#0102 R\n"
     path.write_text(good * 3 + good[:-4], "ascii")
-    assert len(received_frames([path], 0).t_ns) == 3
+    assert len(read_frame_columns([path], 0).t_ns) == 3
 
 
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match=r"frames\.log: cannot be read: No such file"):
-        received_frames([tmp_path / "frames.log"], 0)
+        read_frame_columns([tmp_path / "frames.log"], 0)
 
 
 @pytest.mark.parametrize("stamp", ["9999999999.000000000", "99000000000.000000000", "-5.000000000"])
@@ -115,4 +115,4 @@ def test_a_time_that_cannot_be_is_refused(tmp_path, stamp):
     good = "(1.000000000) can0 100#0102 R\n"
     path.write_text(f"{good}({stamp}) can0 100#0102 R\n", "ascii")
     with pytest.raises(InputError, match=r"frames\.log: line 2: "):
-        received_frames([path], 0)
+        read_frame_columns([path], 0)

@@ -14,7 +14,8 @@ import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
 from can_dbc.errors import InputError
-from rig.log.reader import FRAMES_FILE, STEPS_FILE, read_run
+from rig.log.file_names import FRAMES_FILE, STEPS_FILE
+from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.plan.plan import Plan

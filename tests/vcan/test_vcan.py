@@ -17,12 +17,13 @@ from can_dbc.frame import Frame
 from can_dbc.protection import check_crc
 from rig.bridge.values import Mode
 from rig.bus.bus import Bus, BusConfig
-from rig.log.reader import RunFolder, parse_frame, read_run
+from rig.log.candump import parse_frame
+from rig.log.reader import RunFolder, read_run
 from rig.plan.build import build_bridge
 from rig.plan.load import load_plan
 from rig.run.replay import replay
+from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.simulated import Bench
 from tests.vcan.conftest import BENCH_IDS, RATE_HZ, Files, in_process, run_for, running
 
 pytestmark = pytest.mark.vcan
@@ -75,7 +76,10 @@ def logged_error_n(found: RunFolder, dbc: Path) -> float:
 def lockstep_error_n(files: Files, age_ns: int, ticks_ns: list[int]) -> float:
     """The force error without processes and clocks, with measurements of a given age."""
     ready = load_plan(files.bridge("vcan0"))
-    bridge, bench = build_bridge(ready), Bench(load_bench_config(files.bench), ready.database)
+    bridge, bench = (
+        build_bridge(ready),
+        SimulatedBench(load_bench_config(files.bench), ready.database),
+    )
     message = cantools.database.load_file(files.dbc).get_message_by_name("BENCH_AUXILIARY")
     state, cell, t_ns, force_n = bridge.init(0), [], [], []
     for tick_ns in ticks_ns:

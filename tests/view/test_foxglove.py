@@ -10,9 +10,10 @@ import yaml
 
 from can_dbc.errors import InputError
 from rig.formats.run_arrays import open_run
+from rig.log.file_names import CHANGES_FILE
 from rig.pages.view import foxglove
 from rig.pages.view.foxglove import FoxgloveView, Playback
-from rig.run.changes import CHANGES_FILE, change_line
+from rig.run.changes import change_line
 from tests.view.browser import browser, needs_chromium, until
 from tests.view.serving import COUNT, make_run
 

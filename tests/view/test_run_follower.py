@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rig.log.file_names import part_name
 from rig.log.follower import BUCKET, FLAGS, RunFollower
-from rig.log.reader import END_OF_STREAM, part_name
-from rig.log.steps import Step, StepRows
+from rig.log.steps import END_OF_STREAM, Step, StepRows
 
 MS = 1_000_000
 NAMES = ("force_n", "sparse_m")

@@ -11,8 +11,9 @@ from can_dbc.bus_load import frame_time_s
 from can_dbc.database import load_database
 from can_dbc.errors import InputError
 from dart_model.spec import ModelSpec, load_model
+from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
 from rig.log.follower import RunFollower
-from rig.log.reader import DBC_FILE, MODEL_FILE, RUN_FILE, read_header
+from rig.log.reader import read_header
 
 _SILENT_S = 2.0
 """Time without a write after which a run without an ending counts as killed."""

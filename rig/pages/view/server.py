@@ -20,7 +20,7 @@ import numpy as np
 from can_dbc.errors import InputError
 from dart_model.spec import ModelSpec
 from rig.diagnosis.outcome import REPORT_FILE
-from rig.log.reader import MODEL_FILE
+from rig.log.file_names import MODEL_FILE
 from rig.pages import charts
 from rig.pages.view import visible_stretch
 from rig.pages.view.diagnosis_job import DiagnosisJob

@@ -13,8 +13,9 @@ from dart_model.effects import AMBIENT_C
 from dart_model.plant.strut import Strut, struts_of
 from dart_model.spec import ModelSpec
 from rig.channels.quantities import TEMPERATURE
+from rig.log.candump import LATEST_S, parse_frame
+from rig.log.file_names import FRAMES_FILE, parts
 from rig.log.follower import RunFollower
-from rig.log.reader import FRAMES_FILE, LATEST_S, parse_frame, parts
 from rig.pages.plotted_quantities import (
     ESTIMATED_FORCE,
     LOAD_CELL,

@@ -1,8 +1,8 @@
 """The simulated bench on the bus: its sensors, and the frames that it sends.
 
-`Bench.update(now_ns)` gives the frames that are due and the time to come back, so the one who calls
-owns the clock: a virtual one in lockstep, the real one otherwise. The bench listens to nothing, so
-its motion is the same whatever the bridge does.
+`SimulatedBench.update(now_ns)` returns the frames that are due and the time of the next ones, so
+that the caller owns the clock: a virtual one in lockstep, the real one otherwise. The bench
+receives nothing: its motion is the same whatever the bridge does.
 """
 
 import heapq
@@ -19,20 +19,20 @@ from can_dbc.units import Dimension
 from rig.simulated_bench.assembly import assemble
 from rig.simulated_bench.equations_of_motion import RECORD_COLUMNS, RECORD_EXTRA
 from rig.simulated_bench.schema import BenchConfig, BenchConfigError, Transmission
-from rig.simulated_bench.trajectory import Motion, advanced, regular_grid
+from rig.simulated_bench.trajectory import BenchState, advance_records, regular_grid
 
 RECORDS_AHEAD = 4
 """Records computed in one go: few enough not to delay a loop, enough to share the overhead."""
 
 RECORDS_KEPT = 4096
-"""Records kept for `Bench.truth`."""
+"""Records kept for `SimulatedBench.truth`."""
 
 SHORTEST_GRID_NS = 10_000
 """Smallest common divisor of all periods that is accepted."""
 
 
 class StrutTruth(NamedTuple):
-    """What a strut really does.
+    """True motion and force of a strut at one time.
 
     Attributes:
         height_m: Height in m.
@@ -46,7 +46,7 @@ class StrutTruth(NamedTuple):
 
 
 class BenchTruth(NamedTuple):
-    """What the bench really does at one time.
+    """True state of the bench at one time.
 
     Attributes:
         t_ns: Time on the caller's clock.
@@ -64,7 +64,7 @@ class BenchTruth(NamedTuple):
 
 
 class _Channel(NamedTuple):
-    """One measured quantity: where it stands in a record, its noise and the noise's source."""
+    """One measured quantity: its column of a record, its noise and the noise's source."""
 
     signal: str
     dimension: Dimension
@@ -73,7 +73,7 @@ class _Channel(NamedTuple):
     noise: np.random.Generator
 
     def measure(self, record: list[float]) -> float:
-        """Read the quantity, with noise."""
+        """The quantity, with noise."""
         value = record[self.column]
         if self.noise_std > 0.0:
             value += self.noise_std * self.noise.standard_normal()
@@ -81,7 +81,7 @@ class _Channel(NamedTuple):
 
 
 class _Sender:
-    """One message: its sensors, its counter, and how its frames travel."""
+    """One message: its sensors, its counter, and the delay and loss of its frames."""
 
     def __init__(self, config: BenchConfig, index: int, database: Database) -> None:
         self.transmission = config.transmissions[index]
@@ -126,7 +126,7 @@ class _Sender:
         )
 
 
-class Bench:
+class SimulatedBench:
     """A bench that moves by its own laws and reports on the bus.
 
     Args:
@@ -154,7 +154,7 @@ class Bench:
         self._period_ns = period_ns
         self._grid = regular_grid(config, period_ns)
         self._assembly = assemble(config)
-        self._motion = Motion(0, self._assembly.start)
+        self._motion = BenchState(0, self._assembly.start)
         columns = RECORD_COLUMNS * len(config.struts) + RECORD_EXTRA
         self._records = np.empty((RECORDS_KEPT, columns))
         self._queue: list[tuple[int, int, int, Frame]] = []
@@ -167,7 +167,7 @@ class Bench:
         return sum(sender.saturated_frames for sender in self._senders)
 
     def update(self, now_ns: int) -> tuple[list[Frame], int]:
-        """Give the frames that were sent up to a time.
+        """The frames that were sent up to a time.
 
         Args:
             now_ns: Time on the caller's clock.
@@ -189,7 +189,7 @@ class Bench:
         return frames, self._next_due_ns()
 
     def truth(self, t_ns: int) -> BenchTruth:
-        """What the bench really does at a time.
+        """True state of the bench at a time.
 
         At the sensors' sample times the values are those that were sampled. Between, heights follow
         a cubic and the rest a straight line.
@@ -234,7 +234,9 @@ class Bench:
 
     def _advance(self) -> None:
         first = self._motion.records % RECORDS_KEPT
-        self._motion, records = advanced(self._assembly, self._grid, self._motion, RECORDS_AHEAD)
+        self._motion, records = advance_records(
+            self._assembly, self._grid, self._motion, RECORDS_AHEAD
+        )
         self._records[first : first + RECORDS_AHEAD] = records
 
     def _next_sender(self) -> _Sender:
@@ -293,9 +295,9 @@ def _channels(
 def _between(before: list[float], after: list[float], share: float, period_s: float) -> list[float]:
     """Record at a share of the way: heights by their rates (Hermite), the rest straight."""
     record = [a + share * (b - a) for a, b in zip(before, after, strict=True)]
-    left = 1.0 - share
+    rest = 1.0 - share
     for i in range(0, len(record) - RECORD_EXTRA, RECORD_COLUMNS):
         chord = after[i] - before[i]
-        bend = left * (before[i + 1] * period_s - chord) - share * (after[i + 1] * period_s - chord)
-        record[i] += share * left * bend
+        bend = rest * (before[i + 1] * period_s - chord) - share * (after[i + 1] * period_s - chord)
+        record[i] += share * rest * bend
     return record

@@ -1,0 +1,7 @@
+"""Error of a run's folder."""
+
+from can_dbc.errors import InputError
+
+
+class LogError(InputError):
+    """A run's folder is damaged, none, or cannot be written; one line: file, line, expectation."""

@@ -1,0 +1,33 @@
+"""Names of the files in a run's folder.
+
+    run.yaml        what was known before the first tick, and how the run ended
+    frames.log      every frame, received (R) and sent (T), in candump's format with ns
+    steps.arrow     one record a tick, as an Arrow IPC stream
+    model.yaml      the model
+    bus.dbc         the DBC
+    changes.jsonl   changes of the configuration during the run
+    timing.json     histograms of its ticks
+    trace.arrow     parts of its late ticks, if they were traced
+    captures/       windows around its faults, each a run folder
+
+Where a run was rotated, `frames.0001.log` and `steps.0001.arrow` follow, and so on.
+"""
+
+from pathlib import Path
+
+RUN_FILE, FRAMES_FILE, STEPS_FILE = "run.yaml", "frames.log", "steps.arrow"
+MODEL_FILE, DBC_FILE = "model.yaml", "bus.dbc"
+CHANGES_FILE, HISTOGRAMS_FILE, TRACE_FILE = "changes.jsonl", "timing.json", "trace.arrow"
+CAPTURES_FOLDER = "captures"
+
+
+def parts(folder: Path, name: str) -> list[Path]:
+    """A file of a run and what it was continued in, in their order."""
+    stem, _, ending = name.partition(".")
+    return [folder / name, *sorted(folder.glob(f"{stem}.[0-9][0-9][0-9][0-9].{ending}"))]
+
+
+def part_name(name: str, number: int) -> str:
+    """Name of a file's part; the first, number 0, has the plain name."""
+    stem, _, ending = name.partition(".")
+    return f"{stem}.{number:04d}.{ending}" if number else name

@@ -1,0 +1,64 @@
+"""When a run is continued in further files, and the two files of a part."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rig.log.file_names import FRAMES_FILE, STEPS_FILE, part_name
+from rig.log.steps import END_OF_STREAM
+from rig.log.whole_file import WholeFile
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """When a run is continued in further files; None for never.
+
+    Attributes:
+        size_bytes: Size of frames and steps together.
+        time_ns: Time of the run that they span.
+    """
+
+    size_bytes: int | None = None
+    time_ns: int | None = None
+
+
+class Part:
+    """Frames and steps of one part of a run, being written.
+
+    Args:
+        folder: The run's folder.
+        number: Number of the part, 0 for the first.
+        schema: Arrow schema of the steps.
+        begin_ns: Time of the run at its begin.
+
+    Raises:
+        OSError: A file cannot be created.
+    """
+
+    def __init__(self, folder: Path, number: int, schema: Any, begin_ns: int) -> None:
+        self.number = number
+        self.begin_ns = begin_ns
+        self.frames = WholeFile(folder / part_name(FRAMES_FILE, number))
+        try:
+            self.steps = WholeFile(folder / part_name(STEPS_FILE, number))
+            try:
+                self.steps.append(schema.serialize().to_pybytes())
+            except OSError:
+                self.steps.close()
+                raise
+        except OSError:
+            self.frames.close()
+            raise
+
+    @property
+    def size(self) -> int:
+        """Bytes of both files."""
+        return self.frames.size + self.steps.size
+
+    def close(self) -> None:
+        """End the Arrow stream and close both files."""
+        try:
+            self.steps.append(END_OF_STREAM)
+        finally:
+            self.steps.close()
+            self.frames.close()

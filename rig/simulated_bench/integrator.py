@@ -1,0 +1,105 @@
+"""Integrator of the bench's equations of motion.
+
+Reference: Hairer, Norsett, Wanner, "Solving Ordinary Differential Equations I" (1993), II.1.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rig.simulated_bench.compilation import Floats, compiled
+from rig.simulated_bench.drive import BenchDrive
+from rig.simulated_bench.equations_of_motion import (
+    INPUTS,
+    BenchMechanics,
+    derivatives,
+    observe,
+    prescribe,
+    write_inputs,
+)
+
+
+class IntegrationStep(NamedTuple):
+    """One step of the integrator.
+
+    Attributes:
+        t_s: Time at its start in s.
+        length_s: Length in s.
+    """
+
+    t_s: float
+    length_s: float
+
+
+class Span(NamedTuple):
+    """Consecutive records.
+
+    Attributes:
+        first: Index of the first record; record k is at `k * substeps * step_s`.
+        substeps: Steps of the integrator between records.
+        step_s: Length of a step in s.
+    """
+
+    first: int
+    substeps: int
+    step_s: float
+
+
+@compiled
+def runge_kutta_step(
+    mechanics: BenchMechanics, step: IntegrationStep, inputs: Floats, y: Floats, work: Floats
+) -> None:
+    """Advance the state by one step of the classical fourth-order method.
+
+    Args:
+        mechanics: The bench.
+        step: Time and length of the step.
+        inputs: Inputs at start, middle and end of the step, shape (3, INPUTS).
+        y: State, shape (states,); changed in place.
+        work: Scratch, shape (5, states).
+    """
+    t_s = step.t_s
+    step_s = step.length_s
+    half_s = 0.5 * step_s
+    derivatives(mechanics, t_s, inputs[0], y, work[0])
+    for j in range(y.shape[0]):
+        work[4, j] = y[j] + half_s * work[0, j]
+    derivatives(mechanics, t_s + half_s, inputs[1], work[4], work[1])
+    for j in range(y.shape[0]):
+        work[4, j] = y[j] + half_s * work[1, j]
+    derivatives(mechanics, t_s + half_s, inputs[1], work[4], work[2])
+    for j in range(y.shape[0]):
+        work[4, j] = y[j] + step_s * work[2, j]
+    derivatives(mechanics, t_s + step_s, inputs[2], work[4], work[3])
+    for j in range(y.shape[0]):
+        slope = work[0, j] + 2.0 * (work[1, j] + work[2, j]) + work[3, j]
+        y[j] += step_s / 6.0 * slope
+    prescribe(mechanics, inputs[2], y)
+
+
+@compiled
+def advance(
+    mechanics: BenchMechanics, drive: BenchDrive, span: Span, y: Floats, records: Floats
+) -> None:
+    """Write records at equal times, advancing the state to the time after the last one.
+
+    Args:
+        mechanics: The bench.
+        drive: Applied force and prescribed motion.
+        span: The records, and the steps between them.
+        y: State at the first record, shape (states,); changed in place.
+        records: Receives the records, shape (records, RECORD_COLUMNS * n + RECORD_EXTRA).
+    """
+    work = np.zeros((5, y.shape[0]))
+    inputs = np.zeros((3, INPUTS))
+    step_s = span.step_s
+    for row in range(records.shape[0]):
+        start = (span.first + row) * span.substeps
+        write_inputs(mechanics, drive, start * step_s, inputs[2])
+        prescribe(mechanics, inputs[2], y)
+        observe(mechanics, drive, start * step_s, y, records[row])
+        for i in range(start, start + span.substeps):
+            inputs[0] = inputs[2]
+            write_inputs(mechanics, drive, (i + 0.5) * step_s, inputs[1])
+            write_inputs(mechanics, drive, (i + 1) * step_s, inputs[2])
+            runge_kutta_step(mechanics, IntegrationStep(i * step_s, step_s), inputs, y, work)
