@@ -129,7 +129,7 @@ def read_csv(path: Path, struts: Sequence[str] | None = None) -> Recording:
         missing = names[[height is None for height in heights].index(True)]
         raise RecordingError(f"{name}: header: expected a column height_m:{missing}")
     cells = [_column_of(name, values, "strut_force_n", strut, names) for strut in names]
-    return checked(
+    return check_recording(
         Recording(
             name,
             values["t_s"],
@@ -291,7 +291,7 @@ def read_run(folder: Path) -> Recording:
             "signals.load_cell_force in its configuration, and frames of it"
         )
     # The bus carries one load cell; with several struts nothing says whose it is.
-    return checked(
+    return check_recording(
         Recording(
             folder.name,
             t_s,
@@ -365,7 +365,7 @@ def _nearest(t_s: Array, own_t_s: Array, values: Array, half_s: float) -> Array:
 # --- Checks -----------------------------------------------------------------------------------
 
 
-def checked(recording: Recording) -> Recording:
+def check_recording(recording: Recording) -> Recording:
     """The recording, or an error for what would mislead; single missing heights are allowed.
 
     Raises:

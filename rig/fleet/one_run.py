@@ -24,7 +24,7 @@ from dart_model.spec import ModelSpec, parse_model
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.outcome import Estimate, FoundEffect
 from rig.diagnosis.recording import Recording, read_recording
-from rig.diagnosis.refit import refitted
+from rig.diagnosis.refit import refit_parameters
 from rig.dyno.characterise import characterise
 from rig.fleet.sources import Source, shown
 from rig.log.reader import RUN_FILE
@@ -195,7 +195,7 @@ def _evaluated(task: Task) -> Row:
     found = diagnose(spec, [recording]).diagnosis
     own = [
         _value("model", item.strut, item.effect, item.parameter, item.estimate)
-        for item in refitted(spec, [recording])
+        for item in refit_parameters(spec, [recording])
     ]
     new = [value for item in found.effects for value in _found(item)]
     held_out = found.held_out

@@ -15,7 +15,7 @@ class SelectionCriteria:
     Attributes:
         blocks: Blocks of cross-validation over all recordings: the standard error of a sum over
             them is then known to an eighth (1 / sqrt(2 * blocks)), and each holds some periods.
-        kept_every: Without held-out runs, one block of so many is held out to be judged on; a
+        held_out_every: Without held-out runs, one block of so many is held out to be judged on; a
             fifth is usual (Hastie, Tibshirani, Friedman, The Elements of Statistical Learning,
             2009, 7.10).
         screened: Laws of each round whose parameters are refined before they are compared: their
@@ -67,7 +67,7 @@ class SelectionCriteria:
     """
 
     blocks: int = 32
-    kept_every: int = 5
+    held_out_every: int = 5
     screened: int = 10
     beam: int = 3
     most_laws: int = 3
