@@ -1,12 +1,13 @@
 """Recordings of a bench: what was measured, read from CSV or from a run folder, and checked.
 
-A recording that cannot be diagnosed is refused here with one line that says what is wrong and what
-would help, before anything is computed from it.
+A recording that cannot be diagnosed is refused before anything is computed from it, with one line:
+what is wrong, and what to do.
 """
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import cast
 
@@ -18,7 +19,8 @@ from can_dbc.codec import decode_log
 from can_dbc.database import Message
 from can_dbc.errors import InputError
 from can_dbc.protection import check_crc_log
-from rig.log.reader import RunFolder
+from dart_model.spec import ModelSpec
+from rig.log.reader import STEPS_FILE, RunFolder, parts
 from rig.plan.config import SignalName
 from rig.plan.quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, TEMPERATURE, Quantity
 from rig.plan.setup import Setup
@@ -36,14 +38,16 @@ _LEAST_DURATION_S = 0.5
 _LARGEST_BYTES = 2_000_000_000
 _LARGEST_SAMPLES = 5_000_000
 _LARGEST_HEIGHT_M = 100.0
+_LONGEST_DURATION_S = 600.0
+"""A longer recording adds nothing about a strut, and takes minutes."""
 _MOST_MISSING = 0.3
 """Share of missing heights above which a sensor is taken for broken."""
 _LONGEST_STEP_S = 0.05
 """Usual time between samples above which a time in other units is more likely."""
 _LONGEST_PLATEAU = 0.002
-"""Share of the samples that a signal that is not clipped may stand at its extreme value on end."""
+"""Share of the samples for which an unclipped signal may stay at its extreme value at a time."""
 _STANDS = 4
-"""Samples on end at an extreme value that are no coincidence."""
+"""Consecutive samples at an extreme value that are no coincidence."""
 _FULL_SPEED = 0.3
 """Share of its usual speed with which a signal enters a plateau by being clipped: one that comes
 to rest slows down before."""
@@ -65,6 +69,7 @@ class Recording:
         strut_forces_n: Load-cell force of each strut, shape (N, struts), a column of NaN for a
             strut without a cell; None where there is no cell.
         temperature_c: Damper temperature, shape (N,), or None.
+        sha256: Of the file, or of the run's steps, in hex; None where it was not read from one.
     """
 
     name: str
@@ -73,6 +78,7 @@ class Recording:
     applied_force_n: Array | None = None
     strut_forces_n: Array | None = None
     temperature_c: Array | None = None
+    sha256: str | None = None
 
     @property
     def duration_s(self) -> float:
@@ -92,10 +98,20 @@ def read_recording(path: Path, struts: Sequence[str] | None = None) -> Recording
         RecordingError: It holds nothing that can be diagnosed.
     """
     if path.is_dir():
-        return read_run(path)
+        return replace(read_run(path), sha256=_sha256(parts(path, STEPS_FILE)))
     if not path.is_file():
         raise InputError(f"{path}: no such run, expected a run's folder or a CSV file")
-    return read_csv(path, struts)
+    return replace(read_csv(path, struts), sha256=_sha256([path]))
+
+
+def _sha256(files: Iterable[Path]) -> str:
+    """SHA-256 of files, one after another, in hex."""
+    digest = sha256()
+    for path in files:
+        with path.open("rb") as file:
+            while piece := file.read(1 << 20):
+                digest.update(piece)
+    return digest.hexdigest()
 
 
 # --- CSV --------------------------------------------------------------------------------------
@@ -267,8 +283,8 @@ def read_run(folder: Path) -> Recording:
         InputError: The run is damaged, or holds no height.
         RecordingError: It holds nothing that can be diagnosed.
     """
-    found, ready = setup_of_run(folder)
-    payloads = _payloads(found, ready)
+    run, ready = setup_of_run(folder)
+    payloads = _payloads(run, ready)
     signals = ready.config.signals
     heights = [_channel(ready, payloads, entry, HEIGHT) for entry in signals.height.values()]
     for (name, entry), (t_s, _) in zip(signals.height.items(), heights, strict=True):
@@ -290,7 +306,7 @@ def read_run(folder: Path) -> Recording:
             f"{folder}: has heights alone, expected signals.applied_force or "
             "signals.load_cell_force in its configuration, and frames of it"
         )
-    # The bus carries one load cell; with several struts nothing says whose it is.
+    # The bus carries one load cell; with several struts its strut is not known.
     return check_recording(
         Recording(
             folder.name,
@@ -306,26 +322,26 @@ def read_run(folder: Path) -> Recording:
 _Payloads = dict[str, tuple[NDArray[np.int64], NDArray[np.uint8]]]
 
 
-def _payloads(found: RunFolder, ready: Setup) -> _Payloads:
+def _payloads(run: RunFolder, ready: Setup) -> _Payloads:
     """Times and payloads of every received message, wrong lengths left out."""
     names = sorted({entry.message for entry in ready.config.signals.named().values()})
     messages = [ready.database.message(name) for name in names]
     directory = Directory(messages)
     times: list[list[int]] = [[] for _ in messages]
     data: list[list[bytes]] = [[] for _ in messages]
-    for frame, direction in found.frames():
-        place = directory.place(frame.arbitration_id, frame.is_extended)
-        if place is None or direction != "R" or frame.is_error:
+    for frame, direction in run.frames():
+        index = directory.place(frame.arbitration_id, frame.is_extended)
+        if index is None or direction != "R" or frame.is_error:
             continue
-        if len(frame.data) == messages[place].length_bytes:
-            times[place].append(frame.t_ns)
-            data[place].append(frame.data)
+        if len(frame.data) == messages[index].length_bytes:
+            times[index].append(frame.t_ns)
+            data[index].append(frame.data)
     return {
         message.name: (
-            np.array(times[place], dtype=np.int64),
-            np.frombuffer(b"".join(data[place]), dtype=np.uint8).reshape(-1, message.length_bytes),
+            np.array(times[index], dtype=np.int64),
+            np.frombuffer(b"".join(data[index]), dtype=np.uint8).reshape(-1, message.length_bytes),
         )
-        for place, message in enumerate(messages)
+        for index, message in enumerate(messages)
     }
 
 
@@ -345,7 +361,7 @@ def _channel(
 
 
 def _sample_times_s(t_ns: NDArray[np.int64], message: Message) -> Array:
-    """Times of sampling: on the grid of the cycle time where arrivals say that there is one."""
+    """Times of sampling in s: on the grid of the cycle time where the arrivals fit one."""
     cycle_ns = message.cycle_time_ns
     if cycle_ns is None or len(t_ns) == 0:
         return np.asarray(t_ns * 1e-9, dtype=np.float64)
@@ -366,10 +382,10 @@ def _nearest(t_s: Array, own_t_s: Array, values: Array, half_s: float) -> Array:
 
 
 def check_recording(recording: Recording) -> Recording:
-    """The recording, or an error for what would mislead; single missing heights are allowed.
+    """The recording itself; single missing heights are allowed.
 
     Raises:
-        RecordingError: See the module.
+        RecordingError: Its data would mislead: clipped, constant, in wrong units, too short.
     """
     name, t_s = recording.name, recording.t_s
     if len(t_s) < _LEAST_SAMPLES:
@@ -394,6 +410,26 @@ def check_recording(recording: Recording) -> Recording:
         if label == "strut_force_n":
             _check_clipped(name, label, "N", channel)
     return recording
+
+
+def check_fits(recording: Recording, spec: ModelSpec) -> None:
+    """Refuse a recording that does not belong to a model, or that misleads, see `check_recording`.
+
+    Raises:
+        RecordingError: See above.
+    """
+    check_recording(recording)
+    struts = len(spec.struts)
+    if recording.heights_m.shape[1] != struts:
+        raise RecordingError(
+            f"{recording.name}: {recording.heights_m.shape[1]} heights, model {spec.name} has "
+            f"{struts} struts, expected one height for each"
+        )
+    if recording.duration_s > _LONGEST_DURATION_S:
+        raise RecordingError(
+            f"{recording.name}: {recording.duration_s:.0f} s long, "
+            f"expected at most {_LONGEST_DURATION_S:.0f} s: cut it"
+        )
 
 
 def _channels(recording: Recording) -> Iterable[tuple[str, Array, str]]:
@@ -453,7 +489,7 @@ def _check_height(name: str, height_m: Array) -> None:
 
 
 def _check_clipped(name: str, label: str, unit: str, values: Array) -> None:
-    """Refuse a signal that stands at an extreme value which it entered at full speed."""
+    """Refuse a signal that stays at an extreme value which it reached at full speed."""
     steps = np.diff(np.unique(values))
     if len(steps) == 0 or float(np.ptp(values)) <= 50.0 * float(steps.min()):
         return
@@ -470,7 +506,7 @@ def _check_clipped(name: str, label: str, unit: str, values: Array) -> None:
             if first > 0
         ]
         if not speeds or float(np.median(speeds)) < _FULL_SPEED * usual:
-            continue  # It came to rest there.
+            continue  # The signal came to rest.
         raise RecordingError(
             f"{name}: {label} stays at its {extreme} value {limit:.6g} {unit} for {length} "
             "samples on end, expected a sensor that is not clipped: widen its range or reduce "

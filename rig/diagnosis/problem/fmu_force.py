@@ -1,4 +1,4 @@
-"""The force of an FMU as a part of the mechanism: along the measured motion, and linear about it.
+"""The force of an FMU along a measured motion, and linear about it.
 
 No compiled loop can call an FMU. As with a tabulated mechanism, a simulation that converges to the
 measurement converges to the FMU; the reported figures are computed by the FMU itself.
@@ -9,15 +9,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.plant import DartPlant
 from dart_model.plant.fmu import MockUp
 from rig.diagnosis.problem.grid import Track
-from rig.diagnosis.problem.mechanism import (
-    LinearisedMechanism,
-    MechanismPlants,
-    constant_mechanism,
-    tabulate_mechanism,
-)
 
 Array = NDArray[np.float64]
 
@@ -28,47 +21,6 @@ _LEAST_REACH = 1e-9
 """Least secant in m and m/s, for a strut that stands still, which is refused later."""
 _LONGEST_STATE_STEP_S = 0.5e-3
 """Longest step of an FMU's internal states: that of a strut whose motion is prescribed."""
-
-
-def mechanism_along(plants: MechanismPlants, motion: Track) -> LinearisedMechanism:
-    """The mechanism along a measured motion: constant where it can be, and with FMUs' forces."""
-    if plants.plain.is_constant:
-        mechanism = constant_mechanism(plants)
-    else:
-        mechanism = tabulate_mechanism(plants, motion.heights_m.T, motion.velocities_m_per_s.T)
-    return _with_mockups(mechanism, plants.plain, motion)
-
-
-def _with_mockups(
-    mechanism: LinearisedMechanism, plant: DartPlant, motion: Track
-) -> LinearisedMechanism:
-    """The mechanism with the forces of FMUs, along a motion and linear about it.
-
-    Args:
-        mechanism: Without them, constant or along the motion.
-        plant: The model.
-        motion: The measured motion, with the applied force; N nodes.
-    """
-    if not any(plant.mockups):
-        return mechanism
-    nodes = len(motion.t_s)
-    m = LinearisedMechanism(*(np.repeat(part, nodes // len(part), axis=0) for part in mechanism))
-    heights_m, velocities = motion.heights_m.T, motion.velocities_m_per_s.T
-    q = m.q + _solve_coordinates(m.jacobian, heights_m - m.heights_m)
-    v = _solve_coordinates(m.jacobian, velocities)
-    bias = m.bias + np.einsum("kij,kj->ki", m.bias_q, q - m.q)
-    bias = bias + np.einsum("kij,kj->ki", m.bias_v, v - m.v)
-    bias_q, bias_v = m.bias_q, m.bias_v
-    for strut, mockup in enumerate(plant.mockups):
-        if mockup is not None:
-            row = m.jacobian[:, strut]
-            force_n, by_height, by_velocity = forces_along(mockup, strut, motion)
-            square = row[:, :, np.newaxis] * row[:, np.newaxis, :]
-            bias = bias + row * force_n[:, np.newaxis]
-            bias_q = bias_q + square * by_height[:, np.newaxis, np.newaxis]
-            bias_v = bias_v + square * by_velocity[:, np.newaxis, np.newaxis]
-    linearised = m._replace(q=q, v=v, heights_m=heights_m, bias=bias, bias_q=bias_q, bias_v=bias_v)
-    return LinearisedMechanism(*(np.ascontiguousarray(part) for part in linearised))
 
 
 def forces_along(mockup: MockUp, strut: int, motion: Track) -> tuple[Array, Array, Array]:
@@ -107,8 +59,3 @@ def forces_along(mockup: MockUp, strut: int, motion: Track) -> tuple[Array, Arra
                 half = states + 0.5 * h * rates(begin, states)
                 states = states + h * rates(middle, half)
     return forces[0], forces[1], forces[2]
-
-
-def _solve_coordinates(jacobian: Array, heights: Array) -> Array:
-    """Coordinates (K, n) of heights (K, struts), about the reference."""
-    return np.asarray(np.linalg.solve(jacobian, heights[..., np.newaxis])[..., 0], np.float64)

@@ -30,7 +30,6 @@ from rig.diagnosis.problem.driven_run import (
     first_motion,
     input_noise_n,
 )
-from rig.diagnosis.problem.fmu_force import mechanism_along
 from rig.diagnosis.problem.grid import (
     RecordingGrid,
     SmoothRecording,
@@ -40,7 +39,7 @@ from rig.diagnosis.problem.grid import (
     fine_times,
 )
 from rig.diagnosis.problem.linear_dynamics import FilterMechanism, LinearDynamics, system_matrix
-from rig.diagnosis.problem.mechanism import LinearisedMechanism
+from rig.diagnosis.problem.mechanism import LinearisedMechanism, mechanism_along
 from rig.diagnosis.problem.problem import (
     Candidate,
     CandidateModel,

@@ -4,11 +4,14 @@ Reference: Hampel, The influence curve and its role in robust estimation, JASA 6
 median absolute deviation as a scale that outliers do not move.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dart_model.effects import Motion
+from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.smoother import Noise, Smoothed, estimate_noise, smooth
 from rig.diagnosis.recording import Recording, RecordingError
 
@@ -217,6 +220,47 @@ def _place_on_nodes(recording: Recording) -> tuple[RecordingGrid, Integers]:
         outliers,
     )
     return grid, sample_nodes
+
+
+def _largest_force_std_n(recordings: Sequence[SmoothRecording]) -> float:
+    """Largest standard deviation of a measured force."""
+    channels = ((r.recording.applied_force_n, r.recording.strut_forces_n) for r in recordings)
+    return max(float(np.nanstd(c)) for pair in channels for c in pair if c is not None)
+
+
+def strut_motions(spec: ModelSpec, recordings: Sequence[SmoothRecording]) -> tuple[Motion, ...]:
+    """What each strut did on the recordings."""
+    grids, tracks = [r.grid for r in recordings], [r.motion for r in recordings]
+    largest_n = _largest_force_std_n(recordings)
+    warm = [grid.temperature_c for grid in grids if grid.has_temperature]
+    celsius = (NO_TEMPERATURE_C, NO_TEMPERATURE_C)
+    if warm:
+        celsius = (float(min(w.min() for w in warm)), float(max(w.max() for w in warm)))
+    motions: list[Motion] = []
+    for i, strut in enumerate(spec.struts):
+        z = np.concatenate([t.heights_m[i] for t in tracks])
+        w = np.concatenate([t.velocities_m_per_s[i] for t in tracks])
+        stroke = float(z.max() - z.min())
+        force = strut.stiffness_n_per_m * stroke + strut.damping_n_s_per_m * float(np.std(w))
+        motions.append(
+            Motion(
+                float(z.min()),
+                float(z.max()),
+                float(np.sqrt(np.mean(w**2))),
+                float(np.max(np.abs(w))),
+                min(float(np.ptp(t.heights_m[i])) for t in tracks),
+                max(grid.duration_s for grid in grids),
+                float(np.median([grid.step_s for grid in grids])),
+                strut.free_length_m,
+                strut.stiffness_n_per_m,
+                strut.damping_n_s_per_m,
+                1.0,
+                force or largest_n,
+                celsius,
+                (),
+            )
+        )
+    return tuple(motions)
 
 
 def block_numbers(t_s: Array, length_s: float) -> Integers:

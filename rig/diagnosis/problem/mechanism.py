@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from dart_model.plant import DartPlant
 from dart_model.spec import EffectSpec, ModelSpec
+from rig.diagnosis.problem.fmu_force import forces_along
+from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.recording import RecordingError
 
 Array = NDArray[np.float64]
@@ -125,6 +127,47 @@ def open_plants(spec: ModelSpec) -> MechanismPlants:
     return MechanismPlants(plain, heavier)
 
 
+def mechanism_along(plants: MechanismPlants, motion: Track) -> LinearisedMechanism:
+    """The mechanism along a measured motion: constant where it can be, and with FMUs' forces."""
+    if plants.plain.is_constant:
+        mechanism = constant_mechanism(plants)
+    else:
+        mechanism = tabulate_mechanism(plants, motion.heights_m.T, motion.velocities_m_per_s.T)
+    return _with_mockups(mechanism, plants.plain, motion)
+
+
+def _with_mockups(
+    mechanism: LinearisedMechanism, plant: DartPlant, motion: Track
+) -> LinearisedMechanism:
+    """The mechanism with the forces of FMUs, along a motion and linear about it.
+
+    Args:
+        mechanism: Without them, constant or along the motion.
+        plant: The model.
+        motion: The measured motion, with the applied force; N nodes.
+    """
+    if not any(plant.mockups):
+        return mechanism
+    nodes = len(motion.t_s)
+    m = LinearisedMechanism(*(np.repeat(part, nodes // len(part), axis=0) for part in mechanism))
+    heights_m, velocities = motion.heights_m.T, motion.velocities_m_per_s.T
+    q = m.q + _solve_coordinates(m.jacobian, heights_m - m.heights_m)
+    v = _solve_coordinates(m.jacobian, velocities)
+    bias = m.bias + np.einsum("kij,kj->ki", m.bias_q, q - m.q)
+    bias = bias + np.einsum("kij,kj->ki", m.bias_v, v - m.v)
+    bias_q, bias_v = m.bias_q, m.bias_v
+    for strut, mockup in enumerate(plant.mockups):
+        if mockup is not None:
+            row = m.jacobian[:, strut]
+            force_n, by_height, by_velocity = forces_along(mockup, strut, motion)
+            square = row[:, :, np.newaxis] * row[:, np.newaxis, :]
+            bias = bias + row * force_n[:, np.newaxis]
+            bias_q = bias_q + square * by_height[:, np.newaxis, np.newaxis]
+            bias_v = bias_v + square * by_velocity[:, np.newaxis, np.newaxis]
+    linearised = m._replace(q=q, v=v, heights_m=heights_m, bias=bias, bias_q=bias_q, bias_v=bias_v)
+    return LinearisedMechanism(*(np.ascontiguousarray(part) for part in linearised))
+
+
 def constant_mechanism(plants: MechanismPlants) -> LinearisedMechanism:
     """The mechanism of bodies on straight guides."""
     n = plants.plain.coordinates
@@ -183,3 +226,8 @@ def _stack(entries: list[LinearisedMechanism]) -> LinearisedMechanism:
     return LinearisedMechanism(
         *(np.ascontiguousarray(np.stack(part)) for part in zip(*entries, strict=True))
     )
+
+
+def _solve_coordinates(jacobian: Array, heights: Array) -> Array:
+    """Coordinates (K, n) of heights (K, struts), about the reference."""
+    return np.asarray(np.linalg.solve(jacobian, heights[..., np.newaxis])[..., 0], np.float64)

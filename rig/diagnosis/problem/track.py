@@ -5,11 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.effects import Motion
+from dart_model.effects import Motion, effect
+from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.compiled import along, law
 from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.problem import (
     CandidateModel,
+    ExistingParameters,
     Problem,
     Segment,
     slots_of,
@@ -27,6 +29,8 @@ _PIECES = 8
 _TURN = 0.5
 """Most that the fastest motion turns between samples: a cubic through heights and velocities then
 errs by less than a thousandth."""
+_NEGLIGIBLE = 1e-9
+"""Share of the strut's force below which an existing effect does not act on the recordings."""
 _NO_STATE = np.zeros(0)
 
 
@@ -129,6 +133,27 @@ def segment_forces(
             lead_forces[id(whole)] = law_force(whole, strut, name, values, constants)
         forces.append(np.interp(along.t_s, whole.t_s, lead_forces[id(whole)]))
     return forces
+
+
+def existing_effects(spec: ModelSpec, tracks: Sequence[Track]) -> tuple[ExistingParameters, ...]:
+    """Effects of a model, and whether each acts along motions so that it can be refitted."""
+    existing: list[ExistingParameters] = []
+    constants = np.array(
+        [
+            (s.free_length_m, s.stiffness_n_per_m, s.damping_n_s_per_m, spec.gravity_m_per_s2)
+            for s in spec.struts
+        ]
+    )
+    for i, strut in enumerate(spec.struts):
+        for item in strut.effects:
+            values = tuple(item.values())
+            spring = max(float(np.std(t.heights_m[i])) * strut.stiffness_n_per_m for t in tracks)
+            acting = not effect(item.name).linear and item.name != "restoring_surface"
+            if acting and item.name != "delay":
+                forces = [law_force(t, i, item.name, np.array(values), constants) for t in tracks]
+                acting = any(float(np.max(np.abs(f))) > _NEGLIGIBLE * spring for f in forces)
+            existing.append(ExistingParameters(i, item.name, values, acting))
+    return tuple(existing)
 
 
 def effect_forces(
