@@ -172,7 +172,7 @@ def _fit_to_all(
     for i, model in enumerate(models := searched.best_and_subsets()):
         progress("fitting all of the recordings", 0.5 * i / len(models))
         pool.adopt(model.fit)
-    pool.settle_best()
+    pool.converge_best()
     if not pool.is_formula(pool.least()):
         explore(pool, within(progress, 0.5, 1.0))
     return pool

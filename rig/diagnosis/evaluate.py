@@ -72,6 +72,6 @@ class HeldOutData(NamedTuple):
 
 
 def held_out_data(problems: Problems, learnt: Problem) -> HeldOutData:
-    """Held-out data, with the motions of the problem as the search left it."""
+    """Held-out data, with the motions of the problem at the end of the search."""
     held_out = replace(problems.evaluated, motions=learnt.motions)
     return HeldOutData(learnt, held_out, problems.by_blocks)

@@ -54,7 +54,7 @@ to rest slows down before."""
 
 
 class RecordingError(InputError):
-    """A recording that cannot be diagnosed; one line: file, column, what was found and expected."""
+    """A recording that cannot be diagnosed; one line: file, column, fault, what was expected."""
 
 
 @dataclass(frozen=True)
@@ -273,7 +273,7 @@ def _is_number(cell: str) -> bool:
 def read_run(folder: Path) -> Recording:
     """What the bench sent in a run, on the time of the first strut's height.
 
-    Frames with a wrong CRC or length are left out; single missing heights are NaN, the other
+    Frames with a wrong CRC or length are ignored; single missing heights are NaN, the other
     channels are linear between their samples.
 
     Args:
@@ -323,7 +323,7 @@ _Payloads = dict[str, tuple[NDArray[np.int64], NDArray[np.uint8]]]
 
 
 def _payloads(run: RunFolder, ready: Setup) -> _Payloads:
-    """Times and payloads of every received message, wrong lengths left out."""
+    """Times and payloads of every received message, frames of wrong length ignored."""
     names = sorted({entry.message for entry in ready.config.signals.named().values()})
     messages = [ready.database.message(name) for name in names]
     directory = Directory(messages)

@@ -398,7 +398,7 @@ def _outside(estimate: Estimate, value: float) -> bool:
 def _effects_hidden_from_bench(problem: Problem) -> tuple[RejectedEffect, ...]:
     """Effects that this kind of bench cannot show."""
     bench = "a prescribed motion" if problem.bench == "motion_given" else "this kind of bench"
-    strut, why = problem.spec.struts[0].name, f"{bench} does not show it"
+    strut, why = problem.spec.struts[0].name, f"{bench} cannot show it"
     return tuple(
         RejectedEffect(item.family, item.name, strut, why, None)
         for item in CATALOGUE.values()
@@ -457,16 +457,16 @@ def _fitted_series(
 def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[str, ...]:
     notes = [problem.assumption]
     if outliers := sum(grid.outliers for grid in problem.grids):
-        notes.append(f"{outliers} heights were found to be outliers and left out.")
+        notes.append(f"{outliers} heights are outliers and were removed.")
     if search.gain_alike:
         notes.append(
-            "A gain of the applied force looks the same as a change of mass, stiffness and damping "
-            "in one proportion: these data cannot separate the two; weighing the mass would."
+            "In these data a gain of the applied force is indistinguishable from a change of mass, "
+            "stiffness and damping in one proportion. Weigh the mass to separate the two."
         )
     if _resembles_hold(problem, search.chosen.fit):
         notes.append(
-            "The delay found is half a sampling interval: that is what an applied force looks like "
-            "under a zero-order hold. If the bench has one, nothing is wrong with it."
+            "The delay is half a sampling interval, which a zero-order hold of the applied force "
+            "causes. If the bench has such a hold, its applied force is not late."
         )
     if by_blocks:
         notes.append(
@@ -477,7 +477,7 @@ def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[
 
 
 def _resembles_hold(problem: Problem, result: Fit) -> bool:
-    """Whether there is a delay as a zero-order hold of the applied force would cause."""
+    """Whether there is a delay that a zero-order hold of the applied force would cause."""
     half_s = 0.5 * problem.motions[0].step_s
     index = slots_of(problem, result.candidate).index[len(result.candidate.kept) :]
     return any(

@@ -17,10 +17,10 @@ _STEP_ANGLE = 0.2
 _LONGEST_STEP_S = 1.25e-3
 """Longest step where the motion is slow: laws that switch need it."""
 _LARGEST_INPUT_NOISE = 0.01
-"""Share of an applied force's range above which what is not smooth is not noise but excitation."""
+"""Share of an applied force's range from which on its rough part is excitation, not noise."""
 _TOP = 0.8
 """Share of the sampled band above which a bench excites nothing: anti-aliasing filters and the
-actuator end below, so what is there is noise."""
+actuator end below, so that only noise is left above."""
 
 
 class LoadCells(NamedTuple):

@@ -126,7 +126,7 @@ def _simulate_heights(
     )
     no_forces = (0.0,) * len(plant.spec.struts)
     heights = np.empty((count, len(no_forces)))
-    applied = _interpolate_applied(run, count, steps).tolist()
+    applied = _interpolate_force(run, count, steps).tolist()
     lengths = (np.diff(grid.t_s[:count]) / steps).tolist()
     temperature = grid.temperature_c.tolist()
     for k in range(count):
@@ -139,7 +139,7 @@ def _simulate_heights(
     return heights
 
 
-def _interpolate_applied(run: DrivenRun, count: int, steps: int) -> Array:
+def _interpolate_force(run: DrivenRun, count: int, steps: int) -> Array:
     """Applied force at `steps` points between nodes, shape (steps * (count - 1) + 1,)."""
     parts = 2 * run.substeps
     fine = run.fine_n[: parts * (count - 1) + 1]

@@ -81,8 +81,8 @@ class DynoRun(NamedTuple):
     cell_noise_n: Array
 
     @property
-    def fitted(self) -> Flags:
-        """Nodes that take part in fits."""
+    def fit_nodes(self) -> Flags:
+        """Nodes that take part in fits, shape (N,)."""
         return self.grid.fitted & self.certain
 
     def cut(self, nodes: slice) -> "DynoRun":
@@ -170,7 +170,7 @@ class PrescribedProblem(Problem):
 
     def fit_nodes(self, k: int) -> Flags:
         """Nodes of a recording that take part in fits, shape (N,)."""
-        return self.runs[k].fitted
+        return self.runs[k].fit_nodes
 
     def cut(self, pieces: Sequence[tuple[int, slice]]) -> "PrescribedProblem":
         """The problem of pieces of recordings."""
@@ -190,7 +190,7 @@ class PrescribedProblem(Problem):
         return np.flatnonzero(np.isfinite(self.noise_n))
 
     def _rows(self, k: int) -> Integers:
-        return np.flatnonzero(self.runs[k].fitted)
+        return np.flatnonzero(self.runs[k].fit_nodes)
 
     def blocks(self, k: int) -> Integers:
         """Block of each row of a recording's residual."""
@@ -247,7 +247,7 @@ class PrescribedProblem(Problem):
             residual_n = self._residual_n(k, model)
             cuts = track.pieces(nodes[k], sum(nodes), most_samples, largest_stride)
             segments += [
-                self._segment(k, residual_n, cut) for cut in cuts if np.any(run.fitted[cut])
+                self._segment(k, residual_n, cut) for cut in cuts if np.any(run.fit_nodes[cut])
             ]
         return tuple(segments)
 
@@ -255,7 +255,7 @@ class PrescribedProblem(Problem):
         run = self.runs[k]
         whole = run.along
         along = whole.cut(cut)
-        rows = np.flatnonzero(run.fitted[cut])
+        rows = np.flatnonzero(run.fit_nodes[cut])
         numbers = block_numbers(whole.t_s, self.block_s)[cut][rows]
 
         def respond(strut: int, force: Array) -> Array:
@@ -365,7 +365,7 @@ def _check_channels(run: DynoRun, model_n: Array) -> None:
             )
         if own > 0.0 and float(np.mean(force * law)) < _OPPOSITE * swing * own:
             raise RecordingError(
-                f"{name}: strut_force_n goes against the model's force (correlation "
+                f"{name}: strut_force_n opposes the model's force (correlation "
                 f"{np.mean(force * law) / (swing * own):.2f}), expected a force that is positive "
-                "where the strut pushes its bodies apart: turn its sign"
+                "where the strut pushes its bodies apart: change its sign"
             )

@@ -64,8 +64,8 @@ def conclude(
 
     Args:
         pool: Models to choose from.
-        first: Models about the linear model, for what was not chosen.
-        first_round: Single laws there.
+        first: Models about the linear model, for the rejected laws.
+        first_round: Single laws about the linear model, where they were screened.
         progress: Called with what is being done and the share that is done.
     """
     progress("removing superfluous laws", 0.85)
@@ -132,12 +132,12 @@ def _simpler_models(
     if chosen.size > 1:
         # Its first fit may have ended in a side valley, which the larger model has left.
         is_fitted = less in pool.fits and pool.is_near(pool.fits[less], chosen)
-        is_fitted |= less in pool.settled and less in pool.invalid
+        is_fitted |= less in pool.converged and less in pool.invalid
         if not is_fitted and is_promising(
             refine(stage, less.new, [known[other] for other in less.new])
         ):
             pool.attempt(model_for(pool.problem, chosen.fit, less))
-        yield from _settle_candidate(pool, less, chosen)
+        yield from _converge_candidate(pool, less, chosen)
     for name in effect(law[1]).simpler:
         other = (law[0], name)
         if effect(name).linear or other in less.new:
@@ -147,7 +147,7 @@ def _simpler_models(
             for screening in rank_laws(stage, _as_screening(less.new, known), 1, [other]):
                 if screening.values and is_promising(screening):
                     pool.attempt_screening(stage, pool.linear, screening, FULL)
-        yield from _settle_candidate(pool, candidate, chosen)
+        yield from _converge_candidate(pool, candidate, chosen)
 
 
 def _as_screening(laws: Sequence[StrutEffect], known: Mapping[StrutEffect, Array]) -> Screening:
@@ -155,12 +155,12 @@ def _as_screening(laws: Sequence[StrutEffect], known: Mapping[StrutEffect, Array
     return Screening(tuple(laws), tuple(known[law] for law in laws), 0.0, np.zeros(1))
 
 
-def _settle_candidate(
+def _converge_candidate(
     pool: Pool, candidate: Candidate, chosen: ValidatedModel
 ) -> Iterable[ValidatedModel]:
     """A candidate's model, converged if it is near the chosen one; empty without a valid fit."""
     if candidate in pool.fits:
-        pool.settle(pool.fits[candidate], chosen)
+        pool.converge(pool.fits[candidate], chosen)
         if candidate not in pool.invalid:
             yield pool.fits[candidate]
 
@@ -331,7 +331,7 @@ def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] |
     return changes, free
 
 
-# --- what was not chosen --------------------------------------------------------------------------
+# --- rejected laws ----------------------------------------------------------------------------
 
 
 def _rejected_effects(
@@ -354,7 +354,7 @@ def _rejected_effects(
         nothing = first_round.nothing.cost
         residual = float(np.sqrt(max(screening.cost, 0.0) / max(nothing, 1e-300)))
         why = (
-            "cannot be told from what was chosen by these data"
+            "these data cannot distinguish it from the chosen model"
             if law in tied
             else _why_rejected(first, chosen.size, share, law, residual)
         )
@@ -372,6 +372,6 @@ def _why_rejected(first: Pool, laws: int, share: float, law: StrutEffect, residu
         ratio = float(np.sqrt(alone / max(share, 1e-300)))
         if laws == 1:
             return f"its out-of-sample residual is {ratio:.3g} times that of the chosen model"
-        return f"alone it leaves {ratio:.3g} times the out-of-sample residual of the chosen set"
-    taken = 100.0 * (1.0 - min(residual, 1.0))
-    return f"along the motion it takes {taken:.3g} % off the residual of the linear model"
+        return f"alone, its out-of-sample residual is {ratio:.3g} times that of the chosen model"
+    reduction = 100.0 * (1.0 - min(residual, 1.0))
+    return f"along the motion it reduces the residual of the linear model by {reduction:.3g} %"

@@ -53,7 +53,7 @@ def explore(pool: Pool, progress: Progress) -> FirstRound | None:
         _expand_best(pool, progress)
     else:
         first = _search_along_motion(pool, progress)
-    pool.settle_best()
+    pool.converge_best()
     return first
 
 
@@ -62,11 +62,11 @@ def _search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
     criteria = pool.criteria
     if pool.at_floor(pool.linear):
         return None
-    first = _singles(pool, progress)
+    first = _screen_single_laws(pool, progress)
     best = _best_refined([first.screenings])[:1]
     if not any(_gains(pool, pool.linear_stage, first.nothing, screening) for screening in best):
         pool.take_every_sample()
-        first = _singles(pool, progress)
+        first = _screen_single_laws(pool, progress)
     stage, beam = pool.linear_stage, [first.nothing]
     rounds: Sequence[Sequence[Screening]] = [first.screenings]
     levels: list[list[Screening]] = []
@@ -75,7 +75,7 @@ def _search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
         end = _EXPLORED * size / criteria.most_laws
         if levels:
             beam = _diverse(levels[-1], criteria.beam)
-            rounds = _rounds(pool, stage, beam, within(progress, begin, 0.5 * (begin + end)))
+            rounds = _screen_rounds(pool, stage, beam, within(progress, begin, 0.5 * (begin + end)))
         level = _best_refined(rounds)
         if not level or not _gains(pool, stage, min(beam, key=_cost), level[0]):
             break
@@ -83,14 +83,14 @@ def _search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
         levels.append(level)
         _fit_all(pool, stage, pool.linear, chosen, within(progress, 0.5 * (begin + end), end))
         # One law may imitate two. The search beyond a pair is about it, not the linear model.
-        if pool.at_floor(pool.settle_least()) or (size > 1 and pool.is_formula(pool.least())):
+        if pool.at_floor(pool.converge_least()) or (size > 1 and pool.is_formula(pool.least())):
             break
     return first
 
 
-def _singles(pool: Pool, progress: Progress) -> FirstRound:
+def _screen_single_laws(pool: Pool, progress: Progress) -> FirstRound:
     nothing = no_law(pool.linear_stage)
-    (screenings,) = _rounds(pool, pool.linear_stage, [nothing], progress)
+    (screenings,) = _screen_rounds(pool, pool.linear_stage, [nothing], progress)
     return FirstRound(nothing, tuple(screenings))
 
 
@@ -107,7 +107,7 @@ def _expand_best(pool: Pool, progress: Progress) -> None:
     turns = 2 * pool.criteria.most_laws
     for turn in range(turns):
         reference = pool.next_to_expand()
-        if pool.at_floor(pool.settle_least()) or reference.fit.candidate in expanded:
+        if pool.at_floor(pool.converge_least()) or reference.fit.candidate in expanded:
             return
         expanded.add(reference.fit.candidate)
         _expand(pool, reference, within(progress, turn / turns, (turn + 1) / turns))
@@ -127,14 +127,14 @@ def _expand(pool: Pool, reference: ValidatedModel, progress: Progress) -> None:
         else:
             _expand_along_motion(pool, reference, part)
         is_surpassed = not pool.is_near(reference, pool.next_to_expand())
-        if is_surpassed or pool.at_floor(pool.settle_least()):
+        if is_surpassed or pool.at_floor(pool.converge_least()):
             return
 
 
 def _expand_along_motion(pool: Pool, reference: ValidatedModel, progress: Progress) -> None:
     """Fit single laws in the order of the regression about a model's motion."""
     stage = stage_of(pool.problem, reference.fit.model)
-    rounds = _rounds(pool, stage, [no_law(stage)], within(progress, 0.0, 0.5))
+    rounds = _screen_rounds(pool, stage, [no_law(stage)], within(progress, 0.0, 0.5))
     level = [s for s in _best_refined(rounds) if s.laws != reference.fit.candidate.new]
     _fit_all(pool, stage, reference, _choose_for_fitting(pool, level), within(progress, 0.5, 1.0))
 
@@ -164,7 +164,7 @@ def _expand_in_simulation(
         pool.attempt(change.model)
 
 
-def _rounds(
+def _screen_rounds(
     pool: Pool, stage: Stage, beam: Sequence[Screening], progress: Progress
 ) -> list[list[Screening]]:
     """For each combination of a beam, that with one law more, best first."""

@@ -83,12 +83,12 @@ class ValidatedModel(NamedTuple):
 
 
 class Pool:
-    """Models that were fitted, by their effects; of two fits of one the better is kept.
+    """Fitted models by candidate; of two fits of one candidate the better is kept.
 
     Args:
         problem: Model and recordings.
         given: The nominal model, initial states fitted.
-        seeds: Models to begin with, the best linear one first.
+        seeds: First models, the best linear one first.
         criteria: What decides.
     """
 
@@ -99,7 +99,7 @@ class Pool:
         self.along = smooth_tracks(problem, given)
         self.fits: dict[Candidate, ValidatedModel] = {}
         self.invalid: dict[Candidate, str] = {}
-        self.settled: set[Candidate] = set()
+        self.converged: set[Candidate] = set()
         self.floors: dict[Candidate, tuple[ValidatedModel, float]] = {}
         self.tested: dict[Candidate, tuple[ValidatedModel, tuple[ModelChange, ...]]] = {}
         for seed in seeds:
@@ -139,7 +139,7 @@ class Pool:
         candidate = model.candidate
         result = self.refit(model, effort, most_level)
         if effort is FULL:
-            self.settled.add(candidate)
+            self.converged.add(candidate)
         if result is None:
             return
         validated = self.validate(result)
@@ -199,18 +199,18 @@ class Pool:
     def reject(self, candidate: Candidate, why: str) -> None:
         """Mark a candidate as invalid, for a reason that its last fit shows."""
         self.invalid[candidate] = why
-        self.settled.add(candidate)
+        self.converged.add(candidate)
 
-    def settle(self, model: ValidatedModel, best: ValidatedModel) -> None:
+    def converge(self, model: ValidatedModel, best: ValidatedModel) -> None:
         """Fit a model until converged if it comes near the best one."""
-        if model.size and self.is_near(model, best) and model.fit.candidate not in self.settled:
+        if model.size and self.is_near(model, best) and model.fit.candidate not in self.converged:
             self.attempt(model.fit.model, FULL)
 
-    def settle_best(self) -> None:
+    def converge_best(self) -> None:
         """Fit the models that may be chosen until converged."""
         best = self.best()
         for model in best:
-            self.settle(model, best[0])
+            self.converge(model, best[0])
 
     # --- what may be chosen -------------------------------------------------------------------
 
@@ -231,10 +231,10 @@ class Pool:
         best, valid = min(self.fits.values(), key=lambda model: model.cost), self.least()
         return valid if self.is_near(valid, best) else best
 
-    def settle_least(self) -> ValidatedModel:
+    def converge_least(self) -> ValidatedModel:
         """The best valid model, fitted until converged: the search ends if it is at the floor."""
         best = self.least()
-        self.settle(best, best)
+        self.converge(best, best)
         return self.least()
 
     def best(self) -> tuple[ValidatedModel, ...]:

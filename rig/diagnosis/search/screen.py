@@ -49,7 +49,7 @@ part in a hundred with far fewer."""
 _COARSE_SAMPLES = 4_000
 """Samples on which starts are compared."""
 _EVERY_SAMPLE = 1_000_000_000
-"""More than a recording may hold, so that none is left out."""
+"""More samples than any recording has, so that all are taken."""
 _REFINED_STARTS = 2
 """Starts of a law that are refined: its best one may lie in a side valley."""
 _SIDE_VALLEY = 2.0

@@ -84,7 +84,7 @@ def _find_unbounded_law(problem: Problem, result: Fit, criteria: SelectionCriter
         white = np.sqrt(power / max(result.mean_square, 1.0))
         robust = power / max(float(np.linalg.norm(scores)), _TINY)
         if min(float(white), robust) < criteria.bounded:
-            return f"the data do not bound its size ({name})"
+            return f"its size is not identifiable from these data ({name})"
     return None
 
 
@@ -103,7 +103,7 @@ def find_unidentifiable_law(problem: Problem, result: Fit) -> str | None:
     for row, name in _new(result):
         scaled = variables[row][list(effect(name).scaled or (0,))]
         if not np.any(half[scaled] < sizes[scaled]):
-            return f"the data do not bound its size ({name})"
+            return f"its size is not identifiable from these data ({name})"
     return None
 
 
