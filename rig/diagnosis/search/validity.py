@@ -60,7 +60,7 @@ def _new(result: Fit) -> list[tuple[int, str]]:
 
 
 def _find_unbounded_law(problem: Problem, result: Fit, criteria: SelectionCriteria) -> str | None:
-    """A law whose size, the linear part projected out, does not differ from zero."""
+    """Reason against a law whose size, the linear part projected out, does not differ from zero."""
     variables = effect_variables(problem, result)
     jacobian, residual = result.solution.jacobian, result.solution.residual
     starts = start_variables(problem, result)
@@ -89,7 +89,7 @@ def _find_unbounded_law(problem: Problem, result: Fit, criteria: SelectionCriter
 
 
 def find_unidentifiable_law(problem: Problem, result: Fit) -> str | None:
-    """A law all of whose sizes have intervals that contain zero; None if there is none.
+    """Reason against a law all of whose sizes have intervals that contain zero; None without one.
 
     Args:
         problem: Model and recordings.
@@ -113,7 +113,7 @@ def _find_linear_law(
     along: Sequence[Track],
     criteria: SelectionCriteria,
 ) -> str | None:
-    """A law that is a linear spring and damper along this motion."""
+    """Reason against a law that is a linear spring and damper along this motion."""
     for row, name in _new(result):
         strut, force = forces[row]
         basis = linear_forces(along, strut)
@@ -127,7 +127,7 @@ def _find_linear_law(
 def _find_cancelling_laws(
     result: Fit, forces: list[tuple[int, Array]], criteria: SelectionCriteria
 ) -> str | None:
-    """Two laws of one strut whose forces cancel each other."""
+    """Reason against two laws of one strut whose forces cancel each other."""
     new = _new(result)
     for i, (row, name) in enumerate(new):
         for other_row, other in new[i + 1 :]:
@@ -144,7 +144,7 @@ def _find_cancelling_laws(
 def _find_active_strut(
     problem: Problem, result: Fit, along: Sequence[Track], criteria: SelectionCriteria
 ) -> str | None:
-    """A strut that feeds energy in at a height and velocity that the motion went through."""
+    """Reason against a strut that feeds energy in at a height and velocity of the motion."""
     constants = strut_constants(problem, result.parts.linear)
     index = slots_of(problem, result.candidate).index
     effects = strut_effects(problem, result.candidate)
