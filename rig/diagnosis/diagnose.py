@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dart_model.spec import ModelSpec
-from rig.diagnosis.evaluate import HeldOutData, held_out_data
+from rig.diagnosis.evaluate import evaluate_held_out
 from rig.diagnosis.numerics.compiled import SLOTS
 from rig.diagnosis.numerics.least_squares import Effort
 from rig.diagnosis.outcome import Result
@@ -76,26 +76,28 @@ def _diagnose_problems(
 ) -> Result:
     search, problem = _search(problems.learnt, criteria, progress)
     progress("evaluating on held-out data", 0.95)
-    data = held_out_data(problems, problem)
+    problems = problems.with_learnt(problem)
     linear = search.linear.fit
-    evaluations = data.evaluate(linear, search.chosen.fit)
+    evaluations = evaluate_held_out(problems, linear, search.chosen.fit)
     if search.chosen.size and are_laws_superfluous(problem, linear, evaluations, criteria):
         search = search._replace(chosen=search.lawless, rivals=())
-        evaluations = data.evaluate(linear, search.chosen.fit)
+        evaluations = evaluate_held_out(problems, linear, search.chosen.fit)
     verdict = find_verdict(problem, evaluations, search, criteria)
     if verdict == "not_explained":
         progress("tabulating the force that no law explains", 0.97)
-        search, evaluations = _least_error_model(data, search, evaluations)
-    return compose_result(problem, search, verdict, evaluations, criteria, by_blocks=data.by_blocks)
+        search, evaluations = _least_error_model(problems, search, evaluations)
+    return compose_result(
+        problem, search, verdict, evaluations, criteria, by_blocks=problems.by_blocks
+    )
 
 
 def _least_error_model(
-    data: HeldOutData, search: SearchResult, evaluations: tuple[RunEvaluation, ...]
+    problems: Problems, search: SearchResult, evaluations: tuple[RunEvaluation, ...]
 ) -> tuple[SearchResult, tuple[RunEvaluation, ...]]:
     """The model with the least held-out error where no law explains: laws, a table, or neither."""
-    table = fit_surface(data.learnt, search.linear.fit)
+    table = fit_surface(problems.learnt, search.linear.fit)
     for other in (*([] if table is None else [table]), search.lawless.fit, search.given):
-        others = data.evaluate(search.linear.fit, other)
+        others = evaluate_held_out(problems, search.linear.fit, other)
         if _error(others) < _error(evaluations):
             evaluations = others
             search = search._replace(chosen=search.chosen._replace(fit=other), rivals=())

@@ -4,9 +4,6 @@ A free run's heights are DART's, with the applied force as the only input; only 
 which is not measured, is fitted. An observer with a high gain would hide any model error.
 """
 
-from dataclasses import replace
-from typing import NamedTuple
-
 import numpy as np
 
 from rig.diagnosis.numerics.least_squares import Effort
@@ -14,7 +11,6 @@ from rig.diagnosis.problem.build import Problems
 from rig.diagnosis.problem.problem import (
     CandidateModel,
     ComparedModels,
-    Problem,
     RunEvaluation,
     first_starts,
     nominal_model,
@@ -23,55 +19,39 @@ from rig.diagnosis.recording import RecordingError
 from rig.diagnosis.search.fit import Fit, fit
 
 
-class HeldOutData(NamedTuple):
-    """Held-out data, and the problem that was learnt from.
+def evaluate_held_out(problems: Problems, linear: Fit, corrected: Fit) -> tuple[RunEvaluation, ...]:
+    """Figures of every held-out recording.
 
-    Attributes:
-        learnt: The problem that models were fitted to.
-        held_out: The problem of held-out runs, or that whose blocks were held out.
-        by_blocks: Whether blocks were held out; their initial states are those of the fit.
+    Args:
+        problems: What models were fitted to, and what is held out.
+        linear: The best linear model.
+        corrected: The corrected model.
+
+    Raises:
+        RecordingError: A model runs away on a recording.
     """
+    held_out = problems.held_out
+    nominal = nominal_model(problems.learnt, linear.parts.starts)
+    models = ComparedModels(
+        *(_with_fitted_starts(problems, m) for m in (nominal, linear.model, corrected.model))
+    )
+    fitted_rms_n = problems.learnt.residual_force_rms_n(corrected.mean_square)
+    return tuple(
+        held_out.evaluate(k, models, fitted_rms_n, blocks=problems.by_blocks)
+        for k in range(held_out.recordings)
+    )
 
-    learnt: Problem
-    held_out: Problem
-    by_blocks: bool
 
-    def evaluate(self, linear: Fit, corrected: Fit) -> tuple[RunEvaluation, ...]:
-        """Figures of every held-out recording.
-
-        Args:
-            linear: The best linear model.
-            corrected: The corrected model.
-
-        Raises:
-            RecordingError: A model runs away on a recording.
-        """
-        nominal = nominal_model(self.learnt, linear.parts.starts)
-        models = ComparedModels(
-            *(self._with_fitted_starts(m) for m in (nominal, linear.model, corrected.model))
+def _with_fitted_starts(problems: Problems, model: CandidateModel) -> CandidateModel:
+    """A model with initial states fitted to held-out runs; to blocks, from those of its fit."""
+    problem, (candidate, parts) = problems.held_out, model
+    if not problems.by_blocks:
+        parts = parts._replace(starts=first_starts(problem, candidate))
+    fixed = np.zeros(len(problem.linear), dtype=np.bool_)
+    result = fit(problem, CandidateModel(candidate, parts), fixed, Effort(10), effects=False)
+    if result is None:
+        raise RecordingError(
+            f"model {problem.spec.name}: runs away on the held-out runs, expected runs that stay "
+            "near the motion it was learnt from"
         )
-        fitted_rms_n = self.learnt.residual_force_rms_n(corrected.mean_square)
-        return tuple(
-            self.held_out.evaluate(k, models, fitted_rms_n, blocks=self.by_blocks)
-            for k in range(self.held_out.recordings)
-        )
-
-    def _with_fitted_starts(self, model: CandidateModel) -> CandidateModel:
-        problem, (candidate, parts) = self.held_out, model
-        if not self.by_blocks:
-            parts = parts._replace(starts=first_starts(problem, candidate))
-        fixed = np.zeros(len(problem.linear), dtype=np.bool_)
-        first = CandidateModel(candidate, parts)
-        result = fit(problem, first, fixed, Effort(10), effects=False)
-        if result is None:
-            raise RecordingError(
-                f"model {problem.spec.name}: runs away on the held-out runs, expected runs that "
-                "stay near the motion it was learnt from"
-            )
-        return result.model
-
-
-def held_out_data(problems: Problems, learnt: Problem) -> HeldOutData:
-    """Held-out data, with the motions of the problem at the end of the search."""
-    held_out = replace(problems.evaluated, motions=learnt.motions)
-    return HeldOutData(learnt, held_out, problems.by_blocks)
+    return result.model

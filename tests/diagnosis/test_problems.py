@@ -8,8 +8,8 @@ import pytest
 
 from dart_model.effects import CATALOGUE
 from rig.diagnosis.diagnose import first_fits
-from rig.diagnosis.evaluate import held_out_data
-from rig.diagnosis.problem.build import build_problems, problem_kind
+from rig.diagnosis.evaluate import evaluate_held_out
+from rig.diagnosis.problem.build import Problems, build_problems, problem_kind
 from rig.diagnosis.problem.free_run import FreeRunProblem
 from rig.diagnosis.problem.prescribed_motion import PrescribedProblem
 from rig.diagnosis.problem.problem import Problem, nominal
@@ -136,22 +136,21 @@ def test_the_regression_about_a_model_responds_to_forces_linearly(problems, fits
 @pytest.mark.parametrize("by_blocks", [False, True])
 def test_held_out_figures_make_an_outcome(problems, fits, by_blocks):
     given, linear = fits
-    learnt = problems.learnt
-    data = replace_by_blocks(problems) if by_blocks else held_out_data(problems, learnt)
-    for run in data.evaluate(linear, given):
+    if by_blocks:
+        problems = with_last_fifth_held_out(problems.learnt)
+    for run in evaluate_held_out(problems, linear, given):
         assert run.target.after == pytest.approx(run.target.before)
         assert run.drift_m >= 0.0
         assert run.series[0].t_s.shape == run.series[0].measured.shape
         assert {item.unit for item in run.series} <= {"m", "N"}
 
 
-def replace_by_blocks(problems):
-    """Held-out data of a problem whose last fifth takes no part in fits."""
-    learnt = problems.learnt
+def with_last_fifth_held_out(learnt):
+    """A problem of which the last fifth takes no part in fits."""
     changed = []
     for run in learnt.runs:
         held_out = np.arange(len(run.grid.t_s)) > 0.8 * len(run.grid.t_s)
         grid = run.grid._replace(held_out=held_out, fitted=run.grid.fitted & ~held_out)
         changed.append(run._replace(grid=grid))
     problem = replace(learnt, runs=tuple(changed))
-    return held_out_data(type(problems)(problem, problem), problem)
+    return Problems(problem, problem, by_blocks=True)

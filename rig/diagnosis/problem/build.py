@@ -38,16 +38,17 @@ class Problems(NamedTuple):
 
     Attributes:
         learnt: That of the recordings that are learnt from.
-        evaluated: That of the held-out runs; `learnt`, with blocks held out, where there are none.
+        held_out: That of the held-out runs; with blocks held out, the learnt one.
+        by_blocks: Whether blocks are held out, not runs.
     """
 
     learnt: Problem
-    evaluated: Problem
+    held_out: Problem
+    by_blocks: bool
 
-    @property
-    def by_blocks(self) -> bool:
-        """Whether blocks are held out, not runs."""
-        return self.evaluated is self.learnt
+    def with_learnt(self, learnt: Problem) -> "Problems":
+        """The problems with the noise and motions that a search determined."""
+        return self._replace(learnt=learnt, held_out=replace(self.held_out, motions=learnt.motions))
 
 
 def build_problems(
@@ -72,11 +73,12 @@ def build_problems(
     problem_kind((*runs, *held_out))
     learnt = build(spec, runs, blocks, None if held_out else held_out_every)
     if not held_out:
-        return Problems(learnt, learnt)
+        return Problems(learnt, learnt, by_blocks=True)
     for recording in held_out:
         check_fits(recording, spec)
     smooth = [smooth_recording(recording, None) for recording in held_out]
-    return Problems(learnt, type(learnt).of_recordings(learnt.basis, smooth))
+    evaluated = type(learnt).of_recordings(learnt.basis, smooth)
+    return Problems(learnt, evaluated, by_blocks=False)
 
 
 def build(

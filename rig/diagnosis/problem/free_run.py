@@ -133,7 +133,6 @@ class FreeRunProblem(Problem):
 
     @property
     def grids(self) -> tuple[RecordingGrid, ...]:
-        """Nodes of each recording."""
         return tuple(run.grid for run in self.runs)
 
     def finer(self) -> "FreeRunProblem":
@@ -141,11 +140,9 @@ class FreeRunProblem(Problem):
         return replace(self, runs=tuple(run.finer() for run in self.runs))
 
     def fit_nodes(self, k: int) -> Flags:
-        """Nodes of a recording that take part in fits, shape (N,)."""
         return self.runs[k].grid.fitted
 
     def cut(self, pieces: Sequence[tuple[int, slice]]) -> "FreeRunProblem":
-        """The problem of pieces of recordings."""
         return replace(self, runs=tuple(self.runs[k].cut(nodes) for k, nodes in pieces))
 
     @cached_property
@@ -157,7 +154,6 @@ class FreeRunProblem(Problem):
         return tuple(input_noise_n(run) for run in self.runs)
 
     def blocks(self, k: int) -> Integers:
-        """Block of each row of a recording's residual."""
         return np.repeat(self.runs[k].grid.blocks(self.block_s), len(self.noise_m))
 
     def start(self, k: int, candidate: Candidate) -> Array:
@@ -229,7 +225,6 @@ class FreeRunProblem(Problem):
         return ((run.grid.heights_m - motion.heights_m)[run.grid.fitted] / self.noise_m).ravel()
 
     def states(self, k: int, model: CandidateModel) -> Array:
-        """Internal states at the beginning of a recording."""
         return model.parts.starts[k][2 * self.runs[k].mechanism.coordinates :]
 
     # --- noise ------------------------------------------------------------------------------------

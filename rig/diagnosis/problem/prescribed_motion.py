@@ -165,15 +165,12 @@ class PrescribedProblem(Problem):
 
     @property
     def grids(self) -> tuple[RecordingGrid, ...]:
-        """Nodes of each recording."""
         return tuple(run.grid for run in self.runs)
 
     def fit_nodes(self, k: int) -> Flags:
-        """Nodes of a recording that take part in fits, shape (N,)."""
         return self.runs[k].fit_nodes
 
     def cut(self, pieces: Sequence[tuple[int, slice]]) -> "PrescribedProblem":
-        """The problem of pieces of recordings."""
         return replace(self, runs=tuple(self.runs[k].cut(nodes) for k, nodes in pieces))
 
     def finer(self) -> None:
@@ -193,7 +190,6 @@ class PrescribedProblem(Problem):
         return np.flatnonzero(self.runs[k].fit_nodes)
 
     def blocks(self, k: int) -> Integers:
-        """Block of each row of a recording's residual."""
         numbers = block_numbers(self.runs[k].grid.t_s, self.block_s)[self._rows(k)]
         return np.repeat(numbers, len(self._cell_struts))
 
@@ -207,7 +203,6 @@ class PrescribedProblem(Problem):
         return state_scales(strut_effects(self, candidate))
 
     def states(self, k: int, model: CandidateModel) -> Array:
-        """Internal states at the beginning of a recording."""
         return model.parts.starts[k]
 
     def _residual_n(self, k: int, model: CandidateModel) -> Array:

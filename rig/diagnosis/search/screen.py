@@ -382,13 +382,13 @@ def rank_laws(
             for cost, values in starts[i][:_REFINED_STARTS]
             if cost < _SIDE_VALLEY * least
         ]
-        coarse = _best_of_each(pool.map(this.refine_coarsely, jobs))
+        coarse = best_of_each(pool.map(this.refine_coarsely, jobs))
         # A law begins no worse than a simpler one that is known.
         general = pool.map(
             lambda job: (job[0], this.starts(*job)[:1]), _more_general_laws(coarse, laws)
         )
         jobs = [(at, values) for at, best in list(general) for _, values in best]
-        coarse = _best_of_each([*coarse, *pool.map(this.refine_coarsely, jobs)])
+        coarse = best_of_each([*coarse, *pool.map(this.refine_coarsely, jobs)])
         fine = [s for s in pool.map(this.refine, coarse[:_FINE]) if s is not None]
     # Coarse costs in terms of fine ones, for laws that are not refined there.
     scale = len(stage.target) / len(this.coarse.target)
@@ -402,14 +402,12 @@ def rank_laws(
     return [*sorted(fine, key=lambda screening: screening.validation_cost), *rest]
 
 
-def _best_of_each(screenings: Iterable[Screening | None]) -> list[Screening]:
-    return best_of_each(screening for screening in screenings if screening is not None)
-
-
-def best_of_each(screenings: Iterable[Screening]) -> list[Screening]:
-    """Each combination of laws at its best, best first."""
+def best_of_each(screenings: Iterable[Screening | None]) -> list[Screening]:
+    """Each combination of laws at its best, best first; None where a refinement failed."""
     best: dict[frozenset[StrutEffect], Screening] = {}
     for screening in screenings:
+        if screening is None:
+            continue
         key = frozenset(screening.laws)
         if key not in best or screening.validation_cost < best[key].validation_cost:
             best[key] = screening
