@@ -1,6 +1,7 @@
 """Files that are written whole or not at all, whatever interrupts the program."""
 
 import contextlib
+import os
 import secrets
 from collections.abc import Generator
 from pathlib import Path
@@ -36,3 +37,15 @@ def write_whole(path: Path, content: str | bytes) -> None:
     """
     with replacing(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def write_durably(path: Path, content: str) -> None:
+    """Write a result whole or not at all, and have it on the disk: UTF-8.
+
+    Raises:
+        OSError: The folder is missing, or the disk fails.
+    """
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())

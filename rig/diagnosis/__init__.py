@@ -1,1 +1,1 @@
-"""From recordings and a nominal model to what the model lacks."""
+"""From recordings and a nominal model to the effects that the model lacks."""

@@ -1,4 +1,4 @@
-"""Runs in, diagnosis out: what `rig diagnose` does but for its page."""
+"""Recordings in, diagnosis out: `rig diagnose` without its page."""
 
 import os
 from collections.abc import Sequence
@@ -13,13 +13,13 @@ from rig.diagnosis.outcome import (
     CORRECTED_FILE,
     DIAGNOSIS_FILE,
     REPORT_FILE,
+    DiagnosisSource,
     Result,
-    Source,
     write_results,
 )
 from rig.diagnosis.progress import Progress
-from rig.diagnosis.recording import read_recording
-from rig.log.file_names import RUN_FILE, STEPS_FILE, parts
+from rig.diagnosis.recording import Recording, read_recording
+from rig.log.file_names import RUN_FILE
 
 
 def diagnose_runs(
@@ -34,7 +34,7 @@ def diagnose_runs(
     Args:
         runs: Folders of runs, or CSV files.
         model: The nominal model.
-        held_out: Runs to judge on.
+        held_out: Runs to evaluate on.
         out: Folder to write into.
         progress: Called with what is being done, and the share that is done.
 
@@ -43,37 +43,24 @@ def diagnose_runs(
             run.
         RecordingError: A run holds nothing that can be diagnosed.
     """
-    if (out / RUN_FILE).exists():
-        raise InputError(f"{out}: holds a run, expected another folder for what was found")
-    # Before a search that takes minutes, not after it.
-    for name in (DIAGNOSIS_FILE, CORRECTED_FILE, REPORT_FILE, "report.pdf"):
-        if (out / name).exists():
-            raise InputError(f"{out}: holds {name} already, expected a folder without one")
-    for name in files_of(model):
-        copied = out / name
-        if copied.exists() and not copied.samefile(model.folder / name):
-            raise InputError(f"{copied}: exists already, expected a folder without it")
-    standing = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
-    if not standing.is_dir() or not os.access(standing, os.W_OK):
-        raise InputError(f"{out}: cannot be written: {standing}: expected a folder to write into")
-    given = (*runs, *held_out)
-    for i, path in enumerate(given):
-        if path.resolve() in {other.resolve() for other in given[:i]}:
+    _check_folder(out, model)  # Before a search that takes minutes, not after it.
+    paths = (*runs, *held_out)
+    for i, path in enumerate(paths):
+        if path.resolve() in {other.resolve() for other in paths[:i]}:
             raise InputError(f"{path}: given twice, expected each run once: held-out ones are new")
     names = [strut.name for strut in model.struts]
-    result = diagnose(
-        model,
-        [read_recording(path, names) for path in runs],
-        [read_recording(path, names) for path in held_out],
-        progress,
+    recordings = [read_recording(path, names) for path in paths]
+    learnt, evaluated = recordings[: len(runs)], recordings[len(runs) :]
+    result = replace(
+        diagnose(model, learnt, evaluated, progress),
+        sources=(
+            DiagnosisSource(
+                "nominal model", model.name, sha256(dump_model(model).encode()).hexdigest()
+            ),
+            *map(_source, ["fitted"] * len(runs) + ["held out"] * len(held_out), paths, recordings),
+        ),
     )
-    sources = [
-        Source("nominal model", model.name, sha256(dump_model(model).encode()).hexdigest()),
-        *(Source("fitted", str(path), _fingerprint(path)) for path in runs),
-        *(Source("held out", str(path), _fingerprint(path)) for path in held_out),
-    ]
-    result = replace(result, sources=tuple(sources))
-    progress("writing what was found", 1.0)
+    progress("writing the diagnosis", 1.0)
     try:
         write_results(result, model, out)
     except OSError as error:
@@ -81,11 +68,21 @@ def diagnose_runs(
     return result
 
 
-def _fingerprint(path: Path) -> str:
-    """SHA-256 of a recording: of a run's steps, part by part, or of the file."""
-    found = sha256()
-    for part in parts(path, STEPS_FILE) if path.is_dir() else [path]:
-        with part.open("rb") as file:
-            while piece := file.read(1 << 20):
-                found.update(piece)
-    return found.hexdigest()
+def _source(role: str, path: Path, recording: Recording) -> DiagnosisSource:
+    return DiagnosisSource(role, str(path), recording.sha256 or "")
+
+
+def _check_folder(out: Path, model: ModelSpec) -> None:
+    """Refuse a folder that holds a run or a diagnosis, or that cannot be written."""
+    if (out / RUN_FILE).exists():
+        raise InputError(f"{out}: holds a run, expected another folder for the diagnosis")
+    for name in (DIAGNOSIS_FILE, CORRECTED_FILE, REPORT_FILE, "report.pdf"):
+        if (out / name).exists():
+            raise InputError(f"{out}: holds {name} already, expected a folder without one")
+    for name in files_of(model):
+        copied = out / name
+        if copied.exists() and not copied.samefile(model.folder / name):
+            raise InputError(f"{copied}: exists already, expected a folder without it")
+    existing = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise InputError(f"{out}: cannot be written: {existing}: expected a folder to write into")

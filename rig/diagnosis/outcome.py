@@ -1,4 +1,4 @@
-"""What a diagnosis found, as a value, and its JSON."""
+"""The outcome of a diagnosis, as a value, and its JSON."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from can_dbc.atomic_file import write_whole
+from can_dbc.atomic_file import write_durably
 from dart_model.spec import ModelSpec, copy_files, dump_model
 from rig.files.json_text import json_text
 
@@ -22,7 +22,7 @@ DIAGNOSIS_FILE, CORRECTED_FILE, REPORT_FILE = "diagnosis.json", "corrected.yaml"
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value and its 95 % confidence interval; an end is None where the data do not bound it."""
+    """A value and its 95 % confidence interval; an end is None where it is not identifiable."""
 
     value: float
     low: float | None
@@ -38,8 +38,8 @@ class LinearCorrection:
         parameter: ``mass_kg`` (of the strut's upper body and what it carries),
             ``stiffness_n_per_m``, ``damping_n_s_per_m``, ``preload_n``, ``free_length_m`` or
             ``input_gain``.
-        nominal: As the model file has it, the preload about mid-stroke.
-        total: As the data have it.
+        nominal: Its value in the model file, the preload about mid-stroke.
+        total: Its value by the data.
         about_height_m: Mid-stroke, about which stiffness and preload are taken; else None.
     """
 
@@ -82,7 +82,7 @@ class ExistingEffect:
         change: ``refitted``: other parameters; ``superfluous``: the data are as well described
             without it.
         nominal: Its parameters in the model file.
-        parameters: Its parameters as the data have them; empty where it is superfluous.
+        parameters: Its parameters by the data; empty where it is superfluous.
     """
 
     name: str
@@ -99,10 +99,10 @@ class RejectedEffect:
     Attributes:
         family: Family.
         name: Effect in the catalogue.
-        strut: Strut on which it was tried.
+        strut: Strut on which it was tested.
         why: One line.
-        left: Residual with it beside the corrected linear part alone, as a share of the residual of
-            the latter along the motion (1: it explains nothing); None where it was not tried.
+        left: Residual along the motion with it and the corrected linear part, as a share of the
+            residual without it (1: it explains nothing); None where it was not tested.
     """
 
     family: str
@@ -158,7 +158,7 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """What a right model leaves on the held-out data."""
+    """RMS that a right model can reach on the held-out data."""
 
     height_rmse_m: float
     residual_force_rmse_n: float
@@ -174,21 +174,20 @@ class White:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What a nominal model lacks. Fields as in ``diagnosis.json``.
+    """The diagnosis of a nominal model. Fields as in ``diagnosis.json``.
 
     Attributes:
-        verdict: What can be said.
+        verdict: What held-out data show.
         linear: Linear corrections.
-        effects: What is missing, strongest first; the linear families stand here too where linear
-            corrections are all that was found.
+        effects: Missing effects, strongest first; where there are linear corrections alone, these.
         existing: Effects of the nominal model that the data change.
         rejected: Candidates that were not chosen, best first.
-        ambiguous_with: Families that these recordings cannot distinguish from what was found.
-        suggested_excitation: What recording would distinguish them.
+        ambiguous_with: Families that these recordings cannot distinguish from the effects.
+        suggested_excitation: A recording that would distinguish them.
         held_out: Figures on data that took no part in the search.
-        noise_floor: What a right model leaves there.
+        noise_floor: RMS that a right model can reach there.
         residual_white: Whether the residual is white.
-        notes: Whole sentences: what the data cannot separate, what was left out.
+        notes: Whole sentences: what the data cannot distinguish, what was removed.
         runs: Names of the recordings that were learnt from.
         model: Name of the nominal model.
     """
@@ -242,7 +241,7 @@ class HeldOutSeries:
         strut: Name of the strut.
         unit: ``m`` or ``N``, of the next three.
         t_s: Times in s, increasing, shape (N,).
-        measured: Height or load-cell force; NaN where it is missing or not judged on.
+        measured: Height or load-cell force; NaN where it is missing or not evaluated.
         before: The nominal model, open loop (or driven along the motion).
         after: The corrected model.
         height_m: Measured height, smoothed where the motion is prescribed.
@@ -261,8 +260,8 @@ class HeldOutSeries:
 
 
 @dataclass(frozen=True)
-class Source:
-    """What a diagnosis was made from.
+class DiagnosisSource:
+    """A file or model that a diagnosis was made from.
 
     Attributes:
         role: ``fitted``, ``held out`` or ``nominal model``.
@@ -277,21 +276,21 @@ class Source:
 
 @dataclass(frozen=True)
 class Result:
-    """All that a diagnosis gives.
+    """The result of a diagnosis.
 
     Attributes:
-        diagnosis: What was found.
+        diagnosis: The diagnosis.
         corrected: The corrected model.
         fitted: Residual force along the recordings that were learnt from, for the report.
         held_out: Held-out runs, for the report.
-        sources: What it was made from, where that are files.
+        sources: Files and model that it was made from, where it was made from files.
     """
 
     diagnosis: Diagnosis
     corrected: ModelSpec
     fitted: tuple[FittedSeries, ...]
     held_out: tuple[HeldOutSeries, ...]
-    sources: tuple[Source, ...] = ()
+    sources: tuple[DiagnosisSource, ...] = ()
 
 
 def to_json(diagnosis: Diagnosis) -> str:
@@ -306,6 +305,6 @@ def write_results(result: Result, nominal: ModelSpec, folder: Path) -> None:
         OSError: The folder cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / CORRECTED_FILE, dump_model(result.corrected))
-    write_whole(folder / DIAGNOSIS_FILE, to_json(result.diagnosis))
+    write_durably(folder / CORRECTED_FILE, dump_model(result.corrected))
+    write_durably(folder / DIAGNOSIS_FILE, to_json(result.diagnosis))
     copy_files(nominal, folder)

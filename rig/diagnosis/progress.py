@@ -1,4 +1,4 @@
-"""How far long work is."""
+"""Progress of long work."""
 
 from collections.abc import Callable
 
@@ -7,7 +7,7 @@ Progress = Callable[[str, float], None]
 
 
 def within(progress: Progress, first: float, last: float, of: str = "") -> Progress:
-    """Progress of a part, in shares of the whole; its steps named after what they are of."""
+    """Progress of a part, a range of shares of the whole; `of` precedes the names of its steps."""
 
     def part(what: str, share: float) -> None:
         progress(f"{of}: {what}" if of else what, first + (last - first) * share)

@@ -1,11 +1,12 @@
 """Recordings of a bench: what was measured, read from CSV or from a run folder, and checked.
 
-A recording that cannot be diagnosed is refused here with one line that says what is wrong and what
-would help, before anything is computed from it.
+A recording that cannot be diagnosed is refused before anything is computed from it, with one line:
+what is wrong, and what to do.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,12 @@ from can_dbc.codec import decode_log
 from can_dbc.database import Message
 from can_dbc.errors import InputError
 from can_dbc.protection import check_crc_log
+from dart_model.spec import ModelSpec
 from rig.channels.channel import Channel
 from rig.channels.quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE, Quantity
 from rig.diagnosis.clipping import find_long_plateaus
 from rig.files.delimited_text import read_csv_columns
+from rig.log.file_names import STEPS_FILE, parts
 from rig.log.reader import RunFolder
 from rig.log.reader import read_run as read_run_folder
 from rig.plan.load import plan_of_run
@@ -36,6 +39,8 @@ _LEAST_SAMPLES = 200
 _LEAST_DURATION_S = 0.5
 _LARGEST_BYTES = 2_000_000_000
 _LARGEST_HEIGHT_M = 100.0
+_LONGEST_DURATION_S = 600.0
+"""A longer recording adds nothing about a strut, and takes minutes."""
 _MOST_MISSING = 0.3
 """Share of missing heights above which a sensor is taken for broken."""
 _LONGEST_STEP_S = 0.05
@@ -43,7 +48,7 @@ _LONGEST_STEP_S = 0.05
 
 
 class RecordingError(InputError):
-    """A recording that cannot be diagnosed; one line: file, column, what was found and expected."""
+    """A recording that cannot be diagnosed; one line: file, column, fault, what was expected."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,7 @@ class Recording:
         strut_forces_n: Load-cell force of each strut, shape (N, struts), a column of NaN for a
             strut without a cell; None where there is no cell.
         temperature_c: Damper temperature, shape (N,), or None.
+        sha256: Of the file, or of the run's steps, in hex; None where it was not read from one.
     """
 
     name: str
@@ -66,6 +72,7 @@ class Recording:
     applied_force_n: Array | None = None
     strut_forces_n: Array | None = None
     temperature_c: Array | None = None
+    sha256: str | None = None
 
     @property
     def duration_s(self) -> float:
@@ -85,10 +92,20 @@ def read_recording(path: Path, struts: Sequence[str] | None = None) -> Recording
         RecordingError: It holds nothing that can be diagnosed.
     """
     if path.is_dir():
-        return read_run(path)
+        return replace(read_run(path), sha256=_sha256(parts(path, STEPS_FILE)))
     if not path.is_file():
         raise InputError(f"{path}: no such run, expected a run's folder or a CSV file")
-    return read_csv(path, struts)
+    return replace(read_csv(path, struts), sha256=_sha256([path]))
+
+
+def _sha256(files: Iterable[Path]) -> str:
+    """SHA-256 of files, one after another, in hex."""
+    digest = sha256()
+    for path in files:
+        with path.open("rb") as file:
+            while piece := file.read(1 << 20):
+                digest.update(piece)
+    return digest.hexdigest()
 
 
 # --- CSV --------------------------------------------------------------------------------------
@@ -121,7 +138,7 @@ def read_csv(path: Path, struts: Sequence[str] | None = None) -> Recording:
         missing = names[[height is None for height in heights].index(True)]
         raise RecordingError(f"{name}: header: expected a column height_m:{missing}")
     cells = [_column_of(name, values, "strut_force_n", strut, names) for strut in names]
-    return checked(
+    return check_recording(
         Recording(
             name,
             values["t_s"],
@@ -196,7 +213,7 @@ def _check_header(name: str, columns: list[str]) -> list[str]:
 def read_run(folder: Path) -> Recording:
     """What the bench sent in a run, on the time of the first strut's height.
 
-    Frames with a wrong CRC or length are left out; single missing heights are NaN, the other
+    Frames with a wrong CRC or length are ignored; single missing heights are NaN, the other
     channels are linear between their samples.
 
     Args:
@@ -230,8 +247,8 @@ def read_run(folder: Path) -> Recording:
             f"{folder}: has heights alone, expected signals.applied_force or "
             "signals.load_cell_force in its configuration, and frames of it"
         )
-    # The bus carries one load cell; with several struts it is not known whose it is.
-    return checked(
+    # The bus carries one load cell; with several struts its strut is not known.
+    return check_recording(
         Recording(
             folder.name,
             t_s,
@@ -292,7 +309,7 @@ def _samples(payloads: _Payloads, channel: Channel) -> tuple[Array, Array]:
 
 
 def _sample_times_s(t_ns: NDArray[np.int64], message: Message) -> Array:
-    """Times of sampling: on the grid of the cycle time where arrivals say that there is one."""
+    """Times of sampling in s: on the grid of the cycle time where the arrivals fit one."""
     cycle_ns = message.cycle_time_ns
     if cycle_ns is None or len(t_ns) == 0:
         return np.asarray(t_ns * 1e-9, dtype=np.float64)
@@ -312,11 +329,11 @@ def _nearest(t_s: Array, own_t_s: Array, values: Array, half_s: float) -> Array:
 # --- Checks -----------------------------------------------------------------------------------
 
 
-def checked(recording: Recording) -> Recording:
-    """The recording, or an error for what would mislead; single missing heights are allowed.
+def check_recording(recording: Recording) -> Recording:
+    """The recording itself; single missing heights are allowed.
 
     Raises:
-        RecordingError: See the module.
+        RecordingError: Its data would mislead: clipped, constant, in wrong units, too short.
     """
     name, t_s = recording.name, recording.t_s
     if len(t_s) < _LEAST_SAMPLES:
@@ -341,6 +358,26 @@ def checked(recording: Recording) -> Recording:
         if label == "strut_force_n":
             _refuse_clipped(name, label, "N", channel)
     return recording
+
+
+def check_fits(recording: Recording, spec: ModelSpec) -> None:
+    """Refuse a recording that does not belong to a model, or that misleads, see `check_recording`.
+
+    Raises:
+        RecordingError: See above.
+    """
+    check_recording(recording)
+    struts = len(spec.struts)
+    if recording.heights_m.shape[1] != struts:
+        raise RecordingError(
+            f"{recording.name}: {recording.heights_m.shape[1]} heights, model {spec.name} has "
+            f"{struts} struts, expected one height for each"
+        )
+    if recording.duration_s > _LONGEST_DURATION_S:
+        raise RecordingError(
+            f"{recording.name}: {recording.duration_s:.0f} s long, "
+            f"expected at most {_LONGEST_DURATION_S:.0f} s: cut it"
+        )
 
 
 def _channels(recording: Recording) -> Iterable[tuple[str, Array, str]]:

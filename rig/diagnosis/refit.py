@@ -1,7 +1,7 @@
-"""A model's own parameters as recordings have them, whether or not they differ from its file's.
+"""All parameters of a model fitted to recordings, whether or not they differ from its file's.
 
-A diagnosis corrects what the data call for; who follows a parameter over a hundred runs wants its
-value and its interval from every one.
+A diagnosis corrects only what the data call for; to follow a parameter over a hundred runs, its
+value and interval are needed from every one.
 """
 
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ from rig.diagnosis.outcome import Estimate
 from rig.diagnosis.problem.build import build
 from rig.diagnosis.recording import Recording
 from rig.diagnosis.search.criteria import CRITERIA
-from rig.diagnosis.search.fit import effect_variables, spread
-from rig.diagnosis.write_up import Known, estimates_of, linear_corrections
+from rig.diagnosis.search.fit import effect_variables
+from rig.diagnosis.write_up import estimates_of, estimates_of_fit, linear_corrections
 
 
 class OwnParameter(NamedTuple):
@@ -33,29 +33,29 @@ class OwnParameter(NamedTuple):
     estimate: Estimate
 
 
-def refitted(spec: ModelSpec, runs: Sequence[Recording]) -> list[OwnParameter]:
-    """The parameters of a model, its laws as they are, fitted to recordings.
+def refit_parameters(spec: ModelSpec, runs: Sequence[Recording]) -> list[OwnParameter]:
+    """The parameters of a model with its given laws, fitted to recordings.
 
     Args:
         spec: The model.
         runs: Recordings.
 
     Returns:
-        Of the linear part those that the recordings can tell apart, and all of the effects'.
+        The parameters of the linear part that are identifiable, and all of the effects.
 
     Raises:
         RecordingError: A recording or the model cannot be used.
     """
     problem = build(spec, runs, CRITERIA.blocks, None)
     _, fit = first_fits(problem)
-    known = Known(fit, spread(fit))
-    found = [
+    estimates = estimates_of_fit(fit)
+    parameters = [
         OwnParameter(item.strut, "", item.parameter, item.total)
-        for item in linear_corrections(problem, known)
+        for item in linear_corrections(problem, estimates)
     ]
     for row in effect_variables(problem, fit):
         item = problem.existing[fit.candidate.kept[row]]
-        for name, estimate in estimates_of(problem, known, row, item.name).items():
+        for name, estimate in estimates_of(problem, estimates, row, item.name).items():
             strut = spec.struts[item.strut].name
-            found.append(OwnParameter(strut, item.name, name, estimate))
-    return found
+            parameters.append(OwnParameter(strut, item.name, name, estimate))
+    return parameters

@@ -1,4 +1,4 @@
-"""What was found, as an outcome: verdict on held-out data, intervals, corrected model."""
+"""The outcome of a search: verdict on held-out data, intervals, corrected model."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,8 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import CATALOGUE, effect
-from rig.diagnosis.evaluate import Evaluated, rms
-from rig.diagnosis.on_dart import corrected_model
 from rig.diagnosis.outcome import (
     BeforeAfter,
     Diagnosis,
@@ -24,48 +22,56 @@ from rig.diagnosis.outcome import (
     Verdict,
     White,
 )
-from rig.diagnosis.problem.free_run import FreeRun
 from rig.diagnosis.problem.linear_part import EFFECTS, PARAMETERS
-from rig.diagnosis.problem.prescribed_motion import Prescribed
+from rig.diagnosis.problem.on_dart import corrected_model
 from rig.diagnosis.problem.problem import (
     LinearParameter,
     Problem,
     ResidualForces,
-    middle_m,
+    RunEvaluation,
+    StrutEffect,
+    mid_stroke_m,
+    rms,
     slots_of,
 )
 from rig.diagnosis.problem.track import forces_along
-from rig.diagnosis.recording import Recording
-from rig.diagnosis.search.conclude import Found
+from rig.diagnosis.search.conclude import SearchResult
 from rig.diagnosis.search.criteria import SelectionCriteria
-from rig.diagnosis.search.fit import UNBOUND, Fit, Spread, effect_variables, is_white, spread
+from rig.diagnosis.search.fit import (
+    UNBOUND,
+    Fit,
+    FitCovariance,
+    effect_variables,
+    fit_covariance,
+    is_white,
+)
 
 Array = NDArray[np.float64]
 
 _NEARLY = 0.02
-"""Share of a preload up to which it counts as brought along by a change of stiffness."""
+"""Share of a preload up to which it counts as implied by a change of stiffness."""
 _CLOCK = 5e-5
 """Half-width that an interval has at least, as a share of the value: clocks of sensors and loggers
 run right to 50 ppm (a usual crystal), which shifts a mass as a frequency; integration errs less."""
-_HELD = 0.3
-"""Share of half a sampling interval within which a delay is what a zero-order hold looks like."""
+_HOLD = 0.3
+"""Share of half a sampling interval within which a delay may be that of a zero-order hold."""
 
 
-class Known(NamedTuple):
-    """A fit and what it does not know.
+class FitEstimates(NamedTuple):
+    """A fit with its covariance, from which estimates with confidence intervals follow.
 
     Attributes:
         fit: The fit.
-        spread: The covariance of what was searched.
+        covariance: The covariance of its variables.
     """
 
     fit: Fit
-    spread: Spread
+    covariance: FitCovariance
 
     def estimate(self, variable: int, nominal: float = 0.0) -> Estimate:
-        """A search variable's value, with what it is a change of, and its confidence interval."""
+        """Value of a search variable, added to its nominal value, with its confidence interval."""
         space, value = self.fit.space, float(self.fit.solution.values[variable])
-        half = float(self.spread.half[variable])
+        half = float(self.covariance.half[variable])
         low, high = float(space.low[variable]), float(space.high[variable])
         if space.logarithmic[variable]:
             if half > np.log(UNBOUND):
@@ -81,155 +87,158 @@ class Known(NamedTuple):
         )
 
 
-def written_up(
+def estimates_of_fit(result: Fit) -> FitEstimates:
+    """A fit with its covariance."""
+    return FitEstimates(result, fit_covariance(result))
+
+
+def compose_result(
     problem: Problem,
-    found: Found,
+    search: SearchResult,
     verdict: Verdict,
-    results: Sequence[Evaluated],
-    runs: Sequence[Recording],
+    evaluations: Sequence[RunEvaluation],
     criteria: SelectionCriteria,
     *,
-    blocks: bool,
+    by_blocks: bool,
 ) -> Result:
     """The outcome of a search.
 
     Args:
         problem: Model and recordings.
-        found: What the search found.
-        verdict: What held-out data allow to be said.
-        results: Held-out recordings, before and after.
-        runs: Recordings that were learnt from.
+        search: The result of the search.
+        verdict: What held-out data show.
+        evaluations: Held-out recordings, before and after.
         criteria: What decides.
-        blocks: Whether blocks were held out, since no run was held out.
+        by_blocks: Whether blocks were held out, not runs.
     """
-    chosen = found.chosen.fit
-    before = [_forces(problem, k, found.given) for k in range(problem.recordings)]
-    after = [_forces(problem, k, chosen) for k in range(problem.recordings)]
-    known = Known(chosen, spread(chosen))
-    linear = linear_corrections(problem, known)
-    effects = _effects(problem, known, after)
-    if not effects:
-        effects = _linear_effects(problem, known, after)
-    held_out = _held_out(results, blocks=blocks)
-    floor = NoiseFloor(
-        _mean([r.floor.height_rmse_m for r in results]),
-        _mean([r.floor.residual_force_rmse_n for r in results]),
-    )
-    rivals = [name for rival in found.rivals for _, name in rival.fit.candidate.new]
-    own = {effect(name).family for _, name in chosen.candidate.new}
-    other = tuple(dict.fromkeys(f for f in (effect(n).family for n in rivals) if f not in own))
+    chosen = search.chosen.fit
+    recordings = range(problem.recordings)
+    before = [problem.residual_forces(k, search.given.model) for k in recordings]
+    after = [problem.residual_forces(k, chosen.model) for k in recordings]
+    estimates = estimates_of_fit(chosen)
     ambiguous = verdict == "ambiguous"
+    floors = [run.floor for run in evaluations]
     diagnosis = Diagnosis(
         verdict,
-        linear,
-        effects,
-        _existing(problem, found, known),
-        found.rejected + _unseen(problem),
-        other if ambiguous else (),
-        _suggestion(found) if ambiguous else None,
-        held_out,
-        floor,
+        linear_corrections(problem, estimates),
+        _effects(problem, estimates, after) or _linear_effects(problem, estimates, after),
+        _changed_effects(problem, search, estimates),
+        search.rejected + _effects_hidden_from_bench(problem),
+        _other_families(search) if ambiguous else (),
+        _suggestion(search) if ambiguous else None,
+        _held_out(evaluations, by_blocks=by_blocks),
+        NoiseFloor(
+            _quadratic_mean([floor.height_rmse_m for floor in floors]),
+            _quadratic_mean([floor.residual_force_rmse_n for floor in floors]),
+        ),
         White(
-            is_white(problem, found.given, criteria.white),
+            is_white(problem, search.given, criteria.white),
             is_white(problem, chosen, criteria.white),
         ),
-        _notes(problem, found, blocks=blocks),
-        tuple(recording.name for recording in runs),
+        _notes(problem, search, by_blocks=by_blocks),
+        tuple(grid.name for grid in problem.grids),
         problem.spec.name,
     )
-    series = tuple(
-        item
-        for k in range(problem.recordings)
-        for item in _fitted_series(problem, before[k], after[k])
-    )
+    series = (_fitted_series(problem, before[k], after[k]) for k in recordings)
     return Result(
         diagnosis,
-        corrected_model(problem, chosen.candidate, chosen.parts),
-        series,
-        tuple(item for result in results for item in result.series),
+        corrected_model(problem, chosen.model),
+        tuple(item for items in series for item in items),
+        tuple(item for run in evaluations for item in run.series),
     )
 
 
-def needless(
-    problem: Problem, linear: Fit, results: Sequence[Evaluated], criteria: SelectionCriteria
-) -> bool:
-    """Whether all data are at the floor without any law, and held-out ones no nearer with the laws.
+def _other_families(search: SearchResult) -> tuple[str, ...]:
+    """Families of the rivals that the chosen model lacks."""
+    rivals = [effect(name).family for r in search.rivals for _, name in r.fit.candidate.new]
+    chosen = set(search.chosen.families)
+    return tuple(dict.fromkeys(family for family in rivals if family not in chosen))
 
-    By less than what noise of the applied force alone causes is no nearer. A law that the data call
-    for may not act on held-out ones, as a stop that is not reached: they say nothing of it.
+
+def are_laws_superfluous(
+    problem: Problem,
+    linear: Fit,
+    evaluations: Sequence[RunEvaluation],
+    criteria: SelectionCriteria,
+) -> bool:
+    """Whether all data are at the floor without any law, and laws gain nothing on held-out data.
+
+    A gain below the effect of the applied force's noise counts as none. A law that the data call
+    for may not act on held-out ones, as a stop that is not reached: these do not contradict it.
     """
-    if not _is_left_at_floor(problem, linear, criteria):
+    if not _is_at_floor(problem, linear, criteria):
         return False
-    after = _mean([r.counted.after for r in results]) ** 2
-    lawless = _mean([r.linear for r in results]) ** 2
-    floor = _mean([_floor(r) for r in results]) ** 2
-    drift = _mean([r.drift_m for r in results]) ** 2
+    after = _quadratic_mean([run.target.after for run in evaluations]) ** 2
+    lawless = _quadratic_mean([run.linear for run in evaluations]) ** 2
+    floor = _quadratic_mean([_floor(run) for run in evaluations]) ** 2
+    drift = _quadratic_mean([run.drift_m for run in evaluations]) ** 2
     least = max(criteria.least_above_noise * floor, criteria.least_share * (lawless - floor), drift)
     return lawless <= criteria.explained**2 * floor and lawless - after <= least
 
 
-def _is_left_at_floor(problem: Problem, result: Fit, criteria: SelectionCriteria) -> bool:
-    """Whether a model leaves no more than noise of the recordings that were learnt from."""
-    floor = problem.floor_level(result.candidate, result.parts)
+def _is_at_floor(problem: Problem, result: Fit, criteria: SelectionCriteria) -> bool:
+    """Whether a fit's residual is noise of the recordings that were learnt from."""
+    floor = problem.floor_level(result.model)
     return result.mean_square <= criteria.explained**2 * floor
 
 
-def judgement(
-    problem: Problem, results: Sequence[Evaluated], found: Found, criteria: SelectionCriteria
+def find_verdict(
+    problem: Problem,
+    evaluations: Sequence[RunEvaluation],
+    search: SearchResult,
+    criteria: SelectionCriteria,
 ) -> Verdict:
-    """What held-out data allow to be said.
+    """What held-out data show.
 
-    A finding explains where every held-out run is left at the noise floor; it is partial where laws
-    take away a good share of what the best linear model leaves there. How bad the nominal model was
+    A model explains where every held-out run is at the noise floor; it explains partly where laws
+    reduce the residual of the best linear model by a good share. The error of the nominal model
     does not count. Nothing is missing only where that holds of what was learnt from, too.
     """
-    ratios = [r.counted.after / max(_floor(r), 1e-300) for r in results]
+    chosen = search.chosen.fit
+    ratios = [run.target.after / max(_floor(run), 1e-300) for run in evaluations]
     if all(ratio <= criteria.explained for ratio in ratios):
-        if not (found.chosen.fit.candidate.new or np.any(found.chosen.fit.free)):
-            at_floor = _is_left_at_floor(problem, found.chosen.fit, criteria)
+        if not (chosen.candidate.new or np.any(chosen.free)):
+            at_floor = _is_at_floor(problem, chosen, criteria)
             return "nothing_missing" if at_floor else "not_explained"
-        return "ambiguous" if found.rivals else "explained"
-    if found.chosen.fit.candidate.new and all(np.isfinite(ratios)):
+        return "ambiguous" if search.rivals else "explained"
+    if chosen.candidate.new and all(np.isfinite(ratios)):
         share = 1.0 - criteria.partly
-        left, linear = _mean([r.counted.after for r in results]), _mean([r.linear for r in results])
-        force = _mean([r.figures.residual_force_rmse_n.after for r in results])
-        linear_force = _mean([r.linear_force_n for r in results])
-        # Where heights drift, as those of an axis without a spring do, the force is what counts.
-        by_force = force < share * linear_force and left < criteria.explained * linear
-        if left < share * linear or by_force:
+        after = _quadratic_mean([run.target.after for run in evaluations])
+        linear = _quadratic_mean([run.linear for run in evaluations])
+        force = _quadratic_mean([run.figures.residual_force_rmse_n.after for run in evaluations])
+        linear_force = _quadratic_mean([run.linear_force_n for run in evaluations])
+        # Where heights drift, as those of an axis without a spring do, the force decides.
+        by_force = force < share * linear_force and after < criteria.explained * linear
+        if after < share * linear or by_force:
             return "partly_explained"
     return "not_explained"
 
 
-def _floor(result: Evaluated) -> float:
-    height = result.floor.height_rmse_m
-    return height if np.isfinite(height) else result.floor.residual_force_rmse_n
+def _floor(run: RunEvaluation) -> float:
+    height = run.floor.height_rmse_m
+    return height if np.isfinite(height) else run.floor.residual_force_rmse_n
 
 
-def _mean(values: Sequence[float]) -> float:
+def _quadratic_mean(values: Sequence[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _forces(problem: Problem, k: int, result: Fit) -> ResidualForces | None:
-    return problem.residual_forces(k, result.candidate, result.parts)
-
-
-def linear_corrections(problem: Problem, known: Known) -> tuple[LinearCorrection, ...]:
+def linear_corrections(problem: Problem, estimates: FitEstimates) -> tuple[LinearCorrection, ...]:
     """The linear parameters that a fit left free, with their intervals."""
-    found: list[LinearCorrection] = []
-    for variable, p in enumerate(_free(problem, known.fit)):
+    corrections: list[LinearCorrection] = []
+    for variable, p in enumerate(_free(problem, estimates.fit)):
         nominal_value = p.nominal + (_existing_preload(problem, p) if p.kind == "preload" else 0.0)
         about = p.kind in ("stiffness", "preload")
-        found.append(
+        corrections.append(
             LinearCorrection(
                 problem.spec.struts[p.strut].name,
                 PARAMETERS[p.kind],
                 nominal_value,
-                known.estimate(variable, nominal_value),
-                middle_m(problem.motions[p.strut]) if about else None,
+                estimates.estimate(variable, nominal_value),
+                mid_stroke_m(problem.motions[p.strut]) if about else None,
             )
         )
-    return tuple(found)
+    return tuple(corrections)
 
 
 def _free(problem: Problem, result: Fit) -> list[LinearParameter]:
@@ -243,81 +252,101 @@ def _existing_preload(problem: Problem, parameter: LinearParameter) -> float:
 
 
 def _effects(
-    problem: Problem, known: Known, after: Sequence[ResidualForces | None]
+    problem: Problem, estimates: FitEstimates, after: Sequence[ResidualForces | None]
 ) -> tuple[FoundEffect, ...]:
-    model, there = known.fit, [(k, f) for k, f in enumerate(after) if f is not None]
+    """The chosen laws, strongest first.
+
+    Args:
+        problem: Model and recordings.
+        estimates: The chosen model.
+        after: Its residual force along each recording.
+    """
+    model, residuals = estimates.fit.model, [(k, f) for k, f in enumerate(after) if f is not None]
     first = len(model.candidate.kept)
-    tracks = [(k, f.track) for k, f in there]
-    forces = forces_along(problem, model.candidate, model.parts, tracks)
-    found: list[FoundEffect] = []
+    forces = forces_along(problem, model, [(k, f.track) for k, f in residuals])
+    effects: list[FoundEffect] = []
     for row, (strut, name) in enumerate(model.candidate.new, first):
-        left = np.concatenate([f.force_n[strut] for _, f in there])
-        estimates = estimates_of(problem, known, row, name)
-        found.append(_found(problem, strut, name, left, forces[row][1], estimates))
-    return tuple(sorted(found, key=lambda item: -item.force_rms_n))
+        residual = np.concatenate([f.force_n[strut] for _, f in residuals])
+        parameters = estimates_of(problem, estimates, row, name)
+        effects.append(
+            _describe_effect(problem, (strut, name), residual, forces[row][1], parameters)
+        )
+    return tuple(sorted(effects, key=lambda item: -item.force_rms_n))
 
 
-def _found(
+def _describe_effect(
     problem: Problem,
-    strut: int,
-    name: str,
-    left: Array,
+    strut_effect: StrutEffect,
+    residual: Array,
     force: Array,
-    estimates: dict[str, Estimate],
+    parameters: dict[str, Estimate],
 ) -> FoundEffect:
-    """An effect by its force and by what is left with it."""
-    there = np.isfinite(left)
-    without = float(np.mean((left + force)[there] ** 2))
-    share = 1.0 - float(np.mean(left[there] ** 2)) / max(without, 1e-300)
+    """An effect with the share of the residual force that it explains.
+
+    Args:
+        problem: Model and recordings.
+        strut_effect: The effect in its strut.
+        residual: Residual force with it, shape (N,); NaN where it is not known.
+        force: Its force, shape (N,).
+        parameters: Estimates of its parameters.
+    """
+    strut, name = strut_effect
+    known = np.isfinite(residual)
+    without = float(np.mean((residual + force)[known] ** 2))
+    share = 1.0 - float(np.mean(residual[known] ** 2)) / max(without, 1e-300)
     where = problem.spec.struts[strut].name
     return FoundEffect(
-        effect(name).family, name, where, float(np.clip(share, 0.0, 1.0)), rms(force), estimates
+        effect(name).family, name, where, float(np.clip(share, 0.0, 1.0)), rms(force), parameters
     )
 
 
-def estimates_of(problem: Problem, known: Known, row: int, name: str) -> dict[str, Estimate]:
+def estimates_of(
+    problem: Problem, estimates: FitEstimates, row: int, name: str
+) -> dict[str, Estimate]:
     """Parameters of an effect by name; those of a table have no interval."""
-    result = known.fit
+    result = estimates.fit
     variables = effect_variables(problem, result).get(row)
     if variables is not None:
-        return effect(name).named(known.estimate(int(v)) for v in variables)
+        return effect(name).named(estimates.estimate(int(v)) for v in variables)
     slot = slots_of(problem, result.candidate).index[row]
     values = result.parts.effects[slot[1] : slot[2]]
     return effect(name).named(Estimate(float(value), None, None) for value in values)
 
 
 def _linear_effects(
-    problem: Problem, known: Known, after: Sequence[ResidualForces | None]
+    problem: Problem, estimates: FitEstimates, after: Sequence[ResidualForces | None]
 ) -> tuple[FoundEffect, ...]:
-    """Linear corrections as effects, where they are all that was found."""
-    result = known.fit
-    found: list[FoundEffect] = []
-    places = np.flatnonzero(result.free)
-    implied = _implied_preloads(problem, known)
-    for variable, (place, p) in enumerate(zip(places, _free(problem, result), strict=True)):
+    """Linear corrections as effects, where there are no others; arguments as for `_effects`."""
+    result = estimates.fit
+    effects: list[FoundEffect] = []
+    indices = np.flatnonzero(result.free)
+    implied = _implied_preloads(problem, estimates)
+    for variable, (index, p) in enumerate(zip(indices, _free(problem, result), strict=True)):
         if variable in implied or p.kind not in EFFECTS:
             continue
         linear = result.parts.linear.copy()
-        linear[place] = 0.0
-        parts = result.parts._replace(linear=linear)
+        linear[index] = 0.0
+        nominal = result.model._replace(parts=result.parts._replace(linear=linear))
         forces: list[Array] = []
-        left: list[Array] = []
-        for k, there in enumerate(after):
-            without = problem.residual_forces(k, result.candidate, parts)
-            if there is not None and without is not None:
-                forces.append(without.force_n[p.strut] - there.force_n[p.strut])
-                left.append(there.force_n[p.strut])
+        residuals: list[Array] = []
+        for k, corrected in enumerate(after):
+            without = problem.residual_forces(k, nominal)
+            if corrected is not None and without is not None:
+                forces.append(without.force_n[p.strut] - corrected.force_n[p.strut])
+                residuals.append(corrected.force_n[p.strut])
         name = EFFECTS[p.kind]
-        estimates = {effect(name).parameters[0].name: known.estimate(variable)}
-        all_left, force = (np.concatenate(rows) if rows else np.zeros(1) for rows in (left, forces))
-        found.append(_found(problem, p.strut, name, all_left, force, estimates))
-    return tuple(sorted(found, key=lambda item: -item.force_rms_n))
+        parameters = {effect(name).parameters[0].name: estimates.estimate(variable)}
+        residual, force = (
+            np.concatenate(rows) if rows else np.zeros(1) for rows in (residuals, forces)
+        )
+        effects.append(_describe_effect(problem, (p.strut, name), residual, force, parameters))
+    return tuple(sorted(effects, key=lambda item: -item.force_rms_n))
 
 
-def _implied_preloads(problem: Problem, known: Known) -> set[int]:
-    """Preloads about mid-stroke that a change of stiffness about the free length brings along."""
-    free = _free(problem, known.fit)
-    found: set[int] = set()
+def _implied_preloads(problem: Problem, estimates: FitEstimates) -> set[int]:
+    """Preloads about mid-stroke that a change of stiffness about the free length implies."""
+    free = _free(problem, estimates.fit)
+    implied: set[int] = set()
     for i, preload in enumerate(free):
         for j, spring in enumerate(free):
             if (preload.kind, spring.kind) != ("preload", "stiffness"):
@@ -325,36 +354,39 @@ def _implied_preloads(problem: Problem, known: Known) -> set[int]:
             if preload.strut != spring.strut:
                 continue
             strut = problem.spec.struts[spring.strut]
-            lever = middle_m(problem.motions[spring.strut]) - strut.free_length_m
-            covariance = known.spread.covariance
+            lever = mid_stroke_m(problem.motions[spring.strut]) - strut.free_length_m
+            covariance = estimates.covariance.covariance
             weights = np.zeros(len(covariance))
             weights[i], weights[j] = preload.deviation, lever * spring.deviation
-            values = known.fit.solution.values
-            left = float(values[i] + lever * values[j])
-            half = known.spread.factor * float(np.sqrt(max(weights @ covariance @ weights, 0.0)))
-            if abs(left) < max(half, _NEARLY * abs(float(values[i]))):
-                found.add(i)
-    return found
+            values = estimates.fit.solution.values
+            rest = float(values[i] + lever * values[j])
+            variance = max(weights @ covariance @ weights, 0.0)
+            half = estimates.covariance.factor * float(np.sqrt(variance))
+            if abs(rest) < max(half, _NEARLY * abs(float(values[i]))):
+                implied.add(i)
+    return implied
 
 
-def _existing(problem: Problem, found: Found, known: Known) -> tuple[ExistingEffect, ...]:
+def _changed_effects(
+    problem: Problem, search: SearchResult, estimates: FitEstimates
+) -> tuple[ExistingEffect, ...]:
     """Existing effects that are superfluous, or whose file values lie outside their intervals."""
-    result = known.fit
+    result = estimates.fit
     variables = effect_variables(problem, result)
-    listed: list[ExistingEffect] = []
+    changed: list[ExistingEffect] = []
     for row, kept in enumerate(result.candidate.kept):
         item = problem.existing[kept]
         nominal_values = effect(item.name).named(item.values)
         strut = problem.spec.struts[item.strut].name
-        if kept in found.superfluous:
-            listed.append(ExistingEffect(item.name, strut, "superfluous", nominal_values, {}))
+        if kept in search.superfluous:
+            changed.append(ExistingEffect(item.name, strut, "superfluous", nominal_values, {}))
         elif row in variables:
-            estimates = estimates_of(problem, known, row, item.name)
-            if any(_outside(estimates[name], value) for name, value in nominal_values.items()):
-                listed.append(
-                    ExistingEffect(item.name, strut, "refitted", nominal_values, estimates)
+            refitted = estimates_of(problem, estimates, row, item.name)
+            if any(_outside(refitted[name], value) for name, value in nominal_values.items()):
+                changed.append(
+                    ExistingEffect(item.name, strut, "refitted", nominal_values, refitted)
                 )
-    return tuple(listed)
+    return tuple(changed)
 
 
 def _outside(estimate: Estimate, value: float) -> bool:
@@ -363,10 +395,10 @@ def _outside(estimate: Estimate, value: float) -> bool:
     return not estimate.low <= value <= estimate.high
 
 
-def _unseen(problem: Problem) -> tuple[RejectedEffect, ...]:
-    """Effects that this kind of bench does not show."""
+def _effects_hidden_from_bench(problem: Problem) -> tuple[RejectedEffect, ...]:
+    """Effects that this kind of bench cannot show."""
     bench = "a prescribed motion" if problem.bench == "motion_given" else "this kind of bench"
-    strut, why = problem.spec.struts[0].name, f"{bench} does not show it"
+    strut, why = problem.spec.struts[0].name, f"{bench} cannot show it"
     return tuple(
         RejectedEffect(item.family, item.name, strut, why, None)
         for item in CATALOGUE.values()
@@ -374,19 +406,22 @@ def _unseen(problem: Problem) -> tuple[RejectedEffect, ...]:
     )
 
 
-def _suggestion(found: Found) -> str:
-    candidates = [found.chosen, *found.rivals]
-    names = [name for scored in candidates for _, name in scored.fit.candidate.new]
-    wanted = dict.fromkeys(effect(name).excitation for name in names)
-    return "a run with " + "; and ".join(wanted)
+def _suggestion(search: SearchResult) -> str:
+    """A recording that would distinguish the chosen model and its rivals."""
+    models = [search.chosen, *search.rivals]
+    names = [name for model in models for _, name in model.fit.candidate.new]
+    excitations = dict.fromkeys(effect(name).excitation for name in names)
+    return "a run with " + "; and ".join(excitations)
 
 
-def _held_out(results: Sequence[Evaluated], *, blocks: bool) -> HeldOut:
-    figures = [result.figures for result in results]
+def _held_out(evaluations: Sequence[RunEvaluation], *, by_blocks: bool) -> HeldOut:
+    figures = [run.figures for run in evaluations]
 
     def mean(pairs: Sequence[BeforeAfter | None]) -> BeforeAfter:
-        there = [pair for pair in pairs if pair is not None]
-        return BeforeAfter(_mean([p.before for p in there]), _mean([p.after for p in there]))
+        known = [pair for pair in pairs if pair is not None]
+        return BeforeAfter(
+            _quadratic_mean([p.before for p in known]), _quadratic_mean([p.after for p in known])
+        )
 
     cells = [f.strut_force_rmse_n for f in figures]
     return HeldOut(
@@ -394,7 +429,7 @@ def _held_out(results: Sequence[Evaluated], *, blocks: bool) -> HeldOut:
         mean([f.residual_force_rmse_n for f in figures]),
         mean(cells) if any(cell is not None for cell in cells) else None,
         tuple(figures),
-        "blocks" if blocks else "runs",
+        "blocks" if by_blocks else "runs",
     )
 
 
@@ -419,30 +454,21 @@ def _fitted_series(
     ]
 
 
-def _notes(problem: Problem, found: Found, *, blocks: bool) -> tuple[str, ...]:
-    notes: list[str] = []
-    if problem.bench == "force_given":
+def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[str, ...]:
+    notes = [problem.assumption]
+    if outliers := sum(grid.outliers for grid in problem.grids):
+        notes.append(f"{outliers} heights are outliers and were removed.")
+    if search.gain_alike:
         notes.append(
-            "The initial state of every recording is fitted, for both models; between samples the "
-            "applied force is a cubic spline."
+            "In these data a gain of the applied force is indistinguishable from a change of mass, "
+            "stiffness and damping in one proportion. Weigh the mass to separate the two."
         )
-        grids = [run.grid for run in problem.runs] if isinstance(problem, FreeRun) else []
-    else:
-        notes.append("The motion is smoothed over the whole recording.")
-        grids = [drive.grid for drive in problem.drives] if isinstance(problem, Prescribed) else []
-    if outliers := sum(grid.outliers for grid in grids):
-        notes.append(f"{outliers} heights were found to be outliers and left out.")
-    if found.gain_alike:
+    if _resembles_hold(problem, search.chosen.fit):
         notes.append(
-            "A gain of the applied force looks the same as a change of mass, stiffness and damping "
-            "in one proportion: these data cannot separate the two; weighing the mass would."
+            "The delay is half a sampling interval, which a zero-order hold of the applied force "
+            "causes. If the bench has such a hold, its applied force is not late."
         )
-    if _looks_held(problem, found.chosen.fit):
-        notes.append(
-            "The delay found is half a sampling interval: that is what an applied force looks like "
-            "under a zero-order hold. If the bench has one, nothing is wrong with it."
-        )
-    if blocks:
+    if by_blocks:
         notes.append(
             "No run was held out: blocks spread over the recordings took no part in the search; "
             "the initial states are those of the fit."
@@ -450,11 +476,11 @@ def _notes(problem: Problem, found: Found, *, blocks: bool) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _looks_held(problem: Problem, result: Fit) -> bool:
-    """Whether a delay was found that a zero-order hold of the force would feign."""
+def _resembles_hold(problem: Problem, result: Fit) -> bool:
+    """Whether there is a delay that a zero-order hold of the applied force would cause."""
     half_s = 0.5 * problem.motions[0].step_s
     index = slots_of(problem, result.candidate).index[len(result.candidate.kept) :]
     return any(
-        name == "delay" and abs(result.parts.effects[slot[1]] / half_s - 1.0) < _HELD
+        name == "delay" and abs(result.parts.effects[slot[1]] / half_s - 1.0) < _HOLD
         for (_, name), slot in zip(result.candidate.new, index, strict=True)
     )

@@ -24,7 +24,7 @@ from dart_model.spec import ModelSpec, parse_model
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.outcome import Estimate, FoundEffect
 from rig.diagnosis.recording import Recording, read_recording
-from rig.diagnosis.refit import refitted
+from rig.diagnosis.refit import refit_parameters
 from rig.dyno.characterise import characterise
 from rig.fleet.sources import RunSource, printable
 from rig.log.file_names import RUN_FILE
@@ -195,7 +195,7 @@ def _diagnose_run(task: Task) -> RunRow:
     found = diagnose(spec, [recording]).diagnosis
     own = [
         _value("model", item.strut, item.effect, item.parameter, item.estimate)
-        for item in refitted(spec, [recording])
+        for item in refit_parameters(spec, [recording])
     ]
     new = [value for item in found.effects for value in _effect_values(item)]
     held_out = found.held_out

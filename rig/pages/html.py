@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from can_dbc.atomic_file import write_whole
+from can_dbc.atomic_file import write_durably
 from can_dbc.errors import InputError
 from rig.pages import charts
 
@@ -52,7 +52,7 @@ def write_page(text: str, path: Path) -> None:
         InputError: The file cannot be written.
     """
     try:
-        write_whole(path, text)
+        write_durably(path, text)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
 

@@ -15,7 +15,7 @@ from tests.criteria_study.cases import CASES, answer
 
 ABSURD = [
     ("blocks", 2, "kept_back"),
-    ("kept_every", 1, "kept_back"),
+    ("held_out_every", 1, "kept_back"),
     ("screened", 0, "one_kind"),
     ("most_laws", 0, "hardening"),
     ("most_laws", 1, "two_kinds"),
@@ -79,8 +79,8 @@ def explored(criteria):
 
 
 def test_without_a_beam_no_pair_is_looked_for():
-    assert max(scored.size for scored in explored(CRITERIA).fits.values()) == 2
-    assert max(scored.size for scored in explored(replace(CRITERIA, beam=0)).fits.values()) == 1
+    assert max(model.size for model in explored(CRITERIA).fits.values()) == 2
+    assert max(model.size for model in explored(replace(CRITERIA, beam=0)).fits.values()) == 1
 
 
 @pytest.mark.parametrize(
@@ -88,20 +88,20 @@ def test_without_a_beam_no_pair_is_looked_for():
 )
 def test_a_pair_that_is_but_a_better_formula_for_one_law_is_not_worth_it(absurd, worth):
     pool = explored(replace(CRITERIA, **absurd))
-    pair = next(s for s in pool.fits.values() if s.size == 2 and not pool.unsound)
+    pair = next(s for s in pool.fits.values() if s.size == 2 and not pool.invalid)
     one = next(s for s in pool.fits.values() if s.size and set(s.families) < set(pair.families))
     rows = one.fit.rows
 
-    def leaving(scored, above):
-        share = (rows + above) / scored.scores.sum()
-        return scored._replace(scores=share * scored.scores)
+    def leaving(model, above):
+        share = (rows + above) / model.block_costs.sum()
+        return model._replace(block_costs=share * model.block_costs)
 
-    nearly = leaving(one, 1e-3 * pool.linear.score)
+    nearly = leaving(one, 1e-3 * pool.linear.cost)
     assert pool.is_formula(nearly) is ("formula" not in absurd)
-    better = leaving(pair, 0.1 * (nearly.score - rows))
+    better = leaving(pair, 0.1 * nearly.excess)
     assert not pool.at_floor(better)
-    assert pool.worth(nearly, better) is worth
-    assert pool.worth(nearly, leaving(pair, 1e-3 * (nearly.score - rows)))
+    assert pool.prefers(better, nearly) is worth
+    assert pool.prefers(leaving(pair, 1e-3 * nearly.excess), nearly)
 
 
 @pytest.mark.parametrize(
@@ -120,9 +120,12 @@ def test_beside_a_nearly_right_law_storing_and_dissipating_ones_take_a_share(one
 
     def leaving(laws, above):
         rows = fitted.fit.rows
-        fit = fitted.fit._replace(candidate=candidate._replace(new=tuple((0, law) for law in laws)))
-        return fitted._replace(fit=fit, scores=(rows + above) / fitted.score * fitted.scores)
+        other = candidate._replace(new=tuple((0, law) for law in laws))
+        fit = fitted.fit._replace(model=fitted.fit.model._replace(candidate=other))
+        share = (rows + above) / fitted.cost
+        return fitted._replace(fit=fit, block_costs=share * fitted.block_costs)
 
-    above = 5e-3 * fitted.score
+    above = 5e-3 * fitted.cost
     assert pool.is_formula(leaving([one], above))
-    assert pool.worth(leaving([one], above), leaving([one, other], 0.5 * above)) is worth
+    pair = leaving([one, other], 0.5 * above)
+    assert pool.prefers(pair, leaving([one], above)) is worth

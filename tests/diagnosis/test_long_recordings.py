@@ -60,7 +60,7 @@ def test_what_no_piece_shows_is_searched_for_in_all():
     heights_m = runs[0].heights_m[:, 0]
     problem = build(bench.model(), runs[:1], 32, None)
     part = part_of(problem, SEARCHED)
-    assert heights_m.min() < DEEP_M < min(np.nanmin(run.grid.heights_m) for run in part.runs)
+    assert heights_m.min() < DEEP_M < min(np.nanmin(grid.heights_m) for grid in part.grids)
     found = diagnose(bench.model(), runs[:1], runs[1:]).diagnosis
     assert [name.endswith("bump_stop") for name in missing(found)] == [True]
     assert is_at_the_floor(found)

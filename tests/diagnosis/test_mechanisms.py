@@ -5,7 +5,7 @@ import pytest
 from dart_model.spec import MODELS, load_model
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.problem.linear_part import moving_mass_kg
-from rig.diagnosis.problem.mechanism import constant, readers
+from rig.diagnosis.problem.mechanism import constant_mechanism, open_plants
 from rig.diagnosis.recording import read_csv
 from tests.diagnosis.answers import is_at_the_floor, missing
 from tests.diagnosis.mechanisms import (
@@ -46,7 +46,7 @@ def test_a_complete_trailing_arm_lacks_nothing(tmp_path):
 def test_a_mass_is_that_of_a_struts_upper_body_with_what_it_carries():
     spec = load_model(MODELS / "quarter_car.yaml")
     wheel, body = (part.mass_kg for part in spec.skeleton.bodies)
-    mechanism = constant(readers(spec))
+    mechanism = constant_mechanism(open_plants(spec))
     assert moving_mass_kg(mechanism, 0) == pytest.approx(wheel + body)
     assert moving_mass_kg(mechanism, 1) == pytest.approx(body)
 

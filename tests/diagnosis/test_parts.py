@@ -8,8 +8,8 @@ from scipy.interpolate import CubicHermiteSpline
 
 from dart_model.effects import Motion
 from rig.diagnosis.problem.build import build, part_of, with_tones
-from rig.diagnosis.problem.problem import Parts, nominal
-from rig.diagnosis.problem.track import most_thinned, pieces
+from rig.diagnosis.problem.problem import first_starts, nominal, nominal_model
+from rig.diagnosis.problem.track import largest_stride, pieces
 from rig.diagnosis.search.fit import fit
 from tests.diagnosis import little_bench, little_dyno
 
@@ -37,7 +37,7 @@ def motion_of(t_s, z, w):
 )
 def test_a_motion_is_known_between_the_samples_that_are_kept(frequency_hz, rate_hz, most):
     t_s, z, w = sine(frequency_hz, rate_hz, 20_000)
-    thinned = most_thinned([motion_of(t_s, z, w)])
+    thinned = largest_stride([motion_of(t_s, z, w)])
     for cut in pieces(len(t_s), len(t_s), most, thinned):
         if cut.stop - cut.start <= cut.step:
             continue
@@ -62,18 +62,15 @@ def test_about_as_many_samples_are_looked_at_as_are_asked_for(nodes, most, thinn
 def test_parts_that_are_kept_back_are_not_looked_at(bench):
     recording = bench.run(bench.Nothing(), duration_s=60.0)
     problem = build(bench.model(), [recording], 32, 5)
-    candidate = nominal(problem)
-    parts = Parts(np.zeros(len(problem.linear)), np.zeros(0), (problem.start(0, candidate),))
-    segments = problem.segments(candidate, parts, 500, 1)
+    model = nominal_model(problem, first_starts(problem, nominal(problem)))
+    segments = problem.segments(model, 500, 1)
     assert 0 < len(segments) < 8
     assert all(len(segment.target) for segment in segments)
 
 
 def test_a_slow_line_is_taken_out_and_is_no_tone():
     problem = build(little_dyno.model(), [little_dyno.run(little_dyno.Nothing())], 32, None)
-    candidate = nominal(problem)
-    parts = Parts(np.zeros(len(problem.linear)), np.zeros(0), (np.zeros(0),))
-    forces = problem.residual_forces(0, candidate, parts)
+    forces = problem.residual_forces(0, nominal_model(problem, (np.zeros(0),)))
     t_s = forces.track.t_s
     slow_hz, fast_hz = 3.0 / t_s[-1], 31.0 / t_s[-1]
     force_n = np.array(
@@ -87,52 +84,47 @@ def test_a_slow_line_is_taken_out_and_is_no_tone():
 def cut_and_whole(bench):
     """A problem, its pieces, and the residual of the model without effects over all of it."""
     problem = build(bench.model(), [bench.run(bench.Nothing(), duration_s=24.0)], 32, None)
-    nodes = problem.fitted(0).size
-    base, part = nominal(problem), part_of(problem, nodes // 4)
-    parts = Parts(np.zeros(len(problem.linear)), np.zeros(0), (problem.start(0, base),))
+    nodes = problem.fit_nodes(0).size
+    part = part_of(problem, nodes // 4)
+    model = nominal_model(problem, first_starts(problem, nominal(problem)))
     whole = np.full(nodes, np.nan)
-    whole[problem.fitted(0)] = problem.residual(0, base, parts)
+    whole[problem.fit_nodes(0)] = problem.residual(0, model)
     cuts = pieces(nodes, nodes, nodes // 4, 1)
     there = [w[np.isfinite(w)] for w in (whole[cut] for cut in cuts)]
-    return part, base, parts, there
+    return part, model, there
 
 
 def test_along_a_given_motion_a_piece_misses_what_the_whole_misses_there():
-    part, base, parts, whole = cut_and_whole(little_dyno)
+    part, _, whole = cut_and_whole(little_dyno)
     assert part.recordings == len(whole) == 8
     for k, there in enumerate(whole):
-        own = part.residual(k, base, parts._replace(starts=(np.zeros(0),) * 8))
+        own = part.residual(k, nominal_model(part, (np.zeros(0),) * 8))
         assert own == pytest.approx(there, rel=1e-9)
         assert len(part.blocks(k)) == len(there)
 
 
 def test_the_first_piece_of_a_free_run_begins_as_the_recording_does():
-    part, base, parts, whole = cut_and_whole(little_bench)
+    part, model, whole = cut_and_whole(little_bench)
     assert part.recordings == len(whole) == 8
-    assert part.residual(0, base, parts) == pytest.approx(whole[0], rel=1e-9)
+    assert part.residual(0, model) == pytest.approx(whole[0], rel=1e-9)
 
 
 def test_pieces_of_a_free_run_are_where_they_were_in_the_recording():
-    part, base, parts, _ = cut_and_whole(little_bench)
-    found = fit(
-        part,
-        base,
-        Parts(parts.linear, np.zeros(0), tuple(part.start(k, base) for k in range(8))),
-        parts.linear > 0.0,
-        effects=False,
-    )
+    part, model, _ = cut_and_whole(little_bench)
+    first = nominal_model(part, first_starts(part, model.candidate))
+    found = fit(part, first, model.parts.linear > 0.0, effects=False)
     assert found.mean_square == pytest.approx(1.0, abs=0.2)
 
 
 def test_no_piece_is_searched_that_is_kept_back():
     problem = build(little_bench.model(), [little_bench.run(little_bench.Nothing())], 32, 5)
-    part = part_of(problem, problem.fitted(0).size // 8)
-    shares = [part.fitted(k).mean() for k in range(part.recordings)]
+    part = part_of(problem, problem.fit_nodes(0).size // 8)
+    shares = [part.fit_nodes(k).mean() for k in range(part.recordings)]
     assert min(shares) > 0.5
     assert len(shares) < 8
 
 
 def test_short_recordings_are_searched_whole():
     problem = build(little_bench.model(), [little_bench.run(little_bench.Nothing())], 32, None)
-    assert part_of(problem, problem.fitted(0).size) is problem
-    assert part_of(problem, problem.fitted(0).size // 2 + 1) is problem
+    assert part_of(problem, problem.fit_nodes(0).size) is problem
+    assert part_of(problem, problem.fit_nodes(0).size // 2 + 1) is problem

@@ -316,7 +316,8 @@ def test_two_recordings_are_learnt_from_together_and_blocks_of_them_are_kept_bac
 
 def test_a_load_cell_is_judged_where_blocks_were_kept_back() -> None:
     run = bench.run(bench.Nothing())
-    (kept,) = (r.grid.kept for r in build(bench.model(), [run], 32, CRITERIA.kept_every).runs)
+    problem = build(bench.model(), [run], 32, CRITERIA.held_out_every)
+    (kept,) = (grid.held_out for grid in problem.grids)
     cell_n = np.where(kept, 30.0, 1e6)[:, np.newaxis] + 0.1 * run.heights_m
     found = diagnose(bench.model(), [replace(run, strut_forces_n=cell_n)]).diagnosis
     assert found.held_out.source == "blocks"

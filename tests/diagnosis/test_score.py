@@ -8,9 +8,9 @@ from rig.diagnosis.diagnose import first_fits
 from rig.diagnosis.problem.build import build
 from rig.diagnosis.problem.problem import nominal
 from rig.diagnosis.search.criteria import CRITERIA
-from rig.diagnosis.search.fit import law_values, parts_for
+from rig.diagnosis.search.fit import law_values, model_for
 from rig.diagnosis.search.pool import FULL, Pool
-from rig.diagnosis.search.score_test import changes
+from rig.diagnosis.search.score_test import find_changes
 from tests.diagnosis import little_bench, little_dyno
 from tests.diagnosis.test_planted_effects import FrictionAndHardening
 from tests.diagnosis.test_prescribed import Orifice
@@ -25,25 +25,25 @@ def pool_of(bench, force):
 def with_laws(pool, **laws):
     """The model with laws that were fitted from where they are said to begin."""
     at = {(0, name): np.array(values) for name, values in laws.items()}
-    candidate = nominal(pool.problem).added(*at)
-    pool.attempt(candidate, parts_for(pool.problem, pool.linear.fit, candidate, at), FULL)
+    candidate = nominal(pool.problem).with_effects(*at)
+    pool.attempt(model_for(pool.problem, pool.linear.fit, candidate, at), FULL)
     return pool.fits[candidate].fit
 
 
 def changes_of(pool, fitted):
-    return changes(pool.problem, fitted, pool.along, CRITERIA.most_laws)
+    return find_changes(pool.problem, fitted, pool.along, CRITERIA.most_laws)
 
 
 def test_where_the_answer_is_linear_the_promise_is_what_a_fit_reaches():
     pool = pool_of(little_dyno, Orifice())
     found = changes_of(pool, pool.linear.fit)
     change = next(c for c in found if c.laws == ((0, "quadratic_damping"),))
-    assert change is found[0] or found[0].left > 0.5 * change.left
-    pool.attempt(change.candidate, change.parts, FULL)
-    cost = pool.fits[change.candidate].fit.solution.cost
-    assert change.left == pytest.approx(cost, rel=0.02)
-    (reached,) = law_values(pool.problem, pool.fits[change.candidate].fit).values()
-    assert change.parts.effects == pytest.approx(reached, rel=0.02)
+    assert change is found[0] or found[0].cost > 0.5 * change.cost
+    pool.attempt(change.model, FULL)
+    cost = pool.fits[change.model.candidate].fit.solution.cost
+    assert change.cost == pytest.approx(cost, rel=0.02)
+    (reached,) = law_values(pool.problem, pool.fits[change.model.candidate].fit).values()
+    assert change.model.parts.effects == pytest.approx(reached, rel=0.02)
 
 
 def test_what_lies_beside_dry_friction_is_seen():
@@ -52,7 +52,7 @@ def test_what_lies_beside_dry_friction_is_seen():
     best = next(c for c in changes_of(pool, fitted) if len(c.laws) == 2)
     families = {effect(name).family for _, name in best.laws}
     assert families == {"friction", "nonlinear_stiffness"}
-    assert best.left < 0.3 * fitted.solution.cost
+    assert best.cost < 0.3 * fitted.solution.cost
 
 
 def test_a_like_law_begins_where_its_force_is_the_other_ones():
@@ -60,8 +60,8 @@ def test_a_like_law_begins_where_its_force_is_the_other_ones():
     fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3])
     found = changes_of(pool, fitted)
     like = next(c for c in found if c.laws == ((0, "stribeck_friction"),))
-    assert like.left < 1.5 * fitted.solution.cost
-    assert like.parts.effects[0] == pytest.approx(fitted.parts.effects[0], rel=0.3)
+    assert like.cost < 1.5 * fitted.solution.cost
+    assert like.model.parts.effects[0] == pytest.approx(fitted.parts.effects[0], rel=0.3)
 
 
 def test_no_change_holds_a_family_twice_or_the_law_it_stands_for():
@@ -69,13 +69,13 @@ def test_no_change_holds_a_family_twice_or_the_law_it_stands_for():
     fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3])
     for change in changes_of(pool, fitted):
         families = [effect(name).family for _, name in change.laws]
-        assert change.candidate != fitted.candidate
+        assert change.model.candidate != fitted.candidate
         assert families.count("friction") <= 1
-        assert change.left >= 0.0
+        assert change.cost >= 0.0
 
 
 def test_a_model_with_as_many_laws_as_may_be_is_not_added_to():
     pool = pool_of(little_bench, FrictionAndHardening())
     fitted = with_laws(pool, coulomb_friction=[5.0, 1e-3])
-    for change in changes(pool.problem, fitted, pool.along, 1):
+    for change in find_changes(pool.problem, fitted, pool.along, 1):
         assert len(change.laws) == 1

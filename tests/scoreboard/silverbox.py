@@ -20,11 +20,10 @@ import numpy as np
 from can_dbc.errors import InputError
 from dart_model.spec import ModelSpec, load_model
 from rig.diagnosis.files import diagnose_runs
-from rig.diagnosis.on_dart import dart_heights
+from rig.diagnosis.numerics.least_squares import Effort
 from rig.diagnosis.outcome import CORRECTED_FILE
 from rig.diagnosis.problem.build import build
-from rig.diagnosis.problem.free_run import FreeRun
-from rig.diagnosis.problem.problem import Parts, existing_values, nominal
+from rig.diagnosis.problem.problem import first_starts, nominal, nominal_model
 from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.recording import Recording, RecordingError, read_recording
 from rig.diagnosis.search.fit import fit
@@ -139,22 +138,20 @@ def open_loop_rmse_m(spec: ModelSpec, record: Recording, skipped: int) -> float:
         skipped: Samples at the start that do not count.
     """
     problem = build(spec, [record], 2, None)
-    if not isinstance(problem, FreeRun):
+    if problem.bench != "force_given":
         raise InputError(f"{record.name}: has no applied_force_n, expected a force-driven bench")
     (run,) = problem.runs
     head = np.arange(len(run.grid.t_s)) < skipped
     heads = replace(
         problem, runs=(run._replace(grid=run.grid._replace(fitted=run.grid.fitted & head)),)
     )
-    base = nominal(heads)
-    none = np.zeros(len(problem.linear))
-    first = Parts(none, existing_values(heads, base), (heads.start(0, base),))
-    found = fit(heads, base, first, none > 0.0, 20, effects=False)
+    first = nominal_model(heads, first_starts(heads, nominal(heads)))
+    found = fit(heads, first, first.parts.linear > 0.0, Effort(20), effects=False)
     if found is None:
         return float("nan")
-    there = problem.simulated(run, base, found.parts, found.parts.starts[0])
+    there = problem.simulate(run, found.model, found.parts.starts[0])
     if there is None:
         return float("nan")
     tolerance = _AGREEMENT * float(np.nanstd(run.grid.heights_m - there.heights_m))
-    heights_m = dart_heights(problem, 0, base, found.parts, there.heights_m, tolerance)
+    heights_m = problem.heights_on_dart(0, found.model, there.heights_m, tolerance)
     return float(np.sqrt(np.nanmean((run.grid.heights_m - heights_m)[skipped:] ** 2)))

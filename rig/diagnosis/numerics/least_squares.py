@@ -26,20 +26,20 @@ _DIFFERENCE = 1e-4
 _FIRST_DAMPING = 1e-3
 _LARGEST_DAMPING = 1e9
 _TRUE = 0.05
-"""Share of the change of a residual, squared, that its tangent may miss and still be mended."""
+"""Share of the change of a residual, squared, up to which an error of its Jacobian is updated."""
 _SETTLED = 0.9
-"""Share of a residual's level that is left by a step that is called the last."""
+"""Least share of the residual's level after a step for which that step can be the last."""
 _LARGEST_LOGARITHMIC_STEP = 1.5
-"""A factor of 4.5: beyond it a law's shape is another one, and its tangent says nothing."""
+"""A factor of 4.5: beyond it a law has another shape, and its Jacobian is no guide."""
 
 
 class Space(NamedTuple):
-    """Where parameters are searched.
+    """Bounds and scales of the parameters that are searched.
 
     Attributes:
         low: Lowest values, shape (k,).
         high: Highest values, shape (k,).
-        scale: What counts as a change of one that is searched as it is, shape (k,).
+        scale: Unit of each parameter that is not searched by its logarithm, shape (k,).
         logarithmic: Which are searched by their logarithm, shape (k,).
     """
 
@@ -61,25 +61,25 @@ class Space(NamedTuple):
         return np.clip(values, self.low, self.high)
 
     def part(self, chosen: NDArray[np.bool_]) -> "Space":
-        """Some of the parameters."""
+        """The space of some of the parameters."""
         return Space(
             self.low[chosen], self.high[chosen], self.scale[chosen], self.logarithmic[chosen]
         )
 
 
-def joined(spaces: list[Space]) -> Space:
-    """Spaces one after another."""
+def concatenate_spaces(spaces: list[Space]) -> Space:
+    """The space of all parameters of several, one after another."""
     return Space(*(np.concatenate(entries) for entries in zip(*spaces, strict=True)))
 
 
 class Prior(NamedTuple):
-    """What is known of the search variables before.
+    """Prior of the search variables, Gaussian and independent.
 
     Attributes:
         centre: Their most likely values, shape (k,).
-        weight: Inverse standard deviations; zero where nothing is known; shape (k,).
-        most_level: Mean square of the residual up to which a prior gains weight with it: what a
-            wrong model leaves tells less of its parameters than noise would.
+        weight: Inverse standard deviations; zero where there is no prior; shape (k,).
+        most_level: Mean square of the residual up to which a prior gains weight with it: the
+            residual of a wrong model determines its parameters less than noise would.
     """
 
     centre: Array
@@ -87,7 +87,7 @@ class Prior(NamedTuple):
     most_level: float = np.inf
 
     def level(self, residual: Array) -> float:
-        """Variance that a whitened residual stands for, one at the noise floor."""
+        """Variance of a whitened residual, at least one, the noise floor."""
         return min(max(1.0, float(np.mean(residual**2))), self.most_level)
 
 
@@ -99,7 +99,7 @@ class Solution(NamedTuple):
         residual: Residual there, shape (m,).
         jacobian: Derivative of the residual by the search variables, shape (m, k).
         cost: Sum of squares.
-        level: Variance that the residual stands for.
+        level: Variance of the residual, see `Prior.level`.
         prior: Precision of the prior in units of that variance, shape (k,).
     """
 
@@ -112,12 +112,12 @@ class Solution(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Rows of the residual that are all that one parameter moves.
+    """The rows of the residual that depend on a parameter.
 
     Attributes:
         first: First row.
         last: Past the last row.
-        residual_of: Those rows alone, of parameters, or None where there are none.
+        residual_of: Those rows alone as a function of parameters; None where the model runs away.
     """
 
     first: int
@@ -125,79 +125,122 @@ class Rows(NamedTuple):
     residual_of: ResidualOf
 
 
+class Effort(NamedTuple):
+    """How far a fit goes.
+
+    Attributes:
+        steps: Most steps that are accepted.
+        gain: Relative gain below which it ends.
+        sides: Sides on which its last differences are taken. With two the smaller counts: where a
+            law switches, one may catch a jump that is no derivative. With one the last Jacobian of
+            the search is kept.
+    """
+
+    steps: int
+    gain: float = 1e-4
+    sides: int = 2
+
+
+class Differences(NamedTuple):
+    """A residual with its derivatives by differences.
+
+    Attributes:
+        residual_of: Residual as a function of parameters, or None where there is none.
+        rows: Parameters, by index, on which some rows only depend; they then cost less.
+        threads: Differences that are taken at a time.
+    """
+
+    residual_of: ResidualOf
+    rows: Mapping[int, Rows] = MappingProxyType({})
+    threads: int = 1
+
+    def jacobian(self, x: Array, residual: Array, space: Space, sides: int) -> Array:
+        """Derivatives (m, k) at search variables; of two sides the smaller."""
+        columns = np.zeros((len(residual), len(x)))
+        all_rows = Rows(0, len(residual), self.residual_of)
+
+        def fill(i: int) -> None:
+            rows = self.rows.get(i, all_rows)
+            part = slice(rows.first, rows.last)
+            size = _DIFFERENCE * (1.0 if space.logarithmic[i] else max(1.0, abs(x[i])))
+            slopes: list[Array] = []
+            for step in (size, -size):
+                trial = x.copy()
+                trial[i] += step
+                difference = space.inner(space.outer(trial))[i] - x[i]
+                if abs(difference) < 0.5 * size:
+                    continue
+                moved = rows.residual_of(space.outer(trial))
+                if moved is not None and np.all(np.isfinite(moved)):
+                    slopes.append((moved - residual[part]) / difference)
+                if len(slopes) == sides:
+                    break
+            if slopes:
+                with np.errstate(over="ignore"):  # A column that overflows is the larger one.
+                    columns[part, i] = min(slopes, key=lambda column: float(column @ column))
+
+        if self.threads == 1:
+            for i in range(len(x)):
+                fill(i)
+        else:
+            # The simulations are machine code, which releases the interpreter's lock.
+            with ThreadPoolExecutor(self.threads) as pool:
+                list(pool.map(fill, range(len(x))))
+        return columns
+
+
 def solve(
-    residual_of: ResidualOf,
-    start: Array,
-    space: Space,
-    iterations: int,
-    tolerance: float = 1e-4,
-    rows: Mapping[int, Rows] = MappingProxyType({}),
-    threads: int = 1,
-    prior: Prior | None = None,
-    sides: int = 1,
+    differences: Differences, start: Array, space: Space, effort: Effort, prior: Prior | None = None
 ) -> Solution | None:
     """Least squares from a start.
 
     Args:
-        residual_of: Residual of parameters, or None where there is none.
+        differences: The residual and how its derivatives are taken.
         start: First parameters, shape (k,).
-        space: Where to search.
-        iterations: Most steps that are accepted.
-        tolerance: Relative gain below which the search ends.
-        rows: Parameters, by index, that move some rows only; their derivatives then cost less.
-        threads: Differences that are taken at a time.
-        prior: What is known before; nothing if absent.
-        sides: Sides on which the last differences are taken. With two the smaller counts: where a
-            law switches, one may catch a jump that is no derivative. With one the last tangent of
-            the search is kept.
+        space: Bounds and scales.
+        effort: How far to go.
+        prior: Prior of the search variables; none if absent.
 
     Returns:
         The solution, or None if there is no residual at the start.
     """
     x = space.inner(start)
-    begin = residual_of(space.outer(x))
-    if begin is None or not np.all(np.isfinite(begin)):
+    r = differences.residual_of(space.outer(x))
+    if r is None or not np.all(np.isfinite(r)):
         return None
-    r, damping = begin, _FIRST_DAMPING
-    known = prior or Prior(np.zeros_like(x), np.zeros_like(x))
+    known, damping = prior or Prior(np.zeros_like(x), np.zeros_like(x)), _FIRST_DAMPING
     level = known.level(r)
-
-    def tangent(sides: int = 1) -> Array:
-        return _jacobian(residual_of, x, r, space, rows, threads, sides)
-
-    jacobian, fresh = tangent(), True
-    for _ in range(iterations):
-        precision = level * known.weight**2
-        here = _Point(x, r, known.centre, precision)
-        moved = _moved(residual_of, here, space, jacobian, damping, patient=fresh)
-        if moved is None:
+    jacobian, fresh = differences.jacobian(x, r, space, 1), True
+    for _ in range(effort.steps):
+        point = _Point(x, r, known.centre, level * known.weight**2)
+        accepted = _damped_step(differences.residual_of, point, space, (jacobian, fresh), damping)
+        if accepted is None:
             if fresh:
                 break
-            jacobian, fresh = tangent(), True
+            jacobian, fresh = differences.jacobian(x, r, space, 1), True
             continue
-        there, damping = moved
-        change, move = there.residual - r, there.x - x
+        after, damping = accepted
+        change, move = after.residual - r, after.x - x
         error = change - jacobian @ move
-        small = here.cost - there.cost < tolerance * here.cost
-        x, r = there.x, there.residual
-        # A residual that has fallen leaves less weight to the prior: there may be more to gain.
+        small = point.cost - after.cost < effort.gain * point.cost
+        x, r = after.x, after.residual
+        # A residual that has fallen gives less weight to the prior: there may be more to gain.
         lower = min(level, known.level(r))
         small, level = small and lower > _SETTLED * level, lower
         if small and fresh:
             break
         if not small and error @ error < _TRUE * (change @ change):
-            # Near to the truth: a rank of one mends it, at the cost of nothing.
+            # The Jacobian is nearly true: Broyden's update costs no simulation.
             jacobian, fresh = jacobian + np.outer(error, move) / float(move @ move), False
         else:
-            jacobian, fresh = tangent(), True
-    precision = level * known.weight**2
-    if sides > 1 or not fresh:
-        jacobian = tangent(sides)
-    return Solution(space.outer(x), r, jacobian, float(r @ r), level, precision)
+            jacobian, fresh = differences.jacobian(x, r, space, 1), True
+    if effort.sides > 1 or not fresh:
+        jacobian = differences.jacobian(x, r, space, effort.sides)
+    return Solution(space.outer(x), r, jacobian, float(r @ r), level, level * known.weight**2)
 
 
 class _Point(NamedTuple):
-    """Where a search is."""
+    """A point of a search: variables, residual, and the prior with its precision there."""
 
     x: Array
     residual: Array
@@ -206,38 +249,46 @@ class _Point(NamedTuple):
 
     @property
     def cost(self) -> float:
-        """Sum of squares, the prior's with it."""
-        away = self.x - self.centre
-        return float(self.residual @ self.residual + away @ (self.precision * away))
+        """Sum of squares, the prior's included."""
+        offset = self.x - self.centre
+        return float(self.residual @ self.residual + offset @ (self.precision * offset))
 
 
-def _moved(
+def _damped_step(
     residual_of: ResidualOf,
-    here: _Point,
+    point: _Point,
     space: Space,
-    jacobian: Array,
+    tangent: tuple[Array, bool],
     damping: float,
-    *,
-    patient: bool,
 ) -> tuple[_Point, float] | None:
-    """A step with as little damping as lowers the cost; without patience one is tried."""
+    """A step with as little damping as lowers the cost, and the damping to begin the next with.
+
+    Args:
+        residual_of: Residual of parameters.
+        point: Where the step begins.
+        space: Bounds and scales.
+        tangent: The Jacobian, and whether it was taken here; with an older one a single damping is
+            tried.
+        damping: First damping.
+    """
+    jacobian, fresh = tangent
     with np.errstate(over="ignore", invalid="ignore"):  # No step is taken from what overflows.
-        products = jacobian.T @ jacobian + np.diag(here.precision)
-        gradient = jacobian.T @ here.residual + here.precision * (here.x - here.centre)
+        products = jacobian.T @ jacobian + np.diag(point.precision)
+        gradient = jacobian.T @ point.residual + point.precision * (point.x - point.centre)
     diagonal = np.maximum(np.diag(products), 1e-300)
     largest = np.where(space.logarithmic, _LARGEST_LOGARITHMIC_STEP, np.inf)
-    free = ~_pressed(here.x, gradient, space)
+    free = ~_at_active_bound(point.x, gradient, space)
     while damping < _LARGEST_DAMPING:
         step = _step(products, gradient, diagonal * damping, free)
         if step is None:
             return None
-        trial = space.inner(space.outer(here.x + np.clip(step, -largest, largest)))
+        trial = space.inner(space.outer(point.x + np.clip(step, -largest, largest)))
         residual = residual_of(space.outer(trial))
         if residual is not None:
-            there = here._replace(x=trial, residual=residual)
-            if there.cost < here.cost:
-                return there, max(damping * 0.1, 1e-12)
-        if not patient:
+            after = point._replace(x=trial, residual=residual)
+            if after.cost < point.cost:
+                return after, max(damping * 0.1, 1e-12)
+        if not fresh:
             return None
         damping *= 10.0
     return None
@@ -257,50 +308,7 @@ def _step(
     return step
 
 
-def _pressed(x: Array, gradient: Array, space: Space) -> NDArray[np.bool_]:
-    """Which variables the gradient presses against a bound."""
+def _at_active_bound(x: Array, gradient: Array, space: Space) -> NDArray[np.bool_]:
+    """Which variables are at a bound that the step would leave, shape (k,)."""
     values = space.outer(x)
     return ((values <= space.low) & (gradient > 0.0)) | ((values >= space.high) & (gradient < 0.0))
-
-
-def _jacobian(
-    residual_of: ResidualOf,
-    x: Array,
-    r: Array,
-    space: Space,
-    rows: Mapping[int, Rows],
-    threads: int,
-    sides: int,
-) -> Array:
-    """Derivatives (m, k) by differences; of two sides the smaller."""
-    columns = np.zeros((len(r), len(x)))
-    everything = Rows(0, len(r), residual_of)
-
-    def fill(i: int) -> None:
-        there = rows.get(i, everything)
-        part = slice(there.first, there.last)
-        size = _DIFFERENCE * (1.0 if space.logarithmic[i] else max(1.0, abs(x[i])))
-        found: list[Array] = []
-        for step in (size, -size):
-            trial = x.copy()
-            trial[i] += step
-            moved_by = space.inner(space.outer(trial))[i] - x[i]
-            if abs(moved_by) < 0.5 * size:
-                continue
-            moved = there.residual_of(space.outer(trial))
-            if moved is not None and np.all(np.isfinite(moved)):
-                found.append((moved - r[part]) / moved_by)
-            if len(found) == sides:
-                break
-        if found:
-            with np.errstate(over="ignore"):  # A column that overflows is the larger one.
-                columns[part, i] = min(found, key=lambda column: float(column @ column))
-
-    if threads == 1:
-        for i in range(len(x)):
-            fill(i)
-    else:
-        # The simulations are machine code, which lets go of the interpreter.
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(fill, range(len(x))))
-    return columns

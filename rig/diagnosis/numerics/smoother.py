@@ -1,4 +1,4 @@
-"""Smoothing over the whole run: what force the model lacks, without an observer's lag.
+"""Smoothing of a signal over a whole recording, without an observer's lag.
 
 The difference between measured and simulated height is smoothed with a Rauch-Tung-Striebel smoother
 whose state is the difference, its first two derivatives and the slope of the second (an integrated
@@ -44,7 +44,7 @@ class Smoothed(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """What the data say of themselves.
+    """Noise and smoothness of a signal.
 
     Attributes:
         variance: Variance of the sensor's noise.
@@ -82,23 +82,81 @@ _T3: Any = types.Array(types.float64, 3, "C")
 _transition_c = compile_loop(_transition, types.void(_F8, _M, _M))
 
 
+def _predict(a: Array, q: Array, ratio: float, m: Array, p: Array, work: Array) -> None:
+    """Mean (4,) and covariance (4, 4) one step ahead, in place; `work` (5, 4) is scratch."""
+    for i in range(4):
+        total = 0.0
+        for j in range(i, 4):
+            total += a[i, j] * m[j]
+        work[4, i] = total
+    for i in range(4):
+        m[i] = work[4, i]
+    for i in range(4):
+        for j in range(4):
+            total = 0.0
+            for l in range(i, 4):
+                total += a[i, l] * p[l, j]
+            work[i, j] = total
+    for i in range(4):
+        for j in range(i + 1):
+            total = ratio * q[i, j]
+            for l in range(j, 4):
+                total += work[i, l] * a[j, l]
+            p[i, j] = total
+            p[j, i] = total
+
+
+def _update(y: float, m: Array, p: Array, sums: Array, work: Array) -> None:
+    """Mean and covariance after a measurement, in place, and the sums of the likelihood."""
+    s = p[0, 0] + 1.0
+    e = y - m[0]
+    for i in range(4):
+        work[4, i] = p[i, 0] / s
+    for i in range(4):
+        m[i] += work[4, i] * e
+    for i in range(4):
+        for j in range(4):
+            work[i, j] = p[i, j] - work[4, i] * p[0, j]
+    for i in range(4):
+        for j in range(i + 1):
+            p[i, j] = 0.5 * (work[i, j] + work[j, i])
+            p[j, i] = p[i, j]
+    sums[2] += 1
+    # The first measurements determine the state, which is diffuse.
+    if sums[2] > 0:
+        sums[0] += e * e / s
+        sums[1] += np.log(s)
+
+
+_predict_c = compile_loop(_predict, types.void(_M, _M, _F8, _V, _M, _M))
+_update_c = compile_loop(_update, types.void(_F8, _V, _M, _V, _M))
+
+
 def _filter(
-    t: Array, y: Array, ratio: float, means: Array, covariances: Array, out: Array, keep: int
+    t: Array, y: Array, ratio: float, means: Array, covariances: Array, sums: Array
 ) -> None:
-    # All covariances are in units of the noise variance, which is concentrated out.
+    """Kalman filter; all covariances are in units of the noise variance, concentrated out.
+
+    Args:
+        t: Times, shape (N,).
+        y: Signal, NaN where missing, shape (N,).
+        ratio: Intensity of the random walk over the noise variance.
+        means: Receives the filtered means, shape (N, 4); empty where only sums are needed.
+        covariances: Receives the filtered covariances, shape (N, 4, 4), or empty.
+        sums: Receives squares and logarithms of innovations, and their number, shape (3,).
+    """
     m = np.zeros(4)
     p = np.zeros((4, 4))
     a = np.eye(4)
     q = np.zeros((4, 4))
-    ap = np.zeros((4, 4))
-    m2 = np.zeros(4)
+    work = np.zeros((5, 4))
     scale = 1.0
     for i in range(4):
         p[i, i] = 1e14 * scale
         scale *= 1e3
-    squares = 0.0
-    logs = 0.0
-    count = 0
+    sums[0] = 0.0
+    sums[1] = 0.0
+    sums[2] = -8.0
     last = -1.0
     for k in range(t.shape[0]):
         if k > 0:
@@ -106,55 +164,17 @@ def _filter(
             if abs(h - last) > 1e-12:
                 _transition_c(h, a, q)
                 last = h
-            for i in range(4):
-                total = 0.0
-                for j in range(i, 4):
-                    total += a[i, j] * m[j]
-                m2[i] = total
-            for i in range(4):
-                m[i] = m2[i]
-            for i in range(4):
-                for j in range(4):
-                    total = 0.0
-                    for l in range(i, 4):
-                        total += a[i, l] * p[l, j]
-                    ap[i, j] = total
-            for i in range(4):
-                for j in range(i + 1):
-                    total = ratio * q[i, j]
-                    for l in range(j, 4):
-                        total += ap[i, l] * a[j, l]
-                    p[i, j] = total
-                    p[j, i] = total
+            _predict_c(a, q, ratio, m, p, work)
         if y[k] == y[k]:
-            s = p[0, 0] + 1.0
-            e = y[k] - m[0]
-            for i in range(4):
-                m2[i] = p[i, 0] / s
-            for i in range(4):
-                m[i] += m2[i] * e
-            for i in range(4):
-                for j in range(4):
-                    ap[i, j] = p[i, j] - m2[i] * p[0, j]
-            for i in range(4):
-                for j in range(i + 1):
-                    p[i, j] = 0.5 * (ap[i, j] + ap[j, i])
-                    p[j, i] = p[i, j]
-            count += 1
-            if count > 8:
-                squares += e * e / s
-                logs += np.log(s)
-        if keep == 1:
+            _update_c(y[k], m, p, sums, work)
+        if means.shape[0] > 0:
             for i in range(4):
                 means[k, i] = m[i]
                 for j in range(4):
                     covariances[k, i, j] = p[i, j]
-    out[0] = squares
-    out[1] = logs
-    out[2] = count - 8
 
 
-_filter_c = compile_loop(_filter, types.void(_V, _V, _F8, _M, _T3, _V, types.int64))
+_filter_c = compile_loop(_filter, types.void(_V, _V, _F8, _M, _T3, _V))
 
 
 def _smooth(t: Array, ratio: float, means: Array, covariances: Array) -> None:
@@ -191,7 +211,7 @@ def estimate_noise(t_s: Array, y: Array) -> Noise:
     """
     n = len(t_s)
     if n > _LONGEST_FOR_LIKELIHOOD:
-        # A third from each part of the run says as much as the whole.
+        # A third from each part of the recording determines the noise as well as the whole.
         piece = _LONGEST_FOR_LIKELIHOOD // 3
         parts = [slice(i, i + piece) for i in (0, (n - piece) // 2, n - piece)]
     else:
@@ -203,7 +223,7 @@ def estimate_noise(t_s: Array, y: Array) -> Noise:
     def sums(log_ratio: float) -> tuple[float, float, float]:
         total = np.zeros(3)
         for t, part in pieces:
-            _filter_c(t, part, float(np.exp(log_ratio)), empty_means, empty_covariances, out, 0)
+            _filter_c(t, part, float(np.exp(log_ratio)), empty_means, empty_covariances, out)
             total += out
         return float(total[0]), float(total[1]), float(total[2])
 
@@ -217,13 +237,13 @@ def estimate_noise(t_s: Array, y: Array) -> Noise:
     high = -7.0 * np.log(step) + _FASTER
     grid = np.linspace(low, high, 25)
     values = [deviance(x) for x in grid]
-    # Where the likelihood hardly tells, the smoothest: a white signal has no best one.
+    # Where the likelihood hardly differs, the smoothest: a white signal has no best one.
     best = int(np.argmax(np.array(values) <= min(values) + _AS_LIKELY))
     left, right = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-    found: Any = minimize_scalar(
+    optimum: Any = minimize_scalar(
         deviance, bounds=(left, right), method="bounded", options={"xatol": 0.02}
     )
-    log_ratio = float(found.x)
+    log_ratio = float(optimum.x)
     squares, _, count = sums(log_ratio)
     return Noise(squares / count, float(np.exp(log_ratio)))
 
@@ -239,7 +259,7 @@ def smooth(t_s: Array, y: Array, noise: Noise) -> Smoothed:
     n = len(t_s)
     means, covariances, out = np.empty((n, _ORDER)), np.empty((n, _ORDER, _ORDER)), np.empty(3)
     t = np.ascontiguousarray(t_s)
-    _filter_c(t, np.ascontiguousarray(y), noise.ratio, means, covariances, out, 1)
+    _filter_c(t, np.ascontiguousarray(y), noise.ratio, means, covariances, out)
     _smooth_c(t, noise.ratio, means, covariances)
     variances = np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0) * noise.variance
     return Smoothed(means, np.sqrt(variances))

@@ -2,9 +2,9 @@
 
 The regression along the motion rests on an identity. Let the reference be a simulation with the
 linear dynamics G (heights by force). The residual of the measured heights is G applied to the
-force of what is missing, and to the changes of the linear part times the measured motion, plus
-sensor noise as it is: an equation error that passes through the model's own dynamics has the noise
-of an output error (Young 2011, 8.2). The measured motion itself comes from a smoother.
+missing force, and to the changes of the linear part times the measured motion, plus sensor noise
+as it is: an equation error that passes through the model's own dynamics has the noise of an output
+error (Young 2011, 8.2). The measured motion itself comes from a smoother.
 """
 
 from collections.abc import Sequence
@@ -15,140 +15,94 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
-from scipy.linalg import expm
 
-from dart_model.effects import Bench, Motion
-from rig.diagnosis.numerics.compiled import respond, simulate
+from dart_model.effects import Bench
+from dart_model.spec import ModelSpec
+from rig.diagnosis.numerics.compiled import simulate
 from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise
-from rig.diagnosis.problem import linear_part, track
-from rig.diagnosis.problem.grid import Grid, fine_times, smoothed
-from rig.diagnosis.problem.mechanism import Mechanism
-from rig.diagnosis.problem.problem import (
-    Candidate,
-    Flags,
-    Integers,
-    LinearParameter,
-    Parts,
-    Problem,
-    ResidualForces,
-    Segment,
+from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
+from rig.diagnosis.problem import linear_part, on_dart, track
+from rig.diagnosis.problem.driven_run import (
+    DrivenRun,
+    LoadCells,
+    SimulatedMotion,
+    driven_run,
+    first_motion,
+    input_noise_n,
+)
+from rig.diagnosis.problem.grid import (
+    RecordingGrid,
+    SmoothRecording,
     Track,
     block_numbers,
-    placed,
+    check_swing,
+    fine_times,
+)
+from rig.diagnosis.problem.linear_dynamics import FilterMechanism, LinearDynamics, system_matrix
+from rig.diagnosis.problem.mechanism import LinearisedMechanism, mechanism_along
+from rig.diagnosis.problem.problem import (
+    Candidate,
+    CandidateModel,
+    ComparedModels,
+    Flags,
+    Integers,
+    Problem,
+    ProblemBasis,
+    ResidualForces,
+    RunEvaluation,
+    Segment,
+    evaluated_nodes,
+    first_starts,
+    nominal,
+    nominal_model,
+    rms,
     slots_of,
     state_scales,
     strut_constants,
+    strut_effects,
 )
+from rig.diagnosis.recording import Recording, RecordingError
 
 Array = NDArray[np.float64]
 
-_STEP_ANGLE = 0.2
-"""Longest step as an angle of the model's fastest motion: the integrator errs by 1e-5 a radian."""
-_LONGEST_STEP_S = 1.25e-3
-"""Longest step where the motion is slow: laws that switch need it."""
 _BEND = 4.0
 """How much more than its fastest linear motion a smooth nonlinear one may bend within a step."""
-_FILTER_ANGLE = 0.25
-"""Longest step of the linear dynamics under a force that is linear between samples, as an angle."""
-_SETTLES_WITHIN = 0.15
-"""Time constant of the slowest response of the regression's dynamics, as a share of a segment."""
+_LEVEL_DRAWS, _FLOOR_DRAWS = 3, 8
+"""Draws of the applied force's noise. Their mean square is known to a third with three; of a floor
+the largest counts, since a lightly damped motion answers to it in so few independent swings that
+their RMS scatters by a third."""
+_AGREEMENT, _ACCURACY = 0.1, 0.01
+"""Share of the noise, or of the error if that is more, to which DART's steps are refined."""
+_IMPLAUSIBLE = 5.0
+"""Times the largest deflection that the load could cause from which on columns are mixed up."""
 
 
-class Run(NamedTuple):
-    """A recording as it is simulated.
+class _Reference(NamedTuple):
+    """A simulated recording that the regression along the motion is about.
 
     Attributes:
-        grid: Its nodes.
-        applied_n: Applied force at the nodes, shape (N,).
-        fine_n: Applied force at half sub-steps, shape (2 * substeps * (N - 1) + 1,).
-        substeps: Steps of the integrator between nodes.
-        angle: Angle by which the fastest motion turns within such a step.
-        mechanism: Constant, or along this recording's motion.
+        run: The recording.
+        motion: Its free run.
+        residual: Measured less simulated heights, smoothed, one entry a strut.
     """
 
-    grid: Grid
-    applied_n: Array
-    fine_n: Array
-    substeps: int
-    angle: float
-    mechanism: Mechanism
+    run: DrivenRun
+    motion: SimulatedMotion
+    residual: Sequence[Smoothed]
 
-
-class Trajectory(NamedTuple):
-    """Strut motions at the nodes, each of shape (N, struts)."""
-
-    heights_m: Array
-    velocities_m_per_s: Array
-    accelerations_m_per_s2: Array
-
-
-def run_of(
-    grid: Grid, applied_at: tuple[Array, Array], mechanism: Mechanism, fastest: float
-) -> Run:
-    """A recording ready to be simulated; the applied force as a cubic spline between its samples.
-
-    Args:
-        grid: Its nodes.
-        applied_at: Times and values of the applied force.
-        mechanism: The mechanism.
-        fastest: Largest eigenvalue of the model by size, in rad/s.
-    """
-    usual = grid.step_s
-    substeps = max(1, int(np.ceil(usual / min(_LONGEST_STEP_S, _STEP_ANGLE / fastest) - 1e-9)))
-    fine = CubicSpline(*applied_at)(fine_times(grid.t_s, 2 * substeps))
-    fine_n = np.ascontiguousarray(fine, dtype=np.float64)
-    return Run(
-        grid,
-        np.ascontiguousarray(fine_n[:: 2 * substeps]),
-        fine_n,
-        substeps,
-        fastest * usual / substeps,
-        mechanism,
-    )
-
-
-def _cut(run: Run, nodes: slice) -> Run:
-    fine = slice(2 * run.substeps * nodes.start, 2 * run.substeps * (nodes.stop - 1) + 1)
-    return run._replace(
-        grid=run.grid.cut(nodes),
-        applied_n=run.applied_n[nodes],
-        fine_n=run.fine_n[fine],
-        mechanism=run.mechanism.cut(nodes),
-    )
-
-
-def _finer(run: Run) -> Run:
-    steps = 2 * run.substeps
-    spline = CubicSpline(fine_times(run.grid.t_s, steps), run.fine_n)
-    fine_n = np.ascontiguousarray(spline(fine_times(run.grid.t_s, 2 * steps)))
-    return run._replace(fine_n=fine_n, substeps=steps, angle=0.5 * run.angle)
-
-
-_LEVEL_DRAWS = 3
-"""Draws of the applied force's noise: their mean square is known to a third."""
-_LARGEST_INPUT_NOISE = 0.01
-"""Share of an applied force's range above which what is not smooth is not noise but excitation."""
-_TOP = 0.8
-"""Share of the sampled band above which a bench excites nothing: anti-aliasing filters and the
-actuator end below, so what is there is noise."""
-
-
-def input_noise_n(run: Run) -> float:
-    """Standard deviation of the applied force's noise and resolution.
-
-    White noise is in all of the band. What is not smooth, but not at its top either, is excitation.
-    """
-    force = run.applied_n - run.applied_n.mean()
-    variance = estimate_noise(run.grid.t_s, force).variance
-    window = np.hanning(len(force))
-    power = np.abs(np.fft.rfft(force * window)) ** 2 / float(window @ window)
-    # Lines of a periodogram are exponentially distributed: their median is ln 2 of their mean.
-    top = float(np.median(power[int(_TOP * len(power)) :])) / np.log(2.0)
-    return min(float(np.sqrt(min(variance, top))), _LARGEST_INPUT_NOISE * float(np.ptp(force)))
+    def whole(self) -> tuple[Track, Track]:
+        """Measured and reference motion of the whole recording, at its nodes."""
+        reference = self.motion.track(self.run)
+        measured = reference._replace(
+            heights_m=reference.heights_m + np.array([s.states[:, 0] for s in self.residual]),
+            velocities_m_per_s=reference.velocities_m_per_s
+            + np.array([s.states[:, 1] for s in self.residual]),
+        )
+        return measured, reference
 
 
 @dataclass(frozen=True, eq=False)
-class FreeRun(Problem):
+class FreeRunProblem(Problem):
     """A model held against recordings of a force-driven bench.
 
     Attributes:
@@ -157,25 +111,39 @@ class FreeRun(Problem):
     """
 
     bench: ClassVar[Bench] = "force_given"
-    runs: tuple[Run, ...]
+    assumption: ClassVar[str] = (
+        "The initial state of every recording is fitted, for both models; between samples the "
+        "applied force is a cubic spline."
+    )
+    runs: tuple[DrivenRun, ...]
     noise_m: Array
 
+    @classmethod
+    def of_recordings(
+        cls, basis: ProblemBasis, recordings: Sequence[SmoothRecording]
+    ) -> "FreeRunProblem":
+        """The problem of recordings with an applied force."""
+        runs = tuple(_driven(basis, recording) for recording in recordings)
+        problem = cls(*basis, runs, np.full(len(basis.spec.struts), np.inf))
+        for run in runs:
+            check_swing(run.grid)
+        return problem.with_noise_of(
+            nominal_model(problem, first_starts(problem, nominal(problem)))
+        )
+
     @property
-    def recordings(self) -> int:
-        """Number of recordings."""
-        return len(self.runs)
+    def grids(self) -> tuple[RecordingGrid, ...]:
+        return tuple(run.grid for run in self.runs)
 
-    def finer(self) -> "FreeRun":
-        """The same problem with steps half as long: the integrator then errs a sixteenth."""
-        return replace(self, runs=tuple(_finer(run) for run in self.runs))
+    def finer(self) -> "FreeRunProblem":
+        """The problem with steps half as long: the integrator then errs a sixteenth."""
+        return replace(self, runs=tuple(run.finer() for run in self.runs))
 
-    def fitted(self, k: int) -> Flags:
-        """Nodes of a recording that take part in fits, shape (N,)."""
+    def fit_nodes(self, k: int) -> Flags:
         return self.runs[k].grid.fitted
 
-    def cut(self, pieces: Sequence[tuple[int, slice]]) -> "FreeRun":
-        """The same of pieces of recordings."""
-        return replace(self, runs=tuple(_cut(self.runs[k], nodes) for k, nodes in pieces))
+    def cut(self, pieces: Sequence[tuple[int, slice]]) -> "FreeRunProblem":
+        return replace(self, runs=tuple(self.runs[k].cut(nodes) for k, nodes in pieces))
 
     @cached_property
     def _stroke_m(self) -> float:
@@ -186,7 +154,6 @@ class FreeRun(Problem):
         return tuple(input_noise_n(run) for run in self.runs)
 
     def blocks(self, k: int) -> Integers:
-        """Block of each row of a recording's residual."""
         return np.repeat(self.runs[k].grid.blocks(self.block_s), len(self.noise_m))
 
     def start(self, k: int, candidate: Candidate) -> Array:
@@ -200,57 +167,29 @@ class FreeRun(Problem):
 
     def start_scales(self, candidate: Candidate) -> tuple[Array, Flags]:
         """A thousandth of the stroke, a hundredth of the speed, and the laws' own scales."""
-        row = float(np.max(np.abs(self.runs[0].mechanism.jacobian)))
-        q = 1e-3 * self._stroke_m / row
-        v = 1e-2 * max(motion.speed_m_per_s for motion in self.motions) / row
+        largest = float(np.max(np.abs(self.runs[0].mechanism.jacobian)))
+        q = 1e-3 * self._stroke_m / largest
+        v = 1e-2 * max(motion.speed_m_per_s for motion in self.motions) / largest
         n = self.runs[0].mechanism.coordinates
-        scales, fitted = state_scales(placed(self, candidate))
+        scales, fitted = state_scales(strut_effects(self, candidate))
         return (
             np.concatenate([np.full(n, q), np.full(n, v), scales]),
             np.concatenate([np.ones(2 * n, dtype=np.bool_), fitted]),
         )
 
-    def floor_level(self, candidate: Candidate, parts: Parts) -> float:
-        """One for the heights' noise, and what noise of the applied forces adds in simulation."""
-        squares = [
-            float(np.mean((heights_m / self.noise_m) ** 2))
-            for k in range(self.recordings)
-            for heights_m in self.disturbances_m(k, candidate, parts, _LEVEL_DRAWS)
-        ]
-        return 1.0 + (float(np.mean(squares)) if squares else 0.0)
+    # --- the residual in simulation ---------------------------------------------------------------
 
-    def disturbances_m(self, k: int, candidate: Candidate, parts: Parts, draws: int) -> list[Array]:
-        """Heights that draws of the applied force's noise cause, drift of springless axes included.
-
-        Each of shape (n, struts); none where there is no noise, or the model runs away.
-        """
-        run = self.runs[k]
-        noise = self._input_noise_n[k]
-        there = self.simulated(run, candidate, parts, parts.starts[k]) if noise > 0.0 else None
-        if there is None:
-            return []
-        rng = np.random.default_rng(0)
-        found: list[Array] = []
-        for _ in range(draws):
-            # White between samples: what the force is wrong by is held over a sample or so.
-            nodes = noise * rng.standard_normal(len(run.grid.t_s))
-            fine = np.append(np.repeat(nodes[:-1], 2 * run.substeps), nodes[-1])
-            other = run._replace(fine_n=run.fine_n + fine)
-            moved = self.simulated(other, candidate, parts, parts.starts[k])
-            if moved is not None:
-                found.append(moved.heights_m - there.heights_m)
-        return found
-
-    def simulated(
-        self, run: Run, candidate: Candidate, parts: Parts, start: Array
-    ) -> Trajectory | None:
+    def simulate(
+        self, run: DrivenRun, model: CandidateModel, start: Array
+    ) -> SimulatedMotion | None:
         """Free-run simulation, or None if it runs away or its mass is not positive."""
-        m = linear_part.corrected(run.mechanism, self.linear, parts.linear)
+        parts = model.parts
+        m = linear_part.with_linear_changes(run.mechanism, self.linear, parts.linear)
         if m is None:
             return None
         shape = (len(run.grid.t_s), len(self.noise_m))
-        there = Trajectory(np.empty(shape), np.empty(shape), np.empty(shape))
-        slots = slots_of(self, candidate)
+        motion = SimulatedMotion(np.empty(shape), np.empty(shape), np.empty(shape))
+        slots = slots_of(self, model.candidate)
         finite = simulate(
             slots.forces,
             slots.rates,
@@ -273,63 +212,104 @@ class FreeRun(Problem):
             _BEND * run.angle**2,
             self._stroke_m,
             start,
-            *there,
+            *motion,
         )
-        return there if finite else None
+        return motion if finite else None
 
-    def residual(self, k: int, candidate: Candidate, parts: Parts) -> Array | None:
+    def residual(self, k: int, model: CandidateModel) -> Array | None:
         """Measured less simulated heights over the noise, at the fitted nodes, flat."""
         run = self.runs[k]
-        there = self.simulated(run, candidate, parts, parts.starts[k])
-        if there is None:
+        motion = self.simulate(run, model, model.parts.starts[k])
+        if motion is None:
             return None
-        return ((run.grid.heights_m - there.heights_m)[run.grid.fitted] / self.noise_m).ravel()
+        return ((run.grid.heights_m - motion.heights_m)[run.grid.fitted] / self.noise_m).ravel()
 
-    def residual_forces(self, k: int, candidate: Candidate, parts: Parts) -> ResidualForces | None:
+    def states(self, k: int, model: CandidateModel) -> Array:
+        return model.parts.starts[k][2 * self.runs[k].mechanism.coordinates :]
+
+    # --- noise ------------------------------------------------------------------------------------
+
+    def with_noise_of(self, model: CandidateModel) -> "FreeRunProblem":
+        """The problem with the sensors' noise as a model's free run shows it, or an earlier one's.
+
+        A residual is noise and the model's error, of which a part looks like noise: the smallest
+        estimate is nearest.
+        """
+        variances: list[Array] = []
+        for run, start in zip(self.runs, model.parts.starts, strict=True):
+            motion = self.simulate(run, model, start)
+            heights = run.grid.heights_m
+            reference = np.nanmean(heights, axis=0) if motion is None else motion.heights_m
+            residual = heights - reference
+            variances.append(
+                np.array([estimate_noise(run.grid.t_s, column).variance for column in residual.T])
+            )
+        noise = np.minimum(np.sqrt(np.median(variances, axis=0)), self.noise_m)
+        return replace(self, noise_m=np.maximum(noise, 1e-300))
+
+    def floor_level(self, model: CandidateModel) -> float:
+        """One for the heights' noise, and what noise of the applied forces adds in simulation."""
+        squares = [
+            float(np.mean((heights_m / self.noise_m) ** 2))
+            for k in range(self.recordings)
+            for heights_m in self.disturbances_m(k, model, _LEVEL_DRAWS)
+        ]
+        return 1.0 + (float(np.mean(squares)) if squares else 0.0)
+
+    def disturbances_m(self, k: int, model: CandidateModel, draws: int) -> list[Array]:
+        """Heights that draws of the applied force's noise cause, drift of springless axes included.
+
+        Each of shape (N, struts); an empty list where there is no noise, or the model runs away.
+        """
+        run, start = self.runs[k], model.parts.starts[k]
+        noise = self._input_noise_n[k]
+        motion = self.simulate(run, model, start) if noise > 0.0 else None
+        if motion is None:
+            return []
+        rng = np.random.default_rng(0)
+        disturbances: list[Array] = []
+        for _ in range(draws):
+            # White between samples: the error of the force is held over a sample or so.
+            nodes = noise * rng.standard_normal(len(run.grid.t_s))
+            fine = np.append(np.repeat(nodes[:-1], 2 * run.substeps), nodes[-1])
+            disturbed = self.simulate(run._replace(fine_n=run.fine_n + fine), model, start)
+            if disturbed is not None:
+                disturbances.append(disturbed.heights_m - motion.heights_m)
+        return disturbances
+
+    # --- the residual force -----------------------------------------------------------------------
+
+    def residual_force_rms_n(self, mean_square: float) -> float:
+        """NaN: heights are fitted."""
+        del mean_square
+        return np.nan
+
+    def residual_forces(self, k: int, model: CandidateModel) -> ResidualForces | None:
         """The force that would make the residual vanish, along the smoothed motion."""
-        run = self.runs[k]
-        there = self.simulated(run, candidate, parts, parts.starts[k])
-        m = linear_part.corrected(run.mechanism, self.linear, parts.linear)
-        if there is None or m is None:
+        run, parts = self.runs[k], model.parts
+        motion = self.simulate(run, model, parts.starts[k])
+        m = linear_part.with_linear_changes(run.mechanism, self.linear, parts.linear)
+        if motion is None or m is None:
             return None
-        residual, _ = smoothed(run.grid, there.heights_m)
+        residual, _ = run.grid.residual_states(motion.heights_m)
         z, w, a = (
-            b + np.column_stack([s.states[:, i] for s in residual]) for i, b in enumerate(there)
+            b + np.column_stack([s.states[:, i] for s in residual]) for i, b in enumerate(motion)
         )
+        along = SimulatedMotion(z, w, a).track(run)
+        forces = track.strut_forces(self, model, along, self.states(k, model))
+        needed = m.strut_forces_of_motion(z, w, a, run.applied_n)
         spread = [np.column_stack([s.deviations[:, i] for s in residual]) for i in range(3)]
-        along = Track.of_columns(run.grid.t_s, z, w, run.applied_n, run.grid.temperature_c)
-        states = self.states(k, candidate, parts)
-        forces = track.strut_forces(self, candidate, parts, along, states)
-        every = np.arange(len(z)) if len(m.q) > 1 else np.zeros(len(z), dtype=np.int64)
-        jacobian, mass = m.jacobian[every], m.mass[every]
-        q = (
-            m.q[every]
-            + np.linalg.solve(jacobian, (z - m.heights_m[every])[..., np.newaxis])[..., 0]
-        )
-        v = np.linalg.solve(jacobian, w[..., np.newaxis])[..., 0]
-        acceleration = np.linalg.solve(jacobian, a[..., np.newaxis])[..., 0]
-        bias = m.bias[every] + m.applied[every] * run.applied_n[:, np.newaxis]
-        bias = bias + np.einsum("kij,kj->ki", m.bias_q[every], q - m.q[every])
-        bias = bias + np.einsum("kij,kj->ki", m.bias_v[every], v - m.v[every])
-        needed = np.einsum("kij,kj->ki", mass, acceleration) - bias
-        transposed = np.swapaxes(jacobian, 1, 2)
-        needed = np.linalg.solve(transposed, needed[..., np.newaxis])[..., 0]
         constants = strut_constants(self, parts.linear)
-        inertia = np.abs(np.linalg.solve(transposed[0], mass[0] @ np.linalg.inv(jacobian[0])))
+        inertia = m.strut_inertia()
         deviation = (
             spread[2] @ inertia.T + constants[:, 2] * spread[1] + constants[:, 1] * spread[0]
         )
         return ResidualForces(run.grid.name, along, needed.T - forces, deviation.T)
 
-    def states(self, k: int, candidate: Candidate, parts: Parts) -> Array:
-        """Internal states at the beginning of a recording."""
-        del candidate
-        return parts.starts[k][2 * self.runs[k].mechanism.coordinates :]
-
-    # --- the regression along the motion ------------------------------------------------------
+    # --- the regression along the motion ----------------------------------------------------------
 
     def segments(
-        self, candidate: Candidate, parts: Parts, most_samples: int, most_thinned: int
+        self, model: CandidateModel, most_samples: int, largest_stride: int
     ) -> tuple[Segment, ...]:
         """The regression about a free run of a model, which becomes the reference.
 
@@ -337,33 +317,36 @@ class FreeRun(Problem):
             FloatingPointError: The model runs away.
         """
         samples = sum(len(run.grid.t_s) for run in self.runs)
-        found: list[Segment] = []
+        segments: list[Segment] = []
         for k, run in enumerate(self.runs):
-            there = self.simulated(run, candidate, parts, parts.starts[k])
-            if there is None:
+            motion = self.simulate(run, model, model.parts.starts[k])
+            if motion is None:
                 raise FloatingPointError(run.grid.name)
-            residual, _ = smoothed(run.grid, there.heights_m)
-            pieces = track.pieces(len(run.grid.t_s), samples, most_samples, most_thinned)
-            lead = self._whole(run, there, residual) if len(pieces) > 1 else None
+            residual, _ = run.grid.residual_states(motion.heights_m)
+            reference = _Reference(run, motion, residual)
+            pieces = track.pieces(len(run.grid.t_s), samples, most_samples, largest_stride)
+            lead = reference.whole() if len(pieces) > 1 else None
             for cut in pieces:
                 if not np.any(run.grid.fitted[cut]):
                     continue  # All of it is held out.
-                dynamics = _Dynamics(self, run, parts.linear, cut)
-                found.append(self._segment(run, there, residual, lead, cut, dynamics))
-        return tuple(found)
+                segments.append(self._segment(reference, lead, cut, model.parts.linear))
+        return tuple(segments)
+
+    def _dynamics(self, run: DrivenRun, linear: Array, cut: slice) -> LinearDynamics:
+        m = linear_part.with_linear_changes(run.mechanism, self.linear, linear)
+        if m is None:
+            raise FloatingPointError(run.grid.name)
+        step_s = run.grid.step_s
+        constants = strut_constants(self, linear)
+        return LinearDynamics(m, constants, (cut.stop - cut.start) * step_s, step_s * cut.step)
 
     def _segment(
-        self,
-        run: Run,
-        there: Trajectory,
-        residual: Sequence[Smoothed],
-        lead: tuple[Track, Track] | None,
-        cut: slice,
-        dynamics: "_Dynamics",
+        self, about: _Reference, lead: tuple[Track, Track] | None, cut: slice, linear: Array
     ) -> Segment:
-        grid = run.grid
+        run, simulated, residual = about
+        grid, dynamics = run.grid, self._dynamics(run, linear, cut)
         states = [np.column_stack([s.states[cut, i] for s in residual]) for i in range(3)]
-        motion = [a[cut] + b for a, b in zip(there, states, strict=True)]
+        motion = [a[cut] + b for a, b in zip(simulated, states, strict=True)]
         # The grid of the filter: finer where the motion is fast, never coarser than the samples.
         t_s = fine_times(grid.t_s[cut], dynamics.finer)
         z = CubicHermiteSpline(grid.t_s[cut], motion[0], motion[1])(t_s)
@@ -376,28 +359,30 @@ class FreeRun(Problem):
         every = dynamics.finer
         weight = 1.0 / self.noise_m
 
-        def answer(forces: Array) -> Array:
+        def whitened_heights(forces: Array) -> Array:
             """Whitened heights (m,) under generalised forces (N, n)."""
             return (dynamics.heights(forces)[rows * every] * weight).ravel()
 
-        tables = _Tables(run.mechanism.cut(cut), grid.t_s[cut], t_s)
+        mechanism = FilterMechanism(run.mechanism.cut(cut), grid.t_s[cut], t_s)
 
         def respond_to(strut: int, force: Array) -> Array:
-            return answer(tables.jacobian[:, strut] * force[:, np.newaxis])
+            return whitened_heights(mechanism.jacobian[:, strut] * force[:, np.newaxis])
 
-        raw = grid.heights_m[cut] - there.heights_m[cut]
+        raw = grid.heights_m[cut] - simulated.heights_m[cut]
         held = dynamics.holding_forces(states[0], states[1], grid.t_s[cut], t_s)
-        target = (raw[rows] * weight).ravel() - answer(held)
+        target = (raw[rows] * weight).ravel() - whitened_heights(held)
         columns = [
-            answer(tables.generalised(parameter, z, w, acceleration, applied, self.motions))
+            whitened_heights(mechanism.unit_force(parameter, along, acceleration, self.motions))
             for parameter in self.linear
         ]
         initial = [(h[rows * every] * weight).ravel() for h in dynamics.free_motions(len(t_s))]
         numbers = block_numbers(grid.t_s, self.block_s)[cut][rows]
         blocks = np.repeat(numbers - numbers[0], len(self.noise_m))
         reference = along._replace(
-            heights_m=_spline_through(grid.t_s[cut], there.heights_m[cut], t_s),
-            velocities_m_per_s=_spline_through(grid.t_s[cut], there.velocities_m_per_s[cut], t_s),
+            heights_m=_spline_through(grid.t_s[cut], simulated.heights_m[cut], t_s),
+            velocities_m_per_s=_spline_through(
+                grid.t_s[cut], simulated.velocities_m_per_s[cut], t_s
+            ),
         )
         return Segment(
             along,
@@ -410,151 +395,136 @@ class FreeRun(Problem):
             blocks,
         )
 
-    def _whole(
-        self, run: Run, there: Trajectory, residual: Sequence[Smoothed]
-    ) -> tuple[Track, Track]:
-        """Measured and reference motion of a whole recording, at its nodes."""
-        reference = track_of(run, there)
-        measured = reference._replace(
-            heights_m=reference.heights_m + np.array([s.states[:, 0] for s in residual]),
-            velocities_m_per_s=reference.velocities_m_per_s
-            + np.array([s.states[:, 1] for s in residual]),
+    # --- held-out data ----------------------------------------------------------------------------
+
+    def evaluate(
+        self, k: int, models: ComparedModels, fitted_rms_n: float, *, blocks: bool
+    ) -> RunEvaluation:
+        """Figures of a held-out recording: heights are DART's, with the applied force as input."""
+        del fitted_rms_n
+        run = self.runs[k]
+        grid, rows = run.grid, evaluated_nodes(run.grid, blocks=blocks)
+        measured = np.where(rows[:, np.newaxis], grid.heights_m, np.nan)
+        simulated = [self.simulate(run, model, model.parts.starts[k]) for model in models]
+        motions = [motion for motion in simulated if motion is not None]
+        if len(motions) < len(models):
+            raise RecordingError(
+                f"{grid.name}: the model runs away on this run, expected one that stays near the "
+                "motion it was learnt from"
+            )
+        before, linear, after = motions
+        noise = np.sqrt(
+            [estimate_noise(grid.t_s, c).variance for c in (grid.heights_m - after.heights_m).T]
         )
-        return measured, reference
+        on_dart_m: list[Array] = []
+        for model, motion in ((models.nominal, before), (models.corrected, after)):
+            error_m = rms(measured - motion.heights_m)
+            tolerance_m = max(_AGREEMENT * float(noise.min()), _ACCURACY * error_m)
+            on_dart_m.append(self.heights_on_dart(k, model, motion.heights_m, tolerance_m))
+        forces = [self.residual_forces(k, model) for model in models]
+        residual_n = [
+            np.nan if f is None else rms(np.where(rows, f.force_n, np.nan)) for f in forces
+        ]
+        heights = BeforeAfter(*(rms(measured - heights_m) for heights_m in on_dart_m))
+        deviation = np.nan if forces[2] is None else rms(forces[2].deviation_n)
+        disturbances = self.disturbances_m(k, models.corrected, _FLOOR_DRAWS)
+        drift_m = max((rms(heights_m) for heights_m in disturbances), default=0.0)
+        floor_m = float(np.hypot(rms(noise), drift_m))
+        speeds = measured.T if forces[0] is None else forces[0].track.velocities_m_per_s
+        series = tuple(
+            HeldOutSeries(
+                grid.name, strut.name, "m", grid.t_s, measured[:, i], on_dart_m[0][:, i],
+                on_dart_m[1][:, i], grid.heights_m[:, i], speeds[i],
+            )
+            for i, strut in enumerate(self.spec.struts)
+        )  # fmt: skip
+        figures = RunFigures(
+            grid.name,
+            heights,
+            BeforeAfter(residual_n[0], residual_n[2]),
+            self._cell_errors(k, models, (before, after), rows),
+        )
+        return RunEvaluation(
+            figures, heights, rms(measured - linear.heights_m), residual_n[1],
+            NoiseFloor(floor_m, deviation), drift_m, series,
+        )  # fmt: skip
+
+    def heights_on_dart(
+        self, k: int, model: CandidateModel, expected_m: Array, tolerance_m: float
+    ) -> Array:
+        """Heights of a model's free run in DART, see `on_dart.dart_heights`."""
+        return on_dart.dart_heights(
+            self, self.runs[k], model, model.parts.starts[k], expected_m, tolerance_m
+        )
+
+    def _cell_errors(
+        self,
+        k: int,
+        models: ComparedModels,
+        motions: tuple[SimulatedMotion, SimulatedMotion],
+        rows: Flags,
+    ) -> BeforeAfter | None:
+        """Errors against the load cell where it is evaluated, the models in free run."""
+        run = self.runs[k]
+        if run.cells is None or any(self.plants.plain.mockups):
+            return None  # The mechanism of an FMU contains its force.
+        t_s = run.cells.t_s
+        evaluated = np.interp(t_s, run.grid.t_s, rows) > 0.5
+        cells = np.where(evaluated[:, np.newaxis], run.cells.forces_n, np.nan)
+        errors: list[float] = []
+        for model, motion in zip((models.nominal, models.corrected), motions, strict=True):
+            forces = track.strut_forces(self, model, motion.track(run), self.states(k, model))
+            at = np.column_stack([np.interp(t_s, run.grid.t_s, force) for force in forces])
+            errors.append(rms(cells - at))
+        return BeforeAfter(*errors)
 
 
-def track_of(run: Run, there: Trajectory) -> Track:
-    """A simulated motion of a recording as a track."""
-    z, w, _ = there
-    return Track.of_columns(run.grid.t_s, z, w, run.applied_n, run.grid.temperature_c)
+def _driven(basis: ProblemBasis, smooth: SmoothRecording) -> DrivenRun:
+    recording = smooth.recording
+    if recording.applied_force_n is None:
+        raise RecordingError(f"{recording.name}: expected a column applied_force_n")
+    applied = (recording.t_s, recording.applied_force_n)
+    motion = smooth.motion._replace(applied_n=np.interp(smooth.grid.t_s, *applied))
+    mechanism = mechanism_along(basis.plants, motion)
+    _check_columns(basis.spec, recording, mechanism)
+    cells = recording.strut_forces_n
+    return driven_run(
+        smooth.grid,
+        applied,
+        mechanism,
+        _fastest(basis.spec, mechanism),
+        None if cells is None else LoadCells(recording.t_s, cells),
+    )
+
+
+def _fastest(spec: ModelSpec, m: LinearisedMechanism) -> float:
+    """Largest eigenvalue of the model without effects, by size, in rad/s."""
+    constants = np.array([(s.stiffness_n_per_m, s.damping_n_s_per_m) for s in spec.struts])
+    jacobian, mass = m.jacobian.mean(axis=0), m.mass.mean(axis=0)
+    stiffness = jacobian.T @ np.diag(constants[:, 0]) @ jacobian - m.bias_q.mean(axis=0)
+    damping = jacobian.T @ np.diag(constants[:, 1]) @ jacobian - m.bias_v.mean(axis=0)
+    poles = np.linalg.eigvals(system_matrix(mass, stiffness, damping))
+    return max(float(np.max(np.abs(poles))), 1e-9)
+
+
+def _check_columns(spec: ModelSpec, recording: Recording, mechanism: LinearisedMechanism) -> None:
+    """Refuse heights that the applied force cannot have caused."""
+    load = float(np.max(np.abs(mechanism.bias)))
+    if recording.applied_force_n is not None:
+        load += float(np.max(np.abs(recording.applied_force_n)))
+    for strut, height_m in zip(spec.struts, recording.heights_m.T, strict=True):
+        if strut.stiffness_n_per_m <= 0.0:
+            continue
+        bend = load / strut.stiffness_n_per_m
+        middle = float(np.nanmedian(height_m))
+        if abs(middle - strut.free_length_m) > _IMPLAUSIBLE * (abs(strut.free_length_m) + bend):
+            raise RecordingError(
+                f"{recording.name}: height_m is {middle:.3g} m in the middle of the run, but a "
+                f"load of at most {load:.3g} N bends the model's strut by {bend:.3g} m: expected "
+                "heights near its free length: are the columns swapped, or the units wrong?"
+            )
 
 
 def _spline_through(nodes_s: Array, values: Array, t_s: Array) -> Array:
     """Columns (N, struts) at other times, as rows."""
     return np.ascontiguousarray(CubicSpline(nodes_s, values)(t_s).T)
-
-
-def first_motion(grid: Grid) -> tuple[Array, Array]:
-    """Heights and velocities at a run's start, by a parabola through its first samples."""
-    count = min(len(grid.t_s), max(20, int(0.05 / grid.step_s)))
-    heights: list[float] = []
-    velocities: list[float] = []
-    t = grid.t_s[:count] - grid.t_s[0]
-    for column in grid.heights_m[:count].T:
-        there = np.isfinite(column)
-        polynomial = np.polynomial.Polynomial.fit(t[there], column[there], 2)
-        heights.append(float(polynomial(0.0)))
-        velocities.append(float(polynomial.deriv()(0.0)))
-    return np.array(heights), np.array(velocities)
-
-
-class _Tables:
-    """The mechanism on the grid of the filter."""
-
-    def __init__(self, mechanism: Mechanism, nodes_s: Array, t_s: Array) -> None:
-        at = np.zeros(len(t_s), dtype=np.int64)
-        if len(mechanism.q) > 1:
-            at = np.clip(np.searchsorted(nodes_s, t_s - 1e-12), 0, len(nodes_s) - 1)
-        self._mechanism, self._at = mechanism, at
-        self.jacobian = mechanism.jacobian[at]
-
-    def generalised(
-        self,
-        parameter: LinearParameter,
-        z: Array,
-        w: Array,
-        acceleration: Array,
-        applied: Array,
-        motions: Sequence[Motion],
-    ) -> Array:
-        """Generalised force (N, n) of a unit change of a linear parameter along the motion."""
-        strut = parameter.strut
-        if parameter.kind == "mass":
-            q = np.linalg.solve(self.jacobian, acceleration[..., np.newaxis])[..., 0]
-            inertia = np.einsum("kij,kj->ki", self._mechanism.mass_by_kg[self._at, strut], q)
-            return self._mechanism.bias_by_kg[self._at, strut] - inertia
-        if parameter.kind == "gain":
-            return self._mechanism.applied[self._at] * applied[:, np.newaxis]
-        force = linear_part.strut_force(parameter.kind, z[:, strut], w[:, strut], motions[strut])
-        return self.jacobian[:, strut] * force[:, np.newaxis]
-
-
-class _Dynamics:
-    """The linear dynamics of a model about its mean configuration, discretised."""
-
-    def __init__(self, problem: FreeRun, run: Run, linear: Array, cut: slice) -> None:
-        m = linear_part.corrected(run.mechanism, problem.linear, linear)
-        if m is None:
-            raise FloatingPointError(run.grid.name)
-        n = m.coordinates
-        constants = strut_constants(problem, linear)
-        jacobian = m.jacobian.mean(axis=0)
-        mass = m.mass.mean(axis=0)
-        stiffness = jacobian.T @ np.diag(constants[:, 1]) @ jacobian - m.bias_q.mean(axis=0)
-        damping = jacobian.T @ np.diag(constants[:, 2]) @ jacobian - m.bias_v.mean(axis=0)
-        duration = (cut.stop - cut.start) * run.grid.step_s
-        coarse_s = run.grid.step_s * cut.step
-        self.more_stiffness, self.more_damping = _settling(
-            mass, stiffness, damping, 1.0 / (_SETTLES_WITHIN * duration)
-        )
-        a = system(mass, stiffness + self.more_stiffness, damping + self.more_damping)
-        fastest = float(np.max(np.abs(np.linalg.eigvals(a))))
-        self.finer = max(1, int(np.ceil(fastest * coarse_s / _FILTER_ANGLE)))
-        step = coarse_s / self.finer
-        b = np.vstack([np.zeros((n, n)), np.linalg.inv(mass)])
-        augmented = np.zeros((4 * n, 4 * n))
-        augmented[: 2 * n, : 2 * n] = a * step
-        augmented[: 2 * n, 2 * n : 3 * n] = b * step
-        augmented[2 * n : 3 * n, 3 * n :] = np.eye(n)
-        e = expm(augmented)
-        late = e[: 2 * n, 3 * n :]
-        parts = (
-            e[: 2 * n, : 2 * n],
-            e[: 2 * n, 2 * n : 3 * n] - late,
-            late,
-            np.hstack([jacobian, np.zeros_like(jacobian)]),
-        )
-        self._parts = tuple(np.ascontiguousarray(part, dtype=np.float64) for part in parts)
-        self._jacobian = jacobian
-
-    def heights(self, forces: Array) -> Array:
-        """Heights (N, struts) from rest under generalised forces (N, n)."""
-        out = np.empty((len(forces), len(self._jacobian)))
-        respond(*self._parts, np.ascontiguousarray(forces), out)
-        return out
-
-    def holding_forces(self, z: Array, w: Array, nodes_s: Array, t_s: Array) -> Array:
-        """Generalised force of what was added so that the dynamics settle, along a difference."""
-        inverse = np.linalg.pinv(self._jacobian)
-        force = z @ inverse.T @ self.more_stiffness.T + w @ inverse.T @ self.more_damping.T
-        return CubicSpline(nodes_s, force)(t_s)
-
-    def free_motions(self, samples: int) -> list[Array]:
-        """Heights (N, struts) of the free motion from a unit of each coordinate and velocity."""
-        transition, output = self._parts[0], self._parts[3]
-        powers = np.eye(len(transition))[np.newaxis]
-        ahead = transition
-        while len(powers) < samples:
-            powers = np.concatenate([powers, powers @ ahead])
-            ahead = ahead @ ahead
-        return [(output @ powers[:samples, :, i].T).T for i in range(len(transition))]
-
-
-def system(mass: Array, stiffness: Array, damping: Array) -> Array:
-    """System matrix of coordinates and velocities."""
-    n = len(mass)
-    lower = -np.linalg.solve(mass, np.hstack([stiffness, damping]))
-    return np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower], dtype=np.float64)
-
-
-def _settling(mass: Array, stiffness: Array, damping: Array, slowest: float) -> tuple[Array, Array]:
-    """Stiffness and damping to add so that no response lasts longer than a time constant."""
-    n = len(mass)
-    more_stiffness, more_damping = np.zeros((n, n)), np.zeros((n, n))
-    softest = float(np.min(np.linalg.eigvals(np.linalg.solve(mass, stiffness)).real))
-    if softest < 4.0 * slowest**2:
-        more_stiffness = mass * (4.0 * slowest**2 - min(softest, 0.0))
-    poles = np.linalg.eigvals(system(mass, stiffness + more_stiffness, damping)).real
-    if float(np.max(poles)) > -slowest:
-        more_damping = mass * 2.0 * (slowest + max(float(np.max(poles)), 0.0))
-    return more_stiffness, more_damping

@@ -1,21 +1,23 @@
-"""A recording on the nodes of a computation: gaps are filled, outliers and held-out nodes apart.
+"""Recordings on the nodes of a computation: gaps filled, outliers removed, heights smoothed.
 
 Reference: Hampel, The influence curve and its role in robust estimation, JASA 69 (1974), for the
 median absolute deviation as a scale that outliers do not move.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.effects import AMBIENT_C
+from dart_model.effects import AMBIENT_C, Motion
+from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.smoother import Noise, Smoothed, estimate_noise, smooth
-from rig.diagnosis.problem.problem import Track, block_numbers
-from rig.diagnosis.recording import Recording
+from rig.diagnosis.recording import Recording, RecordingError
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Integers = NDArray[np.int64]
 
 _OUTLIER = 10.0
 """Times the robust scale of fourth differences from which on a sample can be an outlier: of 1e6
@@ -24,11 +26,48 @@ _PATTERN = (-2.0 / 3.0, 0.25)
 """Neighbour over middle in the fourth difference of a single false sample, and the tolerance."""
 _GAUSS = 1.4826
 """Standard deviation over median absolute deviation of a Gaussian."""
+_LEAST_SWING = 5.0
+"""Motion over sensor noise below which no law can be determined."""
 _QUIET = 0.3
-"""Share of the RMS velocity below which a block shows too little motion to judge on."""
+"""Share of the RMS velocity below which a block shows too little motion to evaluate on."""
 
 
-class Grid(NamedTuple):
+class Track(NamedTuple):
+    """A motion on a grid, along which laws are evaluated.
+
+    Attributes:
+        t_s: Times, shape (N,).
+        heights_m: Heights, shape (struts, N).
+        velocities_m_per_s: Their rates, shape (struts, N).
+        applied_n: Applied force, shape (N,); zero where there is none.
+        temperature_c: Temperature, shape (N,).
+    """
+
+    t_s: Array
+    heights_m: Array
+    velocities_m_per_s: Array
+    applied_n: Array
+    temperature_c: Array
+
+    @classmethod
+    def of_columns(
+        cls,
+        t_s: Array,
+        heights_m: Array,
+        velocities_m_per_s: Array,
+        applied_n: Array,
+        temperature_c: Array,
+    ) -> "Track":
+        """A motion whose heights and velocities are given as columns, shape (N, struts)."""
+        rows = t_s, heights_m.T, velocities_m_per_s.T, applied_n, temperature_c
+        return cls(*(np.ascontiguousarray(row) for row in rows))
+
+    def cut(self, nodes: slice) -> "Track":
+        """The motion at some of the nodes."""
+        return Track(*(np.ascontiguousarray(part[..., nodes]) for part in self))
+
+
+class RecordingGrid(NamedTuple):
     """A recording on nodes.
 
     Attributes:
@@ -36,17 +75,17 @@ class Grid(NamedTuple):
         t_s: Times of the nodes: measured times and, in gaps, times between, shape (N,).
         heights_m: Measured heights, NaN elsewhere and where outliers were, shape (N, struts).
         fitted: Nodes whose measurements take part in fits, shape (N,).
-        kept: Nodes that are held out to be judged on, shape (N,).
+        held_out: Nodes that are held out of fits, to evaluate on, shape (N,).
         temperature_c: Temperature at the nodes, shape (N,).
         has_temperature: Whether it was measured.
-        outliers: Number of heights that were left out as outliers.
+        outliers: Number of heights that were removed as outliers.
     """
 
     name: str
     t_s: Array
     heights_m: Array
     fitted: Flags
-    kept: Flags
+    held_out: Flags
     temperature_c: Array
     has_temperature: bool
     outliers: int
@@ -61,26 +100,103 @@ class Grid(NamedTuple):
         """Time from first to last node."""
         return float(self.t_s[-1] - self.t_s[0])
 
-    def cut(self, nodes: slice) -> "Grid":
+    def cut(self, nodes: slice) -> "RecordingGrid":
         """The recording at some of the nodes."""
         return self._replace(
             t_s=self.t_s[nodes],
             heights_m=self.heights_m[nodes],
             fitted=self.fitted[nodes],
-            kept=self.kept[nodes],
+            held_out=self.held_out[nodes],
             temperature_c=self.temperature_c[nodes],
         )
 
-    def blocks(self, length_s: float) -> NDArray[np.int64]:
+    def blocks(self, length_s: float) -> Integers:
         """Block of each fitted node."""
         return block_numbers(self.t_s, length_s)[self.fitted]
 
+    def with_held_out_blocks(self, length_s: float, every: int) -> "RecordingGrid":
+        """The recording with one block in `every` held out, spread over where there is motion."""
+        numbers = block_numbers(self.t_s, length_s)
+        speed = np.zeros(len(self.t_s))
+        for column in self.heights_m.T:
+            measured = np.isfinite(column)
+            height_m = np.interp(self.t_s, self.t_s[measured], column[measured])
+            speed += np.gradient(height_m, self.t_s) ** 2
+        moving = [
+            number
+            for number in range(int(numbers[-1]) + 1)
+            if float(np.mean(speed[numbers == number])) > _QUIET**2 * float(np.mean(speed))
+        ]
+        # The first block holds the initial state, which the fit needs.
+        chosen = [number for number in moving if number > 0][every // 2 :: every]
+        held_out = np.isin(numbers, chosen) & self.fitted
+        return self._replace(held_out=held_out, fitted=self.fitted & ~held_out)
 
-def grid_of(recording: Recording) -> tuple[Grid, NDArray[np.int64]]:
-    """A recording on nodes, and which node each sample is, shape (samples,)."""
-    t_s, at = _nodes(recording.t_s)
+    def residual_states(self, reference_m: Array) -> tuple[list[Smoothed], list[Noise]]:
+        """Measured less reference heights, smoothed, and their noise: one entry a strut."""
+        difference = self.heights_m - reference_m
+        noises = [estimate_noise(self.t_s, column) for column in difference.T]
+        states = [
+            smooth(self.t_s, column, noise)
+            for column, noise in zip(difference.T, noises, strict=True)
+        ]
+        return states, noises
+
+
+class SmoothRecording(NamedTuple):
+    """A recording on nodes, with its motion smoothed without any model.
+
+    Attributes:
+        recording: As measured.
+        grid: Its nodes.
+        sample_nodes: Node of each sample, shape (samples,).
+        motion: The smoothed motion.
+        deviations: The smoothed difference from the mean height, one entry a strut.
+        noises: Noise of each height sensor.
+    """
+
+    recording: Recording
+    grid: RecordingGrid
+    sample_nodes: Integers
+    motion: Track
+    deviations: list[Smoothed]
+    noises: list[Noise]
+
+
+class HeldOutBlocks(NamedTuple):
+    """Blocks that are held out of fits where no run is.
+
+    Attributes:
+        length_s: Length of a block.
+        every: One block in so many is held out.
+    """
+
+    length_s: float
+    every: int
+
+
+def smooth_recording(recording: Recording, blocks: HeldOutBlocks | None) -> SmoothRecording:
+    """A recording on nodes and smoothed, some blocks held out of fits if asked for."""
+    grid, sample_nodes = _place_on_nodes(recording)
+    if blocks is not None:
+        grid = grid.with_held_out_blocks(*blocks)
+    middle_m = np.nanmean(grid.heights_m, axis=0)
+    states, noises = grid.residual_states(np.broadcast_to(middle_m, grid.heights_m.shape))
+    heights_m, velocities_m_per_s = (
+        np.column_stack([s.states[:, i] for s in states]) for i in (0, 1)
+    )
+    no_force_n = np.zeros(len(grid.t_s))
+    motion = Track.of_columns(
+        grid.t_s, heights_m + middle_m, velocities_m_per_s, no_force_n, grid.temperature_c
+    )
+    return SmoothRecording(recording, grid, sample_nodes, motion, states, noises)
+
+
+def _place_on_nodes(recording: Recording) -> tuple[RecordingGrid, Integers]:
+    """A recording on nodes, and the node of each sample, shape (samples,)."""
+    t_s, sample_nodes = _nodes(recording.t_s)
     heights = np.full((len(t_s), recording.heights_m.shape[1]), np.nan)
-    heights[at] = recording.heights_m
+    heights[sample_nodes] = recording.heights_m
     outliers = 0
     for column in heights.T:
         false = _outliers(column)
@@ -90,7 +206,7 @@ def grid_of(recording: Recording) -> tuple[Grid, NDArray[np.int64]]:
     temperature = np.full(len(t_s), AMBIENT_C)
     if recording.temperature_c is not None:
         temperature = _smooth_temperature(recording.t_s, recording.temperature_c, t_s)
-    grid = Grid(
+    grid = RecordingGrid(
         recording.name,
         t_s,
         heights,
@@ -100,53 +216,71 @@ def grid_of(recording: Recording) -> tuple[Grid, NDArray[np.int64]]:
         recording.temperature_c is not None,
         outliers,
     )
-    return grid, at
+    return grid, sample_nodes
 
 
-def with_blocks_kept(grid: Grid, length_s: float, every: int) -> Grid:
-    """One block of every few held out, spread over the recording where there is motion."""
-    numbers = block_numbers(grid.t_s, length_s)
-    speed = np.zeros(len(grid.t_s))
+def _largest_force_std_n(recordings: Sequence[SmoothRecording]) -> float:
+    """Largest standard deviation of a measured force."""
+    channels = ((r.recording.applied_force_n, r.recording.strut_forces_n) for r in recordings)
+    return max(float(np.nanstd(c)) for pair in channels for c in pair if c is not None)
+
+
+def strut_motions(spec: ModelSpec, recordings: Sequence[SmoothRecording]) -> tuple[Motion, ...]:
+    """What each strut did on the recordings."""
+    grids, tracks = [r.grid for r in recordings], [r.motion for r in recordings]
+    largest_n = _largest_force_std_n(recordings)
+    warm = [grid.temperature_c for grid in grids if grid.has_temperature]
+    celsius = (AMBIENT_C, AMBIENT_C)
+    if warm:
+        celsius = (float(min(w.min() for w in warm)), float(max(w.max() for w in warm)))
+    motions: list[Motion] = []
+    for i, strut in enumerate(spec.struts):
+        z = np.concatenate([t.heights_m[i] for t in tracks])
+        w = np.concatenate([t.velocities_m_per_s[i] for t in tracks])
+        stroke = float(z.max() - z.min())
+        force = strut.stiffness_n_per_m * stroke + strut.damping_n_s_per_m * float(np.std(w))
+        motions.append(
+            Motion(
+                float(z.min()),
+                float(z.max()),
+                float(np.sqrt(np.mean(w**2))),
+                float(np.max(np.abs(w))),
+                min(float(np.ptp(t.heights_m[i])) for t in tracks),
+                max(grid.duration_s for grid in grids),
+                float(np.median([grid.step_s for grid in grids])),
+                strut.free_length_m,
+                strut.stiffness_n_per_m,
+                strut.damping_n_s_per_m,
+                1.0,
+                force or largest_n,
+                celsius,
+                (),
+            )
+        )
+    return tuple(motions)
+
+
+def block_numbers(t_s: Array, length_s: float) -> Integers:
+    """Block of each time of a recording, at least two of equal length, shape (N,)."""
+    count = max(2, round(float(t_s[-1] - t_s[0]) / length_s))
+    share = (t_s - t_s[0]) / float(t_s[-1] - t_s[0])
+    return np.minimum((share * count).astype(np.int64), count - 1)
+
+
+def check_swing(grid: RecordingGrid) -> None:
+    """Refuse a recording whose motion hardly exceeds the sensor's noise.
+
+    Raises:
+        RecordingError: See above.
+    """
     for column in grid.heights_m.T:
-        there = np.isfinite(column)
-        speed += np.gradient(np.interp(grid.t_s, grid.t_s[there], column[there]), grid.t_s) ** 2
-    moving = [
-        number
-        for number in range(int(numbers[-1]) + 1)
-        if float(np.mean(speed[numbers == number])) > _QUIET**2 * float(np.mean(speed))
-    ]
-    # The first block holds the initial state, which the fit needs.
-    chosen = [number for number in moving if number > 0][every // 2 :: every]
-    kept = np.isin(numbers, chosen) & grid.fitted
-    return grid._replace(kept=kept, fitted=grid.fitted & ~kept)
-
-
-def smoothed(grid: Grid, reference_m: Array) -> tuple[list[Smoothed], list[Noise]]:
-    """Measured less reference heights, smoothed, and their noise: one entry a strut."""
-    difference = grid.heights_m - reference_m
-    noises = [estimate_noise(grid.t_s, column) for column in difference.T]
-    states = [
-        smooth(grid.t_s, column, noise) for column, noise in zip(difference.T, noises, strict=True)
-    ]
-    return states, noises
-
-
-SmoothMotion = tuple[Track, list[Smoothed], list[Noise]]
-"""A smoothed motion, and of each strut its deviations and its sensor's noise."""
-
-
-def smooth_motion(grid: Grid) -> SmoothMotion:
-    """Measured motion, smoothed without any model."""
-    middle_m = np.nanmean(grid.heights_m, axis=0)
-    found, noises = smoothed(grid, np.broadcast_to(middle_m, grid.heights_m.shape))
-    heights_m, velocities_m_per_s = (
-        np.column_stack([s.states[:, i] for s in found]) for i in (0, 1)
-    )
-    none_n = np.zeros(len(grid.t_s))
-    motion = Track.of_columns(
-        grid.t_s, heights_m + middle_m, velocities_m_per_s, none_n, grid.temperature_c
-    )
-    return motion, found, noises
+        swing = float(np.nanstd(column))
+        noise = float(np.sqrt(estimate_noise(grid.t_s, column).variance))
+        if swing < _LEAST_SWING * noise:
+            raise RecordingError(
+                f"{grid.name}: height_m moves by {swing:.3g} m RMS and its noise is {noise:.3g} m, "
+                "expected a run with more motion: apply a larger force, or widen the stroke"
+            )
 
 
 def fine_times(t_s: Array, parts: int) -> Array:
@@ -156,7 +290,7 @@ def fine_times(t_s: Array, parts: int) -> Array:
     return np.append(fine.ravel(), t_s[-1])
 
 
-def _nodes(t_s: Array) -> tuple[Array, NDArray[np.int64]]:
+def _nodes(t_s: Array) -> tuple[Array, Integers]:
     steps = np.diff(t_s)
     usual = float(np.median(steps))
     pieces = np.maximum(1, np.rint(steps / usual)).astype(np.int64)

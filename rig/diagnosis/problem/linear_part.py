@@ -1,8 +1,8 @@
 """The linear part of a model: mass, stiffness, damping, preload, gain, free length, never exact.
 
 Each has a prior, from the model file's `tolerance` or a default, which decides only where the data
-do not. A change of mass, stiffness and damping in one proportion looks like one of the gain, which
-is never free beside all three.
+do not. A change of mass, stiffness and damping in one proportion is indistinguishable from one of
+the gain, which is never fitted together with all three.
 """
 
 from collections.abc import Sequence
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from dart_model.effects import Bench, Motion
 from dart_model.spec import WORLD, EffectSpec, InlineSkeleton, ModelSpec
-from rig.diagnosis.problem.mechanism import Mechanism
-from rig.diagnosis.problem.problem import Kind, LinearParameter, middle_m
+from rig.diagnosis.problem.mechanism import LinearisedMechanism
+from rig.diagnosis.problem.problem import Kind, LinearParameter, mid_stroke_m
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ installed to 20; dampers vary by 30 % from warm to cold and from piece to piece 
 Absorber Handbook, 2007, 9); a load cell in calibration is good to 2 %."""
 _LEAST_MASS = 0.1
 """Lowest mass that a correction may leave, as a share of the nominal value. Springs and dampers
-may vanish altogether: a law with a stiffness or damping of its own may take their place."""
+may vanish altogether: a law that has a stiffness or damping may replace them."""
 _SIGNIFICANT_DIGITS = 12
 
 PARAMETERS = {
@@ -49,8 +49,8 @@ EFFECTS = {
 """Effects that stand for a change of each."""
 
 
-def parameters(
-    spec: ModelSpec, bench: Bench, motions: Sequence[Motion], mechanism: Mechanism
+def linear_parameters(
+    spec: ModelSpec, bench: Bench, motions: Sequence[Motion], mechanism: LinearisedMechanism
 ) -> tuple[LinearParameter, ...]:
     """Linear parameters of a model that a bench can show, with their priors.
 
@@ -60,10 +60,10 @@ def parameters(
         motions: What each strut did.
         mechanism: For the masses, and for whether the applied force acts along a strut.
     """
-    found: list[LinearParameter] = []
+    parameters: list[LinearParameter] = []
     for i, (strut, motion) in enumerate(zip(spec.struts, motions, strict=True)):
         stiffness, damping = strut.stiffness_n_per_m, strut.damping_n_s_per_m
-        # Of a nominal value of zero no share is left to speak of: what the motion would call large.
+        # A nominal value of zero has no share: the scale is then a large value for the motion.
         force = max(motion.force_n, 1e-300)
         stiffness_scale = stiffness or force / motion.stroke_m
         damping_scale = damping or force / motion.speed_m_per_s
@@ -77,15 +77,15 @@ def parameters(
         if bench == "force_given":
             mass = moving_mass_kg(mechanism, i)
             kinds.append(("mass", mass, mass, -(1.0 - _LEAST_MASS) * mass))
-        found += [
+        parameters += [
             LinearParameter(i, kind, value, _deviation(spec, kind, scale), least)
             for kind, value, scale, least in kinds
         ]
     if bench == "force_given" and _along_last_strut(mechanism):
-        found.append(
+        parameters.append(
             LinearParameter(len(motions) - 1, "gain", 1.0, _deviation(spec, "gain", 1.0), -0.95)
         )
-    return tuple(found)
+    return tuple(parameters)
 
 
 def _deviation(spec: ModelSpec, kind: Kind, scale: float) -> float:
@@ -95,17 +95,17 @@ def _deviation(spec: ModelSpec, kind: Kind, scale: float) -> float:
     return (TOLERANCES[kind] if stated is None else float(stated)) * scale
 
 
-def moving_mass_kg(mechanism: Mechanism, strut: int) -> float:
-    """Mass that a strut's force moves directly: of its upper body with all that it carries."""
+def moving_mass_kg(mechanism: LinearisedMechanism, strut: int) -> float:
+    """Mass that a strut's force moves directly: its upper body with all that it carries."""
     per_kg = mechanism.mass_by_kg[:, strut].mean(axis=0)
     mass = mechanism.mass.mean(axis=0)
-    # Of the coordinates that a kg on this body loads, that which moves least else: further ones
-    # carry it along with what is below.
+    # Of the coordinates that a kg on this body loads, the one that moves the least other mass:
+    # further ones move it together with the bodies below.
     loaded = np.diag(per_kg) > 0.0
     return float(np.min(np.diag(mass)[loaded] / np.diag(per_kg)[loaded]))
 
 
-def _along_last_strut(mechanism: Mechanism) -> bool:
+def _along_last_strut(mechanism: LinearisedMechanism) -> bool:
     """Whether the applied force acts as a force in the last strut would."""
     return bool(np.allclose(mechanism.applied, mechanism.jacobian[:, -1], rtol=1e-9, atol=1e-12))
 
@@ -113,15 +113,15 @@ def _along_last_strut(mechanism: Mechanism) -> bool:
 def strut_force(kind: Kind, height_m: Array, velocity_m_per_s: Array, motion: Motion) -> Array:
     """Strut force (N,) of a unit change of stiffness, damping or preload."""
     if kind == "stiffness":
-        return -(height_m - middle_m(motion))
+        return -(height_m - mid_stroke_m(motion))
     if kind == "damping":
         return -velocity_m_per_s
     return np.full_like(height_m, 1.0 if kind == "preload" else 0.0)
 
 
-def corrected(
-    mechanism: Mechanism, linear: Sequence[LinearParameter], changes: Array
-) -> Mechanism | None:
+def with_linear_changes(
+    mechanism: LinearisedMechanism, linear: Sequence[LinearParameter], changes: Array
+) -> LinearisedMechanism | None:
     """The mechanism with masses and gain changed; None if the mass matrix is not positive."""
     mass, bias, bias_q, applied = (
         mechanism.mass, mechanism.bias, mechanism.bias_q, mechanism.applied
@@ -137,13 +137,13 @@ def corrected(
     return mechanism._replace(mass=mass, bias=bias, bias_q=bias_q, applied=applied)
 
 
-def corrected_spec(
+def spec_with_linear_changes(
     spec: ModelSpec,
     linear: Sequence[LinearParameter],
     changes: Array,
     motions: Sequence[Motion],
 ) -> ModelSpec:
-    """The model with its linear part changed: where a field of the file says it, that field."""
+    """The model with its linear part changed: in the field of the file where there is one."""
     for parameter, change in zip(linear, changes, strict=True):
         if change == 0.0:
             continue
@@ -151,7 +151,7 @@ def corrected_spec(
         match parameter.kind:
             case "stiffness":
                 # About mid-stroke: what the spring then carries at its free length is a preload.
-                middle = middle_m(motions[parameter.strut]) - strut.free_length_m
+                middle = mid_stroke_m(motions[parameter.strut]) - strut.free_length_m
                 spec = _with_field(spec, strut.name, "stiffness_n_per_m", change)
                 spec = _with_preload(spec, strut.name, change * middle)
             case "damping" if strut.damping_n_s_per_m + change >= 0.0:
@@ -170,7 +170,7 @@ def corrected_spec(
 
 def _with_field(spec: ModelSpec, strut: str, field: str, change: float) -> ModelSpec:
     struts = tuple(
-        item.model_copy(update={field: rounded(getattr(item, field) + change)})
+        item.model_copy(update={field: round_for_file(getattr(item, field) + change)})
         if item.name == strut
         else item
         for item in spec.struts
@@ -183,27 +183,27 @@ def _with_preload(spec: ModelSpec, strut: str, force_n: float) -> ModelSpec:
 
 
 def _with_sum(spec: ModelSpec, strut: str, name: str, change: float) -> ModelSpec:
-    """An effect of one parameter more, or more of it where it is there already."""
+    """The model with an effect of one parameter added, or increased where it exists already."""
     effects = list(spec.strut(strut).effects)
     for i, item in enumerate(effects):
         if item.name == name:
             ((key, value),) = item.parameters.items()
-            effects[i] = EffectSpec(name=name, parameters={key: rounded(value + change)})
+            effects[i] = EffectSpec(name=name, parameters={key: round_for_file(value + change)})
             return spec.with_effects(strut, effects)
     key = {"preload": "force_n", "linear_damping": "damping_n_s_per_m", "input_gain": "gain"}
     key["added_mass"] = "mass_kg"
-    new = EffectSpec(name=name, parameters={key[name]: rounded(change)})
+    new = EffectSpec(name=name, parameters={key[name]: round_for_file(change)})
     return spec.with_effects(strut, (*effects, new))
 
 
 def _with_mass(spec: ModelSpec, strut: str, change: float) -> ModelSpec:
-    """More mass on the body that `added_mass` would load."""
+    """The model with more mass on the body that `added_mass` would load."""
     between = spec.strut(strut).between
     end = between[1] if between[1] != WORLD else between[0]
     if not isinstance(spec.skeleton, InlineSkeleton):
         return _with_sum(spec, strut, "added_mass", change)
     bodies = tuple(
-        body.model_copy(update={"mass_kg": rounded(body.mass_kg + change)})
+        body.model_copy(update={"mass_kg": round_for_file(body.mass_kg + change)})
         if body.name == end and body.mass_kg + change > 0.0
         else body
         for body in spec.skeleton.bodies
@@ -211,6 +211,6 @@ def _with_mass(spec: ModelSpec, strut: str, change: float) -> ModelSpec:
     return spec.model_copy(update={"skeleton": InlineSkeleton(bodies=bodies)})
 
 
-def rounded(value: float) -> float:
-    """A number for a model file, with more digits than any data bind."""
+def round_for_file(value: float) -> float:
+    """A number for a model file, with more digits than any data determine."""
     return float(np.format_float_scientific(value, precision=_SIGNIFICANT_DIGITS))

@@ -12,16 +12,18 @@ from numpy.typing import NDArray
 
 from dart_model.plant import DartPlant
 from dart_model.spec import EffectSpec, ModelSpec
+from rig.diagnosis.problem.fmu_force import forces_along
+from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.recording import RecordingError
 
 Array = NDArray[np.float64]
 
 _REACHED_M = 1e-12
-"""Error of a height at which Newton's method has arrived: a millionth of any sensor's step."""
+"""Error of a height at which Newton's method ends: a millionth of any sensor's step."""
 _ONE_KG = EffectSpec(name="added_mass", parameters={"mass_kg": 1.0})
 
 
-class Mechanism(NamedTuple):
+class LinearisedMechanism(NamedTuple):
     """Equations of motion about reference coordinates, constant (K = 1) or at N nodes (K = N).
 
     Attributes:
@@ -56,12 +58,41 @@ class Mechanism(NamedTuple):
         """Number of coordinates."""
         return self.q.shape[1]
 
-    def cut(self, nodes: slice) -> "Mechanism":
+    def cut(self, nodes: slice) -> "LinearisedMechanism":
         """The mechanism at some of the nodes."""
-        return self if len(self.q) == 1 else Mechanism(*(part[nodes] for part in self))
+        return self if len(self.q) == 1 else LinearisedMechanism(*(part[nodes] for part in self))
+
+    def strut_forces_of_motion(self, z: Array, w: Array, a: Array, applied_n: Array) -> Array:
+        """Strut forces that a motion takes, shape (N, struts).
+
+        Args:
+            z: Heights, shape (N, struts).
+            w: Their rates.
+            a: Their accelerations.
+            applied_n: Applied force, shape (N,).
+        """
+        every = np.arange(len(z)) if len(self.q) > 1 else np.zeros(len(z), dtype=np.int64)
+        jacobian, mass = self.jacobian[every], self.mass[every]
+        q = (
+            self.q[every]
+            + np.linalg.solve(jacobian, (z - self.heights_m[every])[..., np.newaxis])[..., 0]
+        )
+        v = np.linalg.solve(jacobian, w[..., np.newaxis])[..., 0]
+        acceleration = np.linalg.solve(jacobian, a[..., np.newaxis])[..., 0]
+        bias = self.bias[every] + self.applied[every] * applied_n[:, np.newaxis]
+        bias = bias + np.einsum("kij,kj->ki", self.bias_q[every], q - self.q[every])
+        bias = bias + np.einsum("kij,kj->ki", self.bias_v[every], v - self.v[every])
+        generalised = np.einsum("kij,kj->ki", mass, acceleration) - bias
+        transposed = np.swapaxes(jacobian, 1, 2)
+        return np.linalg.solve(transposed, generalised[..., np.newaxis])[..., 0]
+
+    def strut_inertia(self) -> Array:
+        """Strut forces per acceleration of a strut at the first node, by size, (struts, struts)."""
+        transposed = np.swapaxes(self.jacobian[:1], 1, 2)[0]
+        return np.abs(np.linalg.solve(transposed, self.mass[0] @ np.linalg.inv(self.jacobian[0])))
 
 
-class Readers(NamedTuple):
+class MechanismPlants(NamedTuple):
     """DART with the model, and with a kg more on the body of each strut.
 
     Attributes:
@@ -73,7 +104,7 @@ class Readers(NamedTuple):
     heavier: tuple[DartPlant, ...]
 
 
-def readers(spec: ModelSpec) -> Readers:
+def open_plants(spec: ModelSpec) -> MechanismPlants:
     """DART for a model.
 
     Raises:
@@ -93,60 +124,110 @@ def readers(spec: ModelSpec) -> Readers:
         DartPlant(bare.with_effects(strut.name, (*bare.strut(strut.name).effects, _ONE_KG)))
         for strut in bare.struts
     )
-    return Readers(plain, heavier)
+    return MechanismPlants(plain, heavier)
 
 
-def constant(read: Readers) -> Mechanism:
+def mechanism_along(plants: MechanismPlants, motion: Track) -> LinearisedMechanism:
+    """The mechanism along a measured motion: constant where it can be, and with FMUs' forces."""
+    if plants.plain.is_constant:
+        mechanism = constant_mechanism(plants)
+    else:
+        mechanism = tabulate_mechanism(plants, motion.heights_m.T, motion.velocities_m_per_s.T)
+    return _with_mockups(mechanism, plants.plain, motion)
+
+
+def _with_mockups(
+    mechanism: LinearisedMechanism, plant: DartPlant, motion: Track
+) -> LinearisedMechanism:
+    """The mechanism with the forces of FMUs, along a motion and linear about it.
+
+    Args:
+        mechanism: Without them, constant or along the motion.
+        plant: The model.
+        motion: The measured motion, with the applied force; N nodes.
+    """
+    if not any(plant.mockups):
+        return mechanism
+    nodes = len(motion.t_s)
+    m = LinearisedMechanism(*(np.repeat(part, nodes // len(part), axis=0) for part in mechanism))
+    heights_m, velocities = motion.heights_m.T, motion.velocities_m_per_s.T
+    q = m.q + _solve_coordinates(m.jacobian, heights_m - m.heights_m)
+    v = _solve_coordinates(m.jacobian, velocities)
+    bias = m.bias + np.einsum("kij,kj->ki", m.bias_q, q - m.q)
+    bias = bias + np.einsum("kij,kj->ki", m.bias_v, v - m.v)
+    bias_q, bias_v = m.bias_q, m.bias_v
+    for strut, mockup in enumerate(plant.mockups):
+        if mockup is not None:
+            row = m.jacobian[:, strut]
+            force_n, by_height, by_velocity = forces_along(mockup, strut, motion)
+            square = row[:, :, np.newaxis] * row[:, np.newaxis, :]
+            bias = bias + row * force_n[:, np.newaxis]
+            bias_q = bias_q + square * by_height[:, np.newaxis, np.newaxis]
+            bias_v = bias_v + square * by_velocity[:, np.newaxis, np.newaxis]
+    linearised = m._replace(q=q, v=v, heights_m=heights_m, bias=bias, bias_q=bias_q, bias_v=bias_v)
+    return LinearisedMechanism(*(np.ascontiguousarray(part) for part in linearised))
+
+
+def constant_mechanism(plants: MechanismPlants) -> LinearisedMechanism:
     """The mechanism of bodies on straight guides."""
-    n = read.plain.coordinates
-    return _stacked([_at(read, np.zeros(n), np.zeros(n))])
+    n = plants.plain.coordinates
+    return _stack([_mechanism_at(plants, np.zeros(n), np.zeros(n))])
 
 
-def tabulated(read: Readers, heights_m: Array, velocities_m_per_s: Array) -> Mechanism:
+def tabulate_mechanism(
+    plants: MechanismPlants, heights_m: Array, velocities_m_per_s: Array
+) -> LinearisedMechanism:
     """The mechanism along a motion.
 
     Args:
-        read: DART.
+        plants: DART.
         heights_m: Heights at the nodes, without gaps, shape (N, struts).
         velocities_m_per_s: Their rates, shape (N, struts).
 
     Raises:
         InputError: The joints cannot reach the heights.
     """
-    plant = read.plain
+    plant = plants.plain
     q = np.array(plant.init(heights_m[0].tolist()).positions)
-    entries: list[Mechanism] = []
+    entries: list[LinearisedMechanism] = []
     for height, velocity in zip(heights_m, velocities_m_per_s, strict=True):
         for _ in range(20):
-            there = plant.jacobians(q)
-            error = height - there.offsets_m - there.struts @ q
-            q = q + np.linalg.lstsq(there.struts, error, rcond=None)[0]
+            jacobians = plant.jacobians(q)
+            error = height - jacobians.offsets_m - jacobians.struts @ q
+            q = q + np.linalg.lstsq(jacobians.struts, error, rcond=None)[0]
             if float(np.max(np.abs(error))) < _REACHED_M:
                 break
         v = np.linalg.lstsq(plant.jacobians(q).struts, velocity, rcond=None)[0]
-        entries.append(_at(read, q, v))
-    return _stacked(entries)
+        entries.append(_mechanism_at(plants, q, v))
+    return _stack(entries)
 
 
-def _at(read: Readers, q: Array, v: Array) -> Mechanism:
-    plain = read.plain
-    there = plain.mechanics(q, v)
+def _mechanism_at(plants: MechanismPlants, q: Array, v: Array) -> LinearisedMechanism:
+    plain = plants.plain
+    here = plain.mechanics(q, v)
     bias_q, bias_v = plain.bias_slopes(q, v)
-    heavier = [plant.mechanics(q, v) for plant in read.heavier]
-    return Mechanism(
+    heavier = [plant.mechanics(q, v) for plant in plants.heavier]
+    return LinearisedMechanism(
         q,
         v,
-        there.heights_m,
-        there.struts,
-        there.applied,
-        there.mass,
-        there.bias,
+        here.heights_m,
+        here.struts,
+        here.applied,
+        here.mass,
+        here.bias,
         bias_q,
         bias_v,
-        np.array([other.mass - there.mass for other in heavier]),
-        np.array([other.bias - there.bias for other in heavier]),
+        np.array([other.mass - here.mass for other in heavier]),
+        np.array([other.bias - here.bias for other in heavier]),
     )
 
 
-def _stacked(entries: list[Mechanism]) -> Mechanism:
-    return Mechanism(*(np.ascontiguousarray(np.stack(part)) for part in zip(*entries, strict=True)))
+def _stack(entries: list[LinearisedMechanism]) -> LinearisedMechanism:
+    return LinearisedMechanism(
+        *(np.ascontiguousarray(np.stack(part)) for part in zip(*entries, strict=True))
+    )
+
+
+def _solve_coordinates(jacobian: Array, heights: Array) -> Array:
+    """Coordinates (K, n) of heights (K, struts), about the reference."""
+    return np.asarray(np.linalg.solve(jacobian, heights[..., np.newaxis])[..., 0], np.float64)

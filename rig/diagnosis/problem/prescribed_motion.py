@@ -1,7 +1,7 @@
-"""A strut whose motion is given: its residual is the load-cell force that its law does not explain.
+"""A strut whose motion is given: its residual is the load-cell force less its law's force.
 
 Nothing is simulated: the motion is smoothed over the whole recording, and a law's force along it
-takes one pass. What is left of initial states are the laws' internal ones.
+takes one pass. Of the initial states only the laws' internal ones remain.
 """
 
 from collections.abc import Sequence
@@ -14,33 +14,53 @@ from numpy.typing import NDArray
 
 from dart_model.effects import Bench
 from dart_model.spec import ModelSpec
-from rig.diagnosis.numerics.smoother import estimate_noise
+from rig.diagnosis.numerics.smoother import estimate_noise, smooth
+from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem import linear_part, track
-from rig.diagnosis.problem.grid import Grid, SmoothMotion
-from rig.diagnosis.problem.problem import (
-    Candidate,
-    Flags,
-    Integers,
-    Parts,
-    Problem,
-    ResidualForces,
-    Segment,
+from rig.diagnosis.problem.grid import (
+    RecordingGrid,
+    SmoothRecording,
     Track,
     block_numbers,
-    placed,
-    state_scales,
+    check_swing,
 )
-from rig.diagnosis.recording import Recording
+from rig.diagnosis.problem.problem import (
+    Candidate,
+    CandidateModel,
+    ComparedModels,
+    Flags,
+    Integers,
+    Problem,
+    ProblemBasis,
+    ResidualForces,
+    RunEvaluation,
+    Segment,
+    evaluated_nodes,
+    nominal,
+    nominal_model,
+    rms,
+    state_scales,
+    strut_effects,
+)
+from rig.diagnosis.recording import RecordingError
 
 Array = NDArray[np.float64]
 
 _UNCERTAIN = 1.5
 """Times its median from which on the deviation of the smoothed velocity is that of a recording's
 end, where nothing follows to smooth with."""
+_DRAWS = 3
+"""Draws of the motion's noise for a floor: the third changes it by a few percent."""
+_LEAST_SWING = 5.0
+"""Force over load cell noise below which no law can be determined."""
+_OTHER_UNITS = 100.0
+"""Model's over measured force from which on the units are not those of the columns."""
+_OPPOSITE = -0.6
+"""Correlation of model and load cell from which on the cell's sign is the other one."""
 
 
-class Drive(NamedTuple):
-    """A prescribed motion and the forces that it took.
+class DynoRun(NamedTuple):
+    """A recording of a prescribed motion and the forces that it took.
 
     Attributes:
         grid: Nodes of the recording.
@@ -48,11 +68,11 @@ class Drive(NamedTuple):
         cells_n: Load cells at the nodes, shape (struts, N); NaN where a strut has none.
         certain: Nodes at which the motion is well known, shape (N,).
         height_noise_m: Standard deviation of each height's noise, shape (struts,).
-        velocity_noise_m_per_s: Of the smoothed velocity, shape (struts,).
-        cell_noise_n: Of each load cell, shape (struts,).
+        velocity_noise_m_per_s: Standard deviation of each smoothed velocity, shape (struts,).
+        cell_noise_n: Standard deviation of each load cell's noise, shape (struts,).
     """
 
-    grid: Grid
+    grid: RecordingGrid
     along: Track
     cells_n: Array
     certain: Flags
@@ -61,39 +81,32 @@ class Drive(NamedTuple):
     cell_noise_n: Array
 
     @property
-    def fitted(self) -> Flags:
-        """Nodes that take part in fits."""
+    def fit_nodes(self) -> Flags:
+        """Nodes that take part in fits, shape (N,)."""
         return self.grid.fitted & self.certain
 
+    def cut(self, nodes: slice) -> "DynoRun":
+        """The recording at some of the nodes."""
+        return self._replace(
+            grid=self.grid.cut(nodes),
+            along=self.along.cut(nodes),
+            cells_n=self.cells_n[:, nodes],
+            certain=self.certain[nodes],
+        )
 
-def _cut(drive: Drive, nodes: slice) -> Drive:
-    return drive._replace(
-        grid=drive.grid.cut(nodes),
-        along=drive.along.cut(nodes),
-        cells_n=drive.cells_n[:, nodes],
-        certain=drive.certain[nodes],
-    )
 
-
-def drive_of(grid: Grid, at: Integers, recording: Recording, smooth: SmoothMotion) -> Drive:
-    """A recording with load cells as a prescribed motion.
-
-    Args:
-        grid: Its nodes.
-        at: Which node each sample is.
-        recording: The recording.
-        smooth: Its motion.
-    """
-    motion, states, noises = smooth
+def dyno_run(smooth_recording: SmoothRecording) -> DynoRun:
+    """A recording with load cells as a prescribed motion."""
+    recording, grid, sample_nodes, motion, states, noises = smooth_recording
     spread = np.array([s.deviations[:, 1] for s in states])
     cells = np.full((len(states), len(grid.t_s)), np.nan)
     noise_n = np.full(len(states), np.nan)
-    given = recording.strut_forces_n
+    measured = recording.strut_forces_n
     for i in range(len(states)):
-        if given is not None and np.all(np.isfinite(given[:, i])):
-            cells[i] = np.interp(grid.t_s, grid.t_s[at], given[:, i])
+        if measured is not None and np.all(np.isfinite(measured[:, i])):
+            cells[i] = np.interp(grid.t_s, grid.t_s[sample_nodes], measured[:, i])
             noise_n[i] = np.sqrt(estimate_noise(grid.t_s, cells[i]).variance)
-    return Drive(
+    return DynoRun(
         grid,
         motion,
         cells,
@@ -104,119 +117,146 @@ def drive_of(grid: Grid, at: Integers, recording: Recording, smooth: SmoothMotio
     )
 
 
-def noise_of(spec: ModelSpec, drives: Sequence[Drive]) -> Array:
+def cell_residual_std(spec: ModelSpec, runs: Sequence[DynoRun]) -> Array:
     """Standard deviation of each load cell's residual (struts,); NaN where a strut has no cell.
 
     Noise of the velocity passes through the damping, noise of the height through the spring.
     """
     slopes = np.array([(s.stiffness_n_per_m, s.damping_n_s_per_m) for s in spec.struts])
     motion_n = [
-        np.hypot(slopes[:, 0] * d.height_noise_m, slopes[:, 1] * d.velocity_noise_m_per_s)
-        for d in drives
+        np.hypot(slopes[:, 0] * run.height_noise_m, slopes[:, 1] * run.velocity_noise_m_per_s)
+        for run in runs
     ]
-    cells_n = [d.cell_noise_n for d in drives]
+    cells_n = [run.cell_noise_n for run in runs]
     return np.median(np.hypot(motion_n, cells_n), axis=0)
 
 
 @dataclass(frozen=True, eq=False)
-class Prescribed(Problem):
+class PrescribedProblem(Problem):
     """A model held against recordings of a displacement-controlled bench.
 
     Attributes:
-        drives: The recordings.
+        runs: The recordings.
         noise_n: Standard deviation of each load cell's residual, shape (struts,).
     """
 
     bench: ClassVar[Bench] = "motion_given"
-    drives: tuple[Drive, ...]
+    assumption: ClassVar[str] = "The motion is smoothed over the whole recording."
+    runs: tuple[DynoRun, ...]
     noise_n: Array
 
+    @classmethod
+    def of_recordings(
+        cls, basis: ProblemBasis, recordings: Sequence[SmoothRecording]
+    ) -> "PrescribedProblem":
+        """The problem of recordings with a load cell and without an applied force."""
+        spec = basis.spec
+        if any(strut.fmu is not None for strut in spec.struts):
+            raise RecordingError(
+                f"model {spec.name}: an FMU, and runs whose motion is prescribed: expected runs "
+                "with applied_force_n"
+            )
+        runs = tuple(dyno_run(recording) for recording in recordings)
+        problem = cls(*basis, runs, cell_residual_std(spec, runs))
+        base, start = nominal_model(problem, ()), problem.start(0, nominal(problem))
+        for run in runs:
+            _check_channels(run, track.strut_forces(problem, base, run.along, start))
+        return problem
+
     @property
-    def recordings(self) -> int:
-        """Number of recordings."""
-        return len(self.drives)
+    def grids(self) -> tuple[RecordingGrid, ...]:
+        return tuple(run.grid for run in self.runs)
 
-    def fitted(self, k: int) -> Flags:
-        """Nodes of a recording that take part in fits, shape (N,)."""
-        return self.drives[k].fitted
+    def fit_nodes(self, k: int) -> Flags:
+        return self.runs[k].fit_nodes
 
-    def cut(self, pieces: Sequence[tuple[int, slice]]) -> "Prescribed":
-        """The same of pieces of recordings."""
-        return replace(self, drives=tuple(_cut(self.drives[k], nodes) for k, nodes in pieces))
+    def cut(self, pieces: Sequence[tuple[int, slice]]) -> "PrescribedProblem":
+        return replace(self, runs=tuple(self.runs[k].cut(nodes) for k, nodes in pieces))
+
+    def finer(self) -> None:
+        """None: nothing is integrated."""
+        return
+
+    def with_noise_of(self, model: CandidateModel) -> "PrescribedProblem":
+        """The problem itself: its noise is that of the load cells and of the motion."""
+        del model
+        return self
 
     @cached_property
-    def _celled(self) -> Integers:
+    def _cell_struts(self) -> Integers:
         return np.flatnonzero(np.isfinite(self.noise_n))
 
     def _rows(self, k: int) -> Integers:
-        return np.flatnonzero(self.drives[k].fitted)
+        return np.flatnonzero(self.runs[k].fit_nodes)
 
     def blocks(self, k: int) -> Integers:
-        """Block of each row of a recording's residual."""
-        numbers = block_numbers(self.drives[k].grid.t_s, self.block_s)[self._rows(k)]
-        return np.repeat(numbers, len(self._celled))
+        numbers = block_numbers(self.runs[k].grid.t_s, self.block_s)[self._rows(k)]
+        return np.repeat(numbers, len(self._cell_struts))
 
     def start(self, k: int, candidate: Candidate) -> Array:
         """Internal states at zero."""
         del k
-        return np.zeros(len(state_scales(placed(self, candidate))[0]))
+        return np.zeros(len(state_scales(strut_effects(self, candidate))[0]))
 
     def start_scales(self, candidate: Candidate) -> tuple[Array, Flags]:
         """The laws' own scales."""
-        return state_scales(placed(self, candidate))
+        return state_scales(strut_effects(self, candidate))
 
-    def states(self, k: int, candidate: Candidate, parts: Parts) -> Array:
-        """Internal states at the beginning of a recording."""
-        del candidate
-        return parts.starts[k]
+    def states(self, k: int, model: CandidateModel) -> Array:
+        return model.parts.starts[k]
 
-    def _missed_n(self, k: int, candidate: Candidate, parts: Parts) -> Array:
-        drive = self.drives[k]
-        forces = track.strut_forces(self, candidate, parts, drive.along, parts.starts[k])
-        return drive.cells_n - forces
+    def _residual_n(self, k: int, model: CandidateModel) -> Array:
+        """Load cells less the model's forces, shape (struts, N)."""
+        run = self.runs[k]
+        return run.cells_n - track.strut_forces(self, model, run.along, model.parts.starts[k])
 
-    def residual(self, k: int, candidate: Candidate, parts: Parts) -> Array | None:
+    def residual(self, k: int, model: CandidateModel) -> Array | None:
         """Load cells less the model's forces over the noise, at the fitted nodes, flat."""
-        missed = self._missed_n(k, candidate, parts)
-        return self._whitened(missed, self._rows(k))
+        return self._whiten(self._residual_n(k, model), self._rows(k))
 
-    def _whitened(self, forces: Array, rows: Integers) -> Array:
-        return (forces[np.ix_(self._celled, rows)].T / self.noise_n[self._celled]).ravel()
+    def _whiten(self, forces: Array, rows: Integers) -> Array:
+        return (forces[np.ix_(self._cell_struts, rows)].T / self.noise_n[self._cell_struts]).ravel()
 
-    def floor_level(self, candidate: Candidate, parts: Parts) -> float:
+    def floor_level(self, model: CandidateModel) -> float:
         """One: noise of the motion is in what whitens the residual."""
-        del candidate, parts
+        del model
         return 1.0
 
-    def residual_forces(self, k: int, candidate: Candidate, parts: Parts) -> ResidualForces | None:
+    def residual_force_rms_n(self, mean_square: float) -> float:
+        """RMS residual force of a fit by its whitened mean square, in N."""
+        return float(np.sqrt(mean_square * np.nanmean(self.noise_n**2)))
+
+    def residual_forces(self, k: int, model: CandidateModel) -> ResidualForces | None:
         """Load cells less the model's forces along the smoothed motion."""
-        missed = self._missed_n(k, candidate, parts)
-        deviation = np.broadcast_to(self.noise_n[:, np.newaxis], missed.shape)
-        return ResidualForces(self.drives[k].grid.name, self.drives[k].along, missed, deviation)
+        residual_n = self._residual_n(k, model)
+        deviation = np.broadcast_to(self.noise_n[:, np.newaxis], residual_n.shape)
+        return ResidualForces(self.runs[k].grid.name, self.runs[k].along, residual_n, deviation)
 
     def segments(
-        self, candidate: Candidate, parts: Parts, most_samples: int, most_thinned: int
+        self, model: CandidateModel, most_samples: int, largest_stride: int
     ) -> tuple[Segment, ...]:
         """The regression about a model's force along the motion."""
-        nodes = [len(drive.grid.t_s) for drive in self.drives]
-        found: list[Segment] = []
-        for k, drive in enumerate(self.drives):
-            missed = self._missed_n(k, candidate, parts)
-            cuts = track.pieces(nodes[k], sum(nodes), most_samples, most_thinned)
-            found += [self._segment(k, missed, cut) for cut in cuts if np.any(drive.fitted[cut])]
-        return tuple(found)
+        nodes = [len(run.grid.t_s) for run in self.runs]
+        segments: list[Segment] = []
+        for k, run in enumerate(self.runs):
+            residual_n = self._residual_n(k, model)
+            cuts = track.pieces(nodes[k], sum(nodes), most_samples, largest_stride)
+            segments += [
+                self._segment(k, residual_n, cut) for cut in cuts if np.any(run.fit_nodes[cut])
+            ]
+        return tuple(segments)
 
-    def _segment(self, k: int, missed: Array, cut: slice) -> Segment:
-        drive = self.drives[k]
-        whole = drive.along
+    def _segment(self, k: int, residual_n: Array, cut: slice) -> Segment:
+        run = self.runs[k]
+        whole = run.along
         along = whole.cut(cut)
-        rows = np.flatnonzero(drive.fitted[cut])
+        rows = np.flatnonzero(run.fit_nodes[cut])
         numbers = block_numbers(whole.t_s, self.block_s)[cut][rows]
 
         def respond(strut: int, force: Array) -> Array:
             forces = np.zeros((len(self.noise_n), len(force)))
             forces[strut] = force
-            return self._whitened(forces, rows)
+            return self._whiten(forces, rows)
 
         columns = [
             respond(
@@ -228,7 +268,7 @@ class Prescribed(Problem):
             )
             for p in self.linear
         ]  # fmt: skip
-        target = self._whitened(missed[:, cut], rows)
+        target = self._whiten(residual_n[:, cut], rows)
         return Segment(
             along,
             along,
@@ -237,5 +277,90 @@ class Prescribed(Problem):
             target,
             np.column_stack(columns),
             np.zeros((len(target), 0)),
-            np.repeat(numbers - numbers[0], len(self._celled)),
+            np.repeat(numbers - numbers[0], len(self._cell_struts)),
         )
+
+    def evaluate(
+        self, k: int, models: ComparedModels, fitted_rms_n: float, *, blocks: bool
+    ) -> RunEvaluation:
+        """Figures of a held-out recording: forces along the smoothed motion."""
+        run = self.runs[k]
+        rows = evaluated_nodes(run.grid, blocks=blocks) & run.certain
+        measured = np.where(rows, run.cells_n, np.nan)
+        forces = [
+            track.strut_forces(self, model, run.along, self.states(k, model)) for model in models
+        ]
+        error = BeforeAfter(rms(measured - forces[0]), rms(measured - forces[2]))
+        series = tuple(
+            HeldOutSeries(
+                run.grid.name, self.spec.struts[i].name, "N", run.grid.t_s, measured[i],
+                forces[0][i], forces[2][i], run.along.heights_m[i], run.along.velocities_m_per_s[i],
+            )
+            for i in range(len(measured)) if np.any(np.isfinite(measured[i]))
+        )  # fmt: skip
+        # Near a reversal a redrawn motion changes the sign of friction; a smoothed one does not.
+        floor_n = min(fitted_rms_n, self._motion_floor_n(k, models.corrected))
+        figures = RunFigures(run.grid.name, BeforeAfter(np.nan, np.nan), error, error)
+        linear_n = rms(measured - forces[1])
+        return RunEvaluation(
+            figures, error, linear_n, linear_n, NoiseFloor(np.nan, floor_n), 0.0, series
+        )
+
+    def _motion_floor_n(self, k: int, model: CandidateModel) -> float:
+        """RMS residual force of a right model: noise of the cell, and of the motion by the law.
+
+        The share of the motion is determined by drawing the sensor's noise again and smoothing it
+        again (a parametric bootstrap; Efron and Tibshirani, An Introduction to the Bootstrap, 1993,
+        6.5).
+        """
+        run, states = self.runs[k], self.states(k, model)
+        forces = track.strut_forces(self, model, run.along, states)
+        rng = np.random.default_rng(0)
+        squares: list[float] = []
+        for _ in range(_DRAWS):
+            z, w = run.along.heights_m.copy(), run.along.velocities_m_per_s.copy()
+            for i, sigma in enumerate(run.height_noise_m):
+                middle = float(z[i].mean())
+                noisy = z[i] - middle + sigma * rng.standard_normal(z.shape[1])
+                again = smooth(run.grid.t_s, noisy, estimate_noise(run.grid.t_s, noisy)).states
+                z[i], w[i] = again[:, 0] + middle, again[:, 1]
+            redrawn = run.along._replace(heights_m=z, velocities_m_per_s=w)
+            change = track.strut_forces(self, model, redrawn, states) - forces
+            squares.append(float(np.mean(change[:, run.certain] ** 2)))
+        cell = run.cell_noise_n[np.isfinite(run.cell_noise_n)]
+        return float(np.sqrt(np.mean(squares) + np.mean(cell**2)))
+
+
+def _check_channels(run: DynoRun, model_n: Array) -> None:
+    """Refuse channels of a dyno that cannot be what their names say.
+
+    Args:
+        run: The recording.
+        model_n: Forces of the nominal model along its motion, shape (struts, N).
+    """
+    name = run.grid.name
+    check_swing(run.grid)
+    if not np.any(np.isfinite(run.cells_n)):
+        raise RecordingError(f"{name}: expected strut_force_n of one strut at least")
+    for cell, model, noise in zip(run.cells_n, model_n, run.cell_noise_n, strict=True):
+        if not np.all(np.isfinite(cell)):
+            continue
+        force, law = cell - cell.mean(), model - model.mean()
+        swing, own = float(np.std(force)), float(np.std(law))
+        if swing < _LEAST_SWING * noise:
+            raise RecordingError(
+                f"{name}: strut_force_n moves by {swing:.3g} N RMS and its noise is {noise:.3g} N, "
+                "expected a force that stands out of its noise: is the load cell connected?"
+            )
+        if own > _OTHER_UNITS * swing:
+            raise RecordingError(
+                f"{name}: along height_m the model gives {own:.3g} N RMS and strut_force_n shows "
+                f"{swing:.3g} N: expected the same order: are the units m and N, or columns "
+                "swapped?"
+            )
+        if own > 0.0 and float(np.mean(force * law)) < _OPPOSITE * swing * own:
+            raise RecordingError(
+                f"{name}: strut_force_n opposes the model's force (correlation "
+                f"{np.mean(force * law) / (swing * own):.2f}), expected a force that is positive "
+                "where the strut pushes its bodies apart: change its sign"
+            )

@@ -1,7 +1,8 @@
-"""What a model held against recordings is, for whatever kind of bench.
+"""A model held against recordings, for every kind of bench.
 
-A problem gives the whitened residual of a candidate and, for the screening of laws, the same
-regression along the measured motion. Whoever searches knows nothing else of a bench.
+A problem gives the whitened residual of a candidate model, the same regression along the measured
+motion for the screening of laws, and the figures of a model on held-out data. Search, evaluation
+and outcome use nothing else of a bench: a further kind of bench is one subclass in one file.
 
 References:
     Ljung, System Identification (1999), 7.2 and 9.4, output error and its covariance.
@@ -21,12 +22,14 @@ from dart_model.effects import effect
 from dart_model.effects.law import Bench, Motion
 from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.compiled import Slots, slots
-from rig.diagnosis.problem.mechanism import Readers
+from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
+from rig.diagnosis.problem.grid import RecordingGrid, SmoothRecording, Track
+from rig.diagnosis.problem.mechanism import MechanismPlants
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-Placed = tuple[int, str]
+StrutEffect = tuple[int, str]
 """Index of a strut, and the name of an effect in it."""
 
 Kind = Literal["mass", "stiffness", "damping", "preload", "gain", "free_length"]
@@ -51,8 +54,8 @@ class LinearParameter(NamedTuple):
     least: float
 
 
-class Existing(NamedTuple):
-    """An effect that the nominal model has.
+class ExistingParameters(NamedTuple):
+    """An effect of the nominal model, with its parameters.
 
     Attributes:
         strut: Index of the strut.
@@ -73,23 +76,23 @@ class Candidate(NamedTuple):
 
     Attributes:
         kept: Which of the nominal model's effects stay, by index.
-        new: Effects beside them.
+        new: Effects that the nominal model lacks.
     """
 
     kept: tuple[int, ...]
-    new: tuple[Placed, ...]
+    new: tuple[StrutEffect, ...]
 
-    def added(self, *placed: Placed) -> "Candidate":
-        """The candidate with further effects, in one order whatever way they were found."""
-        return self._replace(new=tuple(sorted({*self.new, *placed})))
+    def with_effects(self, *effects: StrutEffect) -> "Candidate":
+        """The candidate with further effects, sorted, so that equal sets are equal candidates."""
+        return self._replace(new=tuple(sorted({*self.new, *effects})))
 
-    def without(self, placed: Placed) -> "Candidate":
+    def without(self, strut_effect: StrutEffect) -> "Candidate":
         """The candidate less one effect."""
-        return self._replace(new=tuple(other for other in self.new if other != placed))
+        return self._replace(new=tuple(other for other in self.new if other != strut_effect))
 
 
 class Parts(NamedTuple):
-    """All that a model's answer depends on.
+    """Values of all that a model's response depends on.
 
     Attributes:
         linear: Changes of the linear parameters, shape (L,).
@@ -103,39 +106,30 @@ class Parts(NamedTuple):
     starts: tuple[Array, ...]
 
 
-class Track(NamedTuple):
-    """A motion on a grid, for laws that are evaluated along it.
+class CandidateModel(NamedTuple):
+    """A candidate with its values: a model that can be simulated.
 
     Attributes:
-        t_s: Times, shape (N,).
-        heights_m: Heights, shape (struts, N).
-        velocities_m_per_s: Their rates, shape (struts, N).
-        applied_n: Applied force, shape (N,); zero where there is none.
-        temperature_c: Temperature, shape (N,).
+        candidate: Its effects.
+        parts: Their parameters, the linear changes and the initial vectors.
     """
 
-    t_s: Array
-    heights_m: Array
-    velocities_m_per_s: Array
-    applied_n: Array
-    temperature_c: Array
+    candidate: Candidate
+    parts: Parts
 
-    @classmethod
-    def of_columns(
-        cls,
-        t_s: Array,
-        heights_m: Array,
-        velocities_m_per_s: Array,
-        applied_n: Array,
-        temperature_c: Array,
-    ) -> "Track":
-        """A motion whose heights and velocities come as columns, shape (N, struts)."""
-        rows = t_s, heights_m.T, velocities_m_per_s.T, applied_n, temperature_c
-        return cls(*(np.ascontiguousarray(row) for row in rows))
 
-    def cut(self, nodes: slice) -> "Track":
-        """The motion at some of the nodes."""
-        return Track(*(np.ascontiguousarray(part[..., nodes]) for part in self))
+class ComparedModels(NamedTuple):
+    """The models that are compared on held-out data.
+
+    Attributes:
+        nominal: The model as given.
+        linear: The best linear one.
+        corrected: The corrected one.
+    """
+
+    nominal: CandidateModel
+    linear: CandidateModel
+    corrected: CandidateModel
 
 
 class Segment(NamedTuple):
@@ -144,13 +138,13 @@ class Segment(NamedTuple):
     Attributes:
         track: The measured motion, smoothed.
         reference: The motion along which the reference's laws acted.
-        lead: Both motions over the whole recording, of which this is a part, for laws that remember
-            where they have been; None where this is all of it.
-        respond: What a force (N,) in a strut adds to the whitened answer, shape (m,).
-        target: Whitened answer that the reference leaves over, shape (m,).
-        linear: Whitened answers to a unit change of each linear parameter, shape (m, L).
-        initial: Whitened answers to initial states, shape (m, c).
-        blocks: Block of each row, counted within it, shape (m,).
+        lead: Both motions over the whole recording, of which this is a part, for laws whose
+            internal state depends on what went before; None where this is all of it.
+        respond: Change of the whitened response, shape (m,), by a force (N,) in a strut.
+        target: Whitened residual of the reference, shape (m,).
+        linear: Whitened responses to a unit change of each linear parameter, shape (m, L).
+        initial: Whitened responses to initial states, shape (m, c).
+        blocks: Block of each row, counted within the segment, shape (m,).
     """
 
     track: Track
@@ -179,43 +173,94 @@ class ResidualForces(NamedTuple):
     deviation_n: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Problem(ABC):
-    """A model held against recordings.
+class RunEvaluation(NamedTuple):
+    """Figures of one held-out recording.
 
     Attributes:
-        bench: Kind of bench.
+        figures: As they are reported.
+        target: Error that decides (of height or load cell), of nominal and corrected model.
+        linear: The same of the best linear model.
+        linear_force_n: Residual force of the best linear model.
+        floor: RMS that a right model can reach.
+        drift_m: Share of the floor that noise of the applied force causes; zero on a dyno.
+        series: For the report.
+    """
+
+    figures: RunFigures
+    target: BeforeAfter
+    linear: float
+    linear_force_n: float
+    floor: NoiseFloor
+    drift_m: float
+    series: tuple[HeldOutSeries, ...]
+
+
+class ProblemBasis(NamedTuple):
+    """What the problems of one diagnosis share, in the order of the fields of `Problem`.
+
+    Attributes:
         spec: The nominal model.
         linear: Parameters of the linear part.
         existing: Effects of the nominal model.
         motions: What each strut did on the recordings that are learnt from.
         block_s: Length of the blocks of cross-validation.
-        read: DART with the nominal model.
+        plants: DART with the nominal model.
+    """
+
+    spec: ModelSpec
+    linear: tuple[LinearParameter, ...]
+    existing: tuple[ExistingParameters, ...]
+    motions: tuple[Motion, ...]
+    block_s: float
+    plants: MechanismPlants
+
+
+@dataclass(frozen=True, eq=False)
+class Problem(ABC):
+    """A model held against recordings; fields as in `ProblemBasis`.
+
+    Attributes:
+        bench: Kind of bench.
+        assumption: Note of a diagnosis: what the bench's residual takes for granted.
     """
 
     bench: ClassVar[Bench]
+    assumption: ClassVar[str]
     spec: ModelSpec
     linear: tuple[LinearParameter, ...]
-    existing: tuple[Existing, ...]
+    existing: tuple[ExistingParameters, ...]
     motions: tuple[Motion, ...]
     block_s: float
-    read: Readers
+    plants: MechanismPlants
+
+    @classmethod
+    @abstractmethod
+    def of_recordings(cls, basis: ProblemBasis, recordings: Sequence[SmoothRecording]) -> Self:
+        """The problem of recordings of this kind of bench.
+
+        Raises:
+            RecordingError: A channel cannot be what its name says.
+        """
 
     @property
     @abstractmethod
-    def recordings(self) -> int:
-        """Number of recordings."""
+    def grids(self) -> tuple[RecordingGrid, ...]:
+        """Nodes of each recording."""
+
+    @abstractmethod
+    def fit_nodes(self, k: int) -> Flags:
+        """Nodes of a recording that take part in fits, shape (N,)."""
 
     @abstractmethod
     def blocks(self, k: int) -> Integers:
-        """Block of each row of a recording's residual, counted within it."""
+        """Block of each row of a recording's residual, counted within it, shape (m,)."""
 
     @abstractmethod
-    def residual(self, k: int, candidate: Candidate, parts: Parts) -> Array | None:
-        """Whitened residual of a recording, or None where the model runs away."""
+    def residual(self, k: int, model: CandidateModel) -> Array | None:
+        """Whitened residual of a recording, shape (m,); None where the model runs away."""
 
     @abstractmethod
-    def floor_level(self, candidate: Candidate, parts: Parts) -> float:
+    def floor_level(self, model: CandidateModel) -> float:
         """Mean square of a right model's residual: noise of the sensors and the applied force."""
 
     @abstractmethod
@@ -227,36 +272,88 @@ class Problem(ABC):
         """Usual sizes of an initial vector's entries, and which of them are fitted."""
 
     @abstractmethod
-    def residual_forces(self, k: int, candidate: Candidate, parts: Parts) -> ResidualForces | None:
-        """The residual force of a recording, or None where the model runs away."""
-
-    @abstractmethod
-    def states(self, k: int, candidate: Candidate, parts: Parts) -> Array:
+    def states(self, k: int, model: CandidateModel) -> Array:
         """Internal states at the beginning of a recording."""
 
     @abstractmethod
-    def fitted(self, k: int) -> Flags:
-        """Nodes of a recording that take part in fits, shape (N,)."""
+    def residual_forces(self, k: int, model: CandidateModel) -> ResidualForces | None:
+        """The residual force of a recording; None where the model runs away."""
+
+    @abstractmethod
+    def residual_force_rms_n(self, mean_square: float) -> float:
+        """RMS residual force of a fit by its whitened mean square; NaN where heights are fitted."""
+
+    @abstractmethod
+    def with_noise_of(self, model: CandidateModel) -> Self:
+        """The problem with the sensors' noise as a model's residual shows it."""
+
+    @abstractmethod
+    def finer(self) -> Self | None:
+        """The problem with steps half as long; None where nothing is integrated."""
 
     @abstractmethod
     def cut(self, pieces: Sequence[tuple[int, slice]]) -> Self:
-        """The same of pieces of recordings, each given by its recording's index and its nodes.
+        """The problem of pieces of recordings, each given by its recording's index and its nodes.
 
-        Internal states begin anew with each piece: those that add up over a recording are wrong.
+        Internal states start again with each piece: those that add up over a recording are wrong.
         """
 
     @abstractmethod
     def segments(
-        self, candidate: Candidate, parts: Parts, most_samples: int, most_thinned: int
+        self, model: CandidateModel, most_samples: int, largest_stride: int
     ) -> tuple[Segment, ...]:
-        """The regression along the motion about a model: its free run, or its force.
+        """The regression along the motion about a model, the reference.
 
-        Of longer recordings it takes one node of `most_thinned` at least, and where that leaves too
-        many, parts of them.
+        Args:
+            model: The reference: its free run, or its force along the motion.
+            most_samples: Nodes of all recordings that are taken, about.
+            largest_stride: Longer recordings are thinned to one node in so many at most; where that
+                leaves too many nodes, parts of the recordings are taken.
+
+        Raises:
+            FloatingPointError: The model runs away.
         """
 
+    @abstractmethod
+    def evaluate(
+        self, k: int, models: ComparedModels, fitted_rms_n: float, *, blocks: bool
+    ) -> RunEvaluation:
+        """Figures of a held-out recording.
 
-def placed(problem: Problem, candidate: Candidate) -> tuple[Placed, ...]:
+        Args:
+            k: Index of the recording.
+            models: What is compared, with initial vectors fitted to these recordings.
+            fitted_rms_n: Residual force of the corrected model where it was fitted.
+            blocks: Whether the figures are those of held-out blocks, not of the whole recording.
+
+        Raises:
+            RecordingError: A model runs away.
+        """
+
+    @property
+    def recordings(self) -> int:
+        """Number of recordings."""
+        return len(self.grids)
+
+    @property
+    def basis(self) -> ProblemBasis:
+        """What the problem shares with others of the same diagnosis."""
+        return ProblemBasis(
+            self.spec, self.linear, self.existing, self.motions, self.block_s, self.plants
+        )
+
+
+def evaluated_nodes(grid: RecordingGrid, *, blocks: bool) -> Flags:
+    """Nodes of a recording that are evaluated on: its held-out blocks, or all, shape (N,)."""
+    return grid.held_out if blocks else np.ones_like(grid.held_out)
+
+
+def rms(values: Array) -> float:
+    """Root mean square of the values that are not NaN."""
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def strut_effects(problem: Problem, candidate: Candidate) -> tuple[StrutEffect, ...]:
     """All effects of a candidate, existing ones first."""
     kept = ((problem.existing[i].strut, problem.existing[i].name) for i in candidate.kept)
     return (*kept, *candidate.new)
@@ -264,12 +361,24 @@ def placed(problem: Problem, candidate: Candidate) -> tuple[Placed, ...]:
 
 def slots_of(problem: Problem, candidate: Candidate) -> Slots:
     """All effects of a candidate as the compiled loops read them."""
-    return slots(placed(problem, candidate))
+    return slots(strut_effects(problem, candidate))
 
 
 def nominal(problem: Problem) -> Candidate:
-    """The nominal model."""
+    """The candidate without new effects."""
     return Candidate(tuple(range(len(problem.existing))), ())
+
+
+def nominal_model(problem: Problem, starts: tuple[Array, ...]) -> CandidateModel:
+    """The nominal model as given, from initial vectors."""
+    base = nominal(problem)
+    parts = Parts(np.zeros(len(problem.linear)), existing_values(problem, base), starts)
+    return CandidateModel(base, parts)
+
+
+def first_starts(problem: Problem, candidate: Candidate) -> tuple[Array, ...]:
+    """First guess of all recordings' initial vectors."""
+    return tuple(problem.start(k, candidate) for k in range(problem.recordings))
 
 
 def existing_values(problem: Problem, candidate: Candidate) -> Array:
@@ -294,7 +403,7 @@ def strut_constants(problem: Problem, linear: Array) -> Array:
         row = constants[parameter.strut]
         if parameter.kind == "stiffness":
             row[1] += change
-            row[4] += change * (middle_m(problem.motions[parameter.strut]) - row[0])
+            row[4] += change * (mid_stroke_m(problem.motions[parameter.strut]) - row[0])
         elif parameter.kind == "damping":
             row[2] += change
         elif parameter.kind == "preload":
@@ -306,41 +415,36 @@ def strut_constants(problem: Problem, linear: Array) -> Array:
     return constants
 
 
-def free_beside(problem: Problem, candidate: Candidate) -> Flags:
-    """Linear parameters that are free beside a candidate's laws, shape (L,).
+def free_linear(problem: Problem, candidate: Candidate) -> Flags:
+    """Linear parameters that are fitted together with a candidate's laws, shape (L,).
 
-    The gain of the applied force is degenerate with all else, and has a turn of its own. The free
-    length is seen only where a law is taken from it.
+    The gain of the applied force is degenerate with all others, and is fitted separately. The free
+    length acts only where a law depends on it.
     """
-    seen = {strut for strut, name in placed(problem, candidate) if effect(name).about_free_length}
+    effects = strut_effects(problem, candidate)
+    acting = {strut for strut, name in effects if effect(name).about_free_length}
     return np.array(
-        [p.kind != "gain" and (p.kind != "free_length" or p.strut in seen) for p in problem.linear],
+        [
+            p.kind != "gain" and (p.kind != "free_length" or p.strut in acting)
+            for p in problem.linear
+        ],
         dtype=np.bool_,
     )
 
 
-def middle_m(motion: Motion) -> float:
-    """Mid-stroke."""
+def mid_stroke_m(motion: Motion) -> float:
+    """Mid-stroke height."""
     return 0.5 * (motion.low_m + motion.high_m)
 
 
-def state_scales(candidate_effects: Sequence[Placed]) -> tuple[Array, Flags]:
+def state_scales(effects: Sequence[StrutEffect]) -> tuple[Array, Flags]:
     """Usual sizes of effects' internal states, and which are fitted at the beginning."""
-    scales = [scale for _, name in candidate_effects for scale in effect(name).state_scales]
-    fitted = [
-        effect(name).fits_state for _, name in candidate_effects for _ in effect(name).state_scales
-    ]
+    scales = [scale for _, name in effects for scale in effect(name).state_scales]
+    fitted = [effect(name).fits_state for _, name in effects for _ in effect(name).state_scales]
     return np.array(scales, dtype=np.float64), np.array(fitted, dtype=np.bool_)
 
 
-def numbered_on(blocks: Sequence[Integers]) -> Integers:
-    """Blocks of several parts as those of all, one part after another."""
+def concatenate_blocks(blocks: Sequence[Integers]) -> Integers:
+    """Block of each row of several parts, numbered on from one part to the next, shape (m,)."""
     firsts = np.cumsum([0, *(int(part.max()) + 1 for part in blocks[:-1])])
     return np.concatenate([part + first for part, first in zip(blocks, firsts, strict=True)])
-
-
-def block_numbers(t_s: Array, length_s: float) -> Integers:
-    """Blocks of equal length over the times of a recording, at least two."""
-    count = max(2, round(float(t_s[-1] - t_s[0]) / length_s))
-    share = (t_s - t_s[0]) / float(t_s[-1] - t_s[0])
-    return np.minimum((share * count).astype(np.int64), count - 1)

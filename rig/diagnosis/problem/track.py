@@ -5,17 +5,18 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.effects import Motion
+from dart_model.effects import Motion, effect
+from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.compiled import along, law
+from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.problem import (
-    Candidate,
-    Parts,
+    CandidateModel,
+    ExistingParameters,
     Problem,
     Segment,
-    Track,
-    placed,
     slots_of,
     strut_constants,
+    strut_effects,
 )
 
 Array = NDArray[np.float64]
@@ -24,10 +25,12 @@ _LONGEST_STATE_STEP_S = 0.6e-3
 """Longest step of an internal state along a motion: a bristle that settles at 2000 1/s needs it."""
 _MOST_STATE_STEPS = 8
 _PIECES = 8
-"""Parts of recordings that are too long for all of them to be looked at; one of each at least."""
+"""Parts that are taken of recordings too long to be taken whole; one of each at least."""
 _TURN = 0.5
 """Most that the fastest motion turns between samples: a cubic through heights and velocities then
 errs by less than a thousandth."""
+_NEGLIGIBLE = 1e-9
+"""Share of the strut's force below which an existing effect does not act on the recordings."""
 _NO_STATE = np.zeros(0)
 
 
@@ -37,24 +40,24 @@ def _substeps(t_s: Array) -> int:
     return int(np.clip(np.ceil(step / _LONGEST_STATE_STEP_S), 1, _MOST_STATE_STEPS))
 
 
-def most_thinned(motions: Sequence[Motion]) -> int:
-    """Of how many samples one may be kept so that a motion is still known between them."""
+def largest_stride(motions: Sequence[Motion]) -> int:
+    """Largest number of samples of which one may be kept, the motion still known between them."""
     return max(
         1, min(int(_TURN * 0.5 * m.stroke_m / (m.top_speed_m_per_s * m.step_s)) for m in motions)
     )
 
 
-def pieces(nodes: int, samples: int, most: int, most_thinned: int) -> list[slice]:
-    """Parts of a recording that are looked at.
+def pieces(nodes: int, samples: int, most: int, largest_stride: int) -> list[slice]:
+    """Parts of a recording that a computation takes.
 
     Args:
         nodes: Nodes of the recording.
         samples: Nodes of all recordings.
-        most: Nodes of all that are looked at.
-        most_thinned: Of how many nodes one may be kept; where that leaves more, pieces are spread
-            over the recording.
+        most: Nodes of all recordings that are taken, about.
+        largest_stride: Number of nodes of which one is kept at least; where that leaves more than
+            `most`, pieces are spread over the recording.
     """
-    step = max(1, min(round(samples / most), most_thinned))
+    step = max(1, min(round(samples / most), largest_stride))
     share = most * step * nodes / samples
     if nodes < 2.0 * share:
         return [slice(0, nodes, step)]
@@ -102,8 +105,7 @@ def linear_forces(tracks: Sequence[Track], strut: int) -> Array:
 
 def segment_forces(
     segments: Sequence[Segment],
-    strut: int,
-    name: str,
+    strut_effect: tuple[int, str],
     values: Array,
     constants: Array,
     *,
@@ -113,30 +115,52 @@ def segment_forces(
 
     Args:
         segments: The segments.
-        strut: Index of the strut.
-        name: Name of the effect.
+        strut_effect: Index of the strut, and name of the effect.
         values: Its parameters.
         constants: Strut constants.
         reference: Along the reference's motion, not the measured one.
     """
-    found: list[Array] = []
-    known: dict[int, Array] = {}
+    strut, name = strut_effect
+    forces: list[Array] = []
+    lead_forces: dict[int, Array] = {}
     for segment in segments:
-        own = segment.reference if reference else segment.track
+        along = segment.reference if reference else segment.track
         if segment.lead is None or law(name).states == 0:
-            found.append(law_force(own, strut, name, values, constants))
+            forces.append(law_force(along, strut, name, values, constants))
             continue
         whole = segment.lead[1] if reference else segment.lead[0]
-        if id(whole) not in known:
-            known[id(whole)] = law_force(whole, strut, name, values, constants)
-        found.append(np.interp(own.t_s, whole.t_s, known[id(whole)]))
-    return found
+        if id(whole) not in lead_forces:
+            lead_forces[id(whole)] = law_force(whole, strut, name, values, constants)
+        forces.append(np.interp(along.t_s, whole.t_s, lead_forces[id(whole)]))
+    return forces
+
+
+def existing_effects(spec: ModelSpec, tracks: Sequence[Track]) -> tuple[ExistingParameters, ...]:
+    """Effects of a model, and whether each acts along motions so that it can be refitted."""
+    existing: list[ExistingParameters] = []
+    constants = np.array(
+        [
+            (s.free_length_m, s.stiffness_n_per_m, s.damping_n_s_per_m, spec.gravity_m_per_s2)
+            for s in spec.struts
+        ]
+    )
+    for i, strut in enumerate(spec.struts):
+        for item in strut.effects:
+            values = tuple(item.values())
+            spring = max(float(np.std(t.heights_m[i])) * strut.stiffness_n_per_m for t in tracks)
+            acting = not effect(item.name).linear and item.name != "restoring_surface"
+            if acting and item.name != "delay":
+                forces = [law_force(t, i, item.name, np.array(values), constants) for t in tracks]
+                acting = any(float(np.max(np.abs(f))) > _NEGLIGIBLE * spring for f in forces)
+            existing.append(ExistingParameters(i, item.name, values, acting))
+    return tuple(existing)
 
 
 def effect_forces(
-    problem: Problem, candidate: Candidate, parts: Parts, track: Track, states: Array
+    problem: Problem, model: CandidateModel, track: Track, states: Array
 ) -> list[tuple[int, Array]]:
-    """Strut and force (N,) of each effect of a candidate along a motion."""
+    """Strut and force (N,) of each effect of a model along a motion."""
+    candidate, parts = model
     constants = strut_constants(problem, parts.linear)
     index = slots_of(problem, candidate).index
     return [
@@ -147,31 +171,26 @@ def effect_forces(
                 states[slot[3] : slot[4]],
             ),
         )
-        for (strut, name), slot in zip(placed(problem, candidate), index, strict=True)
+        for (strut, name), slot in zip(strut_effects(problem, candidate), index, strict=True)
     ]  # fmt: skip
 
 
 def forces_along(
-    problem: Problem, candidate: Candidate, parts: Parts, tracks: Sequence[tuple[int, Track]]
+    problem: Problem, model: CandidateModel, tracks: Sequence[tuple[int, Track]]
 ) -> list[tuple[int, Array]]:
     """Strut and force of each effect over recordings, given by index and motion, in their order."""
-    each = [
-        effect_forces(problem, candidate, parts, track, problem.states(k, candidate, parts))
-        for k, track in tracks
-    ]
+    each = [effect_forces(problem, model, track, problem.states(k, model)) for k, track in tracks]
     return [
         (rows[0][0], np.concatenate([force for _, force in rows]))
         for rows in zip(*each, strict=True)
     ]
 
 
-def strut_forces(
-    problem: Problem, candidate: Candidate, parts: Parts, track: Track, states: Array
-) -> Array:
+def strut_forces(problem: Problem, model: CandidateModel, track: Track, states: Array) -> Array:
     """Force of every strut of a model along a motion, shape (struts, N)."""
-    constants = strut_constants(problem, parts.linear)
+    constants = strut_constants(problem, model.parts.linear)
     free, stiffness, damping, preload = constants[:, [0, 1, 2, 4], np.newaxis].transpose(1, 0, 2)
     total = preload - stiffness * (track.heights_m - free) - damping * track.velocities_m_per_s
-    for strut, force in effect_forces(problem, candidate, parts, track, states):
+    for strut, force in effect_forces(problem, model, track, states):
         total[strut] += force
     return total

@@ -1,1 +1,1 @@
-"""The search for what a model lacks: one for every kind of bench."""
+"""The search for missing effects, for every kind of bench."""

@@ -1,4 +1,4 @@
-"""Joint fit of effects, linear part and initial states, and what it says of data not fitted.
+"""Joint fit of effects, linear part and initial states, its covariance and its cross-validation.
 
 References:
     Ljung, System Identification (1999), 9.4, covariance of output-error estimates.
@@ -22,16 +22,26 @@ from scipy.stats import chi2
 from scipy.stats import t as student
 
 from dart_model.effects import Effect, Motion, effect
-from rig.diagnosis.numerics.least_squares import Prior, Rows, Solution, Space, joined, solve
+from rig.diagnosis.numerics.least_squares import (
+    Differences,
+    Effort,
+    Prior,
+    Rows,
+    Solution,
+    Space,
+    concatenate_spaces,
+    solve,
+)
 from rig.diagnosis.problem.problem import (
     Candidate,
+    CandidateModel,
     Integers,
     Parts,
-    Placed,
     Problem,
-    numbered_on,
-    placed,
+    StrutEffect,
+    concatenate_blocks,
     slots_of,
+    strut_effects,
 )
 
 Array = NDArray[np.float64]
@@ -42,9 +52,11 @@ _EXISTING_PRIOR = 0.5
 _STATE_PRIOR = 10.0
 """Prior on internal states at the beginning, in units of their scale: wide."""
 _TINY = 1e-100
-"""Stands for nothing in a quotient; its square is still a number."""
+"""Least divisor; its square is still a number."""
 _NIL = 1e-2
-"""Share of a like parameter below which one is searched in that one's units."""
+"""Least scale of a parameter, as a share of the largest one of the same unit."""
+USUAL = Effort(15)
+"""Fits for which nothing else is given."""
 _LAGS = 20
 """Lags of the whiteness test."""
 
@@ -53,28 +65,36 @@ class Fit(NamedTuple):
     """A fitted model.
 
     Attributes:
-        candidate: Its effects.
+        model: The model.
         free: Which linear parameters were fitted, shape (L,).
-        parts: All that it consists of.
-        solution: The fit itself.
-        space: Where it was searched.
         fits_effects: Whether effects' parameters were fitted.
+        solution: The solution of the least-squares problem.
+        space: Bounds and scales of its variables.
         blocks: Block of each row of data, over all recordings, shape (m,).
         recording: Recording of each row of data, shape (m,).
     """
 
-    candidate: Candidate
+    model: CandidateModel
     free: Flags
     fits_effects: bool
-    parts: Parts
     solution: Solution
     space: Space
     blocks: Integers
     recording: Integers
 
     @property
+    def candidate(self) -> Candidate:
+        """Its effects."""
+        return self.model.candidate
+
+    @property
+    def parts(self) -> Parts:
+        """Its parameters and initial vectors."""
+        return self.model.parts
+
+    @property
     def rows(self) -> int:
-        """Rows of data."""
+        """Number of rows of data."""
         return len(self.blocks)
 
     @property
@@ -88,19 +108,19 @@ class Fit(NamedTuple):
         return float(np.mean(self.residual**2))
 
 
-def residual(problem: Problem, candidate: Candidate, parts: Parts) -> Array | None:
+def whitened_residual(problem: Problem, model: CandidateModel) -> Array | None:
     """Whitened residual of all recordings, shape (m,), or None where the model runs away."""
-    found: list[Array] = []
+    residuals: list[Array] = []
     for k in range(problem.recordings):
-        there = problem.residual(k, candidate, parts)
-        if there is None:
+        residual = problem.residual(k, model)
+        if residual is None:
             return None
-        found.append(there)
-    return np.concatenate(found)
+        residuals.append(residual)
+    return np.concatenate(residuals)
 
 
 def law_space(name: str, motion: Motion, values: Array) -> Space:
-    """Where an effect's parameters are searched, beginning at `values`."""
+    """Bounds and scales of a new effect's parameters, for a search from `values`."""
     item = effect(name)
     narrower = item.bounds(motion)
     low = np.array([max(p.low, narrower.get(p.name, (p.low,))[0]) for p in item.parameters])
@@ -115,7 +135,7 @@ def law_space(name: str, motion: Motion, values: Array) -> Space:
 
 
 def _size(item: Effect, i: int, values: Array) -> float:
-    """Size of a parameter, at least a share of one with its unit: a side of a damper may be nil."""
+    """Scale of a parameter, at least a share of others of its unit: one may be zero."""
     alike = [
         abs(float(value))
         for parameter, value in zip(item.parameters, values, strict=True)
@@ -125,6 +145,7 @@ def _size(item: Effect, i: int, values: Array) -> float:
 
 
 def _existing_space(name: str, values: Array, free: bool) -> Space:
+    """Bounds and scales of an existing effect's parameters; equal bounds where it is not free."""
     parameters = effect(name).parameters
     low = np.array([p.low for p in parameters])
     high = np.array([p.high for p in parameters])
@@ -134,11 +155,17 @@ def _existing_space(name: str, values: Array, free: bool) -> Space:
 
 
 class _Layout:
-    """How the search variables of a fit make up a model's parts."""
+    """How the search variables of a fit are ordered in a model's parts.
 
-    def __init__(
-        self, problem: Problem, candidate: Candidate, first: Parts, free: Flags, effects: bool
-    ) -> None:
+    Args:
+        problem: Model and recordings.
+        model: Where the fit begins.
+        free: Which linear parameters are fitted, shape (L,).
+        effects: Whether effects' parameters are fitted.
+    """
+
+    def __init__(self, problem: Problem, model: CandidateModel, free: Flags, effects: bool) -> None:
+        candidate, first = model
         self.problem, self.candidate, self.first, self.free = problem, candidate, first, free
         linear = problem.linear
         deviation = np.array([p.deviation for p in linear])
@@ -152,7 +179,7 @@ class _Layout:
         ]
         index = slots_of(problem, candidate).index
         varied = [free]
-        for row, (strut, name) in enumerate(placed(problem, candidate)):
+        for row, (strut, name) in enumerate(strut_effects(problem, candidate)):
             values = first.effects[index[row, 1] : index[row, 2]]
             if row < len(candidate.kept):
                 is_free = problem.existing[candidate.kept[row]].free
@@ -166,7 +193,7 @@ class _Layout:
         for _ in first.starts:
             spaces.append(Space(-endless, endless, scales, np.zeros(len(scales), dtype=np.bool_)))
             varied.append(fitted)
-        self.whole = joined(spaces)
+        self.whole = concatenate_spaces(spaces)
         self.varied = np.concatenate(varied)
         self.space = self.whole.part(self.varied)
         self.full = np.concatenate([first.linear, first.effects, *first.starts])
@@ -188,28 +215,31 @@ class _Layout:
         inner = self.whole.inner(np.clip(centre, self.whole.low, self.whole.high))
         return Prior(np.where(weight > 0.0, inner, 0.0)[self.varied], weight[self.varied])
 
-    def parts(self, x: Array) -> Parts:
+    def model(self, x: Array) -> CandidateModel:
+        """The model of search variables, shape (k,)."""
         full = self.full.copy()
         full[self.varied] = x
         linear = len(self.first.linear)
         effects = len(self.first.effects)
         starts = full[linear + effects :].reshape(len(self.first.starts), self.start_size)
-        return Parts(
-            full[:linear], np.ascontiguousarray(full[linear : linear + effects]),
+        parts = Parts(
+            full[:linear],
+            np.ascontiguousarray(full[linear : linear + effects]),
             tuple(np.ascontiguousarray(row) for row in starts),
-        )  # fmt: skip
+        )
+        return CandidateModel(self.candidate, parts)
 
     def residual_of(self, k: int, x: Array) -> Array | None:
-        return self.problem.residual(k, self.candidate, self.parts(x))
+        return self.problem.residual(k, self.model(x))
 
     def residual(self, x: Array) -> Array | None:
-        return residual(self.problem, self.candidate, self.parts(x))
+        return whitened_residual(self.problem, self.model(x))
 
     def rows(self, blocks: list[Integers]) -> dict[int, Rows]:
-        """Of each variable of a recording's initial vector, the rows that it moves."""
+        """The rows that depend on each variable of an initial vector: those of its recording."""
         if len(blocks) < 2:
             return {}
-        found: dict[int, Rows] = {}
+        rows_by_variable: dict[int, Rows] = {}
         varied = np.flatnonzero(self.varied)
         before = len(self.first.linear) + len(self.first.effects)
         at = 0
@@ -217,63 +247,60 @@ class _Layout:
             rows = Rows(at, at + len(block), functools.partial(self.residual_of, k))
             low, high = before + k * self.start_size, before + (k + 1) * self.start_size
             for i in np.flatnonzero((varied >= low) & (varied < high)):
-                found[int(i)] = rows
+                rows_by_variable[int(i)] = rows
             at += len(block)
-        return found
+        return rows_by_variable
 
 
 def fit(
     problem: Problem,
-    candidate: Candidate,
-    first: Parts,
+    first: CandidateModel,
     free: Flags,
-    iterations: int = 15,
-    tolerance: float = 1e-4,
-    sides: int = 2,
+    effort: Effort = USUAL,
     *,
     effects: bool = True,
     most_level: float = np.inf,
 ) -> Fit | None:
-    """Fit a candidate.
+    """Fit a model.
 
     Args:
         problem: Model and recordings.
-        candidate: Its effects.
         first: Where to begin.
         free: Which linear parameters are fitted, shape (L,); the others stay as in `first`.
-        iterations: Most steps.
-        tolerance: Relative gain below which the fit ends.
-        sides: Sides on which the last differences are taken, see `solve`.
+        effort: How far to go.
         effects: Whether effects' parameters are fitted.
-        most_level: Variance of the residual up to which priors gain weight with it. One that weighs
-            by what is left where a fit begins would hold it there.
+        most_level: Variance of the residual up to which priors gain weight with it. A prior that is
+            weighted by the residual where a fit begins would hold it there.
 
     Returns:
         The fit, or None if the model runs away where it begins.
     """
-    layout = _Layout(problem, candidate, first, free, effects)
+    layout = _Layout(problem, first, free, effects)
     blocks = [problem.blocks(k) for k in range(problem.recordings)]
     solution = solve(
-        layout.residual, layout.full[layout.varied], layout.space, iterations, tolerance,
-        layout.rows(blocks), os.cpu_count() or 1, layout.prior._replace(most_level=most_level),
-        sides,
-    )  # fmt: skip
+        Differences(layout.residual, layout.rows(blocks), os.cpu_count() or 1),
+        layout.full[layout.varied],
+        layout.space,
+        effort,
+        layout.prior._replace(most_level=most_level),
+    )
     if solution is None:
         return None
     return Fit(
-        candidate,
+        layout.model(solution.values),
         free,
         effects,
-        layout.parts(solution.values),
         solution,
         layout.space,
-        numbered_on(blocks),
+        concatenate_blocks(blocks),
         np.concatenate([np.full(len(block), k) for k, block in enumerate(blocks)]),
     )
 
 
-def left_out(residual: Array, jacobian: Array, blocks: Integers, prior: Array) -> Array:
-    """Sum of squares of each block's residual when it took no part in the fit, shape (blocks,).
+def leave_block_out_costs(
+    residual: Array, jacobian: Array, blocks: Integers, prior: Array
+) -> Array:
+    """Sum of squares of each block's residual in a fit to the other blocks, shape (blocks,).
 
     Args:
         residual: At the solution, shape (m,).
@@ -285,28 +312,30 @@ def left_out(residual: Array, jacobian: Array, blocks: Integers, prior: Array) -
     size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + np.diag(prior), _TINY))
     scaled = jacobian / size
     grams = np.zeros((count, len(size), len(size)))
-    scores = np.zeros((count, len(size)))
+    gradients = np.zeros((count, len(size)))
     squares = np.bincount(blocks, residual**2, count)
     for b in range(count):
         part = blocks == b
         grams[b] = scaled[part].T @ scaled[part]
-        scores[b] = scaled[part].T @ residual[part]
+        gradients[b] = scaled[part].T @ residual[part]
     whole = grams.sum(axis=0) + prior / np.outer(size, size)
-    found = np.empty(count)
+    costs = np.empty(count)
     for b in range(count):
-        step = np.linalg.lstsq(whole - grams[b], scores[b], rcond=1e-9)[0]
-        found[b] = squares[b] + 2.0 * step @ scores[b] + step @ grams[b] @ step
-    return found
+        step = np.linalg.lstsq(whole - grams[b], gradients[b], rcond=1e-9)[0]
+        costs[b] = squares[b] + 2.0 * step @ gradients[b] + step @ grams[b] @ step
+    return costs
 
 
-def block_scores(problem: Problem, result: Fit) -> Array:
-    """Out-of-sample sum of squares of each block.
+def validation_costs(problem: Problem, result: Fit) -> Array:
+    """Out-of-sample sum of squares of each block, shape (blocks,).
 
-    Initial states are held, since they belong to the block that begins a recording.
+    Initial states are fixed, since they belong to the block that begins a recording.
     """
     starts = start_variables(problem, result)
     prior = np.diag(result.solution.prior[~starts])
-    return left_out(result.residual, result.solution.jacobian[:, ~starts], result.blocks, prior)
+    return leave_block_out_costs(
+        result.residual, result.solution.jacobian[:, ~starts], result.blocks, prior
+    )
 
 
 def start_variables(problem: Problem, result: Fit) -> Flags:
@@ -319,11 +348,11 @@ def start_variables(problem: Problem, result: Fit) -> Flags:
 
 
 UNBOUND = 30.0
-"""Factor, or multiple of a value, beyond which an interval says nothing."""
+"""Factor, or multiple of a value, from which on a parameter is not identifiable."""
 
 
-class Spread(NamedTuple):
-    """What a fit does not know.
+class FitCovariance(NamedTuple):
+    """Uncertainty of a fit.
 
     Attributes:
         covariance: Of the search variables, shape (k, k).
@@ -339,23 +368,23 @@ class Spread(NamedTuple):
         return self.factor * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
-def spread(result: Fit) -> Spread:
-    """Covariance of a fit that takes the residual as autocorrelated as it is (White's sandwich).
+def fit_covariance(result: Fit) -> FitCovariance:
+    """Covariance of a fit whose residual may be autocorrelated (White's sandwich).
 
-    The smaller covariance of white noise is a lower limit.
+    The covariance under white noise is a lower limit.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         return _sandwich(result)
 
 
-def _sandwich(result: Fit) -> Spread:
+def _sandwich(result: Fit) -> FitCovariance:
     jacobian, residual = result.solution.jacobian, result.solution.residual
     prior = result.solution.prior
     size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + prior, _TINY))
     scaled = jacobian / size
     inverse = np.linalg.pinv(scaled.T @ scaled + np.diag(prior / size**2), rcond=1e-13)
     count = int(result.blocks.max()) + 1
-    # What the prior's own uncertainty adds.
+    # The uncertainty of the prior itself.
     meat = np.diag(result.solution.level * prior / size**2)
     for b in range(count):
         part = np.flatnonzero(result.blocks == b)
@@ -368,25 +397,25 @@ def _sandwich(result: Fit) -> Spread:
     ratio = np.maximum(np.diag(white), 0.0) / np.maximum(np.diag(robust), _TINY)
     stretch = np.sqrt(np.maximum(ratio, 1.0))
     covariance = robust * np.outer(stretch, stretch) / np.outer(size, size)
-    return Spread(covariance, float(student.ppf(0.975, max(count - 1, 2))))
+    return FitCovariance(covariance, float(student.ppf(0.975, max(count - 1, 2))))
 
 
 def effect_variables(problem: Problem, result: Fit) -> dict[int, Integers]:
-    """Search variables of each effect that was fitted, by its place among all of the candidate."""
+    """Search variables of each fitted effect, by its index among all of the candidate."""
     index = slots_of(problem, result.candidate).index
-    found: dict[int, Integers] = {}
+    variables: dict[int, Integers] = {}
     at = int(result.free.sum())
     if not result.fits_effects:
-        return found
+        return variables
     for row in range(len(index)):
         if row < len(result.candidate.kept):
             kept = problem.existing[result.candidate.kept[row]]
             if not kept.free:
                 continue
         count = int(index[row, 2] - index[row, 1])
-        found[row] = np.arange(at, at + count)
+        variables[row] = np.arange(at, at + count)
         at += count
-    return found
+    return variables
 
 
 def is_white(problem: Problem, result: Fit, level: float) -> bool:
@@ -413,7 +442,7 @@ def is_white(problem: Problem, result: Fit, level: float) -> bool:
     return True
 
 
-def law_values(problem: Problem, result: Fit) -> dict[Placed, Array]:
+def law_values(problem: Problem, result: Fit) -> dict[StrutEffect, Array]:
     """Parameters of the laws that the nominal model lacks."""
     index = slots_of(problem, result.candidate).index[len(result.candidate.kept) :]
     return {
@@ -422,13 +451,13 @@ def law_values(problem: Problem, result: Fit) -> dict[Placed, Array]:
     }
 
 
-def parts_for(
+def model_for(
     problem: Problem,
     result: Fit,
     candidate: Candidate,
-    further: Mapping[int | Placed, Array] = MappingProxyType({}),
-) -> Parts:
-    """A fitted model as another candidate: the effects of both, and further laws from rest.
+    further: Mapping[int | StrutEffect, Array] = MappingProxyType({}),
+) -> CandidateModel:
+    """A fitted model with the effects of another candidate, further laws starting at rest.
 
     Args:
         problem: Model and recordings.
@@ -451,4 +480,5 @@ def parts_for(
             states.append(np.zeros((problem.recordings, row[4] - row[3])))
     motions = (start[: len(start) - old.states] for start in result.parts.starts)
     starts = (np.append(*both) for both in zip(motions, np.hstack(states), strict=True))
-    return Parts(result.parts.linear, np.concatenate([np.zeros(0), *effects]), tuple(starts))
+    parts = Parts(result.parts.linear, np.concatenate([np.zeros(0), *effects]), tuple(starts))
+    return CandidateModel(candidate, parts)

@@ -1,4 +1,4 @@
-"""Models that were fitted, and which of them is worth more than another.
+"""Fitted models, and the rules by which one is preferred to another.
 
 Reference: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees (1984), 3.4.3, the
 one-standard-error rule.
@@ -13,45 +13,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
+from rig.diagnosis.numerics.least_squares import Effort
 from rig.diagnosis.problem.problem import (
     Candidate,
+    CandidateModel,
     Parts,
     Problem,
     existing_values,
-    free_beside,
+    first_starts,
+    free_linear,
     nominal,
 )
 from rig.diagnosis.search.criteria import DISSIPATING, STORING, SelectionCriteria
-from rig.diagnosis.search.fit import Fit, block_scores, fit
-from rig.diagnosis.search.score_test import Change, changes
+from rig.diagnosis.search.fit import Fit, fit, validation_costs
+from rig.diagnosis.search.score_test import ModelChange, find_changes
 from rig.diagnosis.search.screen import (
     Screening,
     Stage,
     law_and_shift,
-    linear_beside,
+    linear_changes,
     stage_of,
     whole_stage_of,
 )
-from rig.diagnosis.search.sound import tracks, unsound
+from rig.diagnosis.search.validity import find_defect, smooth_tracks
 
 Array = NDArray[np.float64]
 
 
-class Effort(NamedTuple):
-    """How far a fit goes.
-
-    Attributes:
-        steps: Most steps.
-        gain: Relative gain below which it ends.
-        sides: Sides on which its last differences are taken.
-    """
-
-    steps: int
-    gain: float
-    sides: int
-
-
-_BEGUN = Effort(8, 1e-2, 1)
+_STARTS = Effort(8, 1e-2, 1)
 """Fits of initial states alone."""
 ROUGH = Effort(8, 1e-3, 1)
 """Fits that are compared among themselves."""
@@ -61,21 +50,26 @@ FINAL = Effort(15, 1e-6, 2)
 """The fit that is reported; that of a free run once more with finer steps."""
 
 
-class Scored(NamedTuple):
-    """A fitted model and what it does on blocks that took no part.
+class ValidatedModel(NamedTuple):
+    """A fitted model and its cross-validation.
 
     Attributes:
         fit: The model.
-        scores: Out-of-sample sum of squares of each block.
+        block_costs: Out-of-sample sum of squares of each block.
     """
 
     fit: Fit
-    scores: Array
+    block_costs: Array
 
     @property
-    def score(self) -> float:
+    def cost(self) -> float:
         """Out-of-sample sum of squares."""
-        return float(self.scores.sum())
+        return float(self.block_costs.sum())
+
+    @property
+    def excess(self) -> float:
+        """Out-of-sample sum of squares above that of white noise of the sensors."""
+        return self.cost - self.fit.rows
 
     @property
     def size(self) -> int:
@@ -84,17 +78,17 @@ class Scored(NamedTuple):
 
     @property
     def families(self) -> tuple[str, ...]:
-        """Families of its laws."""
+        """Families of its laws, sorted."""
         return tuple(sorted(effect(name).family for _, name in self.fit.candidate.new))
 
 
 class Pool:
-    """Models that were fitted, by their effects; of two fits of one the better is kept.
+    """Fitted models by candidate; of two fits of one candidate the better is kept.
 
     Args:
         problem: Model and recordings.
         given: The nominal model, initial states fitted.
-        seeds: Models to begin with, the best linear one first.
+        seeds: First models, the best linear one first.
         criteria: What decides.
     """
 
@@ -102,71 +96,69 @@ class Pool:
         self, problem: Problem, given: Fit, seeds: Sequence[Fit], criteria: SelectionCriteria
     ) -> None:
         self.problem, self.given, self.criteria = problem, given, criteria
-        self.along = tracks(problem, given)
-        self.fits: dict[Candidate, Scored] = {}
-        self.unsound: dict[Candidate, str] = {}
-        self.settled: set[Candidate] = set()
-        self.floors: dict[Candidate, tuple[Scored, float]] = {}
-        self.tested: dict[Candidate, tuple[Scored, tuple[Change, ...]]] = {}
+        self.along = smooth_tracks(problem, given)
+        self.fits: dict[Candidate, ValidatedModel] = {}
+        self.invalid: dict[Candidate, str] = {}
+        self.converged: set[Candidate] = set()
+        self.floors: dict[Candidate, tuple[ValidatedModel, float]] = {}
+        self.tested: dict[Candidate, tuple[ValidatedModel, tuple[ModelChange, ...]]] = {}
         for seed in seeds:
-            self.attempt(seed.candidate, seed.parts)
+            self.attempt(seed.model)
         base = nominal(problem)
-        self.linear = self.fits.setdefault(base, self.scored(given))
+        self.linear = self.fits.setdefault(base, self.validate(given))
 
     @cached_property
     def linear_stage(self) -> Stage:
         """The regression about the best linear model."""
-        return stage_of(self.problem, self.linear.fit.candidate, self.linear.fit.parts)
+        return stage_of(self.problem, self.linear.fit.model)
 
-    def look_closer(self) -> None:
-        """Let the regression about the best linear model look at every sample."""
-        linear = self.linear.fit
-        self.linear_stage = whole_stage_of(self.problem, linear.candidate, linear.parts)
+    def take_every_sample(self) -> None:
+        """Take every sample in the regression about the best linear model."""
+        self.linear_stage = whole_stage_of(self.problem, self.linear.fit.model)
 
     # --- fits ---------------------------------------------------------------------------------
 
-    def scored(self, result: Fit) -> Scored:
-        """A fit with its scores."""
-        return Scored(result, block_scores(self.problem, result))
+    def validate(self, result: Fit) -> ValidatedModel:
+        """A fit with its cross-validation."""
+        return ValidatedModel(result, validation_costs(self.problem, result))
 
     def refit(
-        self, candidate: Candidate, parts: Parts, effort: Effort, most_level: float = np.inf
+        self, model: CandidateModel, effort: Effort, most_level: float = np.inf
     ) -> Fit | None:
-        """Fit a candidate with all of its linear part that may be free beside it."""
-        free = free_beside(self.problem, candidate)
+        """Fit a model with all linear parameters that may be fitted together with its laws."""
+        candidate, parts = model
+        free = free_linear(self.problem, candidate)
         parts = parts._replace(linear=np.where(free, parts.linear, 0.0))
-        return fit(self.problem, candidate, parts, free, *effort, most_level=most_level)
+        first = CandidateModel(candidate, parts)
+        return fit(self.problem, first, free, effort, most_level=most_level)
 
     def attempt(
-        self,
-        candidate: Candidate,
-        parts: Parts,
-        effort: Effort = ROUGH,
-        most_level: float = np.inf,
+        self, model: CandidateModel, effort: Effort = ROUGH, most_level: float = np.inf
     ) -> None:
-        """Fit a candidate in simulation and keep the better of this and an earlier fit."""
-        result = self.refit(candidate, parts, effort, most_level)
+        """Fit a model in simulation and keep the better of this and an earlier fit."""
+        candidate = model.candidate
+        result = self.refit(model, effort, most_level)
         if effort is FULL:
-            self.settled.add(candidate)
+            self.converged.add(candidate)
         if result is None:
             return
-        scored = self.scored(result)
-        if candidate in self.fits and scored.score >= self.fits[candidate].score:
+        validated = self.validate(result)
+        if candidate in self.fits and validated.cost >= self.fits[candidate].cost:
             return
-        self.fits[candidate] = scored
-        self.unsound.pop(candidate, None)
-        why = unsound(self.problem, result, self.along, self.criteria)
+        self.fits[candidate] = validated
+        self.invalid.pop(candidate, None)
+        why = find_defect(self.problem, result, self.along, self.criteria)
         if why is not None:
-            self.unsound[candidate] = why
+            self.invalid[candidate] = why
 
-    def attempt_screened(
-        self, stage: Stage, reference: Scored, screening: Screening, effort: Effort = ROUGH
+    def attempt_screening(
+        self, stage: Stage, reference: ValidatedModel, screening: Screening, effort: Effort = ROUGH
     ) -> None:
-        """Fit a screening's laws in simulation, from what it found along the motion.
+        """Fit a screening's laws in simulation, from their parameters along the motion.
 
         Args:
-            stage: Where it was found.
-            reference: The model that stage is about.
+            stage: The regression that the screening belongs to.
+            reference: The model that the regression is about.
             screening: The laws.
             effort: How far to go.
         """
@@ -174,171 +166,176 @@ class Pool:
         existing = existing_values(self.problem, base)
         if known.candidate.kept == base.kept:
             existing = known.parts.effects[: len(existing)]
-        values, linear = [existing], known.parts.linear + linear_beside(stage, screening)
-        for at, own in sorted(
+        values, linear = [existing], known.parts.linear + linear_changes(stage, screening)
+        for at, law_values in sorted(
             zip(screening.laws, screening.values, strict=True), key=lambda law: law[0]
         ):
-            parameters, shift = law_and_shift(at[1], own)
+            parameters, shift = law_and_shift(at[1], law_values)
             values.append(parameters)
-            here = [(p.strut, p.kind) == (at[0], "free_length") for p in self.problem.linear]
-            linear = linear + shift * np.array(here)
+            shifted = [(p.strut, p.kind) == (at[0], "free_length") for p in self.problem.linear]
+            linear = linear + shift * np.array(shifted)
         least = np.array([p.least for p in self.problem.linear])
-        candidate = base.added(*screening.laws)
-        parts = self._begun(candidate, np.maximum(linear, least), np.concatenate(values))
-        # Priors weigh as they did there: a free run may begin far off with the right parameters.
-        self.attempt(candidate, parts, effort, max(1.0, screening.cost / len(stage.target)))
+        candidate = base.with_effects(*screening.laws)
+        model = self._with_fitted_starts(
+            candidate, np.maximum(linear, least), np.concatenate(values)
+        )
+        # Priors weigh as in the regression: a free run may begin far off with right parameters.
+        self.attempt(model, effort, max(1.0, screening.cost / len(stage.target)))
 
-    def _begun(self, candidate: Candidate, linear: Array, effects: Array) -> Parts:
-        """With initial states of its own: those of a poorer model make up for what it lacks."""
-        recordings = range(self.problem.recordings)
-        starts = tuple(self.problem.start(k, candidate) for k in recordings)
-        own, none = Parts(linear, effects, starts), np.zeros(len(linear), dtype=np.bool_)
-        result = fit(self.problem, candidate, own, none, *_BEGUN, effects=False)
-        return own if result is None else result.parts
+    def _with_fitted_starts(
+        self, candidate: Candidate, linear: Array, effects: Array
+    ) -> CandidateModel:
+        """A model with fitted initial states; those of a poorer model compensate its error."""
+        parts = Parts(linear, effects, first_starts(self.problem, candidate))
+        model, none_free = CandidateModel(candidate, parts), np.zeros(len(linear), dtype=np.bool_)
+        result = fit(self.problem, model, none_free, _STARTS, effects=False)
+        return model if result is None else result.model
 
     def adopt(self, result: Fit) -> None:
-        """Fit the laws of a model of other recordings, beginning with what they are there."""
-        parts = self._begun(result.candidate, result.parts.linear, result.parts.effects)
-        self.attempt(result.candidate, parts)
+        """Fit the laws of a model of other recordings, starting from its parameters."""
+        parts = result.parts
+        self.attempt(self._with_fitted_starts(result.candidate, parts.linear, parts.effects))
 
     def reject(self, candidate: Candidate, why: str) -> None:
-        """Leave out a set that its last fit shows to be none that an engineer would use."""
-        self.unsound[candidate] = why
-        self.settled.add(candidate)
+        """Mark a candidate as invalid, for a reason that its last fit shows."""
+        self.invalid[candidate] = why
+        self.converged.add(candidate)
 
-    def settle(self, scored: Scored, best: Scored) -> None:
-        """Fit a set to its end if it comes near the best one."""
-        candidate = scored.fit.candidate
-        if scored.size and self.is_near(scored, best) and candidate not in self.settled:
-            self.attempt(candidate, scored.fit.parts, FULL)
+    def converge(self, model: ValidatedModel, best: ValidatedModel) -> None:
+        """Fit a model until converged if it comes near the best one."""
+        if model.size and self.is_near(model, best) and model.fit.candidate not in self.converged:
+            self.attempt(model.fit.model, FULL)
 
-    def settle_best(self) -> None:
-        """Fit the sets that may be chosen to their end."""
+    def converge_best(self) -> None:
+        """Fit the models that may be chosen until converged."""
         best = self.best()
-        for scored in best:
-            self.settle(scored, best[0])
+        for model in best:
+            self.converge(model, best[0])
 
     # --- what may be chosen -------------------------------------------------------------------
 
-    def sound(self) -> Iterable[Scored]:
-        """Models that an engineer would use."""
-        return (s for c, s in self.fits.items() if c not in self.unsound)
+    def valid(self) -> Iterable[ValidatedModel]:
+        """Models without a defect that rules them out."""
+        return (model for c, model in self.fits.items() if c not in self.invalid)
 
-    def least(self) -> Scored:
-        """The best sound one."""
-        return min(self.sound(), key=lambda s: s.score)
+    def least(self) -> ValidatedModel:
+        """The best valid model."""
+        return min(self.valid(), key=lambda model: model.cost)
 
-    def nearest(self) -> Scored:
-        """The best one to look about: an unsound one that is far better lacks one exchange."""
-        best, sound = min(self.fits.values(), key=lambda s: s.score), self.least()
-        return sound if self.is_near(sound, best) else best
+    def next_to_expand(self) -> ValidatedModel:
+        """The model to expand next.
 
-    def settled_least(self) -> Scored:
-        """The best sound one, fitted to its end: whether it is at the floor decides on going on."""
+        An invalid model with a much smaller cost is kept, because one swap of a law often makes it
+        valid.
+        """
+        best, valid = min(self.fits.values(), key=lambda model: model.cost), self.least()
+        return valid if self.is_near(valid, best) else best
+
+    def converge_least(self) -> ValidatedModel:
+        """The best valid model, fitted until converged: the search ends if it is at the floor."""
         best = self.least()
-        self.settle(best, best)
+        self.converge(best, best)
         return self.least()
 
-    def best(self) -> tuple[Scored, ...]:
-        """The best sound sets that come near the best one."""
-        order = sorted((s for s in self.sound() if s.size > 0), key=lambda s: s.score)
-        near = (s for s in order if self.is_near(s, order[0]))
+    def best(self) -> tuple[ValidatedModel, ...]:
+        """The best valid models with laws that come near the best one."""
+        order = sorted((m for m in self.valid() if m.size > 0), key=lambda model: model.cost)
+        near = (model for model in order if self.is_near(model, order[0]))
         return tuple(near)[: self.criteria.fitted_a_size]
 
-    def best_and_less(self) -> list[Scored]:
-        """The best sets and what they hold: a smaller one may be all that can be defended."""
-        best = [set(s.fit.candidate.new) for s in self.best()]
+    def best_and_subsets(self) -> list[ValidatedModel]:
+        """The best models and those with a subset of their laws, which may suffice."""
+        best = [set(model.fit.candidate.new) for model in self.best()]
         return [
-            s for s in self.sound() if s.size and any(set(s.fit.candidate.new) <= b for b in best)
+            model
+            for model in self.valid()
+            if model.size and any(set(model.fit.candidate.new) <= laws for laws in best)
         ]
 
-    def chosen(self, most_laws: int) -> Scored:
-        """The smallest set that no larger one is worth more than, of so many laws at most."""
-        sets = [s for s in self.sound() if s.size <= most_laws]
+    def chosen(self, most_laws: int) -> ValidatedModel:
+        """The smallest model that no larger one of at most `most_laws` laws is preferred to."""
+        models = [model for model in self.valid() if model.size <= most_laws]
         current = self.linear
         while True:
-            larger = [s for s in sets if s.size > current.size and self.worth(current, s)]
+            larger = [m for m in models if m.size > current.size and self.prefers(m, current)]
             if not larger:
                 return current
-            least = min(s.size for s in larger)
-            current = self._plainest([s for s in larger if s.size == least])
+            least = min(model.size for model in larger)
+            current = self._plainest([model for model in larger if model.size == least])
 
-    def _plainest(self, sets: Sequence[Scored]) -> Scored:
-        """Of the sets as good as the best for all the data say, that with the fewest parameters."""
-        best = min(sets, key=lambda s: s.score)
-        alike = [s for s in sets if self.is_alike(s, best)]
-        return min(alike, key=lambda s: (len(s.fit.parts.effects), s.score))
+    def _plainest(self, models: Sequence[ValidatedModel]) -> ValidatedModel:
+        """The model with the fewest parameters of those indistinguishable from the best."""
+        best = min(models, key=lambda model: model.cost)
+        alike = [model for model in models if self.is_alike(model, best)]
+        return min(alike, key=lambda model: (len(model.fit.parts.effects), model.cost))
 
-    def changes(self, result: Scored) -> tuple[Change, ...]:
-        """What a score test about a fit finds, best first."""
-        candidate = result.fit.candidate
-        if candidate not in self.tested or self.tested[candidate][0] is not result:
+    def changes(self, model: ValidatedModel) -> tuple[ModelChange, ...]:
+        """Changes of a model by one law, as a score test about its fit ranks them."""
+        candidate = model.fit.candidate
+        if candidate not in self.tested or self.tested[candidate][0] is not model:
             most = self.criteria.most_laws
-            self.tested[candidate] = result, changes(self.problem, result.fit, self.along, most)
+            self.tested[candidate] = model, find_changes(self.problem, model.fit, self.along, most)
         return self.tested[candidate][1]
 
-    # --- whether one model is worth more than another -------------------------------------------
+    # --- whether one model is preferred to another ------------------------------------------------
 
-    def worth(self, smaller: Scored, larger: Scored) -> bool:
-        """Whether a larger model is worth its further laws."""
-        criteria, above = self.criteria, smaller.score - smaller.fit.rows
+    def prefers(self, larger: ValidatedModel, smaller: ValidatedModel) -> bool:
+        """Whether a larger model gains enough to be preferred to a smaller one."""
+        criteria = self.criteria
         if self.at_floor(smaller) and (larger.size > smaller.size or not smaller.size):
             return False
         if (
             larger.size > smaller.size
             and self.is_formula(smaller)
             and not _adds_a_kind(smaller, larger)
-            and not self.is_right_beside(larger, smaller)
+            and not self.is_imitated(larger, smaller)
         ):
             return False
-        # A law has to take its share; a better formula for one need only be better.
+        # A law has to gain its share; a better formula for one need only be better.
         share = 0.0 if larger.size == smaller.size > 0 else criteria.least_share
-        gain = smaller.score - larger.score
+        gain = smaller.cost - larger.cost
         return (
             gain > criteria.standard_errors * _standard_error(smaller, larger)
             and gain > criteria.least_likelihood_gain
-            and gain > share * above
+            and gain > share * smaller.excess
         )
 
-    def at_floor(self, result: Scored) -> bool:
-        """Whether nothing is left that a law could be looked for in."""
+    def at_floor(self, model: ValidatedModel) -> bool:
+        """Whether a model is at the noise floor, so that a law could explain nothing more."""
         first, later = self.criteria.least_above_noise, self.criteria.least_above_noise_later
-        share = later if result.size else first
-        return result.score < (1.0 + share) * self.floor(result)
+        share = later if model.size else first
+        return model.cost < (1.0 + share) * self.floor(model)
 
-    def floor(self, result: Scored) -> float:
-        """Sum of squares that a right model leaves: noise of the sensors, and of what drives it."""
-        candidate = result.fit.candidate
-        if candidate not in self.floors or self.floors[candidate][0] is not result:
-            level = self.problem.floor_level(candidate, result.fit.parts)
-            self.floors[candidate] = result, level * result.fit.rows
+    def floor(self, model: ValidatedModel) -> float:
+        """Sum of squares of a right model: noise of the sensors, and of the applied force."""
+        candidate = model.fit.candidate
+        if candidate not in self.floors or self.floors[candidate][0] is not model:
+            level = self.problem.floor_level(model.fit.model)
+            self.floors[candidate] = model, level * model.fit.rows
         return self.floors[candidate][1]
 
-    def is_formula(self, result: Scored) -> bool:
-        """Whether what laws leave is so little that it may be their formulas' fault."""
-        linear = self.linear.score - self.linear.fit.rows
-        above = result.score - result.fit.rows
-        return bool(result.size) and above < self.criteria.formula**2 * linear
+    def is_formula(self, model: ValidatedModel) -> bool:
+        """Whether the residual of laws is so small that it may be due to their formulas."""
+        return bool(model.size) and (model.excess < self.criteria.formula**2 * self.linear.excess)
 
-    def is_right_beside(self, larger: Scored, smaller: Scored) -> bool:
-        """Whether a set leaves so little of what a smaller one leaves that this imitates it."""
+    def is_imitated(self, larger: ValidatedModel, smaller: ValidatedModel) -> bool:
+        """Whether a larger model explains so much more that a smaller one only imitates it."""
         share = self.criteria.imitation ** (2 * (larger.size - smaller.size))
-        most = share * (smaller.score - smaller.fit.rows)
-        is_right = self.at_floor(larger) or larger.score - larger.fit.rows < most
+        is_right = self.at_floor(larger) or larger.excess < share * smaller.excess
         return is_right and not self.is_near(smaller, larger)
 
-    def is_near(self, scored: Scored, best: Scored) -> bool:
-        """Whether a set is not hopeless beside the best one."""
-        return scored.score <= self.criteria.hopeless * best.score
+    def is_near(self, model: ValidatedModel, best: ValidatedModel) -> bool:
+        """Whether a model's cost is not hopeless compared with the best one's."""
+        return model.cost <= self.criteria.hopeless * best.cost
 
-    def is_alike(self, other: Scored, best: Scored) -> bool:
-        """Whether the data cannot distinguish a set from the best one."""
-        lost = other.score - best.score
-        return lost <= self.criteria.standard_errors * _standard_error(other, best)
+    def is_alike(self, other: ValidatedModel, best: ValidatedModel) -> bool:
+        """Whether the data cannot distinguish a model from the best one."""
+        loss = other.cost - best.cost
+        return loss <= self.criteria.standard_errors * _standard_error(other, best)
 
 
-def _adds_a_kind(smaller: Scored, larger: Scored) -> bool:
-    """Whether what dissipates is added to what stores energy, or the other way round."""
+def _adds_a_kind(smaller: ValidatedModel, larger: ValidatedModel) -> bool:
+    """Whether dissipating laws are added to storing ones, or the other way round."""
     few, many = Counter(smaller.families), Counter(larger.families)
     old, new = set(few), set(many - few)
     return few < many and (
@@ -346,7 +343,7 @@ def _adds_a_kind(smaller: Scored, larger: Scored) -> bool:
     )
 
 
-def _standard_error(one: Scored, other: Scored) -> float:
+def _standard_error(a: ValidatedModel, b: ValidatedModel) -> float:
     """Standard error of the difference of two out-of-sample sums over blocks."""
-    difference = one.scores - other.scores
+    difference = a.block_costs - b.block_costs
     return float(np.sqrt(len(difference)) * np.std(difference, ddof=1))

@@ -1,4 +1,4 @@
-"""A smooth table of force over height and velocity, for what no law describes.
+"""A smooth table of force over height and velocity, for a missing force that no law describes.
 
 Reference: Masri and Caughey, A nonparametric identification technique for nonlinear dynamic
 problems, J. Appl. Mech. 46 (1979), the restoring-force surface; Eilers and Marx, Flexible smoothing
@@ -9,8 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects.restoring_surface import FIRST_FORCE, HEIGHTS, VELOCITIES
-from rig.diagnosis.problem.problem import Parts, Problem, existing_values, nominal
-from rig.diagnosis.search.fit import Fit, fit, left_out
+from rig.diagnosis.numerics.least_squares import Effort
+from rig.diagnosis.problem.problem import (
+    CandidateModel,
+    Parts,
+    Problem,
+    existing_values,
+    nominal,
+)
+from rig.diagnosis.search.fit import Fit, fit, leave_block_out_costs
 from rig.diagnosis.search.screen import Stage, response, stage_of
 
 Array = NDArray[np.float64]
@@ -20,8 +27,8 @@ _SMOOTHING = np.geomspace(1e-4, 1e4, 9)
 """Weights of the penalty that are tried, in units of the data's own curvature."""
 
 
-def surface(problem: Problem, linear: Fit) -> Fit | None:
-    """The best linear model with a table in the strut where it takes most away.
+def fit_surface(problem: Problem, linear: Fit) -> Fit | None:
+    """The best linear model with a table in the strut where that explains most.
 
     Args:
         problem: Model and recordings.
@@ -30,13 +37,14 @@ def surface(problem: Problem, linear: Fit) -> Fit | None:
     Returns:
         The fit; None where the model runs away with it.
     """
-    stage = stage_of(problem, linear.candidate, linear.parts)
+    stage = stage_of(problem, linear.model)
     tables = [_table(stage, strut) for strut in range(len(problem.motions))]
-    strut = int(np.argmin([score for _, score in tables]))
-    candidate = nominal(problem).added((strut, _NAME))
+    strut = int(np.argmin([cost for _, cost in tables]))
+    candidate = nominal(problem).with_effects((strut, _NAME))
     effects = np.concatenate([existing_values(problem, nominal(problem)), tables[strut][0]])
     parts = Parts(linear.parts.linear, effects, linear.parts.starts)
-    return fit(problem, candidate, parts, linear.free, 10, effects=False)
+    first = CandidateModel(candidate, parts)
+    return fit(problem, first, linear.free, Effort(10), effects=False)
 
 
 def _table(stage: Stage, strut: int) -> tuple[Array, float]:
@@ -49,17 +57,17 @@ def _table(stage: Stage, strut: int) -> tuple[Array, float]:
     for i in range(cells):
         unit = np.zeros(FIRST_FORCE + cells)
         unit[:FIRST_FORCE], unit[FIRST_FORCE + i] = limits, 1.0
-        columns[:, i] = response(stage, strut, _NAME, unit)
+        columns[:, i] = response(stage, (strut, _NAME), unit)
     bends = _bends()
-    gram, score = columns.T @ columns, columns.T @ stage.target
+    gram, gradient = columns.T @ columns, columns.T @ stage.target
     unit = float(np.trace(gram)) / float(np.trace(bends))
     best, least = np.zeros(cells), np.inf
     for weight in _SMOOTHING * unit:
-        values = np.linalg.solve(gram + weight * bends + 1e-12 * unit * np.eye(cells), score)
-        left = stage.target - columns @ values
-        total = float(left_out(left, -columns, stage.blocks, weight * bends).sum())
-        if total < least:
-            best, least = values, total
+        values = np.linalg.solve(gram + weight * bends + 1e-12 * unit * np.eye(cells), gradient)
+        residual = stage.target - columns @ values
+        costs = leave_block_out_costs(residual, -columns, stage.blocks, weight * bends)
+        if float(costs.sum()) < least:
+            best, least = values, float(costs.sum())
     return np.concatenate([limits, best]), least
 
 

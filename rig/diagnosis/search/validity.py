@@ -1,7 +1,7 @@
-"""Which fitted models an engineer would use: passive, bounded, and nothing that cancels itself.
+"""Defects for which a fitted model is not used: unidentifiable, linear, cancelling, active laws.
 
 Reference: van der Schaft, L2-Gain and Passivity Techniques in Nonlinear Control (2017), 2, for
-passivity; here power is looked at where the motion was.
+passivity; here power is evaluated where the motion was.
 """
 
 from collections.abc import Sequence
@@ -10,34 +10,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
-from rig.diagnosis.problem.problem import Problem, Track, placed, slots_of, strut_constants
+from rig.diagnosis.problem.grid import Track
+from rig.diagnosis.problem.problem import Problem, slots_of, strut_constants, strut_effects
 from rig.diagnosis.problem.track import forces_along, law_force, linear_forces
 from rig.diagnosis.search.criteria import SelectionCriteria
-from rig.diagnosis.search.fit import UNBOUND, Fit, effect_variables, spread, start_variables
+from rig.diagnosis.search.fit import UNBOUND, Fit, effect_variables, fit_covariance, start_variables
 
 Array = NDArray[np.float64]
 
 _CELLS = 12
-"""Cells of height and of velocity in which power is looked at."""
+"""Cells of height and of velocity in which power is evaluated."""
 _TINY = 1e-100
-"""Stands for nothing in a quotient."""
+"""Least divisor."""
 _CHANNELS = ("delay", "input_gain", "periodic_force", "unmodelled_mode")
-"""Families that are no property of the strut, or that store energy outside it."""
+"""Families that are no property of the strut, or that store energy outside it: may be active."""
 
 
-def tracks(problem: Problem, result: Fit) -> list[tuple[int, Track]]:
+def smooth_tracks(problem: Problem, result: Fit) -> list[tuple[int, Track]]:
     """The motion of each recording, by its index, smoothed."""
-    forces = (
-        problem.residual_forces(k, result.candidate, result.parts)
-        for k in range(problem.recordings)
-    )
-    return [(k, there.track) for k, there in enumerate(forces) if there is not None]
+    forces = (problem.residual_forces(k, result.model) for k in range(problem.recordings))
+    return [(k, residual.track) for k, residual in enumerate(forces) if residual is not None]
 
 
-def unsound(
+def find_defect(
     problem: Problem, result: Fit, motions: Sequence[tuple[int, Track]], criteria: SelectionCriteria
 ) -> str | None:
-    """Why a model is not to be used; None if it is.
+    """The reason for which a model is not used; None where there is none.
 
     Args:
         problem: Model and recordings.
@@ -45,24 +43,24 @@ def unsound(
         motions: The motion of recordings, by their index.
         criteria: What decides.
     """
-    forces = forces_along(problem, result.candidate, result.parts, motions)
+    forces = forces_along(problem, result.model, motions)
     along = [track for _, track in motions]
     return (
-        _unbound(problem, result, criteria)
-        or _disguised(result, forces, along, criteria)
-        or _cancelling(result, forces, criteria)
-        or _active(problem, result, along, criteria)
+        _find_unbounded_law(problem, result, criteria)
+        or _find_linear_law(result, forces, along, criteria)
+        or _find_cancelling_laws(result, forces, criteria)
+        or _find_active_strut(problem, result, along, criteria)
     )
 
 
 def _new(result: Fit) -> list[tuple[int, str]]:
-    """Place among all effects, and name, of those that the nominal model lacks."""
+    """Index among all effects, and name, of those that the nominal model lacks."""
     first = len(result.candidate.kept)
     return [(first + i, name) for i, (_, name) in enumerate(result.candidate.new)]
 
 
-def _unbound(problem: Problem, result: Fit, criteria: SelectionCriteria) -> str | None:
-    """A law whose size, beyond what the linear part could give, is not away from nothing."""
+def _find_unbounded_law(problem: Problem, result: Fit, criteria: SelectionCriteria) -> str | None:
+    """Reason against a law whose size, the linear part projected out, does not differ from zero."""
     variables = effect_variables(problem, result)
     jacobian, residual = result.solution.jacobian, result.solution.residual
     starts = start_variables(problem, result)
@@ -78,26 +76,26 @@ def _unbound(problem: Problem, result: Fit, criteria: SelectionCriteria) -> str 
         sizes = np.where(
             space.logarithmic[scaled], 1.0, result.solution.values[scaled] / space.scale[scaled]
         )
-        # What the whole law adds to the residual, all its sizes in one proportion.
-        answer = jacobian[:, scaled] @ sizes
-        answer = answer - basis @ (basis.T @ answer)
-        power = float(answer @ answer)
-        scores = np.bincount(result.blocks, answer * residual)
+        # Response of the residual to the whole law, all its sizes in one proportion.
+        response = jacobian[:, scaled] @ sizes
+        response = response - basis @ (basis.T @ response)
+        power = float(response @ response)
+        scores = np.bincount(result.blocks, response * residual)
         white = np.sqrt(power / max(result.mean_square, 1.0))
         robust = power / max(float(np.linalg.norm(scores)), _TINY)
         if min(float(white), robust) < criteria.bounded:
-            return f"the data do not bound its size ({name})"
+            return f"its size is not identifiable from these data ({name})"
     return None
 
 
-def unmeasured(problem: Problem, result: Fit) -> str | None:
-    """A law none of whose sizes has an interval that leaves out nothing; None if there is none.
+def find_unidentifiable_law(problem: Problem, result: Fit) -> str | None:
+    """Reason against a law all of whose sizes have intervals that contain zero; None without one.
 
     Args:
         problem: Model and recordings.
-        result: The model, fitted to its end.
+        result: The model, fitted until converged.
     """
-    half, variables = spread(result).half, effect_variables(problem, result)
+    half, variables = fit_covariance(result).half, effect_variables(problem, result)
     space = result.space
     sizes = np.where(
         space.logarithmic, np.log(UNBOUND), np.abs(result.solution.values) / space.scale
@@ -105,31 +103,31 @@ def unmeasured(problem: Problem, result: Fit) -> str | None:
     for row, name in _new(result):
         scaled = variables[row][list(effect(name).scaled or (0,))]
         if not np.any(half[scaled] < sizes[scaled]):
-            return f"the data do not bound its size ({name})"
+            return f"its size is not identifiable from these data ({name})"
     return None
 
 
-def _disguised(
+def _find_linear_law(
     result: Fit,
     forces: list[tuple[int, Array]],
     along: Sequence[Track],
     criteria: SelectionCriteria,
 ) -> str | None:
-    """A law that is a linear spring and damper along this motion."""
+    """Reason against a law that is a linear spring and damper along this motion."""
     for row, name in _new(result):
         strut, force = forces[row]
         basis = linear_forces(along, strut)
-        left = force - basis @ (basis.T @ force)
-        power = float(np.linalg.norm(force))
-        if power <= 0.0 or float(np.linalg.norm(left)) < criteria.leftover * power:
+        nonlinear = force - basis @ (basis.T @ force)
+        size = float(np.linalg.norm(force))
+        if size <= 0.0 or float(np.linalg.norm(nonlinear)) < criteria.leftover * size:
             return f"along this motion it is a linear spring and damper ({name})"
     return None
 
 
-def _cancelling(
+def _find_cancelling_laws(
     result: Fit, forces: list[tuple[int, Array]], criteria: SelectionCriteria
 ) -> str | None:
-    """Two laws of one strut, each of which takes back what the other gives."""
+    """Reason against two laws of one strut whose forces cancel each other."""
     new = _new(result)
     for i, (row, name) in enumerate(new):
         for other_row, other in new[i + 1 :]:
@@ -143,26 +141,26 @@ def _cancelling(
     return None
 
 
-def _active(
+def _find_active_strut(
     problem: Problem, result: Fit, along: Sequence[Track], criteria: SelectionCriteria
 ) -> str | None:
-    """A strut that feeds energy in at a height and velocity that the motion went through."""
+    """Reason against a strut that feeds energy in at a height and velocity of the motion."""
     constants = strut_constants(problem, result.parts.linear)
     index = slots_of(problem, result.candidate).index
-    effects = placed(problem, result.candidate)
+    effects = strut_effects(problem, result.candidate)
     for strut in range(len(problem.motions)):
         if not any(at == strut for at, _ in result.candidate.new):
             continue
         z = np.concatenate([track.heights_m[strut] for track in along])
         w = np.concatenate([track.velocities_m_per_s[strut] for track in along])
         cells = np.unique(np.column_stack([_cell(z), _cell(w)]), axis=0, return_index=True)[1]
-        here = _at_rest(z[cells], w[cells], len(problem.motions), strut)
-        still = here._replace(velocities_m_per_s=np.zeros_like(here.velocities_m_per_s))
+        moving = _points(z[cells], w[cells], len(problem.motions), strut)
+        still = moving._replace(velocities_m_per_s=np.zeros_like(moving.velocities_m_per_s))
         force = -constants[strut, 2] * w[cells]
         for (at, name), slot in zip(effects, index, strict=True):
             if at == strut and effect(name).family not in _CHANNELS and not effect(name).state_size:
                 values = result.parts.effects[slot[1] : slot[2]]
-                force = force + law_force(here, strut, name, values, constants)
+                force = force + law_force(moving, strut, name, values, constants)
                 force = force - law_force(still, strut, name, values, constants)
         power = force * w[cells]
         if float(power.max()) > criteria.passive * max(-float(power.min()), 0.0):
@@ -172,12 +170,13 @@ def _active(
 
 
 def _cell(values: Array) -> Array:
+    """Cell of each value, by equal parts of their range."""
     low, high = float(values.min()), float(values.max())
     return np.minimum(((values - low) / max(high - low, _TINY) * _CELLS).astype(int), _CELLS - 1)
 
 
-def _at_rest(z: Array, w: Array, struts: int, strut: int) -> Track:
-    """Points of height and velocity as a track, for laws without internal state."""
+def _points(z: Array, w: Array, struts: int, strut: int) -> Track:
+    """Points of height and velocity as a track, for laws without internal state; shapes (N,)."""
     heights, velocities = np.zeros((struts, len(z))), np.zeros((struts, len(z)))
     heights[strut], velocities[strut] = z, w
     zero = np.zeros(len(z))

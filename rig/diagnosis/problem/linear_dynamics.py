@@ -1,0 +1,151 @@
+"""The linear dynamics of a model about its mean configuration: heights by generalised forces."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.linalg import expm
+
+from dart_model.effects import Motion
+from rig.diagnosis.numerics.compiled import respond
+from rig.diagnosis.problem import linear_part
+from rig.diagnosis.problem.grid import Track
+from rig.diagnosis.problem.mechanism import LinearisedMechanism
+from rig.diagnosis.problem.problem import LinearParameter
+
+Array = NDArray[np.float64]
+
+_FILTER_ANGLE = 0.25
+"""Longest step of the linear dynamics under a force that is linear between samples, as an angle."""
+_SETTLES_WITHIN = 0.15
+"""Time constant of the slowest response of the regression's dynamics, as a share of a segment."""
+
+
+class FilterMechanism:
+    """The mechanism on the grid of the filter.
+
+    Args:
+        mechanism: At the nodes.
+        nodes_s: Times of the nodes.
+        t_s: Times of the filter.
+    """
+
+    def __init__(self, mechanism: LinearisedMechanism, nodes_s: Array, t_s: Array) -> None:
+        at = np.zeros(len(t_s), dtype=np.int64)
+        if len(mechanism.q) > 1:
+            at = np.clip(np.searchsorted(nodes_s, t_s - 1e-12), 0, len(nodes_s) - 1)
+        self._mechanism, self._at = mechanism, at
+        self.jacobian = mechanism.jacobian[at]
+
+    def unit_force(
+        self,
+        parameter: LinearParameter,
+        track: Track,
+        accelerations_m_per_s2: Array,
+        motions: Sequence[Motion],
+    ) -> Array:
+        """Generalised force (N, n) of a unit change of a linear parameter along a motion.
+
+        Args:
+            parameter: The parameter.
+            track: The motion.
+            accelerations_m_per_s2: Its accelerations, shape (N, struts).
+            motions: What each strut did.
+        """
+        strut = parameter.strut
+        if parameter.kind == "mass":
+            q = np.linalg.solve(self.jacobian, accelerations_m_per_s2[..., np.newaxis])[..., 0]
+            inertia = np.einsum("kij,kj->ki", self._mechanism.mass_by_kg[self._at, strut], q)
+            return self._mechanism.bias_by_kg[self._at, strut] - inertia
+        if parameter.kind == "gain":
+            return self._mechanism.applied[self._at] * track.applied_n[:, np.newaxis]
+        height_m, velocity = track.heights_m[strut], track.velocities_m_per_s[strut]
+        force = linear_part.strut_force(parameter.kind, height_m, velocity, motions[strut])
+        return self.jacobian[:, strut] * force[:, np.newaxis]
+
+
+class LinearDynamics:
+    """The linear dynamics of a model about its mean configuration, discretised.
+
+    Args:
+        m: The mechanism with the model's masses and gain.
+        constants: Strut constants, shape (struts, 5).
+        duration_s: Length of the part of a recording that is filtered.
+        coarse_s: Time between the samples of the regression.
+    """
+
+    def __init__(
+        self, m: LinearisedMechanism, constants: Array, duration_s: float, coarse_s: float
+    ) -> None:
+        n = m.coordinates
+        jacobian = m.jacobian.mean(axis=0)
+        mass = m.mass.mean(axis=0)
+        stiffness = jacobian.T @ np.diag(constants[:, 1]) @ jacobian - m.bias_q.mean(axis=0)
+        damping = jacobian.T @ np.diag(constants[:, 2]) @ jacobian - m.bias_v.mean(axis=0)
+        self.more_stiffness, self.more_damping = _settling_terms(
+            mass, stiffness, damping, 1.0 / (_SETTLES_WITHIN * duration_s)
+        )
+        a = system_matrix(mass, stiffness + self.more_stiffness, damping + self.more_damping)
+        fastest = float(np.max(np.abs(np.linalg.eigvals(a))))
+        self.finer = max(1, int(np.ceil(fastest * coarse_s / _FILTER_ANGLE)))
+        step = coarse_s / self.finer
+        b = np.vstack([np.zeros((n, n)), np.linalg.inv(mass)])
+        augmented = np.zeros((4 * n, 4 * n))
+        augmented[: 2 * n, : 2 * n] = a * step
+        augmented[: 2 * n, 2 * n : 3 * n] = b * step
+        augmented[2 * n : 3 * n, 3 * n :] = np.eye(n)
+        e = expm(augmented)
+        late = e[: 2 * n, 3 * n :]
+        parts = (
+            e[: 2 * n, : 2 * n],
+            e[: 2 * n, 2 * n : 3 * n] - late,
+            late,
+            np.hstack([jacobian, np.zeros_like(jacobian)]),
+        )
+        self._parts = tuple(np.ascontiguousarray(part, dtype=np.float64) for part in parts)
+        self._jacobian = jacobian
+
+    def heights(self, forces: Array) -> Array:
+        """Heights (N, struts) from rest under generalised forces (N, n)."""
+        out = np.empty((len(forces), len(self._jacobian)))
+        respond(*self._parts, np.ascontiguousarray(forces), out)
+        return out
+
+    def holding_forces(self, z: Array, w: Array, nodes_s: Array, t_s: Array) -> Array:
+        """Generalised force (N, n) of the settling terms, along a difference of heights."""
+        inverse = np.linalg.pinv(self._jacobian)
+        force = z @ inverse.T @ self.more_stiffness.T + w @ inverse.T @ self.more_damping.T
+        return CubicSpline(nodes_s, force)(t_s)
+
+    def free_motions(self, samples: int) -> list[Array]:
+        """Heights (N, struts) of the free motion from a unit of each coordinate and velocity."""
+        transition, output = self._parts[0], self._parts[3]
+        powers = np.eye(len(transition))[np.newaxis]
+        ahead = transition
+        while len(powers) < samples:
+            powers = np.concatenate([powers, powers @ ahead])
+            ahead = ahead @ ahead
+        return [(output @ powers[:samples, :, i].T).T for i in range(len(transition))]
+
+
+def system_matrix(mass: Array, stiffness: Array, damping: Array) -> Array:
+    """System matrix of coordinates and velocities."""
+    n = len(mass)
+    lower = -np.linalg.solve(mass, np.hstack([stiffness, damping]))
+    return np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower], dtype=np.float64)
+
+
+def _settling_terms(
+    mass: Array, stiffness: Array, damping: Array, slowest: float
+) -> tuple[Array, Array]:
+    """Stiffness and damping to add so that no response outlasts a time constant, each (n, n)."""
+    n = len(mass)
+    more_stiffness, more_damping = np.zeros((n, n)), np.zeros((n, n))
+    softest = float(np.min(np.linalg.eigvals(np.linalg.solve(mass, stiffness)).real))
+    if softest < 4.0 * slowest**2:
+        more_stiffness = mass * (4.0 * slowest**2 - min(softest, 0.0))
+    poles = np.linalg.eigvals(system_matrix(mass, stiffness + more_stiffness, damping)).real
+    if float(np.max(poles)) > -slowest:
+        more_damping = mass * 2.0 * (slowest + max(float(np.max(poles)), 0.0))
+    return more_stiffness, more_damping
