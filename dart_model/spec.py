@@ -1,4 +1,4 @@
-"""What a model is: bodies, joints and struts, as a frozen value read from and written to YAML."""
+"""A model: bodies, joints and struts, as a frozen value read from and written to YAML."""
 
 import re
 import shutil
@@ -38,8 +38,8 @@ _PERCENTAGE = re.compile(r"([0-9]{1,20}(?:\.[0-9]{1,40})?) ?%")
 
 
 def _share_of_percentage(value: object) -> float:
-    found = _PERCENTAGE.fullmatch(value) if isinstance(value, str) else None
-    share = float(Decimal(found[1]) / 100) if found else 0.0
+    match = _PERCENTAGE.fullmatch(value) if isinstance(value, str) else None
+    share = float(Decimal(match[1]) / 100) if match else 0.0
     if not 0.0 < share <= 10.0:
         raise PydanticCustomError("percentage", "expected a percentage up to 1000 %, such as 20 %")
     return share
@@ -114,17 +114,17 @@ def _file_in_its_folder(file: str) -> str:
 
 
 InFolder = Annotated[str, Field(min_length=1, max_length=255), AfterValidator(_file_in_its_folder)]
-"""A file beside the model file."""
+"""A file in the model file's folder."""
 
 
 class FileSkeleton(_Frozen):
-    """Bodies given by a URDF, SDF, SKEL or MJCF file beside the model file."""
+    """Bodies given by a URDF, SDF, SKEL or MJCF file in the model file's folder."""
 
     file: InFolder
 
 
 def _skeleton_kind(skeleton: object) -> str:
-    """Which kind is meant, so that an error speaks of that one alone."""
+    """Tag of the kind, so that an error is about this one alone."""
     is_file = isinstance(skeleton, FileSkeleton) or (
         isinstance(skeleton, dict) and "file" in skeleton
     )
@@ -159,7 +159,7 @@ class EffectSpec(_Frozen):
         return self
 
     def values(self) -> list[float]:
-        """Parameters in the order in which the law reads them."""
+        """Parameters in the order of the law's arguments."""
         return [self.parameters[parameter.name] for parameter in effect(self.name).parameters]
 
 
@@ -209,8 +209,8 @@ class StrutSpec(_Frozen):
         stiffness_n_per_m: Linear stiffness.
         damping_n_s_per_m: Linear damping.
         attachments_m: Where the strut is fixed, in the frame of each body.
-        effects: What the law has beyond spring and damper.
-        fmu: A force beside them that a functional mock-up unit computes.
+        effects: Laws besides spring and damper.
+        fmu: A further force, which a functional mock-up unit computes.
     """
 
     name: Name
@@ -229,10 +229,10 @@ class StrutSpec(_Frozen):
         return self
 
 
-class Tolerance(_Frozen):
-    """How far the bench may be from the model's own numbers: one standard deviation each.
+class ModelTolerance(_Frozen):
+    """Prior deviation of the bench from the model's numbers: one standard deviation each.
 
-    A diagnosis takes it as what is known before the recordings; what is not given has a default.
+    A diagnosis uses it as prior of the linear corrections; a value that is not given has a default.
 
     Attributes:
         mass_kg: Share of each mass.
@@ -260,7 +260,7 @@ class ModelSpec(_Frozen):
         skeleton: Bodies and joints, inline or in a file.
         struts: Spring-dampers; one observer may act on each.
         applied_force_body: Body on which the applied force acts; by default the last strut's upper.
-        tolerance: How far the bench may be from these numbers, if that is known.
+        tolerance: Prior deviation of the bench from these numbers, if it is known.
         folder: Folder of the model file, where a skeleton file is looked for; not part of the YAML.
     """
 
@@ -272,22 +272,22 @@ class ModelSpec(_Frozen):
     ]
     struts: Annotated[tuple[StrutSpec, ...], Field(min_length=1, max_length=64)]
     applied_force_body: Name | None = None
-    tolerance: Tolerance | None = None
+    tolerance: ModelTolerance | None = None
     folder: Annotated[Path, Field(exclude=True)] = Path()
 
     @model_validator(mode="after")
     def _names_fit(self) -> "ModelSpec":
-        _refuse_repeated("strut", (strut.name for strut in self.struts))
+        _refuse_duplicates("strut", (strut.name for strut in self.struts))
         if isinstance(self.skeleton, InlineSkeleton):
             self._check_bodies(self.skeleton)
         return self
 
     def _check_bodies(self, skeleton: InlineSkeleton) -> None:
-        _refuse_repeated("body", (body.name for body in skeleton.bodies))
+        _refuse_duplicates("body", (body.name for body in skeleton.bodies))
         known = [WORLD]
         for body in skeleton.bodies:
             if body.name == WORLD:
-                raise ValueError(f"body {WORLD!r}: expected another name, this one is taken")
+                raise ValueError(f"body {WORLD!r}: expected another name, this one is the world's")
             if body.joint.parent not in known:
                 raise ValueError(
                     f"body {body.name}: joint.parent {body.joint.parent!r}: "
@@ -330,7 +330,7 @@ def parse_model(text: str, source: str, folder: Path = Path()) -> ModelSpec:
 
     Args:
         text: YAML as documented in the README.
-        source: What to call the text in an error.
+        source: Name of the text in an error.
         folder: Where a skeleton file is looked for.
 
     Raises:
@@ -374,10 +374,10 @@ def dump_model(spec: ModelSpec) -> str:
 
 def files_of(spec: ModelSpec) -> list[str]:
     """Files that a model names, from its folder on: skeleton and FMUs."""
-    found = [strut.fmu.file for strut in spec.struts if strut.fmu is not None]
+    files = [strut.fmu.file for strut in spec.struts if strut.fmu is not None]
     if isinstance(spec.skeleton, FileSkeleton):
-        found.insert(0, spec.skeleton.file)
-    return list(dict.fromkeys(found))
+        files.insert(0, spec.skeleton.file)
+    return list(dict.fromkeys(files))
 
 
 def copy_files(spec: ModelSpec, folder: Path) -> None:
@@ -394,7 +394,7 @@ def copy_files(spec: ModelSpec, folder: Path) -> None:
             shutil.copyfile(source, target)
 
 
-def _refuse_repeated(what: str, names: Iterable[str]) -> None:
+def _refuse_duplicates(what: str, names: Iterable[str]) -> None:
     name, count = Counter(names).most_common(1)[0]
     if count > 1:
-        raise ValueError(f"{what} {name!r} stands {count} times, expected unique names")
+        raise ValueError(f"{what} {name!r} occurs {count} times, expected unique names")

@@ -3,12 +3,13 @@
     skeleton      bodies and joints in DART
     geometry      heights and Jacobians of the struts
     strut         spring, damper and effects as one force
-    mockup        a force that a functional mock-up unit computes
-    backend       the acceleration, which DART is asked for
+    fmu           a force that a functional mock-up unit computes
+    admitted_programs    FMUs that may run on this machine
+    backend       the acceleration, by DART
     integrator    Kutta's method, and how long its steps may be
-    mechanism     struts on joints: the equations of motion
-    state         what goes in and comes out
-    prescribed    a strut whose motion is given, as on a dyno
+    equations_of_motion  struts on joints
+    state         arguments and results
+    prescribed_strut     a strut whose motion is given, as on a dyno
 
 Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008).
 """
@@ -22,6 +23,7 @@ from scipy.linalg import null_space  # pyright: ignore[reportUnknownVariableType
 from dart_model.effects import AMBIENT_C
 from dart_model.errors import ModelError
 from dart_model.plant.backend import ManyCoordinates, OneCoordinate
+from dart_model.plant.equations_of_motion import EquationsOfMotion
 from dart_model.plant.fmu import MockUp
 from dart_model.plant.geometry import Array, Geometry, Jacobians, sample_positions
 from dart_model.plant.integrator import (
@@ -31,7 +33,6 @@ from dart_model.plant.integrator import (
     exact_step_s,
     stable_step_s,
 )
-from dart_model.plant.mechanism import Mechanism
 from dart_model.plant.prescribed_strut import PrescribedState, PrescribedStrut
 from dart_model.plant.skeleton import build
 from dart_model.plant.state import Loaded, Mechanics, PlantState
@@ -64,7 +65,7 @@ third of the digits of a double, where rounding and truncation are about equal."
 class DartPlant:
     """A model in DART.
 
-    The skeleton inside is scratch paper: every call first writes all of the state that its answer
+    The skeleton inside holds no state: every call first writes all of the state that its result
     depends on, so that results depend on the arguments alone. One plant must not be used from two
     threads at once.
 
@@ -81,13 +82,13 @@ class DartPlant:
         self._skeleton = build(spec)
         self._geometry = Geometry(spec, self._skeleton)
         self._struts = struts_of(spec)
-        self._mechanism: Mechanism[float] | Mechanism[Array]
+        self._equations: EquationsOfMotion[float] | EquationsOfMotion[Array]
         if self.coordinates == 1 and self._geometry.constant is not None:
             one = OneCoordinate(self._skeleton)
-            self._mechanism = Mechanism[float](one, self._struts, self._geometry)
+            self._equations = EquationsOfMotion[float](one, self._struts, self._geometry)
         else:
             many = ManyCoordinates(self._skeleton)
-            self._mechanism = Mechanism[Array](many, self._struts, self._geometry)
+            self._equations = EquationsOfMotion[Array](many, self._struts, self._geometry)
         self.step_s = self._longest_step_s()
         """Longest step of the integrator."""
 
@@ -108,7 +109,7 @@ class DartPlant:
 
     @property
     def mockups(self) -> tuple[MockUp | None, ...]:
-        """Of each strut its FMU, if it has one."""
+        """FMU of each strut, if it has one."""
         return tuple(next(iter(strut.mockups), None) for strut in self._struts)
 
     def init(
@@ -119,7 +120,7 @@ class DartPlant:
     ) -> PlantState:
         """State with given strut heights and velocities; internal states are zero.
 
-        What the heights leave free is where the model would rest under its weight.
+        The model rests under its weight in the directions that the heights leave free.
 
         Args:
             heights_m: One height a strut; NaN where none is given.
@@ -142,7 +143,7 @@ class DartPlant:
     def _resting(self, q: Array, heights_m: Array) -> Array:
         """Coordinates with the given heights, at rest in the directions that these leave free.
 
-        Where there is no such place within a metre, the directions stay as they are.
+        Where there is no such rest within a metre, these directions stay as they are.
 
         Args:
             q: Coordinates with those heights, shape (n,).
@@ -185,14 +186,14 @@ class DartPlant:
         t_s: float,
     ) -> PlantState:
         """State with given coordinates; arguments as of `PlantState`."""
-        return self._mechanism.state(positions, velocities, internal, t_s)
+        return self._equations.state(positions, velocities, internal, t_s)
 
     def numbers(self, state: PlantState) -> tuple[float, ...]:
-        """A state as numbers, for whoever differentiates a step; its time is not among them."""
+        """A state as numbers without its time, to differentiate a step."""
         return (*state.positions, *state.velocities, *state.internal)
 
     def state_of(self, numbers: Sequence[float], t_s: float = 0.0) -> PlantState:
-        """The state of what `numbers` gave."""
+        """The state of numbers as `numbers` returns them."""
         n = self.coordinates
         return self.state(numbers[:n], numbers[n : 2 * n], tuple(numbers[2 * n :]), t_s)
 
@@ -211,7 +212,7 @@ class DartPlant:
             applied_force_n: Applied force.
             temperature_c: Damper temperature.
         """
-        return self._mechanism.load(state, virtual_forces_n, applied_force_n, temperature_c)
+        return self._equations.load(state, virtual_forces_n, applied_force_n, temperature_c)
 
     def step(self, loaded: Loaded, dt_s: float, applied_force_end_n: float) -> PlantState:
         """Advance the model.
@@ -224,7 +225,7 @@ class DartPlant:
         Returns:
             State at the end.
         """
-        return self._mechanism.step(loaded, dt_s, applied_force_end_n, self.step_s)
+        return self._equations.step(loaded, dt_s, applied_force_end_n, self.step_s)
 
     def jacobians(self, q: Array) -> Jacobians:
         """Heights and Jacobians of the struts at coordinates `q`, shape (n,)."""
@@ -269,20 +270,20 @@ class DartPlant:
         rest = np.zeros(self.coordinates)
         samples = sample_positions(self.coordinates)
         benches = [(self.mechanics(q, rest), *self.bias_slopes(q, rest)) for q in samples]
-        exact_s = min(exact_step_s(_linearised(*bench, linear)) for bench in benches)
+        exact_s = min(exact_step_s(_linearise(*bench, linear)) for bench in benches)
         if exact_s < SHORTEST_STEP_S:
             fastest_hz = 1.0 / (2.0 * np.pi * exact_s)
             raise ModelError(
-                f"model {self.spec.name}: its masses, stiffnesses and dampings ask for steps of "
-                f"{exact_s:.1g} s ({fastest_hz:.1g} Hz), expected a bench that {SHORTEST_STEP_S} s "
-                "are short enough for"
+                f"model {self.spec.name}: its masses, stiffnesses and dampings require steps of "
+                f"{exact_s:.1g} s ({fastest_hz:.1g} Hz), expected a bench for which "
+                f"{SHORTEST_STEP_S} s is short enough"
             )
         steepest = [strut.steepest() for strut in self._struts]
-        stable_s = min(stable_step_s(_linearised(*bench, steepest)) for bench in benches)
+        stable_s = min(stable_step_s(_linearise(*bench, steepest)) for bench in benches)
         return min(LONGEST_STEP_S, exact_s, max(stable_s, SHORTEST_STEP_S))
 
 
-def _linearised(
+def _linearise(
     here: Mechanics, by_q: Array, by_v: Array, struts: Sequence[tuple[float, float]]
 ) -> Linearised:
     """The bench about one configuration, with a stiffness and a damping of each strut."""

@@ -1,7 +1,7 @@
-"""Files that are programs, and run with the rights of whoever opens them: which ones may.
+"""Programs that may run with the rights of the user who opens their files.
 
-A configuration or a log never makes one run: its owner imported it, by hand, on this machine. What
-was imported is known by its content (SHA-256), so that it may lie anywhere.
+No configuration and no log admits one: its user imported it, by hand, on this machine. An imported
+program is identified by its content (SHA-256), in whatever folder it is.
 """
 
 import hashlib
@@ -13,43 +13,43 @@ from dart_model.errors import ModelError
 
 
 def admit(content: bytes) -> bool:
-    """Let a program run from now on, for this user.
+    """Admit a program for this user.
 
     Returns:
-        Whether it could not before.
+        Whether it was not admitted before.
 
     Raises:
         ModelError: The user's settings cannot be read or written.
     """
-    found = _fingerprint(content)
-    admitted = _admitted()
-    if found in admitted:
+    fingerprint = _fingerprint(content)
+    admitted = _read_admitted()
+    if fingerprint in admitted:
         return False
-    _write([*admitted, found])
+    _write([*admitted, fingerprint])
     return True
 
 
 def withdraw(content: bytes) -> None:
-    """Let a program run no more.
+    """Withdraw the admission of a program.
 
     Raises:
         ModelError: The user's settings cannot be read or written.
     """
-    found = _fingerprint(content)
-    _write([item for item in _admitted() if item != found])
+    fingerprint = _fingerprint(content)
+    _write([item for item in _read_admitted() if item != fingerprint])
 
 
 def require_admission(content: bytes, path: Path) -> None:
-    """Refuse a program that this user never let run.
+    """Refuse a program that this user never admitted.
 
     Args:
         content: The program.
-        path: What to call it.
+        path: Its name in an error.
 
     Raises:
-        ModelError: It was not, or the user's settings cannot be read.
+        ModelError: It was not admitted, or the user's settings cannot be read.
     """
-    if _fingerprint(content) not in _admitted():
+    if _fingerprint(content) not in _read_admitted():
         raise ModelError(
             f"{path}: a program that was not imported on this machine, expected `rig import "
             f"{path.name} --fmu` first, by someone who trusts it"
@@ -69,7 +69,7 @@ def _write(fingerprints: Sequence[str]) -> None:
         raise ModelError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-def _admitted() -> list[str]:
+def _read_admitted() -> list[str]:
     try:
         text = _list().read_text("utf-8")
     except FileNotFoundError:

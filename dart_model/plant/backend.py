@@ -1,7 +1,7 @@
-"""What DART is asked while a model runs: the acceleration in a state under given forces.
+"""The acceleration in a state under given forces, by DART.
 
 A model with one coordinate, the usual bench, is computed with floats and any other with arrays. The
-two classes are all that tells them apart: the formulas around them hold for both.
+two classes are the whole difference: the formulas around them hold for both.
 """
 
 import math
@@ -12,7 +12,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.plant.geometry import coordinates_add_up, moved
+from dart_model.plant.geometry import coordinates_add_up, move
 from dart_model.plant.skeleton import Skeleton
 
 Array = NDArray[np.float64]
@@ -36,8 +36,8 @@ class Backend(Protocol[Value]):
         """Product of a row of a Jacobian and a value."""
         ...
 
-    def moved(self, q: Value, v: Value, h: float) -> Value:
-        """Where rates lead to in `h` seconds."""
+    def move(self, q: Value, v: Value, h: float) -> Value:
+        """Coordinates after `h` seconds at given rates."""
         ...
 
     def acceleration(self, q: Value, v: Value, force: Value) -> Value:
@@ -46,7 +46,7 @@ class Backend(Protocol[Value]):
 
 
 _SAMPLE_FORCES_N = (0.0, 1e-3, -0.7, 37.3, -4100.0)
-"""A difference in the last bit may hide beside a large force."""
+"""A difference in the last bit may hide behind a large force."""
 
 
 class OneCoordinate:
@@ -62,7 +62,7 @@ class OneCoordinate:
         self._solve: Callable[[], None] = skeleton.dart.computeForwardDynamics
         self._acceleration: Callable[[], float] = coordinate.getAcceleration
         self._only_force_matters = False
-        self._only_force_matters = self._answers_by_force_alone()
+        self._only_force_matters = self._depends_on_force_alone()
 
     def value(self, numbers: Sequence[float] | Array) -> float:
         return float(numbers[0])
@@ -70,7 +70,7 @@ class OneCoordinate:
     def numbers(self, value: float) -> tuple[float, ...]:
         return (value,)
 
-    def moved(self, q: float, v: float, h: float) -> float:
+    def move(self, q: float, v: float, h: float) -> float:
         return q + h * v
 
     def acceleration(self, q: float, v: float, force: float) -> float:
@@ -81,11 +81,11 @@ class OneCoordinate:
         self._solve()
         return self._acceleration()
 
-    def _answers_by_force_alone(self) -> bool:
+    def _depends_on_force_alone(self) -> bool:
         """Whether position and velocity make no difference to DART's answer, not even in a bit.
 
-        So it is for a body on a straight guide without springs or damping of DART's own; to say
-        where it is takes DART as long as the answer itself.
+        So it is for a body on a straight guide without springs or damping of DART's own; setting
+        its position takes DART as long as the answer itself.
         """
         return all(
             len(
@@ -122,8 +122,8 @@ class ManyCoordinates:
     def dot(self, row: Array, value: Array) -> float:
         return float(row @ value)
 
-    def moved(self, q: Array, v: Array, h: float) -> Array:
-        return q + h * v if self._adds_up else moved(self._skeleton, q, v, h)
+    def move(self, q: Array, v: Array, h: float) -> Array:
+        return q + h * v if self._adds_up else move(self._skeleton, q, v, h)
 
     def acceleration(self, q: Array, v: Array, force: Array) -> Array:
         numbers = zip(q.tolist(), v.tolist(), force.tolist(), strict=True)

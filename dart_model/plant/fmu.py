@@ -25,25 +25,25 @@ from dart_model.plant.admitted_programs import require_admission
 from dart_model.spec import FmuSpec
 
 _MOST_ITERATIONS = 20
-"""Of events at one time; more are no end."""
+"""Most event iterations at one time."""
 
 _MESSAGES = 3
-"""The last ones of an FMU that are kept, for the error that they explain."""
+"""Most recent messages of an FMU that an error contains."""
 
 
 class MockUp:
     """One instance of an FMU, as the part of a strut's force that it computes.
 
-    What it answers depends on its arguments alone as long as it remembers nothing but its
-    continuous states; an FMU that says that it does is refused.
+    Its result depends on its arguments alone as long as the FMU has no state but its continuous
+    states; one that declares others is refused.
 
     Args:
-        spec: The file, and what its variables are to a strut.
+        spec: The file, and the meaning of its variables for a strut.
         folder: Where the file lies.
         gravity_m_per_s2: Standard gravity.
 
     Attributes:
-        name: What it is called in messages.
+        name: Its name in messages.
         state_scales: Usual size of each internal state: a continuous state less its start.
 
     Raises:
@@ -59,18 +59,18 @@ class MockUp:
         self.state_scales = self._unit.nominals
         self._mass_kg, self._gravity = spec.mass_kg, gravity_m_per_s2
         self._is_bench = spec.acceleration is not None
-        self._asked: tuple[Any, ...] = ()
-        self._answered: tuple[float, list[float]] = (math.nan, [])
+        self._arguments: tuple[Any, ...] = ()
+        self._result: tuple[float, list[float]] = (math.nan, [])
 
     def force(self, *arguments: Any) -> float:
         """Force in N; arguments as of `dart_model.effects.Force`."""
-        return self._answer(*arguments[:6])[0]
+        return self._evaluate(*arguments[:6])[0]
 
     def rate(self, *arguments: Any) -> None:
         """Derivative of the internal states; arguments as of `dart_model.effects.Rate`."""
-        arguments[8][:] = self._answer(*arguments[:6])[1]
+        arguments[8][:] = self._evaluate(*arguments[:6])[1]
 
-    def _answer(
+    def _evaluate(
         self,
         t_s: float,
         height_m: float,
@@ -79,17 +79,17 @@ class MockUp:
         temperature_c: float,
         state: Sequence[float],
     ) -> tuple[float, list[float]]:
-        asked = (t_s, height_m, velocity_m_per_s, applied_force_n, temperature_c, tuple(state))
-        if asked != self._asked:
-            force, rates = self._unit.at(*asked)
+        arguments = (t_s, height_m, velocity_m_per_s, applied_force_n, temperature_c, tuple(state))
+        if arguments != self._arguments:
+            force, rates = self._unit.at(*arguments)
             if self._is_bench:
                 force = self._mass_kg * (force + self._gravity) - applied_force_n
-            self._asked, self._answered = asked, (force, rates)
-        return self._answered
+            self._arguments, self._result = arguments, (force, rates)
+        return self._result
 
 
 class _Unit:
-    """An FMU with its variables by what they are to a strut."""
+    """An FMU with its variables by their meaning for a strut."""
 
     def __init__(self, content: bytes, path: Path, spec: FmuSpec) -> None:
         description = read_description(content, path)
@@ -97,28 +97,28 @@ class _Unit:
         states = [item.variable.derivative.name for item in description.derivatives]
         _refuse_unfit(path, description, spec, variables)
         roles = (spec.height, spec.velocity, spec.temperature, spec.applied_force)
-        self._inputs: list[_Placed] = []
-        moving: list[_Placed] = []
+        self._inputs: list[_Variable] = []
+        moving: list[_Variable] = []
         for role, name in enumerate(roles):
             if name is None:
                 continue
-            sign, plain = _signed(name)
+            sign, plain = _split_sign(name)
             if plain in states:
-                moving.append(_Placed(states.index(plain), sign, role))
+                moving.append(_Variable(states.index(plain), sign, role))
             elif variables[plain].causality == "input":
-                self._inputs.append(_Placed(variables[plain].valueReference, sign, role))
+                self._inputs.append(_Variable(variables[plain].valueReference, sign, role))
             else:
                 raise ModelError(f"{path}: {plain}: expected an input or a state of the FMU")
         self._moving = moving
-        self._sign, plain = _signed(spec.force or spec.acceleration or "")
+        self._sign, plain = _split_sign(spec.force or spec.acceleration or "")
         self._output = [variables[plain].valueReference]
-        taken = {item.place for item in moving}
+        taken = {item.number for item in moving}
         self.internal = [k for k in range(len(states)) if k not in taken]
         self._count = len(states)
         self._x, self._dx = _doubles(self._count), _doubles(self._count)
         self._has_events = bool(description.numberOfEventIndicators)
         parameters = {variables[n].valueReference: v for n, v in spec.parameters.items()}
-        self._calls = _started(content, path, description, parameters)
+        self._calls = _start(content, path, description, parameters)
         self._start = self._calls.states(self._count)
         nominals = self._calls.nominals(self._count)
         self.nominals = tuple(nominals[k] for k in self.internal)
@@ -137,39 +137,39 @@ class _Unit:
         x, calls = self._x, self._calls
         for k, value in zip(self.internal, state, strict=True):
             x[k] = self._start[k] + value
-        for place, sign, role in self._moving:
-            x[place] = sign * given[role]
+        for index, sign, role in self._moving:
+            x[index] = sign * given[role]
         inputs = [sign * given[role] for _, sign, role in self._inputs]
         try:
-            calls.move(t_s, x, self._count, [place for place, _, _ in self._inputs], inputs)
+            calls.move(t_s, x, self._count, [index for index, _, _ in self._inputs], inputs)
             if self._has_events:
                 calls.settle()
             if self._count:
                 calls.derivatives(self._dx, self._count)
             (value,) = calls.read(self._output)
         except (_Refused, *_errors()):
-            # It may be left anywhere between two calls: anew, so that what is asked next has an
-            # answer of its own.
+            # Its state between two calls is unknown: restarted, so that the next result does not
+            # depend on it.
             calls.begin_again()
             return math.nan, [math.nan] * len(self.internal)
         return self._sign * value, [self._dx[k] for k in self.internal]
 
 
-class _Placed(NamedTuple):
+class _Variable(NamedTuple):
     """A variable that is set.
 
     Attributes:
-        place: Value reference, or index of a state.
+        number: Value reference, or index of a state.
         sign: Sign of the FMU's value where ours is positive.
         role: Index in what is given: height, velocity, temperature, applied force.
     """
 
-    place: int
+    number: int
     sign: float
     role: int
 
 
-class _Refused(Exception):  # noqa: N818  # an FMU's answer, never seen outside
+class _Refused(Exception):  # noqa: N818  # an FMU's refusal, caught in this module
     """An FMU ends the simulation, changes its states by itself, or comes to no end of events."""
 
 
@@ -213,7 +213,7 @@ class _Calls:
             self.write(references, inputs)
 
     def settle(self) -> None:
-        """Let switches turn where they stand."""
+        """Let switches change at the present state."""
         self._it.enterEventMode()
         if self.iterate():
             raise _Refused("changes its states by itself")
@@ -226,7 +226,7 @@ class _Calls:
             again, ends, _, moved, has_own_times, _ = self._update()
             changed |= bool(moved)
             if ends or has_own_times:
-                raise _Refused("ends by itself, or has events at times of its own")
+                raise _Refused("ends by itself, or has events at times that it sets")
             if not again:
                 return changed
         raise _Refused("comes to no end of events")
@@ -250,7 +250,7 @@ def _doubles(count: int) -> Any:
     return (ctypes.c_double * max(count, 1))()
 
 
-def _signed(name: str) -> tuple[float, str]:
+def _split_sign(name: str) -> tuple[float, str]:
     return (-1.0, name[1:]) if name.startswith("-") else (1.0, name)
 
 
@@ -273,11 +273,11 @@ def read_program(path: Path) -> bytes:
 
 
 def read_description(content: bytes, path: Path) -> Any:
-    """What an FMU says of itself, as FMPy reads it; nothing of it is executed.
+    """Description of an FMU, as FMPy reads it; nothing of it is executed.
 
     Args:
         content: The FMU.
-        path: What to call it.
+        path: Its name in an error.
 
     Raises:
         ModelError: It is no FMU, or FMPy is not installed.
@@ -288,19 +288,19 @@ def read_description(content: bytes, path: Path) -> Any:
 
     reader: Any = fmpy
     try:
-        found = reader.read_model_description(io.BytesIO(content))
+        description = reader.read_model_description(io.BytesIO(content))
     except Exception as error:  # of any library that a hostile archive may upset
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ModelError(f"{path}: is no FMU of FMI 2.0 or 3.0 ({reason[:200]})") from error
-    if any(item.variable.derivative is None for item in found.derivatives):
-        raise ModelError(f"{path}: a derivative of nothing, expected the state that it is of")
-    return found
+    if any(item.variable.derivative is None for item in description.derivatives):
+        raise ModelError(f"{path}: a derivative without a state, expected the state that it is of")
+    return description
 
 
 def _refuse_unfit(
     path: Path, description: Any, spec: FmuSpec, variables: Mapping[str, Any]
 ) -> None:
-    """Refuse an FMU that cannot be part of a strut, in words."""
+    """Refuse an FMU that cannot be part of a strut."""
     exchange = description.modelExchange
     if description.fmiVersion not in ("2.0", "3.0"):
         raise ModelError(f"{path}: FMI {description.fmiVersion}: expected 2.0 or 3.0")
@@ -336,7 +336,7 @@ def _refuse_unfit(
     for key, name in roles.items():
         if name is None:
             continue
-        plain = name if key.startswith("parameters ") else _signed(name)[1]
+        plain = name if key.startswith("parameters ") else _split_sign(name)[1]
         if plain not in variables:
             there = [n for n, v in variables.items() if v.causality in ("input", "output")]
             raise ModelError(
@@ -349,16 +349,14 @@ def _refuse_unfit(
             raise ModelError(f"{path}: {key}: expected a parameter of the FMU")
 
 
-def _started(
-    content: bytes, path: Path, description: Any, parameters: Mapping[int, float]
-) -> _Calls:
+def _start(content: bytes, path: Path, description: Any, parameters: Mapping[int, float]) -> _Calls:
     """An instance in continuous time, at its start."""
     import fmpy
     from fmpy.fmi2 import FMU2Model
     from fmpy.fmi3 import FMU3Model
 
     is_3 = description.fmiVersion == "3.0"
-    said: deque[str] = deque(maxlen=_MESSAGES)
+    messages: deque[str] = deque(maxlen=_MESSAGES)
     folder = tempfile.mkdtemp(prefix="rig-fmu-")
     extract: Any = cast("Any", fmpy).extract
     try:
@@ -370,34 +368,36 @@ def _started(
             instanceName="strut",
         )
         if is_3:
-            instance.instantiate(logMessage=_kept(said))
+            instance.instantiate(logMessage=_keep_in(messages))
         else:
-            instance.instantiate(callbacks=_callbacks(said), loggingOn=False)
+            instance.instantiate(callbacks=_callbacks(messages), loggingOn=False)
         calls = _Calls(instance, parameters, is_3=is_3)
         weakref.finalize(calls, _free, instance, folder)
         calls.begin()
     except Exception as error:  # FMPy raises its base class
         shutil.rmtree(folder, ignore_errors=True)
-        raise ModelError(f"{path}: does not start ({'; '.join([str(error), *said])})") from error
+        raise ModelError(
+            f"{path}: does not start ({'; '.join([str(error), *messages])})"
+        ) from error
     return calls
 
 
-def _callbacks(said: deque[str]) -> Any:
-    """What an FMU of FMI 2.0 may call; what it says is kept, and nothing printed."""
+def _callbacks(messages: deque[str]) -> Any:
+    """Functions that an FMU of FMI 2.0 may call; its messages are kept, and nothing is printed."""
     from fmpy import fmi2
 
     callbacks: Any = fmi2.fmi2CallbackFunctions()
-    callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(_kept(said))
+    callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(_keep_in(messages))
     callbacks.allocateMemory = fmi2.defaultCallbacks.allocateMemory
     callbacks.freeMemory = fmi2.defaultCallbacks.freeMemory
     return callbacks
 
 
-def _kept(said: deque[str]) -> Callable[..., None]:
-    def log(*words: Any) -> None:
-        said.append((words[-1] or b"").decode("utf-8", "replace").strip())
+def _keep_in(messages: deque[str]) -> Callable[..., None]:
+    def keep(*arguments: object) -> None:
+        messages.append(cast("bytes", arguments[-1] or b"").decode("utf-8", "replace").strip())
 
-    return log
+    return keep
 
 
 def _free(instance: Any, folder: str) -> None:

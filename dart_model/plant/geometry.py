@@ -1,4 +1,4 @@
-"""Where the struts are: their heights and Jacobians as functions of the joint coordinates."""
+"""Heights and Jacobians of the struts as functions of the joint coordinates."""
 
 import math
 from typing import NamedTuple, cast
@@ -13,13 +13,13 @@ from dart_model.spec import WORLD, ModelSpec, StrutSpec
 Array = NDArray[np.float64]
 
 _NEWTON_STEPS = 50
-"""Newton's method doubles its digits at each step, once it is near: more steps find nothing."""
+"""Newton's method doubles its digits at each step, once it is near: more steps change nothing."""
 
 _REACHED_M, _OUT_OF_REACH_M = 1e-13, 1e-9
 """Error of a height at which Newton's method ends, and above which it has failed."""
 
 _DISAGREEMENT_M = 5e-4
-"""By which sensors of more struts than coordinates may disagree: more is no noise."""
+"""Disagreement of the sensors of more struts than coordinates that noise explains."""
 
 _SHORTEST_M = 1e-12
 """Length of a strut below which its direction is not defined."""
@@ -47,9 +47,9 @@ class _Attached(NamedTuple):
     """The lower ends of all struts, then the upper ones.
 
     Attributes:
-        bodies: Place of each end's body among those that carry ends, the world's last; shape
+        bodies: Index of each end's body among those that carry ends, the world last; shape
             (2, struts).
-        attachments_m: Where they are in their bodies, shape (2, struts, 3).
+        attachments_m: Ends in the frames of their bodies, shape (2, struts, 3).
     """
 
     bodies: NDArray[np.intp]
@@ -96,11 +96,11 @@ class Geometry:
         self._spec = spec
         self._skeleton = skeleton
         names = sorted({name for strut in spec.struts for name in strut.between} - {WORLD})
-        # DART is asked once for each body: for each end it would take thrice as long.
+        # One call of DART for each body: one for each end would take three times as long.
         self._carriers = [skeleton.bodies[name] for name in names]
-        places = {name: index for index, name in enumerate([*names, WORLD])}
+        indices = {name: index for index, name in enumerate([*names, WORLD])}
         self._attached = _Attached(
-            np.array([[places[strut.between[k]] for strut in spec.struts] for k in (0, 1)]),
+            np.array([[indices[strut.between[k]] for strut in spec.struts] for k in (0, 1)]),
             np.array([[strut.attachments_m[k] for strut in spec.struts] for k in (0, 1)], float),
         )
         samples = [self._ends_at(q) for q in sample_positions(skeleton.coordinates)]
@@ -122,14 +122,14 @@ class Geometry:
         lower, upper = (wrenches[:, :, None] @ ends.jacobians)[:, :, 0]
         struts = upper - lower
         heights = np.sum(directions * ends.gaps_m, axis=1)
-        pushed = self._skeleton.dart.getLinearJacobian(self._skeleton.pushed)
-        return Jacobians(heights - struts @ q, struts, np.array(pushed[2], dtype=np.float64))
+        loaded = self._skeleton.dart.getLinearJacobian(self._skeleton.loaded)
+        return Jacobians(heights - struts @ q, struts, np.array(loaded[2], dtype=np.float64))
 
-    def turning(self, q: Array, v: Array) -> Array:
+    def centripetal(self, q: Array, v: Array) -> Array:
         """Second derivative of the heights at `q` with constant rates `v`, shape (struts,).
 
-        It is what the struts' Jacobian changes by in time, times the rates: centripetal
-        accelerations, and of a distance what its ends move across it.
+        It is the time derivative of the struts' Jacobian times the rates: centripetal
+        accelerations, and of a distance the motion of its ends across it.
 
         Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008), 2.10 and 3.
         """
@@ -173,14 +173,14 @@ class Geometry:
         return _Ends(arms, jacobians, upper - lower)
 
     def reaching(self, heights_m: Array, near: Array) -> Array:
-        """Coordinates with given strut heights, found by Newton's method.
+        """Coordinates with given strut heights, by Newton's method.
 
         Heights of more struts than coordinates are those of sensors that disagree by their noise:
         the coordinates are the nearest, in the least squares.
 
         Args:
             heights_m: One height a strut, shape (struts,); NaN where none is given.
-            near: Where to begin, shape (n,).
+            near: Start of the iteration, shape (n,).
 
         Raises:
             ModelError: The joints cannot reach the heights.
@@ -213,8 +213,8 @@ class Geometry:
         return first if same else None
 
 
-def moved(skeleton: Skeleton, q: Array, v: Array, h: float) -> Array:
-    """Where rates `v` lead to from `q` in `h` seconds; rotations in space do not add up."""
+def move(skeleton: Skeleton, q: Array, v: Array, h: float) -> Array:
+    """Coordinates after `h` seconds from `q` at rates `v`; rotations in space do not add up."""
     skeleton.dart.setPositions(q)
     skeleton.dart.setVelocities(v)
     skeleton.dart.integratePositions(h)
@@ -222,16 +222,16 @@ def moved(skeleton: Skeleton, q: Array, v: Array, h: float) -> Array:
 
 
 def coordinates_add_up(skeleton: Skeleton) -> bool:
-    """Whether ``q + h * v`` is where rates lead to, as for all but rotations in space."""
+    """Whether rates `v` lead to ``q + h * v`` in `h` seconds, as for all but rotations in space."""
     for q in sample_positions(skeleton.coordinates):
         v = np.roll(q, 1) + 1.0
-        if not np.allclose(moved(skeleton, q, v, 0.5), q + 0.5 * v, rtol=0.0, atol=1e-12):
+        if not np.allclose(move(skeleton, q, v, 0.5), q + 0.5 * v, rtol=0.0, atol=1e-12):
             return False
     return True
 
 
 def sample_positions(coordinates: int) -> list[Array]:
-    """Fixed generic configurations at which it is tested what is constant."""
+    """Fixed generic configurations at which constancy is tested."""
     return [0.3 * np.sin(1.0 + (k + 0.7) * np.arange(1, coordinates + 1)) for k in range(4)]
 
 
@@ -243,7 +243,7 @@ def _guide(model: str, strut: StrutSpec, columns: Array) -> Array:
         strut: The strut.
         columns: Its gap's derivatives by the coordinates, in many configurations, shape (3, m).
     """
-    left, singular, _ = np.linalg.svd(columns)
+    directions, singular, _ = np.linalg.svd(columns)
     if singular[0] < 1e-9:
         raise ModelError(
             f"model {model}: strut {strut.name}: no joint lets {strut.between[0]} and "
@@ -251,7 +251,7 @@ def _guide(model: str, strut: StrutSpec, columns: Array) -> Array:
         )
     if len(singular) > 1 and singular[1] > 1e-9 * singular[0]:
         return np.full(3, np.nan)
-    direction = cast("Array", np.round(left[:, 0], 14))  # exact for guides along an axis
+    direction = cast("Array", np.round(directions[:, 0], 14))  # exact for guides along an axis
     largest = direction[2] if direction[2] != 0.0 else direction[np.argmax(np.abs(direction))]
     return direction * math.copysign(1.0, largest)
 

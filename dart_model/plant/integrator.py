@@ -24,7 +24,7 @@ Slope = Callable[[Value, Value, Internal, float, float], tuple[Value, Sequence[f
 """Coordinates, their rates, internal states, time (s), input -> second derivative of the
 coordinates, derivative of the internal states."""
 
-Moved = Callable[[Value, Value, float], Value]
+Move = Callable[[Value, Value, float], Value]
 """Coordinates, rates, duration (s) -> coordinates after it."""
 
 LONGEST_STEP_S = 1e-3
@@ -43,74 +43,83 @@ _POLE_STEP = 0.5
 """Largest product of step and magnitude of a pole, for modes too strongly damped to swing."""
 
 _STABLE_STEP = 1.0
-"""The same with the steepest slopes of effects, which act in few places: there it is enough that
-the method is stable, as it is up to 2.5."""
+"""The same with the steepest slopes of effects, which act within short ranges: there it is
+enough that the method is stable, as it is up to 2.5."""
+
+
+class Course(NamedTuple):
+    """Steps of equal length, and the input during them.
+
+    Attributes:
+        t_s: Time at the beginning.
+        duration_s: Duration of all steps.
+        steps: Number of steps.
+        inputs: Input at the beginning and at the end; it is linear in between.
+    """
+
+    t_s: float
+    duration_s: float
+    steps: int
+    inputs: tuple[float, float]
 
 
 def advance(
     slope: Slope[Value],
-    moved: Moved[Value],
+    move: Move[Value],
     start: tuple[Value, Value, Internal],
     first: tuple[Value, Sequence[float]],
-    t_s: float,
-    duration_s: float,
-    steps: int,
-    inputs: tuple[float, float],
+    course: Course,
 ) -> tuple[Value, Value, Internal]:
     """State after a number of equal steps.
 
     Args:
         slope: The differential equation.
-        moved: How rates move coordinates; ``q + h * v`` where coordinates add up.
+        move: How rates move coordinates; ``q + h * v`` where coordinates add up.
         start: Coordinates, their rates and internal states at the beginning.
         first: The slope there.
-        t_s: Time there.
-        duration_s: Duration of all steps.
-        steps: Number of steps.
-        inputs: Input at the beginning and at the end; it is linear in between.
+        course: Steps and input.
 
     Returns:
         Coordinates, rates and internal states at the end.
     """
     (q, v, internal), (a1, rates1) = start, first
+    t_s, duration_s, steps, (given, end) = course
     h = duration_s / steps
     half, sixth = 0.5 * h, h / 6.0
-    given, end = inputs
     rise = (end - given) / steps
-    left = steps
     while True:
         a2, rates2 = slope(
-            moved(q, v, half),
+            move(q, v, half),
             v + half * a1,
-            grown(internal, half, rates1) if internal else internal,
+            propagate(internal, half, rates1) if internal else internal,
             t_s + half,
             given + 0.5 * rise,
         )
         t_s += h
         given += rise
         a3, rates3 = slope(
-            moved(q, v + h * a1, h),
+            move(q, v + h * a1, h),
             v + h * (2.0 * a2 - a1),
-            grown(grown(internal, 2.0 * h, rates2), -h, rates1) if internal else internal,
+            propagate(propagate(internal, 2.0 * h, rates2), -h, rates1) if internal else internal,
             t_s,
             given,
         )
         # The stages' own velocities drive the coordinates.
-        q = moved(q, v + sixth * (a1 + 2.0 * a2), h)
+        q = move(q, v + sixth * (a1 + 2.0 * a2), h)
         v = v + sixth * (a1 + 4.0 * a2 + a3)
         if internal:
             mean = [
-                (one + 4.0 * two + three) / 6.0
-                for one, two, three in zip(rates1, rates2, rates3, strict=True)
+                (begin + 4.0 * middle + after) / 6.0
+                for begin, middle, after in zip(rates1, rates2, rates3, strict=True)
             ]
-            internal = grown(internal, h, mean)
-        left -= 1
-        if left == 0:
+            internal = propagate(internal, h, mean)
+        steps -= 1
+        if steps == 0:
             return q, v, internal
         a1, rates1 = slope(q, v, internal, t_s, given)
 
 
-def grown(internal: Internal, h: float, rates: Sequence[float]) -> Internal:
+def propagate(internal: Internal, h: float, rates: Sequence[float]) -> Internal:
     """Internal states after a duration (s) at constant rates."""
     return tuple([state + h * rate for state, rate in zip(internal, rates, strict=True)])
 
@@ -144,7 +153,7 @@ class Linearised(NamedTuple):
 
 
 def exact_step_s(linear: Linearised) -> float:
-    """Longest step with which the free response of a linear bench is right (see `_FREQUENCY_STEP`).
+    """Longest step with which the free response of a linear bench is exact (see `_FREQUENCY_STEP`).
 
     It is not bounded by `LONGEST_STEP_S` or `SHORTEST_STEP_S`.
     """

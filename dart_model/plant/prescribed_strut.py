@@ -1,11 +1,11 @@
-"""A strut whose motion is given, as on a dyno: its law alone, since nothing is left to solve."""
+"""A strut whose motion is given, as on a dyno: its law alone, without equations of motion."""
 
 import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 from dart_model.errors import ModelError
-from dart_model.plant.integrator import grown
+from dart_model.plant.integrator import propagate
 from dart_model.plant.strut import struts_of
 from dart_model.spec import ModelSpec
 
@@ -72,9 +72,9 @@ class PrescribedStrut:
         for step in range(steps):
             begin_s = state.t_s + step * h
             rates = self._rates(begin_s, motion, internal, temperature_c)
-            half = grown(internal, 0.5 * h, rates)
+            half = propagate(internal, 0.5 * h, rates)
             rates = self._rates(begin_s + 0.5 * h, motion, half, temperature_c)
-            internal = grown(internal, h, rates)
+            internal = propagate(internal, h, rates)
         return PrescribedState(t_s, internal)
 
     def force_n(

@@ -9,13 +9,14 @@ import numpy as np
 
 from dart_model.effects import effect
 from dart_model.errors import ModelError
+from dart_model.plant.dart_types import DartBody, DartSkeleton
 from dart_model.spec import WORLD, BodySpec, FileSkeleton, InlineSkeleton, ModelSpec
 
-# dartpy ships no types: it is untyped in this package, and nowhere else.
+# dartpy ships no types: it is untyped in this module, and nowhere else.
 _dart = cast("Any", dartpy)
 
 _INSTANT_S = 1e-9
-"""DART takes springs and dampers of a joint's own at the end of its time step, not of ours."""
+"""DART evaluates a joint's springs and dampers at the end of its own time step, not of ours."""
 
 
 class Skeleton(NamedTuple):
@@ -24,17 +25,17 @@ class Skeleton(NamedTuple):
     Attributes:
         dart: DART's skeleton.
         bodies: Its bodies by name.
-        pushed: Body on which the applied force acts.
+        loaded: Body on which the applied force acts.
     """
 
-    dart: Any
-    bodies: dict[str, Any]
-    pushed: Any
+    dart: DartSkeleton
+    bodies: dict[str, DartBody]
+    loaded: DartBody
 
     @property
     def coordinates(self) -> int:
         """Number of joint coordinates."""
-        return int(self.dart.getNumDofs())
+        return self.dart.getNumDofs()
 
 
 def build(spec: ModelSpec) -> Skeleton:
@@ -48,7 +49,7 @@ def build(spec: ModelSpec) -> Skeleton:
         dart = _read_skeleton(spec.skeleton, spec.folder)
     else:
         dart = _inline_skeleton(spec.name, spec.skeleton)
-    bodies = {str(body.getName()): body for body in dart.getBodyNodes()}
+    bodies = {body.getName(): body for body in dart.getBodyNodes()}
     for strut in spec.struts:
         for end in strut.between:
             if end != WORLD and end not in bodies:
@@ -56,22 +57,22 @@ def build(spec: ModelSpec) -> Skeleton:
                     f"model {spec.name}: strut {strut.name}: between {end!r}: expected one of "
                     f"{', '.join([WORLD, *bodies])}"
                 )
-    if int(dart.getNumDofs()) == 0:
+    if dart.getNumDofs() == 0:
         raise ModelError(f"model {spec.name}: skeleton has no joint that moves, expected one")
     dart.setGravity([0.0, 0.0, -spec.gravity_m_per_s2])
     dart.setTimeStep(_INSTANT_S)
     _add_masses(spec, bodies)
-    return Skeleton(dart, bodies, bodies[_pushed_body(spec, bodies)])
+    return Skeleton(dart, bodies, bodies[_loaded_body_name(spec, bodies)])
 
 
-def _add_masses(spec: ModelSpec, bodies: dict[str, Any]) -> None:
+def _add_masses(spec: ModelSpec, bodies: dict[str, DartBody]) -> None:
     """Give DART the masses that effects add, so that it carries their weight and inertia."""
     for strut in spec.struts:
         for item in strut.effects:
             if not effect(item.name).adds_mass:
                 continue
             end = strut.between[1] if strut.between[1] != WORLD else strut.between[0]
-            mass = float(bodies[end].getMass()) + item.values()[0]
+            mass = bodies[end].getMass() + item.values()[0]
             if mass <= 0.0:
                 raise ModelError(
                     f"model {spec.name}: strut {strut.name}: effect {item.name} leaves {end} "
@@ -80,7 +81,7 @@ def _add_masses(spec: ModelSpec, bodies: dict[str, Any]) -> None:
             bodies[end].setMass(mass)
 
 
-def _pushed_body(spec: ModelSpec, bodies: dict[str, Any]) -> str:
+def _loaded_body_name(spec: ModelSpec, bodies: dict[str, DartBody]) -> str:
     name = spec.applied_force_body or spec.struts[-1].between[1]
     if name == WORLD:
         name = spec.struts[-1].between[0]
@@ -91,7 +92,7 @@ def _pushed_body(spec: ModelSpec, bodies: dict[str, Any]) -> str:
     return name
 
 
-def _inline_skeleton(name: str, spec: InlineSkeleton) -> Any:
+def _inline_skeleton(name: str, spec: InlineSkeleton) -> DartSkeleton:
     skeleton = _dart.dynamics.Skeleton(name)
     bodies: dict[str, Any] = {}
     for body in spec.bodies:
@@ -124,7 +125,7 @@ def _joint(body: BodySpec, skeleton: Any) -> tuple[Callable[..., Any], Any]:
     return getattr(skeleton, f"create{kind}JointAndBodyNodePair"), properties
 
 
-def _read_skeleton(spec: FileSkeleton, folder: Path) -> Any:
+def _read_skeleton(spec: FileSkeleton, folder: Path) -> DartSkeleton:
     path = (folder / spec.file).resolve()
     if not path.is_file():
         raise ModelError(f"{path}: skeleton.file: no such file, expected URDF, SDF, SKEL or MJCF")
@@ -137,13 +138,13 @@ def _read_skeleton(spec: FileSkeleton, folder: Path) -> Any:
         reason = " ".join(str(error).split())[:200]
         raise ModelError(f"{path}: DART cannot read it: {reason}") from error
     if skeleton is None:
-        raise ModelError(f"{path}: DART finds no skeleton in it, expected a valid {suffix} file")
+        raise ModelError(f"{path}: DART reads no skeleton from it, expected a valid {suffix} file")
     if suffix in _MJCF:
         _refuse_bodies_without_shape(skeleton, path)
     return skeleton
 
 
-def _read_urdf(uri: str) -> Any:
+def _read_urdf(uri: str) -> DartSkeleton | None:
     loader = _dart.utils.DartLoader()
     options = loader.getOptions()
     # A bench stands on the ground; DART would let the root link fly.
@@ -152,26 +153,26 @@ def _read_urdf(uri: str) -> Any:
     return loader.parseSkeleton(uri)
 
 
-def _read_sdf(uri: str) -> Any:
+def _read_sdf(uri: str) -> DartSkeleton | None:
     return _dart.utils.SdfParser.readSkeleton(uri)
 
 
-def _read_skel(uri: str) -> Any:
+def _read_skel(uri: str) -> DartSkeleton | None:
     return _first_skeleton(_dart.utils.SkelParser.readWorld(uri))
 
 
-def _read_mjcf(uri: str) -> Any:
+def _read_mjcf(uri: str) -> DartSkeleton | None:
     return _first_skeleton(_dart.utils.MjcfParser.readWorld(uri))
 
 
-def _first_skeleton(world: Any) -> Any:
+def _first_skeleton(world: Any) -> DartSkeleton | None:
     return world.getSkeleton(0) if world is not None and world.getNumSkeletons() > 0 else None
 
 
 _MJCF = (".xml", ".mjcf")
 
 
-_PARSERS: dict[str, Callable[[str], Any]] = {
+_PARSERS: dict[str, Callable[[str], DartSkeleton | None]] = {
     ".urdf": _read_urdf,
     ".sdf": _read_sdf,
     ".skel": _read_skel,
@@ -180,10 +181,10 @@ _PARSERS: dict[str, Callable[[str], Any]] = {
 """DART's parser for each suffix."""
 
 
-def _refuse_bodies_without_shape(skeleton: Any, path: Path) -> None:
-    """DART's MJCF parser gives a body without a geom 1 kg, whatever its inertial says."""
+def _refuse_bodies_without_shape(skeleton: DartSkeleton, path: Path) -> None:
+    """Refuse bodies without a geom: DART's MJCF parser gives them 1 kg, whatever their inertial."""
     for body in skeleton.getBodyNodes():
-        if int(body.getNumShapeNodes()) == 0:
+        if body.getNumShapeNodes() == 0:
             raise ModelError(
                 f"{path}: body {body.getName()}: no geom, expected one: DART reads no mass without"
             )

@@ -1,4 +1,4 @@
-"""What a plant is given and gives: frozen values."""
+"""Arguments and results of a plant: frozen values."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -18,8 +18,8 @@ class PlantState(Struct, frozen=True, gc=False):
         velocities: Joint velocities, in m/s or rad/s.
         internal: Internal states of all effects, strut after strut.
         t_s: Time, for effects that depend on it.
-        struts: Height (m) and velocity (m/s; positive is rebound) of every strut: what the
-            coordinates mean to them.
+        struts: Height (m) and velocity (m/s; positive is rebound) of every strut at
+            these coordinates.
     """
 
     positions: tuple[float, ...]
@@ -67,8 +67,8 @@ class Mechanics(NamedTuple):
         struts: Jacobian of the struts, shape (struts, n).
         applied: Generalised force per newton of applied force, shape (n,).
         mass: Mass matrix, shape (n, n).
-        bias: Generalised force of all else: weight, Coriolis and centrifugal forces, springs and
-            dampers of the joints' own, shape (n,).
+        bias: Other generalised forces: weight, Coriolis and centrifugal forces, springs and
+            dampers of the joints, shape (n,).
     """
 
     heights_m: Array

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dart_model.plant.integrator import Linearised, advance, exact_step_s, stable_step_s
+from dart_model.plant.integrator import Course, Linearised, advance, exact_step_s, stable_step_s
 
 
 def moved(q, v, h):
@@ -28,7 +28,7 @@ def after(steps, internal=(), omega=7.0, ratio=0.1, duration_s=1.0, inputs=(0.0,
     slope = oscillator(omega, ratio)
     first = slope(0.3, -1.0, internal, 0.0, inputs[0])
     start = (0.3, -1.0, internal)
-    return advance(slope, moved, start, first, 0.0, duration_s, steps, inputs)
+    return advance(slope, moved, start, first, Course(0.0, duration_s, steps, inputs))
 
 
 @pytest.mark.parametrize("internal", [(), (0.2,)])
@@ -48,7 +48,11 @@ def test_steps_on_end_are_the_same_as_steps_of_two_calls(split):
     for steps, begin in ((split, 0), (40 - split, split)):
         first = slope(q, v, internal, begin / 40, 1.0)
         q, v, internal = advance(
-            slope, moved, (q, v, internal), first, begin / 40, steps / 40, steps, (1.0, 1.0)
+            slope,
+            moved,
+            (q, v, internal),
+            first,
+            Course(begin / 40, steps / 40, steps, (1.0, 1.0)),
         )
     assert (q, v) == pytest.approx(whole[:2], abs=1e-12)
 
@@ -58,7 +62,7 @@ def test_floats_and_arrays_are_computed_alike():
     slope = oscillator(7.0, 0.1)
     start = (np.array([0.3, 0.3]), np.array([-1.0, -1.0]), ())
     first = slope(*start, 0.0, 0.0)
-    q, v, _ = advance(slope, moved, start, first, 0.0, 1.0, 50, (0.0, 2.0))
+    q, v, _ = advance(slope, moved, start, first, Course(0.0, 1.0, 50, (0.0, 2.0)))
     assert q.tolist() == [scalar[0]] * 2
     assert v.tolist() == [scalar[1]] * 2
 
@@ -96,6 +100,6 @@ def test_at_that_step_the_free_response_is_off_by_less_than_a_thousandth(omega, 
     q, v = 1.0, 0.0
     for step in range(1, steps + 1):
         first = slope(q, v, (), 0.0, 0.0)
-        q, v, _ = advance(slope, moved, (q, v, ()), first, 0.0, h, 1, (0.0, 0.0))
+        q, v, _ = advance(slope, moved, (q, v, ()), first, Course(0.0, h, 1, (0.0, 0.0)))
         exact = (vectors[0] * weights * np.exp(values * step * h)).sum().real
         assert abs(q - exact) < 1e-3

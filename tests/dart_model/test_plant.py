@@ -542,7 +542,7 @@ def test_a_linear_bench_is_right_to_a_thousandth_or_refused(masses, stiffnesses,
     try:
         plant = DartPlant(spec)
     except InputError as error:
-        assert "ask for steps of" in str(error)  # noqa: PT017 - either is right
+        assert "require steps of" in str(error)  # noqa: PT017 - either is right
         return
     mass = np.array([[m1 + m2, m2], [m2, m2]])
     stiffness = np.diag([k1, k2])
@@ -578,7 +578,7 @@ def test_a_strut_of_five_million_newtons_a_metre_on_half_a_kilogram_is_stable_an
 
 def test_a_bench_that_is_too_stiff_is_refused_in_one_line():
     with pytest.raises(
-        InputError, match=r"model oscillator: .* ask for steps of 1e-07 s"
+        InputError, match=r"model oscillator: .* require steps of 1e-07 s"
     ) as caught:
         DartPlant(one_body(1.0, 1e12))
     assert "\n" not in str(caught.value)

@@ -20,8 +20,8 @@ from dart_model.spec import (
     InlineSkeleton,
     JointSpec,
     ModelSpec,
+    ModelTolerance,
     StrutSpec,
-    Tolerance,
     dump_model,
     load_model,
     parse_model,
@@ -57,12 +57,12 @@ PERCENTAGES = st.none() | st.decimals("0.0001", 1000, places=4).map(lambda x: f"
 
 
 @st.composite
-def tolerances(draw: st.DrawFn) -> Tolerance:
+def tolerances(draw: st.DrawFn) -> ModelTolerance:
     shares = {
         name: draw(PERCENTAGES)
         for name in ("mass_kg", "stiffness_n_per_m", "damping_n_s_per_m", "input_gain")
     }
-    return Tolerance.model_validate({**shares, "preload_n": draw(st.none() | POSITIVE)})
+    return ModelTolerance.model_validate({**shares, "preload_n": draw(st.none() | POSITIVE)})
 
 
 @st.composite
@@ -137,7 +137,7 @@ def test_tolerances_are_shares_and_written_as_percentages():
         "preload_n: 5.0, input_gain: 7 %}"
     )
     spec = parse_model(TEXT + known, "reference.yaml")
-    assert spec.tolerance == Tolerance.model_construct(
+    assert spec.tolerance == ModelTolerance.model_construct(
         mass_kg=0.001, stiffness_n_per_m=0.2, damping_n_s_per_m=0.4, preload_n=5.0, input_gain=0.07
     )
     assert yaml.safe_load(dump_model(spec))["tolerance"] == {
@@ -154,7 +154,7 @@ def test_a_model_without_tolerances_has_none():
     assert spec.tolerance is None
     assert "tolerance" not in dump_model(spec)
     some = parse_model(TEXT + "tolerance: {mass_kg: 1 %}", "reference.yaml").tolerance
-    assert some == Tolerance.model_construct(mass_kg=0.01)
+    assert some == ModelTolerance.model_construct(mass_kg=0.01)
 
 
 def refused(text: str) -> str:
@@ -266,7 +266,7 @@ def test_a_name_that_stands_twice_is_refused(what):
     data = yaml.safe_load(TEXT)
     items = data["skeleton"]["bodies"] if what == "body" else data["struts"]
     items.append(deepcopy(items[0]))
-    assert f"{what} '{what}' stands 2 times" in refused(yaml.safe_dump(data, sort_keys=False))
+    assert f"{what} '{what}' occurs 2 times" in refused(yaml.safe_dump(data, sort_keys=False))
 
 
 def test_parents_stand_before_children():

@@ -8,7 +8,7 @@ import numpy as np
 
 from dart_model.plant.backend import Backend, Value
 from dart_model.plant.geometry import Geometry, Jacobians
-from dart_model.plant.integrator import Internal, advance
+from dart_model.plant.integrator import Course, Internal, advance
 from dart_model.plant.state import Loaded, PlantState
 from dart_model.plant.strut import Strut
 
@@ -16,7 +16,7 @@ _MOST_STEPS = 10_000
 """Steps of one call; one that is so late that it would need more takes longer ones."""
 
 
-class _Placed(NamedTuple, Generic[Value]):
+class _StrutRow(NamedTuple, Generic[Value]):
     """A strut in one configuration: ``height = offset + row @ q``.
 
     Attributes:
@@ -38,17 +38,17 @@ class _Configuration(NamedTuple, Generic[Value]):
         applied: Generalised force per newton of applied force.
     """
 
-    struts: tuple[_Placed[Value], ...]
+    struts: tuple[_StrutRow[Value], ...]
     applied: Value
 
 
-class Mechanism(Generic[Value]):
-    """A model that moves.
+class EquationsOfMotion(Generic[Value]):
+    """Equations of motion of a model, over time.
 
     Args:
         backend: Its coordinates and their dynamics.
         struts: Its struts.
-        geometry: Where they are.
+        geometry: Their heights and Jacobians.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Mechanism(Generic[Value]):
         self._geometry = geometry
         constant = geometry.constant
         self._constant = None if constant is None else self._configuration(constant)
-        # A tick ends where the next force is asked for: its configuration is found once.
+        # The next force is computed where a tick ends: its configuration is computed once.
         self._newest: tuple[tuple[float, ...], _Configuration[Value]] | None = None
 
     def state(
@@ -100,8 +100,9 @@ class Mechanism(Generic[Value]):
         for _, _, row in struts:
             accelerations.append(backend.dot(row, acceleration))
         if self._constant is None:
-            turning = self._geometry.turning(np.array(state.positions), np.array(state.velocities))
-            accelerations = [a + b for a, b in zip(accelerations, turning.tolist(), strict=True)]
+            q_now, v_now = np.array(state.positions), np.array(state.velocities)
+            further = self._geometry.centripetal(q_now, v_now).tolist()
+            accelerations = [a + b for a, b in zip(accelerations, further, strict=True)]
         return Loaded(
             state,
             tuple(virtual_forces_n),
@@ -139,13 +140,15 @@ class Mechanism(Generic[Value]):
 
         q, v, internal = advance(
             slope,
-            backend.moved,
+            backend.move,
             (loaded.position, loaded.velocity, state.internal),
             (loaded.acceleration, loaded.internal_rates),
-            state.t_s,
-            dt_s,
-            steps_of(dt_s, longest_s),
-            (loaded.applied_force_n, applied_force_end_n),
+            Course(
+                state.t_s,
+                dt_s,
+                count_steps(dt_s, longest_s),
+                (loaded.applied_force_n, applied_force_end_n),
+            ),
         )
         return self._state(q, v, internal, state.t_s + dt_s)
 
@@ -158,23 +161,23 @@ class Mechanism(Generic[Value]):
         return PlantState(backend.numbers(q), backend.numbers(v), internal, t_s, motions)
 
     def _at(self, q: Value) -> _Configuration[Value]:
-        where = self._backend.numbers(q)
-        if self._newest is None or self._newest[0] != where:
-            self._newest = where, self._configuration(self._geometry.at(np.array(where)))
+        numbers = self._backend.numbers(q)
+        if self._newest is None or self._newest[0] != numbers:
+            self._newest = numbers, self._configuration(self._geometry.at(np.array(numbers)))
         return self._newest[1]
 
     def _configuration(self, jacobians: Jacobians) -> _Configuration[Value]:
         value = self._backend.value
-        placed = tuple(
-            _Placed(strut, offset_m, value(row))
+        rows = tuple(
+            _StrutRow(strut, offset_m, value(row))
             for strut, offset_m, row in zip(
                 self._struts, jacobians.offsets_m.tolist(), jacobians.struts, strict=True
             )
         )
-        return _Configuration(placed, value(jacobians.applied))
+        return _Configuration(rows, value(jacobians.applied))
 
 
-def steps_of(dt_s: float, longest_s: float) -> int:
+def count_steps(dt_s: float, longest_s: float) -> int:
     """Number of equal steps of at most `longest_s`."""
     if dt_s <= longest_s * (1.0 + 1e-9):  # a tick of one step must not become two by rounding
         return 1
