@@ -2,7 +2,7 @@
 
 import math
 
-from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start
+from dart_model.effects.law import Effect, Motion, Parameter, Start
 from dart_model.effects.ranges import grid, height, moving, within
 
 _BOTH = "heights on both sides of the free play"
@@ -11,32 +11,18 @@ _GAP = Parameter("gap_m", "m", 1e-12, 1e4, "width of the free play")
 
 
 def _dead_zone(
-    _t_s: float,
-    height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    height_m: float, stiffness_n_per_m: float, gap_m: float, centre_height_m: float
 ) -> float:
-    x = height_m - p[2]
-    beyond = max(abs(x) - 0.5 * p[1], 0.0)
-    return -p[0] * math.copysign(beyond, x)
+    x = height_m - centre_height_m
+    beyond = max(abs(x) - 0.5 * gap_m, 0.0)
+    return -stiffness_n_per_m * math.copysign(beyond, x)
 
 
 def _free_play(
-    _t_s: float,
-    height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    strut: Floats,
+    height_m: float, stiffness_n_per_m: float, centre_height_m: float, gap_m: float
 ) -> float:
-    half = 0.5 * p[1]
-    return strut[1] * min(max(height_m - p[0], -half), half)
+    half = 0.5 * gap_m
+    return stiffness_n_per_m * min(max(height_m - centre_height_m, -half), half)
 
 
 def _centres_m(motion: Motion) -> list[float]:

@@ -2,7 +2,7 @@
 
 import math
 
-from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start, Writable
+from dart_model.effects.law import Effect, Motion, Parameter, Start, State
 from dart_model.effects.ranges import grid, moving, within
 
 _FAMILY = "fade"
@@ -16,72 +16,66 @@ _LARGEST_EXPONENT = 40.0
 
 
 def _temperature(
-    _t_s: float,
-    _height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
     temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    strut: Floats,
+    damping_n_s_per_m: float,
+    fraction_per_k: float,
+    reference_c: float,
 ) -> float:
-    exponent = -p[0] * (temperature_c - p[1])
-    return strut[2] * velocity_m_per_s * (1.0 - math.exp(min(exponent, _LARGEST_EXPONENT)))
+    exponent = -fraction_per_k * (temperature_c - reference_c)
+    return damping_n_s_per_m * velocity_m_per_s * (1.0 - math.exp(min(exponent, _LARGEST_EXPONENT)))
 
 
 def _linear_temperature(
-    _t_s: float,
-    _height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
     temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    strut: Floats,
+    damping_n_s_per_m: float,
+    fraction_per_k: float,
+    reference_c: float,
 ) -> float:
-    return strut[2] * velocity_m_per_s * p[0] * (temperature_c - p[1])
+    return damping_n_s_per_m * velocity_m_per_s * fraction_per_k * (temperature_c - reference_c)
 
 
 def _time(
     t_s: float,
-    _height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    strut: Floats,
+    damping_n_s_per_m: float,
+    final_fraction: float,
+    time_constant_s: float,
 ) -> float:
-    return strut[2] * velocity_m_per_s * (1.0 - p[0]) * (1.0 - math.exp(-max(t_s, 0.0) / p[1]))
+    return (
+        damping_n_s_per_m
+        * velocity_m_per_s
+        * (1.0 - final_fraction)
+        * (1.0 - math.exp(-max(t_s, 0.0) / time_constant_s))
+    )
 
 
 def _energy(
-    _t_s: float,
-    _height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    strut: Floats,
+    work_j: float,
+    damping_n_s_per_m: float,
+    final_fraction: float,
+    energy_j: float,
 ) -> float:
-    return strut[2] * velocity_m_per_s * (1.0 - p[0]) * (1.0 - math.exp(-state[0] / p[1]))
+    return (
+        damping_n_s_per_m
+        * velocity_m_per_s
+        * (1.0 - final_fraction)
+        * (1.0 - math.exp(-work_j / energy_j))
+    )
 
 
 def _energy_rate(
-    _t_s: float,
-    _height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    strut: Floats,
-    out: Writable,
-) -> None:
+    work_j: float,
+    damping_n_s_per_m: float,
+    final_fraction: float,
+    energy_j: float,
+) -> float:
     # The state is the work that the damper has turned into heat, in J.
-    left = p[0] + (1.0 - p[0]) * math.exp(-state[0] / p[1])
-    out[0] = strut[2] * left * velocity_m_per_s * velocity_m_per_s
+    left = final_fraction + (1.0 - final_fraction) * math.exp(-work_j / energy_j)
+    return damping_n_s_per_m * left * velocity_m_per_s * velocity_m_per_s
 
 
 def _shows_temperature(motion: Motion) -> bool:
@@ -198,7 +192,7 @@ ENERGY_FADE = Effect(
     reference=_REFERENCE,
     rate=_energy_rate,
     scaled=(),
-    state_scales=(1.0,),
+    states=(State("work_j", 1.0),),
     starts=_energy_starts,
     bounds=within(energy_j=_energies),
     simpler=("linear_damping",),

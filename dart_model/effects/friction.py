@@ -6,7 +6,7 @@ that bends by a fraction of a millimetre before it slides, which holds.
 
 import math
 
-from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start, Writable
+from dart_model.effects.law import Effect, Motion, Parameter, Start, State
 from dart_model.effects.ranges import crossing_time_s, grid, moving, of_speed, of_stroke, within
 
 _FAMILY = "friction"
@@ -20,130 +20,77 @@ _PRESLIDING = Parameter("presliding_m", "m", 1e-12, 1e4, "deflection at which sl
 # A bristle settles at |velocity| / presliding, without bound; what is faster than this rate (1/s)
 # is over before it can be seen, and would only need shorter steps.
 _FASTEST_SETTLING_PER_S = 2000.0
+_DEFLECTION = State("deflection", 1.0)
+"""Of a bristle, in units of `presliding_m`."""
 
 
 def _coulomb(
-    _t_s: float,
-    _height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    velocity_m_per_s: float, coulomb_force_n: float, rounding_velocity_m_per_s: float
 ) -> float:
-    return -p[0] * math.tanh(velocity_m_per_s / p[1])
+    return -coulomb_force_n * math.tanh(velocity_m_per_s / rounding_velocity_m_per_s)
 
 
 def _stribeck(
-    _t_s: float,
-    _height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    coulomb_force_n: float,
+    static_to_coulomb: float,
+    stribeck_velocity_m_per_s: float,
+    rounding_velocity_m_per_s: float,
 ) -> float:
-    ratio = velocity_m_per_s / p[2]
-    level = 1.0 + (p[1] - 1.0) * math.exp(-ratio * ratio)
-    return -p[0] * level * math.tanh(velocity_m_per_s / p[3])
+    ratio = velocity_m_per_s / stribeck_velocity_m_per_s
+    level = 1.0 + (static_to_coulomb - 1.0) * math.exp(-ratio * ratio)
+    return -coulomb_force_n * level * math.tanh(velocity_m_per_s / rounding_velocity_m_per_s)
 
 
-def _presliding(
-    _t_s: float,
-    _height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
-) -> float:
-    return -p[0] * min(max(state[0], -1.0), 1.0)
+def _bristle(deflection: float, coulomb_force_n: float) -> float:
+    return -coulomb_force_n * min(max(deflection, -1.0), 1.0)
 
 
-def _presliding_rate(
-    _t_s: float,
-    _height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
-    out: Writable,
-) -> None:
-    # The state is the bristle's deflection in units of `presliding_m`.
-    speed = min(abs(velocity_m_per_s) / p[1], _FASTEST_SETTLING_PER_S)
-    out[0] = math.copysign(speed, velocity_m_per_s) - speed * state[0]
+def _presliding_rate(velocity_m_per_s: float, deflection: float, presliding_m: float) -> float:
+    speed = min(abs(velocity_m_per_s) / presliding_m, _FASTEST_SETTLING_PER_S)
+    return math.copysign(speed, velocity_m_per_s) - speed * deflection
 
 
-def _elastoplastic(
-    _t_s: float,
-    _height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
-) -> float:
-    return -p[0] * min(max(state[0], -1.0), 1.0)
-
-
-def _elastoplastic_rate(
-    _t_s: float,
-    _height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
-    out: Writable,
-) -> None:
+def _elastoplastic_rate(velocity_m_per_s: float, deflection: float, presliding_m: float) -> float:
     # Elastic up to the limit, then sliding. Near the limit it settles instead of stopping: a force
     # that jumped by where in a step it slips would have no derivative by the parameters.
-    speed = min(abs(velocity_m_per_s) / p[1], _FASTEST_SETTLING_PER_S)
-    if velocity_m_per_s * state[0] > 0.0:
-        speed = min(speed, max(_FASTEST_SETTLING_PER_S * (1.0 - abs(state[0])), 0.0))
-    out[0] = math.copysign(speed, velocity_m_per_s)
+    speed = min(abs(velocity_m_per_s) / presliding_m, _FASTEST_SETTLING_PER_S)
+    if velocity_m_per_s * deflection > 0.0:
+        speed = min(speed, max(_FASTEST_SETTLING_PER_S * (1.0 - abs(deflection)), 0.0))
+    return math.copysign(speed, velocity_m_per_s)
 
 
 def _lugre(
-    _t_s: float,
-    _height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
+    deflection: float,
+    coulomb_force_n: float,
+    static_to_coulomb: float,
+    stribeck_velocity_m_per_s: float,
+    presliding_m: float,
+    bristle_damping_n_s_per_m: float,
 ) -> float:
-    ratio = velocity_m_per_s / p[2]
-    level = 1.0 + (p[1] - 1.0) * math.exp(-ratio * ratio)
-    speed = min(abs(velocity_m_per_s) / p[3], _FASTEST_SETTLING_PER_S)
-    bending = (math.copysign(speed, velocity_m_per_s) - speed * state[0] / level) * p[3]
+    ratio = velocity_m_per_s / stribeck_velocity_m_per_s
+    level = 1.0 + (static_to_coulomb - 1.0) * math.exp(-ratio * ratio)
+    speed = min(abs(velocity_m_per_s) / presliding_m, _FASTEST_SETTLING_PER_S)
+    bending = (math.copysign(speed, velocity_m_per_s) - speed * deflection / level) * presliding_m
     # The bristle's damping fades with speed, else it would act like a viscous damper.
-    return -p[0] * state[0] - p[4] * math.exp(-ratio * ratio) * bending
+    return (
+        -coulomb_force_n * deflection
+        - bristle_damping_n_s_per_m * math.exp(-ratio * ratio) * bending
+    )
 
 
 def _lugre_rate(
-    _t_s: float,
-    _height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
-    out: Writable,
-) -> None:
-    ratio = velocity_m_per_s / p[2]
-    level = 1.0 + (p[1] - 1.0) * math.exp(-ratio * ratio)
-    speed = min(abs(velocity_m_per_s) / p[3], _FASTEST_SETTLING_PER_S)
-    out[0] = math.copysign(speed, velocity_m_per_s) - speed * state[0] / level
+    deflection: float,
+    static_to_coulomb: float,
+    stribeck_velocity_m_per_s: float,
+    presliding_m: float,
+) -> float:
+    ratio = velocity_m_per_s / stribeck_velocity_m_per_s
+    level = 1.0 + (static_to_coulomb - 1.0) * math.exp(-ratio * ratio)
+    speed = min(abs(velocity_m_per_s) / presliding_m, _FASTEST_SETTLING_PER_S)
+    return math.copysign(speed, velocity_m_per_s) - speed * deflection / level
 
 
 @moving
@@ -216,11 +163,11 @@ PRESLIDING_FRICTION = Effect(
     family=_FAMILY,
     words="dry friction with presliding (Dahl's bristle)",
     parameters=(_COULOMB, _PRESLIDING),
-    force=_presliding,
+    force=_bristle,
     excitation=_SLIDING,
     reference="Dahl, Solid friction damping of mechanical vibrations, AIAA J. 14 (1976)",
     rate=_presliding_rate,
-    state_scales=(1.0,),
+    states=(_DEFLECTION,),
     fits_state=True,
     starts=_bristle_starts,
     bounds=within(presliding_m=_DEFLECTIONS),
@@ -233,11 +180,11 @@ ELASTOPLASTIC_FRICTION = Effect(
     family=_FAMILY,
     words="dry friction that holds at rest (elastoplastic bristle)",
     parameters=(_COULOMB, _PRESLIDING),
-    force=_elastoplastic,
+    force=_bristle,
     excitation=_SLIDING,
     reference="Dupont, Hayward, Armstrong, Altpeter, IEEE TAC 47 (2002)",
     rate=_elastoplastic_rate,
-    state_scales=(1.0,),
+    states=(_DEFLECTION,),
     fits_state=True,
     starts=_bristle_starts,
     bounds=within(presliding_m=_DEFLECTIONS),
@@ -261,7 +208,7 @@ LUGRE_FRICTION = Effect(
     reference="Canudas de Wit, Olsson, Åström, Lischinsky, IEEE TAC 40 (1995)",
     rate=_lugre_rate,
     scaled=(0, 4),
-    state_scales=(1.0,),
+    states=(_DEFLECTION,),
     fits_state=True,
     starts=_lugre_starts,
     bounds=within(stribeck_velocity_m_per_s=_FALLS, presliding_m=_DEFLECTIONS),

@@ -2,7 +2,7 @@
 
 import math
 
-from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start, Writable
+from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start, State, Writable
 from dart_model.effects.ranges import geometric, grid, moving, of_least_stroke, of_stroke, within
 
 _FAMILY = "hysteresis"
@@ -19,209 +19,106 @@ _FASTEST_SETTLING_PER_S = 2000.0
 _LARGEST_RATIO = 1e3
 
 
-def _bouc_wen(
-    _t_s: float,
-    _height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
-) -> float:
-    return -p[0] * state[0]
+def _yielding(force_ratio: float, yield_force_n: float) -> float:
+    return -yield_force_n * force_ratio
 
 
 def _bouc_wen_rate(
-    _t_s: float,
-    _height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
-    out: Writable,
-) -> None:
-    # The state is the force in units of `yield_force_n`.
-    speed = velocity_m_per_s / p[1]
-    limited = min(max(speed, -_FASTEST_SETTLING_PER_S), _FASTEST_SETTLING_PER_S)
-    ratio = min(abs(state[0]), 1.5) ** p[2]
-    same_way = 1.0 if velocity_m_per_s * state[0] > 0.0 else -1.0
-    out[0] = limited * (1.0 - ratio * (p[3] * same_way + 1.0 - p[3]))
-
-
-def _dahl(
-    _t_s: float,
-    _height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
+    force_ratio: float,
+    yield_displacement_m: float,
+    exponent: float,
+    shape: float,
 ) -> float:
-    return -p[0] * state[0]
+    speed = velocity_m_per_s / yield_displacement_m
+    limited = min(max(speed, -_FASTEST_SETTLING_PER_S), _FASTEST_SETTLING_PER_S)
+    ratio = min(abs(force_ratio), 1.5) ** exponent
+    same_way = 1.0 if velocity_m_per_s * force_ratio > 0.0 else -1.0
+    return limited * (1.0 - ratio * (shape * same_way + 1.0 - shape))
 
 
 def _dahl_rate(
-    _t_s: float,
-    _height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
-    out: Writable,
-) -> None:
-    speed = velocity_m_per_s / p[1]
-    limited = min(max(speed, -_FASTEST_SETTLING_PER_S), _FASTEST_SETTLING_PER_S)
-    rest = 1.0 - math.copysign(state[0], state[0] * velocity_m_per_s)
-    out[0] = limited * math.copysign(abs(rest) ** p[2], rest)
-
-
-def _iwan(
-    _t_s: float,
-    _height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
+    velocity_m_per_s: float, force_ratio: float, yield_displacement_m: float, exponent: float
 ) -> float:
+    speed = velocity_m_per_s / yield_displacement_m
+    limited = min(max(speed, -_FASTEST_SETTLING_PER_S), _FASTEST_SETTLING_PER_S)
+    rest = 1.0 - math.copysign(force_ratio, force_ratio * velocity_m_per_s)
+    return limited * math.copysign(abs(rest) ** exponent, rest)
+
+
+def _iwan(elements: Floats, yield_force_n: float) -> float:
+    # Each state is the share of the force that an element carries.
     total = 0.0
     for i in range(ELEMENTS):
         limit = 2.0 * (i + 1.0) / (ELEMENTS * (ELEMENTS + 1.0))
-        total += min(max(state[i], -limit), limit)
-    return -p[0] * total
+        total += min(max(elements[i], -limit), limit)
+    return -yield_force_n * total
 
 
 def _iwan_rate(
-    _t_s: float,
-    _height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
-    out: Writable,
+    velocity_m_per_s: float, elements: Floats, yield_displacement_m: float, rates: Writable
 ) -> None:
-    # Elements of equal stiffness slip one after another; each state is an element's share of the
-    # force, elastic up to its limit. Near there it settles instead of stopping: a force that jumped
-    # by where in a step it slips would have no derivative by the parameters.
-    speed = velocity_m_per_s / (p[1] * ELEMENTS)
+    # Elements of equal stiffness slip one after another, each elastic up to its limit. Near there
+    # it settles instead of stopping: a force that jumped by where in a step it slips would have no
+    # derivative by the parameters.
+    speed = velocity_m_per_s / (yield_displacement_m * ELEMENTS)
     for i in range(ELEMENTS):
         limit = 2.0 * (i + 1.0) / (ELEMENTS * (ELEMENTS + 1.0))
         room = math.inf
-        if velocity_m_per_s * state[i] > 0.0:
-            room = max(_FASTEST_SETTLING_PER_S * (limit - abs(state[i])), 0.0)
-        out[i] = math.copysign(min(abs(speed), room), speed)
+        if velocity_m_per_s * elements[i] > 0.0:
+            room = max(_FASTEST_SETTLING_PER_S * (limit - abs(elements[i])), 0.0)
+        rates[i] = math.copysign(min(abs(speed), room), speed)
 
 
-def _maxwell(
-    _t_s: float,
-    _height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
-) -> float:
-    # The state is the spring's deflection in m.
-    return -p[0] * state[0]
+def _spring(spring_deflection_m: float, stiffness_n_per_m: float) -> float:
+    return -stiffness_n_per_m * spring_deflection_m
 
 
 def _maxwell_rate(
-    _t_s: float,
-    _height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
-    out: Writable,
-) -> None:
-    out[0] = velocity_m_per_s - state[0] / p[1]
-
-
-def _general_bouc_wen(
-    _t_s: float,
-    _height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
+    velocity_m_per_s: float, spring_deflection_m: float, relaxation_time_s: float
 ) -> float:
-    # The state is the deflection of the spring that carries the force, in m.
-    return -p[0] * state[0]
+    return velocity_m_per_s - spring_deflection_m / relaxation_time_s
 
 
 def _general_bouc_wen_rate(
-    _t_s: float,
-    _height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
-    out: Writable,
-) -> None:
+    spring_deflection_m: float,
+    bend_m: float,
+    exponent: float,
+    angle_rad: float,
+) -> float:
     # beta = cos(angle) is not negative, so that a loop takes energy (Erlicher and Point). With
     # gamma = sin(angle) below -beta, the slope grows without bound: both ratio and rate are held.
-    speed = velocity_m_per_s / p[1]
+    speed = velocity_m_per_s / bend_m
     limited = min(max(speed, -_FASTEST_SETTLING_PER_S), _FASTEST_SETTLING_PER_S)
-    ratio = min(abs(state[0] / p[1]), _LARGEST_RATIO) ** p[2]
-    same_way = 1.0 if velocity_m_per_s * state[0] > 0.0 else -1.0
-    rate = limited * (1.0 - ratio * (math.cos(p[3]) * same_way + math.sin(p[3])))
-    out[0] = p[1] * min(max(rate, -_FASTEST_SETTLING_PER_S), _FASTEST_SETTLING_PER_S)
+    ratio = min(abs(spring_deflection_m / bend_m), _LARGEST_RATIO) ** exponent
+    same_way = 1.0 if velocity_m_per_s * spring_deflection_m > 0.0 else -1.0
+    rate = limited * (1.0 - ratio * (math.cos(angle_rad) * same_way + math.sin(angle_rad)))
+    return bend_m * min(max(rate, -_FASTEST_SETTLING_PER_S), _FASTEST_SETTLING_PER_S)
 
 
 def _behind_play(
-    _t_s: float,
-    _height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
+    deflection_m: float, coulomb_force_n: float, gap_m: float, travel_m: float
 ) -> float:
-    beyond = max(abs(state[0]) - 0.5 * p[1], 0.0) / p[2]
-    return -p[0] * math.copysign(min(beyond, 1.0), state[0])
+    beyond = max(abs(deflection_m) - 0.5 * gap_m, 0.0) / travel_m
+    return -coulomb_force_n * math.copysign(min(beyond, 1.0), deflection_m)
 
 
 def _behind_play_rate(
-    _t_s: float,
-    _height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
-    out: Writable,
-) -> None:
+    velocity_m_per_s: float, deflection_m: float, gap_m: float, travel_m: float, exponent: float
+) -> float:
     # The state is the deflection of play and elastic travel together, in m. It follows the strut
     # except while the slider is pushed further, when it is the slider that gives way.
-    beyond = max(abs(state[0]) - 0.5 * p[1], 0.0) / p[2]
-    if beyond <= 0.0 or velocity_m_per_s * state[0] <= 0.0:
-        out[0] = velocity_m_per_s
-    elif beyond > 1.0:
+    beyond = max(abs(deflection_m) - 0.5 * gap_m, 0.0) / travel_m
+    if beyond <= 0.0 or velocity_m_per_s * deflection_m <= 0.0:
+        return velocity_m_per_s
+    if beyond > 1.0:
         # A step that overshoots full force is led back to it.
         back = min((beyond - 1.0) * 300.0, _FASTEST_SETTLING_PER_S)
-        out[0] = -math.copysign(back * p[2], state[0])
-    else:
-        fastest = _FASTEST_SETTLING_PER_S * p[2]
-        limited = min(max(velocity_m_per_s, -fastest), fastest)
-        out[0] = limited * (1.0 - beyond ** p[3])
+        return -math.copysign(back * travel_m, deflection_m)
+    fastest = _FASTEST_SETTLING_PER_S * travel_m
+    limited = min(max(velocity_m_per_s, -fastest), fastest)
+    return limited * (1.0 - beyond**exponent)
 
 
 def _bends_m(motion: Motion) -> list[float]:
@@ -287,11 +184,11 @@ BOUC_WEN = Effect(
         Parameter("exponent", "", 0.8, 10.0, "sharpness of the bend"),
         Parameter("shape", "", 0.0, 1.0, "0.5: unloading is elastic"),
     ),
-    force=_bouc_wen,
+    force=_yielding,
     excitation=_LOOPS,
     reference="Ikhouane and Rodellar, Systems with Hysteresis (2007)",
     rate=_bouc_wen_rate,
-    state_scales=(1.0,),
+    states=(State("force_ratio", 1.0),),  # force over `yield_force_n`
     fits_state=True,
     starts=_bouc_wen_starts,
     bounds=within(yield_displacement_m=_bends),
@@ -304,11 +201,11 @@ DAHL = Effect(
     family=_FAMILY,
     words="hysteresis (Dahl)",
     parameters=(_LIMIT, _BEND, Parameter("exponent", "", 0.3, 4.0, "sharpness of the bend")),
-    force=_dahl,
+    force=_yielding,
     excitation=_LOOPS,
     reference="Dahl, Solid friction damping of mechanical vibrations, AIAA J. 14 (1976)",
     rate=_dahl_rate,
-    state_scales=(1.0,),
+    states=(State("force_ratio", 1.0),),  # force over `yield_force_n`
     fits_state=True,
     starts=_dahl_starts,
     bounds=within(yield_displacement_m=_bends),
@@ -332,11 +229,11 @@ GENERAL_BOUC_WEN = Effect(
             "ratio of the two shape terms as an angle; below -pi/4 the loop hardens",
         ),
     ),
-    force=_general_bouc_wen,
+    force=_spring,
     excitation=_LOOPS,
     reference="Wen, J. Eng. Mech. 102 (1976); Erlicher and Point, C. R. Mecanique 332 (2004)",
     rate=_general_bouc_wen_rate,
-    state_scales=(1e-3,),
+    states=(State("spring_deflection_m", 1e-3),),
     fits_state=True,
     starts=_general_bouc_wen_starts,
     bounds=within(bend_m=_bends),
@@ -358,7 +255,7 @@ FRICTION_BEHIND_PLAY = Effect(
     excitation=_LOOPS,
     reference="Baber and Noori, J. Eng. Mech. 111 (1985), pinching; Nordin and Gutman (2002)",
     rate=_behind_play_rate,
-    state_scales=(1e-3,),
+    states=(State("deflection_m", 1e-3),),
     fits_state=True,
     starts=_behind_play_starts,
     bounds=within(gap_m=of_least_stroke(1e-3, 0.8), travel_m=of_stroke(1e-3, 1.0)),
@@ -375,7 +272,7 @@ IWAN = Effect(
     excitation=_LOOPS,
     reference="Iwan, A distributed-element model for hysteresis, J. Appl. Mech. 33 (1966)",
     rate=_iwan_rate,
-    state_scales=(1.0,) * ELEMENTS,
+    states=tuple(State(f"element_{i + 1}", 1.0, group="elements") for i in range(ELEMENTS)),
     starts=_iwan_starts,
     bounds=within(yield_displacement_m=_bends),
     simpler=("elastoplastic_friction", "linear_stiffness"),
@@ -390,11 +287,11 @@ MAXWELL = Effect(
         Parameter("stiffness_n_per_m", "N/m", 0.0, 1e12, "spring in series with a damper"),
         Parameter("relaxation_time_s", "s", 1e-6, 1e9, "damping over stiffness"),
     ),
-    force=_maxwell,
+    force=_spring,
     excitation="frequencies above and below the inverse of the relaxation time",
     reference="Flügge, Viscoelasticity (1975), 1.2",
     rate=_maxwell_rate,
-    state_scales=(0.01,),
+    states=(State("spring_deflection_m", 0.01),),
     fits_state=True,
     starts=_maxwell_starts,
     bounds=within(relaxation_time_s=_relaxation_times),

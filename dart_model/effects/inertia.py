@@ -1,34 +1,16 @@
 """Inertia the model lacks: a mass with its weight, or an inerter, which has none."""
 
-from dart_model.effects.law import Effect, Floats, Parameter
+from dart_model.effects.law import Effect, Parameter
 
 
-def _mass(
-    _t_s: float,
-    _height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    _p: Floats,
-    _strut: Floats,
-) -> float:
+def _none_beyond_dart() -> float:
     # DART carries mass and weight.
     return 0.0
 
 
-def _inerter(
-    _t_s: float,
-    _height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    strut: Floats,
-) -> float:
+def _weight_returned(gravity_m_per_s2: float, inertance_kg: float) -> float:
     # DART carries the mass with its weight, which an inerter does not have.
-    return p[0] * strut[3]
+    return inertance_kg * gravity_m_per_s2
 
 
 ADDED_MASS = Effect(
@@ -36,7 +18,7 @@ ADDED_MASS = Effect(
     family="inertia",
     words="inertia (a mass that moves with the upper body)",
     parameters=(Parameter("mass_kg", "kg", -1e9, 1e9, "mass that moves with the upper body"),),
-    force=_mass,
+    force=_none_beyond_dart,
     excitation="frequencies above and below the resonance, so that mass and stiffness differ",
     reference="Featherstone, Rigid Body Dynamics Algorithms (2008), 2.13",
     adds_mass=True,
@@ -52,7 +34,7 @@ INERTER = Effect(
     parameters=(
         Parameter("inertance_kg", "kg", -1e9, 1e9, "force per acceleration, without weight"),
     ),
-    force=_inerter,
+    force=_weight_returned,
     excitation="frequencies above and below the resonance, so that mass and stiffness differ",
     reference="Smith, Synthesis of mechanical networks: the inerter, IEEE TAC 47 (2002)",
     adds_mass=True,

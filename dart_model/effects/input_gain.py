@@ -1,19 +1,10 @@
 """Input gain: the force that acts is not the force that was recorded."""
 
-from dart_model.effects.law import Effect, Floats, Parameter
+from dart_model.effects.law import Effect, Parameter
 
 
-def _force(
-    _t_s: float,
-    _height_m: float,
-    _velocity_m_per_s: float,
-    applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
-) -> float:
-    return p[0] * applied_force_n
+def _amplified(applied_force_n: float, gain: float) -> float:
+    return gain * applied_force_n
 
 
 INPUT_GAIN = Effect(
@@ -21,7 +12,7 @@ INPUT_GAIN = Effect(
     family="input_gain",
     words="the right gain of the applied force",
     parameters=(Parameter("gain", "", -0.99, 10.0, "share of the applied force that is missing"),),
-    force=_force,
+    force=_amplified,
     excitation="an applied force of several frequencies or levels",
     reference="Ljung, System Identification (1999), 14.1",
     linear=True,

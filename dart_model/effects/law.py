@@ -13,37 +13,15 @@ from typing import Literal, NamedTuple, TypeVar
 _Value = TypeVar("_Value")
 Floats = Sequence[float]
 Writable = MutableSequence[float]
+Rates = tuple[float, ...]
 
-Force = Callable[
-    [
-        float,  # t_s
-        float,  # height_m
-        float,  # velocity_m_per_s
-        float,  # applied_force_n
-        float,  # temperature_c
-        Sequence[float],  # internal state
-        Sequence[float],  # parameters, in the order of Effect.parameters
-        Sequence[float],  # strut: free length (m), stiffness (N/m), damping (N·s/m), gravity (m/s²)
-    ],
-    float,
-]
-"""Force in N, positive when it pushes the strut's bodies apart."""
+Force = Callable[..., float]
+"""Force in N, positive when it pushes the strut's bodies apart, over named arguments: see
+`dart_model.effects.calling` for the names."""
 
-Rate = Callable[
-    [
-        float,
-        float,
-        float,
-        float,
-        float,
-        Sequence[float],
-        Sequence[float],
-        Sequence[float],
-        MutableSequence[float],  # time derivative of the state, written
-    ],
-    None,
-]
-"""Same arguments as `Force`, then the derivative of the internal state, written in place."""
+Rate = Callable[..., float | Rates | None]
+"""Time derivative of the internal state, or of all of them in their order, over the same arguments;
+a law whose states are a group writes them into its argument `rates`."""
 
 Bench = Literal["force_given", "motion_given"]
 """Force given, residual in the height (free run); or motion given, residual in the force (dyno)."""
@@ -122,6 +100,8 @@ class Parameter:
         low: Smallest value that makes physical sense; a model file below it is refused.
         high: Largest value that makes physical sense; a model file above it is refused.
         meaning: One line for the report.
+        group: Argument by which the law takes this parameter together with its neighbours of the
+            same group, as a row; empty if it is an argument of its own.
     """
 
     name: str
@@ -129,25 +109,42 @@ class Parameter:
     low: float
     high: float
     meaning: str
+    group: str = ""
+
+
+class State(NamedTuple):
+    """One internal state of an effect; all start at zero in a live run.
+
+    Attributes:
+        name: Argument of the law, with its unit.
+        scale: Its usual size.
+        group: Argument by which the law takes this state together with its neighbours of the same
+            group, as a row; empty if it is an argument of its own.
+    """
+
+    name: str
+    scale: float
+    group: str = ""
 
 
 @dataclass(frozen=True)
 class Effect:
     """An effect that a model can be given and that a diagnosis can find.
 
-    A law is written once, in plain scalar arithmetic (`math`, no numpy), so that the plant can call
-    it tick by tick and the diagnosis can compile the very same function over a whole recording.
+    A law is written once, as a formula over named arguments in plain scalar arithmetic (`math`, no
+    numpy), so that the plant can call it tick by tick, the diagnosis can compile it for a whole
+    recording, and an FMU can hold it as C.
 
     Attributes:
         name: Key in the model file.
         family: Family as in the diagnosis, e.g. ``friction``.
         words: The effect as a phrase with its article, the law in brackets.
-        parameters: Parameters in the order in which the law reads them.
+        parameters: Parameters in the order in which arrays of values hold them.
         force: The law.
         excitation: What a recording must contain for the effect to be seen.
         reference: Literature.
         rate: Derivative of the internal state, or None for a law without one.
-        state_scales: Usual size of each internal state, which all start at zero in a live run.
+        states: Internal states in the order of `rate`.
         fits_state: Whether the state at the beginning of a recording is fitted: states that fade
             or are overwritten by the motion are, those that add up from the beginning are not.
         adds_mass: The first parameter is a mass in kg which is added to the strut's second body
@@ -172,7 +169,7 @@ class Effect:
     excitation: str
     reference: str
     rate: Rate | None = None
-    state_scales: tuple[float, ...] = ()
+    states: tuple[State, ...] = ()
     fits_state: bool = False
     adds_mass: bool = False
     linear: bool = False
@@ -187,7 +184,12 @@ class Effect:
     @property
     def state_size(self) -> int:
         """Number of internal states."""
-        return len(self.state_scales)
+        return len(self.states)
+
+    @property
+    def state_scales(self) -> tuple[float, ...]:
+        """Usual size of each internal state."""
+        return tuple(state.scale for state in self.states)
 
     def named(self, values: Iterable[_Value]) -> dict[str, _Value]:
         """What belongs to each parameter, in their order, by the parameter's name."""

@@ -1,18 +1,9 @@
 """No effect: the trivial partner of all others."""
 
-from dart_model.effects.law import Effect, Floats
+from dart_model.effects.law import Effect
 
 
-def _force(
-    _t_s: float,
-    _height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    _p: Floats,
-    _strut: Floats,
-) -> float:
+def _nothing() -> float:
     return 0.0
 
 
@@ -21,7 +12,7 @@ NONE = Effect(
     family="none",
     words="nothing",
     parameters=(),
-    force=_force,
+    force=_nothing,
     excitation="none",
     reference="-",
     scaled=(),

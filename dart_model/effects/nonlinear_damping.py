@@ -2,7 +2,7 @@
 
 import math
 
-from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start
+from dart_model.effects.law import Effect, Motion, Parameter, Start
 from dart_model.effects.ranges import (
     Starts,
     always,
@@ -23,182 +23,108 @@ _DAMPING = Parameter("damping_n_s_per_m", "N·s/m", -1e12, 1e12, "damping")
 _KNEE = Parameter("knee_velocity_m_per_s", "m/s", 1e-12, 1e6, "velocity of the knee")
 
 
-def _quadratic(
-    _t_s: float,
-    _height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
-) -> float:
-    return -p[0] * abs(velocity_m_per_s) * velocity_m_per_s
+def _quadratic(velocity_m_per_s: float, damping_n_s2_per_m2: float) -> float:
+    return -damping_n_s2_per_m2 * abs(velocity_m_per_s) * velocity_m_per_s
 
 
-def _power(
-    _t_s: float,
-    _height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
-) -> float:
-    return -p[0] * math.copysign(abs(velocity_m_per_s) ** p[1], velocity_m_per_s)
+def _power(velocity_m_per_s: float, force_at_1_m_per_s_n: float, exponent: float) -> float:
+    return -force_at_1_m_per_s_n * math.copysign(
+        abs(velocity_m_per_s) ** exponent, velocity_m_per_s
+    )
 
 
 def _asymmetric(
-    _t_s: float,
-    _height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    velocity_m_per_s: float, compression_n_s_per_m: float, rebound_n_s_per_m: float
 ) -> float:
-    return -(p[1] if velocity_m_per_s > 0.0 else p[0]) * velocity_m_per_s
+    return (
+        -(rebound_n_s_per_m if velocity_m_per_s > 0.0 else compression_n_s_per_m) * velocity_m_per_s
+    )
 
 
 def _directional(
-    _t_s: float,
-    _height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    compression_at_1_m_per_s_n: float,
+    compression_exponent: float,
+    rebound_at_1_m_per_s_n: float,
+    rebound_exponent: float,
 ) -> float:
     if velocity_m_per_s > 0.0:
-        return -p[2] * velocity_m_per_s ** p[3]
-    return p[0] * (-velocity_m_per_s) ** p[1]
+        return -rebound_at_1_m_per_s_n * velocity_m_per_s**rebound_exponent
+    return compression_at_1_m_per_s_n * (-velocity_m_per_s) ** compression_exponent
 
 
 def _digressive(
-    _t_s: float,
-    _height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    velocity_m_per_s: float, damping_n_s_per_m: float, knee_velocity_m_per_s: float
 ) -> float:
-    ratio = velocity_m_per_s / p[1]
-    return -p[0] * velocity_m_per_s / math.sqrt(1.0 + ratio * ratio)
+    ratio = velocity_m_per_s / knee_velocity_m_per_s
+    return -damping_n_s_per_m * velocity_m_per_s / math.sqrt(1.0 + ratio * ratio)
 
 
 def _saturating(
-    _t_s: float,
-    _height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    damping_n_s_per_m: float,
+    knee_velocity_m_per_s: float,
+    sharpness: float,
 ) -> float:
-    ratio = abs(velocity_m_per_s / p[1])
+    ratio = abs(velocity_m_per_s / knee_velocity_m_per_s)
     if ratio < 1e-9:
-        return -p[0] * velocity_m_per_s
-    return -p[0] * velocity_m_per_s * (1.0 + ratio ** p[2]) ** (-1.0 / p[2])
+        return -damping_n_s_per_m * velocity_m_per_s
+    return -damping_n_s_per_m * velocity_m_per_s * (1.0 + ratio**sharpness) ** (-1.0 / sharpness)
 
 
 def _arctan(
-    _t_s: float,
-    _height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    velocity_m_per_s: float, damping_n_s_per_m: float, knee_velocity_m_per_s: float
 ) -> float:
-    return -p[0] * p[1] * math.atan(velocity_m_per_s / p[1])
+    return (
+        -damping_n_s_per_m
+        * knee_velocity_m_per_s
+        * math.atan(velocity_m_per_s / knee_velocity_m_per_s)
+    )
 
 
 def _blow_off(
-    _t_s: float,
-    _height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    velocity_m_per_s: float, lost_damping_n_s_per_m: float, knee_velocity_m_per_s: float
 ) -> float:
-    return p[0] * math.copysign(max(abs(velocity_m_per_s) - p[1], 0.0), velocity_m_per_s)
+    return lost_damping_n_s_per_m * math.copysign(
+        max(abs(velocity_m_per_s) - knee_velocity_m_per_s, 0.0), velocity_m_per_s
+    )
 
 
 def _smooth_blow_off(
-    _t_s: float,
-    _height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    velocity_m_per_s: float, lost_damping_n_s_per_m: float, knee_velocity_m_per_s: float
 ) -> float:
-    ratio = velocity_m_per_s / p[1]
-    return p[0] * velocity_m_per_s * (1.0 - 1.0 / math.sqrt(1.0 + ratio * ratio))
+    ratio = velocity_m_per_s / knee_velocity_m_per_s
+    return lost_damping_n_s_per_m * velocity_m_per_s * (1.0 - 1.0 / math.sqrt(1.0 + ratio * ratio))
 
 
 def _over_stroke(
-    _t_s: float,
-    height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    strut: Floats,
+    height_m: float, velocity_m_per_s: float, free_length_m: float, damping_n_s_per_m2: float
 ) -> float:
-    return -p[0] * (height_m - strut[0]) * velocity_m_per_s
+    return -damping_n_s_per_m2 * (height_m - free_length_m) * velocity_m_per_s
 
 
 def _over_squared_stroke(
-    _t_s: float,
-    height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    strut: Floats,
+    height_m: float, velocity_m_per_s: float, free_length_m: float, damping_n_s_per_m3: float
 ) -> float:
-    x = height_m - strut[0]
-    return -p[0] * x * x * velocity_m_per_s
+    x = height_m - free_length_m
+    return -damping_n_s_per_m3 * x * x * velocity_m_per_s
 
 
 def _zone(
-    _t_s: float,
     height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    damping_n_s_per_m: float,
+    centre_height_m: float,
+    width_m: float,
 ) -> float:
-    ratio = (height_m - p[1]) / p[2]
-    return -p[0] * math.exp(-ratio * ratio) * velocity_m_per_s
+    ratio = (height_m - centre_height_m) / width_m
+    return -damping_n_s_per_m * math.exp(-ratio * ratio) * velocity_m_per_s
 
 
 def _end_zone(
-    _t_s: float,
-    height_m: float,
-    velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    height_m: float, velocity_m_per_s: float, damping_n_s_per_m2: float, zone_height_m: float
 ) -> float:
-    return -p[0] * max(p[1] - height_m, 0.0) * velocity_m_per_s
+    return -damping_n_s_per_m2 * max(zone_height_m - height_m, 0.0) * velocity_m_per_s
 
 
 def _knees(*shares: float) -> Starts:

@@ -2,7 +2,7 @@
 
 import math
 
-from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start
+from dart_model.effects.law import Effect, Motion, Parameter, Start
 from dart_model.effects.ranges import always, grid, height, moving, of_stroke, within
 
 _FAMILY = "nonlinear_stiffness"
@@ -10,117 +10,59 @@ _WIDE = "deflections from the free length that differ by a factor of three or mo
 _LARGEST_EXPONENT = 40.0
 
 
-def _quadratic(
-    _t_s: float,
-    height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    strut: Floats,
-) -> float:
-    x = height_m - strut[0]
-    return -p[0] * x * x
+def _quadratic(height_m: float, free_length_m: float, stiffness_n_per_m2: float) -> float:
+    x = height_m - free_length_m
+    return -stiffness_n_per_m2 * x * x
 
 
-def _cubic(
-    _t_s: float,
-    height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    strut: Floats,
-) -> float:
-    x = height_m - strut[0]
-    return -p[0] * x * x * x
+def _cubic(height_m: float, free_length_m: float, stiffness_n_per_m3: float) -> float:
+    x = height_m - free_length_m
+    return -stiffness_n_per_m3 * x * x * x
 
 
-def _centred_cubic(
-    _t_s: float,
-    height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
-) -> float:
-    x = height_m - p[1]
-    return -p[0] * x * x * x
+def _centred_cubic(height_m: float, stiffness_n_per_m3: float, centre_height_m: float) -> float:
+    x = height_m - centre_height_m
+    return -stiffness_n_per_m3 * x * x * x
 
 
 def _power(
-    _t_s: float,
-    height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    strut: Floats,
+    height_m: float, free_length_m: float, force_at_100_mm_n: float, exponent: float
 ) -> float:
-    x = height_m - strut[0]
-    return -p[0] * math.copysign((abs(x) / 0.1) ** p[1], x)
+    x = height_m - free_length_m
+    return -force_at_100_mm_n * math.copysign((abs(x) / 0.1) ** exponent, x)
 
 
-def _progressive(
-    _t_s: float,
-    height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    strut: Floats,
-) -> float:
-    ratio = (height_m - strut[0]) / p[1]
+def _progressive(height_m: float, free_length_m: float, force_n: float, length_m: float) -> float:
+    ratio = (height_m - free_length_m) / length_m
     ratio = min(max(ratio, -_LARGEST_EXPONENT), _LARGEST_EXPONENT)
-    return -p[0] * (math.sinh(ratio) - ratio)
+    return -force_n * (math.sinh(ratio) - ratio)
 
 
-def _exponential(
-    _t_s: float,
-    height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    strut: Floats,
-) -> float:
-    ratio = -(height_m - strut[0]) / p[1]
-    return p[0] * (math.exp(min(ratio, _LARGEST_EXPONENT)) - 1.0)
+def _exponential(height_m: float, free_length_m: float, force_n: float, length_m: float) -> float:
+    ratio = -(height_m - free_length_m) / length_m
+    return force_n * (math.exp(min(ratio, _LARGEST_EXPONENT)) - 1.0)
 
 
 def _gas(
-    _t_s: float,
     height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    strut: Floats,
+    free_length_m: float,
+    charge_force_n: float,
+    gas_length_m: float,
+    polytropic_exponent: float,
 ) -> float:
-    length = max(p[1] + height_m - strut[0], 0.01 * p[1])
-    return p[0] * (p[1] / length) ** p[2]
+    length = max(gas_length_m + height_m - free_length_m, 0.01 * gas_length_m)
+    return charge_force_n * (gas_length_m / length) ** polytropic_exponent
 
 
 def _balanced_gas(
-    _t_s: float,
     height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    strut: Floats,
+    free_length_m: float,
+    charge_force_n: float,
+    gas_length_m: float,
+    polytropic_exponent: float,
 ) -> float:
-    length = max(p[1] + height_m - strut[0], 0.01 * p[1])
-    return p[0] * ((p[1] / length) ** p[2] - 1.0)
+    length = max(gas_length_m + height_m - free_length_m, 0.01 * gas_length_m)
+    return charge_force_n * ((gas_length_m / length) ** polytropic_exponent - 1.0)
 
 
 @moving

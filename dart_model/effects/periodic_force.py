@@ -2,7 +2,7 @@
 
 import math
 
-from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start
+from dart_model.effects.law import Effect, Motion, Parameter, Start
 from dart_model.effects.ranges import within
 
 _LEAST_PERIODS = 5.0
@@ -10,17 +10,8 @@ _LEAST_PERIODS = 5.0
 of a damper errs by, as the size of the motion changes."""
 
 
-def _force(
-    t_s: float,
-    _height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
-) -> float:
-    return p[0] * math.sin(2.0 * math.pi * p[1] * t_s + p[2])
+def _sine(t_s: float, amplitude_n: float, frequency_hz: float, phase_rad: float) -> float:
+    return amplitude_n * math.sin(2.0 * math.pi * frequency_hz * t_s + phase_rad)
 
 
 def _starts(motion: Motion) -> list[Start]:
@@ -36,7 +27,7 @@ PERIODIC_FORCE = Effect(
         Parameter("frequency_hz", "Hz", 1e-9, 1e9, "frequency"),
         Parameter("phase_rad", "rad", -100.0, 100.0, "phase of the sine at time zero"),
     ),
-    force=_force,
+    force=_sine,
     excitation="many of its periods, at another frequency than the applied force",
     reference="Rao, Mechanical Vibrations (2017), 3.7, rotating unbalance",
     starts=_starts,

@@ -12,27 +12,29 @@ FIRST_FORCE = 4
 """Parameters before the table: lowest and highest height, lowest and highest velocity."""
 
 
-def _force(
-    _t_s: float,
+def _surface(
     height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    lowest_height_m: float,
+    highest_height_m: float,
+    lowest_velocity_m_per_s: float,
+    highest_velocity_m_per_s: float,
+    forces_n: Floats,
 ) -> float:
-    row = (height_m - p[0]) / (p[1] - p[0]) * (HEIGHTS - 1)
-    column = (velocity_m_per_s - p[2]) / (p[3] - p[2]) * (VELOCITIES - 1)
+    row = (height_m - lowest_height_m) / (highest_height_m - lowest_height_m) * (HEIGHTS - 1)
+    column = (velocity_m_per_s - lowest_velocity_m_per_s) / (
+        highest_velocity_m_per_s - lowest_velocity_m_per_s
+    )
+    column = column * (VELOCITIES - 1)
     row = min(max(row, 0.0), HEIGHTS - 1.000001)
     column = min(max(column, 0.0), VELOCITIES - 1.000001)
     i = int(row)
     j = int(column)
     x = row - i
     y = column - j
-    at = FIRST_FORCE + i * VELOCITIES + j
-    low = p[at] * (1.0 - y) + p[at + 1] * y
-    high = p[at + VELOCITIES] * (1.0 - y) + p[at + VELOCITIES + 1] * y
+    at = i * VELOCITIES + j
+    low = forces_n[at] * (1.0 - y) + forces_n[at + 1] * y
+    high = forces_n[at + VELOCITIES] * (1.0 - y) + forces_n[at + VELOCITIES + 1] * y
     return low * (1.0 - x) + high * x
 
 
@@ -46,12 +48,19 @@ RESTORING_SURFACE = Effect(
         Parameter("lowest_velocity_m_per_s", "m/s", -1e6, 1e6, "velocity of the first column"),
         Parameter("highest_velocity_m_per_s", "m/s", -1e6, 1e6, "velocity of the last column"),
         *(
-            Parameter(f"force_{i}_{j}_n", "N", -1e12, 1e12, f"force in row {i}, column {j}")
+            Parameter(
+                f"force_{i}_{j}_n",
+                "N",
+                -1e12,
+                1e12,
+                f"force in row {i}, column {j}",
+                group="forces_n",
+            )
             for i in range(HEIGHTS)
             for j in range(VELOCITIES)
         ),
     ),
-    force=_force,
+    force=_surface,
     excitation="all combinations of height and velocity that matter",
     reference="Masri and Caughey, J. Appl. Mech. 46 (1979), restoring force surface",
     scaled=tuple(range(FIRST_FORCE, FIRST_FORCE + HEIGHTS * VELOCITIES)),

@@ -1,6 +1,6 @@
 """End stops, which push but never pull."""
 
-from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start
+from dart_model.effects.law import Effect, Motion, Parameter, Start
 from dart_model.effects.ranges import (
     Starts,
     crossing_time_s,
@@ -21,138 +21,144 @@ _KELVIN_VOIGT = "Goldsmith, Impact (1960), 4; Kelvin-Voigt contact"
 
 
 def _bump(
-    _t_s: float,
     height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    contact_height_m: float,
+    stiffness_n_per_m: float,
+    damping_n_s_per_m: float,
 ) -> float:
-    depth = p[0] - height_m
+    depth = contact_height_m - height_m
     if depth <= 0.0:
         return 0.0
-    return max(p[1] * depth - p[2] * velocity_m_per_s, 0.0)
+    return max(stiffness_n_per_m * depth - damping_n_s_per_m * velocity_m_per_s, 0.0)
 
 
 def _rebound(
-    _t_s: float,
     height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    contact_height_m: float,
+    stiffness_n_per_m: float,
+    damping_n_s_per_m: float,
 ) -> float:
-    depth = height_m - p[0]
+    depth = height_m - contact_height_m
     if depth <= 0.0:
         return 0.0
-    return -max(p[1] * depth + p[2] * velocity_m_per_s, 0.0)
+    return -max(stiffness_n_per_m * depth + damping_n_s_per_m * velocity_m_per_s, 0.0)
 
 
 def _hertz_bump(
-    _t_s: float,
     height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    contact_height_m: float,
+    contact_stiffness_n_per_m1_5: float,
+    dissipation_s_per_m: float,
 ) -> float:
-    depth = p[0] - height_m
+    depth = contact_height_m - height_m
     if depth <= 0.0:
         return 0.0
-    return max(p[1] * depth**1.5 * (1.0 - p[2] * velocity_m_per_s), 0.0)
+    return max(
+        contact_stiffness_n_per_m1_5 * depth**1.5 * (1.0 - dissipation_s_per_m * velocity_m_per_s),
+        0.0,
+    )
 
 
 def _hertz_rebound(
-    _t_s: float,
     height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    contact_height_m: float,
+    contact_stiffness_n_per_m1_5: float,
+    dissipation_s_per_m: float,
 ) -> float:
-    depth = height_m - p[0]
+    depth = height_m - contact_height_m
     if depth <= 0.0:
         return 0.0
-    return -max(p[1] * depth**1.5 * (1.0 + p[2] * velocity_m_per_s), 0.0)
+    return -max(
+        contact_stiffness_n_per_m1_5 * depth**1.5 * (1.0 + dissipation_s_per_m * velocity_m_per_s),
+        0.0,
+    )
 
 
 def _power_bump(
-    _t_s: float,
     height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    contact_height_m: float,
+    force_at_10_mm_n: float,
+    exponent: float,
+    dissipation_s_per_m: float,
 ) -> float:
-    depth = p[0] - height_m
+    depth = contact_height_m - height_m
     if depth <= 0.0:
         return 0.0
-    return max(p[1] * (depth / 0.01) ** p[2] * (1.0 - p[3] * velocity_m_per_s), 0.0)
+    return max(
+        force_at_10_mm_n
+        * (depth / 0.01) ** exponent
+        * (1.0 - dissipation_s_per_m * velocity_m_per_s),
+        0.0,
+    )
 
 
 def _power_rebound(
-    _t_s: float,
     height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    contact_height_m: float,
+    force_at_10_mm_n: float,
+    exponent: float,
+    dissipation_s_per_m: float,
 ) -> float:
-    depth = height_m - p[0]
+    depth = height_m - contact_height_m
     if depth <= 0.0:
         return 0.0
-    return -max(p[1] * (depth / 0.01) ** p[2] * (1.0 + p[3] * velocity_m_per_s), 0.0)
+    return -max(
+        force_at_10_mm_n
+        * (depth / 0.01) ** exponent
+        * (1.0 + dissipation_s_per_m * velocity_m_per_s),
+        0.0,
+    )
 
 
 def _ends(
-    _t_s: float,
     height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    low_contact_height_m: float,
+    high_contact_height_m: float,
+    stiffness_n_per_m: float,
+    damping_n_s_per_m: float,
 ) -> float:
-    low = p[0] - height_m
-    high = height_m - p[1]
+    low = low_contact_height_m - height_m
+    high = height_m - high_contact_height_m
     force = 0.0
     if low > 0.0:
-        force += max(p[2] * low - p[3] * velocity_m_per_s, 0.0)
+        force += max(stiffness_n_per_m * low - damping_n_s_per_m * velocity_m_per_s, 0.0)
     if high > 0.0:
-        force -= max(p[2] * high + p[3] * velocity_m_per_s, 0.0)
+        force -= max(stiffness_n_per_m * high + damping_n_s_per_m * velocity_m_per_s, 0.0)
     return force
 
 
 def _hertz_ends(
-    _t_s: float,
     height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    p: Floats,
-    _strut: Floats,
+    low_contact_height_m: float,
+    high_contact_height_m: float,
+    contact_stiffness_n_per_m1_5: float,
+    dissipation_s_per_m: float,
 ) -> float:
-    low = p[0] - height_m
-    high = height_m - p[1]
+    low = low_contact_height_m - height_m
+    high = height_m - high_contact_height_m
     force = 0.0
     if low > 0.0:
-        force += max(p[2] * low**1.5 * (1.0 - p[3] * velocity_m_per_s), 0.0)
+        force += max(
+            contact_stiffness_n_per_m1_5
+            * low**1.5
+            * (1.0 - dissipation_s_per_m * velocity_m_per_s),
+            0.0,
+        )
     if high > 0.0:
-        force -= max(p[2] * high**1.5 * (1.0 + p[3] * velocity_m_per_s), 0.0)
+        force -= max(
+            contact_stiffness_n_per_m1_5
+            * high**1.5
+            * (1.0 + dissipation_s_per_m * velocity_m_per_s),
+            0.0,
+        )
     return force
 
 

@@ -2,41 +2,37 @@
 
 import math
 
-from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start, Writable
+from dart_model.effects.law import Effect, Motion, Parameter, Rates, Start, State
 from dart_model.effects.ranges import geometric, grid, moving, within
 
 
 def _hidden_mass(
-    _t_s: float,
-    _height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    strut: Floats,
+    deflection_m: float,
+    mass_velocity_m_per_s: float,
+    gravity_m_per_s2: float,
+    mass_kg: float,
+    frequency_hz: float,
+    damping_ratio: float,
 ) -> float:
     # The deflection is counted from rest, where the spring carries the mass: its weight acts on
-    # the body. The state is that deflection in m and the hidden mass's own velocity in m/s.
-    omega = 2.0 * math.pi * p[1]
-    spring_and_damper = omega * (omega * state[0] + 2.0 * p[2] * (state[1] - velocity_m_per_s))
-    return p[0] * (spring_and_damper - strut[3])
+    # the body.
+    omega = 2.0 * math.pi * frequency_hz
+    stretching = mass_velocity_m_per_s - velocity_m_per_s
+    spring_and_damper = omega * (omega * deflection_m + 2.0 * damping_ratio * stretching)
+    return mass_kg * (spring_and_damper - gravity_m_per_s2)
 
 
 def _hidden_mass_rate(
-    _t_s: float,
-    _height_m: float,
     velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    state: Floats,
-    p: Floats,
-    _strut: Floats,
-    out: Writable,
-) -> None:
-    omega = 2.0 * math.pi * p[1]
-    out[0] = state[1] - velocity_m_per_s
-    out[1] = -omega * (omega * state[0] + 2.0 * p[2] * (state[1] - velocity_m_per_s))
+    deflection_m: float,
+    mass_velocity_m_per_s: float,
+    frequency_hz: float,
+    damping_ratio: float,
+) -> Rates:
+    omega = 2.0 * math.pi * frequency_hz
+    stretching = mass_velocity_m_per_s - velocity_m_per_s
+    return stretching, -omega * (omega * deflection_m + 2.0 * damping_ratio * stretching)
 
 
 @moving
@@ -78,7 +74,7 @@ HIDDEN_MASS = Effect(
     excitation="frequencies around the mass's own resonance",
     reference="Den Hartog, Mechanical Vibrations (1956), 3.2, dynamic absorber",
     rate=_hidden_mass_rate,
-    state_scales=(0.01, 0.01),
+    states=(State("deflection_m", 0.01), State("mass_velocity_m_per_s", 0.01)),
     fits_state=True,
     starts=_hidden_mass_starts,
     bounds=within(mass_kg=_masses, frequency_hz=_frequencies, damping_ratio=_damping_ratios),

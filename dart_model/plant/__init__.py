@@ -110,7 +110,7 @@ class DartPlant:
     @property
     def mockups(self) -> tuple[MockUp | None, ...]:
         """FMU of each strut, if it has one."""
-        return tuple(next(iter(strut.mockups), None) for strut in self._struts)
+        return tuple(strut.mockup for strut in self._struts)
 
     def init(
         self,

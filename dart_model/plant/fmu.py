@@ -63,11 +63,11 @@ class MockUp:
         self._result: tuple[float, list[float]] = (math.nan, [])
 
     def force(self, *arguments: Any) -> float:
-        """Force in N; arguments as of `dart_model.effects.Force`."""
+        """Force in N; arguments as of `dart_model.effects.calling.ForceOverArrays`."""
         return self._evaluate(*arguments[:6])[0]
 
     def rate(self, *arguments: Any) -> None:
-        """Derivative of the internal states; arguments as of `dart_model.effects.Rate`."""
+        """Derivative of the internal states; arguments as of `RatesOverArrays`."""
         arguments[8][:] = self._evaluate(*arguments[:6])[1]
 
     def _evaluate(

@@ -6,7 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dart_model.effects import AMBIENT_C, Effect, effect
+from dart_model.effects import AMBIENT_C, effect
+from dart_model.effects.calling import (
+    ForceOverArrays,
+    RatesOverArrays,
+    force_over_arrays,
+    rates_over_arrays,
+)
 from dart_model.errors import ModelError
 from dart_model.plant.fmu import MockUp
 from dart_model.spec import ModelSpec, StrutSpec
@@ -15,18 +21,22 @@ _SAMPLED_M, _SAMPLED_M_PER_S = 0.5, 3.0
 """How far from the free length, and how fast, effects are sampled for their steepest slope."""
 
 
-class _Law(NamedTuple):
-    """An effect of a strut, or what an FMU gives beside them.
+class _Part(NamedTuple):
+    """A part of a strut's force: of an effect, or of an FMU.
 
     Attributes:
-        effect: The effect.
+        name: What it is called in messages.
+        force: Its force, N.
+        rates: Rates of its internal states.
         parameters: Its parameters in their order.
         first: Index of its first internal state in the model's.
         end: Index after its last one.
     """
 
-    effect: Effect | MockUp
-    parameters: list[float]
+    name: str
+    force: ForceOverArrays
+    rates: RatesOverArrays
+    parameters: Sequence[float]
     first: int
     end: int
 
@@ -54,21 +64,24 @@ class Strut:
             spec.damping_n_s_per_m,
             gravity_m_per_s2,
         )
-        laws: list[_Law] = []
+        parts: list[_Part] = []
         first = first_state
         for item in spec.effects:
-            end = first + effect(item.name).state_size
-            laws.append(_Law(effect(item.name), item.values(), first, end))
+            law = effect(item.name)
+            end = first + law.state_size
+            force, rates = force_over_arrays(law), rates_over_arrays(law)
+            parts.append(_Part(law.name, force, rates, item.values(), first, end))
             first = end
+        self.mockup: MockUp | None = None
+        """FMU that gives a part of its force; its states are the strut's last."""
         if spec.fmu is not None:
-            unit = MockUp(spec.fmu, folder, gravity_m_per_s2)
-            laws.append(_Law(unit, [], first, first + len(unit.state_scales)))
-            first = laws[-1].end
-        self._laws = tuple(laws)
+            unit = self.mockup = MockUp(spec.fmu, folder, gravity_m_per_s2)
+            end = first + len(unit.state_scales)
+            parts.append(_Part(unit.name, unit.force, unit.rate, (), first, end))
+            first = end
+        self._parts = tuple(parts)
         self.states = first - first_state
         """Number of internal states."""
-        self.mockups = tuple(law.effect for law in laws if isinstance(law.effect, MockUp))
-        """FMUs among what gives its force, at most one; its states are the strut's last."""
 
     def force_n(
         self,
@@ -92,13 +105,25 @@ class Strut:
             internal_rates: Derivative of `internal`; this strut's part is written.
         """
         force = self._stiffness * (self._free_length - height_m) - self._damping * velocity_m_per_s
-        for law, parameters, first, end in self._laws:
+        strut = self._constants
+        for _, part_n, part_rates, values, first, end in self._parts:
             own = internal[first:end]
-            given = (t_s, height_m, velocity_m_per_s, applied_force_n, temperature_c, own)
-            force += law.force(*given, parameters, self._constants)
-            if law.rate is not None:
-                rates = [0.0] * (end - first)
-                law.rate(*given, parameters, self._constants, rates)
+            force += part_n(
+                t_s, height_m, velocity_m_per_s, applied_force_n, temperature_c, own, values, strut
+            )
+            if own:
+                rates = [0.0] * len(own)
+                part_rates(
+                    t_s,
+                    height_m,
+                    velocity_m_per_s,
+                    applied_force_n,
+                    temperature_c,
+                    own,
+                    values,
+                    strut,
+                    rates,
+                )
                 internal_rates[first:end] = rates
         return force
 
@@ -108,12 +133,12 @@ class Strut:
         Raises:
             ModelError: The parameters of an effect give its law no value.
         """
-        if not self._laws:
+        if not self._parts:
             return self._stiffness, self._damping
         heights = self._free_length + np.linspace(-_SAMPLED_M, _SAMPLED_M, 501)
         speeds = np.geomspace(1e-6, _SAMPLED_M_PER_S, 60)
         velocities = np.concatenate([-speeds[::-1], speeds])
-        internal = [0.0] * self._laws[-1].end
+        internal = [0.0] * self._parts[-1].end
         try:
             by_height = [
                 self.force_n(x, 0.0, internal, 0.0, 0.0, AMBIENT_C, internal.copy())
@@ -124,7 +149,7 @@ class Strut:
                 for v in velocities.tolist()
             ]
         except (ArithmeticError, ValueError) as error:
-            names = ", ".join(law.effect.name for law in self._laws)
+            names = ", ".join(part.name for part in self._parts)
             raise ModelError(
                 f"strut {self.name}: effects {names}: no force with these parameters ({error})"
             ) from error

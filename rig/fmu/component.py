@@ -6,7 +6,7 @@ equation of motion as well, with the mass and the levers that DART has for it.
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -14,9 +14,11 @@ import numpy as np
 
 from can_dbc.errors import InputError
 from dart_model.effects import AMBIENT_C, Effect, effect
+from dart_model.effects.calling import STRUT, Origin, arguments
+from dart_model.effects.law import Force, Rate
 from dart_model.plant import DartPlant
 from dart_model.spec import EffectSpec, ModelSpec, StrutSpec
-from rig.fmu.law_in_c import ARGUMENTS, InC, in_c
+from rig.fmu.law_in_c import InC, in_c
 
 Kind = Literal["time", "input", "parameter", "fixed", "state", "rate", "output", "indicator"]
 KINDS: tuple[Kind, ...] = (
@@ -71,7 +73,7 @@ class Component:
         name: Name of the model.
         identifier: The same as a C identifier, and as the name of the file.
         meaning: What it is, in a sentence or two.
-        variables: All variables, in the order of `KINDS`; a value reference is a place in it.
+        variables: All variables, in the order of `KINDS`; a value reference is an index into it.
         laws: C of the laws.
         evaluation: C of the body of `model_evaluate`.
     """
@@ -196,6 +198,10 @@ class _Laws(NamedTuple):
     reads_applied_force: bool
 
 
+_References = Mapping[Origin, Sequence[str]]
+"""References to the variables behind a law's arguments, by their origin."""
+
+
 class _Build:
     """Variables and laws as they come together; references are to names until all are known."""
 
@@ -248,26 +254,25 @@ class _Build:
             _Placed(effect(item.name), prefix + name)
             for item, name in zip(spec.effects, _own_names(spec.effects), strict=True)
         ]
+        constants = [ref(prefix + name) for name in STRUT[:-1]] + [ref("gravity_m_per_s2")]
+        free_length, stiffness, damping = (f"[{name}]" for name in constants[:-1])
+        spring = f"{stiffness} * ({free_length} - height_m)"
+        damper = f"{damping} * velocity_m_per_s"
         lines = [
             "{",
             f"    const double height_m = [{ref(prefix + 'height_m')}];",
             f"    const double velocity_m_per_s = [{ref(prefix + 'velocity_m_per_s')}];",
-            f"    const double strut[4] = {{[{ref(prefix + 'free_length_m')}], "
-            f"[{ref(prefix + 'stiffness_n_per_m')}], [{ref(prefix + 'damping_n_s_per_m')}], "
-            f"[{ref('gravity_m_per_s2')}]}};",
-            "    double force = strut[1] * (strut[0] - height_m) - strut[2] * velocity_m_per_s;",
-            f"    [{ref(prefix + 'spring.part_n')}] = strut[1] * (strut[0] - height_m);",
-            f"    [{ref(prefix + 'damper.part_n')}] = -strut[2] * velocity_m_per_s;",
+            f"    double force = {spring} - {damper};",
+            f"    [{ref(prefix + 'spring.part_n')}] = {spring};",
+            f"    [{ref(prefix + 'damper.part_n')}] = -{damper};",
         ]
-        reads = False
         for item, values in zip(items, spec.effects, strict=True):
-            lines += self._effect(item, values)
-            for name in (item.effect.name, f"{item.effect.name}_rate"):
-                reads |= name in self._laws and "applied_force_n" in self._laws[name].reads
+            lines += self._effect(item, values, constants)
+        reads = any("applied_force_n" in _argument_names(item.effect) for item in items)
         lines += [f"    [{ref(prefix + 'force_n')}] = force;", "}"]
         return _Laws("\n".join(lines), items, reads)
 
-    def _effect(self, item: _Placed, values: EffectSpec) -> list[str]:
+    def _effect(self, item: _Placed, values: EffectSpec, constants: Sequence[str]) -> list[str]:
         law, prefix = item.effect, item.prefix
         for parameter, value in zip(law.parameters, values.values(), strict=True):
             unit = _plain_unit(parameter.unit)
@@ -277,28 +282,42 @@ class _Build:
         for name, scale in zip(states, law.state_scales, strict=True):
             self.add(name, "", "state", f"internal state of {law.words}", 0.0, scale)
             self.add(f"der({name})", "", "rate", "its derivative")
-        p = f"&[{self.ref(prefix + law.parameters[0].name)}]" if law.parameters else "value"
-        state = f"&[{self.ref(states[0])}]" if states else "value"
-        given = ", ".join(_GIVEN_NAMES)
-        called = f"{self._law(law.name, law)}(&s, {given}, {state}, {p}, strut)"
-        lines = self._switches(self._laws[law.name].switches)
-        lines.append(f"        const double part = {called};")
-        lines.append("        force += part;")
-        lines += [f"        [{self.ref(prefix + 'part_n')}] = part;", "    }"]
+        references: _References = {
+            "states": [self.ref(name) for name in states],
+            "parameters": [self.ref(prefix + parameter.name) for parameter in law.parameters],
+            "strut": constants,
+            "rates": [self.ref(f"der({name})") for name in states],
+        }
+        force, call = self._call(law.name, law.force, law, references)
+        lines = [
+            *self._switches(force.switches),
+            f"        const double part = {call};",
+            "        force += part;",
+            f"        [{self.ref(prefix + 'part_n')}] = part;",
+            "    }",
+        ]
         if law.rate is not None:
-            out = f"&[{self.ref(f'der({states[0]})')}]"
-            name = self._law(f"{law.name}_rate", law)
-            lines += self._switches(self._laws[name].switches)
-            lines.append(f"        {name}(&s, {given}, {state}, {p}, strut, {out});")
-            lines.append("    }")
+            rate, call = self._call(f"{law.name}_rate", law.rate, law, references)
+            result = "" if rate.writes else f"[{references['rates'][0]}] = "
+            lines += [*self._switches(rate.switches), f"        {result}{call};", "    }"]
         return lines
 
-    def _law(self, name: str, law: Effect) -> str:
-        """Translate a law, once, and give its name in C."""
+    def _call(
+        self, name: str, function: Force | Rate, law: Effect, references: _References
+    ) -> tuple[InC, str]:
+        """A law, translated once, and its call with the variables of a strut."""
         if name not in self._laws:
-            function = law.force if name == law.name or law.rate is None else law.rate
             self._laws[name] = in_c(function, name)
-        return name
+        given = ["&s"]
+        for item in arguments(function, law):
+            if item.origin == "motion":
+                given.append(item.name)
+            elif item.origin != "rates":
+                row = "" if item.size is None else "&"
+                given.append(f"{row}[{references[item.origin][item.first]}]")
+        if self._laws[name].writes:
+            given.append(f"&[{references['rates'][0]}]")
+        return self._laws[name], f"{name}({', '.join(given)})"
 
     def _switches(self, count: int) -> list[str]:
         """The beginning of a block whose law has a number of switches."""
@@ -307,32 +326,35 @@ class _Build:
         for k in range(first, self._indicators):
             meaning = "changes its sign where a law switches"
             self.add(f"switches.indicator_{k + 1}", "", "indicator", meaning)
-        place = f"{{is_held, answer + {first}, value + FIRST_INDICATOR + {first}}}"
-        return ["    {", f"        const Switches s = {place};"]
+        first_of_block = f"{{is_held, answer + {first}, value + FIRST_INDICATOR + {first}}}"
+        return ["    {", f"        const Switches s = {first_of_block};"]
 
     def component(self, name: str, identifier: str, meaning: str, text: str) -> Component:
-        """All of it, with names replaced by places."""
+        """The component, with references replaced by indices of values."""
         variables = tuple(
             item for kind in KINDS for item in self._variables.values() if item.kind == kind
         )
-        places = {item.name: k for k, item in enumerate(variables)}
-        force = f"value[{places['applied_force_n']}]" if "applied_force_n" in places else "0.0"
+        indices = {item.name: k for k, item in enumerate(variables)}
+        force = f"value[{indices['applied_force_n']}]" if "applied_force_n" in indices else "0.0"
         head = [
             "const double t_s = value[0];",
-            f"const double temperature_c = value[{places['temperature_c']}];",
+            f"const double temperature_c = value[{indices['temperature_c']}];",
             f"const double applied_force_n = {force};",
             "(void)t_s; (void)temperature_c; (void)applied_force_n; (void)is_held;",
         ]
 
-        def place(found: re.Match[str]) -> str:
-            return f"value[{places[found[1]]}]"
+        def value(reference: re.Match[str]) -> str:
+            return f"value[{indices[reference[1]]}]"
 
-        body = re.sub(r"\[<([^<>]*)>\]", place, "\n".join([*head, text]))
+        body = re.sub(r"\[<([^<>]*)>\]", value, "\n".join([*head, text]))
         laws = "\n".join(law.text for law in self._laws.values())
         return Component(name, _identifier(identifier), meaning, variables, laws, body)
 
 
-_GIVEN_NAMES = tuple(item.split()[-1].lstrip("*") for item in ARGUMENTS[1:6])
+def _argument_names(law: Effect) -> set[str]:
+    """Names of the arguments of its force and its rate."""
+    functions = [law.force] if law.rate is None else [law.force, law.rate]
+    return {item.name for function in functions for item in arguments(function, law)}
 
 
 class _Added(NamedTuple):

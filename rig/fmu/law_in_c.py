@@ -1,8 +1,9 @@
-"""A law of the catalogue as C, read from the one place where it is written.
+"""A law of the catalogue as C, read from the one file in which it is written.
 
-A law is a small Python function in plain scalar arithmetic. Its syntax tree is translated statement
-by statement, so that the C computes what the Python computes, in the same order: the two agree to
-the last bits of the mathematical functions. Whatever a law may not use is refused, with its line.
+A law is a small Python function of named arguments in plain scalar arithmetic. Its syntax tree is
+translated statement by statement, so that the C computes what the Python computes, in the same
+order: the two agree to the last bits of the mathematical functions. Whatever a law may not use is
+refused, with its line.
 
 Where a law switches (a comparison, `min`, `max`, `abs`, `copysign`, a whole part), the C asks a
 switch that has a number of its own. A solver that steps over the laws may hold all switches, so
@@ -13,26 +14,18 @@ that what it integrates is smooth, and look at their indicators for the time at 
 import ast
 import inspect
 import textwrap
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple
 
-ARGUMENTS = (
-    "const Switches *s",
-    "double t_s",
-    "double height_m",
-    "double velocity_m_per_s",
-    "double applied_force_n",
-    "double temperature_c",
-    "const double *state",
-    "const double *p",
-    "const double *strut",
-)
-"""Of every law in C: its switches, then what `Force` is given."""
+from dart_model.effects.law import Force, Rate
 
-_GIVEN = len(ARGUMENTS) - 1
-_OUT = "double *out"
-_POINTERS = frozenset({5, 6, 7, 8})
-_INPUTS = ("t_s", "height_m", "velocity_m_per_s", "applied_force_n", "temperature_c")
+_C_TYPES: Mapping[str, str] = {
+    "float": "double ",
+    "Floats": "const double *",
+    "Writable": "double *",
+}
+"""Types of a law's arguments, and what they are in C."""
+_ROWS = ("Floats", "Writable")
 
 _FUNCTIONS: Mapping[str, str] = {
     "math.exp": "exp",
@@ -67,22 +60,22 @@ class InC(NamedTuple):
     """A law in C.
 
     Attributes:
-        text: A static function of `ARGUMENTS`; that of a rate writes into one more.
+        text: A static function of its switches, then the law's own arguments: rows as pointers.
         switches: Number of its switches.
-        reads: Which of time and inputs it reads, by their names in Python.
+        writes: Whether it writes rates behind a last argument, rather than to return its value.
     """
 
     text: str
     switches: int
-    reads: frozenset[str]
+    writes: bool
 
 
-def in_c(law: Callable[..., Any], name: str) -> InC:
+def in_c(law: Force | Rate, name: str) -> InC:
     """A law as a C function.
 
     Args:
-        law: Its force or its rate.
-        name: What the C function is called.
+        law: The force or the rate of an effect.
+        name: Name of the C function.
 
     Raises:
         NoLawError: It uses what no law may use.
@@ -90,7 +83,7 @@ def in_c(law: Callable[..., Any], name: str) -> InC:
     tree = ast.parse(textwrap.dedent(inspect.getsource(law))).body[0]
     if not isinstance(tree, ast.FunctionDef):
         raise NoLawError(f"{name}: expected a function")
-    return _Translation(law, tree, name).made()
+    return _Translation(law.__globals__, tree, name).function()
 
 
 class _Loop(NamedTuple):
@@ -110,32 +103,37 @@ class _Loop(NamedTuple):
 class _Translation:
     """The translation of one function."""
 
-    def __init__(self, law: Callable[..., Any], tree: ast.FunctionDef, name: str) -> None:
-        self._globals: Mapping[str, Any] = law.__globals__
+    def __init__(self, known: Mapping[str, object], tree: ast.FunctionDef, name: str) -> None:
+        self._globals = known
         self._tree = tree
         self._name = name
-        names = [item.arg for item in tree.args.args]
-        self._is_rate = len(names) == _GIVEN + 1
-        self._own = {item: item.lstrip("_") for item in names}
-        self._pointers = {item for place, item in enumerate(names) if place in _POINTERS}
+        self._arguments = {
+            item.arg: ast.unparse(item.annotation) if item.annotation else ""
+            for item in tree.args.args
+        }
         self._whole: set[str] = set()
         self._declared: list[str] = []
-        self._reads: set[str] = set()
         self._switches = 0
         self._loop: _Loop | None = None
 
-    def made(self) -> InC:
+    def function(self) -> InC:
         """The function in C."""
         body = self._block(self._tree.body, 1)
-        arguments = (*ARGUMENTS, _OUT) if self._is_rate else ARGUMENTS
+        returns = ast.unparse(self._tree.returns) if self._tree.returns else ""
+        arguments = ["const Switches *s"]
+        for name, annotation in self._arguments.items():
+            if annotation not in _C_TYPES:
+                raise NoLawError(f"{self._name}: {name}: expected one of {', '.join(_C_TYPES)}")
+            arguments.append(f"{_C_TYPES[annotation]}{name}")
+        if returns == "Rates":
+            arguments.append("double *rates")
+        writes = returns != "float"
+        head = f"static {'void' if writes else 'double'} {self._name}({', '.join(arguments)}) {{"
         declared = [
             f"    {'long' if name in self._whole else 'double'} {name};" for name in self._declared
         ]
-        unused = " ".join(f"(void){item.split()[-1].lstrip('*')};" for item in arguments)
-        kind = "void" if self._is_rate else "double"
-        head = f"static {kind} {self._name}({', '.join(arguments)}) {{"
-        lines = [head, *declared, f"    {unused}", *body, "}"]
-        return InC("\n".join(lines) + "\n", self._switches, frozenset(self._reads))
+        lines = [head, *declared, "    (void)s;", *body, "}"]
+        return InC("\n".join(lines) + "\n", self._switches, writes)
 
     def _block(self, statements: list[ast.stmt], depth: int) -> list[str]:
         return [line for item in statements for line in self._statement(item, depth)]
@@ -143,6 +141,9 @@ class _Translation:
     def _statement(self, node: ast.stmt, depth: int) -> list[str]:
         before = "    " * depth
         match node:
+            case ast.Return(value=ast.Tuple(elts=values)):
+                written = (f"rates[{k}] = {self._real(item)};" for k, item in enumerate(values))
+                return [f"{before}{line}" for line in (*written, "return;")]
             case ast.Return(value=value) if value is not None:
                 return [f"{before}return {self._real(value)};"]
             case ast.Assign(targets=[target], value=value):
@@ -187,13 +188,13 @@ class _Translation:
                 self._declare(name, whole=is_whole)
                 text = self._expression(value) if is_whole else self._real(value)
                 return f"{name} = {text}"
-            case ast.Subscript(value=ast.Name(id=name), slice=index) if name in self._pointers:
-                return f"{self._own[name]}[{self._expression(index)}] = {self._real(value)}"
+            case ast.Subscript(value=ast.Name(id=name), slice=index) if self._is_row(name):
+                return f"{name}[{self._expression(index)}] = {self._real(value)}"
             case _:
                 raise self._refused(target)
 
     def _declare(self, name: str, *, whole: bool) -> None:
-        if name in self._own:
+        if name in self._arguments:
             raise NoLawError(f"{self._name}: {name}: an argument is given another value")
         if name not in self._declared:
             self._declared.append(name)
@@ -202,12 +203,15 @@ class _Translation:
         elif whole != (name in self._whole):
             raise NoLawError(f"{self._name}: {name}: a whole number and a real one")
 
+    def _is_row(self, name: str) -> bool:
+        return self._arguments.get(name) in _ROWS
+
     def _is_whole(self, node: ast.expr) -> bool:
         """Whether an expression is a whole number in Python."""
         match node:
             case ast.Constant(value=value):
                 return isinstance(value, int)
-            case ast.Name(id=name) if name in self._declared or name in self._own:
+            case ast.Name(id=name) if name in self._declared or name in self._arguments:
                 return name in self._whole
             case ast.Name(id=name):
                 return isinstance(self._global(name, node), int)
@@ -244,8 +248,8 @@ class _Translation:
             case ast.IfExp(test=test, body=body, orelse=orelse):
                 chosen = f"{self._real(body)} : {self._real(orelse)}"
                 return f"({self._expression(test)} ? {chosen})"
-            case ast.Subscript(value=ast.Name(id=name), slice=index) if name in self._pointers:
-                return f"{self._own[name]}[{self._expression(index)}]"
+            case ast.Subscript(value=ast.Name(id=name), slice=index) if self._is_row(name):
+                return f"{name}[{self._expression(index)}]"
             case ast.Call(func=function, args=arguments, keywords=[]):
                 return self._call(ast.unparse(function), arguments, node)
             case _:
@@ -270,17 +274,13 @@ class _Translation:
     def _switch(self, function: str, arguments: list[ast.expr]) -> str:
         number, loop = self._switches, self._loop
         self._switches += 1
-        place = str(number)
+        index = str(number)
         if loop is not None:
-            place = f"{number} + {loop.each} * {loop.variable}"
-        return f"{function}(s, {place}, {', '.join(self._real(item) for item in arguments)})"
+            index = f"{number} + {loop.each} * {loop.variable}"
+        return f"{function}(s, {index}, {', '.join(self._real(item) for item in arguments)})"
 
     def _variable(self, name: str, node: ast.AST) -> str:
-        if name in self._own:
-            if self._own[name] in _INPUTS:
-                self._reads.add(self._own[name])
-            return self._own[name]
-        if name in self._declared:
+        if name in self._declared or name in self._arguments:
             return name
         return repr(self._global(name, node))
 

@@ -4,6 +4,7 @@ import base64
 import inspect
 import io
 import re
+import textwrap
 import types
 import typing
 from collections.abc import Iterator, Mapping
@@ -18,6 +19,8 @@ from pydantic_core import PydanticUndefined
 
 from can_dbc.errors import InputError
 from dart_model.effects import CATALOGUE, FAMILY_WORDS, Effect, Motion
+from dart_model.effects.calling import force_over_arrays, rates_over_arrays
+from dart_model.effects.law import Force, Rate
 from dart_model.spec import ModelSpec
 from rig.bridge.publications import STATUS, STRUT, TIMING
 from rig.channels.quantities import BENCH_QUANTITIES, HEIGHT
@@ -124,24 +127,27 @@ def _effect(item: Effect) -> str:
     ]
     shown = parameters[:12]
     rest = f"<p>and {len(parameters) - 12} more</p>" if len(parameters) > 12 else ""
-    source = inspect.getsource(item.force)
-    law = source[source.index("->") :].partition(":\n")[2]
     rate = ""
     if item.rate is not None:
-        of_rate = inspect.getsource(item.rate)
-        rate = f"<p>Rate of its internal states:</p><pre>{escape(_body(of_rate))}</pre>"
+        formula = _formula("rate", item.rate)
+        rate = f"<p>Rate of its internal states:</p><pre>{escape(formula)}</pre>"
     simpler = f" Degenerates to {', '.join(item.simpler)}." if item.simpler else ""
     return (
         f'<h3 id="{item.name}">{item.name}</h3><p>{escape(item.words)}.{escape(simpler)} '
         f"Seen with: {escape(item.excitation)}.</p>"
         f"{_table(('parameter', 'unit', 'bounds', 'meaning'), shown)}{rest}"
-        f"<p>Force in N (p: parameters in this order):</p><pre>{escape(inspect.cleandoc(law))}"
-        f"</pre>{rate}{_picture(item)}<p>{escape(item.reference)}</p>"
+        f"<p>Force in N:</p><pre>{escape(_formula('force_n', item.force))}</pre>"
+        f"{rate}{_picture(item)}<p>{escape(item.reference)}</p>"
     )
 
 
-def _body(source: str) -> str:
-    return inspect.cleandoc(source[source.index("->") :].partition(":\n")[2])
+def _formula(name: str, law: Force | Rate) -> str:
+    """A law as it is written, over the names of what it reads."""
+    source = inspect.getsource(law)
+    body = source[source.index("->") :].partition(":\n")[2].rstrip()
+    names = ", ".join(inspect.signature(law).parameters)
+    head = textwrap.fill(f"{name}({names}):", 100, subsequent_indent=" " * (len(name) + 1))
+    return f"{head}\n{body}"
 
 
 def _picture(item: Effect) -> str:
@@ -178,13 +184,15 @@ def _loop(
         motion.damping_n_s_per_m,
         9.81,
     )
-    state, step, force = [0.0] * item.state_size, float(t_s[1]), np.empty(len(t_s))
+    force_n, write_rates = force_over_arrays(item), rates_over_arrays(item)
+    step, force = float(t_s[1]), np.empty(len(t_s))
+    state: list[float] = [0.0] * item.state_size
     for k in range(len(t_s)):
         given = (float(t_s[k]), float(height[k]), float(velocity[k]), 50.0, 60.0, state)
-        force[k] = item.force(*given, parameters, strut)
-        if item.rate is not None:
-            rates = [0.0] * item.state_size
-            item.rate(*given, parameters, strut, rates)
+        force[k] = force_n(*given, parameters, strut)
+        if state:
+            rates: list[float] = [0.0] * item.state_size
+            write_rates(*given, parameters, strut, rates)
             state = [x + step * rate for x, rate in zip(state, rates, strict=True)]
     half = len(t_s) // 2
     return height[half:], velocity[half:], force[half:]

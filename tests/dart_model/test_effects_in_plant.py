@@ -6,6 +6,7 @@ import pytest
 
 from can_dbc.errors import InputError
 from dart_model.effects import CATALOGUE, Effect
+from dart_model.effects.calling import force_over_arrays
 from dart_model.plant import LONGEST_STEP_S, DartPlant, PlantState
 from dart_model.spec import MODELS, EffectSpec, ModelSpec, load_model, parse_model
 
@@ -40,7 +41,8 @@ def test_a_law_s_force_is_in_the_strut(name):
     state = plant.state(state.positions, state.velocities, memory, 1.5)
     ((height_m, velocity),) = state.struts
     values = [parameters[item.name] for item in law.parameters]
-    expected = law.force(1.5, height_m, velocity, 30.0, AMBIENT_C, memory, values, STRUT)
+    force = force_over_arrays(law)
+    expected = force(1.5, height_m, velocity, 30.0, AMBIENT_C, memory, values, STRUT)
     (force_n,) = plant.load(state, (0.0,), 30.0, AMBIENT_C).forces_n
     linear = -500.0 * (height_m - 0.5) - 100.0 * velocity
     assert force_n == pytest.approx(linear + expected, rel=1e-12, abs=1e-9)

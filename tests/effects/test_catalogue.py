@@ -1,11 +1,26 @@
 """Every law against its closed form, and what every entry of the catalogue must have."""
 
+import inspect
 import itertools
 import math
+import random
 
 import pytest
 
-from dart_model.effects import CATALOGUE, FAMILY_WORDS, Motion, UnknownEffectError, effect
+from dart_model.effects import (
+    CATALOGUE,
+    FAMILY_WORDS,
+    Motion,
+    UnknownEffectError,
+    calling,
+    effect,
+)
+from dart_model.effects.calling import (
+    ArgumentError,
+    arguments,
+    force_over_arrays,
+    rates_over_arrays,
+)
 from dart_model.effects.hysteresis import ELEMENTS
 from dart_model.effects.restoring_surface import FIRST_FORCE, HEIGHTS, VELOCITIES
 
@@ -22,14 +37,15 @@ def force(
 ):
     item = effect(name)
     memory = list(state) or [0.0] * item.state_size
-    return item.force(t_s, height, velocity, applied, temperature, memory, parameters, STRUT)
+    law = force_over_arrays(item)
+    return law(t_s, height, velocity, applied, temperature, memory, parameters, STRUT)
 
 
 def rate(name, parameters, velocity=0.0, applied=0.0, state=()):
     item = effect(name)
     out = [math.nan] * item.state_size
     memory = list(state) or [0.0] * item.state_size
-    item.rate(0.0, 0.5, velocity, applied, 20.0, memory, parameters, STRUT, out)
+    rates_over_arrays(item)(0.0, 0.5, velocity, applied, 20.0, memory, parameters, STRUT, out)
     return out
 
 
@@ -121,6 +137,75 @@ def test_every_law_has_a_closed_form_here():
 def test_every_family_has_a_law_and_words():
     assert {item.family for item in CATALOGUE.values()} == FAMILIES | {"none"}
     assert set(FAMILY_WORDS) == FAMILIES
+
+
+@pytest.mark.parametrize("item", CATALOGUE.values(), ids=CATALOGUE)
+def test_every_argument_of_a_law_has_a_known_name(item):
+    """Of the motion, of the strut, or one of the effect's own parameters and states."""
+    own = {thing.group or thing.name for thing in (*item.parameters, *item.states)}
+    known = {*calling.MOTION, *calling.STRUT, *own, "rates"}
+    read = set()
+    for law in filter(None, (item.force, item.rate)):
+        names = list(inspect.signature(law).parameters)
+        assert [argument.name for argument in arguments(law, item)] == names
+        assert set(names) <= known
+        read |= set(names)
+    # DART itself carries the mass of these.
+    assert own <= read or item.name == "added_mass"
+
+
+@pytest.mark.parametrize("item", CATALOGUE.values(), ids=CATALOGUE)
+def test_a_law_over_arrays_is_the_law(item):
+    rng = random.Random(5)
+    size = len(item.parameters)
+    arrays = {
+        "motion": [rng.uniform(0.1, 1.0) for _ in calling.MOTION],
+        "states": [rng.uniform(0.1, 1.0) for _ in item.states],
+        "strut": STRUT,
+        "parameters": TABLE
+        if item.name == "restoring_surface"
+        else rng.choices([0.3, 1.2], k=size),
+    }
+
+    def called(law, **rates):
+        given = dict(rates)
+        for name, origin, first, count in arguments(law, item):
+            if origin != "rates":
+                row = arrays[origin][first : first + (count or 1)]
+                given[name] = row[0] if count is None else row
+        return law(**given)
+
+    given = (*arrays["motion"], arrays["states"], arrays["parameters"], STRUT)
+    assert force_over_arrays(item)(*given) == called(item.force)
+    out = [math.nan] * item.state_size
+    rates_over_arrays(item)(*given, out)
+    if item.state_size > 1 and "rates" in inspect.signature(item.rate).parameters:
+        expected = [math.nan] * item.state_size
+        called(item.rate, rates=expected)
+    elif item.state_size:
+        rate = called(item.rate)
+        expected = list(rate) if isinstance(rate, tuple) else [rate]
+    else:
+        expected = []
+    assert out == expected
+
+
+def test_an_argument_that_stands_for_nothing_is_refused():
+    def law(velocity_m_per_s: float, coulomb_n: float) -> float:
+        return coulomb_n * velocity_m_per_s
+
+    with pytest.raises(
+        ArgumentError, match=r"'coulomb_n' of its law: expected one of t_s, .*coulomb_force_n"
+    ):
+        arguments(law, effect("coulomb_friction"))
+
+
+def test_arguments_in_another_order_are_refused():
+    def law(coulomb_force_n: float, velocity_m_per_s: float) -> float:
+        return coulomb_force_n * velocity_m_per_s
+
+    with pytest.raises(ArgumentError, match=r"expected those of motion, then states"):
+        arguments(law, effect("coulomb_friction"))
 
 
 @pytest.mark.parametrize("item", CATALOGUE.values(), ids=CATALOGUE)
@@ -571,21 +656,21 @@ def test_energy_fade_counts_the_work_of_the_faded_damper():
 
 @pytest.mark.parametrize("delay_s", [0.0004, 0.0015, 0.004, 0.02])
 def test_a_delay_shifts_a_sine(delay_s):
-    item = effect("delay")
+    force, rates = force_over_arrays(effect("delay")), rates_over_arrays(effect("delay"))
     omega, h = 2.0 * math.pi * 4.0, 1e-4
     state, out = [0.0] * 4, [0.0] * 4
     worst = 0.0
     for k in range(10_000):
         t_s = k * h
-        total = math.sin(omega * t_s) + item.force(
+        total = math.sin(omega * t_s) + force(
             t_s, 0.5, 0.0, math.sin(omega * t_s), 20.0, state, [delay_s], STRUT
         )
         if t_s > 0.5:
             worst = max(worst, abs(total - math.sin(omega * (t_s - delay_s))))
         applied = math.sin(omega * (t_s + 0.5 * h))
-        item.rate(t_s, 0.5, 0.0, math.sin(omega * t_s), 20.0, state, [delay_s], STRUT, out)
+        rates(t_s, 0.5, 0.0, math.sin(omega * t_s), 20.0, state, [delay_s], STRUT, out)
         middle = [s + 0.5 * h * r for s, r in zip(state, out, strict=True)]
-        item.rate(t_s, 0.5, 0.0, applied, 20.0, middle, [delay_s], STRUT, out)
+        rates(t_s, 0.5, 0.0, applied, 20.0, middle, [delay_s], STRUT, out)
         state = [s + h * r for s, r in zip(state, out, strict=True)]
     assert worst < 2e-4
 

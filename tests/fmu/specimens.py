@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 from dart_model.effects import CATALOGUE, Effect
+from dart_model.effects.calling import force_over_arrays
 from dart_model.effects.law import Motion
 from dart_model.spec import MODELS, EffectSpec, ModelSpec, load_model
 
@@ -62,7 +63,8 @@ def _force(law: Effect, p: Sequence[float], share: float) -> float:
     height_m = MOVES.low_m + 0.5 * (1.0 + share) * MOVES.stroke_m
     velocity = MOVES.top_speed_m_per_s * math.copysign(math.sqrt(1.0 - share * share), share)
     strut = (MOVES.free_length_m, MOVES.stiffness_n_per_m, MOVES.damping_n_s_per_m, 9.81)
-    return law.force(0.3, height_m, velocity, 20.0, 30.0, law.state_scales, p, strut)
+    force = force_over_arrays(law)
+    return force(0.3, height_m, velocity, 20.0, 30.0, law.state_scales, p, strut)
 
 
 def _middle(low: float, high: float) -> float:

@@ -11,7 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dart_model.effects import CATALOGUE
+from dart_model.effects import CATALOGUE, Effect
+from dart_model.effects.calling import arguments, force_over_arrays, rates_over_arrays
+from dart_model.effects.law import Floats
 from rig.fmu.binaries import compile_for, this_system
 from rig.fmu.law_in_c import NoLawError, in_c
 from rig.fmu.source import read_common_source
@@ -28,15 +30,29 @@ def _exported(name: str) -> str:
     """C of a law and its rate, each behind a function that a test can call."""
     law = CATALOGUE[name]
     force = in_c(law.force, name)
-    text = force.text + _door(name, "double", "", "return ")
+    text = force.text + _door(name, "double", "", f"return {_call(name, law.force, law)}")
     if law.rate is not None:
-        text += in_c(law.rate, f"{name}_rate").text
-        text += _door(f"{name}_rate", "void", ", double *out", "")
+        rate = in_c(law.rate, f"{name}_rate")
+        call = _call(f"{name}_rate", law.rate, law, *["out"] * rate.writes)
+        text += rate.text
+        text += _door(
+            f"{name}_rate", "void", ", double *out", f"{'' if rate.writes else '*out = '}{call}"
+        )
     return text
 
 
-def _door(name: str, kind: str, extra: str, returned: str) -> str:
-    given_out = ", out" if extra else ""
+def _call(name: str, function, law: Effect, *out: str) -> str:
+    """A call with arguments from the arrays that a door is given."""
+    arrays = {"motion": "u", "states": "state", "parameters": "p", "strut": "strut"}
+    given = ["&s"]
+    for item in arguments(function, law):
+        if item.origin != "rates":
+            row = "" if item.size is None else "&"
+            given.append(f"{row}{arrays[item.origin]}[{item.first}]")
+    return f"{name}({', '.join([*given, *out])});"
+
+
+def _door(name: str, kind: str, extra: str, call: str) -> str:
     return (
         f"{kind} call_{name}(int is_held, long *answer, double *indicator, const double *u, "
         f"const double *state, const double *p, const double *strut{extra});\n"
@@ -44,7 +60,7 @@ def _door(name: str, kind: str, extra: str, returned: str) -> str:
         "double *indicator, const double *u, const double *state, const double *p, "
         f"const double *strut{extra}) {{\n"
         "    const Switches s = {is_held, answer, indicator};\n"
-        f"    {returned}{name}(&s, u[0], u[1], u[2], u[3], u[4], state, p, strut{given_out});\n}}\n"
+        f"    {call}\n}}\n"
     )
 
 
@@ -85,10 +101,9 @@ def _in_c(library, name: str, motion, state, p, strut, held=None):
 
 def _in_python(name: str, motion, state, p, strut):
     law = CATALOGUE[name]
-    force = law.force(*motion, state, p, strut)
+    force = force_over_arrays(law)(*motion, state, p, strut)
     rates = [0.0] * law.state_size
-    if law.rate is not None:
-        law.rate(*motion, state, p, strut, rates)
+    rates_over_arrays(law)(*motion, state, p, strut, rates)
     return force, rates
 
 
@@ -190,15 +205,19 @@ def test_what_is_no_function_is_refused(law):
         in_c(law, "it")
 
 
-def _asks_the_clock(t_s, *_):
+def _asks_the_clock(t_s: float) -> float:
     return time.time() + t_s
 
 
-def _calls_another(t_s, height_m, velocity_m_per_s, force_n, temperature_c, state, p, strut):
-    return sum([t_s, height_m, velocity_m_per_s, force_n, temperature_c, *state, *p, *strut])
+def _calls_another(t_s: float, height_m: float, elements: Floats) -> float:
+    return sum([t_s, height_m, *elements])
 
 
-@pytest.mark.parametrize("law", [_asks_the_clock, _calls_another])
+def _is_given_a_word(t_s: float, word: str) -> float:
+    return t_s if word else 0.0
+
+
+@pytest.mark.parametrize("law", [_asks_the_clock, _calls_another, _is_given_a_word])
 def test_what_no_law_may_use_is_refused(law):
     with pytest.raises(NoLawError):
         in_c(law, "it")

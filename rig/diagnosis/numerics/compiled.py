@@ -24,7 +24,7 @@ from numba.typed import List
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
-from dart_model.effects.law import Floats, Writable
+from dart_model.effects.calling import force_over_arrays, rates_over_arrays
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -78,31 +78,26 @@ def _compile_law(function: Callable[..., Any], signature: Any) -> Any:
     return compiler(signature, cache=True, error_model="numpy")(function)
 
 
-def _no_state(
-    _t_s: float,
-    _height_m: float,
-    _velocity_m_per_s: float,
-    _applied_force_n: float,
-    _temperature_c: float,
-    _state: Floats,
-    _p: Floats,
-    _strut: Floats,
-    _out: Writable,
-) -> None:
-    return
-
-
 _KEPT: list[Any] = []
 """Machine code whose addresses are in use: the lists below hold no references."""
 
 
 @functools.cache
+def _compiled_force(name: str) -> Any:
+    force = _compile_law(force_over_arrays(effect(name)), _FORCE_SIGNATURE)
+    _KEPT.append(force)
+    return force
+
+
+@functools.cache
+def _compiled_rate(name: str) -> Any:
+    rate = _compile_law(rates_over_arrays(effect(name)), _RATE_SIGNATURE)
+    _KEPT.append(rate)
+    return rate
+
+
 def _compiled(name: str) -> tuple[Any, Any]:
-    item = effect(name)
-    force = _compile_law(item.force, _FORCE_SIGNATURE)
-    rate = _compile_law(item.rate or _no_state, _RATE_SIGNATURE)
-    _KEPT.extend([force, rate])
-    return force, rate
+    return _compiled_force(name), _compiled_rate(name if effect(name).rate else "none")
 
 
 def _empty() -> tuple[Any, Any]:
