@@ -366,6 +366,24 @@ def load_model(path: Path) -> ModelSpec:
     return parse_model(read_text(path), str(path), path.parent)
 
 
+def load_named_model(name: str, folder: Path, named_by: Path | None = None) -> ModelSpec:
+    """Model from its file, or a shipped one by its name.
+
+    Args:
+        name: File, absolute or from the folder on, or the name of a shipped model.
+        folder: The folder.
+        named_by: File that names the model, for messages; None for the user.
+
+    Raises:
+        ModelError: One line that names file, key, value and what was expected.
+    """
+    try:
+        path = model_file(name, folder)
+    except ModelError as error:
+        raise (error if named_by is None else ModelError(f"{named_by}: {error}")) from None
+    return load_model(path)
+
+
 def dump_model(spec: ModelSpec) -> str:
     """YAML text that `parse_model` reads back to an equal value."""
     data = spec.model_dump(mode="json", exclude_none=True)

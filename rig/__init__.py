@@ -32,7 +32,7 @@ def load_model(name: Path | str) -> "ModelSpec":
     """
     from dart_model import spec
 
-    return spec.load_model(spec.model_file(str(name), Path()))
+    return spec.load_named_model(str(name), Path())
 
 
 def open_run(folder: Path | str) -> "Run":

@@ -91,7 +91,7 @@ def is_sensible(number: float) -> bool:
     return -_LARGEST < number < _LARGEST
 
 
-def first_diverged(struts: Sequence[StrutOutput]) -> int:
+def find_divergence(struts: Sequence[StrutOutput]) -> int:
     """Index of the first strut whose numbers no bench has; 0 where only their sum shows it."""
     for index, strut in enumerate(struts):
         if not is_sensible(strut.force_n + strut.height_m + strut.velocity_m_per_s):

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant, LoadedModel
-from rig.bridge.estimator import Estimate, first_diverged, is_sensible
+from rig.bridge.estimator import Estimate, find_divergence, is_sensible
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.quantities import APPLIED_FORCE, TEMPERATURE
@@ -322,7 +322,7 @@ class FreeModelEstimator:
                 left_out += observer.left_out
         # A model that has diverged is of no use, and would not come back by itself. DART hides it:
         # what is not finite has an acceleration of zero there.
-        diverged = -1 if is_sensible(size) else first_diverged(struts)
+        diverged = -1 if is_sensible(size) else find_divergence(struts)
         state = FreeModelState(t_ns, loaded.temperature_c, (), observers, loaded, past)
         return state, Estimate(tuple(struts), measured_ns, diverged, left_out)
 

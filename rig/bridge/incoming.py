@@ -186,26 +186,26 @@ def _check_of_values(message: Message, signals: Sequence[tuple[str, Dimension]])
 def _with_check(read: Reader, are_values: _Check) -> Reader:
     """A reader that refuses frames without values; most messages cannot hold such."""
 
-    def read_checked(sequence: SequenceState, frame: Frame) -> Reading:
+    def read_values(sequence: SequenceState, frame: Frame) -> Reading:
         sequence, status, values = read(sequence, frame)
         if values is None or are_values(values):
             return sequence, status, values
         return sequence, FrameStatus.NO_VALUE, None
 
-    return read_checked
+    return read_values
 
 
 def _compile_reader(message: Message, decode: Decoder) -> Reader:
     length, ok = message.length_bytes, FrameStatus.OK
 
-    def read_unprotected(sequence: SequenceState, frame: Frame) -> Reading:
+    def read_plain(sequence: SequenceState, frame: Frame) -> Reading:
         values = decode(frame.data)
         # A multiplexed frame without these signals is no fault, a short one is.
         is_short = values is None and len(frame.data) != length
         return sequence, FrameStatus.WRONG_LENGTH if is_short else ok, values
 
     if message.protection is None:
-        return read_unprotected
+        return read_plain
     check = compile_checker(message.protection)
 
     def read(sequence: SequenceState, frame: Frame) -> Reading:

@@ -49,7 +49,7 @@ class PrescribedModel(Protocol[ModelT]):
         ...
 
 
-class Motion(Struct, frozen=True, gc=False):
+class TrackedMotion(Struct, frozen=True, gc=False):
     """The motion as it is known.
 
     Attributes:
@@ -82,14 +82,14 @@ class PrescribedMotionState(Struct, frozen=True, gc=False):
 
     t_ns: int
     temperature_c: float
-    motion: Motion | None = None
+    motion: TrackedMotion | None = None
     model: Any = None
     cell_n: float | None = None
     cell_ns: int = 0
     is_moving: bool = False
 
 
-def update_motion(motion: Motion, sample: Sample, settling_s: float) -> Motion:
+def update_motion(motion: TrackedMotion, sample: Sample, settling_s: float) -> TrackedMotion:
     """The motion after a new measurement.
 
     Args:
@@ -104,7 +104,7 @@ def update_motion(motion: Motion, sample: Sample, settling_s: float) -> Motion:
     innovation_m = sample.value - height_m
     kept = math.exp(-age_s / settling_s)
     fresh = 1.0 - kept
-    return Motion(
+    return TrackedMotion(
         height_m + (1.0 - kept**3) * innovation_m,
         velocity + 1.5 * fresh * fresh * (1.0 + kept) * innovation_m / age_s,
         acceleration + fresh**3 * innovation_m / (age_s * age_s),
@@ -113,7 +113,7 @@ def update_motion(motion: Motion, sample: Sample, settling_s: float) -> Motion:
     )
 
 
-def predict_motion(motion: Motion, t_ns: int) -> tuple[float, float, float]:
+def predict_motion(motion: TrackedMotion, t_ns: int) -> tuple[float, float, float]:
     """Height (m), velocity (m/s) and acceleration (m/s²) at a time after the last measurement."""
     h = (t_ns - motion.measured_ns) * 1e-9
     acceleration = motion.acceleration_m_per_s2
@@ -125,7 +125,7 @@ def predict_motion(motion: Motion, t_ns: int) -> tuple[float, float, float]:
     )
 
 
-def _motion_at(motion: Motion, t_s: float) -> tuple[float, float]:
+def _motion_at(motion: TrackedMotion, t_s: float) -> tuple[float, float]:
     """Height and velocity at a time of the run."""
     height_m, velocity_m_per_s, _ = predict_motion(motion, round(t_s * 1e9))
     return height_m, velocity_m_per_s
@@ -230,7 +230,7 @@ class PrescribedMotionEstimator:
             channel = self._channels[sample.channel]
             if channel.role is Role.HEIGHT:
                 if motion is None:
-                    motion = Motion(sample.value, 0.0, 0.0, 0.0, sample.t_ns)
+                    motion = TrackedMotion(sample.value, 0.0, 0.0, 0.0, sample.t_ns)
                     model = self._model.init(state.t_ns * 1e-9)
                 else:
                     motion = update_motion(motion, sample, self._settling_s)

@@ -58,7 +58,7 @@ KINEMATICS = (
 )
 
 
-def _published_std(std_n: float) -> float:
+def _std_or_infinite(std_n: float) -> float:
     """An unknown standard deviation as the end of its signal's range."""
     return inf if isnan(std_n) else std_n
 
@@ -67,7 +67,7 @@ UNCERTAINTY = (
     Publication(
         "force_std",
         Dimension.FORCE,
-        lambda report, strut: _published_std(report.output.struts[strut].force_std_n),
+        lambda report, strut: _std_or_infinite(report.output.struts[strut].force_std_n),
         "FORCE_STD",
         stops_at_range=True,
     ),

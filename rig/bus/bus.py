@@ -3,11 +3,13 @@
 import contextlib
 import errno
 import socket
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, cast
+from collections.abc import Iterable
+from dataclasses import field
+from typing import Annotated, Any, cast
 
 import can
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from can_dbc.addressing import Filter
 from can_dbc.errors import InputError
@@ -40,23 +42,27 @@ class BusFullError(BusError):
     """A frame cannot be sent now, because the interface's queue is full; it may be later."""
 
 
-@dataclass(frozen=True)
+_Name = Annotated[str, Field(min_length=1, max_length=255)]
+_BitRate = Annotated[int, Field(gt=0, le=1_000_000_000)]
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class BusConfig:
-    """How to open a bus.
+    """How to open the bus.
 
     Attributes:
-        interface: python-can's name: ``virtual``, ``socketcan``, ``pcan``, ``slcan``, ...
+        interface: python-can's name of the interface: `socketcan`, `pcan`, `slcan`, `virtual`, ...
         channel: Channel of the interface.
         bitrate: Bit rate in bit/s.
-        data_bitrate: Bit rate of CAN FD payloads in bit/s; None on classic CAN.
-        options: Further arguments of the interface.
+        data_bitrate: Bit rate of CAN FD payloads in bit/s; classic CAN if absent.
+        options: Further arguments, which go to python-can's interface as they are.
     """
 
-    interface: str
-    channel: str
-    bitrate: int
-    data_bitrate: int | None = None
-    options: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    interface: _Name = "virtual"
+    channel: _Name = "rig"
+    bitrate: _BitRate = 1_000_000
+    data_bitrate: _BitRate | None = None
+    options: dict[str, Any] = field(default_factory=dict[str, Any])
 
 
 class Bus:

@@ -12,7 +12,7 @@ from can_dbc.units import Dimension
 
 
 @dataclass(frozen=True)
-class Noise:
+class SensorNoise:
     """How a configuration states the standard deviation of a sensor's readings.
 
     Attributes:
@@ -42,10 +42,12 @@ class Quantity:
     column: str
     dimension: Dimension
     words: str
-    noise: Noise | None = None
+    noise: SensorNoise | None = None
 
 
-HEIGHT = Quantity("height", "height_m", Dimension.LENGTH, "height", Noise("noise_std_m", 1e-9, 1.0))
+HEIGHT = Quantity(
+    "height", "height_m", Dimension.LENGTH, "height", SensorNoise("noise_std_m", 1e-9, 1.0)
+)
 """Height of a strut; the one under `signals.height` is the reference of its observer."""
 
 VELOCITY = Quantity(
@@ -53,14 +55,14 @@ VELOCITY = Quantity(
     "velocity_m_per_s",
     Dimension.VELOCITY,
     "velocity of the height, positive in rebound",
-    Noise("noise_std_m_per_s", 1e-7, 100.0),
+    SensorNoise("noise_std_m_per_s", 1e-7, 100.0),
 )
 FORCE = Quantity(
     "force",
     "force_n",
     Dimension.FORCE,
     "force of a load cell in the strut, positive when the strut pushes",
-    Noise("noise_std_n", 1e-4, 1e7),
+    SensorNoise("noise_std_n", 1e-4, 1e7),
 )
 
 STRUT_QUANTITIES: Mapping[str, Quantity] = MappingProxyType(

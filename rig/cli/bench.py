@@ -52,7 +52,7 @@ def bench(
     bus, authentication = BusConfig(interface, channel, bitrate), None
     if bridge is not None:
         plan = load_plan(bridge)
-        bus, dbc = plan.config.bus.config(), plan.database.path
+        bus, dbc = plan.config.bus, plan.database.path
         authentication = load_authentication(plan)
     with stoppable() as stop, progress_line(duration_s) as progress:
         frames = run_bench(

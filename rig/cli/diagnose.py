@@ -33,7 +33,7 @@ def diagnose(
     junit: JUnitFile = None,
 ) -> None:
     """Identify the effects that the model lacks, correct it, and evaluate it on other data."""
-    from dart_model.spec import load_model, model_file
+    from dart_model.spec import load_named_model
     from rig.diagnosis.files import diagnose_runs
     from rig.diagnosis.outcome import REPORT_FILE, to_json
     from rig.pages.browser_print import find_browser, print_page
@@ -43,7 +43,7 @@ def diagnose(
         find_browser()  # before a search that takes minutes, not after it
     if junit is not None:
         refuse_existing(junit)
-    spec = load_model(model_file(model, Path()))
+    spec = load_named_model(model, Path())
     with progress_bar() as bar:
         result = diagnose_runs(runs, spec, held_out or [], out, bar)
         write_report(result, out / REPORT_FILE)

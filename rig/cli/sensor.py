@@ -165,7 +165,7 @@ def set_command(
     """
     from rig.bus.bus import BusConfig
     from rig.bus.canopen_network import CanOpenNetwork
-    from rig.sensors.canopen_set_up import DeviceSettings, restore
+    from rig.sensors.canopen_set_up import CanOpenSettings, restore
     from rig.sensors.undo_file import configure_with_undo, read_undo
 
     config = BusConfig(interface, channel, bitrate)
@@ -185,7 +185,7 @@ def set_command(
     with closing(CanOpenNetwork(config)) as network:
         if new:
             _give_node_id(network, node_id)
-        settings = DeviceSettings(cycle_ms, sync, heartbeat_ms)
+        settings = CanOpenSettings(cycle_ms, sync, heartbeat_ms)
         changes = configure_with_undo(network, node_id, settings, undo)
     text = f"Node {node_id}: start requested; "
     if changes:

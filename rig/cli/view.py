@@ -60,7 +60,7 @@ def view(
     """Show runs in the browser, while they are written or afterwards; Ctrl-C ends it."""
     import time
 
-    from dart_model.spec import load_model, model_file
+    from dart_model.spec import load_named_model
     from rig.pages.view.server import ViewServer
 
     if foxglove:
@@ -68,7 +68,7 @@ def view(
             raise InputError("--foxglove: expected neither --control nor --model with it")
         _publish(runs, _FOXGLOVE_PORT if port is None else port)
         return
-    models = {name: load_model(model_file(name, Path())) for name in model or ()}
+    models = {name: load_named_model(name, Path()) for name in model or ()}
     token = secrets.token_urlsafe(16) if control else None
     server = ViewServer(runs, models, _PORT if port is None else port, token)
     server.start_thread()

@@ -12,6 +12,9 @@ import os
 import sys
 from collections.abc import Generator
 from dataclasses import asdict, dataclass
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
 
 _MCL_CURRENT_AND_FUTURE = 3
 _PR_SET_TIMERSLACK = 29
@@ -22,21 +25,24 @@ _SWITCH_INTERVAL_S = 1e-4
 """Longest time for which another thread (the log's) holds the interpreter while the loop waits."""
 
 
-@dataclass(frozen=True)
-class Request:
-    """Real-time conditions that are requested.
+class Realtime(BaseModel):
+    """Real-time conditions that are requested; a run works without any of them.
 
     Attributes:
         fifo_priority: Priority under SCHED_FIFO; 0 requests none.
         lock_memory: Keep all pages in memory.
-        cpu: Core for the loop; None leaves the choice to the scheduler.
-        freeze_garbage: No garbage collection during the run.
+        cpu: Core on which the loop runs; the scheduler's choice if absent.
+        spin_s: How long to spin before a deadline where SCHED_FIFO was granted.
+        freeze_garbage: Collect garbage before the run and not during it.
     """
 
-    fifo_priority: int
-    lock_memory: bool
-    cpu: int | None
-    freeze_garbage: bool
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    fifo_priority: Annotated[int, Field(ge=0, le=99)] = 50
+    lock_memory: bool = True
+    cpu: Annotated[int, Field(ge=0, le=65_535)] | None = None
+    spin_s: Annotated[float, Field(ge=0, le=0.01)] = 0.0002
+    freeze_garbage: bool = True
 
 
 @dataclass(frozen=True)
@@ -65,11 +71,11 @@ class Granted:
 
 
 @contextlib.contextmanager
-def realtime(request: Request) -> Generator[Granted]:
+def realtime(request: Realtime) -> Generator[Granted]:
     """Context with real-time conditions, which are released at its end.
 
     Args:
-        request: Requested conditions.
+        request: Realtimeed conditions.
 
     Yields:
         Granted conditions.

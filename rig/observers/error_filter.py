@@ -191,7 +191,7 @@ class ErrorFilter:
         """The filter with its bandwidth multiplied by a factor, within its bounds."""
         return self.within(factor * self.bandwidth_hz, self.noise_std_m)
 
-    def rounded(self) -> "ErrorFilter":
+    def to_four_digits(self) -> "ErrorFilter":
         """The filter with values of four digits."""
         bandwidth_hz, noise_std_m = self.bandwidth_hz, self.noise_std_m
         return ErrorFilter(

@@ -176,7 +176,7 @@ class KalmanObserver:
 
     def can_continue(self, other: AnyObserver) -> bool:
         """Whether the other one has the same filter, whose state it continues."""
-        return isinstance(other, KalmanObserver) and other.filter == self.filter
+        return type(other) is KalmanObserver and other.filter == self.filter
 
     def remark_on_step(self, step: SensorStep) -> Remark:
         """Whether the rounding of the height sensor is within the filter's noise."""
@@ -190,7 +190,7 @@ class KalmanObserver:
         return self.filter.remark_on_rate(rate_hz)
 
     @classmethod
-    def untuned(cls, noise_std_m: float, interval_ns: int) -> "KalmanObserver":
+    def before_tuning(cls, noise_std_m: float, interval_ns: int) -> "KalmanObserver":
         """An observer for a strut whose noise alone is known."""
         corner = _UNTUNED_CORNER_PER_INTERVAL / (interval_ns * 1e-9)
         return cls("kalman", ErrorFilter.within(corner / (2.0 * math.pi), noise_std_m))
@@ -216,6 +216,6 @@ class KalmanObserver:
         """The observer with its filter's corner multiplied."""
         return replace(self, filter=self.filter.with_bandwidth(factor))
 
-    def rounded(self) -> "KalmanObserver":
+    def to_four_digits(self) -> "KalmanObserver":
         """The observer with parameters of four digits."""
-        return replace(self, filter=self.filter.rounded())
+        return replace(self, filter=self.filter.to_four_digits())

@@ -85,7 +85,7 @@ class NoObserver:
 
     def can_continue(self, other: AnyObserver) -> bool:
         """Whether the other one is no observer either."""
-        return isinstance(other, NoObserver)
+        return type(other) is NoObserver
 
     def remark_on_step(self, step: SensorStep) -> Remark:
         """No remark: no height is used."""

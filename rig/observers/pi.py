@@ -196,7 +196,7 @@ class PiObserver:
 
     def can_continue(self, other: AnyObserver) -> bool:
         """Whether the other one has the same filter, whose state it continues."""
-        return isinstance(other, PiObserver) and other.filter == self.filter
+        return type(other) is PiObserver and other.filter == self.filter
 
     def remark_on_step(self, step: SensorStep) -> Remark:
         """Force that one step of the height sensor makes."""
@@ -247,18 +247,18 @@ class PiObserver:
             filter=None if self.filter is None else self.filter.with_bandwidth(factor),
         )
 
-    def rounded(self) -> "PiObserver":
+    def to_four_digits(self) -> "PiObserver":
         """The observer with parameters of four digits."""
         return replace(
             self,
             proportional_n_per_m=float(f"{self.proportional_n_per_m:.4g}"),
             integral_n_per_m_s=float(f"{self.integral_n_per_m_s:.4g}"),
             derivative_n_s_per_m=float(f"{self.derivative_n_s_per_m:.4g}"),
-            filter=None if self.filter is None else self.filter.rounded(),
+            filter=None if self.filter is None else self.filter.to_four_digits(),
         )
 
 
-def published_observer(mobility_per_kg: float, force_limit_n: float) -> PiObserver:
+def paper_observer(mobility_per_kg: float, force_limit_n: float) -> PiObserver:
     """The published gains, scaled by the effective mass."""
     return PiObserver(
         proportional_n_per_m=PUBLISHED_PER_S2 / mobility_per_kg,

@@ -239,7 +239,7 @@ class TunableObserver(Observer[StateT], Protocol[StateT]):
         """The observer with its bandwidth multiplied by a factor."""
         ...
 
-    def rounded(self) -> "TunableObserver[StateT]":
+    def to_four_digits(self) -> "TunableObserver[StateT]":
         """The observer with parameters of four digits, as they stand in a configuration."""
         ...
 

@@ -13,7 +13,7 @@ from rig.log.reader import read_header
 from rig.pages.html import render_report, write_page
 from rig.pages.plotted_quantities import TICK_CURVES, TICK_TIME, TIME, TIME_PLOTS, Origin
 from rig.pages.report.figures import LineStyle, Panel, Plot, plot
-from rig.run.changes import logged_changes
+from rig.run.changes import read_changes
 from rig.run.timing import read_histograms
 
 _POINTS = 1500
@@ -61,7 +61,7 @@ def write_run_report(folder: Path, path: Path) -> None:
     text = render_report(
         "run.html",
         name=folder.resolve().name,
-        changes=[(t_ns * 1e-9, assignments) for t_ns, assignments in logged_changes(folder)],
+        changes=[(t_ns * 1e-9, assignments) for t_ns, assignments in read_changes(folder)],
         tone=tone,
         sign=sign,
         badge=badge,

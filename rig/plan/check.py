@@ -202,7 +202,7 @@ def _authentication(plan: Plan) -> list[Finding]:
 
 def _load(plan: Plan) -> Finding:
     config = plan.config
-    sent = {message.name for message in plan.sent_messages()}
+    sent = {message.name for message in plan.outgoing_messages()}
     load = 0.0
     for message in sorted(plan.messages(), key=lambda item: item.name):
         cycle_ns = message.cycle_time_ns or plan.period_ns

@@ -29,11 +29,12 @@ from rig.channels.quantities import (
     HEIGHT,
     LOAD_CELL_FORCE,
     STRUT_QUANTITIES,
-    Noise,
     Quantity,
+    SensorNoise,
 )
 from rig.log.captures import CaptureWindow
 from rig.log.rotation import Rotation
+from rig.machine.realtime import Realtime
 from rig.observers import DEFAULT_KIND, OBSERVERS
 from rig.observers.protocol import AnyObserver
 
@@ -113,7 +114,7 @@ class SensorSignal(HeightSignal):
         return float(getattr(self, _noise(self.quantity).key))
 
 
-def _noise(quantity: Quantity) -> Noise:
+def _noise(quantity: Quantity) -> SensorNoise:
     if quantity.noise is None:
         raise ValueError(f"{quantity.key}: expected the noise of a sensor that measures it")
     return quantity.noise
@@ -164,7 +165,7 @@ class Signals(_Frozen):
 
     @model_validator(mode="before")
     @classmethod
-    def _known(cls, data: object) -> object:
+    def _check_keys(cls, data: object) -> object:
         keys = list(cast("dict[object, object]", data)) if isinstance(data, dict) else []
         for key in keys:
             if key not in _KEYS:
@@ -228,48 +229,6 @@ def _mapping(choices: Sequence[Publication]) -> Callable[[object], object]:
                 return data
 
     return read
-
-
-class BusSettings(_Frozen):
-    """How to open the bus.
-
-    Attributes:
-        interface: python-can's name of the interface: `socketcan`, `pcan`, `slcan`, `virtual`, ...
-        channel: Channel of the interface.
-        bitrate: Bit rate in bit/s.
-        data_bitrate: Bit rate of CAN FD payloads in bit/s; classic CAN if absent.
-        options: Further arguments, which go to python-can's interface as they are.
-    """
-
-    interface: Text = "virtual"
-    channel: Text = "rig"
-    bitrate: Annotated[int, Field(gt=0, le=1_000_000_000)] = 1_000_000
-    data_bitrate: Annotated[int, Field(gt=0, le=1_000_000_000)] | None = None
-    options: dict[str, Any] = Field(default_factory=dict[str, Any])
-
-    def config(self) -> BusConfig:
-        """As the bus takes it."""
-        return BusConfig(
-            self.interface, self.channel, self.bitrate, self.data_bitrate, self.options
-        )
-
-
-class Realtime(_Frozen):
-    """What is asked of the machine; every key works without being granted.
-
-    Attributes:
-        fifo_priority: Priority under SCHED_FIFO; 0 asks for none.
-        lock_memory: Keep all pages in memory.
-        cpu: Core on which the loop runs.
-        spin_s: How long to spin before a deadline where SCHED_FIFO was granted.
-        freeze_garbage: Collect garbage before the run and not during it.
-    """
-
-    fifo_priority: Annotated[int, Field(ge=0, le=99)] = 50
-    lock_memory: bool = True
-    cpu: Annotated[int, Field(ge=0, le=65_535)] | None = None
-    spin_s: Annotated[float, Field(ge=0, le=0.01)] = 0.0002
-    freeze_garbage: bool = True
 
 
 class AuthenticationConfig(_Frozen):
@@ -364,7 +323,7 @@ class RunConfig(_Frozen):
     model: Text = "reference"
     engine: Text = "dart"
     dbc: Text | None = None
-    bus: BusSettings = BusSettings()
+    bus: BusConfig = BusConfig()
     authentication: AuthenticationConfig | None = None
     signals: Signals
     devices: dict[SensorName, DeviceSettings] = Field(default_factory=dict[str, DeviceSettings])
@@ -410,14 +369,6 @@ class RunConfig(_Frozen):
                 "requires no force"
             )
         return self
-
-    def published(self) -> dict[str, SignalName]:
-        """Every signal that the bridge sends, by its key."""
-        groups = {f"publish.{strut}": group for strut, group in (self.publish or {}).items()}
-        groups |= {"status": self.status or {}, "timing": self.timing or {}}
-        return {
-            f"{name}.{key}": entry for name, group in groups.items() for key, entry in group.items()
-        }
 
     @property
     def period_ns(self) -> int:

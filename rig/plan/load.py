@@ -5,7 +5,7 @@ from pathlib import Path
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import load_yaml, validate
-from dart_model.spec import load_model, model_file
+from dart_model.spec import load_model, load_named_model
 from rig.bus.secoc import Authentication, read_key
 from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
 from rig.log.reader import read_header
@@ -30,7 +30,10 @@ def load_plan(path: Path, *, model: str | None = None, duration_s: float | None 
         if not 0.0 < duration_s < float("inf"):
             raise InputError(f"--duration-s {duration_s}: expected a finite number above zero")
         config = config.model_copy(update={"duration_s": duration_s})
-    spec = load_model(_model_path(config.model, path) if model is None else _own_model(model))
+    if model is None:
+        spec = load_named_model(config.model, path.parent, path)
+    else:
+        spec = load_named_model(model, Path())
     database = load_database(DEFAULT_DATABASE if config.dbc is None else path.parent / config.dbc)
     return resolve(config, path, spec, database)
 
@@ -58,16 +61,3 @@ def load_authentication(plan: Plan) -> Authentication | None:
     if settings is None:
         return None
     return settings.with_key(read_key(plan.source.parent / settings.key_file))
-
-
-def _own_model(name: str) -> Path:
-    """A model that the user names: from the working directory on, or a shipped one."""
-    return model_file(name, Path())
-
-
-def _model_path(name: str, source: Path) -> Path:
-    """A model that a configuration names: from its folder on, or a shipped one."""
-    try:
-        return model_file(name, source.parent)
-    except InputError as error:
-        raise InputError(f"{source}: {error}") from None

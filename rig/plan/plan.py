@@ -136,9 +136,9 @@ class Plan:
         """Every message that the bridge reads or sends, once."""
         read = [channel.message for channel in self.channels if channel.message is not None]
         read += [message for message, _ in self.alarms]
-        return list({item.name: item for item in (*read, *self.sent_messages())}.values())
+        return list({item.name: item for item in (*read, *self.outgoing_messages())}.values())
 
-    def sent_messages(self) -> list[Message]:
+    def outgoing_messages(self) -> list[Message]:
         """Messages that the bridge sends."""
         return [item.message for item in self.outgoing]
 
@@ -238,7 +238,7 @@ def _with_names(config: RunConfig, model: ModelSpec, database: Database, source:
     if "status" not in config.model_fields_set:
         status = _signals_of("RIG_STATUS", STATUS, database) or None
     observers = {name: config.observers.get(name, PiObserver()) for name in struts}
-    _check_observed(config, observers, list(heights), source)
+    _check_heights(config, observers, list(heights), source)
     height = {name: heights[name] for name in struts if name in heights}
     return config.model_copy(
         update={
@@ -262,7 +262,7 @@ def _by_strut(given: Mapping[str, _Entry], struts: list[str], key: str) -> Mappi
     return {struts[0]: given[""]}
 
 
-def _check_observed(
+def _check_heights(
     config: RunConfig, observers: Mapping[str, AnyObserver], heights: list[str], source: Path
 ) -> None:
     """Refuse an observer without its height, a height and sensors that no observer uses."""

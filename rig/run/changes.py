@@ -112,7 +112,7 @@ def change_line(t_ns: int, assignments: Assignments) -> str:
     return json.dumps({"t_ns": t_ns, "set": assignments}) + "\n"
 
 
-def logged_changes(folder: Path) -> list[tuple[int, dict[str, object]]]:
+def read_changes(folder: Path) -> list[tuple[int, dict[str, object]]]:
     """Changes of a run, in their order: time of the first tick, and what was changed.
 
     Raises:
@@ -136,14 +136,14 @@ def logged_changes(folder: Path) -> list[tuple[int, dict[str, object]]]:
     return changes
 
 
-def replayed_changes(folder: Path, plan: Plan, bridge: Bridge) -> Changes:
+def changes_for_replay(folder: Path, plan: Plan, bridge: Bridge) -> Changes:
     """The changes of a run, for its replay.
 
     Raises:
         InputError: A change cannot be read or made.
     """
     coming: list[tuple[int, Bridge]] = []
-    for t_ns, assignments in logged_changes(folder):
+    for t_ns, assignments in read_changes(folder):
         plan = assign(plan, assignments, str(folder / CHANGES_FILE))
         bridge = bridge_with_settings(bridge, plan)
         coming.append((t_ns, bridge))

@@ -14,7 +14,7 @@ from rig.bus.bus import Bus, BusConfig
 from rig.bus.link import Link
 from rig.bus.secoc import Authentication, Authenticator
 from rig.machine.clock import Clock, RealClock, VirtualClock
-from rig.machine.realtime import Granted, Request, realtime
+from rig.machine.realtime import Granted, realtime
 from rig.plan.build import build_bridge
 from rig.plan.config import RunConfig
 from rig.plan.load import load_authentication
@@ -46,10 +46,7 @@ def real_time(config: RunConfig) -> Generator[tuple[Granted, RealClock]]:
         What was granted, and the clock to wait on; it spins only where SCHED_FIFO was granted.
     """
     settings = config.realtime
-    request = Request(
-        settings.fifo_priority, settings.lock_memory, settings.cpu, settings.freeze_garbage
-    )
-    with realtime(request) as granted:
+    with realtime(settings) as granted:
         # From a real-time thread that never leaves its core Linux takes it for 50 ms in every
         # second.
         spin_ns = min(round(settings.spin_s * 1e9), config.period_ns // _SPINNING_SHARE)
@@ -92,7 +89,7 @@ def live(
 def _open_link(plan: Plan, bridge: Bridge, clock: Clock, *, listen_only: bool = False) -> Link:
     def open_bus() -> Bus:
         return Bus(
-            plan.config.bus.config(),
+            plan.config.bus,
             bridge.filters,
             listen_only=listen_only,
             epoch_ns=clock.epoch_ns,
@@ -140,7 +137,7 @@ def with_bench(
             granted, clock = stack.enter_context(real_time(plan.config))
         link = _open_link(plan, bridge, clock)
         stack.callback(link.close)
-        bench_bus = Bus(plan.config.bus.config(), epoch_ns=clock.epoch_ns)
+        bench_bus = Bus(plan.config.bus, epoch_ns=clock.epoch_ns)
         stack.callback(bench_bus.close)
         authenticator = _authenticator(load_authentication(plan), clock)
         port = BusPort(link)

@@ -136,7 +136,7 @@ def run_logged(
         running.close()
     if trace is not None:
         trace.write(folder)
-    return running.ended()
+    return running.outcome()
 
 
 class _LoggedRun:
@@ -200,7 +200,7 @@ class _LoggedRun:
         """Close the log with how the run ended."""
         self._log.close(self._ending)
 
-    def ended(self) -> Ended:
+    def outcome(self) -> Ended:
         """How the run ended."""
         return Ended(
             self._folder,
@@ -245,7 +245,7 @@ class _LoggedRun:
         requests = Requests(
             self._folder, self._plan, self._bridge, acknowledge, note, self._priority
         )
-        around.enter_context(requests.served())
+        around.enter_context(requests.serve())
         return requests.changes
 
     def _ending(self) -> dict[str, object]:

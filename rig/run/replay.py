@@ -23,7 +23,7 @@ from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step, StepRows
 from rig.plan.build import build_bridge
 from rig.plan.load import plan_of_run
 from rig.plan.plan import Plan
-from rig.run.changes import no_changes, replayed_changes
+from rig.run.changes import changes_for_replay, no_changes
 from rig.run.loop import Progress, Tick, no_progress, run
 
 _TICKS_AT_ONCE = 4096
@@ -106,7 +106,7 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
 
     port = _LogPort(frames, ticks)
     # With another plan the run's own changes would undo what is tried.
-    changes = replayed_changes(folder, own, bridge) if plan is own else no_changes
+    changes = changes_for_replay(folder, own, bridge) if plan is own else no_changes
     state = run(bridge, bridge.init(0), port.ticks(), port, keep, columns, changes)
     batches.append(rows.batch())
     steps = _pa.Table.from_batches(batches, schema=rows.schema)

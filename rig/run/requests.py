@@ -23,7 +23,7 @@ from rig.machine.realtime import follow
 from rig.plan.check import errors
 from rig.plan.load import plan_of_run
 from rig.plan.plan import Plan
-from rig.run.changes import Assignments, assign, bridge_with_settings, change_line, logged_changes
+from rig.run.changes import Assignments, assign, bridge_with_settings, change_line, read_changes
 
 _FOLDER = "requests"
 _LOOK_S = 0.1
@@ -80,7 +80,7 @@ class Requests:
         return bridge
 
     @contextlib.contextmanager
-    def served(self) -> Generator[None]:
+    def serve(self) -> Generator[None]:
         """Requests are read while this lasts."""
         self._folder.mkdir(exist_ok=True)
         thread = threading.Thread(target=self._serve, name="requests")
@@ -103,24 +103,24 @@ class Requests:
         # A list of names takes the interpreter from the loop for some microseconds only.
         names = os.listdir(self._folder)  # noqa: PTH208
         for path in [self._folder / name for name in sorted(names) if name.endswith(".request")]:
-            answer = self._answered(path)
+            answer = self._answer(path)
             path.unlink()
             write_whole(path.with_suffix(".answer"), json.dumps(answer))
 
-    def _answered(self, path: Path) -> Answer:
+    def _answer(self, path: Path) -> Answer:
         try:
             with path.open("rb") as file:
                 content: Any = json.loads(file.read(_MOST_BYTES))
             if content == {"acknowledge": True}:
                 self._acknowledge()
                 return {"acknowledged": True}
-            return self._changed(path, dict(content["set"]))
+            return self._change(path, dict(content["set"]))
         except InputError as error:
             return {"error": str(error)}
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return {"error": f"{path.name}: is no request"}
 
-    def _changed(self, path: Path, assignments: Assignments) -> Answer:
+    def _change(self, path: Path, assignments: Assignments) -> Answer:
         plan = assign(self._plan, assignments, "set")
         bridge = bridge_with_settings(self._bridge, plan)
         self._taken.clear()
@@ -178,7 +178,7 @@ def _refuse_errors(folder: Path, assignments: Assignments) -> None:
     """Check the changed configuration as `rig run` does, here and not beside the loop."""
     try:
         plan = plan_of_run(folder)
-        for _, before in logged_changes(folder):
+        for _, before in read_changes(folder):
             plan = assign(plan, before, str(folder))
         wrong = errors(assign(plan, assignments, "set"))
     except (TypeError, AttributeError) as error:

@@ -117,7 +117,7 @@ class DeviceWriter:
             raise RefusedError(f"{where}: holds {held} after {value} was written")
 
 
-class DeviceSettings(NamedTuple):
+class CanOpenSettings(NamedTuple):
     """Settings of a device for a run.
 
     Attributes:
@@ -131,7 +131,7 @@ class DeviceSettings(NamedTuple):
     heartbeat_ms: int | None = None
 
 
-def configure_device(writer: DeviceWriter, node_id: int, settings: DeviceSettings) -> None:
+def configure_device(writer: DeviceWriter, node_id: int, settings: CanOpenSettings) -> None:
     """Set cycle and heartbeat of a device, and switch it to operational.
 
     Args:

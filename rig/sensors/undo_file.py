@@ -11,7 +11,7 @@ from can_dbc.errors import InputError
 from can_dbc.yaml_file import load_yaml
 from rig.sensors.canopen_set_up import (
     SETTABLE,
-    DeviceSettings,
+    CanOpenSettings,
     DeviceWriter,
     ObjectAccess,
     ObjectChange,
@@ -45,7 +45,7 @@ class _File(BaseModel):
 
 
 def configure_with_undo(
-    access: ObjectAccess, node_id: int, settings: DeviceSettings, undo: Path
+    access: ObjectAccess, node_id: int, settings: CanOpenSettings, undo: Path
 ) -> Sequence[ObjectChange]:
     """Configure a device, and write its changes into a file; returns the changes.
 

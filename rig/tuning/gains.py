@@ -222,7 +222,7 @@ def tune_observer(problem: TuningProblem, kind: str, aim: Aim) -> Tuned:
         ),
         key=lambda item: item.fun,
     )
-    observer: AnyTunableObserver = search.observer(best.x).rounded()
+    observer: AnyTunableObserver = search.observer(best.x).to_four_digits()
     error = expect_error(problem, observer)
     return Tuned(observer, error, gain_margin(problem, observer), margin)
 

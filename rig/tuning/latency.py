@@ -159,10 +159,10 @@ def _delay_step(here: _Series, later: _Series) -> tuple[float, float]:
     slope = slope / _STEP_S
     rows = _functions(here.height_m, here.velocity_m_per_s)
 
-    def unexplained(signal: Array) -> Array:
+    def residual_of(signal: Array) -> Array:
         return signal - rows @ np.linalg.lstsq(rows, signal, rcond=None)[0]
 
-    residual, direction = unexplained(here.force_n), unexplained(slope)
+    residual, direction = residual_of(here.force_n), residual_of(slope)
     power = float(direction @ direction)
     if power <= _LEAST_SHARE * float(slope @ slope):
         return 0.0, math.inf

@@ -15,7 +15,7 @@ from rig.closed_loop.loop import Rhythm
 from rig.closed_loop.strut_response import strut_responses
 from rig.diagnosis.progress import Progress, within
 from rig.observers.kalman import KalmanObserver
-from rig.observers.pi import published_observer
+from rig.observers.pi import paper_observer
 from rig.observers.protocol import AnyObserver, AnyTunableObserver
 from rig.plan.build import build_plant
 from rig.plan.load import plan_of_run
@@ -122,19 +122,19 @@ def tune(
         _expectation(source, channel, response.mobility_per_kg)
         for channel, response in zip(plan.heights, responses, strict=True)
     ]
-    untuned = tuple(
-        KalmanObserver.untuned(item.noise_std_m, strut.interval_ns)
+    others = tuple(
+        KalmanObserver.before_tuning(item.noise_std_m, strut.interval_ns)
         for item, strut in zip(expectations, plan.struts, strict=True)
     )
     tuned: list[TunedStrut] = []
     for index, strut in enumerate(plan.struts):
         share = index / len(plan.struts), (index + 1) / len(plan.struts)
         part = within(progress, *share, of=strut.name)
-        task = LatencyTask(strut.name, responses[index].mobility_per_kg, untuned[index])
+        task = LatencyTask(strut.name, responses[index].mobility_per_kg, others[index])
         height = _find_delay(plan, source, task, part)
         problem = TuningProblem(
             plant,
-            untuned,
+            others,
             index,
             responses,
             heights_m,
@@ -153,7 +153,7 @@ def _tune_strut(
     progress("gains", 0.7)
     tuned = tune_observer(problem, kind, aim)
     progress("other bandwidths", 0.9)
-    published = published_observer(problem.mobility_per_kg, problem.force_limit_n)
+    published = paper_observer(problem.mobility_per_kg, problem.force_limit_n)
     return TunedStrut(
         name,
         problem.expectation,

@@ -128,8 +128,8 @@ def test_the_strut_that_ran_away_is_named():
     right = values.StrutOutput(1.0, 0.0, True, 0.5, 0.0, 0.0, 0.0)
     for wrong in ({"force_n": float("nan")}, {"height_m": 1e30}, {"velocity_m_per_s": -1e30}):
         away = msgspec.structs.replace(right, **wrong)
-        assert estimator.first_diverged((right, away)) == 1
-        assert estimator.first_diverged((away, right)) == 0
+        assert estimator.find_divergence((right, away)) == 1
+        assert estimator.find_divergence((away, right)) == 0
 
 
 def test_nothing_is_counted_at_the_start_and_exactly_what_came_afterwards():

@@ -8,8 +8,8 @@ from can_dbc.errors import InputError
 from dart_model.plant import PrescribedStrut
 from dart_model.spec import MODELS, EffectSpec, load_model, parse_model
 from rig.bridge.prescribed_motion import (
-    Motion,
     PrescribedMotionEstimator,
+    TrackedMotion,
     predict_motion,
     update_motion,
 )
@@ -60,7 +60,7 @@ def dyno(strut: PrescribedStrut, supervision: Supervision = SUPERVISION) -> Supe
 
 
 def test_the_filter_follows_a_constant_acceleration_without_lag() -> None:
-    tracked = Motion(0.3, 0.0, 0.0, 0.0, 0)
+    tracked = TrackedMotion(0.3, 0.0, 0.0, 0.0, 0)
     for number in range(1, 200):
         t_s = number * 1e-3
         height_m = 0.3 + 0.2 * t_s + 0.5 * 1.5 * t_s * t_s
@@ -73,7 +73,7 @@ def test_the_filter_follows_a_constant_acceleration_without_lag() -> None:
 
 
 def test_a_measurement_that_is_not_newer_changes_nothing() -> None:
-    tracked = Motion(0.3, 0.1, 0.0, 0.0, 5)
+    tracked = TrackedMotion(0.3, 0.1, 0.0, 0.0, 5)
     assert update_motion(tracked, Sample(0, 0.4, 5), 0.002) is tracked
 
 

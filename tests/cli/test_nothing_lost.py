@@ -1,5 +1,6 @@
 """No command overwrites what somebody has, and every wrong input is one line and exit code 2."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -101,7 +102,7 @@ def test_a_run_without_a_tick_is_no_success(run, monkeypatch, capsys):
 )
 def test_a_channel_of_any_name_gives_a_log_that_can_be_read(tmp_path, channel, written):
     ready = load_plan(CONFIGS / "reference.yaml", duration_s=0.05)
-    bus = ready.config.bus.model_copy(update={"channel": channel})
+    bus = dataclasses.replace(ready.config.bus, channel=channel)
     ready = ready.with_config(ready.config.model_copy(update={"bus": bus}))
     live(ready, tmp_path / "run", ListPort(bench_frames(ready, 50, {}), set()))
     assert len(list(read_run(tmp_path / "run").frames())) > 50

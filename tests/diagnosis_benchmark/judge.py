@@ -98,7 +98,7 @@ def is_right(planted: tuple[str, ...], diagnosis: dict, *, is_rough: bool = Fals
     """Whether a diagnosis is right.
 
     Nothing planted: it says so; where the model file is rough, it names linear corrections at most,
-    and does not say that anything is unexplained.
+    and does not say that anything is residual_of.
     One effect: its family comes first, or, where the verdict is ``ambiguous``, is among the named
     rivals; where the model file is rough, first of all that is not linear. Several: all families
     are named, those that are linear among the corrections. A force that no catalogue holds:

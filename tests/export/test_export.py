@@ -1,6 +1,7 @@
 """Runs in other formats, as other programs read them, and back."""
 
 import csv
+import dataclasses
 import importlib
 
 import cantools
@@ -28,7 +29,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("export") / "run"
     ready = load_plan(CONFIGS / "reference.yaml", duration_s=1.5)
     log = ready.config.log.model_copy(update={"rotate_s": 1.0})
-    bus = ready.config.bus.model_copy(update={"channel": "export"})
+    bus = dataclasses.replace(ready.config.bus, channel="export")
     config = ready.config.model_copy(update={"log": log, "bus": bus})
     with_bench(
         ready.with_config(config),

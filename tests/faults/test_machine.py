@@ -1,5 +1,6 @@
 """Faults of the interface, the disk, the clock and the process."""
 
+import dataclasses
 import resource
 import signal
 import subprocess
@@ -158,7 +159,7 @@ def test_clock_jump(row, step_s):
 
 def lockstep(folder, name, duration_s, progress=lambda _t_ns, _mode: None):
     ready = load_plan(CONFIGS / "reference.yaml", duration_s=duration_s)
-    bus = ready.config.bus.model_copy(update={"channel": name})
+    bus = dataclasses.replace(ready.config.bus, channel=name)
     return with_bench(
         ready.with_config(ready.config.model_copy(update={"bus": bus})),
         load_bench_config(CONFIGS / "reference_bench.yaml"),
@@ -241,7 +242,7 @@ def test_slow_disk(row, tmp_path, monkeypatch):
     quiet = {"fifo_priority": 0, "lock_memory": False, "freeze_garbage": False}
     config = ready.config.model_copy(
         update={
-            "bus": ready.config.bus.model_copy(update={"channel": "slow"}),
+            "bus": dataclasses.replace(ready.config.bus, channel="slow"),
             "realtime": ready.config.realtime.model_copy(update=quiet),
         }
     )

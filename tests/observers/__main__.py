@@ -23,7 +23,7 @@ from rig.demo.cases import compare_with_bench
 from rig.log.reader import read_run
 from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
-from rig.observers.pi import published_observer
+from rig.observers.pi import paper_observer
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run import live
@@ -67,7 +67,7 @@ def point(given):
     settled = round(min(2.0, 0.25 * len(fresh) / rate_hz) * rate_hz)
     row = {"given": given, "noise_std_m": smoothed.noise_std_m}
     for name, observer in (
-        ("paper", published_observer(bench.mobility_per_kg, bench.force_limit_n)),
+        ("paper", paper_observer(bench.mobility_per_kg, bench.force_limit_n)),
         *((kind, tune_observer(bench, kind, Aim()).observer) for kind in ("pi", "kalman")),
     ):
         share, coverage = judged(truth, follow(truth, fresh, observer), settled)

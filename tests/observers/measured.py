@@ -19,7 +19,7 @@ from rig.closed_loop.strut_response import strut_responses
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
 from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
-from rig.observers.pi import published_observer
+from rig.observers.pi import paper_observer
 from rig.tuning.expectation import Expectation, longest_stretch, residual_force, spectrum
 from rig.tuning.gains import Aim, TuningProblem, tune_observer
 from tests.observers.benches import STRUT, follow
@@ -69,7 +69,7 @@ def compare(name, record, force_n=None):
     deviation = np.std(truth[settled:])
     figures = [f"noise {1e6 * found.noise_std_m:.2g} um"]
     for kind, observer in (
-        ("published", published_observer(bench.mobility_per_kg, bench.force_limit_n)),
+        ("published", paper_observer(bench.mobility_per_kg, bench.force_limit_n)),
         *((kind, tune_observer(bench, kind, Aim()).observer) for kind in ("pi", "kalman")),
     ):
         force = follow(record, record.height_m, observer).column(f"{STRUT}.force_n").to_numpy()

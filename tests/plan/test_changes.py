@@ -10,7 +10,7 @@ from rig.log.file_names import CHANGES_FILE
 from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
-from rig.run.changes import assign, change_line, logged_changes, parse_assignments
+from rig.run.changes import assign, change_line, parse_assignments, read_changes
 from rig.run.replay import replay
 from rig.run.requests import Requests, ask
 from tests.view.serving import make_run
@@ -60,7 +60,7 @@ def test_a_request_is_taken_at_a_tick_and_answered_with_its_time(tmp_path, ready
     (run / "run.yaml").write_text(header[: header.index("ending:")])
     lines, answers = [], []
     requests = served(run, ready, lines)
-    with requests.served():
+    with requests.serve():
         asking = threading.Thread(target=lambda: answers.append(ask(run, {"set": {GAIN: 5e4}})))
         asking.start()
         bridge = None
@@ -92,7 +92,7 @@ def test_what_nobody_waits_for_any_more_is_not_done(tmp_path, ready):
     lines, path = [], tmp_path / "1.request"
     path.write_text(json.dumps({"set": {GAIN: 5e4}}))
     requests, answers = served(tmp_path, ready, lines), []
-    thread = threading.Thread(target=lambda: answers.append(requests._answered(path)))
+    thread = threading.Thread(target=lambda: answers.append(requests._answer(path)))
     thread.start()
     while requests._waiting is None:
         pass
@@ -107,7 +107,7 @@ def test_what_nobody_waits_for_any_more_is_not_done(tmp_path, ready):
 def test_no_request_ends_the_reading_of_requests(tmp_path, ready, content):
     path = tmp_path / "1.request"
     path.write_text(content)
-    assert "error" in served(tmp_path, ready, [])._answered(path)
+    assert "error" in served(tmp_path, ready, [])._answer(path)
 
 
 def test_a_limit_goes_by_the_number_of_its_row(ready):
@@ -162,10 +162,10 @@ def test_a_line_that_a_kill_cut_is_passed_over_and_a_wrong_one_is_not(tmp_path):
     path = tmp_path / CHANGES_FILE
     whole = change_line(5, {GAIN: 1.0})
     path.write_text(whole + whole[:10])
-    assert logged_changes(tmp_path) == [(5, {GAIN: 1.0})]
+    assert read_changes(tmp_path) == [(5, {GAIN: 1.0})]
     path.write_text("nothing\n" + whole)
     with pytest.raises(InputError, match="line 1: 'nothing': expected a change"):
-        logged_changes(tmp_path)
+        read_changes(tmp_path)
     path.write_text(json.dumps([1, 2]) + "\n")
     with pytest.raises(InputError, match="expected a change"):
-        logged_changes(tmp_path)
+        read_changes(tmp_path)

@@ -82,7 +82,7 @@ def test_what_was_proposed_runs_over_a_bus_and_replays(dbc, tmp_path):
     ready = load_plan(config, duration_s=0.3)
     bridge = build_bridge(ready)
     clock = VirtualClock()
-    bus = ready.config.bus.config()
+    bus = ready.config.bus
     link = Link(lambda: Bus(bus, bridge.filters), clock.epoch_now_ns, executor=AtOnce())
     peer = Bus(bus)
     other = cantools.database.load_file(dbc)

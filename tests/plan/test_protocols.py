@@ -67,8 +67,8 @@ def test_a_tunable_observer_is_searched_within_what_a_configuration_accepts(kind
         made = search.observer(x)
         assert made.kind == kind
         assert made.force_limit_n == 5000.0
-        rounded = made.rounded()
-        assert rounded.rounded() == rounded
+        rounded = made.to_four_digits()
+        assert rounded.to_four_digits() == rounded
         assert rounded.bandwidth_hz(0.1) == pytest.approx(made.bandwidth_hz(0.1), rel=1e-3)
         assert TypeAdapter(OBSERVERS[kind]).validate_json(json.dumps(asdict(rounded))) == rounded
     middle = search.observer(search.candidates[len(search.candidates) // 2])

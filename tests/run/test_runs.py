@@ -1,5 +1,6 @@
 """Whole runs in lockstep: the published case, the quarter car, and what a log is good for."""
 
+import dataclasses
 import os
 import shutil
 from dataclasses import replace
@@ -33,7 +34,7 @@ def setup(name: str, duration_s: float) -> Plan:
     """A shipped configuration, on a channel that no other test has."""
     ready = load_plan(CONFIGS / f"{name}.yaml", duration_s=duration_s)
     channel = f"test-{os.getpid()}-{next(_CHANNELS)}"
-    bus = ready.config.bus.model_copy(update={"channel": channel})
+    bus = dataclasses.replace(ready.config.bus, channel=channel)
     config = ready.config.model_copy(update={"bus": bus})
     return ready.with_config(config)
 

@@ -20,7 +20,7 @@ from rig.plan.check import check
 from rig.plan.load import load_plan
 from rig.sensors.bus_scan import scan
 from rig.sensors.canopen_device import describe_device
-from rig.sensors.canopen_set_up import DeviceSettings, DeviceWriter, configure_device, restore
+from rig.sensors.canopen_set_up import CanOpenSettings, DeviceWriter, configure_device, restore
 from rig.sensors.height_zero import HeightZero
 from rig.sensors.proposal import dbc_text
 from rig.sensors.undo_file import read_undo, write_undo
@@ -149,7 +149,7 @@ def test_a_timer_of_its_own_is_set_and_put_back(bus, network, tmp_path):
     with_timer(node, 10)
     objects = node.object_dictionary
     setting = DeviceWriter(network)
-    configure_device(setting, 5, DeviceSettings(cycle_ms=2, heartbeat_ms=100))
+    configure_device(setting, 5, CanOpenSettings(cycle_ms=2, heartbeat_ms=100))
     assert objects.read(0x1800, 5) == 2
     assert objects.read(0x1017, 0) == 100
     assert objects.read(0x1800, 1) & ~NO_REMOTE_REQUEST == 0x185
@@ -166,7 +166,7 @@ def test_a_timer_of_its_own_is_set_and_put_back(bus, network, tmp_path):
 def test_an_encoder_without_an_event_timer_has_its_own(bus, network):
     node = encoder(bus(), 5, cycle_ms=10)
     setting = DeviceWriter(network)
-    configure_device(setting, 5, DeviceSettings(cycle_ms=3))
+    configure_device(setting, 5, CanOpenSettings(cycle_ms=3))
     assert node.object_dictionary.read(0x6200, 0) == 3
     assert [(item.index, item.before) for item in setting.changes] == [(0x6200, "0a00")]
 

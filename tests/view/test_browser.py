@@ -15,7 +15,7 @@ import yaml
 
 from rig.pages.report import page as page_of
 from rig.pages.run_report import write_run_report
-from rig.run.changes import logged_changes
+from rig.run.changes import read_changes
 from rig.run.replay import replay
 from tests.pages.test_report import report
 from tests.view.browser import browser, drawn, frames, in_sight, needs_chromium, page, until
@@ -251,7 +251,7 @@ def test_a_live_run_is_followed(made, tmp_path):
             said = opened.locator("#answer").inner_text()
             assert process.wait(60) in (0, 1)  # 1: a tick was missed
             until(opened, "runs[0].state !== 'live'")
-        ((t_ns, assignments),) = logged_changes(live)
+        ((t_ns, assignments),) = read_changes(live)
         assert said == f"Changed from {t_ns * 1e-9:.3f} s on."
         assert assignments == {"observers.strut.proportional_n_per_m": 50_000}
         assert replay(live).different == 0

@@ -53,7 +53,7 @@ def run_diagnosis(order: DiagnosisOrder, reports: Connection) -> None:
             diagnosis that fails.
     """
     # Imported here: the server, which imports this module, needs none of it.
-    from dart_model.spec import load_model, model_file
+    from dart_model.spec import load_named_model
     from rig.diagnosis.files import diagnose_runs
     from rig.pages.report import write_report
 
@@ -69,7 +69,7 @@ def run_diagnosis(order: DiagnosisOrder, reports: Connection) -> None:
     try:
         result = diagnose_runs(
             [order.run],
-            load_model(model_file(order.model, Path())),
+            load_named_model(order.model, Path()),
             order.held_out,
             order.out,
             lambda stage, share: send(DiagnosisProgress(stage, share)),

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.pages.view.run_status import WatchedRun
-from rig.run.changes import logged_changes
+from rig.run.changes import read_changes
 
 HOST = "127.0.0.1"
 
@@ -126,7 +126,7 @@ class Topic:
     def parameters(self) -> dict[str, object]:
         """Numbers and texts of the configuration, with the changes during the run."""
         parameters = dict(_flat(self.name, self.run.header.get("config", {})))
-        for _, changes in logged_changes(self.run.folder):
+        for _, changes in read_changes(self.run.folder):
             parameters |= {f"{self.name}.{key}": value for key, value in changes.items()}
         return parameters
 
