@@ -281,8 +281,8 @@ def estimates_of(problem: Problem, known: Known, row: int, name: str) -> dict[st
     variables = effect_variables(problem, result).get(row)
     if variables is not None:
         return effect(name).named(known.estimate(int(v)) for v in variables)
-    slot = slots_of(problem, result.candidate).index[row]
-    values = result.parts.effects[slot[1] : slot[2]]
+    slot = slots_of(problem, result.candidate).each[row]
+    values = result.parts.effects[slot.parameters]
     return effect(name).named(Estimate(float(value), None, None) for value in values)
 
 
@@ -453,8 +453,8 @@ def _notes(problem: Problem, found: Found, *, blocks: bool) -> tuple[str, ...]:
 def _looks_held(problem: Problem, result: Fit) -> bool:
     """Whether a delay was found that a zero-order hold of the force would feign."""
     half_s = 0.5 * problem.motions[0].step_s
-    index = slots_of(problem, result.candidate).index[len(result.candidate.kept) :]
+    slots = slots_of(problem, result.candidate).each[len(result.candidate.kept) :]
     return any(
-        name == "delay" and abs(result.parts.effects[slot[1]] / half_s - 1.0) < _HELD
-        for (_, name), slot in zip(result.candidate.new, index, strict=True)
+        name == "delay" and abs(result.parts.effects[slot.parameters][0] / half_s - 1.0) < _HELD
+        for (_, name), slot in zip(result.candidate.new, slots, strict=True)
     )

@@ -18,7 +18,15 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.linalg import expm
 
 from dart_model.effects import Bench, Motion
-from rig.diagnosis.numerics.compiled import respond, simulate
+from rig.diagnosis.numerics.compiled import (
+    Equations,
+    Model,
+    Scenario,
+    Steps,
+    Trajectory,
+    respond,
+    simulate,
+)
 from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise
 from rig.diagnosis.problem import linear_part, track
 from rig.diagnosis.problem.grid import Grid, fine_times, smoothed
@@ -72,14 +80,6 @@ class Run(NamedTuple):
     substeps: int
     angle: float
     mechanism: Mechanism
-
-
-class Trajectory(NamedTuple):
-    """Strut motions at the nodes, each of shape (N, struts)."""
-
-    heights_m: Array
-    velocities_m_per_s: Array
-    accelerations_m_per_s2: Array
 
 
 def run_of(
@@ -250,30 +250,17 @@ class FreeRun(Problem):
             return None
         shape = (len(run.grid.t_s), len(self.noise_m))
         there = Trajectory(np.empty(shape), np.empty(shape), np.empty(shape))
-        slots = slots_of(self, candidate)
+        inverse = np.ascontiguousarray(np.linalg.inv(m.mass), dtype=np.float64)
+        equations = Equations(
+            inverse, m.bias, m.bias_q, m.bias_v, m.jacobian, m.heights_m, m.applied, m.q, m.v
+        )
+        slots, struts = slots_of(self, candidate), strut_constants(self, parts.linear)
         finite = simulate(
-            slots.forces,
-            slots.rates,
-            slots.index,
-            parts.effects,
-            strut_constants(self, parts.linear),
-            np.ascontiguousarray(np.linalg.inv(m.mass)),
-            m.bias,
-            m.bias_q,
-            m.bias_v,
-            m.jacobian,
-            m.heights_m,
-            m.applied,
-            m.q,
-            m.v,
-            run.grid.t_s,
-            run.fine_n,
-            run.grid.temperature_c,
-            run.substeps,
-            _BEND * run.angle**2,
-            self._stroke_m,
-            start,
-            *there,
+            slots.laws,
+            Model(slots.placement, parts.effects, struts, equations),
+            Scenario(start, run.grid.t_s, run.fine_n, run.grid.temperature_c),
+            Steps(run.substeps, _BEND * run.angle**2, self._stroke_m),
+            there,
         )
         return there if finite else None
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.effects import Motion
-from rig.diagnosis.numerics.compiled import along, law
+from dart_model.effects import Motion, effect
+from rig.diagnosis.numerics.compiled import LawValues, StrutMotion, force_along
 from rig.diagnosis.problem.problem import (
     Candidate,
     Parts,
@@ -77,15 +77,13 @@ def law_force(
         constants: Free length, stiffness, damping and gravity of all struts, shape (struts, 4...).
         state: Internal state at the beginning; at zero if absent.
     """
-    functions = law(name)
-    out = np.empty(len(track.t_s))
-    along(
-        functions.forces, functions.rates, np.ascontiguousarray(values), constants[strut],
+    start = state if len(state) else np.zeros(effect(name).state_size)
+    motion = StrutMotion(
         track.t_s, track.heights_m[strut], track.velocities_m_per_s[strut],
-        track.applied_n, track.temperature_c, _substeps(track.t_s),
-        state if len(state) else np.zeros(functions.states), out,
+        track.applied_n, track.temperature_c,
     )  # fmt: skip
-    return out
+    own = LawValues(np.ascontiguousarray(values), constants[strut], start)
+    return force_along(name, own, motion, _substeps(track.t_s))
 
 
 def linear_forces(tracks: Sequence[Track], strut: int) -> Array:
@@ -123,7 +121,7 @@ def segment_forces(
     known: dict[int, Array] = {}
     for segment in segments:
         own = segment.reference if reference else segment.track
-        if segment.lead is None or law(name).states == 0:
+        if segment.lead is None or effect(name).state_size == 0:
             found.append(law_force(own, strut, name, values, constants))
             continue
         whole = segment.lead[1] if reference else segment.lead[0]
@@ -138,16 +136,16 @@ def effect_forces(
 ) -> list[tuple[int, Array]]:
     """Strut and force (N,) of each effect of a candidate along a motion."""
     constants = strut_constants(problem, parts.linear)
-    index = slots_of(problem, candidate).index
+    slots = slots_of(problem, candidate).each
     return [
         (
             strut,
             law_force(
-                track, strut, name, parts.effects[slot[1] : slot[2]], constants,
-                states[slot[3] : slot[4]],
+                track, strut, name, parts.effects[slot.parameters], constants,
+                states[slot.states],
             ),
         )
-        for (strut, name), slot in zip(placed(problem, candidate), index, strict=True)
+        for (strut, name), slot in zip(placed(problem, candidate), slots, strict=True)
     ]  # fmt: skip
 
 

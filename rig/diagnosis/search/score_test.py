@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
-from rig.diagnosis.numerics.compiled import law
+from rig.diagnosis.numerics.compiled import compile_law
 from rig.diagnosis.numerics.least_squares import solve
 from rig.diagnosis.problem.problem import (
     Candidate,
@@ -120,7 +120,7 @@ def changes(
     added = _additions(base) if len(laws) < most_laws else []
     like = list(_likenesses(base))
     for _, name in [*laws, *(at for at, _ in (*added, *like))]:
-        law(name)  # Compiled here: numba's compiler is no place for two threads.
+        compile_law(name)  # here: numba's compiler admits no two threads
     olds = {at: _old(base, at) for at in laws}
     with ThreadPoolExecutor(cpu_count()) as pool:
         tried = [

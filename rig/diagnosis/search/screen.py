@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import CATALOGUE, effect
-from rig.diagnosis.numerics.compiled import law
+from rig.diagnosis.numerics.compiled import compile_law
 from rig.diagnosis.numerics.least_squares import Prior, Space, joined, solve
 from rig.diagnosis.problem.problem import (
     Candidate,
@@ -146,11 +146,11 @@ def _stage(
     coarse: Stage | None,
 ) -> Stage:
     constants = strut_constants(problem, parts.linear)
-    index = slots_of(problem, candidate).index
+    slots = slots_of(problem, candidate).each
     target = [segment.target.copy() for segment in segments]
     tangents: list[list[Array]] = [[] for _ in segments]
     for row, (strut, name) in enumerate(placed(problem, candidate)):
-        values = parts.effects[index[row, 1] : index[row, 2]]
+        values = parts.effects[slots[row].parameters]
         # The reference's laws acted along its own motion; those of a screening, along the measured.
         forces = segment_forces(segments, strut, name, values, constants, reference=True)
         if row < len(candidate.kept):
@@ -324,7 +324,7 @@ def ranked(
     laws = proposed(stage.problem) if only is None else only
     laws = [at for at in laws if goes_with(at, base.laws)]
     for _, name in laws:
-        law(name)  # Compiled here: numba's compiler is no place for two threads.
+        compile_law(name)  # here: numba's compiler admits no two threads
 
     def first(at: Placed, known: Mapping[str, float] = MappingProxyType({})) -> list[_Start]:
         found = [

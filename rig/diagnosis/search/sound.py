@@ -148,7 +148,7 @@ def _active(
 ) -> str | None:
     """A strut that feeds energy in at a height and velocity that the motion went through."""
     constants = strut_constants(problem, result.parts.linear)
-    index = slots_of(problem, result.candidate).index
+    slots = slots_of(problem, result.candidate).each
     effects = placed(problem, result.candidate)
     for strut in range(len(problem.motions)):
         if not any(at == strut for at, _ in result.candidate.new):
@@ -159,9 +159,9 @@ def _active(
         here = _at_rest(z[cells], w[cells], len(problem.motions), strut)
         still = here._replace(velocities_m_per_s=np.zeros_like(here.velocities_m_per_s))
         force = -constants[strut, 2] * w[cells]
-        for (at, name), slot in zip(effects, index, strict=True):
+        for (at, name), slot in zip(effects, slots, strict=True):
             if at == strut and effect(name).family not in _CHANNELS and not effect(name).state_size:
-                values = result.parts.effects[slot[1] : slot[2]]
+                values = result.parts.effects[slot.parameters]
                 force = force + law_force(here, strut, name, values, constants)
                 force = force - law_force(still, strut, name, values, constants)
         power = force * w[cells]
