@@ -308,8 +308,8 @@ def estimates_of(
     variables = effect_variables(problem, result).get(row)
     if variables is not None:
         return effect(name).named(estimates.estimate(int(v)) for v in variables)
-    slot = slots_of(problem, result.candidate).index[row]
-    values = result.parts.effects[slot[1] : slot[2]]
+    slot = slots_of(problem, result.candidate).each[row]
+    values = result.parts.effects[slot.parameters]
     return effect(name).named(Estimate(float(value), None, None) for value in values)
 
 
@@ -479,8 +479,8 @@ def _notes(problem: Problem, search: SearchResult, *, by_blocks: bool) -> tuple[
 def _resembles_hold(problem: Problem, result: Fit) -> bool:
     """Whether there is a delay that a zero-order hold of the applied force would cause."""
     half_s = 0.5 * problem.motions[0].step_s
-    index = slots_of(problem, result.candidate).index[len(result.candidate.kept) :]
+    slots = slots_of(problem, result.candidate).each[len(result.candidate.kept) :]
     return any(
-        name == "delay" and abs(result.parts.effects[slot[1]] / half_s - 1.0) < _HOLD
-        for (_, name), slot in zip(result.candidate.new, index, strict=True)
+        name == "delay" and abs(result.parts.effects[slot.parameters][0] / half_s - 1.0) < _HOLD
+        for (_, name), slot in zip(result.candidate.new, slots, strict=True)
     )

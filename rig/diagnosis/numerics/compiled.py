@@ -52,18 +52,16 @@ _TEN_RATES: Any = types.UniTuple(_RATE, SLOTS)
 _TEN_POINTERS: Any = types.UniTuple(_POINTER, SLOTS)
 
 
-class Law(NamedTuple):
-    """A law as machine code.
+class Laws(NamedTuple):
+    """Laws as machine code.
 
     Attributes:
-        forces: Its force, a list of one.
-        rates: Its internal state's rate, a list of one.
-        states: Number of internal states.
+        forces: Their forces, a typed list.
+        rates: Rates of their internal states, likewise.
     """
 
     forces: Any
     rates: Any
-    states: int
 
 
 def compile_loop(function: Callable[..., Any], signature: Any) -> Any:
@@ -72,32 +70,37 @@ def compile_loop(function: Callable[..., Any], signature: Any) -> Any:
     return compiler(signature, cache=True, error_model="numpy", nogil=True)(function)
 
 
+def _inlined(function: Callable[..., Any]) -> Any:
+    """A part of a loop: compiled with the loop that calls it, and never on its own.
+
+    It allocates nothing, and counts no references: an array would be held and released at each
+    call, and so would every array of a structure.
+    """
+    compiler = cast("Any", numba.njit)
+    return compiler(
+        error_model="numpy",
+        forceinline=True,
+        no_cpython_wrapper=True,
+        no_cfunc_wrapper=True,
+        _nrt=False,
+    )(function)
+
+
 def _compile_law(function: Callable[..., Any], signature: Any) -> Any:
     # A law only reads and writes by index, so bare pointers do, which cost least in a call.
     compiler = cast("Any", numba.cfunc)
     return compiler(signature, cache=True, error_model="numpy")(function)
 
 
-_KEPT: list[Any] = []
-"""Machine code whose addresses are in use: the lists below hold no references."""
+# The lists of laws hold addresses, not references: the caches keep the machine code.
+@functools.cache
+def _force(name: str) -> Any:
+    return _compile_law(force_over_arrays(effect(name)), _FORCE_SIGNATURE)
 
 
 @functools.cache
-def _compiled_force(name: str) -> Any:
-    force = _compile_law(force_over_arrays(effect(name)), _FORCE_SIGNATURE)
-    _KEPT.append(force)
-    return force
-
-
-@functools.cache
-def _compiled_rate(name: str) -> Any:
-    rate = _compile_law(rates_over_arrays(effect(name)), _RATE_SIGNATURE)
-    _KEPT.append(rate)
-    return rate
-
-
-def _compiled(name: str) -> tuple[Any, Any]:
-    return _compiled_force(name), _compiled_rate(name if effect(name).rate else "none")
+def _rate(name: str) -> Any:
+    return _compile_law(rates_over_arrays(effect(name)), _RATE_SIGNATURE)
 
 
 def _empty() -> tuple[Any, Any]:
@@ -113,39 +116,64 @@ _empty = compile_loop(_empty, types.Tuple((_FORCES, _RATES))())
 _append = compile_loop(_append, types.void(_FORCES, _RATES, _FORCE, _RATE))
 
 
-def _listed(names: tuple[str, ...]) -> tuple[Any, Any]:
+@functools.cache
+def _laws(names: tuple[str, ...]) -> Laws:
     # The interpreter is asked for a function's address once, here; it would be at every call of a
     # loop that took functions themselves, for longer than a short loop runs. They are appended one
     # by one, because numba warns of a tuple of functions, and a thread cannot silence warnings
     # without silencing other threads'.
     forces, rates = _empty()
     for name in names:
-        _append(forces, rates, *_compiled(name))
-    return forces, rates
+        _append(forces, rates, _force(name), _rate(name if effect(name).rate else "none"))
+    return Laws(forces, rates)
 
 
-@functools.cache
-def law(name: str) -> Law:
-    """The law of an effect as machine code, compiled on first use and kept on disk."""
-    return Law(*_listed((name,)), effect(name).state_size)
+def compile_law(name: str) -> None:
+    """Compile the law of an effect, before threads need it: numba's compiler admits one."""
+    _laws((name,))
+
+
+class Slot(NamedTuple):
+    """Where a placed effect reads its values.
+
+    Attributes:
+        strut: Index of its strut.
+        parameters: Its part of all parameters.
+        states: Its part of all internal states.
+    """
+
+    strut: int
+    parameters: slice
+    states: slice
+
+
+class Placement(NamedTuple):
+    """Where the laws of a simulation are, each of shape (effects,).
+
+    Attributes:
+        struts: Index of the strut.
+        first_parameters: Index of the first parameter among all.
+        first_states: Index of the first internal state among all; -1 if it has none.
+    """
+
+    struts: Integers
+    first_parameters: Integers
+    first_states: Integers
 
 
 class Slots(NamedTuple):
-    """Placed effects as the loops read them.
+    """Effects in the struts of a model.
 
     Attributes:
-        forces: Their forces, a list filled up to `SLOTS`.
-        rates: Their internal states' rates, likewise.
-        index: For each effect its strut, first parameter, past the last parameter, first internal
-            state and past the last one, shape (effects, 5).
-        parameters: Number of parameters of all.
+        laws: Their laws, filled up to `SLOTS`.
+        placement: Where they are, for the compiled loops.
+        each: The same, one by one.
         states: Number of internal states of all.
     """
 
-    forces: Any
-    rates: Any
-    index: Integers
-    parameters: int
+    laws: Laws
+    placement: Placement
+    each: tuple[Slot, ...]
     states: int
 
 
@@ -158,15 +186,22 @@ def slots(effects: tuple[tuple[int, str], ...]) -> Slots:
     """
     if len(effects) > SLOTS:
         raise ValueError(f"{len(effects)} effects in one simulation, which carries at most {SLOTS}")
-    index = np.zeros((len(effects), 5), dtype=np.int64)
+    each: list[Slot] = []
     parameter = state = 0
-    for row, (strut, name) in enumerate(effects):
+    for strut, name in effects:
         item = effect(name)
         past_parameter, past_state = parameter + len(item.parameters), state + item.state_size
-        index[row] = strut, parameter, past_parameter, state, past_state
+        each.append(Slot(strut, slice(parameter, past_parameter), slice(state, past_state)))
         parameter, state = past_parameter, past_state
     names = tuple(name for _, name in effects) + ("none",) * (SLOTS - len(effects))
-    return Slots(*_listed(names), index, parameter, state)
+    placement = Placement(
+        np.array([slot.strut for slot in each], np.int64),
+        np.array([slot.parameters.start for slot in each], np.int64),
+        np.array(
+            [s.states.start if s.states.stop > s.states.start else -1 for s in each], np.int64
+        ),
+    )
+    return Slots(_laws(names), placement, tuple(each), state)
 
 
 def _ten(f: Any) -> Any:
@@ -196,6 +231,197 @@ _pointer = compile_loop(_pointer, _POINTER(_VECTOR, _I8))
 _pointers = compile_loop(_pointers, _TEN_POINTERS(_VECTOR, _INTEGERS))
 
 
+class Equations(NamedTuple):
+    """Equations of motion without the struts' forces: constant (K = 1) or at the nodes (K = N).
+
+    Attributes:
+        mass_inverse: Inverse mass matrix, shape (K, n, n).
+        bias: Generalised force of all but struts and applied force, shape (K, n).
+        bias_q: Its derivative by the coordinates, shape (K, n, n).
+        bias_v: Its derivative by their rates, shape (K, n, n).
+        jacobian: Jacobian of the struts, shape (K, struts, n).
+        heights_m: Strut heights, shape (K, struts).
+        applied: Generalised force per newton of applied force, shape (K, n).
+        q: Coordinates to which these belong, shape (K, n).
+        v: Their rates, shape (K, n).
+    """
+
+    mass_inverse: Cube
+    bias: Array
+    bias_q: Cube
+    bias_v: Cube
+    jacobian: Cube
+    heights_m: Array
+    applied: Array
+    q: Array
+    v: Array
+
+
+class Scenario(NamedTuple):
+    """Where a simulation begins, and what drives it.
+
+    Attributes:
+        start: Coordinates, their rates and internal states, shape (2 n + states,).
+        t_s: Times of the nodes, shape (N,).
+        applied_n: Applied force at half sub-steps, shape (2 * substeps * (N - 1) + 1,).
+        temperature_c: Temperature at the nodes, shape (N,).
+    """
+
+    start: Array
+    t_s: Array
+    applied_n: Array
+    temperature_c: Array
+
+
+class Steps(NamedTuple):
+    """How finely a simulation steps.
+
+    Attributes:
+        substeps: Steps between nodes.
+        bend: Share by which a smooth acceleration bends within one.
+        stroke_m: Stroke of the recordings.
+    """
+
+    substeps: int
+    bend: float
+    stroke_m: float
+
+
+class Trajectory(NamedTuple):
+    """Strut motions at the nodes, each of shape (N, struts)."""
+
+    heights_m: Array
+    velocities_m_per_s: Array
+    accelerations_m_per_s2: Array
+
+
+class Model(NamedTuple):
+    """A model as it is simulated.
+
+    Attributes:
+        placement: Where the laws of its effects are.
+        parameters: Their parameters, one after another.
+        struts: Constants of the struts, shape (struts, 5): free length, stiffness,
+            damping, gravity and preload.
+        equations: Its equations of motion.
+    """
+
+    placement: Placement
+    parameters: Array
+    struts: Array
+    equations: Equations
+
+
+class _Span(NamedTuple):
+    """A step of the integrator between two nodes, and what drives it.
+
+    Attributes:
+        before: Index of the node before in the equations' tables.
+        after: Index of the node after.
+        gap_s: Time between the nodes.
+        first_s: Time of the node before.
+        step_s: Duration of the step.
+        step: Number of steps between that node and this one.
+        steps: Number of steps between the nodes.
+        applied_n: Applied force at the beginning, the middle and the end of the step.
+        temperature_c: Temperature at the node before.
+        warming_k: Change of the temperature from node to node.
+    """
+
+    before: int
+    after: int
+    gap_s: float
+    first_s: float
+    step_s: float
+    step: int
+    steps: int
+    applied_n: tuple[float, float, float]
+    temperature_c: float
+    warming_k: float
+
+
+class _Work(NamedTuple):
+    """What one evaluation of the slope leaves behind.
+
+    Attributes:
+        x: Coordinates, their rates and internal states there, shape (2 n + states,).
+        slope: Derivative of `x`.
+        q: Reference coordinates there, shape (n,).
+        v: Their rates, shape (n,).
+        general: Generalised force, shape (n,).
+        heights_m: Strut heights, shape (struts,).
+        velocities: Their rates, m/s, shape (struts,).
+        forces_n: Strut forces, shape (struts,).
+    """
+
+    x: Array
+    slope: Array
+    q: Array
+    v: Array
+    general: Array
+    heights_m: Array
+    velocities: Array
+    forces_n: Array
+
+
+class _Step(NamedTuple):
+    """Sums of a step by Runge and Kutta's method.
+
+    Attributes:
+        x: Where the step has come to, shape (2 n + states,).
+        began: Where it began.
+        total: Weighted slopes.
+        twist: Second difference of the accelerations, shape (n,).
+    """
+
+    x: Array
+    began: Array
+    total: Array
+    twist: Array
+
+
+class _Calls(NamedTuple):
+    """The laws of a simulation with pointers to what each reads and writes, `SLOTS` of each.
+
+    Attributes:
+        forces: Forces.
+        rates: Rates of the internal states.
+        states: Pointers to the internal states.
+        slopes: Pointers to where their rates are written.
+        parameters: Pointers to the parameters.
+        struts: Pointers to the constants of the strut.
+    """
+
+    forces: Any
+    rates: Any
+    states: Any
+    slopes: Any
+    parameters: Any
+    struts: Any
+
+
+class _Instant(NamedTuple):
+    """A time between two nodes.
+
+    Attributes:
+        before: Index of the node before in the equations' tables.
+        after: Index of the node after.
+        gap_s: Time between the nodes.
+        share: Share of it that has passed.
+        t_s: The time.
+        applied_n: Applied force.
+        temperature_c: Temperature.
+    """
+
+    before: int
+    after: int
+    gap_s: float
+    share: float
+    t_s: float
+    applied_n: float
+    temperature_c: float
+
+
 _PIECES = 8
 """Parts into which a step is cut where a force jumps."""
 _MOST_PIECES = 32
@@ -205,243 +431,351 @@ _LARGEST_ERROR = 5e-8
 """Change of height within a step by a jump of force, as a share of the stroke, from which on the
 step is cut: a tenth of the resolution of usual height sensors over their range."""
 
+FREE_LENGTH, STIFFNESS, DAMPING, GRAVITY, PRELOAD = range(5)
+"""Columns of a strut's constants."""
 
+
+@_inlined
+def _span(scenario: Scenario, substeps: int, node: int, step: int, tabulated: bool) -> _Span:
+    t, fine, temperature = scenario.t_s, scenario.applied_n, scenario.temperature_c
+    after = min(node + 1, t.shape[0] - 1)
+    gap = t[after] - t[node]
+    last = fine.shape[0] - 1
+    at = min(2 * (substeps * node + step), last)
+    return _Span(
+        node if tabulated else 0,
+        after if tabulated else 0,
+        gap,
+        t[node],
+        gap / substeps,
+        step,
+        substeps,
+        (fine[at], fine[min(at + 1, last)], fine[min(at + 2, last)]),
+        temperature[node],
+        temperature[after] - temperature[node],
+    )
+
+
+@_inlined
+def _instant(span: _Span, u: float) -> _Instant:
+    """The time at a share `u` of a step; the applied force as a parabola over it."""
+    f0, f1, f2 = span.applied_n
+    share = (span.step + u) / span.steps
+    return _Instant(
+        span.before,
+        span.after,
+        span.gap_s,
+        share,
+        span.first_s + (span.step + u) * span.step_s,
+        f0 * (1.0 - u) * (1.0 - 2.0 * u) + 4.0 * f1 * u * (1.0 - u) + f2 * u * (2.0 * u - 1.0),
+        span.temperature_c + share * span.warming_k,
+    )
+
+
+@_inlined
+def _cubic(rise: float, early: float, late: float, share: float) -> float:
+    """Change since a node by Hermite's cubic: of a rise with slopes times the gap at both ends."""
+    turn = early + late - 2.0 * rise
+    sag = 3.0 * rise - 2.0 * early - late
+    return share * (early + share * (sag + share * turn))
+
+
+@_inlined
+def _follow_reference(equations: Equations, at: _Instant, work: _Work) -> None:
+    """Write the reference coordinates and their rates, between nodes."""
+    # Hermite's cubic: a chord would cut the motion's bends.
+    q, v, a, b = equations.q, equations.v, at.before, at.after
+    for j in range(q.shape[1]):
+        rise = q[b, j] - q[a, j]
+        early = at.gap_s * v[a, j]
+        late = at.gap_s * v[b, j]
+        work.q[j] = q[a, j] + _cubic(rise, early, late, at.share)
+        work.v[j] = v[a, j]
+        if at.gap_s > 0.0:
+            turn = early + late - 2.0 * rise
+            sag = 3.0 * rise - 2.0 * early - late
+            rate = early + at.share * (2.0 * sag + 3.0 * at.share * turn)
+            work.v[j] = rate / at.gap_s
+
+
+@_inlined
+def _move_struts(
+    equations: Equations, struts: Array, at: _Instant, work: _Work, tabulated: bool
+) -> None:
+    """Write the struts' heights, velocities and linear forces."""
+    rows, heights, a, b = equations.jacobian, equations.heights_m, at.before, at.after
+    n = rows.shape[2]
+    for i in range(rows.shape[1]):
+        height = heights[a, i]
+        if tabulated:
+            # Heights follow the reference by a cubic, and to first order in the distance from it.
+            early = 0.0
+            late = 0.0
+            for j in range(n):
+                early += at.gap_s * rows[a, i, j] * equations.v[a, j]
+                late += at.gap_s * rows[b, i, j] * equations.v[b, j]
+            height += _cubic(heights[b, i] - heights[a, i], early, late, at.share)
+        velocity = 0.0
+        for j in range(n):
+            row = rows[a, i, j] + at.share * (rows[b, i, j] - rows[a, i, j])
+            height += row * (work.x[j] - work.q[j])
+            velocity += row * work.x[n + j]
+        work.heights_m[i] = height
+        work.velocities[i] = velocity
+        work.forces_n[i] = (
+            struts[i, PRELOAD]
+            - struts[i, STIFFNESS] * (height - struts[i, FREE_LENGTH])
+            - struts[i, DAMPING] * velocity
+        )
+
+
+@_inlined
+def _add_effects(placement: Placement, calls: _Calls, at: _Instant, work: _Work) -> None:
+    """Add the forces of the effects, and write the rates of their internal states."""
+    for slot in range(SLOTS):
+        # A fixed number of turns is unrolled, so that no tuple is searched.
+        if slot >= placement.struts.shape[0]:
+            break
+        i = placement.struts[slot]
+        if placement.first_states[slot] >= 0:
+            calls.rates[slot](
+                at.t_s, work.heights_m[i], work.velocities[i], at.applied_n, at.temperature_c,
+                calls.states[slot], calls.parameters[slot], calls.struts[slot], calls.slopes[slot],
+            )  # fmt: skip
+        work.forces_n[i] += calls.forces[slot](
+            at.t_s, work.heights_m[i], work.velocities[i], at.applied_n, at.temperature_c,
+            calls.states[slot], calls.parameters[slot], calls.struts[slot],
+        )  # fmt: skip
+
+
+@_inlined
+def _accelerate(equations: Equations, at: _Instant, work: _Work) -> None:
+    """Write the slope of coordinates and rates."""
+    rows, a, b, share = equations.jacobian, at.before, at.after, at.share
+    bias, applied, inverses = equations.bias, equations.applied, equations.mass_inverse
+    n = rows.shape[2]
+    for j in range(n):
+        sum_n = bias[a, j] + share * (bias[b, j] - bias[a, j])
+        sum_n += (applied[a, j] + share * (applied[b, j] - applied[a, j])) * at.applied_n
+        for i in range(rows.shape[1]):
+            row = rows[a, i, j] + share * (rows[b, i, j] - rows[a, i, j])
+            sum_n += row * work.forces_n[i]
+        for i in range(n):
+            sum_n += equations.bias_q[a, j, i] * (work.x[i] - work.q[i])
+            sum_n += equations.bias_v[a, j, i] * (work.x[n + i] - work.v[i])
+        work.general[j] = sum_n
+    for j in range(n):
+        acceleration = 0.0
+        for i in range(n):
+            inverse = inverses[a, j, i]
+            inverse += share * (inverses[b, j, i] - inverse)
+            acceleration += inverse * work.general[i]
+        work.slope[j] = work.x[n + j]
+        work.slope[n + j] = acceleration
+
+
+@_inlined
+def _write_slope(model: Model, calls: _Calls, at: _Instant, work: _Work) -> None:
+    """Evaluate the differential equation at `work.x`."""
+    tabulated = model.equations.jacobian.shape[0] > 1
+    if tabulated:
+        _follow_reference(model.equations, at, work)
+    _move_struts(model.equations, model.struts, at, work, tabulated)
+    _add_effects(model.placement, calls, at, work)
+    _accelerate(model.equations, at, work)
+
+
+@_inlined
+def _begin_stage(stage: int, h: float, step: _Step, work: _Work) -> None:
+    """Write where a stage of the classical Runge-Kutta method evaluates the slope."""
+    if stage == 0:
+        for i in range(step.x.shape[0]):
+            work.x[i] = step.x[i]
+    else:
+        reach = h if stage == 3 else 0.5 * h
+        for i in range(step.x.shape[0]):
+            work.x[i] = step.x[i] + reach * work.slope[i]
+
+
+@_inlined
+def _end_stage(stage: int, h: float, step: _Step, work: _Work) -> None:
+    """Add a stage's slope with its weight: 1, 2, 2, 1; the last one ends the step."""
+    n, size = step.twist.shape[0], step.x.shape[0]
+    if stage == 0:
+        for j in range(n):
+            step.twist[j] = work.slope[n + j]
+        for i in range(size):
+            step.total[i] = work.slope[i]
+    elif stage == 3:
+        for j in range(n):
+            step.twist[j] += work.slope[n + j]
+        for i in range(size):
+            step.x[i] += h / 6.0 * (step.total[i] + work.slope[i])
+    else:
+        for j in range(n):
+            step.twist[j] -= work.slope[n + j]
+        for i in range(size):
+            step.total[i] += 2.0 * work.slope[i]
+
+
+@_inlined
+def _jumped(h: float, steps: Steps, step: _Step, work: _Work) -> bool:
+    """Whether a force jumped within a step, as it does where a contact closes or friction turns."""
+    n = step.twist.shape[0]
+    worst = 0.0
+    largest = 0.0
+    for j in range(n):
+        worst = max(worst, abs(step.twist[j]))
+        largest = max(largest, abs(work.slope[n + j]), abs(step.total[n + j]) / 5.0)
+    least = _LARGEST_ERROR * steps.stroke_m
+    return bool(worst * h * h > 6.0 * least and worst > steps.bend * largest)
+
+
+@_inlined
+def _record(equations: Equations, node: int, work: _Work, out: Trajectory) -> None:
+    """Write the motion at a node."""
+    rows = equations.jacobian
+    a = node if rows.shape[0] > 1 else 0
+    n = rows.shape[2]
+    for i in range(rows.shape[1]):
+        out.heights_m[node, i] = work.heights_m[i]
+        out.velocities_m_per_s[node, i] = work.velocities[i]
+        along_strut = 0.0
+        for j in range(n):
+            along_strut += rows[a, i, j] * work.slope[n + j]
+        out.accelerations_m_per_s2[node, i] = along_strut
+
+
+@_inlined
 def _march(
-    forces: Any, rates: Any, own: Any, slopes: Any, values: Any, constants: Any,
-    y: Array, dy: Array, index: Integers, struts: Array,
-    mass_inverse: Cube, bias: Array, bias_q: Cube, bias_v: Cube, rows: Cube, heights0: Array,
-    applied: Array, q0: Array, v0: Array,
-    t: Array, fine: Array, temperature: Array, substeps: int, bend: float, stroke: float,
-    start: Array, heights: Array, velocities: Array, accelerations: Array,
+    model: Model, calls: _Calls, scenario: Scenario, steps: Steps, work: _Work, step: _Step,
+    out: Trajectory,
 ) -> bool:  # fmt: skip
     # Laws take bare pointers, because an array would be counted as held and released at each call.
     # The pointers come as arguments: numba has no arithmetic to make them of others in the loop,
     # and to cut an array there for each call takes longer than most laws.
-    n = rows.shape[2]
-    count = rows.shape[1]
-    tabulated = rows.shape[0] > 1
-    size = start.shape[0]
-    x = start.copy()
-    began = start.copy()
-    total = np.zeros(size)
-    twist = np.zeros(n)
-    z = np.zeros(count)
-    w = np.zeros(count)
-    force = np.zeros(count)
-    general = np.zeros(n)
-    q = q0[0].copy()
-    v = v0[0].copy()
-    least = _LARGEST_ERROR * stroke
-    for k in range(t.shape[0]):
-        last = k + 1 == t.shape[0]
-        after = k if last else k + 1
-        gap = 0.0 if last else t[k + 1] - t[k]
-        whole = gap / substeps
-        a = k if tabulated else 0
-        b = after if tabulated else 0
-        for step in range(substeps):
-            at = min(2 * (substeps * k + step), fine.shape[0] - 1)
-            f0 = fine[at]
-            f1 = fine[min(at + 1, fine.shape[0] - 1)]
-            f2 = fine[min(at + 2, fine.shape[0] - 1)]
-            for i in range(size):
-                began[i] = x[i]
+    tabulated = model.equations.jacobian.shape[0] > 1
+    farthest_m = 1e3 * steps.stroke_m + 1e3 * abs(model.equations.heights_m[0, 0])
+    nodes = scenario.t_s.shape[0]
+    for node in range(nodes):
+        for substep in range(steps.substeps):
+            span = _span(scenario, steps.substeps, node, substep, tabulated)
+            for i in range(step.x.shape[0]):
+                step.began[i] = step.x[i]
             pieces = 1
             piece = 0
             while piece < pieces:
-                h = whole / pieces
+                h = span.step_s / pieces
                 for stage in range(4):
-                    # Classical Runge-Kutta: nodes 0, 1/2, 1/2, 1; weights 1, 2, 2, 1.
-                    half = (stage + 1) // 2
-                    if stage == 0:
-                        for i in range(size):
-                            y[i] = x[i]
-                    else:
-                        reach = h if stage == 3 else 0.5 * h
-                        for i in range(size):
-                            y[i] = x[i] + reach * dy[i]
-                    u = (piece + 0.5 * half) / pieces
-                    share = (step + u) / substeps
-                    now = t[k] + (step + u) * whole
-                    warm = temperature[k] + share * (temperature[after] - temperature[k])
-                    load = (
-                        f0 * (1.0 - u) * (1.0 - 2.0 * u)
-                        + 4.0 * f1 * u * (1.0 - u)
-                        + f2 * u * (2.0 * u - 1.0)
-                    )
-                    if tabulated:
-                        # Hermite's cubic between nodes: a chord would cut the motion's bends.
-                        for j in range(n):
-                            rise = q0[b, j] - q0[a, j]
-                            early = gap * v0[a, j]
-                            late = gap * v0[b, j]
-                            turn = early + late - 2.0 * rise
-                            sag = 3.0 * rise - 2.0 * early - late
-                            q[j] = q0[a, j] + share * (early + share * (sag + share * turn))
-                            v[j] = v0[a, j]
-                            if gap > 0.0:
-                                v[j] = (early + share * (2.0 * sag + 3.0 * share * turn)) / gap
-                    for i in range(count):
-                        height = heights0[a, i]
-                        if tabulated:
-                            # Heights follow the reference by a cubic, to first order beside it.
-                            rise = heights0[b, i] - heights0[a, i]
-                            early = 0.0
-                            late = 0.0
-                            for j in range(n):
-                                early += gap * rows[a, i, j] * v0[a, j]
-                                late += gap * rows[b, i, j] * v0[b, j]
-                            turn = early + late - 2.0 * rise
-                            sag = 3.0 * rise - 2.0 * early - late
-                            height += share * (early + share * (sag + share * turn))
-                        velocity = 0.0
-                        for j in range(n):
-                            row = rows[a, i, j] + share * (rows[b, i, j] - rows[a, i, j])
-                            height += row * (y[j] - q[j])
-                            velocity += row * y[n + j]
-                        z[i] = height
-                        w[i] = velocity
-                        force[i] = (
-                            struts[i, 4]
-                            - struts[i, 1] * (height - struts[i, 0])
-                            - struts[i, 2] * velocity
-                        )
-                    for slot in range(SLOTS):
-                        # A fixed number of turns is unrolled, so that no tuple is searched.
-                        if slot >= index.shape[0]:
-                            break
-                        i = index[slot, 0]
-                        if index[slot, 4] > index[slot, 3]:
-                            rates[slot](
-                                now, z[i], w[i], load, warm,
-                                own[slot], values[slot], constants[slot], slopes[slot],
-                            )  # fmt: skip
-                        force[i] += forces[slot](
-                            now, z[i], w[i], load, warm, own[slot], values[slot], constants[slot]
-                        )
-                    for j in range(n):
-                        sum_n = bias[a, j] + share * (bias[b, j] - bias[a, j])
-                        sum_n += (applied[a, j] + share * (applied[b, j] - applied[a, j])) * load
-                        for i in range(count):
-                            row = rows[a, i, j] + share * (rows[b, i, j] - rows[a, i, j])
-                            sum_n += row * force[i]
-                        for i in range(n):
-                            sum_n += bias_q[a, j, i] * (y[i] - q[i])
-                            sum_n += bias_v[a, j, i] * (y[n + i] - v[i])
-                        general[j] = sum_n
-                    for j in range(n):
-                        acceleration = 0.0
-                        for i in range(n):
-                            inverse = mass_inverse[a, j, i]
-                            inverse += share * (mass_inverse[b, j, i] - inverse)
-                            acceleration += inverse * general[i]
-                        dy[j] = y[n + j]
-                        dy[n + j] = acceleration
-                        if stage == 0:
-                            twist[j] = acceleration
-                        elif stage == 3:
-                            twist[j] += acceleration
-                        else:
-                            twist[j] -= acceleration
-                    if stage == 0:
-                        if step == 0 and piece == 0 and pieces == 1:
-                            for i in range(count):
-                                heights[k, i] = z[i]
-                                velocities[k, i] = w[i]
-                                along_strut = 0.0
-                                for j in range(n):
-                                    along_strut += rows[a, i, j] * dy[n + j]
-                                accelerations[k, i] = along_strut
-                            if last:
-                                return True
-                        for i in range(size):
-                            total[i] = dy[i]
-                    elif stage == 3:
-                        for i in range(size):
-                            x[i] += h / 6.0 * (total[i] + dy[i])
-                    else:
-                        for i in range(size):
-                            total[i] += 2.0 * dy[i]
+                    # Nodes of the classical Runge-Kutta method: 0, 1/2, 1/2, 1.
+                    u = (piece + 0.5 * ((stage + 1) // 2)) / pieces
+                    _begin_stage(stage, h, step, work)
+                    _write_slope(model, calls, _instant(span, u), work)
+                    if stage == 0 and substep == 0 and piece == 0 and pieces == 1:
+                        _record(model.equations, node, work, out)
+                        if node + 1 == nodes:
+                            return True
+                    _end_stage(stage, h, step, work)
                 piece += 1
-                if pieces < _MOST_PIECES:
-                    worst = 0.0
-                    largest = 0.0
-                    for j in range(n):
-                        worst = max(worst, abs(twist[j]))
-                        largest = max(largest, abs(dy[n + j]), abs(total[n + j]) / 5.0)
-                    if worst * h * h > 6.0 * least and worst > bend * largest:
-                        # A contact closed or friction turned within the step: again, in parts.
-                        for i in range(size):
-                            x[i] = began[i]
-                        pieces = _PIECES if pieces == 1 else _MOST_PIECES
-                        piece = 0
-        if not abs(z[0]) < 1e3 * stroke + 1e3 * abs(heights0[0, 0]):
+                if pieces < _MOST_PIECES and _jumped(h, steps, step, work):
+                    # Again, in parts.
+                    for i in range(step.x.shape[0]):
+                        step.x[i] = step.began[i]
+                    pieces = _PIECES if pieces == 1 else _MOST_PIECES
+                    piece = 0
+        if not abs(work.heights_m[0]) < farthest_m:
             return False
     return True
 
 
-_MECHANISM = (_CUBE, _MATRIX, _CUBE, _CUBE, _CUBE, _MATRIX, _MATRIX, _MATRIX, _MATRIX)
-_RUN = (_VECTOR, _VECTOR, _VECTOR, _I8, _F8, _F8, _VECTOR, _MATRIX, _MATRIX, _MATRIX)
-
-_march = compile_loop(
-    _march,
-    types.boolean(
-        _TEN_FORCES, _TEN_RATES, *(_TEN_POINTERS,) * 4,
-        _VECTOR, _VECTOR, _INDEX, _MATRIX, *_MECHANISM, *_RUN,
-    ),
-)  # fmt: skip
+# Signatures of what is kept on disk hold plain tuples: numba's index of it names the classes of
+# a signature, and could not be read after one of them was renamed.
+_PLACEMENT = types.UniTuple(_INTEGERS, 3)
+_EQUATIONS = types.Tuple((_CUBE, _MATRIX, _CUBE, _CUBE, _CUBE, _MATRIX, _MATRIX, _MATRIX, _MATRIX))
+_MODEL = types.Tuple((_PLACEMENT, _VECTOR, _MATRIX, _EQUATIONS))
+_SCENARIO = types.UniTuple(_VECTOR, 4)
+_STEPS = types.Tuple((_I8, _F8, _F8))
+_TRAJECTORY = types.UniTuple(_MATRIX, 3)
 
 
 def _simulate(
-    forces: Any, rates: Any,
-    index: Integers, p: Array, struts: Array,
-    mass_inverse: Cube, bias: Array, bias_q: Cube, bias_v: Cube, rows: Cube, heights0: Array,
-    applied: Array, q0: Array, v0: Array,
-    t: Array, fine: Array, temperature: Array, substeps: int, bend: float, stroke: float,
-    start: Array, heights: Array, velocities: Array, accelerations: Array,
-) -> bool:  # fmt: skip
+    forces: Any, rates: Any, model_parts: Any, scenario_parts: Any, steps: Any, out: Any
+) -> bool:
     # Pointers hold nothing: what they lead to is held by this function or by its caller.
-    y = start.copy()
-    dy = np.zeros(start.shape[0])
+    placement, equations = Placement(*model_parts[0]), Equations(*model_parts[3])
+    model = Model(placement, model_parts[1], model_parts[2], equations)
+    scenario = Scenario(*scenario_parts)
+    start, struts = scenario.start, model.struts
+    size = start.shape[0]
+    count, n = equations.jacobian.shape[1:]
     states = np.zeros(SLOTS, dtype=np.int64)
     parameters = np.zeros(SLOTS, dtype=np.int64)
     strut = np.zeros(SLOTS, dtype=np.int64)
-    for slot in range(index.shape[0]):
-        states[slot] = 2 * rows.shape[2] + index[slot, 3]
-        parameters[slot] = index[slot, 1]
-        strut[slot] = index[slot, 0] * struts.shape[1]
-    return _march(
-        _ten(forces), _ten(rates), _pointers(y, states), _pointers(dy, states),
-        _pointers(p, parameters), _pointers(struts.ravel(), strut),
-        y, dy, index, struts,
-        mass_inverse, bias, bias_q, bias_v, rows, heights0, applied, q0, v0,
-        t, fine, temperature, substeps, bend, stroke, start, heights, velocities, accelerations,
+    for slot in range(placement.struts.shape[0]):
+        states[slot] = 2 * n + max(placement.first_states[slot], 0)
+        parameters[slot] = placement.first_parameters[slot]
+        strut[slot] = placement.struts[slot] * struts.shape[1]
+    work = _Work(
+        start.copy(), np.zeros(size), equations.q[0].copy(), equations.v[0].copy(),
+        np.zeros(n), np.zeros(count), np.zeros(count), np.zeros(count),
     )  # fmt: skip
+    calls = _Calls(
+        _ten(forces), _ten(rates),
+        _pointers(work.x, states), _pointers(work.slope, states),
+        _pointers(model.parameters, parameters), _pointers(struts.ravel(), strut),
+    )  # fmt: skip
+    step = _Step(start.copy(), start.copy(), np.zeros(size), np.zeros(n))
+    return _march(model, calls, scenario, Steps(*steps), work, step, Trajectory(*out))
 
 
-simulate = compile_loop(
-    _simulate,
-    types.boolean(_FORCES, _RATES, _INDEX, _VECTOR, _MATRIX, *_MECHANISM, *_RUN),
+_simulate = compile_loop(
+    _simulate, types.boolean(_FORCES, _RATES, _MODEL, _SCENARIO, _STEPS, _TRAJECTORY)
 )
-"""Free-run simulation.
-
-Args: forces, rates and index of the slots; parameters; strut constants (struts, 5), the last one a
-preload; then the mechanism, constant (K = 1) or tabulated at the nodes (K = N): inverse mass matrix
-(K, n, n), bias force (K, n), its derivatives by coordinates and velocities (K, n, n), Jacobian of
-the struts (K, struts, n), heights (K, struts), generalised force per applied newton (K, n),
-coordinates and velocities to which these belong (K, n); times of the nodes (N,), applied force at
-half sub-steps (2 * substeps * (N - 1) + 1,), temperature (N,), sub-steps, share by which a smooth
-acceleration bends within one, stroke, start (2 n + states,); heights, velocities and accelerations
-of the struts (N, struts), written. Returns whether the motion stayed finite.
-"""
 
 
-def _along(
-    forces: Any, rates: Any, p: Array, strut: Array, t: Array, z: Array, w: Array,
-    applied: Array, temperature: Array, substeps: int, start: Array, out: Array,
-) -> None:  # fmt: skip
+def simulate(laws: Laws, model: Model, scenario: Scenario, steps: Steps, out: Trajectory) -> bool:
+    """Free-run simulation by the classical Runge-Kutta method; whether the motion stayed finite.
+
+    Args:
+        laws: Laws of the model's effects, `SLOTS` of them.
+        model: The model.
+        scenario: Start and inputs.
+        steps: How finely to step.
+        out: Where the motion is written.
+    """
+    parts = (tuple(model.placement), model.parameters, model.struts, tuple(model.equations))
+    return _simulate(*laws, parts, tuple(scenario), tuple(steps), tuple(out))
+
+
+class StrutMotion(NamedTuple):
+    """A known motion of a strut, each of shape (N,)."""
+
+    t_s: Array
+    heights_m: Array
+    velocities_m_per_s: Array
+    applied_n: Array
+    temperature_c: Array
+
+
+class LawValues(NamedTuple):
+    """What a law along a motion reads.
+
+    Attributes:
+        parameters: Its parameters.
+        strut: Constants of its strut.
+        start: Internal states at the beginning.
+    """
+
+    parameters: Array
+    strut: Array
+    start: Array
+
+
+def _along(forces: Any, rates: Any, values: Any, motion: Any, substeps: int, out: Array) -> None:
     force = forces[0]
     rate = rates[0]
+    t, z, w, applied, temperature = motion
+    parameters, strut, start = values
     size = start.shape[0]
     s = start.copy()
     y = np.empty(size)
@@ -449,7 +783,7 @@ def _along(
     k2 = np.zeros(size)
     s_at, y_at = _pointer(s, 0), _pointer(y, 0)
     k1_at, k2_at = _pointer(k1, 0), _pointer(k2, 0)
-    p_at, strut_at = _pointer(p, 0), _pointer(strut, 0)
+    p_at, strut_at = _pointer(parameters, 0), _pointer(strut, 0)
     for k in range(t.shape[0]):
         out[k] = force(t[k], z[k], w[k], applied[k], temperature[k], s_at, p_at, strut_at)
         if size == 0 or k + 1 == t.shape[0]:
@@ -475,17 +809,23 @@ def _along(
                 s[i] += h * k2[i]
 
 
-along = compile_loop(
-    _along,
-    types.void(
-        _FORCES, _RATES, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _I8,
-        _VECTOR, _VECTOR,
-    ),
-)  # fmt: skip
-"""Force of one law along a known motion: its force and rate, each a list of one, parameters, strut
-constants (4,), then times, heights, velocities, applied force and temperature (N,), sub-steps for
-the internal state, its start; force, written.
-"""
+_VALUES = types.UniTuple(_VECTOR, 3)
+_MOTION = types.UniTuple(_VECTOR, 5)
+_along = compile_loop(_along, types.void(_FORCES, _RATES, _VALUES, _MOTION, _I8, _VECTOR))
+
+
+def force_along(name: str, values: LawValues, motion: StrutMotion, substeps: int) -> Array:
+    """Force (N,) of the law of an effect along a known motion.
+
+    Args:
+        name: Name of the effect.
+        values: What the law reads.
+        motion: The motion.
+        substeps: Steps of the internal states between two samples.
+    """
+    out = np.empty(len(motion.t_s))
+    _along(*_laws((name,)), tuple(values), tuple(motion), substeps, out)
+    return out
 
 
 def _respond(

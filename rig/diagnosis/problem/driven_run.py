@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from rig.diagnosis.numerics.compiled import Trajectory
 from rig.diagnosis.numerics.smoother import estimate_noise
 from rig.diagnosis.problem.grid import RecordingGrid, Track, fine_times
 from rig.diagnosis.problem.mechanism import LinearisedMechanism
@@ -74,19 +75,12 @@ class DrivenRun(NamedTuple):
         return self._replace(fine_n=fine_n, substeps=steps, angle=0.5 * self.angle)
 
 
-class SimulatedMotion(NamedTuple):
-    """Strut motions at the nodes, each of shape (N, struts)."""
-
-    heights_m: Array
-    velocities_m_per_s: Array
-    accelerations_m_per_s2: Array
-
-    def track(self, run: DrivenRun) -> Track:
-        """The motion as a track along which laws are evaluated."""
-        heights_m, velocities, _ = self
-        return Track.of_columns(
-            run.grid.t_s, heights_m, velocities, run.applied_n, run.grid.temperature_c
-        )
+def track_of(motion: Trajectory, run: DrivenRun) -> Track:
+    """A simulated motion as a track along which laws are evaluated."""
+    heights_m, velocities, _ = motion
+    return Track.of_columns(
+        run.grid.t_s, heights_m, velocities, run.applied_n, run.grid.temperature_c
+    )
 
 
 def driven_run(

@@ -18,17 +18,24 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from dart_model.effects import Bench
 from dart_model.spec import ModelSpec
-from rig.diagnosis.numerics.compiled import simulate
+from rig.diagnosis.numerics.compiled import (
+    Equations,
+    Model,
+    Scenario,
+    Steps,
+    Trajectory,
+    simulate,
+)
 from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise
 from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem import linear_part, on_dart, track
 from rig.diagnosis.problem.driven_run import (
     DrivenRun,
     LoadCells,
-    SimulatedMotion,
     driven_run,
     first_motion,
     input_noise_n,
+    track_of,
 )
 from rig.diagnosis.problem.grid import (
     RecordingGrid,
@@ -87,12 +94,12 @@ class _Reference(NamedTuple):
     """
 
     run: DrivenRun
-    motion: SimulatedMotion
+    motion: Trajectory
     residual: Sequence[Smoothed]
 
     def whole(self) -> tuple[Track, Track]:
         """Measured and reference motion of the whole recording, at its nodes."""
-        reference = self.motion.track(self.run)
+        reference = track_of(self.motion, self.run)
         measured = reference._replace(
             heights_m=reference.heights_m + np.array([s.states[:, 0] for s in self.residual]),
             velocities_m_per_s=reference.velocities_m_per_s
@@ -179,40 +186,25 @@ class FreeRunProblem(Problem):
 
     # --- the residual in simulation ---------------------------------------------------------------
 
-    def simulate(
-        self, run: DrivenRun, model: CandidateModel, start: Array
-    ) -> SimulatedMotion | None:
+    def simulate(self, run: DrivenRun, model: CandidateModel, start: Array) -> Trajectory | None:
         """Free-run simulation, or None if it runs away or its mass is not positive."""
         parts = model.parts
         m = linear_part.with_linear_changes(run.mechanism, self.linear, parts.linear)
         if m is None:
             return None
         shape = (len(run.grid.t_s), len(self.noise_m))
-        motion = SimulatedMotion(np.empty(shape), np.empty(shape), np.empty(shape))
-        slots = slots_of(self, model.candidate)
+        motion = Trajectory(np.empty(shape), np.empty(shape), np.empty(shape))
+        inverse = np.ascontiguousarray(np.linalg.inv(m.mass), dtype=np.float64)
+        equations = Equations(
+            inverse, m.bias, m.bias_q, m.bias_v, m.jacobian, m.heights_m, m.applied, m.q, m.v
+        )
+        slots, struts = slots_of(self, model.candidate), strut_constants(self, parts.linear)
         finite = simulate(
-            slots.forces,
-            slots.rates,
-            slots.index,
-            parts.effects,
-            strut_constants(self, parts.linear),
-            np.ascontiguousarray(np.linalg.inv(m.mass)),
-            m.bias,
-            m.bias_q,
-            m.bias_v,
-            m.jacobian,
-            m.heights_m,
-            m.applied,
-            m.q,
-            m.v,
-            run.grid.t_s,
-            run.fine_n,
-            run.grid.temperature_c,
-            run.substeps,
-            _BEND * run.angle**2,
-            self._stroke_m,
-            start,
-            *motion,
+            slots.laws,
+            Model(slots.placement, parts.effects, struts, equations),
+            Scenario(start, run.grid.t_s, run.fine_n, run.grid.temperature_c),
+            Steps(run.substeps, _BEND * run.angle**2, self._stroke_m),
+            motion,
         )
         return motion if finite else None
 
@@ -295,7 +287,7 @@ class FreeRunProblem(Problem):
         z, w, a = (
             b + np.column_stack([s.states[:, i] for s in residual]) for i, b in enumerate(motion)
         )
-        along = SimulatedMotion(z, w, a).track(run)
+        along = track_of(Trajectory(z, w, a), run)
         forces = track.strut_forces(self, model, along, self.states(k, model))
         needed = m.strut_forces_of_motion(z, w, a, run.applied_n)
         spread = [np.column_stack([s.deviations[:, i] for s in residual]) for i in range(3)]
@@ -461,7 +453,7 @@ class FreeRunProblem(Problem):
         self,
         k: int,
         models: ComparedModels,
-        motions: tuple[SimulatedMotion, SimulatedMotion],
+        motions: tuple[Trajectory, Trajectory],
         rows: Flags,
     ) -> BeforeAfter | None:
         """Errors against the load cell where it is evaluated, the models in free run."""
@@ -473,7 +465,7 @@ class FreeRunProblem(Problem):
         cells = np.where(evaluated[:, np.newaxis], run.cells.forces_n, np.nan)
         errors: list[float] = []
         for model, motion in zip((models.nominal, models.corrected), motions, strict=True):
-            forces = track.strut_forces(self, model, motion.track(run), self.states(k, model))
+            forces = track.strut_forces(self, model, track_of(motion, run), self.states(k, model))
             at = np.column_stack([np.interp(t_s, run.grid.t_s, force) for force in forces])
             errors.append(rms(cells - at))
         return BeforeAfter(*errors)

@@ -24,8 +24,7 @@ def corrected_model(problem: Problem, model: CandidateModel) -> ModelSpec:
     """The nominal model with a fit's linear corrections and effects."""
     candidate, parts = model
     spec = problem.spec
-    index = slots_of(problem, candidate).index
-    values = [parts.effects[slot[1] : slot[2]] for slot in index]
+    values = [parts.effects[slot.parameters] for slot in slots_of(problem, candidate).each]
     kept = dict(zip(candidate.kept, values, strict=False))
     for i, strut in enumerate(spec.struts):
         existing = [
@@ -94,9 +93,9 @@ def _plant_states(
     """
     states: list[float] = []
     for strut, mockup in enumerate(plant.mockups):
-        for row in slots_of(problem, model.candidate).index:
-            if row[0] == strut:
-                states += given[row[3] : row[4]].tolist()
+        for slot in slots_of(problem, model.candidate).each:
+            if slot.strut == strut:
+                states += given[slot.states].tolist()
         if mockup is not None:
             states += [0.0] * len(mockup.state_scales)
     return tuple(states)

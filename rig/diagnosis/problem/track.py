@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import Motion, effect
 from dart_model.spec import ModelSpec
-from rig.diagnosis.numerics.compiled import along, law
+from rig.diagnosis.numerics.compiled import LawValues, StrutMotion, force_along
 from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.problem import (
     CandidateModel,
@@ -80,15 +80,13 @@ def law_force(
         constants: Free length, stiffness, damping and gravity of all struts, shape (struts, 4...).
         state: Internal state at the beginning; at zero if absent.
     """
-    functions = law(name)
-    out = np.empty(len(track.t_s))
-    along(
-        functions.forces, functions.rates, np.ascontiguousarray(values), constants[strut],
+    start = state if len(state) else np.zeros(effect(name).state_size)
+    motion = StrutMotion(
         track.t_s, track.heights_m[strut], track.velocities_m_per_s[strut],
-        track.applied_n, track.temperature_c, _substeps(track.t_s),
-        state if len(state) else np.zeros(functions.states), out,
+        track.applied_n, track.temperature_c,
     )  # fmt: skip
-    return out
+    own = LawValues(np.ascontiguousarray(values), constants[strut], start)
+    return force_along(name, own, motion, _substeps(track.t_s))
 
 
 def linear_forces(tracks: Sequence[Track], strut: int) -> Array:
@@ -124,14 +122,14 @@ def segment_forces(
     forces: list[Array] = []
     lead_forces: dict[int, Array] = {}
     for segment in segments:
-        along = segment.reference if reference else segment.track
-        if segment.lead is None or law(name).states == 0:
-            forces.append(law_force(along, strut, name, values, constants))
+        own = segment.reference if reference else segment.track
+        if segment.lead is None or effect(name).state_size == 0:
+            forces.append(law_force(own, strut, name, values, constants))
             continue
         whole = segment.lead[1] if reference else segment.lead[0]
         if id(whole) not in lead_forces:
             lead_forces[id(whole)] = law_force(whole, strut, name, values, constants)
-        forces.append(np.interp(along.t_s, whole.t_s, lead_forces[id(whole)]))
+        forces.append(np.interp(own.t_s, whole.t_s, lead_forces[id(whole)]))
     return forces
 
 
@@ -162,16 +160,16 @@ def effect_forces(
     """Strut and force (N,) of each effect of a model along a motion."""
     candidate, parts = model
     constants = strut_constants(problem, parts.linear)
-    index = slots_of(problem, candidate).index
+    slots = slots_of(problem, candidate).each
     return [
         (
             strut,
             law_force(
-                track, strut, name, parts.effects[slot[1] : slot[2]], constants,
-                states[slot[3] : slot[4]],
+                track, strut, name, parts.effects[slot.parameters], constants,
+                states[slot.states],
             ),
         )
-        for (strut, name), slot in zip(strut_effects(problem, candidate), index, strict=True)
+        for (strut, name), slot in zip(strut_effects(problem, candidate), slots, strict=True)
     ]  # fmt: skip
 
 

@@ -177,10 +177,10 @@ class _Layout:
                 np.zeros(len(linear), dtype=np.bool_),
             )
         ]
-        index = slots_of(problem, candidate).index
+        slots = slots_of(problem, candidate).each
         varied = [free]
         for row, (strut, name) in enumerate(strut_effects(problem, candidate)):
-            values = first.effects[index[row, 1] : index[row, 2]]
+            values = first.effects[slots[row].parameters]
             if row < len(candidate.kept):
                 is_free = problem.existing[candidate.kept[row]].free
                 spaces.append(_existing_space(name, values, is_free))
@@ -402,17 +402,17 @@ def _sandwich(result: Fit) -> FitCovariance:
 
 def effect_variables(problem: Problem, result: Fit) -> dict[int, Integers]:
     """Search variables of each fitted effect, by its index among all of the candidate."""
-    index = slots_of(problem, result.candidate).index
+    slots = slots_of(problem, result.candidate).each
     variables: dict[int, Integers] = {}
     at = int(result.free.sum())
     if not result.fits_effects:
         return variables
-    for row in range(len(index)):
+    for row, slot in enumerate(slots):
         if row < len(result.candidate.kept):
             kept = problem.existing[result.candidate.kept[row]]
             if not kept.free:
                 continue
-        count = int(index[row, 2] - index[row, 1])
+        count = slot.parameters.stop - slot.parameters.start
         variables[row] = np.arange(at, at + count)
         at += count
     return variables
@@ -444,10 +444,10 @@ def is_white(problem: Problem, result: Fit, level: float) -> bool:
 
 def law_values(problem: Problem, result: Fit) -> dict[StrutEffect, Array]:
     """Parameters of the laws that the nominal model lacks."""
-    index = slots_of(problem, result.candidate).index[len(result.candidate.kept) :]
+    slots = slots_of(problem, result.candidate).each[len(result.candidate.kept) :]
     return {
-        law: result.parts.effects[slot[1] : slot[2]]
-        for law, slot in zip(result.candidate.new, index, strict=True)
+        law: result.parts.effects[slot.parameters]
+        for law, slot in zip(result.candidate.new, slots, strict=True)
     }
 
 
@@ -466,18 +466,17 @@ def model_for(
         further: Parameters of its laws that the fitted model lacks.
     """
     old, new = slots_of(problem, result.candidate), slots_of(problem, candidate)
-    rows = dict(zip((*result.candidate.kept, *result.candidate.new), old.index, strict=True))
+    known = dict(zip((*result.candidate.kept, *result.candidate.new), old.each, strict=True))
     effects: list[Array] = []
     states: list[Array] = [np.zeros((problem.recordings, 0))]
     internal = np.array([start[len(start) - old.states :] for start in result.parts.starts])
-    for key, row in zip((*candidate.kept, *candidate.new), new.index, strict=True):
-        if key in rows:
-            _, first, past, first_state, past_state = rows[key]
-            effects.append(result.parts.effects[first:past])
-            states.append(internal[:, first_state:past_state])
+    for key, slot in zip((*candidate.kept, *candidate.new), new.each, strict=True):
+        if key in known:
+            effects.append(result.parts.effects[known[key].parameters])
+            states.append(internal[:, known[key].states])
         else:
             effects.append(further[key])
-            states.append(np.zeros((problem.recordings, row[4] - row[3])))
+            states.append(np.zeros((problem.recordings, slot.states.stop - slot.states.start)))
     motions = (start[: len(start) - old.states] for start in result.parts.starts)
     starts = (np.append(*both) for both in zip(motions, np.hstack(states), strict=True))
     parts = Parts(result.parts.linear, np.concatenate([np.zeros(0), *effects]), tuple(starts))

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
-from rig.diagnosis.numerics.compiled import law
+from rig.diagnosis.numerics.compiled import compile_law
 from rig.diagnosis.numerics.least_squares import Differences, Effort, solve
 from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.problem import (
@@ -115,7 +115,7 @@ def find_changes(
     additions = _additions(base) if len(laws) < most_laws else []
     exchanges = list(_exchanges(base))
     for _, name in [*laws, *(at for at, _ in (*additions, *exchanges))]:
-        law(name)  # Compiled here: numba's compiler is not thread-safe.
+        compile_law(name)  # Compiled here: numba's compiler is not thread-safe.
     replaced = {at: _replaced_law(base, at) for at in laws}
     with ThreadPoolExecutor(cpu_count()) as pool:
         tested = [

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.effects import CATALOGUE, effect
-from rig.diagnosis.numerics.compiled import law
+from rig.diagnosis.numerics.compiled import compile_law
 from rig.diagnosis.numerics.least_squares import (
     Differences,
     Effort,
@@ -153,11 +153,11 @@ def _stage(
 ) -> Stage:
     candidate, parts = reference
     constants = strut_constants(problem, parts.linear)
-    index = slots_of(problem, candidate).index
+    slots = slots_of(problem, candidate).each
     target = [segment.target.copy() for segment in segments]
     tangents: list[list[Array]] = [[] for _ in segments]
     for row, at in enumerate(strut_effects(problem, candidate)):
-        values = parts.effects[index[row, 1] : index[row, 2]]
+        values = parts.effects[slots[row].parameters]
         # The reference's laws acted along its own motion; those of a screening, along the measured.
         forces = segment_forces(segments, at, values, constants, reference=True)
         if row < len(candidate.kept):
@@ -371,7 +371,7 @@ def rank_laws(
     laws = candidate_laws(stage.problem) if only is None else only
     laws = [at for at in laws if is_compatible(at, base.laws)]
     for _, name in laws:
-        law(name)  # Compiled here: numba's compiler is not thread-safe.
+        compile_law(name)  # Compiled here: numba's compiler is not thread-safe.
     this = _begin_round(stage, base)
     with ThreadPoolExecutor(cpu_count()) as pool:
         starts = list(pool.map(lambda at: this.starts(at, MappingProxyType({})), laws))

@@ -146,7 +146,7 @@ def _find_active_strut(
 ) -> str | None:
     """Reason against a strut that feeds energy in at a height and velocity of the motion."""
     constants = strut_constants(problem, result.parts.linear)
-    index = slots_of(problem, result.candidate).index
+    slots = slots_of(problem, result.candidate).each
     effects = strut_effects(problem, result.candidate)
     for strut in range(len(problem.motions)):
         if not any(at == strut for at, _ in result.candidate.new):
@@ -157,9 +157,9 @@ def _find_active_strut(
         moving = _points(z[cells], w[cells], len(problem.motions), strut)
         still = moving._replace(velocities_m_per_s=np.zeros_like(moving.velocities_m_per_s))
         force = -constants[strut, 2] * w[cells]
-        for (at, name), slot in zip(effects, index, strict=True):
+        for (at, name), slot in zip(effects, slots, strict=True):
             if at == strut and effect(name).family not in _CHANNELS and not effect(name).state_size:
-                values = result.parts.effects[slot[1] : slot[2]]
+                values = result.parts.effects[slot.parameters]
                 force = force + law_force(moving, strut, name, values, constants)
                 force = force - law_force(still, strut, name, values, constants)
         power = force * w[cells]
