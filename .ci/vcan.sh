@@ -3,7 +3,7 @@
 #
 #   .ci/vcan.sh [PYTEST_ARGUMENT...]
 #
-# Wants Debian, root, and in $PYTHON (default: python3) an interpreter that has the project with its
+# Requires Debian, root, and in $PYTHON (default: python3) an interpreter that has the project with its
 # `test` extra. The kernel is emulated, with this machine's own files under it, read-only. Python goes
 # onto disk images, because reading it file by file would take minutes, and what numba compiles is
 # compiled here, because it would take longer still in there. The clock in there counts instructions,
@@ -58,9 +58,9 @@ fill_caches() {
     (cd "$project" && timeout 600 "$python" -c '
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from rig.simulated_bench.config import load_bench_config
-from rig.simulated_bench.simulated import Bench
+from rig.simulated_bench.bench import SimulatedBench
 from rig.plan.config import CONFIGS
-Bench(load_bench_config(CONFIGS / "reference_bench.yaml"), load_database(DEFAULT_DATABASE)).update(10**8)
+SimulatedBench(load_bench_config(CONFIGS / "reference_bench.yaml"), load_database(DEFAULT_DATABASE)).update(10**8)
 '
         timeout 600 "$python" -m tests.sensors.warm)
 }

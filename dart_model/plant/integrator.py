@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -47,7 +48,7 @@ _STABLE_STEP = 1.0
 enough that the method is stable, as it is up to 2.5."""
 
 
-class Course(NamedTuple):
+class Course(Struct, frozen=True, gc=False):
     """Steps of equal length, and the input during them.
 
     Attributes:
@@ -83,7 +84,8 @@ def advance(
         Coordinates, rates and internal states at the end.
     """
     (q, v, internal), (a1, rates1) = start, first
-    t_s, duration_s, steps, (given, end) = course
+    t_s, duration_s, steps = course.t_s, course.duration_s, course.steps
+    given, end = course.inputs
     h = duration_s / steps
     half, sixth = 0.5 * h, h / 6.0
     rise = (end - given) / steps
@@ -153,7 +155,7 @@ class Linearised(NamedTuple):
 
 
 def exact_step_s(linear: Linearised) -> float:
-    """Longest step with which the free response of a linear bench is exact (see `_FREQUENCY_STEP`).
+    """Longest step with which the free response of a linear bench is accurate (see `_FREQUENCY_STEP`).
 
     It is not bounded by `LONGEST_STEP_S` or `SHORTEST_STEP_S`.
     """

@@ -1,13 +1,13 @@
 """The terminal: console, tables and JSON of the commands, and their exit codes."""
 
-import json
-import math
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Column, Table
+
+from rig.files.json_text import json_text
 
 OK, FAILED, WRONG_INPUT = 0, 1, 2
 console = Console()
@@ -23,14 +23,4 @@ def table(*heads: str, title: str | None = None) -> Table:
 
 def print_json(content: object) -> None:
     """Print as JSON; numbers that are not finite become null."""
-    typer.echo(json.dumps(finite(content), indent=2, ensure_ascii=False))
-
-
-def finite(content: object) -> object:
-    """Content with null for numbers that are not finite, which JSON does not have."""
-    if isinstance(content, dict):
-        items = cast("dict[object, object]", content).items()
-        return {str(key): finite(item) for key, item in items}
-    if isinstance(content, list | tuple):
-        return [finite(item) for item in cast("list[object]", content)]
-    return None if isinstance(content, float) and not math.isfinite(content) else content
+    typer.echo(json_text(content), nl=False)

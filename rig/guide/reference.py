@@ -25,7 +25,7 @@ from dart_model.spec import ModelSpec
 from rig.bridge.publications import STATUS, STRUT, TIMING
 from rig.channels.quantities import BENCH_QUANTITIES, HEIGHT
 from rig.observers import OBSERVERS
-from rig.plan.config import RunConfig
+from rig.plan.config import OneOf, RunConfig
 from rig.simulated_bench.effects import EFFECT_KINDS
 from rig.simulated_bench.schema import BenchConfig
 
@@ -252,10 +252,13 @@ def _default_text(default: object) -> str:
     return str(default) if isinstance(default, str | int | float | bool) else ""
 
 
-def _sections(annotation: Any) -> list[type[BaseModel]]:
+def _sections(annotation: Any) -> list[type[Any]]:
     """Sections that a key may hold, also in unions, tuples and mappings."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+    if isinstance(annotation, type) and hasattr(annotation, "__pydantic_fields__"):
         return [annotation]
+    kinds = [item for item in getattr(annotation, "__metadata__", ()) if isinstance(item, OneOf)]
+    if kinds:
+        return list(kinds[0].choices.values())
     origin = typing.get_origin(annotation)
     if origin in (typing.Union, types.UnionType, tuple, dict, typing.Annotated):
         return [section for part in typing.get_args(annotation) for section in _sections(part)]

@@ -51,7 +51,7 @@ class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class _OneOf:
+class OneOf:
     """Reads one of several kinds of settings, told by the value of one key.
 
     Args:
@@ -61,7 +61,7 @@ class _OneOf:
     """
 
     def __init__(self, key: str, choices: Mapping[str, type[Any]], default: str | None) -> None:
-        self._key, self._choices, self._default = key, choices, default
+        self._key, self.choices, self._default = key, choices, default
 
     def _kind(self, data: object) -> str:
         """Kind of an entry, in brackets: it is no key of the file."""
@@ -72,7 +72,7 @@ class _OneOf:
     def __get_pydantic_core_schema__(
         self, _source: object, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        choices = {f"<{kind}>": handler.generate_schema(it) for kind, it in self._choices.items()}
+        choices = {f"<{kind}>": handler.generate_schema(it) for kind, it in self.choices.items()}
         return tagged_union_schema(choices, self._kind)
 
 
@@ -160,7 +160,7 @@ class Signals(_Frozen):
 
     height: Annotated[dict[str, HeightSignal], Field(min_length=1)]
     further: dict[
-        str, dict[SensorName, Annotated[SensorSignal, _OneOf("measures", SENSORS, None)]]
+        str, dict[SensorName, Annotated[SensorSignal, OneOf("measures", SENSORS, None)]]
     ] = Field(default_factory=dict[str, dict[str, SensorSignal]])
 
     @model_validator(mode="before")
@@ -328,7 +328,7 @@ class RunConfig(_Frozen):
     signals: Signals
     devices: dict[SensorName, DeviceSettings] = Field(default_factory=dict[str, DeviceSettings])
     prescribed_motion: PrescribedMotion | None = None
-    observers: dict[str, Annotated[AnyObserver, _OneOf("kind", OBSERVERS, DEFAULT_KIND)]] = Field(
+    observers: dict[str, Annotated[AnyObserver, OneOf("kind", OBSERVERS, DEFAULT_KIND)]] = Field(
         default_factory=dict
     )
     publish: dict[str, Annotated[Mapped, BeforeValidator(_mapping(STRUT))]] | None = None

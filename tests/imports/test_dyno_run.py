@@ -141,7 +141,7 @@ def test_a_dyno_asks_for_a_load_cell_and_no_applied_force(tmp_path: Path) -> Non
     given = (CONFIGS / "dyno.yaml").read_text()
     path = tmp_path / "dyno.yaml"
     path.write_text(given.replace("load_cell_force:", "applied_force:"))
-    with pytest.raises(InputError, match=r"prescribed_motion: expected signals\.load_cell_force"):
+    with pytest.raises(InputError, match=r"prescribed_motion: requires signals\.load_cell_force"):
         load_plan(path)
 
 

@@ -57,7 +57,7 @@ class Rig(NamedTuple):
 
 def driven(effects: tuple[Planted, ...], drive, rig: Rig) -> tuple[np.ndarray, Motion]:
     """Motion under any force that depends on time."""
-    bench, steps = rig.simulated_bench, rig.steps
+    bench, steps = rig.bench, rig.steps
     samples = round(rig.duration_s * RATE_HZ) + 1
     half_steps = np.arange(2 * steps * (samples - 1) + 1) / (2 * steps * RATE_HZ)
     balance = bench.free_length_m - bench.weight_n / bench.stiffness_n_per_m
