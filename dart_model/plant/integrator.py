@@ -155,7 +155,7 @@ class Linearised(NamedTuple):
 
 
 def exact_step_s(linear: Linearised) -> float:
-    """Longest step with which the free response of a linear bench is accurate (see `_FREQUENCY_STEP`).
+    """Longest step with which the free response of a linear bench is right (see `_FREQUENCY_STEP`).
 
     It is not bounded by `LONGEST_STEP_S` or `SHORTEST_STEP_S`.
     """
