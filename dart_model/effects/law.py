@@ -1,8 +1,7 @@
 """What an effect is: a strut force that the linear spring-damper law does not have.
 
-Everything that one needs to know of an effect stands with it: the law, its internal states, where
-a search for its parameters begins and ends, what it degenerates to, where it can be seen, and how
-it is said.
+An effect is defined in one place: the law, its internal states, where a search for its parameters
+begins and ends, what it degenerates to, where it can be observed, and its wording in reports.
 """
 
 from collections.abc import Callable, Iterable, Mapping, MutableSequence, Sequence

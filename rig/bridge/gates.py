@@ -2,13 +2,14 @@
 
 1. addressed: it is a frame of a message that the bridge reads (`Gates.receive`). What is not may be
    a heartbeat, an emergency or an address claim of a device, or a second sender.
-2. protected: its length, CRC and counter are right, and its signals hold values (`_protected`).
+2. protected: its length, CRC and counter are right, and its signals hold values (`Incoming.read`).
 3. sent by its device: its sender is the configured device (`_sent_by_device`).
 4. healthy sender: that device is not at fault (`_healthy_sender`).
 5. plausible: no limit refuses its heights (`_plausible`).
 
-Whether a frame is authentic is decided before, on the bus (`rig.bus.secoc`). A frame that a gate
-refuses is counted there and used in no part.
+Whether a frame is authentic is decided before, on the bus (`rig.bus.secoc`). No part of a
+refused frame is used. It is counted where it was refused; that of another sender than the device
+is none of the message's frames, and is not.
 """
 
 from collections.abc import Callable, Sequence
@@ -175,7 +176,7 @@ class Gates:
             incoming = self.incoming[index]
             sequences[index], status, values = incoming.read(sequences[index], frame)
             if status is not _OK:
-                self._count(reception, index, frame.t_ns, status)
+                self._record_status(reception, index, frame.t_ns, status)
             if values is not None and (gates := self._gates[index]):
                 values = _pass(gates, reception, frame, values)
             if values is not None:
@@ -203,7 +204,9 @@ class Gates:
             health = update_by_frame(self._devices[index], healths[index], frame)
             reception.set_health(index, health)
 
-    def _count(self, reception: Reception, index: int, t_ns: int, status: FrameStatus) -> None:
+    def _record_status(
+        self, reception: Reception, index: int, t_ns: int, status: FrameStatus
+    ) -> None:
         """Count a frame that did not simply follow the one before."""
         if status is FrameStatus.FIRST:
             reception.count(started=1)

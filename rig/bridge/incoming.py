@@ -29,7 +29,7 @@ class Delivery(NamedTuple):
     Attributes:
         value: Index of the value among the frame's.
         channel: Index of the channel.
-        delay_ns: How much later the value arrives than it is true.
+        delay_ns: Time from the measurement to the arrival of its frame.
     """
 
     value: int

@@ -15,7 +15,7 @@ EXAMPLES = (
 
 
 def set_command(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run that goes on.")],
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run in progress.")],
     assignments: Annotated[
         list[str] | None,
         typer.Argument(
@@ -30,7 +30,7 @@ def set_command(
         bool, typer.Option("--force", help="Change it although `rig check` finds an error.")
     ] = False,
 ) -> None:
-    """Change gains or limits of a run that goes on, or acknowledge its safe state."""
+    """Change gains or limits of a run in progress, or acknowledge its safe state."""
     from rig.run.changes import parse_assignments
     from rig.run.requests import ask
 

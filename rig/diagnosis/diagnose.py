@@ -23,13 +23,14 @@ from rig.diagnosis.problem.problem import (
 )
 from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.recording import Recording, RecordingError
-from rig.diagnosis.search.conclude import SearchResult, conclude
 from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
 from rig.diagnosis.search.explore import FirstRound, explore
 from rig.diagnosis.search.fit import Fit, fit
+from rig.diagnosis.search.model_selection import SearchResult, select_model
 from rig.diagnosis.search.pool import Pool, ValidatedModel
 from rig.diagnosis.search.surface import fit_surface
-from rig.diagnosis.write_up import are_laws_superfluous, compose_result, find_verdict
+from rig.diagnosis.verdict import are_laws_superfluous, find_verdict
+from rig.diagnosis.write_up import compose_result
 
 _SEARCHED_NODES = 32_000
 """Nodes of all recordings that are searched, half a minute at 1 kHz; with more than twice as many,
@@ -125,7 +126,7 @@ class _Search(NamedTuple):
 def _search(
     problem: Problem, criteria: SelectionCriteria, progress: Progress
 ) -> tuple[SearchResult, Problem]:
-    """Search, long recordings in pieces, and conclude on all of them.
+    """Search, long recordings in pieces, and choose a model on all of them.
 
     Returns:
         The result, and the problem with noise and tones as they are known in the end.
@@ -141,7 +142,7 @@ def _search(
         last = _fit_to_all(problem, fits, search.last, within(progress, 0.6, 0.85))
         search = search._replace(last=last)
     problem = search.last.problem
-    result = conclude(search.last, search.first, search.first_round, progress)
+    result = select_model(search.last, search.first, search.first_round, progress)
     return result._replace(chosen=_refit_with_finer_steps(problem, result.chosen)), problem
 
 

@@ -1,4 +1,4 @@
-"""The outcome of a search: verdict on held-out data, intervals, corrected model."""
+"""The outcome of a search, put together: effects, intervals, figures, corrected model."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -31,11 +31,11 @@ from rig.diagnosis.problem.problem import (
     RunEvaluation,
     StrutEffect,
     mid_stroke_m,
+    quadratic_mean,
     rms,
     slots_of,
 )
 from rig.diagnosis.problem.track import forces_along
-from rig.diagnosis.search.conclude import SearchResult
 from rig.diagnosis.search.criteria import SelectionCriteria
 from rig.diagnosis.search.fit import (
     UNBOUND,
@@ -45,6 +45,7 @@ from rig.diagnosis.search.fit import (
     fit_covariance,
     is_white,
 )
+from rig.diagnosis.search.model_selection import SearchResult
 
 Array = NDArray[np.float64]
 
@@ -128,8 +129,8 @@ def compose_result(
         _suggestion(search) if ambiguous else None,
         _held_out(evaluations, by_blocks=by_blocks),
         NoiseFloor(
-            _quadratic_mean([floor.height_rmse_m for floor in floors]),
-            _quadratic_mean([floor.residual_force_rmse_n for floor in floors]),
+            quadratic_mean([floor.height_rmse_m for floor in floors]),
+            quadratic_mean([floor.residual_force_rmse_n for floor in floors]),
         ),
         White(
             is_white(problem, search.given, criteria.white),
@@ -153,74 +154,6 @@ def _other_families(search: SearchResult) -> tuple[str, ...]:
     rivals = [effect(name).family for r in search.rivals for _, name in r.fit.candidate.new]
     chosen = set(search.chosen.families)
     return tuple(dict.fromkeys(family for family in rivals if family not in chosen))
-
-
-def are_laws_superfluous(
-    problem: Problem,
-    linear: Fit,
-    evaluations: Sequence[RunEvaluation],
-    criteria: SelectionCriteria,
-) -> bool:
-    """Whether all data are at the floor without any law, and laws gain nothing on held-out data.
-
-    A gain below the effect of the applied force's noise counts as none. A law that the data call
-    for may not act on held-out ones, as a stop that is not reached: these do not contradict it.
-    """
-    if not _is_at_floor(problem, linear, criteria):
-        return False
-    after = _quadratic_mean([run.target.after for run in evaluations]) ** 2
-    lawless = _quadratic_mean([run.linear for run in evaluations]) ** 2
-    floor = _quadratic_mean([_floor(run) for run in evaluations]) ** 2
-    drift = _quadratic_mean([run.drift_m for run in evaluations]) ** 2
-    least = max(criteria.least_above_noise * floor, criteria.least_share * (lawless - floor), drift)
-    return lawless <= criteria.explained**2 * floor and lawless - after <= least
-
-
-def _is_at_floor(problem: Problem, result: Fit, criteria: SelectionCriteria) -> bool:
-    """Whether a fit's residual is noise of the recordings that were learnt from."""
-    floor = problem.floor_level(result.model)
-    return result.mean_square <= criteria.explained**2 * floor
-
-
-def find_verdict(
-    problem: Problem,
-    evaluations: Sequence[RunEvaluation],
-    search: SearchResult,
-    criteria: SelectionCriteria,
-) -> Verdict:
-    """What held-out data show.
-
-    A model explains where every held-out run is at the noise floor; it explains partly where laws
-    reduce the residual of the best linear model by a good share. The error of the nominal model
-    does not count. Nothing is missing only where that holds of what was learnt from, too.
-    """
-    chosen = search.chosen.fit
-    ratios = [run.target.after / max(_floor(run), 1e-300) for run in evaluations]
-    if all(ratio <= criteria.explained for ratio in ratios):
-        if not (chosen.candidate.new or np.any(chosen.free)):
-            at_floor = _is_at_floor(problem, chosen, criteria)
-            return "nothing_missing" if at_floor else "not_explained"
-        return "ambiguous" if search.rivals else "explained"
-    if chosen.candidate.new and all(np.isfinite(ratios)):
-        share = 1.0 - criteria.partly
-        after = _quadratic_mean([run.target.after for run in evaluations])
-        linear = _quadratic_mean([run.linear for run in evaluations])
-        force = _quadratic_mean([run.figures.residual_force_rmse_n.after for run in evaluations])
-        linear_force = _quadratic_mean([run.linear_force_n for run in evaluations])
-        # Where heights drift, as those of an axis without a spring do, the force decides.
-        by_force = force < share * linear_force and after < criteria.explained * linear
-        if after < share * linear or by_force:
-            return "partly_explained"
-    return "not_explained"
-
-
-def _floor(run: RunEvaluation) -> float:
-    height = run.floor.height_rmse_m
-    return height if np.isfinite(height) else run.floor.residual_force_rmse_n
-
-
-def _quadratic_mean(values: Sequence[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def linear_corrections(problem: Problem, estimates: FitEstimates) -> tuple[LinearCorrection, ...]:
@@ -420,7 +353,7 @@ def _held_out(evaluations: Sequence[RunEvaluation], *, by_blocks: bool) -> HeldO
     def mean(pairs: Sequence[BeforeAfter | None]) -> BeforeAfter:
         known = [pair for pair in pairs if pair is not None]
         return BeforeAfter(
-            _quadratic_mean([p.before for p in known]), _quadratic_mean([p.after for p in known])
+            quadratic_mean([p.before for p in known]), quadratic_mean([p.after for p in known])
         )
 
     cells = [f.strut_force_rmse_n for f in figures]

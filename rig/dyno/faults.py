@@ -253,8 +253,8 @@ def name_faults(tested: Characteristics, master: Master, scatter: float) -> Mast
 
 
 _WORST_MISFIT = 1.5
-"""Chi-squared over the number of forces up to which a damper with no fault that has a name is good;
-the good ones of the study have 0.6 to 1.2."""
+"""Chi-squared per force up to which a damper without an identified fault is accepted; the good ones
+of the study have 0.6 to 1.2."""
 
 
 class _FaultFit(NamedTuple):

@@ -23,7 +23,7 @@ def parse_frame(line: str, epoch_ns: int) -> tuple[Frame, str]:
     """A frame and its direction from a line of candump's log format.
 
     Raises:
-        ValueError: The line is none.
+        ValueError: The line is not a valid line of that format.
     """
     stamp, _, rest = line.strip().split(" ", 2)
     text, _, direction = rest.partition(" ")

@@ -92,7 +92,7 @@ def read_header(folder: Path) -> dict[str, object]:
     """Content of a run's `run.yaml`.
 
     Raises:
-        LogError: It is no run's, or one of another version.
+        LogError: It is not a run's header, or was written by another version.
     """
     path = folder / RUN_FILE
     header = parse_mapping(read_text(path, 64 * 1024 * 1024), str(path))

@@ -33,7 +33,7 @@ class Start(Struct, frozen=True, gc=False):
         t_ns: Time of the measurement that it starts with.
         mobility_per_kg: Acceleration of the strut's height per newton in the strut.
         interval_ns: Time between two measurements.
-        delay_ns: How much later a measurement arrives than it is true.
+        delay_ns: Time from a measurement to the arrival of its frame.
         stiffness_per_s2: Decrease of that acceleration per metre of height: of the model's own
             law, its stiffness over the effective mass.
         damping_per_s: The same per m/s.
@@ -178,7 +178,7 @@ class Observer(Protocol[StateT]):
         ...
 
     def remark_on_rate(self, rate_hz: float) -> Remark | None:
-        """What the rate of the measurements means to it; None where it means nothing."""
+        """A remark on the rate of the measurements; None if it does not affect this observer."""
         ...
 
 

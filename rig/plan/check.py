@@ -20,7 +20,8 @@ from rig.plan.load import load_authentication
 from rig.plan.plan import Plan
 
 LITTLE_DAMPING = 0.02
-"""Damping ratio below which a pole is warned of: it rings for some 8 periods to a third."""
+"""Damping ratio below which a pole gives a warning: its oscillation takes about 9 periods to decay
+to one third."""
 
 _OTHERS_MAY_READ = stat.S_IRGRP | stat.S_IROTH
 FULL_LOAD, HIGH_LOAD = 1.0, 0.7

@@ -132,7 +132,7 @@ def _sensor_settings(quantity: Quantity) -> type[SensorSignal]:
     Attributes:
         message: Message of the DBC.
         signal: Signal of the message; its unit is converted.
-        delay_s: How much later its frame arrives than it was true.
+        delay_s: Time from the measurement to the arrival of its frame.
         measures: What it measures: `{quantity.key}`.
         {noise.key}: Standard deviation of a reading, quantisation included.
     """
@@ -263,9 +263,9 @@ class LogConfig(_Frozen):
 
     Attributes:
         rotate_bytes: Size at which the log is continued in further files; never if absent.
-        rotate_s: Time after which it is.
+        rotate_s: Time after which the log is continued in further files; never if absent.
         capture_before_s: Time before a fault that is kept apart.
-        capture_after_s: Time after it.
+        capture_after_s: Time after the fault that is kept apart.
         most_captures: Windows kept apart in one run; 0 for none. A window is opened by HOLD, SAFE,
             a fault of bus or log, and SIGUSR2.
     """
@@ -277,12 +277,12 @@ class LogConfig(_Frozen):
     most_captures: Annotated[int, Field(ge=0, le=1000)] = 0
 
     def rotation(self) -> Rotation:
-        """As the log takes it."""
+        """Limits of a log file, in nanoseconds and bytes, for the writer."""
         time_ns = None if self.rotate_s is None else round(self.rotate_s * 1e9)
         return Rotation(self.rotate_bytes, time_ns)
 
     def window(self) -> CaptureWindow | None:
-        """As the log takes it; None captures nothing."""
+        """Time around a fault that is kept apart, for the writer; None keeps nothing apart."""
         if self.most_captures == 0:
             return None
         before_ns, after_ns = round(self.capture_before_s * 1e9), round(self.capture_after_s * 1e9)
@@ -300,7 +300,7 @@ class RunConfig(_Frozen):
         dbc: DBC file beside the configuration; the package's own if absent.
         bus: How to open the bus.
         authentication: Authentication of all frames; none if absent.
-        signals: What is read from it.
+        signals: Signals that are read from the bus.
         devices: Devices that report their state, by the names of their nodes in the DBC.
         prescribed_motion: Declares a dyno; there is then a load cell and no applied force.
         observers: One for each strut of the model, by strut name; PI where none is named.

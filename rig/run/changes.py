@@ -35,7 +35,7 @@ def parse_assignments(texts: Sequence[str]) -> dict[str, object]:
     """Assignments from texts such as ``observers.strut.proportional_n_per_m=2e5``.
 
     Raises:
-        InputError: A text is none.
+        InputError: A text is not an assignment.
     """
     assignments: dict[str, object] = {}
     for text in texts:
@@ -116,7 +116,7 @@ def read_changes(folder: Path) -> list[tuple[int, dict[str, object]]]:
     """Changes of a run, in their order: time of the first tick, and what was changed.
 
     Raises:
-        InputError: A line other than the last, which a kill may have cut, is none.
+        InputError: A line is not a valid change; the last may be cut off, as by a kill.
     """
     path = folder / CHANGES_FILE
     if not path.exists():

@@ -1,4 +1,4 @@
-"""Requests to a run that goes on, through its folder: gains, limits, acknowledgement.
+"""Requests to a run in progress, through its folder: gains, limits, acknowledgement.
 
 Whoever may write into the folder may ask; nothing listens on a network. A request is a file, which
 a thread of the run reads, checks and answers with another; the loop only takes what is ready.
@@ -118,7 +118,7 @@ class Requests:
         except InputError as error:
             return {"error": str(error)}
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
-            return {"error": f"{path.name}: is no request"}
+            return {"error": f"{path.name}: is not a valid request"}
 
     def _change(self, path: Path, assignments: Assignments) -> Answer:
         plan = assign(self._plan, assignments, "set")
@@ -152,7 +152,9 @@ def ask(folder: Path, content: Mapping[str, object], *, force: bool = False) -> 
         _refuse_errors(folder, cast("Assignments", content["set"]))
     requests = folder / _FOLDER
     if not requests.is_dir():
-        raise InputError(f"{folder}: takes no requests, expected a run of `rig run`")
+        raise InputError(
+            f"{folder}: does not accept requests, expected a run started with `rig run`"
+        )
     path = requests / f"{time.time_ns()}-{uuid.uuid4().hex}.request"
     answer = path.with_suffix(".answer")
     try:

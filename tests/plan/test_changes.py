@@ -70,7 +70,7 @@ def test_a_request_is_taken_at_a_tick_and_answered_with_its_time(tmp_path, ready
         assert requests.changes(43_000_000) is None
         with pytest.raises(InputError, match="greater than or equal"):
             ask(run, {"set": {GAIN: -5}})
-        with pytest.raises(InputError, match="is no request"):
+        with pytest.raises(InputError, match="is not a valid request"):
             ask(run, {"sett": 1})
     assert answers == [{"t_ns": 42_000_000}]
     assert lines == [change_line(42_000_000, {GAIN: 5e4})]
@@ -84,7 +84,7 @@ def test_what_the_check_refuses_is_not_set_without_force(tmp_path):
     (run / "run.yaml").write_text(header[: header.index("ending:")])
     with pytest.raises(InputError, match=r"unstable.*--force sets it all the same"):
         ask(run, {"set": {GAIN: 1e8}})
-    with pytest.raises(InputError, match="takes no requests"):
+    with pytest.raises(InputError, match="does not accept requests"):
         ask(run, {"set": {GAIN: 1e8}}, force=True)
 
 

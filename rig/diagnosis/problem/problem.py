@@ -353,6 +353,11 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 
+def quadratic_mean(values: Sequence[float]) -> float:
+    """Quadratic mean; NaN if a value is."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
 def strut_effects(problem: Problem, candidate: Candidate) -> tuple[StrutEffect, ...]:
     """All effects of a candidate, existing ones first."""
     kept = ((problem.existing[i].strut, problem.existing[i].name) for i in candidate.kept)

@@ -57,7 +57,7 @@ class SearchResult(NamedTuple):
     gain_alike: bool
 
 
-def conclude(
+def select_model(
     pool: Pool, first: Pool, first_round: FirstRound | None, progress: Progress
 ) -> SearchResult:
     """The result of a search.
