@@ -140,7 +140,7 @@ def _over_arrays(law: Force | Rate, effect: Effect, names: Sequence[str]) -> Fun
         raise ArgumentError(f"effect {effect.name}: expected a function as its law")
     taken = arguments(law, effect)
     read = [
-        _assigned(ast.Name(item.name, ast.Store()), _element(item.origin, ast.Constant(item.first)))
+        _assign(ast.Name(item.name, ast.Store()), _element(item.origin, ast.Constant(item.first)))
         for item in taken
         if item.size is None and item.origin != "motion"
     ]
@@ -179,7 +179,7 @@ class _OverArrays(ast.NodeTransformer):
             return node
         values = node.value.elts if isinstance(node.value, ast.Tuple) else [node.value]
         written: list[ast.stmt] = [
-            _assigned(_element("rates", ast.Constant(index), ast.Store()), value)
+            _assign(_element("rates", ast.Constant(index), ast.Store()), value)
             for index, value in enumerate(values)
         ]
         return [ast.copy_location(item, node) for item in (*written, ast.Return())]
@@ -191,5 +191,5 @@ def _element(
     return ast.Subscript(ast.Name(origin, ast.Load()), index, context or ast.Load())
 
 
-def _assigned(target: ast.expr, value: ast.expr) -> ast.Assign:
+def _assign(target: ast.expr, value: ast.expr) -> ast.Assign:
     return ast.Assign([target], value)

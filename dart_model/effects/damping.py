@@ -1,4 +1,4 @@
-"""Linear damping beside the strut's own."""
+"""Linear damping in parallel with the strut's."""
 
 from dart_model.effects.law import Effect, Parameter
 

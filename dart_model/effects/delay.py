@@ -4,7 +4,7 @@ from dart_model.effects.law import Effect, Motion, Parameter, Rates, Start, Stat
 from dart_model.effects.ranges import moving, within
 
 # Padé approximants of exp(-delay * s). An explicit integrator must follow their poles, so a short
-# delay, which needs no more, has a low order and a pole of its own.
+# delay, which needs no more, has a low order and one more pole.
 _POLE_PER_S = 2000.0
 _SECOND_ORDER_FROM_S = 0.002
 _FOURTH_ORDER_FROM_S = 0.006

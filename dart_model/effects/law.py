@@ -80,12 +80,12 @@ Bounds = Mapping[str, tuple[float, float]]
 
 
 def no_starts(_: Motion) -> list[Start]:
-    """Of an effect that no search proposes."""
+    """No start: the effect is proposed by no search."""
     return []
 
 
 def no_bounds(_: Motion) -> Bounds:
-    """Of an effect whose parameters keep their own bounds."""
+    """No bounds by the motion: the parameters keep those that they are declared with."""
     return MappingProxyType({})
 
 
@@ -100,7 +100,7 @@ class Parameter:
         high: Largest value that makes physical sense; a model file above it is refused.
         meaning: One line for the report.
         group: Argument by which the law takes this parameter together with its neighbours of the
-            same group, as a row; empty if it is an argument of its own.
+            same group, as a row; empty if it is a separate argument.
     """
 
     name: str
@@ -118,7 +118,7 @@ class State(NamedTuple):
         name: Argument of the law, with its unit.
         scale: Its usual size.
         group: Argument by which the law takes this state together with its neighbours of the same
-            group, as a row; empty if it is an argument of its own.
+            group, as a row; empty if it is a separate argument.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""A force that nobody applied: unbalance or motor ripple."""
+"""A force that was not commanded: unbalance or motor ripple."""
 
 import math
 

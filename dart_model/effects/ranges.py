@@ -92,5 +92,5 @@ def height(low: float, high: float) -> Span:
 
 
 def dissipation(motion: Motion) -> tuple[float, float]:
-    """Of a contact's dissipation by closing speed: up to ten times its force at the usual speed."""
+    """Bounds of a contact's dissipation: up to ten times its force at the usual speed."""
     return 0.0, 10.0 * slowness_s_per_m(motion)

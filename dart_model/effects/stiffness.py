@@ -1,4 +1,4 @@
-"""Linear stiffness beside the strut's own."""
+"""Linear stiffness in parallel with the strut's."""
 
 from dart_model.effects.law import Effect, Parameter
 

@@ -16,7 +16,7 @@ from dart_model.spec import WORLD, BodySpec, FileSkeleton, InlineSkeleton, Model
 _dart = cast("Any", dartpy)
 
 _INSTANT_S = 1e-9
-"""DART evaluates a joint's springs and dampers at the end of its own time step, not of ours."""
+"""DART evaluates a joint's springs and dampers at the end of its time step, not of the plant's."""
 
 
 class Skeleton(NamedTuple):

@@ -150,7 +150,7 @@ class Bridge:
         frames: Sequence[Frame],
         conditions: Conditions = _NO_CONDITIONS,
     ) -> tuple[BridgeState, TickResult]:
-        """One tick.
+        """Compute one tick.
 
         Args:
             state: State after the last tick.

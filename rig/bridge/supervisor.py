@@ -149,7 +149,7 @@ class Supervisor:
     def step(
         self, state: SupervisedState, step_input: StepInput, reports: Reports = NO_REPORTS
     ) -> tuple[SupervisedState, StepOutput, int]:
-        """One step.
+        """Compute one step.
 
         Args:
             state: State after the last step.

@@ -163,7 +163,7 @@ class Link:
                 bus.send(frame if secured is None else secured(frame))
                 done += 1
         except BusError as error:
-            self._record_unsent(frames[done:], error)
+            self._record_send_failure(frames[done:], error)
             return frames[:done]
         if self._unsent_since_ns is not None and frames:
             self._unsent_since_ns = None
@@ -222,7 +222,7 @@ class Link:
         faulty = self._controller >= Controller.PASSIVE
         self.fault = f"the controller is {self._controller.name}" if faulty else None
 
-    def _record_unsent(self, frames: Sequence[Frame], error: BusError) -> None:
+    def _record_send_failure(self, frames: Sequence[Frame], error: BusError) -> None:
         self.figures.unsent += len(frames)
         self.fault = str(error)
         if self._unsent_since_ns is None:

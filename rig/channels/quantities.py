@@ -68,8 +68,8 @@ FORCE = Quantity(
 STRUT_QUANTITIES: Mapping[str, Quantity] = MappingProxyType(
     {quantity.key: quantity for quantity in (HEIGHT, VELOCITY, FORCE)}
 )
-"""What a sensor of a strut may measure, by key. `rig.observers.strut_sensors` says what the model
-reads of each."""
+"""What a sensor of a strut may measure, by key. `rig.observers.strut_sensors` defines the
+reading of each on the model."""
 
 APPLIED_FORCE = Quantity("applied_force", "applied_force_n", Dimension.FORCE, "applied force")
 LOAD_CELL_FORCE = Quantity(
@@ -80,4 +80,4 @@ TEMPERATURE = Quantity(
 )
 
 BENCH_QUANTITIES = (APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE)
-"""What a bench sends once, beside the sensors of its struts, in the order of the log's columns."""
+"""What a bench sends once, and not for each strut, in the order of the log's columns."""

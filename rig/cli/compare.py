@@ -53,17 +53,17 @@ def compare_command(
             print_json({"schema": 1, "trends": trends})
         else:
             _print_trends(trends)
-            _print_not_compared(records)
+            _print_missing(records)
         return
     differences = compare_dampers(records[0], records[1])
     if as_json:
         print_json({"schema": 1, "differences": differences})
         return
     _print_differences(differences, records[0].name, records[1].name)
-    _print_not_compared(records)
+    _print_missing(records)
 
 
-def _print_not_compared(records: "list[Characteristics]") -> None:
+def _print_missing(records: "list[Characteristics]") -> None:
     from rig.dyno.comparison import steps_without_partner
 
     for text in steps_without_partner(records):

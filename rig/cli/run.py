@@ -30,7 +30,7 @@ def run(
     configs: Annotated[
         list[Path],
         typer.Argument(
-            metavar="CONFIG...", help="YAML file; several are bridges of their own, at once."
+            metavar="CONFIG...", help="YAML file; several run as separate bridges at once."
         ),
     ],
     out: Annotated[

@@ -35,7 +35,7 @@ def run_side_by_side(
 
     Args:
         configs: Their configurations.
-        folder: Where each gets a folder of its own.
+        folder: Where each gets a folder.
         options: For each of them.
         as_json: Whether their summaries are printed as JSON.
 
@@ -53,9 +53,9 @@ def run_side_by_side(
         refuse_full(folder / name)
     bridges: dict[str, subprocess.Popen[str]] = {}
     readers: list[threading.Thread] = []
-    with _ended_together(bridges):
+    with _end_together(bridges):
         for name, config in zip(names, configs, strict=True):
-            bridges[name] = _started(config, folder / name, options)
+            bridges[name] = _start(config, folder / name, options)
         for item in bridges.items():
             readers.append(threading.Thread(target=_pass_on, args=item, daemon=True))
             readers[-1].start()
@@ -72,9 +72,9 @@ def run_side_by_side(
     )
 
 
-def _started(config: Path, folder: Path, options: Sequence[str]) -> "subprocess.Popen[str]":
+def _start(config: Path, folder: Path, options: Sequence[str]) -> "subprocess.Popen[str]":
     command = [sys.executable, "-m", "rig", "run", str(config), "--out", str(folder), *options]
-    # A session of its own: the terminal's Ctrl-C comes here, and is passed on once.
+    # A separate session: the terminal's Ctrl-C comes here, and is passed on once.
     return subprocess.Popen(  # noqa: S603  # a list, no shell
         command,
         stdin=subprocess.DEVNULL,
@@ -103,7 +103,7 @@ def _pass_on(name: str, bridge: "subprocess.Popen[str]") -> None:
 
 
 @contextlib.contextmanager
-def _ended_together(bridges: Mapping[str, "subprocess.Popen[str]"]) -> Generator[None]:
+def _end_together(bridges: Mapping[str, "subprocess.Popen[str]"]) -> Generator[None]:
     """Ctrl-C, an end that is asked for and a closed terminal go to every bridge, and an error."""
 
     def forward(_number: int, _frame: Any) -> None:

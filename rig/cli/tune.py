@@ -65,7 +65,9 @@ def tune_command(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="Write the configuration, beside CONFIG."),
+        typer.Option(
+            "--out", metavar="FILE", help="Write the configuration, in the folder of CONFIG."
+        ),
     ] = None,
     plot: Annotated[
         Path | None,

@@ -356,7 +356,7 @@ def check_recording(recording: Recording) -> Recording:
                 f"{advice}"
             )
         if label == "strut_force_n":
-            _refuse_clipped(name, label, "N", channel)
+            _refuse_clipping(name, label, "N", channel)
     return recording
 
 
@@ -433,10 +433,10 @@ def _check_height(name: str, height_m: Array) -> None:
             f"{name}: height_m is constant at {heights[0]:.6g} m, "
             "expected motion: is the sensor connected?"
         )
-    _refuse_clipped(name, "height_m", "m", heights)
+    _refuse_clipping(name, "height_m", "m", heights)
 
 
-def _refuse_clipped(name: str, label: str, unit: str, values: Array) -> None:
+def _refuse_clipping(name: str, label: str, unit: str, values: Array) -> None:
     plateaus = find_long_plateaus(values)
     if plateaus is not None:
         raise RecordingError(

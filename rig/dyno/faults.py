@@ -312,7 +312,7 @@ def _misfit(residual_n: Array, covariance: Array) -> float:
 
 
 def _covariance(stack: _Stack, master: Master, scatter: float) -> Array:
-    """Of the differences between two good dampers."""
+    """Covariance of the differences between two good dampers."""
     whole = np.diag(stack.noise_n**2)
     parts: dict[str, list[Array]] = {}
     begin = 0

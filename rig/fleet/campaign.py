@@ -211,7 +211,7 @@ def _submit(
 
 
 def _alone(task: Task, make_executor: Callable[[], Executor]) -> RunRow:
-    """A run in an executor of its own, which it may break."""
+    """A run in a separate executor, which it may break."""
     executor = make_executor()
     try:
         return executor.submit(evaluate_run, task).result()

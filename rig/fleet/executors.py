@@ -21,7 +21,7 @@ class Engine(NamedTuple):
     """What computes.
 
     Attributes:
-        words: As it is said.
+        words: The executor as a phrase.
         make: Makes an executor.
         window: Runs that it is given at a time.
     """

@@ -54,17 +54,17 @@ class RunRow:
     """What is known of a run; a row of the store, and one for each of its values.
 
     Attributes:
-        key: Of its content, the model and the version: the same run counts once.
-        identity: Of its place, size and time, the model and the version: what was evaluated is
-            known by it without being read again.
+        key: Hash of its content, the model and the version: the same run counts once.
+        identity: Hash of its location, size and time, the model and the version, by which an
+            evaluated run is recognised without being read again.
         source: Where it was.
         bench: Bench.
         damper: Damper.
         date: Day.
         model: Name of the model.
-        model_sha256: Of its file and of the files that it names.
+        model_sha256: Hash of its file and of the files that it names.
         version: Version of rig.
-        verdict: Of the diagnosis; empty where it failed.
+        verdict: Verdict of the diagnosis; empty where it failed.
         error: Why it failed; empty where it did not.
         samples: Number of samples.
         duration_s: Length.
@@ -96,7 +96,7 @@ class RunRow:
     values: tuple["RunValue", ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
-        """As columns, without its values."""
+        """The columns, without the values."""
         return {
             item.name: getattr(self, item.name) for item in fields(self) if item.name != "values"
         }
@@ -283,7 +283,7 @@ def _local(source: RunSource) -> Generator[Path]:
 
 
 def _key(path: Path, task: Task) -> str:
-    """Of a run's content, the model and the version."""
+    """Hash of a run's content, the model and the version."""
     found = hashlib.sha256(f"{task.model_sha256}\0{rig_version()}\0".encode())
     files = sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]
     for file in files:

@@ -48,7 +48,7 @@ class SeriesQuantity(NamedTuple):
 
     @property
     def words(self) -> str:
-        """As it is said."""
+        """Effect and parameter as a phrase."""
         return f"{self.effect.replace('_', ' ')} {self.parameter}".strip()
 
 
@@ -245,8 +245,8 @@ _Collected = dict[SeriesQuantity, dict[Where, list[DatedValue]]]
 def _read_series(connection: Any) -> _Collected:
     """Every series by quantity.
 
-    Values that their run does not bound are left out, and dampers that nobody named: of several,
-    one series would be nobody's.
+    Values that their run does not bound are left out, and dampers without a name: of several,
+    one series would belong to none.
     """
     rows = connection.execute(
         "SELECT v.strut, v.effect, v.parameter, t.bench, t.damper, t.date, v.value "

@@ -19,7 +19,7 @@ FIELDS = ("bench", "damper", "date")
 """What a pattern may name."""
 
 UNKNOWN = "unknown"
-"""A bench or a damper that nobody named."""
+"""A bench or a damper without a name."""
 
 _CHANGED = ("mtime", "LastModified", "last_modified", "updated", "created")
 """What file systems call the time of the last change."""
@@ -57,24 +57,24 @@ class RunSource:
 
 
 def find_sources(given: Sequence[str], pattern: str | None = None) -> list[RunSource]:
-    """All runs in or at some places, by bench, day and place.
+    """All runs in or at some locations, by bench, day and location.
 
     Args:
         given: Run folders, CSV files, or folders with any number of either; any of them as a URL
             that fsspec knows (``s3://...``).
-        pattern: Path of a run from its place on, with ``{bench}``, ``{damper}`` and ``{date}``, and
-            ``*`` for what does not matter. Without it the folder above a run is the bench, and a
-            day is looked for in the path.
+        pattern: Path of a run from its location on, with ``{bench}``, ``{damper}`` and ``{date}``,
+            and ``*`` for what does not matter. Without it the folder above a run is the bench, and
+            a day is looked for in the path.
 
     Raises:
-        InputError: A place is not there, or holds no run; the pattern is wrong, or does not fit.
+        InputError: A location is not there, or holds no run; the pattern is wrong, or does not fit.
     """
     compiled = None if pattern is None else _compile_pattern(pattern)
     found: dict[str, RunSource] = {}
-    for place in given:
-        there = list(_find_in(place, compiled, pattern))
+    for location in given:
+        there = list(_find_in(location, compiled, pattern))
         if not there:
-            raise InputError(f"{place}: no runs, expected run folders or CSV files")
+            raise InputError(f"{location}: no runs, expected run folders or CSV files")
         found |= {source.url: source for source in there}
     return sorted(
         found.values(), key=lambda item: (item.bench, item.date or item.changed, item.url)
@@ -95,7 +95,7 @@ def parse_shard(text: str) -> tuple[int, int]:
 
 
 def select_shard(sources: Sequence[RunSource], index: int, count: int) -> list[RunSource]:
-    """One of so many parts; a run is in the same part whatever else there is.
+    """A share of the runs, of `count` shares; a run is in the same share whatever the others are.
 
     Args:
         sources: All runs.
@@ -106,9 +106,9 @@ def select_shard(sources: Sequence[RunSource], index: int, count: int) -> list[R
 
 
 def _find_in(
-    place: str, compiled: re.Pattern[str] | None, pattern: str | None
+    location: str, compiled: re.Pattern[str] | None, pattern: str | None
 ) -> Iterator[RunSource]:
-    files, protocol, root = _list_files(place)
+    files, protocol, root = _list_files(location)
     folders = {str(PurePosixPath(p).parent) for p in files if PurePosixPath(p).name == RUN_FILE}
     sizes: dict[str, int] = {}
     stamps: dict[str, str] = {}
@@ -140,29 +140,29 @@ def _find_in(
         )
 
 
-def _list_files(place: str) -> tuple[Mapping[str, Any], str, str]:
-    """Files at a place with what is known of them, what URLs of it begin with, and its root."""
-    if "://" not in place:
-        return _list_local_files(Path(place)), "", str(Path(place).absolute())
+def _list_files(location: str) -> tuple[Mapping[str, Any], str, str]:
+    """Files at a location with what is known of them, what URLs of it begin with, and its root."""
+    if "://" not in location:
+        return _list_local_files(Path(location)), "", str(Path(location).absolute())
     try:
-        system, root = url_to_fs(place)
+        system, root = url_to_fs(location)
         files = system.find(root, detail=True)
-    except Exception as error:  # of any library that knows such places
-        raise InputError(f"{place}: cannot be read ({error})") from error
-    return files, place.split("://", 1)[0] + "://", root.rstrip("/")
+    except Exception as error:  # of any library that knows such locations
+        raise InputError(f"{location}: cannot be read ({error})") from error
+    return files, location.split("://", 1)[0] + "://", root.rstrip("/")
 
 
-def _list_local_files(place: Path) -> dict[str, dict[str, float]]:
-    """Files of this machine at a place, also behind links."""
+def _list_local_files(location: Path) -> dict[str, dict[str, float]]:
+    """Files of this machine at a location, also behind links."""
     found: dict[str, dict[str, float]] = {}
-    place = place.absolute()
+    location = location.absolute()
 
     def refuse(error: OSError) -> None:
         raise InputError(f"{error.filename}: cannot be read ({error.strerror})") from error
 
-    listed = os.walk(place, followlinks=True, onerror=refuse) if place.is_dir() else []
+    listed = os.walk(location, followlinks=True, onerror=refuse) if location.is_dir() else []
     paths = [Path(folder) / name for folder, _, names in listed for name in names]
-    for path in [*paths, *([place] if place.is_file() else [])]:
+    for path in [*paths, *([location] if location.is_file() else [])]:
         with contextlib.suppress(FileNotFoundError):
             status = path.stat()
             found[str(path)] = {"size": status.st_size, "mtime": status.st_mtime}

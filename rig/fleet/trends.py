@@ -1,7 +1,7 @@
-"""What a value does over time: a change-point beside wear, outliers, and jumps of a whole bench.
+"""What a value does over time: wear, a change-point, outliers, and jumps of a whole bench.
 
 A series is a straight line (wear) until it has a change-point: a step, or a bend. Its statistic is
-the largest F over all places of the change (Quandt 1960; Andrews 1993, Econometrica 61), whose
+the largest F over all instants of the change (Quandt 1960; Andrews 1993, Econometrica 61), whose
 distribution under a straight line with independent errors depends on the times alone and is drawn
 here; a level for a whole fleet is divided among its series (Bonferroni).
 """
@@ -33,8 +33,8 @@ _TAIL = 40
 _PIECES = 20
 """In how many parts they are drawn, so that memory does not grow with the series."""
 
-_MOST_PLACES = 200
-"""Places at which a change is looked for in a series; of more, evenly spread ones."""
+_MOST_CHANGES = 200
+"""Days at which a change is looked for in a series; of more, evenly spread ones."""
 
 _ALONE = 5
 """Dampers from which on one is held against the others."""
@@ -149,7 +149,7 @@ def fit_drift(points: Sequence[DatedValue], stepped_on: float | None = None) -> 
 
 
 def without_step(points: Sequence[DatedValue], day: float) -> list[DatedValue]:
-    """A series without the step that it has on a day, beside its straight line."""
+    """A series without the step that it has on a day, its straight line kept."""
     columns = _line_and_step(np.array([point.day for point in points]), day)
     if columns.shape[1] < 3:
         return list(points)
@@ -160,9 +160,9 @@ def without_step(points: Sequence[DatedValue], day: float) -> list[DatedValue]:
 
 def _line_and_step(days: Array, day: float | None) -> Array:
     """Line, and step where there are points enough on either side, shape (N, 2 or 3)."""
-    place = len(days) if day is None else int(np.searchsorted(days, day))
-    has_step = _EDGE <= place <= len(days) - _EDGE
-    columns = _columns(days, place if has_step else 1)
+    index = len(days) if day is None else int(np.searchsorted(days, day))
+    has_step = _EDGE <= index <= len(days) - _EDGE
+    columns = _columns(days, index if has_step else 1)
     return columns[:, : 3 if has_step else 2]
 
 
@@ -235,7 +235,7 @@ def find_bench_jump(series: Mapping[str, Sequence[DatedValue]], level: float) ->
 
 
 def _step_at(points: Sequence[DatedValue], day: float) -> float | None:
-    """Size of a step on a day beside the line of wear; None where a side has too few points."""
+    """Size of a step on a day, from the line of wear; None where a side has too few points."""
     columns = _line_and_step(np.array([point.day for point in points]), day)
     if columns.shape[1] < 3:
         return None
@@ -247,27 +247,27 @@ def _step_at(points: Sequence[DatedValue], day: float) -> float | None:
 
 
 def _change_indices(days: Array) -> list[int]:
-    """Indices of the first point after a change, each on a day of its own."""
+    """Indices of the first point after a change, each on another day."""
     found = [k for k in range(_EDGE, len(days) - _EDGE + 1) if days[k] > days[k - 1]]
-    return found[:: -(-len(found) // _MOST_PLACES)] if found else []
+    return found[:: -(-len(found) // _MOST_CHANGES)] if found else []
 
 
-def _columns(days: Array, place: int) -> Array:
+def _columns(days: Array, index: int) -> Array:
     """Line, step and bend, shape (N, 4)."""
     x = (days - days.mean()) / np.ptp(days)
-    after = np.arange(len(days)) >= place
-    bend = np.where(after, (days - days[place - 1]) / np.ptp(days), 0.0)
+    after = np.arange(len(days)) >= index
+    bend = np.where(after, (days - days[index - 1]) / np.ptp(days), 0.0)
     return np.column_stack([np.ones_like(x), x, after.astype(np.float64), bend])
 
 
 def _largest(days: Array, y: Array) -> Array:
-    """Largest F over all places of each column of y, shape (N, M)."""
+    """Largest F over all change-points of each column of y, shape (N, M)."""
     line, _ = np.linalg.qr(_columns(days, _EDGE)[:, :2])
     left = y - line @ (line.T @ y)
     total = np.sum(left**2, axis=0)
     best = np.zeros(y.shape[1])
-    for place in _change_indices(days):
-        basis, _ = np.linalg.qr(_columns(days, place))
+    for index in _change_indices(days):
+        basis, _ = np.linalg.qr(_columns(days, index))
         explained = np.sum((basis[:, 2:].T @ left) ** 2, axis=0)
         f = (explained / 2.0) / np.maximum((total - explained) / (len(days) - 4), 1e-300)
         best = np.maximum(best, f)
@@ -286,7 +286,7 @@ def _null(days: tuple[float, ...]) -> Array:
 
 
 def _chance(days: tuple[float, ...], statistic: float) -> float:
-    """Chance of a statistic as large; beyond the draws by the F of one place, times their number.
+    """Chance of a statistic as large; beyond the draws by the F of one instant times their number.
 
     The largest of many dependent F has the tail of so many independent ones; how many they are is
     read where both are known.
@@ -310,15 +310,15 @@ _KINDS: tuple[tuple[Literal["step", "bend"], list[int]], ...] = (
 def _describe_change(days: Array, y: Array, p: float) -> ChangePoint:
     """The likelier of a step and a bend, where it likeliest is, and from what to what it leads."""
     kinds = {
-        kind: {place: _rss(_columns(days, place)[:, own], y) for place in _change_indices(days)}
+        kind: {index: _rss(_columns(days, index)[:, own], y) for index in _change_indices(days)}
         for kind, own in _KINDS
     }
     kind, own = min(_KINDS, key=lambda item: min(kinds[item[0]].values()))
     left = kinds[kind]
-    at = min(left, key=lambda place: left[place])
-    # The profile likelihood of the place, with the variance estimated (Hinkley 1970).
+    at = min(left, key=lambda index: left[index])
+    # The profile likelihood of the change-point, with the variance estimated (Hinkley 1970).
     bound = left[at] * (1.0 + float(fisher.ppf(0.95, 1, len(days) - 3)) / (len(days) - 3))
-    likely = [place for place, rss in left.items() if rss <= bound]
+    likely = [index for index, rss in left.items() if rss <= bound]
     columns = _columns(days, at)[:, own]
     weights = np.linalg.lstsq(columns, y, rcond=None)[0]
     span = float(np.ptp(days))

@@ -36,7 +36,7 @@ KINDS: tuple[Kind, ...] = (
 LONGEST_STEP = "longest_step_s"
 
 _STRUT_STEP_S = 0.5e-3
-"""Longest step of an element's internal states where nobody has said how fast the motion is: that
+"""Longest step of an element's internal states where the speed of the motion is not known: that
 of a strut whose motion is prescribed (`dart_model.plant.prescribed_strut`)."""
 
 _SAME = 1e-9
@@ -51,7 +51,7 @@ class Variable(NamedTuple):
         unit: Its unit; empty if it has none.
         kind: What it is.
         meaning: One line.
-        start: Its value at the beginning, if it has one of its own.
+        start: Its value at the beginning, if it is declared.
         nominal: Its usual size.
         is_output: Whether a state is an output as well.
     """
@@ -237,7 +237,7 @@ class _Build:
         Args:
             spec: The strut.
             prefix: Before the names of its variables.
-            gravity_m_per_s2: Gravity as a parameter of its own; None where the bench has it.
+            gravity_m_per_s2: Gravity as a separate parameter; None where the bench has it.
         """
         add, ref = self.add, self.ref
         add(prefix + "free_length_m", "m", "parameter", "height without force", spec.free_length_m)
@@ -361,7 +361,7 @@ class _Added(NamedTuple):
     """What a kilogram of an effect's mass does to the equation of motion.
 
     Attributes:
-        inertia: Mass beside the first strut per kilogram.
+        inertia: Mass in parallel with the first strut per kilogram.
         weight_n_per_kg: Force along it per kilogram, for a gravity of one.
     """
 

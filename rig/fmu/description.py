@@ -104,7 +104,7 @@ def description_2(component: Component, provenance: Provenance, files: list[str]
     for tag, indices in (
         ("Outputs", _outputs(component)),
         ("Derivatives", list(states)),
-        ("InitialUnknowns", _calculated(component)),
+        ("InitialUnknowns", _calculated_variables(component)),
     ):
         if indices:
             unknowns = SubElement(structure, tag)
@@ -147,7 +147,7 @@ def description_3(component: Component, provenance: Provenance) -> str:
     for tag, indices in (
         ("Output", _outputs(component)),
         ("ContinuousStateDerivative", list(states)),
-        ("InitialUnknown", _calculated(component)),
+        ("InitialUnknown", _calculated_variables(component)),
         ("EventIndicator", [index for index, _ in component.of("indicator")]),
     ):
         for index in indices:
@@ -223,7 +223,7 @@ def _outputs(component: Component) -> list[int]:
     return [index for index, item in variables if item.kind == "output" or item.is_output]
 
 
-def _calculated(component: Component) -> list[int]:
+def _calculated_variables(component: Component) -> list[int]:
     """Indices of the rates and the outputs."""
     return [index for index, _ in (*component.of("rate"), *component.of("output"))]
 

@@ -6,7 +6,7 @@ order: the two agree to the last bits of the mathematical functions. Whatever a 
 refused, with its line.
 
 Where a law switches (a comparison, `min`, `max`, `abs`, `copysign`, a whole part), the C asks a
-switch that has a number of its own. A solver that steps over the laws may hold all switches, so
+switch with a number. A solver that steps over the laws may hold all switches, so
 that what it integrates is smooth, and look at their indicators for the time at which one turns
 (Cellier and Kofman, "Continuous System Simulation" (2006), chapter 9).
 """
@@ -147,7 +147,7 @@ class _Translation:
             case ast.Return(value=value) if value is not None:
                 return [f"{before}return {self._real(value)};"]
             case ast.Assign(targets=[target], value=value):
-                return [f"{before}{self._assigned(target, value)};"]
+                return [f"{before}{self._assign(target, value)};"]
             case ast.AugAssign(target=ast.Name(id=name), op=op, value=value):
                 return [f"{before}{name} {self._operator(op, node)}= {self._real(value)};"]
             case ast.If(test=test, body=body, orelse=orelse):
@@ -165,7 +165,7 @@ class _Translation:
             case ast.Expr(value=ast.Constant(value=str())):
                 return []
             case _:
-                raise self._refused(node)
+                raise self._refusal(node)
 
     def _for(self, name: str, rounds: int, body: list[ast.stmt], depth: int) -> list[str]:
         before = "    " * depth
@@ -181,7 +181,7 @@ class _Translation:
         head = f"{before}for ({name} = 0; {name} < {rounds}; ++{name}) {{"
         return [head, *lines, f"{before}}}"]
 
-    def _assigned(self, target: ast.expr, value: ast.expr) -> str:
+    def _assign(self, target: ast.expr, value: ast.expr) -> str:
         match target:
             case ast.Name(id=name):
                 is_whole = self._is_whole(value)
@@ -191,7 +191,7 @@ class _Translation:
             case ast.Subscript(value=ast.Name(id=name), slice=index) if self._is_row(name):
                 return f"{name}[{self._expression(index)}] = {self._real(value)}"
             case _:
-                raise self._refused(target)
+                raise self._refusal(target)
 
     def _declare(self, name: str, *, whole: bool) -> None:
         if name in self._arguments:
@@ -253,7 +253,7 @@ class _Translation:
             case ast.Call(func=function, args=arguments, keywords=[]):
                 return self._call(ast.unparse(function), arguments, node)
             case _:
-                raise self._refused(node)
+                raise self._refusal(node)
 
     def _arithmetic(self, left: ast.expr, op: ast.operator, right: ast.expr) -> str:
         if isinstance(op, ast.Pow):
@@ -269,7 +269,7 @@ class _Translation:
             return self._switch(_SWITCHING[called][0], arguments)
         if called in _FUNCTIONS and len(arguments) == 1:
             return f"{_FUNCTIONS[called]}({self._real(arguments[0])})"
-        raise self._refused(node)
+        raise self._refusal(node)
 
     def _switch(self, function: str, arguments: list[ast.expr]) -> str:
         number, loop = self._switches, self._loop
@@ -287,15 +287,15 @@ class _Translation:
     def _global(self, name: str, node: ast.AST) -> float:
         value = self._globals.get(name)
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self._refused(node)
+            raise self._refusal(node)
         return value
 
     def _operator(self, op: ast.AST, node: ast.AST) -> str:
         sign = _OPERATORS.get(type(op))
         if sign is None:
-            raise self._refused(node)
+            raise self._refusal(node)
         return sign
 
-    def _refused(self, node: ast.AST) -> NoLawError:
+    def _refusal(self, node: ast.AST) -> NoLawError:
         line = getattr(node, "lineno", 0)
         return NoLawError(f"{self._name}: line {line}: {ast.unparse(node)}: no law may use this")

@@ -77,7 +77,7 @@ def _header(component: Component, token: str, version: Fmi) -> str:
             "#ifndef MODEL_H",
             "#define MODEL_H",
             "",
-            "/* Linked from their sources, FMUs are told apart by the names of their functions; a",
+            "/* Linked from their sources, FMUs differ in the names of their functions; a",
             "   shared library has those of the standard. */",
             f"#ifndef {fmi}_OVERRIDE_FUNCTION_PREFIX",
             f"#define {fmi}_FUNCTION_PREFIX {component.identifier}_",

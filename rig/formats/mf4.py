@@ -111,7 +111,7 @@ def _append_signals(mdf: Any, dbc: Path, content: RunContent) -> None:
     with closing(mdf.extract_bus_logging({"CAN": [(str(dbc), 0)]})) as decoded:
         for number in range(len(decoded.groups)):
             channels = [
-                _rename_decoded(signal)
+                _rename_columns(signal)
                 for signal in decoded.iter_channels(skip_master=True)
                 if signal.group_index == number
             ]
@@ -119,7 +119,7 @@ def _append_signals(mdf: Any, dbc: Path, content: RunContent) -> None:
                 mdf.append(channels, comment="decoded with the DBC")
 
 
-def _rename_decoded(signal: Any) -> Any:
+def _rename_columns(signal: Any) -> Any:
     """Prefix a signal's name: readers that decode the frames themselves use the plain one."""
     names = [name for name in signal.display_names if name.endswith(f".{signal.name}")]
     signal.name = f"decoded.{min(names, key=len, default=signal.name)}"

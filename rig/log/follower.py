@@ -1,7 +1,7 @@
 """Reads a run's steps while they are being written, in memory that hardly grows.
 
 Of all steps only the least and the largest value of each 64 are kept; the newest are kept whole,
-and older ones are read again where somebody looks closely. A window is thinned by minimum and
+and older ones are read again where they are looked at closely. A window is thinned by minimum and
 maximum, never by skipping, so that no peak is lost at any zoom.
 """
 
@@ -129,15 +129,15 @@ class RunFollower:
             rows = self.rows(begin, end)
             rows = rows[(rows[:, 0] >= begin_ns) & (rows[:, 0] <= end_ns)]
             if len(rows) <= 2 * points:
-                return Stretch(rows[:, 0] * 1e-9, _chosen(rows, columns), len(rows))
-            values = _chosen(rows, columns)
-            return _thinned(rows[:, 0], values, values, points, len(rows))
+                return Stretch(rows[:, 0] * 1e-9, _select_columns(rows, columns), len(rows))
+            values = _select_columns(rows, columns)
+            return _thin(rows[:, 0], values, values, points, len(rows))
         least, largest = self._least.rows[first:last], self._largest.rows[first:last]
         if last > len(self._least.rows) and len(self._open):
             least = np.vstack([least, np.fmin.reduce(self._open)])
             largest = np.vstack([largest, np.fmax.reduce(self._open)])
-        low, high = _chosen(least, columns), _chosen(largest, columns)
-        return _thinned(least[:, 0], low, high, points, end - begin)
+        low, high = _select_columns(least, columns), _select_columns(largest, columns)
+        return _thin(least[:, 0], low, high, points, end - begin)
 
     def between(self, begin_s: float, end_s: float) -> tuple[int, int]:
         """Numbers of steps between which all of a stretch are, with some before and after it."""
@@ -274,16 +274,16 @@ def _matrix(table: Any) -> Array:
     return np.column_stack([*columns, *((flags & bit > 0) for bit in FLAGS.values())])
 
 
-def _chosen(rows: Array, columns: Sequence[int]) -> Array:
+def _select_columns(rows: Array, columns: Sequence[int]) -> Array:
     """Columns of rows, shape (columns, N); NaN where there is none."""
     found = np.full((len(columns), len(rows)), np.nan)
-    for place, column in enumerate(columns):
+    for row, column in enumerate(columns):
         if column >= 0:
-            found[place] = rows[:, column]
+            found[row] = rows[:, column]
     return found
 
 
-def _thinned(t_ns: Array, least: Array, largest: Array, points: int, steps: int) -> Stretch:
+def _thin(t_ns: Array, least: Array, largest: Array, points: int, steps: int) -> Stretch:
     """Least and largest values of some buckets, one after the other."""
     edges = np.linspace(0, len(t_ns), min(points, len(t_ns)) + 1).astype(np.intp)[:-1]
     low = np.fmin.reduceat(least, edges, axis=1)

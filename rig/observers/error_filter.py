@@ -9,7 +9,7 @@ m the effective mass that the strut's force moves, k and c the slopes of the mod
 is not where the bench is. The residual force is an integrated random walk of third order (the
 third derivative of d is white noise): a smooth force that nothing else is known of. State: x, its
 rate, and the acceleration d / m with its first two derivatives. The virtual force is a known input,
-so that the filter also tells where the error stands now, when the newest measurement is some
+so that the filter also estimates the error at the present time, when the newest measurement is some
 milliseconds old.
 
 The intensity of the noise is given as a bandwidth: of a sensor with standard deviation sigma every

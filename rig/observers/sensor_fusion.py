@@ -1,10 +1,10 @@
 """Several sensors of one strut in one filter: another height, a velocity, a load cell.
 
 Each reading is a line of the filter of the model's error: a height is the error x, a velocity its
-rate, and a load cell the force that the model's law lacks, m (d/m - k x - c dx/dt), with a standard
-deviation of its own. They are used one after another in the order of the times at which they were
-true: where a reading is older than what was used already, the filter goes back to before it and
-takes the later ones once more.
+rate, and a load cell the force that the model's law lacks, m (d/m - k x - c dx/dt), with a
+standard deviation each. They are used one after another in the order of their times of
+measurement: where a reading is older than what was used already, the filter goes back to before it
+and takes the later ones once more.
 
 The strut's own height is the reference: it is always used, and without it no sensor that is left
 out is used again. A further sensor is gated. A reading beyond the gate is not used; some in a row

@@ -158,7 +158,7 @@ def _resolution(plan: Plan) -> list[Finding]:
 
 
 def _weight_n(plan: Plan) -> float | None:
-    """Weight of the model's bodies; None where they stand in a file of their own."""
+    """Weight of the model's bodies; None where they are declared in another file."""
     skeleton = plan.model.skeleton
     if not isinstance(skeleton, InlineSkeleton):
         return None

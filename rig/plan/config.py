@@ -52,7 +52,7 @@ class _Frozen(BaseModel):
 
 
 class OneOf:
-    """Reads one of several kinds of settings, told by the value of one key.
+    """Reads one of several kinds of settings, selected by the value of one key.
 
     Args:
         key: The key.
@@ -235,7 +235,7 @@ class AuthenticationConfig(_Frozen):
     """Authentication of all frames after AUTOSAR SecOC, on CAN FD.
 
     Attributes:
-        key_file: File with 32 hexadecimal digits, beside the configuration.
+        key_file: File with 32 hexadecimal digits, in the folder of the configuration.
         freshness_bits: Bits of the freshness value in a frame.
         mac_bits: Bits of the CMAC in a frame.
         clock_tolerance_s: How far bench's and bridge's clocks may be apart. A frame that was
@@ -248,7 +248,7 @@ class AuthenticationConfig(_Frozen):
     clock_tolerance_s: Annotated[float, Field(ge=0.001, le=10.0, allow_inf_nan=False)] = 0.1
 
     def with_key(self, key: bytes) -> Authentication:
-        """As the bus takes it."""
+        """Authentication with its key, for the bus."""
         tolerance_ns = round(self.clock_tolerance_s * 1e9)
         return Authentication(key, self.freshness_bits // 8, self.mac_bits // 8, tolerance_ns)
 
@@ -295,9 +295,9 @@ class RunConfig(_Frozen):
     Attributes:
         rate_hz: Ticks a second.
         duration_s: Length of the run; until Ctrl-C if absent.
-        model: Model file, beside the configuration, or the name of one that comes with the package.
+        model: Model file, in the folder of the configuration, or the name of one of the package.
         engine: What simulates the model.
-        dbc: DBC file beside the configuration; the package's own if absent.
+        dbc: DBC file in the folder of the configuration; the package's own if absent.
         bus: How to open the bus.
         authentication: Authentication of all frames; none if absent.
         signals: Signals that are read from the bus.

@@ -18,7 +18,7 @@ from rig.plan.config import RunConfig
 from rig.plan.plan import Plan
 
 CHANGEABLE = ("observers", "supervision")
-"""Sections of the configuration that can be changed while a run goes on."""
+"""Sections of the configuration that can be changed during a run."""
 
 Assignments = Mapping[str, object]
 """Values by their keys in the configuration, sections joined by dots."""

@@ -177,7 +177,7 @@ def ask(folder: Path, content: Mapping[str, object], *, force: bool = False) -> 
 
 
 def _refuse_errors(folder: Path, assignments: Assignments) -> None:
-    """Check the changed configuration as `rig run` does, here and not beside the loop."""
+    """Check the changed configuration as `rig run` does, but not in the loop's process."""
     try:
         plan = plan_of_run(folder)
         for _, before in read_changes(folder):

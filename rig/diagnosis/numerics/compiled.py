@@ -70,7 +70,7 @@ def compile_loop(function: Callable[..., Any], signature: Any) -> Any:
     return compiler(signature, cache=True, error_model="numpy", nogil=True)(function)
 
 
-def _inlined(function: Callable[..., Any]) -> Any:
+def _inline(function: Callable[..., Any]) -> Any:
     """A part of a loop: compiled with the loop that calls it, and never on its own.
 
     It allocates nothing, and counts no references: an array would be held and released at each
@@ -435,7 +435,7 @@ FREE_LENGTH, STIFFNESS, DAMPING, GRAVITY, PRELOAD = range(5)
 """Columns of a strut's constants."""
 
 
-@_inlined
+@_inline
 def _span(scenario: Scenario, substeps: int, node: int, step: int, tabulated: bool) -> _Span:
     t, fine, temperature = scenario.t_s, scenario.applied_n, scenario.temperature_c
     after = min(node + 1, t.shape[0] - 1)
@@ -456,7 +456,7 @@ def _span(scenario: Scenario, substeps: int, node: int, step: int, tabulated: bo
     )
 
 
-@_inlined
+@_inline
 def _instant(span: _Span, u: float) -> _Instant:
     """The time at a share `u` of a step; the applied force as a parabola over it."""
     f0, f1, f2 = span.applied_n
@@ -472,7 +472,7 @@ def _instant(span: _Span, u: float) -> _Instant:
     )
 
 
-@_inlined
+@_inline
 def _cubic(rise: float, early: float, late: float, share: float) -> float:
     """Change since a node by Hermite's cubic: of a rise with slopes times the gap at both ends."""
     turn = early + late - 2.0 * rise
@@ -480,7 +480,7 @@ def _cubic(rise: float, early: float, late: float, share: float) -> float:
     return share * (early + share * (sag + share * turn))
 
 
-@_inlined
+@_inline
 def _follow_reference(equations: Equations, at: _Instant, work: _Work) -> None:
     """Write the reference coordinates and their rates, between nodes."""
     # Hermite's cubic: a chord would cut the motion's bends.
@@ -498,7 +498,7 @@ def _follow_reference(equations: Equations, at: _Instant, work: _Work) -> None:
             work.v[j] = rate / at.gap_s
 
 
-@_inlined
+@_inline
 def _move_struts(
     equations: Equations, struts: Array, at: _Instant, work: _Work, tabulated: bool
 ) -> None:
@@ -529,7 +529,7 @@ def _move_struts(
         )
 
 
-@_inlined
+@_inline
 def _add_effects(placement: Placement, calls: _Calls, at: _Instant, work: _Work) -> None:
     """Add the forces of the effects, and write the rates of their internal states."""
     for slot in range(SLOTS):
@@ -548,7 +548,7 @@ def _add_effects(placement: Placement, calls: _Calls, at: _Instant, work: _Work)
         )  # fmt: skip
 
 
-@_inlined
+@_inline
 def _accelerate(equations: Equations, at: _Instant, work: _Work) -> None:
     """Write the slope of coordinates and rates."""
     rows, a, b, share = equations.jacobian, at.before, at.after, at.share
@@ -574,7 +574,7 @@ def _accelerate(equations: Equations, at: _Instant, work: _Work) -> None:
         work.slope[n + j] = acceleration
 
 
-@_inlined
+@_inline
 def _write_slope(model: Model, calls: _Calls, at: _Instant, work: _Work) -> None:
     """Evaluate the differential equation at `work.x`."""
     tabulated = model.equations.jacobian.shape[0] > 1
@@ -585,7 +585,7 @@ def _write_slope(model: Model, calls: _Calls, at: _Instant, work: _Work) -> None
     _accelerate(model.equations, at, work)
 
 
-@_inlined
+@_inline
 def _begin_stage(stage: int, h: float, step: _Step, work: _Work) -> None:
     """Write where a stage of the classical Runge-Kutta method evaluates the slope."""
     if stage == 0:
@@ -597,7 +597,7 @@ def _begin_stage(stage: int, h: float, step: _Step, work: _Work) -> None:
             work.x[i] = step.x[i] + reach * work.slope[i]
 
 
-@_inlined
+@_inline
 def _end_stage(stage: int, h: float, step: _Step, work: _Work) -> None:
     """Add a stage's slope with its weight: 1, 2, 2, 1; the last one ends the step."""
     n, size = step.twist.shape[0], step.x.shape[0]
@@ -618,7 +618,7 @@ def _end_stage(stage: int, h: float, step: _Step, work: _Work) -> None:
             step.total[i] += 2.0 * work.slope[i]
 
 
-@_inlined
+@_inline
 def _jumped(h: float, steps: Steps, step: _Step, work: _Work) -> bool:
     """Whether a force jumped within a step, as it does where a contact closes or friction turns."""
     n = step.twist.shape[0]
@@ -631,7 +631,7 @@ def _jumped(h: float, steps: Steps, step: _Step, work: _Work) -> bool:
     return bool(worst * h * h > 6.0 * least and worst > steps.bend * largest)
 
 
-@_inlined
+@_inline
 def _record(equations: Equations, node: int, work: _Work, out: Trajectory) -> None:
     """Write the motion at a node."""
     rows = equations.jacobian
@@ -646,7 +646,7 @@ def _record(equations: Equations, node: int, work: _Work, out: Trajectory) -> No
         out.accelerations_m_per_s2[node, i] = along_strut
 
 
-@_inlined
+@_inline
 def _march(
     model: Model, calls: _Calls, scenario: Scenario, steps: Steps, work: _Work, step: _Step,
     out: Trajectory,

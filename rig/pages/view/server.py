@@ -196,7 +196,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _check_host(self) -> bool:
         """Whether the request is for this server and comes from its page; if not, refuse it."""
-        # A page of another site could point a host name of its own at this machine.
+        # A page of another site could point a host name at this machine.
         port = self._view.server_address[1]
         hosts = [f"{name}:{port}" for name in (HOST, "localhost")]
         hosts += [HOST, "localhost"] if port == _HTTP_PORT else []
