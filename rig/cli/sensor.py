@@ -1,6 +1,7 @@
 """`rig sensor`: sensors on the bus without a DBC."""
 
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -109,7 +110,7 @@ def scan_command(
                 )
     files = None if out is None else write_proposal(out, survey, config, zero)
     if as_json:
-        print_json(_as_dict(survey))
+        print_json(asdict(survey))
         return
     _print(survey)
     if files is not None:
@@ -283,10 +284,3 @@ def _pdo_lines(device: "CanOpenDevice") -> list[str]:
         )
         lines.append(f"{pdo.arbitration_id:03X} {every}: {names}")
     return lines or ["nothing"]
-
-
-def _as_dict(survey: "BusSurvey") -> dict[str, object]:
-    """The survey for JSON, whose readers know the groups as `spoken`."""
-    from dataclasses import asdict
-
-    return {"spoken" if key == "groups" else key: item for key, item in asdict(survey).items()}

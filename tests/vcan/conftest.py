@@ -173,9 +173,7 @@ def run_until_terminated(bench: Path, channel: str, dbc: Path) -> None:
         load_bench_config(bench),
         BusConfig("socketcan", channel, 500_000),
         dbc,
-        duration_s=None,
-        stop=lambda: bool(asked),
-        progress=lambda _t_ns, _mode: None,
+        RunControl(stop=lambda: bool(asked), progress=lambda _t_ns, _mode: None),
     )
 
 

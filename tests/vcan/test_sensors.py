@@ -75,8 +75,9 @@ def test_a_level_sensor_of_the_kernels_j1939(second_vcan, tmp_path):
             out = tmp_path / "found"
             text = rig("sensor", "scan", *bus, "--listen-s", 1.0, "--json", "--out", out)
     found = json.loads(text)
-    ((address, name),) = found["claims"]
+    (claim,) = found["claims"]
+    address = claim["address"]
     assert 128 <= address <= 140
-    assert name == int(NAME, 16)
-    assert [item[2] for item in found["spoken"]] == [address]
+    assert claim["name"] == int(NAME, 16)
+    assert [item["address"] for item in found["groups"]] == [address]
     assert f"source_address: {address}" in (out / "rig.yaml").read_text()
