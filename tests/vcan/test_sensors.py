@@ -3,6 +3,7 @@ kernel's own and can-utils."""
 
 import json
 import shutil
+import subprocess
 import time
 from collections.abc import Iterator
 
@@ -69,8 +70,11 @@ def test_a_level_sensor_of_the_kernels_j1939(second_vcan, tmp_path):
     claims = ["j1939acd", "-r", "128-140", "-c", tmp_path / "name.jacd", NAME, second_vcan]
     bus = ("--interface", "socketcan", "--channel", second_vcan)
     with running(claims):
-        time.sleep(1.0)
         send = ["testj1939", "-B", "-s8", f"{second_vcan}:,{ASC3},0x{NAME}", f":,{ASC3}"]
+        for _ in range(100):  # sending fails until the address is claimed
+            if subprocess.run(send, check=False, timeout=60.0).returncode == 0:
+                break
+            time.sleep(0.1)
         with running(["sh", "-c", f"while true; do {' '.join(send)}; sleep 0.1; done"]):
             out = tmp_path / "found"
             text = rig("sensor", "scan", *bus, "--listen-s", 1.0, "--json", "--out", out)

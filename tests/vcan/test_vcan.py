@@ -345,4 +345,4 @@ def test_listening_only_sends_nothing(bench, bridge, tmp_path):
         ended = bridge(bench, 3.0, listen_only=True)
     assert record.read_text() == ""
     assert {direction for _, direction in read_run(ended.folder).frames()} == {"R"}
-    assert ended.state.model is not None  # it had something to say
+    assert ended.state.supervised.estimator.model is not None  # it had something to send
