@@ -173,7 +173,7 @@ def killed(task):
 @pytest.mark.long
 def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path, monkeypatch):
     """One run kills its worker always, one only the first time: the others are all there."""
-    monkeypatch.setattr(campaigns, "evaluated", killed)
+    monkeypatch.setattr(campaigns, "evaluate_run", killed)
     # Workers import `killed` from here, and not from a package of the name `tests` elsewhere.
     monkeypatch.syspath_prepend(Path(__file__).parents[2])
     names = [f"run_{k}" for k in range(12)] + ["poison", "once"]
