@@ -20,6 +20,7 @@ from rig.diagnosis.problem.problem import (
     free_linear,
     nominal,
     nominal_model,
+    quadratic_mean,
 )
 from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.recording import Recording, RecordingError
@@ -106,7 +107,7 @@ def _least_error_model(
 
 
 def _error(evaluations: Sequence[RunEvaluation]) -> float:
-    return float(np.sqrt(np.mean([run.target.after**2 for run in evaluations])))
+    return quadratic_mean([run.target.after for run in evaluations])
 
 
 class _Search(NamedTuple):

@@ -25,10 +25,14 @@ _ALIKE = 0.1
 """Relative difference of speed and amplitude up to which steps are compared."""
 
 _LEVEL = 0.05
+"""Chance of one figure called different where none is (Holm 1979)."""
+
 _STDS = 1.96
 """Standard deviations of half an interval."""
 
 _FEWEST_DOSES = 3
+"""Doses from which on a line can fail to fit: it passes through any two."""
+
 _MISFIT = 3.0
 """Mean squared distance of the points from a line, in their standard deviations, above which it is
 called bent."""

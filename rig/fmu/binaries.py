@@ -56,6 +56,7 @@ _FLAGS = (
     "-Wextra",
 )
 _TIMEOUT_S = 300.0
+"""Time that a compiler may take: far longer than one needs, so that one that hangs is ended."""
 
 
 def this_system() -> Target:

@@ -22,7 +22,12 @@ LAST_SYNCHRONOUS, BY_ITSELF = 240, (254, 255)
 INHIBIT_UNIT_S = 1e-4
 _FLOAT_BITS = (32, 64)
 
-_MOST_PDOS, _MOST_MAPPED = 16, 64
+MOST_PDOS = 16
+"""PDOs of a device that are read and set; few have more than the four of the predefined set."""
+
+_MOST_MAPPED = 64
+"""Objects in a PDO at the most: one for each bit of its frame (CiA 301)."""
+
 _LAST_DUMMY = 0x001F
 """Indices up to this are data types: a gap in the frame."""
 
@@ -160,7 +165,7 @@ def _eleven_bits(cob_id: int | None) -> int:
 
 def _pdos(objects: CanOpenObjects, device_type: int) -> Iterator[Pdo]:
     """Process data objects that are switched on and not empty."""
-    for index in range(_MOST_PDOS):
+    for index in range(MOST_PDOS):
         cob_id = number(objects, COMMUNICATION + index, COB_ID)
         if cob_id is None or cob_id & OFF:
             continue

@@ -21,6 +21,7 @@ from rig.sensors.canopen_device import (
     INHIBIT,
     INHIBIT_UNIT_S,
     MAPPING,
+    MOST_PDOS,
     OFF,
     SYNC,
     SYNC_PERIOD,
@@ -30,9 +31,8 @@ from rig.sensors.canopen_profiles import ENCODER
 
 _BY_EVENT, _AT_EVERY_SYNC = 255, 1
 _PRODUCES_SYNC = 1 << 30
-_MOST_PDOS = 16
 SETTABLE = frozenset(
-    {HEARTBEAT, SYNC, SYNC_PERIOD, CYCLE, *range(COMMUNICATION, COMMUNICATION + _MOST_PDOS)}
+    {HEARTBEAT, SYNC, SYNC_PERIOD, CYCLE, *range(COMMUNICATION, COMMUNICATION + MOST_PDOS)}
 )
 """Indices that are ever written; 1010h, which would store them, is not among them."""
 
@@ -175,7 +175,7 @@ def restore(access: ObjectAccess, changes: Sequence[ObjectChange]) -> None:
 
 def _write_with_pdo_off(access: ObjectAccess, item: ObjectChange, content: bytes) -> None:
     """Write an object; an object of a PDO while the PDO is switched off."""
-    is_pdo = COMMUNICATION <= item.index < COMMUNICATION + _MOST_PDOS and item.subindex != COB_ID
+    is_pdo = COMMUNICATION <= item.index < COMMUNICATION + MOST_PDOS and item.subindex != COB_ID
     on = access.read(item.node_id, item.index, COB_ID) if is_pdo else None
     if on is None:
         access.write(item.node_id, item.index, item.subindex, content)
@@ -196,7 +196,7 @@ def _number(access: ObjectAccess, node_id: int, index: int, subindex: int) -> in
 def _active_pdos(access: ObjectAccess, node_id: int) -> list[int]:
     """Indices of the PDOs that are switched on and not empty; 0 is TPDO 1."""
     active: list[int] = []
-    for pdo in range(_MOST_PDOS):
+    for pdo in range(MOST_PDOS):
         cob_id = _number(access, node_id, COMMUNICATION + pdo, COB_ID)
         is_mapped = bool(_number(access, node_id, MAPPING + pdo, 0))
         if cob_id is not None and not cob_id & OFF and is_mapped:
