@@ -3,7 +3,7 @@
 import http.client
 import json
 import shutil
-import threading
+import signal
 
 import pytest
 import yaml
@@ -40,9 +40,7 @@ def state(server, run=0):
 
 def ended(server):
     """The state after the process has ended."""
-    for thread in threading.enumerate():
-        if thread.name == "diagnosis":
-            thread.join(timeout=300)
+    server.diagnoses[0].wait()
     return state(server)
 
 
@@ -76,9 +74,8 @@ def test_it_stands_beside_the_run_and_its_report_reads_nothing_of_the_page(run):
 def test_the_end_of_the_server_ends_it(run):
     with serving(run, token="secret") as server:
         post(server, "/diagnose?run=0")
-        process = server.diagnoses[0]._process
-    process.join(timeout=60)
-    assert process.exitcode not in (None, 0)
+        job = server.diagnoses[0]
+    assert job.wait() == -signal.SIGTERM
 
 
 def test_what_fails_says_why(tmp_path):

@@ -46,7 +46,7 @@ class DiagnosisJob:
             held_out: Folders of the held-out runs.
         """
         with self._lock:
-            if self._process is not None and self._process.is_alive():
+            if self._is_running():
                 return
             self._progress, self._reason, self._is_cancelled = _STARTING, "", False
             out = free_folder(self._first_folder())
@@ -67,29 +67,33 @@ class DiagnosisJob:
     def cancel(self) -> None:
         """End the diagnosis, if it is running; its results so far are lost."""
         with self._lock:
-            if self._process is not None and self._process.is_alive():
+            if self._process is not None and self._is_running():
                 self._is_cancelled = True
                 self._process.terminate()
 
     def state(self) -> Mapping[str, object]:
         """State for the page: `state`, and what belongs to that state."""
-        process = self._process
-        if process is not None:
-            # The reason of a failure is read after the process has ended.
-            is_read = self._reader is None or not self._reader.is_alive()
-            if process.is_alive() or not is_read:
-                return {"state": "running", **self._progress._asdict()}
-            if self._is_cancelled:
-                return {"state": "cancelled"}
-            if process.exitcode:
-                return {
-                    "state": "failed",
-                    "why": self._reason or f"the process ended with exit code {process.exitcode}",
-                }
+        if self._is_running():
+            return {"state": "running", **self._progress._asdict()}
+        if self._is_cancelled:
+            return {"state": "cancelled"}
+        if self._process is not None and self._process.exitcode:
+            reason = f"the process ended with exit code {self._process.exitcode}"
+            return {"state": "failed", "why": self._reason or reason}
         folder = self.newest_folder()
         if folder is None:
             return {"state": "none"}
         return {"state": "done", "verdict": _read_verdict(folder), "folder": str(folder)}
+
+    def wait(self) -> int | None:
+        """Wait for the end of the diagnosis.
+
+        Returns:
+            Exit code of its process; None if none was started.
+        """
+        if self._reader is not None:
+            self._reader.join()
+        return None if self._process is None else self._process.exitcode
 
     def newest_folder(self) -> Path | None:
         """The newest folder of a diagnosis of the run that holds a report."""
@@ -103,6 +107,11 @@ class DiagnosisJob:
 
     def _first_folder(self) -> Path:
         return self._run.with_name(f"{self._run.name}-diagnosis")
+
+    def _is_running(self) -> bool:
+        # The reader alone waits for the process: of two threads that wait for one child, the
+        # system gives the exit code to one, and the other is told that there is no child.
+        return self._reader is not None and self._reader.is_alive()
 
     def _read(self, process: SpawnProcess, receiver: Connection) -> None:
         with receiver, contextlib.suppress(EOFError, OSError):
