@@ -8,11 +8,11 @@ from msgspec.structs import replace
 from can_dbc.addressing import Directory, Filter
 from can_dbc.frame import Frame
 from can_dbc.protection import SequenceState
+from rig.bridge.counts import Conditions, Counts, Report
 from rig.bridge.devices import CLAIM, CLAIM_MASK, Device, faults
 from rig.bridge.gates import GateMemory, Gates, Reception
 from rig.bridge.incoming import Incoming
 from rig.bridge.outgoing import Outgoing
-from rig.bridge.report import Conditions, Counts, Report
 from rig.bridge.supervisor import NO_REPORTS, Reports, SupervisedState, Supervision, Supervisor
 from rig.bridge.values import Mode, StepInput, StepOutput
 from rig.channels.channel import Channel, Role, Sample

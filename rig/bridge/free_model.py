@@ -191,7 +191,7 @@ class FreeModelEstimator:
             start = Start(
                 measured_ns,
                 mobility_per_kg,
-                *self._rhythm(strut),
+                *self._sample_timing(strut),
                 stiffness_per_s2,
                 damping_per_s,
                 self._sensors[strut],
@@ -200,7 +200,7 @@ class FreeModelEstimator:
         newest_ns = min(samples[-1].t_ns for samples in first if samples)
         return self._estimate(t_ns, tuple(observers), loaded, newest_ns, ())
 
-    def _rhythm(self, strut: int) -> tuple[int, int]:
+    def _sample_timing(self, strut: int) -> tuple[int, int]:
         """Interval and delay of a strut's heights in ns; zero where none is measured."""
         channel = self._heights.get(strut)
         return (0, 0) if channel is None else (channel.interval_ns, channel.delay_ns)
@@ -216,7 +216,7 @@ class FreeModelEstimator:
             if len(samples) != required[strut]:
                 return False
             if samples and samples[-1].t_ns - samples[0].t_ns > (
-                2 * len(samples) * self._rhythm(strut)[0]
+                2 * len(samples) * self._sample_timing(strut)[0]
             ):
                 return False
         newest_ns = min(samples[-1].t_ns for samples in first if samples)

@@ -16,13 +16,12 @@ from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from dart_model.spec import copy_files, dump_model
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
-from rig.bridge.log_columns import LogColumns
 from rig.bridge.values import Mode
 from rig.bus.link import LinkFigures
 from rig.files.folders import refuse_full
 from rig.log.file_names import CHANGES_FILE, DBC_FILE, HISTOGRAMS_FILE, MODEL_FILE
 from rig.log.reader import RUN_SCHEMA
-from rig.log.steps import Step
+from rig.log.steps import LogColumns, Step
 from rig.log.writer import LogOptions, RunWriter
 from rig.machine.clock import Clock, OccupiedClock
 from rig.machine.realtime import Granted

@@ -8,10 +8,9 @@ from msgspec import Struct
 
 from can_dbc.frame import Frame
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
-from rig.bridge.log_columns import LogColumns
-from rig.bridge.report import Conditions, Counts
+from rig.bridge.counts import Conditions, Counts
 from rig.bridge.values import Mode, StepOutput
-from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step
+from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, LogColumns, Step
 from rig.machine.clock import Clock
 from rig.run.changes import Changes, no_changes
 from rig.run.timing import BINS, Timing

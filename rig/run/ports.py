@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import cast
 
 from can_dbc.frame import Frame
-from rig.bridge.report import NO_TIMING, Conditions, Levels, TimingFigures
+from rig.bridge.counts import NO_TIMING, Conditions, Levels, TimingFigures
 from rig.bus.bus import Bus
 from rig.bus.link import Link
 from rig.bus.secoc import Authenticator

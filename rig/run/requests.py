@@ -20,9 +20,9 @@ from rig.bridge.bridge import Bridge
 from rig.log.file_names import RUN_FILE
 from rig.log.reader import read_header
 from rig.machine.realtime import follow
-from rig.plan.check import errors
 from rig.plan.load import plan_of_run
 from rig.plan.plan import Plan
+from rig.plan.preflight_checks import errors
 from rig.run.changes import Assignments, assign, bridge_with_settings, change_line, read_changes
 
 _FOLDER = "requests"

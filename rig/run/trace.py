@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from can_dbc.frame import Frame
 from rig.bridge.bridge import TickResult
-from rig.bridge.report import Conditions
+from rig.bridge.counts import Conditions
 from rig.log.errors import LogError
 from rig.log.file_names import TRACE_FILE
 from rig.log.steps import Step

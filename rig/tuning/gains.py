@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from dart_model.protocol import AnyPlant
-from rig.closed_loop.loop import LinearLoop, Loop, Rhythm
+from rig.closed_loop.loop import LinearLoop, Loop, SampleTiming
 from rig.closed_loop.poles import Pole, poles_of
 from rig.closed_loop.strut_response import StrutResponse
 from rig.observers import OBSERVERS
@@ -100,7 +100,7 @@ class TuningProblem(NamedTuple):
         strut: Index of the strut.
         responses: Responses of the model's struts.
         heights_m: Heights at which the bench rests.
-        rhythm: When the loop is closed.
+        timing: How often the loop is closed.
         expectation: Noise and residual force that are expected of the strut.
         force_limit_n: Limit of the virtual force.
     """
@@ -110,7 +110,7 @@ class TuningProblem(NamedTuple):
     strut: int
     responses: Sequence[StrutResponse]
     heights_m: Sequence[float]
-    rhythm: Rhythm
+    timing: SampleTiming
     expectation: Expectation
     force_limit_n: float
 
@@ -129,7 +129,7 @@ class TuningProblem(NamedTuple):
         """
         plant: Any = self.plant if factor == 1.0 else _StrongerPlant(self.plant, factor)
         observers = self.with_observer(observer)
-        loop = Loop(plant, observers, self.heights_m, self.rhythm, self.responses)
+        loop = Loop(plant, observers, self.heights_m, self.timing, self.responses)
         return loop.linear(self.strut)
 
     def with_observer(self, observer: AnyObserver) -> tuple[AnyObserver, ...]:
@@ -189,7 +189,7 @@ def tune_observer(problem: TuningProblem, kind: str, aim: Aim) -> Tuned:
     task = TuningTask(
         1.0 / problem.mobility_per_kg,
         problem.expectation.noise_std_m,
-        problem.rhythm.interval_ns * 1e-9,
+        problem.timing.interval_ns * 1e-9,
         problem.force_limit_n,
     )
     search: Search = OBSERVERS[kind].search(task)

@@ -11,7 +11,7 @@ from can_dbc.codec import si_step
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import parse_mapping, read_text
 from rig.channels.channel import Channel
-from rig.closed_loop.loop import Rhythm
+from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.strut_response import strut_responses
 from rig.diagnosis.progress import Progress, within
 from rig.observers.kalman import KalmanObserver
@@ -138,7 +138,7 @@ def tune(
             index,
             responses,
             heights_m,
-            Rhythm.of(plan.period_ns, strut.interval_ns, round(height.delay_s * 1e9)),
+            SampleTiming.of(plan.period_ns, strut.interval_ns, round(height.delay_s * 1e9)),
             expectations[index],
             cast("AnyTunableObserver", strut.observer).force_limit_n,
         )

@@ -15,7 +15,7 @@ from rig.bridge import (
     supervisor,
     values,
 )
-from rig.bridge.report import Conditions
+from rig.bridge.counts import Conditions
 from rig.bridge.values import Mode
 from tests.faults.trial import BEGIN_NS, MS, Trial, after
 

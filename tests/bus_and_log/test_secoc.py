@@ -13,9 +13,9 @@ from can_dbc.frame import Frame
 from rig.bus.link import Link
 from rig.bus.secoc import Authentication, Authenticator, cmac, read_key
 from rig.log.file_names import STEPS_FILE
-from rig.plan.check import Severity, check
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
+from rig.plan.preflight_checks import Severity, check
 from rig.run.live import with_bench
 from rig.run.loop import RunControl
 from rig.run.ports import BusPort
