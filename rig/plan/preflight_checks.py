@@ -16,7 +16,6 @@ from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import Pole, closed_loop_poles
 from rig.observers.protocol import SensorStep
 from rig.plan.build import build_bridge, build_plant
-from rig.plan.load import load_authentication
 from rig.plan.plan import Plan
 
 LITTLE_DAMPING = 0.02
@@ -189,13 +188,13 @@ def _authentication(plan: Plan) -> list[Finding]:
     settings = plan.config.authentication
     if settings is None:
         return []
-    load_authentication(plan)
     text = (
         f"AES-128 CMAC, {settings.mac_bits} bits, freshness {settings.freshness_bits} bits, "
         f"clocks within {settings.clock_tolerance_s:g} s"
     )
     path = plan.source.parent / settings.key_file
-    if path.stat().st_mode & _OTHERS_MAY_READ:
+    is_loaded = plan.authentication is not None
+    if is_loaded and path.stat().st_mode & _OTHERS_MAY_READ:
         text += f"; {path} can be read by others, expected mode 0600"
         return [Finding(Severity.ERROR, "authentication", text)]
     return [Finding(Severity.OK, "authentication", text)]
