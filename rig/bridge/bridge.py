@@ -199,10 +199,8 @@ class Bridge:
                 supervised, samples = self._catch_up(supervised, samples)
                 measured = 0
             arrived_ns = min(frame_ns, t_ns)
-            samples += [
-                Sample(channel, values[value], arrived_ns - delay_ns)
-                for value, channel, delay_ns in incoming.deliveries
-            ]
+            for value, channel, delay_ns in incoming.deliveries:
+                samples.append(Sample(channel, values[value], arrived_ns - delay_ns))
             measured |= incoming.struts
         return supervised, samples
 
@@ -236,7 +234,8 @@ class Bridge:
         """State of the outgoing messages, frames to send, counts, and counts as reported."""
         frames: list[Frame] = []
         sendings, reported = state.sendings, state.reported
-        if not output.struts:  # nothing is sent before the first valid measurement
+        # Nothing is sent before the first valid measurement.
+        if not (sendings and output.struts):
             return sendings, frames, counts, reported
         after = list(sendings)
         for index, item in enumerate(self._outgoing):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from msgspec import Struct
@@ -44,7 +44,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
     past: tuple[Instant, ...] = ()
 
 
-class _Received(NamedTuple):
+class _Received(Struct, frozen=True, gc=False):
     """Samples of a step, by what they are used for.
 
     Attributes:
@@ -226,7 +226,8 @@ class FreeModelEstimator:
         self, state: FreeModelState, loaded: LoadedModel[Any], t_ns: int, received: _Received
     ) -> tuple[FreeModelState, Estimate]:
         """Advance the model to the tick and correct it with what was measured."""
-        heights, readings, applied_n, temperature_c = received
+        heights, readings = received.heights, received.readings
+        applied_n, temperature_c = received.applied_n, received.temperature_c
         if applied_n is None:
             applied_n = loaded.applied_force_n
         if temperature_c is None:

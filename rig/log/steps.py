@@ -48,7 +48,7 @@ class Step(Struct, frozen=True, gc=False):
     received: int
     mode: int
     flags: int
-    numbers: tuple[float, ...]
+    numbers: Sequence[float]
 
 
 class LogColumns:
@@ -64,8 +64,10 @@ class LogColumns:
     def __init__(self, struts: Sequence[str], channels: Sequence[Channel]) -> None:
         bench = [channel for channel in channels if channel.role is Role.BENCH]
         sensors = [channel for channel in channels if channel.role is Role.SENSOR]
-        self._first = [len(bench) + i * len(STRUT_COLUMNS) for i in range(len(struts))]
+        first = [len(bench) + i * len(STRUT_COLUMNS) for i in range(len(struts))]
         begin_of_sensors = len(bench) + len(struts) * len(STRUT_COLUMNS)
+        published = [begin + len(_MEASURED) for begin in first]
+        self._published = [slice(begin, begin + len(_PUBLISHED)) for begin in published]
         self._column_of = [0] * len(channels)
         for column, channel in enumerate(bench):
             self._column_of[channel.index] = column
@@ -73,7 +75,7 @@ class LogColumns:
             self._column_of[channel.index] = begin_of_sensors + 2 * column
         for channel in channels:
             if channel.role is Role.HEIGHT:
-                self._column_of[channel.index] = self._first[channel.strut]
+                self._column_of[channel.index] = first[channel.strut]
         self._is_height = [channel.role is Role.HEIGHT for channel in channels]
         self._blank = [nan] * begin_of_sensors + [nan, 0.0] * len(sensors)
         self.names: tuple[str, ...] = (
@@ -83,21 +85,20 @@ class LogColumns:
         )
         """Names of the columns."""
 
-    def numbers(self, step_input: StepInput, output: StepOutput) -> tuple[float, ...]:
+    def numbers(self, step_input: StepInput, output: StepOutput) -> list[float]:
         """Numbers of a tick; NaN where nothing arrived or nothing was published."""
-        numbers = self._blank.copy()
+        numbers, column_of = self._blank.copy(), self._column_of
         for sample in step_input.samples:
-            channel = sample.channel
-            column = self._column_of[channel]
+            column = column_of[sample.channel]
             numbers[column] = sample.value
-            if self._is_height[channel]:
+            if self._is_height[sample.channel]:
                 numbers[column + 1] = sample.t_ns
         if output.struts:
-            for first, strut in zip(self._first, output.struts, strict=True):
-                numbers[first + 2 : first + 2 + len(_PUBLISHED)] = astuple(strut)
+            for columns, strut in zip(self._published, output.struts, strict=True):
+                numbers[columns] = astuple(strut)
         for channel in output.left_out:
-            numbers[self._column_of[channel] + 1] = 1.0
-        return tuple(numbers)
+            numbers[column_of[channel] + 1] = 1.0
+        return numbers
 
 
 def step_schema(columns: Sequence[str] = ()) -> Any:
@@ -128,31 +129,35 @@ class StepRows:
 
     def __init__(self, columns: Sequence[str]) -> None:
         self.schema = step_schema(columns)
-        self._packer = struct.Struct(f"<qiibb{len(columns)}d")
+        self._pack = struct.Struct(f"<qiibb{len(columns)}d").pack
         self._columns = np.dtype(
             [(field.name, field.type.to_pandas_dtype()) for field in self.schema]
         )
         self._rows = bytearray()
-        self._first_ns = 0
-        self.last_ns = 0
-        """Time of the last one."""
-        self.count = 0
-        """How many they are."""
+
+    @property
+    def count(self) -> int:
+        """Number of steps."""
+        return len(self._rows) // self._columns.itemsize
+
+    @property
+    def last_ns(self) -> int:
+        """Time of the last one; 0 if there is none."""
+        return self._time_at(len(self._rows) - self._columns.itemsize)
 
     @property
     def span_ns(self) -> int:
         """Time from the first one to the last."""
-        return self.last_ns - self._first_ns if self._rows else 0
+        return self.last_ns - self._time_at(0)
 
     def append(self, step: Step) -> None:
         """Add a step."""
-        if not self._rows:
-            self._first_ns = step.t_ns
-        self.last_ns = step.t_ns
-        self.count += 1
-        self._rows += self._packer.pack(
+        self._rows += self._pack(
             step.t_ns, step.overruns, step.received, step.mode, step.flags, *step.numbers
         )
+
+    def _time_at(self, begin: int) -> int:
+        return int.from_bytes(self._rows[begin : begin + 8], "little") if self._rows else 0
 
     def batch(self) -> Any:
         """All steps as an Arrow record batch."""
@@ -163,4 +168,3 @@ class StepRows:
     def clear(self) -> None:
         """Remove all steps."""
         self._rows = bytearray()
-        self.count = 0

@@ -3,7 +3,7 @@
 The ticks, the frames of each and what the loop knew come from the log; nothing is sent.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -98,16 +98,16 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
         _received: Sequence[Frame], _sent: Sequence[Frame], result: TickResult, step: Step
     ) -> None:
         rows.append(step)
-        if rows.count == _TICKS_AT_ONCE:
-            batches.append(rows.batch())
-            rows.clear()
         progress(step.t_ns, result.output.mode)
+
+    def make_batch() -> None:
+        batches.append(rows.batch())
+        rows.clear()
 
     port = _LogPort(frames, ticks)
     # With another plan the run's own changes would undo what is tried.
     changes = changes_for_replay(folder, own, bridge) if plan is own else no_changes
-    state = run(bridge, bridge.init(0), port.ticks(), port, keep, columns, changes)
-    batches.append(rows.batch())
+    state = run(bridge, bridge.init(0), port.ticks(make_batch), port, keep, columns, changes)
     steps = _pa.Table.from_batches(batches, schema=rows.schema)
     different = _find_differences(run_folder.steps, steps)
     return Replay(
@@ -125,43 +125,46 @@ class _LogPort:
     def __init__(self, frames: FrameColumns, ticks: LoggedTicks) -> None:
         self._frames = frames
         self._ticks = ticks
-        self._waiting: Iterator[tuple[Sequence[Frame], Conditions]] = iter(())
+        self._current: tuple[Sequence[Frame], Conditions] = (), _NO_CONDITIONS
 
-    def ticks(self) -> Iterator[Tick]:
-        """The ticks; frames and conditions of some are made ready at a time."""
-        ticks, begin = self._ticks, 0
-        for first in range(0, len(ticks.t_ns), _TICKS_AT_ONCE):
+    def ticks(self, end_part: Callable[[], None]) -> Iterator[Tick]:
+        """The ticks, in parts whose frames are in memory at once.
+
+        Args:
+            end_part: Called after the last tick of each part.
+        """
+        logged = self._ticks
+        begins = np.concatenate([[0], np.cumsum(logged.received)])
+        for first in range(0, len(logged.t_ns), _TICKS_AT_ONCE):
             part = slice(first, first + _TICKS_AT_ONCE)
-            received = ticks.received[part].tolist()
-            frames = list(self._frames.between(begin, begin + sum(received)))
-            begin += sum(received)
-            self._waiting = _frames_by_tick(frames, received, ticks.flags[part].tolist())
-            yield from map(Tick, ticks.t_ns[part].tolist(), ticks.overruns[part].tolist())
+            ends = begins[1:][part]
+            begin = int(begins[first])
+            frames = list(self._frames.between(begin, int(ends[-1])))
+            columns = (logged.t_ns[part], logged.overruns[part], logged.flags[part], ends - begin)
+            begin = 0
+            for t_ns, overruns, flags, end in zip(*(c.tolist() for c in columns), strict=True):
+                conditions = _conditions(flags) if flags else _NO_CONDITIONS
+                self._current = frames[begin:end], conditions
+                begin = end
+                yield Tick(t_ns, overruns)
+            end_part()
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
         """Frames that the tick received, and what the loop knew."""
         _ = t_ns  # the ticks come in their order
-        return next(self._waiting)
+        return self._current
 
     def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
         """Nothing is sent."""
         return frames
 
 
-def _frames_by_tick(
-    frames: list[Frame], received: list[int], flags: list[int]
-) -> Iterator[tuple[Sequence[Frame], Conditions]]:
-    begin = 0
-    for count, known in zip(received, flags, strict=True):
-        conditions = _NO_CONDITIONS
-        if known:
-            conditions = Conditions(
-                acknowledged=bool(known & ACKNOWLEDGED),
-                bus_fault=bool(known & BUS_FAULT),
-                log_fault=bool(known & LOG_FAULT),
-            )
-        yield frames[begin : begin + count], conditions
-        begin += count
+def _conditions(flags: int) -> Conditions:
+    return Conditions(
+        acknowledged=bool(flags & ACKNOWLEDGED),
+        bus_fault=bool(flags & BUS_FAULT),
+        log_fault=bool(flags & LOG_FAULT),
+    )
 
 
 def _ticks(log: RunFolder, frames: FrameColumns, period_ns: int) -> LoggedTicks:
