@@ -18,7 +18,6 @@ from rig.formats.run_content import RunContent, read_content
 from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
 from rig.log.reader import RunFolder
 
-_pa = cast("Any", pa)
 _CAN, _STEPS = "CAN_DataFrame", "steps"
 
 
@@ -127,7 +126,7 @@ def _rename_columns(signal: Any) -> Any:
     return signal
 
 
-def _append_steps(asammdf: Any, mdf: Any, steps: Any) -> None:
+def _append_steps(asammdf: Any, mdf: Any, steps: pa.Table) -> None:
     if steps.num_rows == 0:
         return
     t_s = steps.column("t_ns").to_numpy() * 1e-9
@@ -184,7 +183,7 @@ def _read_frames(mdf: Any, name: str) -> Iterable[tuple[Frame, str]]:
         yield frame, "T" if sent else "R"
 
 
-def _read_steps(mdf: Any) -> Any:
+def _read_steps(mdf: Any) -> pa.Table:
     prefix = f"{_STEPS}."
     group = next(
         (
@@ -195,9 +194,10 @@ def _read_steps(mdf: Any) -> Any:
         None,
     )
     if group is None:
-        return _pa.table({})
+        return pa.table({})
     names = [
         channel.name for channel in mdf.groups[group].channels if channel.name.startswith(prefix)
     ]
-    arrays = [_pa.array(mdf.get(name, group=group).samples) for name in names]
-    return _pa.Table.from_arrays(arrays, names=[name.removeprefix(prefix) for name in names])
+    return pa.table(
+        {name.removeprefix(prefix): mdf.get(name, group=group).samples for name in names}
+    )

@@ -2,7 +2,6 @@
 
 import struct
 from collections.abc import Sequence
-from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -13,8 +12,6 @@ ACKNOWLEDGED, BUS_FAULT, LOG_FAULT = 1, 2, 4
 
 END_OF_STREAM = b"\xff\xff\xff\xff\0\0\0\0"
 """Last bytes of an Arrow stream that was closed."""
-
-_pa = cast("Any", pa)
 
 
 class Step(Struct, frozen=True, gc=False):
@@ -37,20 +34,20 @@ class Step(Struct, frozen=True, gc=False):
     numbers: tuple[float, ...]
 
 
-def step_schema(columns: Sequence[str] = ()) -> Any:
+def step_schema(columns: Sequence[str] = ()) -> pa.Schema:
     """Arrow schema of `steps.arrow`.
 
     Args:
         columns: Names of `Step.numbers`.
     """
     fields = [
-        ("t_ns", _pa.int64()),
-        ("overruns", _pa.int32()),
-        ("received", _pa.int32()),
-        ("mode", _pa.int8()),
-        ("flags", _pa.int8()),
+        ("t_ns", pa.int64()),
+        ("overruns", pa.int32()),
+        ("received", pa.int32()),
+        ("mode", pa.int8()),
+        ("flags", pa.int8()),
     ]
-    return _pa.schema([*fields, *((name, _pa.float64()) for name in columns)])
+    return pa.schema([*fields, *((name, pa.float64()) for name in columns)])
 
 
 class StepRows:
@@ -67,7 +64,10 @@ class StepRows:
         self.schema = step_schema(columns)
         self._packer = struct.Struct(f"<qiibb{len(columns)}d")
         self._columns = np.dtype(
-            [(field.name, field.type.to_pandas_dtype()) for field in self.schema]
+            [
+                (name, kind.to_pandas_dtype())
+                for name, kind in zip(self.schema.names, self.schema.types, strict=True)
+            ]
         )
         self._rows = bytearray()
         self._first_ns = 0
@@ -91,11 +91,11 @@ class StepRows:
             step.t_ns, step.overruns, step.received, step.mode, step.flags, *step.numbers
         )
 
-    def batch(self) -> Any:
+    def batch(self) -> pa.RecordBatch:
         """All steps as an Arrow record batch."""
         table = np.frombuffer(self._rows, self._columns)
-        arrays = [_pa.array(np.ascontiguousarray(table[name])) for name in self.schema.names]
-        return _pa.RecordBatch.from_arrays(arrays, schema=self.schema)
+        arrays = [pa.array(np.ascontiguousarray(table[name])) for name in self.schema.names]
+        return pa.record_batch(arrays, schema=self.schema)
 
     def clear(self) -> None:
         """Remove all steps."""

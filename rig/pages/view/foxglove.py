@@ -81,8 +81,7 @@ class Topic:
     @property
     def epoch_ns(self) -> int | None:
         """Epoch of the run; None before it has begun."""
-        epoch_ns = self.run.header.get("epoch_ns")
-        return None if epoch_ns is None else int(epoch_ns)
+        return self.run.epoch_ns
 
     @property
     def is_subscribed(self) -> bool:
@@ -125,7 +124,7 @@ class Topic:
 
     def parameters(self) -> dict[str, object]:
         """Numbers and texts of the configuration, with the changes during the run."""
-        parameters = dict(_flat(self.name, self.run.header.get("config", {})))
+        parameters = dict(_flat(self.name, self.run.config))
         for _, changes in read_changes(self.run.folder):
             parameters |= {f"{self.name}.{key}": value for key, value in changes.items()}
         return parameters

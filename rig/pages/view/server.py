@@ -275,8 +275,8 @@ def _describe_run(view: ViewServer, run: WatchedRun) -> dict[str, Any]:
     with run.lock:
         run.update()
         state, words = run.state()
-        config = cast("Mapping[str, Any]", run.header.get("config", {}))
-        ending = cast("Mapping[str, Any]", run.header.get("ending") or {})
+        config = run.config
+        ending = run.ending
         return {
             "name": run.folder.name or str(run.folder),
             "folder": str(run.folder),
@@ -285,7 +285,7 @@ def _describe_run(view: ViewServer, run: WatchedRun) -> dict[str, Any]:
             "model": run.model.name if run.model is not None else None,
             "struts": [strut.name for strut in run.model.struts] if run.model is not None else [],
             "rate_hz": config.get("rate_hz"),
-            "epoch_ns": str(run.header.get("epoch_ns", "")),
+            "epoch_ns": "" if run.epoch_ns is None else str(run.epoch_ns),
             "columns": list(run.follower.columns),
             "span_s": run.follower.span_s,
             "steps": run.follower.steps,
@@ -342,7 +342,7 @@ def _closely(view: ViewServer, query: _Query) -> Answer:
                 "laws": visible_stretch.laws({**models, **view.models}, run.follower, rows, strut),
                 "spectrum": visible_stretch.spectrum(run.follower, rows, strut),
                 "bus": visible_stretch.bus_load(
-                    run.folder, run.header.get("epoch_ns", 0), run.frame_times_s, end_s
+                    run.folder, run.epoch_ns or 0, run.frame_times_s, end_s
                 ),
                 "timing": read_histograms(run.folder),
             }
