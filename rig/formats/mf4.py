@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import ModuleType
 from typing import Any, cast
 
 import numpy as np
@@ -22,7 +23,7 @@ _CAN, _STEPS = "CAN_DataFrame", "steps"
 
 
 def _bus_dtype(name: str) -> np.dtype[np.void]:
-    fields: list[Any] = [
+    fields = [
         (f"{name}.BusChannel", "<u1"),
         (f"{name}.ID", "<u4"),
         (f"{name}.IDE", "<u1"),
@@ -58,7 +59,7 @@ def _records(frames: list[tuple[Frame, str]], name: str) -> NDArray[np.void]:
     return records
 
 
-def _asammdf() -> Any:
+def _asammdf() -> ModuleType:
     try:
         return importlib.import_module("asammdf")
     except ImportError as error:
@@ -126,7 +127,7 @@ def _rename_columns(signal: Any) -> Any:
     return signal
 
 
-def _append_steps(asammdf: Any, mdf: Any, steps: pa.Table) -> None:
+def _append_steps(asammdf: ModuleType, mdf: Any, steps: pa.Table) -> None:
     if steps.num_rows == 0:
         return
     t_s = steps.column("t_ns").to_numpy() * 1e-9
@@ -167,14 +168,14 @@ def _read_frames(mdf: Any, name: str) -> Iterable[tuple[Frame, str]]:
     if name not in mdf:
         return
     signal = mdf.get(name)
-    records: Any = signal.samples
+    records = signal.samples
     t_s: NDArray[np.float64] = signal.timestamps
     t_ns = np.rint(t_s * 1e9).astype(np.int64).tolist()
     columns = [
         records[f"{name}.{field}"].tolist()
         for field in ("ID", "DataLength", "IDE", "EDL", "BRS", "Dir")
     ]
-    payloads: Any = records[f"{name}.DataBytes"]
+    payloads = records[f"{name}.DataBytes"]
     for row, (t, number, length, extended, fd, switched, sent) in enumerate(
         zip(t_ns, *columns, strict=True)
     ):
