@@ -54,24 +54,14 @@ class Divergence(TypedDict):
 
 
 class Ending(TypedDict, total=False):
-    """How a run ended, see `rig.run.logged_run`."""
+    """How a run ended, as far as it is read; see `rig.run.logged_run`."""
 
     status: str
-    ticks: int
     counts: dict[str, int]
     diverged: Divergence | None
     timing: dict[str, dict[str, float]]
-    bus: dict[str, object]
     log_fault: str | None
     dropped_steps: int
-    devices: Sequence[object]
-
-
-class CaptureEntry(TypedDict):
-    """What triggered a capture, and when."""
-
-    why: str
-    t_s: float
 
 
 class RunHeader(TypedDict, total=False):
@@ -86,7 +76,7 @@ class RunHeader(TypedDict, total=False):
     granted: dict[str, object] | None
     forced: Sequence[object]
     ending: Ending
-    capture: CaptureEntry
+    capture: dict[str, object]
 
 
 @dataclass(frozen=True)

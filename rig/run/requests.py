@@ -36,13 +36,7 @@ _MOST_BYTES = 100_000
 
 
 class Answer(TypedDict, total=False):
-    """Answer to a request.
-
-    Attributes:
-        t_ns: Time of the first tick with the change.
-        acknowledged: Whether the fault was acknowledged.
-        error: Why the request was refused.
-    """
+    """`t_ns` of the first tick with the change, or `acknowledged`; or `error`."""
 
     t_ns: int
     acknowledged: bool

@@ -33,6 +33,9 @@ from dart_model.effects.law import Writable
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Cube = NDArray[np.float64]
+Forces = MutableSequence[ForceOverArrays]
+Rates = MutableSequence[RatesOverArrays]
+_Arrays = tuple[Array, ...]
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -46,7 +49,6 @@ _VECTOR = types.Array(types.float64, 1, "C")
 _MATRIX = types.Array(types.float64, 2, "C")
 _CUBE = types.Array(types.float64, 3, "C")
 _INTEGERS = types.Array(types.int64, 1, "C")
-_INDEX = types.Array(types.int64, 2, "C")
 _POINTER = types.CPointer(types.float64)
 _FORCE_SIGNATURE = _F8(*(_F8,) * 5, *(_POINTER,) * 3)
 _RATE_SIGNATURE = types.void(*(_F8,) * 5, *(_POINTER,) * 4)
@@ -67,8 +69,8 @@ class Laws(NamedTuple):
         rates: Rates of their internal states, likewise.
     """
 
-    forces: MutableSequence[ForceOverArrays]
-    rates: MutableSequence[RatesOverArrays]
+    forces: Forces
+    rates: Rates
 
 
 def compile_loop(
@@ -111,16 +113,11 @@ def _rate(name: str) -> RatesOverArrays:
     return _compile_law(rates_over_arrays(effect(name)), _RATE_SIGNATURE)
 
 
-def _empty() -> tuple[MutableSequence[ForceOverArrays], MutableSequence[RatesOverArrays]]:
+def _empty() -> tuple[Forces, Rates]:
     return List.empty_list(_FORCE), List.empty_list(_RATE)
 
 
-def _append(
-    forces: MutableSequence[ForceOverArrays],
-    rates: MutableSequence[RatesOverArrays],
-    force: ForceOverArrays,
-    rate: RatesOverArrays,
-) -> None:
+def _append(forces: Forces, rates: Rates, force: ForceOverArrays, rate: RatesOverArrays) -> None:
     forces.append(force)
     rates.append(rate)
 
@@ -717,12 +714,12 @@ _TRAJECTORY = types.UniTuple(_MATRIX, 3)
 
 
 def _simulate(
-    forces: MutableSequence[ForceOverArrays],
-    rates: MutableSequence[RatesOverArrays],
-    model_parts: tuple[tuple[Integers, ...], Array, Array, tuple[Array, ...]],
-    scenario_parts: tuple[Array, ...],
+    forces: Forces,
+    rates: Rates,
+    model_parts: tuple[tuple[Integers, ...], Array, Array, _Arrays],
+    scenario_parts: _Arrays,
     steps: tuple[int, float, float],
-    out: tuple[Array, ...],
+    out: _Arrays,
 ) -> bool:
     # Pointers hold nothing: what they lead to is held by this function or by its caller.
     placement, equations = Placement(*model_parts[0]), Equations(*model_parts[3])
@@ -795,12 +792,7 @@ class LawValues(NamedTuple):
 
 
 def _along(
-    forces: MutableSequence[ForceOverArrays],
-    rates: MutableSequence[RatesOverArrays],
-    values: tuple[Array, ...],
-    motion: tuple[Array, ...],
-    substeps: int,
-    out: Array,
+    forces: Forces, rates: Rates, values: _Arrays, motion: _Arrays, substeps: int, out: Array
 ) -> None:
     force = forces[0]
     rate = rates[0]
