@@ -2,14 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
 from dart_model.effects import AMBIENT_C
-from dart_model.protocol import AnyPlant, LoadedModel
+from dart_model.protocol import AnyPlant, LoadedModel, ModelState
 from rig.bridge.estimator import Estimate, find_divergence, is_sensible
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
@@ -40,7 +39,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
     temperature_c: float
     first: tuple[tuple[Sample, ...], ...]
     observers: tuple[ObserverState, ...] = ()
-    model: LoadedModel[Any] | None = None
+    model: LoadedModel[ModelState] | None = None
     past: tuple[Instant, ...] = ()
 
 
@@ -223,7 +222,7 @@ class FreeModelEstimator:
         return t_ns - newest_ns <= self._stale_after_ns
 
     def _observe(
-        self, state: FreeModelState, loaded: LoadedModel[Any], t_ns: int, received: _Received
+        self, state: FreeModelState, loaded: LoadedModel[ModelState], t_ns: int, received: _Received
     ) -> tuple[FreeModelState, Estimate]:
         """Advance the model to the tick and correct it with what was measured."""
         heights, readings = received.heights, received.readings
@@ -265,7 +264,7 @@ class FreeModelEstimator:
         return self._estimate(t_ns, tuple(observers), loaded, oldest_ns, past)
 
     def _recent_instants(
-        self, state: FreeModelState, before: LoadedModel[Any], now: Instant
+        self, state: FreeModelState, before: LoadedModel[ModelState], now: Instant
     ) -> tuple[Instant, ...]:
         """The model now and before, as far back as a measurement may be old."""
         oldest_ns = now.t_ns - self._oldest_ns
@@ -294,7 +293,7 @@ class FreeModelEstimator:
         self,
         t_ns: int,
         observers: tuple[ObserverState, ...],
-        loaded: LoadedModel[Any],
+        loaded: LoadedModel[ModelState],
         measured_ns: int,
         past: tuple[Instant, ...],
     ) -> tuple[FreeModelState, Estimate]:

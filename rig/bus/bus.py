@@ -25,7 +25,7 @@ _QUEUE_BYTES, _SO_RCVBUFFORCE = 4_000_000, 33
 _MOST_KNOWN = 10_000
 """Identifiers remembered as accepted or not; a flood of others must not fill the memory."""
 
-_LISTEN_ONLY_OPTIONS: dict[str, dict[str, Any]] = {
+_LISTEN_ONLY_OPTIONS: dict[str, dict[str, object]] = {
     "pcan": {"state": can.BusState.PASSIVE},
     "slcan": {"listen_only": True},
     "vector": {"listen_only": True},
@@ -62,7 +62,7 @@ class BusConfig:
     channel: _Name = "rig"
     bitrate: _BitRate = 1_000_000
     data_bitrate: _BitRate | None = None
-    options: dict[str, Any] = field(default_factory=dict[str, Any])
+    options: dict[str, object] = field(default_factory=dict[str, object])
 
 
 class Bus:
@@ -206,7 +206,7 @@ def open_bus(
     Raises:
         BusError: The interface cannot be opened.
     """
-    options: dict[str, Any] = dict(config.options)
+    options: dict[str, object] = dict(config.options)
     if listen_only:
         options |= _LISTEN_ONLY_OPTIONS.get(config.interface, {})
     if config.interface == "virtual":

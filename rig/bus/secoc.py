@@ -14,7 +14,7 @@ import importlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 from msgspec.structs import replace
 
@@ -81,8 +81,8 @@ def cmac(key: bytes) -> Callable[[bytes], bytes]:
         AuthenticationError: The package that computes it is not installed.
     """
     try:
-        module = cast("Any", importlib.import_module("cryptography.hazmat.primitives.cmac"))
-        ciphers = cast("Any", importlib.import_module("cryptography.hazmat.primitives.ciphers"))
+        module = importlib.import_module("cryptography.hazmat.primitives.cmac")
+        ciphers = importlib.import_module("cryptography.hazmat.primitives.ciphers")
     except ImportError as error:
         raise AuthenticationError(
             "authentication: requires the package cryptography: pip install 'rig[secoc]'"

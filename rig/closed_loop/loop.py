@@ -8,7 +8,7 @@ Reference: Åström and Wittenmark, "Computer-Controlled Systems" (1997), chapte
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant
 from rig.closed_loop.derivatives import central_differences
 from rig.closed_loop.strut_response import StrutResponse, strut_responses
-from rig.observers.protocol import AnyObserver, Innovation, Start
+from rig.observers.protocol import AnyObserver, Innovation, Observer, Start, StateT
 
 Array = NDArray[np.float64]
 
@@ -95,7 +95,8 @@ class LinearLoop(NamedTuple):
         response = np.empty(len(frequency_hz), np.complex128)
         for index, frequency in enumerate(frequency_hz):
             z = np.exp(2j * np.pi * frequency * self.interval_s)
-            before = cast("Any", np.linalg.solve(z * eye - self.a, self.b[:, column]))
+            shifted: NDArray[np.complex128] = z * eye - self.a
+            before = np.linalg.solve(shifted, self.b[:, column])
             response[index] = self.c @ before + self.d[column]
         return response
 
@@ -208,7 +209,7 @@ class Loop:
         a, b, c, d = slopes[:-1, :size], slopes[:-1, size:], slopes[-1, :size], slopes[-1, size:]
         return LinearLoop(a, b, c, d, self._timing.interval_ns * 1e-9)
 
-    def _steady_state(self, observer: AnyObserver, response: StrutResponse) -> Any:
+    def _steady_state(self, observer: Observer[StateT], response: StrutResponse) -> StateT:
         """An observer that has followed a bench at rest for long, its last tick at time zero."""
         timing = self._timing
         delay_ns, ticks = timing.delay * timing.interval_ns, timing.delay + 2
@@ -226,8 +227,8 @@ class Loop:
         return state
 
     def _step_observer(
-        self, observer: AnyObserver, state: Any, tick: int, innovation_m: float | None
-    ) -> Any:
+        self, observer: Observer[StateT], state: StateT, tick: int, innovation_m: float | None
+    ) -> StateT:
         """State of an observer at a tick after time zero."""
         timing = self._timing
         t_ns = tick * timing.period_ns

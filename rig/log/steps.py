@@ -6,7 +6,6 @@ What it holds of a channel or a strut is declared here; the frames of a tick are
 import struct
 from collections.abc import Sequence
 from math import nan
-from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -27,8 +26,6 @@ _PUBLISHED = StrutOutput.__struct_fields__
 
 STRUT_COLUMNS = (*_MEASURED, *_PUBLISHED)
 """Columns of each strut, prefixed with its name and a dot; NaN where there is no value."""
-
-_pa = cast("Any", pa)
 
 
 class Step(Struct, frozen=True, gc=False):
@@ -101,20 +98,20 @@ class LogColumns:
         return numbers
 
 
-def step_schema(columns: Sequence[str] = ()) -> Any:
+def step_schema(columns: Sequence[str] = ()) -> pa.Schema:
     """Arrow schema of `steps.arrow`.
 
     Args:
         columns: Names of `Step.numbers`.
     """
     fields = [
-        ("t_ns", _pa.int64()),
-        ("overruns", _pa.int32()),
-        ("received", _pa.int32()),
-        ("mode", _pa.int8()),
-        ("flags", _pa.int8()),
+        ("t_ns", pa.int64()),
+        ("overruns", pa.int32()),
+        ("received", pa.int32()),
+        ("mode", pa.int8()),
+        ("flags", pa.int8()),
     ]
-    return _pa.schema([*fields, *((name, _pa.float64()) for name in columns)])
+    return pa.schema([*fields, *((name, pa.float64()) for name in columns)])
 
 
 class StepRows:
@@ -131,7 +128,10 @@ class StepRows:
         self.schema = step_schema(columns)
         self._pack = struct.Struct(f"<qiibb{len(columns)}d").pack
         self._columns = np.dtype(
-            [(field.name, field.type.to_pandas_dtype()) for field in self.schema]
+            [
+                (name, kind.to_pandas_dtype())
+                for name, kind in zip(self.schema.names, self.schema.types, strict=True)
+            ]
         )
         self._rows = bytearray()
 
@@ -159,11 +159,11 @@ class StepRows:
     def _time_at(self, begin: int) -> int:
         return int.from_bytes(self._rows[begin : begin + 8], "little") if self._rows else 0
 
-    def batch(self) -> Any:
+    def batch(self) -> pa.RecordBatch:
         """All steps as an Arrow record batch."""
         table = np.frombuffer(self._rows, self._columns)
-        arrays = [_pa.array(np.ascontiguousarray(table[name])) for name in self.schema.names]
-        return _pa.RecordBatch.from_arrays(arrays, schema=self.schema)
+        arrays = [pa.array(np.ascontiguousarray(table[name])) for name in self.schema.names]
+        return pa.record_batch(arrays, schema=self.schema)
 
     def clear(self) -> None:
         """Remove all steps."""

@@ -6,7 +6,6 @@ The ticks, the frames of each and what the loop knew come from the log; nothing 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -33,8 +32,6 @@ _MOST_LOST_A_FRAME = 1000
 
 _NO_CONDITIONS = Conditions()
 
-_pa = cast("Any", pa)
-
 
 @dataclass(frozen=True)
 class Replay:
@@ -48,7 +45,7 @@ class Replay:
         refused_frames: Frames refused in the replay.
     """
 
-    steps: Any
+    steps: pa.Table
     logged: int
     different: int
     first_different_ns: int | None
@@ -92,7 +89,7 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
     ticks = _ticks(run_folder, frames, plan.period_ns)
     columns = LogColumns(plan.strut_names, plan.channels)
     rows = StepRows(columns.names)
-    batches: list[Any] = []
+    batches: list[pa.RecordBatch] = []
 
     def keep(
         _received: Sequence[Frame], _sent: Sequence[Frame], result: TickResult, step: Step
@@ -108,7 +105,7 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
     # With another plan the run's own changes would undo what is tried.
     changes = changes_for_replay(folder, own, bridge) if plan is own else no_changes
     state = run(bridge, bridge.init(0), port.ticks(make_batch), port, keep, columns, changes)
-    steps = _pa.Table.from_batches(batches, schema=rows.schema)
+    steps = pa.Table.from_batches(batches, schema=rows.schema)
     different = _find_differences(run_folder.steps, steps)
     return Replay(
         steps,
@@ -204,7 +201,7 @@ def _ticks(log: RunFolder, frames: FrameColumns, period_ns: int) -> LoggedTicks:
     )
 
 
-def _find_differences(logged: Any, again: Any) -> NDArray[np.intp]:
+def _find_differences(logged: pa.Table, again: pa.Table) -> NDArray[np.intp]:
     """Indices of logged steps that are not the same bit for bit."""
     count = min(logged.num_rows, again.num_rows)
     unequal = np.zeros(count, dtype=np.bool_)

@@ -380,7 +380,7 @@ def fit_covariance(result: Fit) -> FitCovariance:
 def _sandwich(result: Fit) -> FitCovariance:
     jacobian, residual = result.solution.jacobian, result.solution.residual
     prior = result.solution.prior
-    size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + prior, _TINY))
+    size: Array = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + prior, _TINY))
     scaled = jacobian / size
     inverse = np.linalg.pinv(scaled.T @ scaled + np.diag(prior / size**2), rcond=1e-13)
     count = int(result.blocks.max()) + 1
