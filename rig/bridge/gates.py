@@ -101,7 +101,7 @@ class Reception:
         more = {name: getattr(counts, name) + number for name, number in increments.items()}
         self.memory = replace(self.memory, counts=counts._replace(**more))
 
-    def count_refused(self, cause: str) -> None:
+    def count_refusal(self, cause: str) -> None:
         """Count a refused frame, and its cause: the name of one of `Counts`."""
         self.count(**{"refused": 1, cause: 1})
 
@@ -213,7 +213,7 @@ class Gates:
         elif status.is_accepted:
             reception.count(lost=reception.sequences[index].lost)
         else:
-            reception.count_refused(status.value)
+            reception.count_refusal(status.value)
         if status is FrameStatus.OUT_OF_SEQUENCE:
             self._count_stray(reception, index, t_ns)
 
@@ -272,7 +272,7 @@ def _healthy_sender(incoming: Incoming, index: int, device: Device) -> Gate:
             reception.set_health(alarm.device, update_by_alarm(health, alarm.alarm, raw))
         if fault(device, reception.memory.healths[index], frame.t_ns) is None:
             return values
-        reception.count_refused("from_faulty_device")
+        reception.count_refusal("from_faulty_device")
         return None
 
     return gate
@@ -293,7 +293,7 @@ def _plausible(incoming: Incoming, limits: Sequence[Limit]) -> Gate:
         if action < Action.REFUSE:
             reception.memory = replace(reception.memory, heights=tuple(heights))
             return values
-        reception.count_refused("implausible")
+        reception.count_refusal("implausible")
         return None
 
     return gate

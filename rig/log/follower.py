@@ -107,7 +107,7 @@ class RunFollower:
             most_steps: About how many steps are taken; the rest is for the next call.
         """
         end = self.steps + most_steps
-        while self.steps < end and (batches := self._written()):
+        while self.steps < end and (batches := self._read_batches()):
             self._add(_matrix(pa.Table.from_batches(batches)))
 
     def window(self, names: Sequence[str], begin_s: float, end_s: float, points: int) -> Stretch:
@@ -156,7 +156,7 @@ class RunFollower:
             return np.zeros((0, max(len(self.columns), 1)))
         kept_from = self.steps - sum(map(len, self._newest))
         if begin >= kept_from:
-            return self._kept(begin - kept_from, end - kept_from)
+            return self._newest_rows(begin - kept_from, end - kept_from)
         first = bisect.bisect_right(self._begins, begin) - 1
         last = bisect.bisect_left(self._begins, end)
         batches = [self._read_again(*self._places[i]) for i in range(first, last)]
@@ -167,7 +167,7 @@ class RunFollower:
     def _path(self) -> Path:
         return self._folder / part_name(STEPS_FILE, self._part)
 
-    def _written(self) -> list[pa.RecordBatch]:
+    def _read_batches(self) -> list[pa.RecordBatch]:
         """The next batches that are whole; none where nothing more has been written."""
         self._go_on()
         if not self.unread_bytes:
@@ -228,15 +228,15 @@ class RunFollower:
             self._largest.add(np.fmax.reduce(buckets, axis=1))
         self._open = rows[whole:].copy()
 
-    def _kept(self, begin: int, end: int) -> Array:
-        """Of the newest steps."""
-        found: list[Array] = []
+    def _newest_rows(self, begin: int, end: int) -> Array:
+        """Rows of the newest steps."""
+        rows: list[Array] = []
         first = 0
         for piece in self._newest:
             if first < end and first + len(piece) > begin:
-                found.append(piece[max(begin - first, 0) : end - first])
+                rows.append(piece[max(begin - first, 0) : end - first])
             first += len(piece)
-        return np.concatenate(found)
+        return np.concatenate(rows)
 
     def _bucket(self, t_ns: float) -> int:
         """Number of the bucket that a time is in."""

@@ -634,7 +634,7 @@ def _end_stage(stage: int, h: float, step: _Step, work: _Work) -> None:
 
 
 @_inline
-def _jumped(h: float, steps: Steps, step: _Step, work: _Work) -> bool:
+def _has_jump(h: float, steps: Steps, step: _Step, work: _Work) -> bool:
     """Whether a force jumped within a step, as it does where a contact closes or friction turns."""
     n = step.twist.shape[0]
     worst = 0.0
@@ -692,7 +692,7 @@ def _march(
                             return True
                     _end_stage(stage, h, step, work)
                 piece += 1
-                if pieces < _MOST_PIECES and _jumped(h, steps, step, work):
+                if pieces < _MOST_PIECES and _has_jump(h, steps, step, work):
                     # Again, in parts.
                     for i in range(step.x.shape[0]):
                         step.x[i] = step.began[i]
