@@ -18,7 +18,13 @@ from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from rig.simulated_bench.assembly import assemble
 from rig.simulated_bench.equations_of_motion import RECORD_COLUMNS, RECORD_EXTRA
-from rig.simulated_bench.schema import BenchConfig, BenchConfigError, Transmission
+from rig.simulated_bench.schema import (
+    BenchConfig,
+    BenchConfigError,
+    HeightSensor,
+    LoadCell,
+    Transmission,
+)
 from rig.simulated_bench.trajectory import BenchState, advance_records, regular_grid
 
 RECORDS_AHEAD = 4
@@ -263,32 +269,21 @@ def _channels(
 ) -> list[_Channel]:
     struts = [strut.name for strut in config.struts]
     extra = RECORD_COLUMNS * len(struts)
+    sensors = (
+        (sent.height, Dimension.LENGTH, 0),
+        (sent.applied_force, Dimension.FORCE, extra),
+        (sent.strut_force, Dimension.FORCE, 2),
+        (sent.temperature, Dimension.TEMPERATURE, extra + 2),
+    )
     channels: list[_Channel] = []
     # Each quantity has its own source, so that one sensor's noise does not depend on another's.
-    if sent.height is not None:
-        column = RECORD_COLUMNS * struts.index(sent.height.strut)
-        noise_std = sent.height.noise_std_m
-        channels.append(
-            _Channel(sent.height.signal, Dimension.LENGTH, column, noise_std, noises[0])
-        )
-    if sent.applied_force is not None:
-        noise_std = sent.applied_force.noise_std_n
-        channels.append(
-            _Channel(sent.applied_force.signal, Dimension.FORCE, extra, noise_std, noises[1])
-        )
-    if sent.strut_force is not None:
-        column = RECORD_COLUMNS * struts.index(sent.strut_force.strut) + 2
-        noise_std = sent.strut_force.noise_std_n
-        channels.append(
-            _Channel(sent.strut_force.signal, Dimension.FORCE, column, noise_std, noises[2])
-        )
-    if sent.temperature is not None:
-        noise_std = sent.temperature.noise_std_k
-        channels.append(
-            _Channel(
-                sent.temperature.signal, Dimension.TEMPERATURE, extra + 2, noise_std, noises[3]
+    for (sensor, dimension, column), noise in zip(sensors, noises, strict=True):
+        if sensor is not None:
+            is_of_strut = isinstance(sensor, HeightSensor | LoadCell)
+            first = RECORD_COLUMNS * struts.index(sensor.strut) if is_of_strut else 0
+            channels.append(
+                _Channel(sensor.signal, dimension, first + column, sensor.noise_std, noise)
             )
-        )
     return channels
 
 
