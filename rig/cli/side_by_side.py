@@ -15,7 +15,8 @@ from typing import Any
 from rich.markup import escape
 
 from can_dbc.errors import InputError
-from rig.cli.terminal import FAILED, OK, WRONG_INPUT, console, print_json, table
+from rig.cli.progress import handled
+from rig.cli.terminal import FAILED, OK, WRONG_INPUT, print_json, print_table
 from rig.files.folders import refuse_full
 
 _PR_SET_PDEATHSIG = 1
@@ -59,9 +60,11 @@ def run_side_by_side(
         for item in bridges.items():
             readers.append(threading.Thread(target=_pass_on, args=item, daemon=True))
             readers[-1].start()
-        codes = {name: _code(bridge.wait()) for name, bridge in bridges.items()}
+        ends = {name: bridge.wait() for name, bridge in bridges.items()}
     for reader in readers:
         reader.join()
+    # A program which a signal ended has failed.
+    codes = {name: FAILED if code < 0 else code for name, code in ends.items()}
     summaries = {name: _summary(folder / name) for name in names}
     if as_json:
         print_json({name: {"exit_code": codes[name], **summaries[name]} for name in names})
@@ -91,11 +94,6 @@ def _ends_with_its_parent() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
 
 
-def _code(code: int) -> int:
-    """An exit code; that of a program which a signal ended is a failure."""
-    return code if code >= 0 else FAILED
-
-
 def _pass_on(name: str, bridge: "subprocess.Popen[str]") -> None:
     """What a bridge says, behind its name, on standard error."""
     for line in bridge.stdout or ():
@@ -111,17 +109,13 @@ def _end_together(bridges: Mapping[str, "subprocess.Popen[str]"]) -> Generator[N
             if bridge.poll() is None:
                 bridge.send_signal(signal.SIGINT)
 
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    numbers += [signal.SIGHUP] if sys.platform != "win32" else []
-    before = {number: signal.signal(number, forward) for number in numbers}
-    try:
-        yield
-    except BaseException:
-        forward(0, None)
-        raise
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    closed_terminal = [signal.SIGHUP] if sys.platform != "win32" else []
+    with handled(forward, signal.SIGINT, signal.SIGTERM, *closed_terminal):
+        try:
+            yield
+        except BaseException:
+            forward(0, None)
+            raise
 
 
 def _summary(folder: Path) -> dict[str, Any]:
@@ -132,14 +126,12 @@ def _summary(folder: Path) -> dict[str, Any]:
 
 
 def _print(codes: dict[str, int], summaries: dict[str, dict[str, Any]], folder: Path) -> None:
-    shown = table("bridge", "ended", "ticks", "missed", "run")
+    rows: list[tuple[str, ...]] = []
     for name, code in codes.items():
         summary = summaries[name]
         words = "in order" if code == OK else f"exit code {code}"
-        mode = summary.get("mode", "")
-        missed = summary.get("counts", {}).get("overruns", "")
+        end = f"{words} {summary.get('mode', '')}".strip()
+        missed = str(summary.get("counts", {}).get("overruns", ""))
         ticks = str(summary.get("ticks", ""))
-        shown.add_row(
-            escape(name), f"{words} {mode}".strip(), ticks, str(missed), escape(str(folder / name))
-        )
-    console.print(shown)
+        rows.append((escape(name), end, ticks, missed, escape(str(folder / name))))
+    print_table(("bridge", "ended", "ticks", "missed", "run"), rows)
