@@ -98,11 +98,6 @@ def status_line(
     """State, rate, lateness, force and losses of a run: one line that is rewritten on a terminal.
 
     Each update is a single write, because the loop of the run calls it.
-
-    Args:
-        duration_s: Length of the run; None if it has none.
-        channels: Names of the channels.
-        devices: Names of the devices.
     """
     is_terminal = sys.stderr.isatty()
     total = "" if duration_s is None else f" of {duration_s:g}"

@@ -29,19 +29,10 @@ _WORST = (WRONG_INPUT, FAILED)
 def run_side_by_side(
     configs: Sequence[Path], folder: Path, options: Sequence[str], *, as_json: bool
 ) -> int:
-    """Run as many bridges as there are configurations.
+    """Run a bridge for each configuration, each with the options; returns the worst exit code.
 
     What each says is shown behind its name. Ctrl-C ends all in order; one that ends, however it
-    does, ends no other.
-
-    Args:
-        configs: Their configurations.
-        folder: Where each gets a folder.
-        options: For each of them.
-        as_json: Whether their summaries are printed as JSON.
-
-    Returns:
-        The worst exit code.
+    does, ends no other. Each has a folder in `folder`, called as its configuration.
 
     Raises:
         InputError: Two of them have one name, or a folder is not empty.

@@ -138,12 +138,7 @@ class Case:
 
 
 def run_case(name: str, folder: Path, options: DemoOptions) -> Case:
-    """Run a case into ``folder/run`` and write its summary and picture into `folder`.
-
-    Args:
-        name: One of `CASES`.
-        folder: Where to write; absent or empty.
-        options: How to run it.
+    """Run one of `CASES` into ``folder/run`` and write its summary and picture into `folder`.
 
     Raises:
         InputError: The folder cannot be written.

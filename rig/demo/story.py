@@ -71,11 +71,7 @@ class Story:
 
 
 def draw_effect(seed: int) -> tuple[str, UndeclaredEffect]:
-    """Family and effect of the bench for a seed.
-
-    Args:
-        seed: Not negative.
-    """
+    """Family and effect of the bench for a seed, which is not negative."""
     random = np.random.default_rng(seed)
     name = list(_RANGES)[seed % len(_RANGES)]  # so that neighbouring seeds give different effects
     family, ranges = _RANGES[name]

@@ -29,9 +29,6 @@ def import_table(source: Path, mapping: TableMapping, out: Path) -> ImportReport
         mapping: What it means.
         out: CSV file to write; it must not exist.
 
-    Returns:
-        What was made and what was assumed.
-
     Raises:
         InputError: One line that names file, line or key, value and what was expected.
     """

@@ -140,13 +140,9 @@ def _read_heads(
 
 
 def mts_mapping(source: Path, rebound: str) -> TableMapping:
-    """The mapping that a file's own names and units give.
+    """The mapping that a file's own names and units give; displacement is positive in rebound.
 
-    Displacement counts as positive in rebound.
-
-    Args:
-        source: The file.
-        rebound: Sign of the force in rebound, where the damper pulls: `positive` or `negative`.
+    `rebound` is the sign of the force in rebound, where the damper pulls: `positive` or `negative`.
 
     Raises:
         InputError: It is no file of MTS, the sign is neither, a quantity is missing or ambiguous,

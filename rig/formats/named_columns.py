@@ -31,12 +31,7 @@ _MAX_BYTES = 1_000_000_000
 def read_named_columns(
     source: Path, mapping: TableMapping, outputs: Sequence[OutputColumn]
 ) -> Columns:
-    """Times and readings of a file that names its columns.
-
-    Args:
-        source: File whose suffix is one of `READERS`.
-        mapping: What its columns mean.
-        outputs: The columns of the CSV.
+    """Times and readings of a file of MTS, or of one whose suffix is in `READERS`.
 
     Raises:
         InputError: One line that names file, column and what was expected.

@@ -178,11 +178,7 @@ def _time_reader(time: TimeColumn, decimal: str) -> Callable[[Column], Array]:
 
 
 class _Dates:
-    """Reads cells as dates, and gives seconds since the first one, exact to the microsecond.
-
-    Args:
-        date_format: Format of the dates, as in the mapping.
-    """
+    """Reads cells as dates, and gives seconds since the first one, exact to the microsecond."""
 
     def __init__(self, date_format: str) -> None:
         self._format = date_format

@@ -49,11 +49,7 @@ _MOTION = Motion(
 
 
 def write_reference(folder: Path, commands: Mapping[str, str]) -> Path:
-    """Write the reference as one page; returns the file.
-
-    Args:
-        folder: Where to write `index.html`.
-        commands: Help text of each command, by its name.
+    """Write the reference as `index.html`, with the help text of each command; returns the file.
 
     Raises:
         InputError: The folder cannot be written, or holds a reference.

@@ -35,12 +35,7 @@ _KINDS = {
 def write_characteristics_page(
     reports: Sequence[DamperReport], path: Path, serial: str | None = None
 ) -> None:
-    """Write the page of one record, or of several superimposed.
-
-    Args:
-        reports: The records.
-        path: New HTML file.
-        serial: Serial number.
+    """Write the HTML page of one record, or of several superimposed, with their serial number.
 
     Raises:
         InputError: The file cannot be written.

@@ -18,22 +18,12 @@ _TEMPLATES = Environment(
 
 
 def render(template: str, **content: object) -> str:
-    """Text of a page.
-
-    Args:
-        template: File of the template, below the folder of this module.
-        content: Variables of the template.
-    """
+    """Text of a page, from a template below the folder of this module."""
     return _TEMPLATES.get_template(template).render(**content)
 
 
 def render_report(template: str, **content: object) -> str:
-    """Text of a report: a page that holds the scripts and styles of its charts.
-
-    Args:
-        template: File of the template in the folder ``report``.
-        content: Variables of the template.
-    """
+    """Text of a report, from a template in ``report``: it holds its charts' scripts and styles."""
     report = _HERE / "report"
     scripts = [path.read_text("utf-8") for path in (*charts.SCRIPTS, report / "page.js")]
     return render(

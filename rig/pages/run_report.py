@@ -40,11 +40,7 @@ _KILLED = ("part", "◐", "Killed, or still running")
 
 
 def write_run_report(folder: Path, path: Path) -> None:
-    """Write the report of a run.
-
-    Args:
-        folder: Folder of the run.
-        path: File to write.
+    """Write the report of a run's folder.
 
     Raises:
         InputError: The folder holds no run, or a run without a tick, or the file cannot be written.

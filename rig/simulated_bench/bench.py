@@ -135,10 +135,7 @@ class _Sender:
 class SimulatedBench:
     """A bench that moves by its own laws and reports on the bus.
 
-    Args:
-        config: The bench.
-        database: What its messages mean.
-        start_ns: Time of its start on the caller's clock.
+    It starts at `start_ns` of the caller's clock.
 
     Raises:
         BenchConfigError: The bench sends nothing, or its periods have no useful common divisor.
@@ -173,10 +170,7 @@ class SimulatedBench:
         return sum(sender.saturated_frames for sender in self._senders)
 
     def update(self, now_ns: int) -> tuple[list[Frame], int]:
-        """The frames that were sent up to a time.
-
-        Args:
-            now_ns: Time on the caller's clock.
+        """The frames that were sent up to a time on the caller's clock.
 
         Returns:
             The frames in the order of their transmission, each stamped with its time, and the
@@ -195,17 +189,11 @@ class SimulatedBench:
         return frames, self._next_due_ns()
 
     def truth(self, t_ns: int) -> BenchTruth:
-        """True state of the bench at a time.
+        """True state of the bench at a time on the caller's clock.
 
         At the sensors' sample times the values are those that were sampled. Between, heights follow
-        a cubic and the rest a straight line.
-
-        Args:
-            t_ns: Time on the caller's clock, not before the start and not more than
-                `RECORDS_KEPT - RECORDS_AHEAD` records before the latest.
-
-        Returns:
-            The truth at that time.
+        a cubic and the rest a straight line. The time is not before the start and not more than
+        `RECORDS_KEPT - RECORDS_AHEAD` records before the latest.
 
         Raises:
             ValueError: The time is before the start, or its record was dropped.

@@ -103,11 +103,11 @@ def curves(*, corrected: bool) -> tuple[LineStyle, ...]:
 def residual_plot(
     key: str, series: Sequence[FittedSeries], shown: Sequence[LineStyle], points: int
 ) -> Plot:
-    """Residual force against height, velocity, time and frequency.
+    """Residual force of a strut, over height, velocity, time and frequency.
 
     Args:
         key: Unique name in the page.
-        series: One strut along all fitted recordings.
+        series: The strut along each fitted recording.
         shown: Curves, from `curves`.
         points: Points of a line; markers are half as many.
     """

@@ -53,11 +53,7 @@ _OF_A_FREE_RUN = ("The free-run simulation has the applied force as its only inp
 
 
 def write_report(result: Result, path: Path) -> None:
-    """Write the page as one file that needs no network.
-
-    Args:
-        result: The result of the diagnosis.
-        path: File to write; it is replaced in one step, never left half written.
+    """Write the page as one file that needs no network; a former one is replaced in one step.
 
     Raises:
         InputError: The file cannot be written.

@@ -24,11 +24,7 @@ _STARTING = DiagnosisProgress("starting", 0.0)
 
 
 class DiagnosisJob:
-    """The diagnosis of one run; its folder is next to that of the run.
-
-    Args:
-        folder: Folder of the run.
-    """
+    """The diagnosis of a run's folder; its own folder is next to it."""
 
     def __init__(self, folder: Path) -> None:
         self._run = folder.absolute()
@@ -39,12 +35,7 @@ class DiagnosisJob:
         self._is_cancelled = False
 
     def start(self, model: str, held_out: Sequence[Path]) -> None:
-        """Start the diagnosis, unless it is running.
-
-        Args:
-            model: File or name of the nominal model.
-            held_out: Folders of the held-out runs.
-        """
+        """Start the diagnosis, unless it is running; `model` is a file or a name."""
         with self._lock:
             if self._is_running():
                 return
@@ -86,11 +77,7 @@ class DiagnosisJob:
         return {"state": "done", "verdict": _read_verdict(folder), "folder": str(folder)}
 
     def wait(self) -> int | None:
-        """Wait for the end of the diagnosis.
-
-        Returns:
-            Exit code of its process; None if none was started.
-        """
+        """Wait for the end of the diagnosis; returns its exit code, or None if none was started."""
         if self._reader is not None:
             self._reader.join()
         return None if self._process is None else self._process.exitcode

@@ -47,10 +47,8 @@ class DiagnosisFailure(NamedTuple):
 def run_diagnosis(order: DiagnosisOrder, reports: Connection) -> None:
     """Diagnose a run, and write the results and their report.
 
-    Args:
-        order: What to diagnose.
-        reports: Takes a `DiagnosisProgress` for each step, and a `DiagnosisFailure` at the end of a
-            diagnosis that fails.
+    `reports` takes a `DiagnosisProgress` for each step, and a `DiagnosisFailure` at the end of a
+    diagnosis that fails.
     """
     # Imported here: the server, which imports this module, needs none of it.
     from dart_model.spec import load_named_model

@@ -64,13 +64,7 @@ class Playback(NamedTuple):
 
 
 class Topic:
-    """A run, and the number of its steps that have been published.
-
-    Args:
-        run: The run.
-        name: Name of the topic.
-        new_channel: Makes a channel of the SDK.
-    """
+    """A run, and the number of its steps that have been published."""
 
     def __init__(self, run: WatchedRun, name: str, new_channel: Callable[..., Any]) -> None:
         self.run, self.name, self._new_channel = run, name, new_channel

@@ -27,11 +27,7 @@ progress."""
 
 
 class WatchedRun:
-    """A run's folder: absent, empty, being written, whole, cut off, or no run at all.
-
-    Args:
-        folder: The folder.
-    """
+    """A run's folder: absent, empty, being written, whole, cut off, or no run at all."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
