@@ -116,12 +116,12 @@ def _print(report: "DamperReport") -> None:
 
 
 def _print_steps(record: "Characteristics") -> None:
-    from rig.pages.characteristics_page import damper_rows, kind_words, with_half
+    from rig.pages.characteristics_page import KIND_WORDS, damper_rows, with_half
 
     heads = ("step", "± mm", "m/s", "compression N", "rebound N", "J a cycle", "N·s/m")
     steps = [
         (
-            kind_words(kind),
+            KIND_WORDS[kind],
             f"±{1e3 * step.amplitude_m:.2f}",
             f"{step.peak_speed_m_per_s:.3g}",
             with_half(step.compression.force_at_peak_velocity_n),

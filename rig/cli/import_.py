@@ -121,8 +121,7 @@ def _mapping_finder(mapping: Path | None, rebound: str) -> "Callable[[Path], Tab
 
 def _import_tables(source: Path, find_mapping: "Callable[[Path], TableMapping]", out: Path) -> None:
     """Import a table, or every table of a folder; exit code 2 if one of these is refused."""
-    from rig.formats.foreign_table import import_table
-    from rig.formats.table_folder import import_folder
+    from rig.formats.foreign_table import import_folder, import_table
 
     if not source.is_dir():
         _print_report(import_table(source, find_mapping(source), out))

@@ -1,7 +1,5 @@
 """Page of a store of many runs: changes and drifts, with the series that show them."""
 
-import base64
-import io
 from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
@@ -13,7 +11,7 @@ from matplotlib.figure import Figure as Drawing
 
 from rig.fleet.overview import Overview, Series
 from rig.fleet.sentences import alarm_sentences, series_name
-from rig.pages.html import render_report, write_page
+from rig.pages.html import render_report, svg_url, write_page
 
 _MOST = 12
 """Series that are drawn, the most certain first."""
@@ -71,9 +69,7 @@ def _picture(overview: Overview, item: Series) -> str:
         axes.plot(days, values, "o-", color=_COLOUR, markersize=3, linewidth=1, label=label)
         change = item.change
         if item.is_change and change is not None:
-            low, day, high = (
-                date.fromordinal(round(d)) for d in (change.low, change.day, change.high)
-            )
+            low, day, high = map(_date, (change.low, change.day, change.high))
             axes.axvspan(low, high, color=_CHANGED, alpha=0.15, linewidth=0)
             axes.axvline(day, color=_CHANGED, label=f"{change.kind}, with its 95 % interval")
         locator = AutoDateLocator()
@@ -81,14 +77,11 @@ def _picture(overview: Overview, item: Series) -> str:
         axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
         axes.set_ylabel(item.quantity.parameter)
         axes.legend(fontsize="small", frameon=False, loc="upper left")
-        image = io.BytesIO()
-        figure.savefig(image, format="svg", metadata={"Date": None})
-    return "data:image/svg+xml;base64," + base64.b64encode(image.getvalue()).decode("ascii")
+        return svg_url(figure)
 
 
 def _columns(item: Series) -> tuple[list[date], list[float]]:
-    points = item.points
-    return [_date(p.day) for p in points], [p.value for p in points]
+    return [_date(point.day) for point in item.points], [point.value for point in item.points]
 
 
 def _date(day: float) -> date:

@@ -2,7 +2,9 @@
 
 import base64
 import hashlib
+import io
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -33,6 +35,13 @@ def render_report(template: str, **content: object) -> str:
         script_hashes=[_hash(script) for script in scripts],
         **content,
     )
+
+
+def svg_url(figure: Any) -> str:
+    """A drawing of matplotlib as an SVG in a data URL."""
+    image = io.BytesIO()
+    figure.savefig(image, format="svg", metadata={"Date": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(image.getvalue()).decode("ascii")
 
 
 def write_page(text: str, path: Path) -> None:

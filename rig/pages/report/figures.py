@@ -20,7 +20,6 @@ from rig.pages.plotted_quantities import (
 )
 from rig.pages.report.series import Joined, cloud, envelope, excerpt, join, spectrum, surface
 
-_LONGEST_MARK = 60
 _WIDE_SIGMA = 2.0
 _SMOOTHED_BAND = f"grey: ±{_WIDE_SIGMA:.0f} standard deviations of the smoothed residual"
 _FLOOR_BAND = f"grey: ±{_WIDE_SIGMA:.0f} × noise floor"
