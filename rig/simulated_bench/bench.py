@@ -17,7 +17,7 @@ from can_dbc.frame import Frame
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from rig.simulated_bench.assembly import assemble
-from rig.simulated_bench.equations_of_motion import RECORD_COLUMNS, RECORD_EXTRA
+from rig.simulated_bench.equations_of_motion import RECORD_COLUMNS
 from rig.simulated_bench.schema import (
     BenchConfig,
     BenchConfigError,
@@ -30,43 +30,8 @@ from rig.simulated_bench.trajectory import BenchState, advance_records, regular_
 RECORDS_AHEAD = 4
 """Records computed in one go: few enough not to delay a loop, enough to share the overhead."""
 
-RECORDS_KEPT = 4096
-"""Records kept for `SimulatedBench.truth`."""
-
 SHORTEST_GRID_NS = 10_000
 """Smallest common divisor of all periods that is accepted."""
-
-
-class StrutTruth(NamedTuple):
-    """True motion and force of a strut at one time.
-
-    Attributes:
-        height_m: Height in m.
-        velocity_m_per_s: Rate of height in m/s.
-        strut_force_n: Total force in N, undeclared effects in the strut included.
-    """
-
-    height_m: float
-    velocity_m_per_s: float
-    strut_force_n: float
-
-
-class BenchTruth(NamedTuple):
-    """True state of the bench at one time.
-
-    Attributes:
-        t_ns: Time on the caller's clock.
-        struts: One entry a strut, in the order of the configuration.
-        applied_force_n: Force that the force sensor sees, without noise, in N.
-        acting_force_n: Force that reaches the driven body in N.
-        temperature_c: Temperature of the damper in degrees Celsius.
-    """
-
-    t_ns: int
-    struts: tuple[StrutTruth, ...]
-    applied_force_n: float
-    acting_force_n: float
-    temperature_c: float
 
 
 class _Channel(NamedTuple):
@@ -158,8 +123,6 @@ class SimulatedBench:
         self._grid = regular_grid(config, period_ns)
         self._assembly = assemble(config)
         self._motion = BenchState(0, self._assembly.start)
-        columns = RECORD_COLUMNS * len(config.struts) + RECORD_EXTRA
-        self._records = np.empty((RECORDS_KEPT, columns))
         self._queue: list[tuple[int, int, int, Frame]] = []
         self._queued = 0
         self._advance()
@@ -188,50 +151,19 @@ class SimulatedBench:
             frames.append(heapq.heappop(self._queue)[3])
         return frames, self._next_due_ns()
 
-    def truth(self, t_ns: int) -> BenchTruth:
-        """True state of the bench at a time on the caller's clock.
-
-        At the sensors' sample times the values are those that were sampled. Between, heights follow
-        a cubic and the rest a straight line. The time is not before the start and not more than
-        `RECORDS_KEPT - RECORDS_AHEAD` records before the latest.
-
-        Raises:
-            ValueError: The time is before the start, or its record was dropped.
-        """
-        period_ns = self._period_ns
-        index, rest_ns = divmod(t_ns - self._start_ns, period_ns)
-        oldest = max(self._motion.records - RECORDS_KEPT, 0)
-        if index < oldest:
-            raise ValueError(
-                f"t_ns = {t_ns}, expected at least {self._start_ns + oldest * period_ns}"
-            )
-        before = self._record(index * period_ns)
-        if rest_ns == 0:
-            return self._as_truth(t_ns, before)
-        after = self._record((index + 1) * period_ns)
-        return self._as_truth(t_ns, _between(before, after, rest_ns / period_ns, period_ns * 1e-9))
-
-    def _as_truth(self, t_ns: int, record: list[float]) -> BenchTruth:
-        extra = RECORD_COLUMNS * len(self.config.struts)
-        struts = tuple(
-            StrutTruth(*record[first : first + RECORD_COLUMNS])
-            for first in range(0, extra, RECORD_COLUMNS)
-        )
-        return BenchTruth(t_ns, struts, *record[extra:])
-
     def _record(self, elapsed_ns: int) -> list[float]:
+        """Record of a time that is not before that of the last call."""
         index = elapsed_ns // self._period_ns
         while index >= self._motion.records:
             self._advance()
-        record: list[float] = self._records[index % RECORDS_KEPT].tolist()
+        # Counted from the end: the newest record is the last.
+        record: list[float] = self._records[index - self._motion.records].tolist()
         return record
 
     def _advance(self) -> None:
-        first = self._motion.records % RECORDS_KEPT
-        self._motion, records = advance_records(
+        self._motion, self._records = advance_records(
             self._assembly, self._grid, self._motion, RECORDS_AHEAD
         )
-        self._records[first : first + RECORDS_AHEAD] = records
 
     def _next_sender(self) -> _Sender:
         return min(self._senders, key=lambda sender: sender.next_sample_ns)
@@ -273,14 +205,3 @@ def _channels(
                 _Channel(sensor.signal, dimension, first + column, sensor.noise_std, noise)
             )
     return channels
-
-
-def _between(before: list[float], after: list[float], share: float, period_s: float) -> list[float]:
-    """Record at a share of the way: heights by their rates (Hermite), the rest straight."""
-    record = [a + share * (b - a) for a, b in zip(before, after, strict=True)]
-    rest = 1.0 - share
-    for i in range(0, len(record) - RECORD_EXTRA, RECORD_COLUMNS):
-        chord = after[i] - before[i]
-        bend = rest * (before[i + 1] * period_s - chord) - share * (after[i + 1] * period_s - chord)
-        record[i] += share * rest * bend
-    return record
