@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from dart_model.spec import load_model
 from rig.demo.cases import SETTLED_NS, DemoOptions
 from rig.diagnosis.files import diagnose_runs
 from rig.diagnosis.outcome import CORRECTED_FILE, REPORT_FILE, Diagnosis, to_json
-from rig.log.reader import read_run
+from rig.formats.run_arrays import open_run
 from rig.pages.report import write_report
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
@@ -147,8 +146,6 @@ def _bench(effect: UndeclaredEffect, excitation: int) -> BenchConfig:
 
 
 def _virtual_force_rms_n(ended: Ended) -> float:
-    steps: Any = read_run(ended.folder).steps
-    t_ns = np.asarray(steps.column("t_ns").to_numpy(), dtype=np.int64)
-    force = np.asarray(steps.column(f"{_STRUT}.virtual_force_n").to_numpy(), dtype=np.float64)
-    force = force[t_ns >= SETTLED_NS]
+    run = open_run(ended.folder)
+    force = run.columns[f"{_STRUT}.virtual_force_n"][run.t_s >= SETTLED_NS * 1e-9]
     return float(np.sqrt(np.mean(force**2)))

@@ -51,14 +51,7 @@ _SINGULAR = 1e-9
 
 
 class _StrutColumns(NamedTuple):
-    """Columns of a run that belong to a strut, shape (ticks,) each.
-
-    Attributes:
-        virtual_n: Virtual force.
-        law_n: Force of the model's law.
-        innovation_m: Innovation.
-        measured_s: Time of the measurement; NaN in a tick without one.
-    """
+    """Columns of a strut, shape (ticks,) each; NaN in `measured_s` where nothing was measured."""
 
     virtual_n: Array
     law_n: Array

@@ -12,12 +12,7 @@ from pathlib import Path
 
 from rig.diagnosis.outcome import DIAGNOSIS_FILE, REPORT_FILE
 from rig.files.folders import free_folder
-from rig.pages.view.diagnosis_worker import (
-    DiagnosisFailure,
-    DiagnosisOrder,
-    DiagnosisProgress,
-    run_diagnosis,
-)
+from rig.pages.view.diagnosis_worker import DiagnosisFailure, DiagnosisProgress, run_diagnosis
 
 _SPAWN = multiprocessing.get_context("spawn")
 _STARTING = DiagnosisProgress("starting", 0.0)
@@ -41,12 +36,12 @@ class DiagnosisJob:
                 return
             self._progress, self._reason, self._is_cancelled = _STARTING, "", False
             out = free_folder(self._first_folder())
-            others = tuple(path.absolute() for path in held_out)
+            others = [path.absolute() for path in held_out]
             receiver, sender = _SPAWN.Pipe(duplex=False)
             with sender:  # the worker keeps its copy alone, so that its end closes the pipe
                 self._process = _SPAWN.Process(
                     target=run_diagnosis,
-                    args=(DiagnosisOrder(self._run, model, others, out), sender),
+                    args=(self._run, model, others, out, sender),
                     daemon=True,
                 )
                 self._process.start()
