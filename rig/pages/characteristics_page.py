@@ -10,7 +10,7 @@ from matplotlib.figure import Figure as Drawing
 
 from rig.dyno.characterise import Characteristics
 from rig.dyno.faults import MasterComparison
-from rig.dyno.figures import SIDES, DynoStep
+from rig.dyno.figures import SIDES
 from rig.dyno.report import DamperReport
 from rig.dyno.stroke_force import ANGLES, Figure
 from rig.dyno.tolerance import PointVerdict
@@ -49,11 +49,10 @@ def write_characteristics_page(
         picture=_draw(records, points),
         serial=serial,
         badge=_badge(points, [report.against_master for report in reports]),
-        records=[
-            _record(report.characteristics)
-            | {"points": report.points, "naming": report.against_master}
-            for report in reports
-        ],
+        reports=reports,
+        kinds=KIND_WORDS,
+        damper_rows=damper_rows,
+        with_half=with_half,
     )
     write_page(text, path)
 
@@ -175,39 +174,6 @@ def _headline(records: Sequence[Characteristics]) -> str:
             f"{fastest.peak_speed_m_per_s:.3g} m/s."
         )
     return " ".join(parts)
-
-
-def _record(item: Characteristics) -> dict[str, object]:
-    warm = any(step.temperature_c is not None for step in item.steps)
-    rows = [
-        {"kind": KIND_WORDS[kind], "cells": _cells(step, warm=warm)}
-        for kind, step in zip(item.damper.kinds, item.steps, strict=True)
-    ]
-    name = f"{item.name}, strut {item.record.strut}" if item.record.strut else item.name
-    return {
-        "name": f"{name} (force: {item.record.source})",
-        "warm": warm,
-        "rows": rows,
-        "damper": damper_rows(item),
-        "notes": (*item.quality, *item.damper.notes),
-    }
-
-
-def _cells(step: DynoStep, *, warm: bool) -> list[str]:
-    down, up = step.compression, step.rebound
-    speeds = dict.fromkeys(f"{side.peak_velocity_m_per_s.value:.3g}" for side in (down, up))
-    temperature = "—" if step.temperature_c is None else f"{step.temperature_c:.1f}"
-    return [
-        f"{step.cycles:g}",
-        f"±{1e3 * step.amplitude_m:.2f}",
-        "—" if step.frequency_hz is None else f"{step.frequency_hz:.3f}",
-        *([temperature] if warm else []),
-        " / ".join(speeds),
-        with_half(down.force_at_peak_velocity_n),
-        with_half(up.force_at_peak_velocity_n),
-        with_half(step.energy_per_cycle_j),
-        with_half(step.equivalent_damping_n_s_per_m),
-    ]
 
 
 def damper_rows(item: Characteristics) -> list[tuple[str, str, str, str]]:
