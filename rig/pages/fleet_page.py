@@ -1,6 +1,5 @@
 """Page of a store of many runs: changes and drifts, with the series that show them."""
 
-from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
 from typing import Any, cast
@@ -34,23 +33,13 @@ def write_fleet_page(overview: Overview, path: Path) -> None:
     drawn += [item for item in overview.series if item.is_drift]
     text = render_report(
         "fleet.html",
-        headline=overview.words,
         alarms=alarm_sentences(overview),
-        verdicts=[verdict.replace("_", " ") for verdict in verdicts],
-        benches=[
-            (bench, sum(counts.values()), [_share(counts, verdict) for verdict in verdicts])
-            for bench, counts in overview.verdicts.items()
-        ],
-        failed=list(overview.failed.items())[:10],
+        verdicts=verdicts,
+        overview=overview,
         pictures=[(series_name(item), _picture(overview, item)) for item in drawn[:_MOST]],
         left_out=max(0, len(drawn) - _MOST),
     )
     write_page(text, path)
-
-
-def _share(counts: Mapping[str, int], verdict: str) -> str:
-    count = counts.get(verdict, 0)
-    return f"{count} ({100 * count / sum(counts.values()):.0f} %)" if count else "0"
 
 
 def _picture(overview: Overview, item: Series) -> str:
