@@ -44,7 +44,6 @@ def write_characteristics_page(
     text = render_report(
         "characteristics.html",
         names=[item.name for item in records],
-        headline=_headline(records),
         signs=_SIGNS,
         picture=_draw(records, points),
         serial=serial,
@@ -160,20 +159,6 @@ def _draw_loops(
             style = {"color": colour, "linewidth": 1.3, "label": name}
             velocities.plot(stroke.velocity_m_per_s, stroke.force_n, **style)
             heights.plot(x_mm, stroke.force_n, **style)
-
-
-def _headline(records: Sequence[Characteristics]) -> str:
-    parts: list[str] = []
-    for item in records:
-        fastest = max(item.steps, key=lambda step: step.peak_speed_m_per_s)
-        down, up = fastest.compression, fastest.rebound
-        steps = f"{len(item.steps)} steps" if len(item.steps) > 1 else "one step"
-        parts.append(
-            f"{item.name}: {steps}, {down.force_at_peak_velocity_n.value:.0f} N in compression and "
-            f"{up.force_at_peak_velocity_n.value:.0f} N in rebound at "
-            f"{fastest.peak_speed_m_per_s:.3g} m/s."
-        )
-    return " ".join(parts)
 
 
 def damper_rows(item: Characteristics) -> list[tuple[str, str, str, str]]:
