@@ -19,13 +19,7 @@ JUnitFile = Annotated[
 
 
 class Outcome(NamedTuple):
-    """One line of a check.
-
-    Attributes:
-        what: Name of the check.
-        text: Its result.
-        failed: Whether that is a failure.
-    """
+    """One line of a check: its name, its result, and whether that is a failure."""
 
     what: str
     text: str

@@ -60,13 +60,9 @@ class DemoOptions:
 
 @dataclass(frozen=True)
 class Figures:
-    """Deviation of a model from the bench.
+    """Deviation of a model from the bench: errors of the height and of the spring-damper force.
 
-    Attributes:
-        height_error_max_m: Largest error of the height.
-        force_error_rms_n: Root mean square error of the spring-damper force.
-        force_error_max_n: Its largest error.
-        force_peak_n: Largest force of the bench.
+    `force_peak_n` is the largest force of the bench.
     """
 
     height_error_max_m: float
@@ -108,12 +104,7 @@ class StrutCase:
 
 @dataclass(frozen=True)
 class Case:
-    """Result of a case.
-
-    Attributes:
-        run: The run.
-        struts: Bench and model, strut by strut.
-    """
+    """Result of a case: the run, and bench and model strut by strut."""
 
     run: Ended
     struts: tuple[StrutCase, ...]

@@ -11,12 +11,7 @@ from rig.pages.report import sentence, tables, write_report
 
 @dataclass(frozen=True)
 class DiagnosisOutcome:
-    """Outcome of a diagnosis.
-
-    Attributes:
-        result: The whole result, with the series that a report draws.
-        nominal: The nominal model.
-    """
+    """Outcome of a diagnosis, with the series that a report draws, and the nominal model."""
 
     result: Result
     nominal: ModelSpec

@@ -52,13 +52,7 @@ EQUILIBRIUM_TOLERANCE_M_PER_S2 = 1e-9
 
 
 class Assembly(NamedTuple):
-    """A bench ready to run.
-
-    Attributes:
-        mechanics: Its equations of motion.
-        drive: Its applied force and prescribed motion.
-        start: State at time zero, shape (states,).
-    """
+    """A bench ready to run, with its state at time zero, shape (states,)."""
 
     mechanics: BenchMechanics
     drive: BenchDrive

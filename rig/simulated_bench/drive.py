@@ -53,12 +53,7 @@ class DrivenHeight(NamedTuple):
 
 
 class BenchDrive(NamedTuple):
-    """What drives the bench.
-
-    Attributes:
-        force: The applied force.
-        prescribed: The prescribed motion; unused where no strut has one.
-    """
+    """What drives the bench; `prescribed` is unused where no strut has a prescribed motion."""
 
     force: DrivenForce
     prescribed: DrivenHeight

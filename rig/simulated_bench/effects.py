@@ -31,13 +31,7 @@ class EffectParameter(NamedTuple):
 
 
 class EffectKind(NamedTuple):
-    """One kind of effect.
-
-    Attributes:
-        law: Code of the law.
-        parameters: Parameters in the order in which the law reads them.
-        states: Number of internal states of the law.
-    """
+    """One kind of effect: its law, parameters in the law's order, number of internal states."""
 
     law: LawCode
     parameters: tuple[EffectParameter, ...]

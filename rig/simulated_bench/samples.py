@@ -17,12 +17,7 @@ TIME_COLUMN = "t_s"
 
 
 class Samples(NamedTuple):
-    """Samples of a quantity.
-
-    Attributes:
-        t_s: Times in s, shape (samples,), increasing.
-        values: Value at each time, shape (samples,).
-    """
+    """Samples of a quantity: times in s, increasing, and a value at each, shape (samples,) each."""
 
     t_s: NDArray[np.float64]
     values: NDArray[np.float64]
