@@ -263,6 +263,8 @@ class FoxgloveView:
                 and now_ns - self._subscribed_ns >= _PLAYBACK_DELAY_NS
             )
             self._playback = Playback(0, now_ns, is_playing=self._has_begun)
+            if not self._has_begun:
+                return  # without a subscription the first step would be lost
         if not self._playback.since_ns:  # requested before the first call
             self._playback = self._playback._replace(since_ns=now_ns)
         self._playback = self._playback.at(now_ns, self._end_ns)
