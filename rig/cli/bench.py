@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from rig.cli.progress import progress_line, stoppable
-from rig.cli.summary_file import write_summary
-from rig.cli.terminal import ConfigFile, console
+from rig.cli.summary_file import SummaryFolder, write_summary
+from rig.cli.terminal import Bitrate, Channel, ConfigFile, Interface, console
 
 EXAMPLES = (
     "Examples: `rig bench my_bench.yaml --interface socketcan --channel vcan0` · "
@@ -17,29 +17,24 @@ EXAMPLES = (
 
 def bench(
     config: ConfigFile,
-    interface: Annotated[
-        str, typer.Option(help="python-can's name of the interface.")
-    ] = "socketcan",
-    channel: Annotated[str, typer.Option(help="Channel of the interface.")] = "vcan0",
-    bitrate: Annotated[int, typer.Option(min=1, help="Bit rate in bit/s.")] = 1_000_000,
+    interface: Interface = "socketcan",
+    channel: Channel = "vcan0",
+    bitrate: Bitrate = 1_000_000,
     dbc: Annotated[
         Path | None, typer.Option(metavar="FILE", help="DBC; the package's own by default.")
     ] = None,
     duration_s: Annotated[
         float | None,
-        typer.Option("--duration-s", min=0.001, help="Length in s; until Ctrl-C by default."),
+        typer.Option(min=0.001, help="Length in s; until Ctrl-C by default."),
     ] = None,
     bridge: Annotated[
         Path | None,
         typer.Option(
-            "--bridge",
             metavar="FILE",
             help="Take bus, DBC and authentication from a bridge's configuration instead.",
         ),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Write summary.json there.")
-    ] = None,
+    out: SummaryFolder = None,
 ) -> None:
     """Run a simulated bench on a bus, in real time."""
     from rig.bus.bus import BusConfig
@@ -64,5 +59,4 @@ def bench(
             duration_s=duration_s,
         )
     console.print(f"Sent {frames} frames.")
-    if out is not None:
-        write_summary(out, {"bench": bench_config.name, "frames": frames})
+    write_summary(out, {"bench": bench_config.name, "frames": frames})

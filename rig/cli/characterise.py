@@ -7,8 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.junit import JUnitFile, Outcome, refuse_existing, write_junit
-from rig.cli.terminal import FAILED, JsonFlag, console, print_json, table
+from rig.cli.junit import JUNIT, JUnitFile, Outcome, write_junit
+from rig.cli.terminal import (
+    FAILED,
+    JsonFlag,
+    StrutOfRun,
+    print_json,
+    print_table,
+    print_text,
+    refuse_existing,
+)
 
 if TYPE_CHECKING:
     from rig.dyno.characterise import Characteristics
@@ -23,47 +31,39 @@ EXAMPLES = (
 )
 
 
+Tolerance = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Band about a master curve, YAML or CSV: pass or fail."),
+]
+Master = Annotated[
+    Path | None,
+    typer.Option(metavar="RUN", help="Record of a good damper, same test: name what is wrong."),
+]
+Scatter = Annotated[
+    float,
+    typer.Option(
+        min=0.001,
+        max=0.5,
+        help="Relative standard deviation of each property among good dampers.",
+    ),
+]
+
+
 def characterise_command(
     runs: Annotated[
         list[Path],
         typer.Argument(metavar="RUN...", help="Folders of runs, or CSV files of measured data."),
     ],
-    strut: Annotated[
-        str | None, typer.Option("--strut", metavar="NAME", help="Which strut of a run.")
-    ] = None,
+    strut: StrutOfRun = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", metavar="DIR", help="New folder for characteristics.json and report.html."
-        ),
+        typer.Option(metavar="DIR", help="New folder for characteristics.json and report.html."),
     ] = None,
-    tolerance: Annotated[
-        Path | None,
-        typer.Option(
-            "--tolerance",
-            metavar="FILE",
-            help="Band about a master curve, YAML or CSV: pass or fail.",
-        ),
-    ] = None,
-    master: Annotated[
-        Path | None,
-        typer.Option(
-            "--master",
-            metavar="RUN",
-            help="Record of a good damper, same test: name what is wrong.",
-        ),
-    ] = None,
-    scatter: Annotated[
-        float,
-        typer.Option(
-            "--scatter",
-            min=0.001,
-            max=0.5,
-            help="Relative standard deviation of each property among good dampers.",
-        ),
-    ] = 0.03,
+    tolerance: Tolerance = None,
+    master: Master = None,
+    scatter: Scatter = 0.03,
     serial: Annotated[
-        str | None, typer.Option("--serial", metavar="TEXT", help="Serial number, for the report.")
+        str | None, typer.Option(metavar="TEXT", help="Serial number, for the report.")
     ] = None,
     as_json: JsonFlag = False,
     junit: JUnitFile = None,
@@ -80,10 +80,9 @@ def characterise_command(
 
     if out is not None:
         refuse_full(out)
-    if junit is not None:
-        refuse_existing(junit)
-        if tolerance is None and master is None:
-            raise InputError("--junit: expected --tolerance or --master, which it reports on")
+    refuse_existing(junit, option=JUNIT)
+    if junit is not None and tolerance is None and master is None:
+        raise InputError("--junit: expected --tolerance or --master, which it reports on")
     band = None if tolerance is None else load_tolerance(tolerance)
     reports = evaluate_records(runs, strut, Criteria(band, master, scatter))
     content = content_of(reports, serial, band)
@@ -93,16 +92,15 @@ def characterise_command(
         write_content(content, out)
         write_characteristics_page(reports, out / "report.html", serial)
     checks = [check for report in reports for check in report.checks()]
-    if junit is not None:
-        outcomes = [Outcome(check.name, check.words, not check.passes) for check in checks]
-        write_junit(junit, f"rig characterise {serial or ''}".strip(), outcomes)
+    outcomes = [Outcome(check.name, check.words, not check.passes) for check in checks]
+    write_junit(junit, f"rig characterise {serial or ''}".strip(), outcomes)
     if as_json:
         print_json(content)
     else:
         for report in reports:
             _print(report)
         if out is not None:
-            console.print(f"Report: {out / 'report.html'}", markup=False)
+            print_text(f"Report: {out / 'report.html'}")
     if not all(check.passes for check in checks):
         raise typer.Exit(FAILED)
 
@@ -112,27 +110,18 @@ def _print(report: "DamperReport") -> None:
     _print_steps(record)
     _print_points(report.points)
     for note in (*record.quality, *record.damper.notes):
-        console.print(f"- {note}", markup=False)
+        print_text(f"- {note}")
     if report.against_master is not None:
-        console.print(f"Against the master: {report.against_master.words()}.", markup=False)
+        print_text(f"Against the master: {report.against_master.words()}.")
 
 
 def _print_steps(record: "Characteristics") -> None:
-    from rig.pages.characteristics_page import damper_rows, kind_words, with_half
+    from rig.pages.characteristics_page import KIND_WORDS, damper_rows, with_half
 
-    shown = table(
-        "step",
-        "± mm",
-        "m/s",
-        "compression N",
-        "rebound N",
-        "J a cycle",
-        "N·s/m",
-        title=f"{record.name} (force: {record.record.source})",
-    )
-    for kind, step in zip(record.damper.kinds, record.steps, strict=True):
-        shown.add_row(
-            kind_words(kind),
+    heads = ("step", "± mm", "m/s", "compression N", "rebound N", "J a cycle", "N·s/m")
+    steps = [
+        (
+            KIND_WORDS[kind],
             f"±{1e3 * step.amplitude_m:.2f}",
             f"{step.peak_speed_m_per_s:.3g}",
             with_half(step.compression.force_at_peak_velocity_n),
@@ -140,19 +129,18 @@ def _print_steps(record: "Characteristics") -> None:
             with_half(step.energy_per_cycle_j),
             with_half(step.equivalent_damping_n_s_per_m),
         )
-    console.print(shown)
+        for kind, step in zip(record.damper.kinds, record.steps, strict=True)
+    ]
+    print_table(heads, steps, f"{record.name} (force: {record.record.source})")
     rows = damper_rows(record)
     if rows:
-        over_all = table("over all steps", "value", "95 % interval", "method")
-        for row in rows:
-            over_all.add_row(*row)
-        console.print(over_all)
+        print_table(("over all steps", "value", "95 % interval", "method"), rows)
 
 
 def _print_points(points: "Sequence[PointVerdict]") -> None:
-    if points:
-        band = table("point", "force", "verdict")
-        for point in points:
-            where = f"{point.side} at {point.velocity_m_per_s:g} m/s"
-            band.add_row(where, point.words(), point.verdict)
-        console.print(band)
+    rows = [
+        (f"{point.side} at {point.velocity_m_per_s:g} m/s", point.words(), point.verdict)
+        for point in points
+    ]
+    if rows:
+        print_table(("point", "force", "verdict"), rows)

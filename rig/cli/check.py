@@ -1,13 +1,13 @@
 """`rig check`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
 from rig.cli.junit import JUnitFile, Outcome, write_junit
-from rig.cli.summary_file import write_summary
-from rig.cli.terminal import FAILED, ConfigFile, JsonFlag, console, print_json, table
+from rig.cli.summary_file import SummaryFolder, write_summary
+from rig.cli.terminal import FAILED, ConfigFile, JsonFlag, print_json, print_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,9 +19,7 @@ EXAMPLES = "Examples: `rig check rig.yaml` · `rig check rig.yaml --junit check.
 
 def check_command(
     config: ConfigFile,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Write summary.json there.")
-    ] = None,
+    out: SummaryFolder = None,
     as_json: JsonFlag = False,
     junit: JUnitFile = None,
 ) -> None:
@@ -30,26 +28,27 @@ def check_command(
     from rig.plan.preflight_checks import Severity, check
 
     findings = check(load_plan(config))
+    as_dicts = [finding.as_dict() for finding in findings]
     if as_json:
-        print_json([finding.as_dict() for finding in findings])
+        print_json(as_dicts)
     else:
         _print(config, findings)
-    if out is not None:
-        write_summary(out, {"findings": [finding.as_dict() for finding in findings]})
-    if junit is not None:
-        wrong = Severity.ERROR
-        outcomes = [Outcome(item.what, item.text, item.severity is wrong) for item in findings]
-        write_junit(junit, f"rig check {config}", outcomes)
-    if any(finding.severity is Severity.ERROR for finding in findings):
+    write_summary(out, {"findings": as_dicts})
+    outcomes = [
+        Outcome(finding.what, finding.text, finding.severity is Severity.ERROR)
+        for finding in findings
+    ]
+    write_junit(junit, f"rig check {config}", outcomes)
+    if any(outcome.failed for outcome in outcomes):
         raise typer.Exit(FAILED)
 
 
 def _print(config: Path, findings: "Sequence[Finding]") -> None:
     from rig.plan.preflight_checks import Severity
 
-    shown = table("", "What", "Finding", title=f"Check of {config}")
     styles = {Severity.OK: "green", Severity.WARNING: "yellow", Severity.ERROR: "red"}
-    for finding in findings:
-        style = styles[finding.severity]
-        shown.add_row(f"[{style}]{finding.severity.value}[/]", finding.what, finding.text)
-    console.print(shown)
+    rows = [
+        (f"[{styles[item.severity]}]{item.severity.value}[/]", item.what, item.text)
+        for item in findings
+    ]
+    print_table(("", "What", "Finding"), rows, f"Check of {config}")

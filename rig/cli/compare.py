@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.terminal import JsonFlag, console, print_json, table
+from rig.cli.terminal import JsonFlag, StrutOfRun, console, print_json, print_table, print_text
 
 if TYPE_CHECKING:
     from rig.dyno.characterise import Characteristics
@@ -28,13 +28,9 @@ def compare_command(
     ],
     dose: Annotated[
         list[float] | None,
-        typer.Option(
-            "--dose", metavar="NUMBER", help="Pressure, clicks, °C of a state; once for each."
-        ),
+        typer.Option(metavar="NUMBER", help="Pressure, clicks, °C of a state; once for each."),
     ] = None,
-    strut: Annotated[
-        str | None, typer.Option("--strut", metavar="NAME", help="Which strut of a run.")
-    ] = None,
+    strut: StrutOfRun = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Compare two states of a damper: which figures differ, by how much, and which do not.
@@ -67,54 +63,47 @@ def _print_missing(records: "list[Characteristics]") -> None:
     from rig.dyno.comparison import steps_without_partner
 
     for text in steps_without_partner(records):
-        console.print(f"- not compared: {text}", markup=False)
+        print_text(f"- not compared: {text}")
 
 
 def _print_differences(differences: "list[Difference]", before: str, after: str) -> None:
     from rig.pages.characteristics_page import with_half
 
-    shown = table("figure", before, after, "change, 95 % interval", title="What differs")
+    rows: list[tuple[str, ...]] = []
     same: list[str] = []
     for item in differences:
-        if not item.differs:
-            unit = f" {item.unit}" if item.unit else ""
-            same.append(f"{item.figure} (by at most {_bound(item.change)}{unit})")
-            continue
-        shown.add_row(
-            item.figure,
-            with_half(item.before),
-            with_half(item.after),
-            _interval(item.change, item.unit),
-        )
-    if shown.rows:
-        console.print(shown)
+        if item.differs:
+            states = with_half(item.before), with_half(item.after)
+            rows.append((item.figure, *states, _interval(item.change, item.unit)))
+        else:
+            bound = f"{max(abs(item.change.low), abs(item.change.high)):.2g} {item.unit}".rstrip()
+            same.append(f"{item.figure} (by at most {bound})")
+    if rows:
+        print_table(("figure", before, after, "change, 95 % interval"), rows, "What differs")
     else:
         console.print("No figure that was compared differs by more than chance.")
     if same:
-        console.print(f"Not shown to differ: {'; '.join(same)}.", markup=False)
+        print_text(f"Not shown to differ: {'; '.join(same)}.")
 
 
 def _print_trends(trends: "list[Trend]") -> None:
-    shown = table("figure", "change per unit of dose", "at zero", "", title="Over the dose")
-    for item in trends:
-        if item.differs:
-            shape = "straight" if item.is_straight else "bent: no straight line"
-            shown.add_row(
-                item.figure,
-                _interval(item.slope, item.unit),
-                f"{item.at_zero:.4g} {item.unit}",
-                shape,
-            )
-    if shown.rows:
-        console.print(shown)
+    rows = [
+        (
+            item.figure,
+            _interval(item.slope, item.unit),
+            f"{item.at_zero:.4g} {item.unit}",
+            "straight" if item.is_straight else "bent: no straight line",
+        )
+        for item in trends
+        if item.differs
+    ]
+    if rows:
+        heads = ("figure", "change per unit of dose", "at zero", "")
+        print_table(heads, rows, "Over the dose")
     same = [item.figure for item in trends if not item.differs]
     if same:
-        console.print(f"No change over the dose: {'; '.join(same)}.", markup=False)
+        print_text(f"No change over the dose: {'; '.join(same)}.")
 
 
 def _interval(figure: "Figure", unit: str) -> str:
     return f"{figure.value:+.3g} {unit} ({figure.low:+.3g} to {figure.high:+.3g})"
-
-
-def _bound(figure: "Figure") -> str:
-    return f"{max(abs(figure.low), abs(figure.high)):.2g}"

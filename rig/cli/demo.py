@@ -8,7 +8,7 @@ import typer
 from can_dbc.errors import InputError
 from rig.cli.progress import progress_bar, status_line, stoppable
 from rig.cli.result_tables import print_case, print_diagnosis, print_run
-from rig.cli.terminal import JsonFlag, console, print_json
+from rig.cli.terminal import JsonFlag, console, print_json, print_text
 from rig.files.folders import free_folder, refuse_full
 
 STORY = "story"
@@ -30,15 +30,12 @@ def demo(
         int, typer.Option(min=0, help="Selects the undeclared effect of the story's bench.")
     ] = 1,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="Folder to write into; rig-demo by default."),
+        Path | None, typer.Option(metavar="DIR", help="Folder to write into; rig-demo by default.")
     ] = None,
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Simulated time, as fast as the machine allows.")
     ] = False,
-    duration_s: Annotated[
-        float | None, typer.Option("--duration-s", min=1.0, help="Length of a run in s.")
-    ] = None,
+    duration_s: Annotated[float | None, typer.Option(min=1.0, help="Length of a run in s.")] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Run a simulated bench and the bridge on this machine, over virtual CAN.
@@ -62,9 +59,7 @@ def demo(
         return
     print_case(result)
     print_run(result.run, with_timing=not lockstep)
-    console.print(
-        f"Written: {out}/summary.json, a picture of each strut, and the run {out}/run", markup=False
-    )
+    print_text(f"Written: {out}/summary.json, a picture of each strut, and the run {out}/run")
 
 
 def _run_story(

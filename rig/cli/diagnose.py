@@ -5,10 +5,10 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.junit import JUnitFile, refuse_existing, write_junit
+from rig.cli.junit import JUNIT, JUnitFile, write_junit
 from rig.cli.progress import progress_bar
 from rig.cli.result_tables import diagnosis_check, print_diagnosis
-from rig.cli.terminal import JsonFlag, console
+from rig.cli.terminal import JsonFlag, print_text, refuse_existing
 
 EXAMPLES = "Example: `rig diagnose runs/7 --model bench.yaml --held-out runs/8 --out found`"
 
@@ -19,12 +19,11 @@ def diagnose(
     ],
     model: Annotated[
         str,
-        typer.Option("--model", metavar="MODEL", help="Model file, or the name of a shipped one."),
+        typer.Option(metavar="MODEL", help="Model file, or the name of a shipped one."),
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write into.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write into.")],
     held_out: Annotated[
-        list[Path] | None,
-        typer.Option("--held-out", metavar="RUN", help="Held-out run; once for each."),
+        list[Path] | None, typer.Option(metavar="RUN", help="Held-out run; once for each.")
     ] = None,
     pdf: Annotated[
         bool, typer.Option("--pdf", help="Print the report too; requires Chromium, Chrome or Edge.")
@@ -41,22 +40,18 @@ def diagnose(
 
     if pdf:
         find_browser()  # before a search that takes minutes, not after it
-    if junit is not None:
-        refuse_existing(junit)
+    refuse_existing(junit, option=JUNIT)
     spec = load_named_model(model, Path())
     with progress_bar() as bar:
         result = diagnose_runs(runs, spec, held_out or [], out, bar)
         write_report(result, out / REPORT_FILE)
         if pdf:
             print_page(out / REPORT_FILE, out / "report.pdf")
-    if junit is not None:
-        write_junit(junit, f"rig diagnose {spec.name}", diagnosis_check(result.diagnosis, spec))
+    write_junit(junit, f"rig diagnose {spec.name}", diagnosis_check(result.diagnosis, spec))
     if as_json:
         typer.echo(to_json(result.diagnosis), nl=False)
         return
     print_diagnosis(result.diagnosis, struts=len(spec.struts))
-    console.print(
-        f"Written: {out}/diagnosis.json, {out}/corrected.yaml, {out}/report.html", markup=False
-    )
+    print_text(f"Written: {out}/diagnosis.json, {out}/corrected.yaml, {out}/report.html")
     if pdf:
-        console.print(f"Printed: {out}/report.pdf", markup=False)
+        print_text(f"Printed: {out}/report.pdf")

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rig.cli.terminal import console
+from rig.cli.terminal import print_text
 
 EXAMPLES = "Example: `rig docs reference`, then open reference/index.html"
 
@@ -18,9 +18,8 @@ def docs(
     """Write the reference: every effect, every key of a configuration, every command."""
     from rig.guide.reference import write_reference
 
-    parent: Any = context.parent
-    texts = dict(_texts(parent))
-    console.print(f"Written: {write_reference(folder, texts)}", markup=False)
+    texts = dict(_texts(context.parent))
+    print_text(f"Written: {write_reference(folder, texts)}")
 
 
 def _texts(parent: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -41,10 +40,6 @@ def _help(parent: Any, name: str) -> str:
     lines = [command.get_usage(made), "", (command.help or "").strip(), ""]
     for parameter in command.get_params(made):
         record = parameter.get_help_record(made)
-        if record is not None:
-            lines.append(f"  {record[0]:34} {record[1]}")
-        else:
-            lines.append(
-                f"  {parameter.make_metavar(made):34} {getattr(parameter, 'help', '') or ''}"
-            )
+        name, text = record or (parameter.make_metavar(made), getattr(parameter, "help", "") or "")
+        lines.append(f"  {name:34} {text}")
     return "\n".join(lines)

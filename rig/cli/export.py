@@ -7,7 +7,7 @@ import typer
 
 from can_dbc.errors import InputError
 from rig.cli.progress import progress_bar
-from rig.cli.terminal import console
+from rig.cli.terminal import console, print_text
 
 EXAMPLES = (
     "Examples: `rig export runs/7 --format mf4 --out run.mf4` · "
@@ -22,25 +22,22 @@ def export_command(
     source: Annotated[
         Path, typer.Argument(metavar="SOURCE", help="Folder of a run; with --fmu a model file.")
     ],
-    out: Annotated[
-        Path, typer.Option("--out", metavar="PATH", help="New file; for Parquet a folder.")
-    ],
+    out: Annotated[Path, typer.Option(metavar="PATH", help="New file; for Parquet a folder.")],
     kind: Annotated[
         str | None, typer.Option("--format", help="Of a run: mf4, parquet, csv or candump.")
     ] = None,
     smoothed: Annotated[
         bool,
         typer.Option(
-            "--smoothed",
-            help="With --format csv: also the forces smoothed over the whole run.",
+            "--smoothed", help="With --format csv: also the forces smoothed over the whole run."
         ),
     ] = False,
     fmu: Annotated[
         bool, typer.Option("--fmu", help="A strut of a model as a functional mock-up unit.")
     ] = False,
-    fmi: Annotated[str, typer.Option("--fmi", help="With --fmu: 2.0 or 3.0.")] = "2.0",
+    fmi: Annotated[str, typer.Option(help="With --fmu: 2.0 or 3.0.")] = "2.0",
     strut: Annotated[
-        str | None, typer.Option("--strut", help="With --fmu: which strut, if there are several.")
+        str | None, typer.Option(help="With --fmu: which strut, if there are several.")
     ] = None,
     bench: Annotated[
         bool,
@@ -67,11 +64,10 @@ def export_command(
     if bench or strut is not None:
         raise InputError("--bench and --strut: expected --fmu with them")
     for path in _export_run(source, kind or "", out, smoothed):
-        console.print(f"Written: {path}", markup=False)
+        print_text(f"Written: {path}")
 
 
 def _export_run(source: Path, kind: str, out: Path, smoothed: bool) -> list[Path]:
-    """Write a run in another format."""
     from rig.formats.export import export_run
 
     if not smoothed:
@@ -83,7 +79,6 @@ def _export_run(source: Path, kind: str, out: Path, smoothed: bool) -> list[Path
 
 
 def _export_model(source: Path, out: Path, fmi: str, strut: str | None, bench: bool) -> None:
-    """Write a model as an FMU."""
     from dart_model.spec import load_model
     from rig.fmu.export import export_fmu
 
@@ -92,8 +87,8 @@ def _export_model(source: Path, out: Path, fmi: str, strut: str | None, bench: b
         component = export_fmu(
             spec, out, fmi, strut, bench, lambda target: status.update(f"{target} compiled")
         )
-    console.print(component.meaning, markup=False)
+    print_text(component.meaning)
     for kind in ("input", "state", "output"):
         names = [item.name for _, item in component.of(kind)]
-        console.print(f"{kind}s: {', '.join(names) or 'none'}", markup=False)
-    console.print(f"Written: {out}", markup=False)
+        print_text(f"{kind}s: {', '.join(names) or 'none'}")
+    print_text(f"Written: {out}")

@@ -13,7 +13,15 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from typer.core import TyperGroup
 
 from can_dbc.errors import InputError
-from rig.cli.terminal import FAILED, OK, JsonFlag, console, print_json, table
+from rig.cli.terminal import (
+    FAILED,
+    OK,
+    JsonFlag,
+    print_json,
+    print_table,
+    print_text,
+    refuse_existing,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator
@@ -54,6 +62,14 @@ QUERY_EXAMPLES = (
 REPORT_EXAMPLES = "Examples: `rig fleet report store` · `rig fleet report store --out fleet.html`"
 
 Store = Annotated[Path, typer.Argument(metavar="STORE", help="Folder that `rig fleet` wrote.")]
+PathPattern = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PATTERN",
+        help="Path of a run below its SOURCE with {bench}, {damper}, {date} and *; without it the "
+        "folder above it is the bench, and a date is looked for in the path.",
+    ),
+]
 
 
 @app.command(RUN, epilog=RUN_EXAMPLES)
@@ -66,29 +82,18 @@ def run_command(
         ),
     ],
     model: Annotated[
-        str,
-        typer.Option("--model", metavar="MODEL", help="Model file, or a shipped one's name."),
+        str, typer.Option(metavar="MODEL", help="Model file, or a shipped one's name.")
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="STORE", help="Store, new or to continue.")],
-    path: Annotated[
-        str | None,
-        typer.Option(
-            "--path",
-            metavar="PATTERN",
-            help="Path of a run below its SOURCE with {bench}, {damper}, {date} and *; without it "
-            "the folder above it is the bench, and a date is looked for in the path.",
-        ),
-    ] = None,
+    out: Annotated[Path, typer.Option(metavar="STORE", help="Store, new or to continue.")],
+    path: PathPattern = None,
     jobs: Annotated[
-        int | None, typer.Option("--jobs", min=1, help="Processes; by default one a core.")
+        int | None, typer.Option(min=1, help="Processes; by default one a core.")
     ] = None,
     dask: Annotated[
-        str | None,
-        typer.Option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster that runs."),
+        str | None, typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster that runs.")
     ] = None,
     shard: Annotated[
-        str | None,
-        typer.Option("--shard", metavar="I/N", help="Only the I-th of N parts, from 1 on."),
+        str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts, from 1 on.")
     ] = None,
     again: Annotated[
         bool, typer.Option("--again", help="Try runs again that failed before.")
@@ -118,7 +123,7 @@ def run_command(
     computing = contextlib.nullcontext(processes(jobs)) if dask is None else dask_at(dask)
     with computing as engine:
         if not as_json:
-            console.print(f"{len(runs)} runs, {engine.words}", markup=False)
+            print_text(f"{len(runs)} runs, {engine.words}")
         with _progress() as show:
             end = run_campaign(
                 runs, nominal, out, engine.make, engine.window, again=again, progress=show
@@ -126,8 +131,8 @@ def run_command(
     if as_json:
         print_json(end._asdict())
     else:
-        console.print(end.words, markup=False)
-        console.print(f"Store: {out}", markup=False)
+        print_text(end.words)
+        print_text(f"Store: {out}")
     return FAILED if end.failed else OK
 
 
@@ -183,10 +188,8 @@ def query_command(
         writer.writerow(names)
         writer.writerows(rows)
     else:
-        shown = table(*names)
-        for row in rows:
-            shown.add_row(*("" if item is None else escape(str(item)) for item in row))
-        console.print(shown)
+        texts = [["" if item is None else escape(str(item)) for item in row] for row in rows]
+        print_table(names, texts)
 
 
 def _plain(value: object) -> object:
@@ -197,15 +200,14 @@ def _plain(value: object) -> object:
 def report_command(
     store: Store,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="New HTML file, a page of it.")
+        Path | None, typer.Option(metavar="FILE", help="New HTML file, a page of it.")
     ] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Summarise a store: verdicts, change-points, wear, outliers, jumps of a bench."""
     from rig.fleet.overview import read_overview
 
-    if out is not None and out.exists():
-        raise InputError(f"{out}: exists, expected a new file")
+    refuse_existing(out)
     whole = read_overview(store)
     if as_json:
         print_json(whole.as_dict())
@@ -216,19 +218,19 @@ def report_command(
 
         write_fleet_page(whole, out)
         if not as_json:
-            console.print(f"Written: {out}", markup=False)
+            print_text(f"Written: {out}")
 
 
 def _print(whole: "Overview") -> None:
     from rig.fleet.sentences import alarm_sentences
 
-    console.print(whole.words, markup=False)
-    shown = table("bench", "verdicts")
-    for bench, counts in whole.verdicts.items():
-        text = ", ".join(f"{count} {verdict}" for verdict, count in counts.items())
-        shown.add_row(escape(bench), text)
-    console.print(shown)
+    print_text(whole.words)
+    rows = [
+        (escape(bench), ", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+        for bench, counts in whole.verdicts.items()
+    ]
+    print_table(("bench", "verdicts"), rows)
     for line in alarm_sentences(whole) or ["Nothing changed, drifts or stands out."]:
-        console.print(f"- {line}", markup=False)
+        print_text(f"- {line}")
     for error, count in list(whole.failed.items())[:5]:
-        console.print(f"failed, {count}: {error}", markup=False, style="red")
+        print_text(f"failed, {count}: {error}", style="red")

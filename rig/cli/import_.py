@@ -7,7 +7,7 @@ import typer
 
 from can_dbc.errors import InputError
 from rig.cli.progress import progress_line
-from rig.cli.terminal import WRONG_INPUT, console
+from rig.cli.terminal import WRONG_INPUT, console, print_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,41 +23,41 @@ EXAMPLES = (
 )
 
 
+Rebound = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SIGN",
+        help="positive or negative: sign of the force in rebound, for an MTS file without "
+        "--mapping, whose names and units are then its own.",
+    ),
+]
+FmuFlag = Annotated[
+    bool,
+    typer.Option(
+        "--fmu",
+        help="SOURCE is an FMU, of which a model is made; --mapping gives the roles of its "
+        "variables, if they are not called as in an FMU of `rig export`.",
+    ),
+]
+
+
 def import_command(
     source: Annotated[
         Path, typer.Argument(metavar="SOURCE", help="Table or folder of tables, bus log, export.")
     ],
     out: Annotated[
-        Path, typer.Option("--out", metavar="PATH", help="CSV file, or folder: of a run, of many.")
+        Path, typer.Option(metavar="PATH", help="CSV file, or folder: of a run, of many.")
     ],
     mapping: Annotated[
-        Path | None,
-        typer.Option("--mapping", metavar="FILE", help="Columns and units of a foreign table."),
+        Path | None, typer.Option(metavar="FILE", help="Columns and units of a foreign table.")
     ] = None,
     config: Annotated[
-        Path | None,
-        typer.Option("--config", metavar="FILE", help="Signals of a bus log, with its DBC."),
+        Path | None, typer.Option(metavar="FILE", help="Signals of a bus log, with its DBC.")
     ] = None,
-    rebound: Annotated[
-        str | None,
-        typer.Option(
-            "--rebound",
-            metavar="SIGN",
-            help="positive or negative: sign of the force in rebound, for an MTS file without "
-            "--mapping, whose names and units are then its own.",
-        ),
-    ] = None,
-    fmu: Annotated[
-        bool,
-        typer.Option(
-            "--fmu",
-            help="SOURCE is an FMU, of which a model is made; --mapping gives the roles of its "
-            "variables, if they are not called as in an FMU of `rig export`.",
-        ),
-    ] = False,
+    rebound: Rebound = None,
+    fmu: FmuFlag = False,
     mass_kg: Annotated[
-        float | None,
-        typer.Option("--mass-kg", metavar="KG", help="With --fmu: what a strut alone carries."),
+        float | None, typer.Option(metavar="KG", help="With --fmu: what a strut alone carries.")
     ] = None,
 ) -> None:
     """Make a CSV of a foreign table, a run of a bus log or of an export, a model of an FMU.
@@ -84,20 +84,19 @@ def import_command(
         from rig.formats.export import import_run
 
         import_run(source, out)
-        console.print(f"Run: {out}", markup=False)
+        print_text(f"Run: {out}")
 
 
 def _import_model(source: Path, mapping: Path | None, mass_kg: float | None, out: Path) -> None:
-    """Make a model of an FMU."""
     from rig.fmu.import_fmu import MODEL_FILE, import_fmu, variables_of
 
     roles = import_fmu(source, mapping, mass_kg, out).struts[0].fmu
     if roles is not None:
         for role, variable in variables_of(roles).items():
-            console.print(f"{role}: {variable}", markup=False)
+            print_text(f"{role}: {variable}")
         if roles.acceleration is not None:
             console.print(f"mass: {roles.mass_kg:.6g} kg along the height, from the FMU")
-    console.print(f"Model: {out / MODEL_FILE}", markup=False)
+    print_text(f"Model: {out / MODEL_FILE}")
 
 
 def _import_bus_log(source: Path, config: Path, out: Path) -> None:
@@ -122,8 +121,7 @@ def _mapping_finder(mapping: Path | None, rebound: str) -> "Callable[[Path], Tab
 
 def _import_tables(source: Path, find_mapping: "Callable[[Path], TableMapping]", out: Path) -> None:
     """Import a table, or every table of a folder; exit code 2 if one of these is refused."""
-    from rig.formats.foreign_table import import_table
-    from rig.formats.table_folder import import_folder
+    from rig.formats.foreign_table import import_folder, import_table
 
     if not source.is_dir():
         _print_report(import_table(source, find_mapping(source), out))
@@ -132,11 +130,11 @@ def _import_tables(source: Path, find_mapping: "Callable[[Path], TableMapping]",
     for path, result in import_folder(source, find_mapping, out):
         if isinstance(result, InputError):
             refused += 1
-            console.print(f"refused: {result}", markup=False, style="red")
+            print_text(f"refused: {result}", style="red")
         else:
-            console.print(f"{path.name}: {result.samples} samples, {result.out}", markup=False)
+            print_text(f"{path.name}: {result.samples} samples, {result.out}")
     if refused:
-        console.print(f"{refused} refused, the others are in {out}", markup=False)
+        print_text(f"{refused} refused, the others are in {out}")
         raise typer.Exit(WRONG_INPUT)
 
 
@@ -146,5 +144,5 @@ def _print_report(report: "ImportReport") -> None:
         f"{', '.join(report.columns)}"
     )
     for line in report.assumptions:
-        console.print(f"- {line}", markup=False)
-    console.print(f"Written: {report.out}", markup=False)
+        print_text(f"- {line}")
+    print_text(f"Written: {report.out}")

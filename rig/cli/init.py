@@ -6,18 +6,16 @@ from typing import Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.terminal import console
+from rig.cli.terminal import print_text, refuse_existing
 
 EXAMPLES = "Example: `rig init --dbc my.dbc --out my.yaml`, then `rig check my.yaml`"
 
 
 def init(
-    dbc: Annotated[Path, typer.Option("--dbc", metavar="FILE", help="DBC of the bench's bus.")],
+    dbc: Annotated[Path, typer.Option(metavar="FILE", help="DBC of the bench's bus.")],
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", metavar="FILE", help="New file in the DBC's folder; printed if absent."
-        ),
+        typer.Option(metavar="FILE", help="New file in the DBC's folder; printed if absent."),
     ] = None,
 ) -> None:
     """Propose a configuration from a DBC: height, forces, temperature, and where to publish."""
@@ -28,14 +26,11 @@ def init(
     if out is None:
         typer.echo(text, nl=False)
         return
-    if out.exists():
-        raise InputError(f"--out {out}: exists, expected a new file")
+    refuse_existing(out, option="--out ")
     if out.resolve().parent != dbc.resolve().parent:
         raise InputError(f"--out {out}: expected a file in the folder of {dbc}")
     try:
         out.write_text(text, "utf-8")
     except OSError as error:
         raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
-    console.print(
-        f"Written: {out}. Read it, set bus and model, then `rig check {out}`.", markup=False
-    )
+    print_text(f"Written: {out}. Read it, set bus and model, then `rig check {out}`.")

@@ -8,44 +8,33 @@ from xml.etree import ElementTree
 import typer
 
 from can_dbc.errors import InputError
+from rig.cli.terminal import refuse_existing
+
+JUNIT = "--junit "
 
 JUnitFile = Annotated[
     Path | None,
-    typer.Option("--junit", metavar="FILE", help="Write it as JUnit XML too, for a CI server."),
+    typer.Option(metavar="FILE", help="Write it as JUnit XML too, for a CI server."),
 ]
 
 
 class Outcome(NamedTuple):
-    """One line of a check.
-
-    Attributes:
-        what: Name of the check.
-        text: Its result.
-        failed: Whether that is a failure.
-    """
+    """One line of a check: its name, its result, and whether that is a failure."""
 
     what: str
     text: str
     failed: bool
 
 
-def refuse_existing(path: Path) -> None:
-    """Refuse to overwrite a file.
-
-    Raises:
-        InputError: It exists.
-    """
-    if path.exists():
-        raise InputError(f"--junit {path}: exists, expected a new file")
-
-
-def write_junit(path: Path, suite: str, outcomes: Sequence[Outcome]) -> None:
-    """Write outcomes as JUnit XML, a test case each.
+def write_junit(path: Path | None, suite: str, outcomes: Sequence[Outcome]) -> None:
+    """Write outcomes as JUnit XML, a test case each, if a file is given.
 
     Raises:
         InputError: The file exists, or cannot be written.
     """
-    refuse_existing(path)
+    if path is None:
+        return
+    refuse_existing(path, option=JUNIT)
     failures = sum(outcome.failed for outcome in outcomes)
     root = ElementTree.Element(
         "testsuite", name=suite, tests=str(len(outcomes)), failures=str(failures), errors="0"
@@ -57,4 +46,4 @@ def write_junit(path: Path, suite: str, outcomes: Sequence[Outcome]) -> None:
     try:
         ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
     except OSError as error:
-        raise InputError(f"--junit {path}: cannot be written: {error.strerror}") from error
+        raise InputError(f"{JUNIT}{path}: cannot be written: {error.strerror}") from error

@@ -45,12 +45,19 @@ def stoppable() -> Generator[Callable[[], bool]]:
         nonlocal is_requested
         is_requested = True
 
-    previous = {n: signal.signal(n, request) for n in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with handled(request, signal.SIGINT, signal.SIGTERM):
         yield lambda: is_requested
+
+
+@contextlib.contextmanager
+def handled(handler: Callable[[int, FrameType | None], None], *numbers: int) -> Generator[None]:
+    """Handle signals by a function, then again as before."""
+    previous = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        for number, former in previous.items():
+            signal.signal(number, former)
 
 
 @contextlib.contextmanager
@@ -91,11 +98,6 @@ def status_line(
     """State, rate, lateness, force and losses of a run: one line that is rewritten on a terminal.
 
     Each update is a single write, because the loop of the run calls it.
-
-    Args:
-        duration_s: Length of the run; None if it has none.
-        channels: Names of the channels.
-        devices: Names of the devices.
     """
     is_terminal = sys.stderr.isatty()
     total = "" if duration_s is None else f" of {duration_s:g}"

@@ -1,22 +1,17 @@
 """`rig replay`."""
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
 from rig.cli.progress import progress_line
-from rig.cli.summary_file import write_summary
-from rig.cli.terminal import FAILED, JsonFlag, console, print_json, table
+from rig.cli.summary_file import SummaryFolder, write_summary
+from rig.cli.terminal import FAILED, JsonFlag, RunFolder, console, print_json, print_table
 
 EXAMPLES = "Example: `rig replay rig-demo/run`"
 
 
 def replay_command(
-    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Write summary.json there.")
-    ] = None,
+    folder: RunFolder,
+    out: SummaryFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Compute a run again from its frames and compare it with its log, bit for bit."""
@@ -34,15 +29,15 @@ def replay_command(
     }
     missing = result.logged - result.steps.num_rows
     changed = find_changed_files(folder)
-    if out is not None:
-        write_summary(out, summary)
+    write_summary(out, summary)
     if as_json:
         print_json({**summary, "changed_files": changed})
     else:
-        shown = table("Replay", str(folder))
-        for name, value in summary.items():
-            shown.add_row(name.replace("_", " "), "-" if value is None else str(value))
-        console.print(shown)
+        rows = [
+            (name.replace("_", " "), "-" if value is None else str(value))
+            for name, value in summary.items()
+        ]
+        print_table(("Replay", str(folder)), rows)
         if result.steps.num_rows == 0:
             console.print("The run holds no tick: nothing was compared.", style="red")
         elif missing > 0:

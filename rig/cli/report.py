@@ -6,16 +6,16 @@ from typing import Annotated
 import typer
 
 from can_dbc.errors import InputError
-from rig.cli.terminal import console
+from rig.cli.terminal import RunFolder, print_text
 
 EXAMPLES = "Examples: `rig report runs/7` · `rig report runs/7 --out handed_over.html --pdf`"
 
 
 def report(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")],
+    run: RunFolder,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="File to write; RUN/report.html by default."),
+        typer.Option(metavar="FILE", help="File to write; RUN/report.html by default."),
     ] = None,
     pdf: Annotated[
         bool, typer.Option("--pdf", help="Print it too; requires Chromium, Chrome or Edge.")
@@ -33,7 +33,7 @@ def report(
         if existing.exists():
             raise InputError(f"{existing}: exists, expected another name (--out)")
     write_run_report(run, path)
-    console.print(f"Written: {path}", markup=False)
+    print_text(f"Written: {path}")
     if pdf:
         print_page(path, paper)
-        console.print(f"Printed: {paper}", markup=False)
+        print_text(f"Printed: {paper}")

@@ -13,7 +13,7 @@ from can_dbc.errors import InputError
 from rig.cli.progress import status_line, stoppable
 from rig.cli.result_tables import print_run
 from rig.cli.side_by_side import run_side_by_side
-from rig.cli.terminal import FAILED, JsonFlag, console
+from rig.cli.terminal import FAILED, JsonFlag, print_text
 from rig.files.folders import refuse_full
 
 if TYPE_CHECKING:
@@ -36,23 +36,18 @@ def run(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out",
-            metavar="DIR",
-            help="Folder of the run, or of the runs; by default runs/ and the time.",
+            metavar="DIR", help="Folder of the run, or of the runs; by default runs/ and the time."
         ),
     ] = None,
     model: Annotated[
         str | None,
         typer.Option(
-            "--model",
-            metavar="MODEL",
-            help="Another model than the configuration's, e.g. a corrected one.",
+            metavar="MODEL", help="Another model than the configuration's, e.g. a corrected one."
         ),
     ] = None,
     duration_s: Annotated[
         float | None,
         typer.Option(
-            "--duration-s",
             min=0.001,
             help="Length of the run in s; else the configuration's, or until Ctrl-C.",
         ),
@@ -124,7 +119,7 @@ def _run_one(
         typer.echo(text, nl=False)
     else:
         print_run(ended, with_timing=True)
-        console.print(f"Run: {folder}", markup=False)
+        print_text(f"Run: {folder}")
     _refuse_bad_ends(plan, ended)
 
 

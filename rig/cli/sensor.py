@@ -10,7 +10,16 @@ from rich.markup import escape
 
 from can_dbc.errors import InputError
 from rig.cli.progress import progress_bar
-from rig.cli.terminal import JsonFlag, console, print_json, table
+from rig.cli.terminal import (
+    Bitrate,
+    Channel,
+    Interface,
+    JsonFlag,
+    console,
+    print_json,
+    print_table,
+    print_text,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,9 +44,33 @@ SET_EXAMPLES = (
     "`rig sensor set --restore sensor-5-before.yaml` · `rig sensor set 5 --new`"
 )
 
-Interface = Annotated[str, typer.Option("--interface", help="python-can's name of the interface.")]
-Channel = Annotated[str, typer.Option("--channel", help="Channel of the interface.")]
-Bitrate = Annotated[int, typer.Option("--bitrate", min=1, help="Bit rate in bit/s.")]
+ListenSeconds = Annotated[float, typer.Option(min=0.0, max=600.0, help="How long to listen first.")]
+EdsFiles = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NODE=FILE",
+        help="Describe a sensor that is not on a bus by its EDS file; no bus is opened.",
+    ),
+]
+HeightNow = Annotated[
+    float | None,
+    typer.Option(
+        metavar="M", help="Height of the strut now, at the reading of the first position sensor."
+    ),
+]
+CycleMs = Annotated[
+    int | None, typer.Option(min=1, max=65_535, help="Time between two measurements.")
+]
+HeartbeatMs = Annotated[
+    int | None, typer.Option(min=1, max=65_535, help="Time between two heartbeats.")
+]
+Before = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="New file for the contents before; sensor-NODE-before.yaml by default.",
+    ),
+]
 
 
 @app.command("scan", epilog=SCAN_EXAMPLES)
@@ -45,32 +78,16 @@ def scan_command(
     interface: Interface = "socketcan",
     channel: Channel = "can0",
     bitrate: Bitrate = 500_000,
-    listen_s: Annotated[
-        float, typer.Option("--listen-s", min=0.0, max=600.0, help="How long to listen first.")
-    ] = 2.0,
+    listen_s: ListenSeconds = 2.0,
     listen_only: Annotated[
         bool, typer.Option("--listen-only", help="Send nothing: list the frames on the bus.")
     ] = False,
-    eds: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--eds",
-            metavar="NODE=FILE",
-            help="Describe a sensor that is not on a bus by its EDS file; no bus is opened.",
-        ),
-    ] = None,
+    eds: EdsFiles = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="New folder for sensors.dbc and rig.yaml."),
+        typer.Option(metavar="DIR", help="New folder for sensors.dbc and rig.yaml."),
     ] = None,
-    height_now_m: Annotated[
-        float | None,
-        typer.Option(
-            "--height-now-m",
-            metavar="M",
-            help="Height of the strut now, at the reading of the first position sensor.",
-        ),
-    ] = None,
+    height_now_m: HeightNow = None,
     is_reversed: Annotated[
         bool, typer.Option("--reversed", help="The sensor counts up while the strut gets shorter.")
     ] = False,
@@ -116,10 +133,9 @@ def scan_command(
     if files is not None:
         dbc, configuration = files
         hint = "" if zero is not None else " Heights are the sensor's readings (--height-now-m)."
-        console.print(
+        print_text(
             f"Written: {dbc}, {configuration}.{hint} Read them, set the model, then "
-            f"`rig check {configuration}`.",
-            markup=False,
+            f"`rig check {configuration}`."
         )
 
 
@@ -128,29 +144,15 @@ def set_command(
     node_id: Annotated[
         int | None, typer.Argument(metavar="[NODE]", min=1, max=127, help="CANopen node id.")
     ] = None,
-    cycle_ms: Annotated[
-        int | None,
-        typer.Option("--cycle-ms", min=1, max=65_535, help="Time between two measurements."),
-    ] = None,
+    cycle_ms: CycleMs = None,
     sync: Annotated[
-        bool,
-        typer.Option("--sync", help="Send at SYNC, which the device then produces."),
+        bool, typer.Option("--sync", help="Send at SYNC, which the device then produces.")
     ] = False,
-    heartbeat_ms: Annotated[
-        int | None,
-        typer.Option("--heartbeat-ms", min=1, max=65_535, help="Time between two heartbeats."),
-    ] = None,
+    heartbeat_ms: HeartbeatMs = None,
     new: Annotated[
         bool, typer.Option("--new", help="First give NODE to the device that has no node id (LSS).")
     ] = False,
-    before: Annotated[
-        Path | None,
-        typer.Option(
-            "--before",
-            metavar="FILE",
-            help="New file for the contents before; sensor-NODE-before.yaml by default.",
-        ),
-    ] = None,
+    before: Before = None,
     restore_from: Annotated[
         Path | None,
         typer.Option("--restore", metavar="FILE", help="Restore the contents in this file."),
@@ -188,12 +190,10 @@ def set_command(
             _give_node_id(network, node_id)
         settings = CanOpenSettings(cycle_ms, sync, heartbeat_ms)
         changes = configure_with_undo(network, node_id, settings, undo)
-    text = f"Node {node_id}: start requested; "
+    changed = "no object had to be changed."
     if changes:
-        text += f"{len(changes)} objects changed. `rig sensor set --restore {undo}` undoes it."
-    else:
-        text += "no object had to be changed."
-    console.print(text, markup=False)
+        changed = f"{len(changes)} objects changed. `rig sensor set --restore {undo}` undoes it."
+    print_text(f"Node {node_id}: start requested; {changed}")
 
 
 def _give_node_id(network: "CanOpenNetwork", node_id: int) -> None:
@@ -201,7 +201,7 @@ def _give_node_id(network: "CanOpenNetwork", node_id: int) -> None:
     if identity is None:
         raise InputError("--new: no device without a node id answers")
     network.give_node_id(node_id)
-    console.print(f"Node id {node_id} given to {_identity_text(identity)}.", markup=False)
+    print_text(f"Node id {node_id} given to {_identity_text(identity)}.")
 
 
 def _files_by_node(options: "Sequence[str]") -> dict[int, Path]:
@@ -218,40 +218,43 @@ def _files_by_node(options: "Sequence[str]") -> dict[int, Path]:
 
 
 def _print(survey: "BusSurvey") -> None:
-    if survey.devices:
-        _print_devices(survey.devices)
+    _print_devices(survey.devices)
     for node_id in survey.silent:
-        console.print(f"- node {node_id}: on the bus, but does not describe itself", markup=False)
+        print_text(f"- node {node_id}: on the bus, but does not describe itself")
     if survey.unconfigured is not None:
         console.print("- a device without a node id: `rig sensor set NODE --new` gives it one")
-    if survey.claims or survey.groups:
-        _print_addresses(survey)
-    if survey.traffic:
-        traffic = table("id", "frames", "bytes", "every", title="Frames on the bus")
-        for item in survey.traffic:
-            every = "" if item.interval_s is None else f"{item.interval_s * 1e3:.3g} ms"
-            name = f"{item.arbitration_id:0{8 if item.is_extended else 3}X}"
-            traffic.add_row(name, str(item.count), str(item.length_bytes), every)
-        console.print(traffic)
+    _print_addresses(survey)
+    traffic = [
+        (
+            f"{item.arbitration_id:0{8 if item.is_extended else 3}X}",
+            str(item.count),
+            str(item.length_bytes),
+            "" if item.interval_s is None else f"{item.interval_s * 1e3:.3g} ms",
+        )
+        for item in survey.traffic
+    ]
+    if traffic:
+        print_table(("id", "frames", "bytes", "every"), traffic, "Frames on the bus")
     if not (survey.devices or survey.silent or survey.claims or survey.traffic):
         console.print("No frame came, and no device answered: check the bit rate.")
 
 
 def _print_devices(devices: "Sequence[CanOpenDevice]") -> None:
-    rows = table("node", "device", "sends", "heartbeat", title="CANopen")
+    rows: list[tuple[str, ...]] = []
     for device in devices:
         label = f"{device.label or '?'}\n{device.kind}\n{_identity_text(device.identity)}"
         beat = f"{device.heartbeat_s * 1e3:g} ms" if device.heartbeat_s else "none"
         sends = "\n".join(_pdo_lines(device))
-        rows.add_row(str(device.node_id), escape(label), escape(sends), beat)
-    console.print(rows)
+        rows.append((str(device.node_id), escape(label), escape(sends), beat))
+    if rows:
+        print_table(("node", "device", "sends", "heartbeat"), rows, "CANopen")
     for device in devices:
         for note in device.notes:
-            console.print(f"- node {device.node_id}: {note}", markup=False)
+            print_text(f"- node {device.node_id}: {note}")
 
 
 def _print_addresses(survey: "BusSurvey") -> None:
-    rows = table("address", "NAME", "manufacturer, function, identity", "sends", title="J1939")
+    rows: list[tuple[str, ...]] = []
     groups = {item.address: item.group.name for item in survey.groups}
     claims = {claim.address: claim for claim in survey.claims}
     for address in sorted({*groups, *claims}):
@@ -260,8 +263,10 @@ def _print_addresses(survey: "BusSurvey") -> None:
         if claim is not None:
             name = f"{claim.name:016X}"
             owner = f"{claim.manufacturer}, {claim.function}, {claim.identity}"
-        rows.add_row(str(address), name, owner, groups.get(address, ""))
-    console.print(rows)
+        rows.append((str(address), name, owner, groups.get(address, "")))
+    if rows:
+        heads = ("address", "NAME", "manufacturer, function, identity", "sends")
+        print_table(heads, rows, "J1939")
 
 
 def _identity_text(identity: "Sequence[int | None]") -> str:

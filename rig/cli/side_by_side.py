@@ -16,7 +16,8 @@ from typing import TypedDict
 from rich.markup import escape
 
 from can_dbc.errors import InputError
-from rig.cli.terminal import FAILED, OK, WRONG_INPUT, console, print_json, table
+from rig.cli.progress import handled
+from rig.cli.terminal import FAILED, OK, WRONG_INPUT, print_json, print_table
 from rig.files.folders import refuse_full
 
 _PR_SET_PDEATHSIG = 1
@@ -29,19 +30,10 @@ _WORST = (WRONG_INPUT, FAILED)
 def run_side_by_side(
     configs: Sequence[Path], folder: Path, options: Sequence[str], *, as_json: bool
 ) -> int:
-    """Run as many bridges as there are configurations.
+    """Run a bridge for each configuration, each with the options; returns the worst exit code.
 
     What each says is shown behind its name. Ctrl-C ends all in order; one that ends, however it
-    does, ends no other.
-
-    Args:
-        configs: Their configurations.
-        folder: Where each gets a folder.
-        options: For each of them.
-        as_json: Whether their summaries are printed as JSON.
-
-    Returns:
-        The worst exit code.
+    does, ends no other. Each has a folder in `folder`, called as its configuration.
 
     Raises:
         InputError: Two of them have one name, or a folder is not empty.
@@ -60,9 +52,11 @@ def run_side_by_side(
         for item in bridges.items():
             readers.append(threading.Thread(target=_pass_on, args=item, daemon=True))
             readers[-1].start()
-        codes = {name: _code(bridge.wait()) for name, bridge in bridges.items()}
+        ends = {name: bridge.wait() for name, bridge in bridges.items()}
     for reader in readers:
         reader.join()
+    # A program which a signal ended has failed.
+    codes = {name: FAILED if code < 0 else code for name, code in ends.items()}
     summaries = {name: _summary(folder / name) for name in names}
     if as_json:
         print_json({name: {"exit_code": codes[name], **summaries[name]} for name in names})
@@ -92,11 +86,6 @@ def _ends_with_its_parent() -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
 
 
-def _code(code: int) -> int:
-    """An exit code; that of a program which a signal ended is a failure."""
-    return code if code >= 0 else FAILED
-
-
 def _pass_on(name: str, bridge: "subprocess.Popen[str]") -> None:
     """What a bridge says, behind its name, on standard error."""
     for line in bridge.stdout or ():
@@ -112,17 +101,13 @@ def _end_together(bridges: Mapping[str, "subprocess.Popen[str]"]) -> Generator[N
             if bridge.poll() is None:
                 bridge.send_signal(signal.SIGINT)
 
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    numbers += [signal.SIGHUP] if sys.platform != "win32" else []
-    before = {number: signal.signal(number, forward) for number in numbers}
-    try:
-        yield
-    except BaseException:
-        forward(0, None)
-        raise
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    closed_terminal = [signal.SIGHUP] if sys.platform != "win32" else []
+    with handled(forward, signal.SIGINT, signal.SIGTERM, *closed_terminal):
+        try:
+            yield
+        except BaseException:
+            forward(0, None)
+            raise
 
 
 class _Summary(TypedDict, total=False):
@@ -141,14 +126,12 @@ def _summary(folder: Path) -> _Summary:
 
 
 def _print(codes: dict[str, int], summaries: dict[str, _Summary], folder: Path) -> None:
-    shown = table("bridge", "ended", "ticks", "missed", "run")
+    rows: list[tuple[str, ...]] = []
     for name, code in codes.items():
         summary = summaries[name]
         words = "in order" if code == OK else f"exit code {code}"
-        mode = summary.get("mode", "")
-        missed = summary.get("counts", {}).get("overruns", "")
+        end = f"{words} {summary.get('mode', '')}".strip()
+        missed = str(summary.get("counts", {}).get("overruns", ""))
         ticks = str(summary.get("ticks", ""))
-        shown.add_row(
-            escape(name), f"{words} {mode}".strip(), ticks, str(missed), escape(str(folder / name))
-        )
-    console.print(shown)
+        rows.append((escape(name), end, ticks, missed, escape(str(folder / name))))
+    print_table(("bridge", "ended", "ticks", "missed", "run"), rows)

@@ -2,16 +2,25 @@
 
 import json
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from can_dbc.errors import InputError
 
+SummaryFolder = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", help="Write summary.json there.")
+]
 
-def write_summary(folder: Path, summary: dict[str, object]) -> None:
-    """Write `summary.json`.
+
+def write_summary(folder: Path | None, summary: dict[str, object]) -> None:
+    """Write `summary.json`, if a folder is given.
 
     Raises:
         InputError: The folder cannot be written, or holds a run or another summary.
     """
+    if folder is None:
+        return
     for name in ("run.yaml", "summary.json"):
         if (folder / name).exists():
             raise InputError(f"--out {folder}: holds {name}, expected a folder without one")

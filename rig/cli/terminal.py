@@ -1,5 +1,6 @@
-"""The terminal: console, tables and JSON of the commands, and their exit codes."""
+"""The terminal: console, tables and JSON of the commands, their common options and exit codes."""
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -7,13 +8,19 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
+from can_dbc.errors import InputError
 from rig.files.json_text import json_text
 
 OK, FAILED, WRONG_INPUT = 0, 1, 2
 console = Console()
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file.")]
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
+StrutOfRun = Annotated[str | None, typer.Option(metavar="NAME", help="Which strut of a run.")]
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print the same as JSON, and nothing else.")]
+Interface = Annotated[str, typer.Option(help="python-can's name of the interface.")]
+Channel = Annotated[str, typer.Option(help="Channel of the interface.")]
+Bitrate = Annotated[int, typer.Option(min=1, help="Bit rate in bit/s.")]
 
 
 def table(*heads: str, title: str | None = None) -> Table:
@@ -21,6 +28,32 @@ def table(*heads: str, title: str | None = None) -> Table:
     return Table(*(Column(head, overflow="fold") for head in heads), title=title)
 
 
+def print_table(
+    heads: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None
+) -> None:
+    """Print a table."""
+    shown = table(*heads, title=title)
+    for row in rows:
+        shown.add_row(*row)
+    console.print(shown)
+
+
+def print_text(text: str, style: str | None = None) -> None:
+    """Print a text in which brackets are no markup."""
+    console.print(text, markup=False, style=style)
+
+
 def print_json(content: object) -> None:
     """Print as JSON; numbers that are not finite become null."""
     typer.echo(json_text(content), nl=False)
+
+
+def refuse_existing(*paths: Path | None, option: str = "") -> None:
+    """Refuse to overwrite a file; `option` stands before its path in the error.
+
+    Raises:
+        InputError: One of the files exists.
+    """
+    for path in paths:
+        if path is not None and path.exists():
+            raise InputError(f"{option}{path}: exists, expected a new file")

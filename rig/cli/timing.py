@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.summary_file import write_summary
-from rig.cli.terminal import JsonFlag, console, print_json, table
+from rig.cli.summary_file import SummaryFolder, write_summary
+from rig.cli.terminal import JsonFlag, console, print_json, print_table
 
 EXAMPLES = "Example: `rig run rig.yaml --trace --out runs/7`, then `rig timing runs/7`"
 
@@ -16,9 +16,7 @@ _MOST_ROWS = 40
 
 def timing(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run with --trace.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Write summary.json there.")
-    ] = None,
+    out: SummaryFolder = None,
     as_json: JsonFlag = False,
 ) -> None:
     """List the missed ticks of a traced run: the part that took longer, and the cause."""
@@ -31,21 +29,25 @@ def timing(
     summary: dict[str, object] = {
         "late": [{**item._asdict(), "cause": item.cause.name.lower()} for item in late]
     }
-    if out is not None:
-        write_summary(out, summary)
+    write_summary(out, summary)
     if as_json:
         print_json(summary)
     elif not late:
         console.print("No tick was missed.")
     else:
-        rows = table("time / s", "missed", "part", "longer by / ms", "cause", title="Gaps")
-        for item in late[:_MOST_ROWS]:
-            when, longer = f"{item.t_ns * 1e-9:.3f}", f"{item.excess_ns * 1e-6:.2f}"
-            rows.add_row(when, str(item.missed), item.part, longer, item.cause.value)
-        console.print(rows)
+        heads = ("time / s", "missed", "part", "longer by / ms", "cause")
+        gaps = [
+            (
+                f"{item.t_ns * 1e-9:.3f}",
+                str(item.missed),
+                item.part,
+                f"{item.excess_ns * 1e-6:.2f}",
+                item.cause.value,
+            )
+            for item in late[:_MOST_ROWS]
+        ]
+        print_table(heads, gaps, "Gaps")
         if len(late) > _MOST_ROWS:
             console.print(f"and {len(late) - _MOST_ROWS} more")
-        causes = table("cause", "gaps", "missed ticks", title="Causes")
-        for cause, gaps, missed in by_cause(late):
-            causes.add_row(cause.value, str(gaps), str(missed))
-        console.print(causes)
+        causes = [(cause.value, str(count), str(ticks)) for cause, count, ticks in by_cause(late)]
+        print_table(("cause", "gaps", "missed ticks"), causes, "Causes")

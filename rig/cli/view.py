@@ -1,6 +1,7 @@
 """`rig view`."""
 
 import secrets
+import time
 import webbrowser
 from pathlib import Path
 from typing import Annotated
@@ -15,51 +16,51 @@ EXAMPLES = (
     "Examples: `rig view runs/7` while it runs · `rig view before after --model corrected.yaml`"
 )
 
-
 _PORT, _FOXGLOVE_PORT = 8321, 8765
+
+
+Port = Annotated[
+    int | None,
+    typer.Option(
+        min=0,
+        max=65535,
+        help=f"Port on this machine; 0 takes a free one. {_PORT} by default, Foxglove's is "
+        f"{_FOXGLOVE_PORT}.",
+    ),
+]
+ControlFlag = Annotated[
+    bool,
+    typer.Option(
+        "--control",
+        help="Let the page change gains and limits of a live run, and start a diagnosis of a "
+        "finished one; open the address it prints.",
+    ),
+]
+FoxgloveFlag = Annotated[
+    bool,
+    typer.Option(
+        "--foxglove",
+        help="Publish the runs to Foxglove or Lichtblick in place of a page; requires the extra of "
+        "that name.",
+    ),
+]
 
 
 def view(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs.")],
     model: Annotated[
         list[str] | None,
-        typer.Option(
-            "--model", metavar="MODEL", help="Draw this model's law too; once for each model."
-        ),
+        typer.Option(metavar="MODEL", help="Draw this model's law too; once for each model."),
     ] = None,
-    port: Annotated[
-        int | None,
-        typer.Option(
-            min=0,
-            max=65535,
-            help=f"Port on this machine; 0 takes a free one. {_PORT} by default, Foxglove's is "
-            f"{_FOXGLOVE_PORT}.",
-        ),
-    ] = None,
-    control: Annotated[
-        bool,
-        typer.Option(
-            "--control",
-            help="Let the page change gains and limits of a live run, and start a diagnosis of a "
-            "finished one; open the address it prints.",
-        ),
-    ] = False,
+    port: Port = None,
+    control: ControlFlag = False,
     no_browser: Annotated[
         bool,
         typer.Option("--no-browser", help="Open no browser, only print the address of the page."),
     ] = False,
-    foxglove: Annotated[
-        bool,
-        typer.Option(
-            "--foxglove",
-            help="Publish the runs to Foxglove or Lichtblick in place of a page; requires the "
-            "extra of that name.",
-        ),
-    ] = False,
+    foxglove: FoxgloveFlag = False,
 ) -> None:
     """Show runs in the browser, while they are written or afterwards; Ctrl-C ends it."""
-    import time
-
     from dart_model.spec import load_named_model
     from rig.pages.view.server import ViewServer
 

@@ -59,13 +59,9 @@ class DemoOptions:
 
 @dataclass(frozen=True)
 class Figures:
-    """Deviation of a model from the bench.
+    """Deviation of a model from the bench: errors of the height and of the spring-damper force.
 
-    Attributes:
-        height_error_max_m: Largest error of the height.
-        force_error_rms_n: Root mean square error of the spring-damper force.
-        force_error_max_n: Its largest error.
-        force_peak_n: Largest force of the bench.
+    `force_peak_n` is the largest force of the bench.
     """
 
     height_error_max_m: float
@@ -107,12 +103,7 @@ class StrutCase:
 
 @dataclass(frozen=True)
 class Case:
-    """Result of a case.
-
-    Attributes:
-        run: The run.
-        struts: Bench and model, strut by strut.
-    """
+    """Result of a case: the run, and bench and model strut by strut."""
 
     run: Ended
     struts: tuple[StrutCase, ...]
@@ -137,12 +128,7 @@ class Case:
 
 
 def run_case(name: str, folder: Path, options: DemoOptions) -> Case:
-    """Run a case into ``folder/run`` and write its summary and picture into `folder`.
-
-    Args:
-        name: One of `CASES`.
-        folder: Where to write; absent or empty.
-        options: How to run it.
+    """Run one of `CASES` into ``folder/run`` and write its summary and picture into `folder`.
 
     Raises:
         InputError: The folder cannot be written.

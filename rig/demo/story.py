@@ -11,7 +11,7 @@ from dart_model.spec import load_model
 from rig.demo.cases import SETTLED_NS, DemoOptions
 from rig.diagnosis.files import diagnose_runs
 from rig.diagnosis.outcome import CORRECTED_FILE, REPORT_FILE, Diagnosis, to_json
-from rig.log.reader import read_run
+from rig.formats.run_arrays import open_run
 from rig.pages.report import write_report
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
@@ -70,11 +70,7 @@ class Story:
 
 
 def draw_effect(seed: int) -> tuple[str, UndeclaredEffect]:
-    """Family and effect of the bench for a seed.
-
-    Args:
-        seed: Not negative.
-    """
+    """Family and effect of the bench for a seed, which is not negative."""
     random = np.random.default_rng(seed)
     name = list(_RANGES)[seed % len(_RANGES)]  # so that neighbouring seeds give different effects
     family, ranges = _RANGES[name]
@@ -150,8 +146,6 @@ def _bench(effect: UndeclaredEffect, excitation: int) -> BenchConfig:
 
 
 def _virtual_force_rms_n(ended: Ended) -> float:
-    steps = read_run(ended.folder).steps
-    t_ns = np.asarray(steps.column("t_ns").to_numpy(), dtype=np.int64)
-    force = np.asarray(steps.column(f"{_STRUT}.virtual_force_n").to_numpy(), dtype=np.float64)
-    force = force[t_ns >= SETTLED_NS]
+    run = open_run(ended.folder)
+    force = run.columns[f"{_STRUT}.virtual_force_n"][run.t_s >= SETTLED_NS * 1e-9]
     return float(np.sqrt(np.mean(force**2)))

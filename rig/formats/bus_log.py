@@ -82,9 +82,6 @@ def import_log(
         out: Folder of the run to write; absent or empty.
         progress: Called with time and mode of every tick.
 
-    Returns:
-        What was made and what was assumed.
-
     Raises:
         InputError: The log cannot be read, holds no frame of the configured signals, or the folder
             cannot be written.

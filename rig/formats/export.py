@@ -33,16 +33,13 @@ from rig.log.reader import RunFolder, read_run
 def export_run(
     folder: Path, kind: str, out: Path, read: Callable[[Path], RunFolder] = read_run
 ) -> list[Path]:
-    """Write a run in another format.
+    """Write a run in another format; returns the files that were written.
 
     Args:
         folder: Folder of the run.
         kind: One of `FORMATS`.
         out: File to write; for Parquet a folder.
         read: Reads the run; what it adds to the steps is exported too.
-
-    Returns:
-        The files that were written.
 
     Raises:
         InputError: The run is damaged, the format is unknown or requires a missing package, or
@@ -75,11 +72,7 @@ def _removed_on_failure(out: Path) -> Generator[None]:
 
 
 def import_run(source: Path, folder: Path) -> None:
-    """Restore the folder of a run from what `export_run` wrote.
-
-    Args:
-        source: An MF4 file, or a folder with Parquet files.
-        folder: Folder to write; absent or empty.
+    """Restore a run, into an absent or empty folder, from what `export_run` wrote: MF4 or Parquet.
 
     Raises:
         InputError: The source is no such export, or the folder cannot be written.

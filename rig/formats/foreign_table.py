@@ -1,6 +1,9 @@
-"""A foreign table, or the channels of an MF4 file, becomes a CSV of measured data."""
+"""A foreign table, or the channels of an MF4 file, becomes a CSV of measured data.
 
-from collections.abc import Sequence
+A folder of tables becomes as many; a wrong one does not stop the others.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
 from math import isnan
 from pathlib import Path
 
@@ -10,6 +13,7 @@ from can_dbc.atomic_file import replacing
 from can_dbc.errors import InputError
 from rig.dyno.quality import preflight
 from rig.files.delimited_text import ROWS_AT_ONCE
+from rig.files.folders import refuse_full
 from rig.formats.import_report import ImportReport
 from rig.formats.mapping import TableMapping, output_columns
 from rig.formats.mf4_channels import read_mf4_channels
@@ -28,9 +32,6 @@ def import_table(source: Path, mapping: TableMapping, out: Path) -> ImportReport
             as the mapping's columns.
         mapping: What it means.
         out: CSV file to write; it must not exist.
-
-    Returns:
-        What was made and what was assumed.
 
     Raises:
         InputError: One line that names file, line or key, value and what was expected.
@@ -64,6 +65,39 @@ def import_table(source: Path, mapping: TableMapping, out: Path) -> ImportReport
     duration_s = float(t_s[-1] - t_s[0])
     rate_hz = 1.0 / float(np.median(np.diff(t_s)))
     return ImportReport(out, len(t_s), duration_s, rate_hz, names, tuple(assumptions))
+
+
+def import_folder(
+    source: Path, find_mapping: Callable[[Path], TableMapping], out: Path
+) -> Iterator[tuple[Path, ImportReport | InputError]]:
+    """Turn every file of a folder into a CSV, in the order of their names.
+
+    Args:
+        source: The folder; folders within and hidden files are ignored.
+        find_mapping: Gives the mapping of a file.
+        out: Folder for the CSV files, which are called as their sources; new or empty.
+
+    Yields:
+        File, and the report of its import or the error by which it was refused.
+
+    Raises:
+        InputError: There is no file, two would have one name, or `out` is not empty.
+    """
+    files = sorted(
+        path for path in source.iterdir() if path.is_file() and not path.name.startswith(".")
+    )
+    if not files:
+        raise InputError(f"{source}: holds no file, expected tables")
+    stems = [path.stem for path in files]
+    twice = next((stem for stem in stems if stems.count(stem) > 1), None)
+    if twice is not None:
+        raise InputError(f"{source}: two files are called {twice}, expected different names")
+    refuse_full(out)
+    for path in files:
+        try:
+            yield path, import_table(path, find_mapping(path), out / f"{path.stem}.csv")
+        except InputError as error:
+            yield path, error
 
 
 def _assumed_signs(mapping: TableMapping) -> list[str]:

@@ -98,6 +98,12 @@ class _Channel(_Section):
     gain: Number = 1.0
     sign: Literal[1, -1] = 1
 
+    @property
+    def offset(self) -> float:
+        """What is added, in SI: the last field."""
+        *_, (_, value) = self
+        return value
+
     @model_validator(mode="after")
     def _is_not_constant(self) -> "_Channel":
         if self.gain == 0.0:
@@ -181,31 +187,25 @@ def output_columns(mapping: TableMapping) -> list[OutputColumn]:
     Raises:
         InputError: A unit is unknown or of another dimension.
     """
-    height, temperature = mapping.height, mapping.temperature
-    columns = [_output_column("height_m", height, Dimension.LENGTH, height.offset_m)]
-    for name, force in (
-        ("applied_force_n", mapping.applied_force),
-        ("strut_force_n", mapping.strut_force),
-    ):
-        if force is not None:
-            columns.append(_output_column(name, force, Dimension.FORCE, force.offset_n))
-    if temperature is not None:
-        columns.append(
-            _output_column(
-                "temperature_c", temperature, Dimension.TEMPERATURE, temperature.offset_k
-            )
-        )
-    return columns
+    channels = (
+        ("height_m", mapping.height, Dimension.LENGTH),
+        ("applied_force_n", mapping.applied_force, Dimension.FORCE),
+        ("strut_force_n", mapping.strut_force, Dimension.FORCE),
+        ("temperature_c", mapping.temperature, Dimension.TEMPERATURE),
+    )
+    return [
+        _output_column(name, channel, dimension)
+        for name, channel, dimension in channels
+        if channel is not None
+    ]
 
 
-def _output_column(
-    name: str, channel: _Channel, dimension: Dimension, added: float
-) -> OutputColumn:
+def _output_column(name: str, channel: _Channel, dimension: Dimension) -> OutputColumn:
     key = name.rpartition("_")[0]
     conversion = unit_conversion(channel.unit, dimension, key)
     factor = conversion.factor * channel.gain * channel.sign
     words = f"{name} = {factor:.9g} * column {channel.column!r}"
-    offset = conversion.offset + added
+    offset = conversion.offset + channel.offset
     if offset:
         words += f" {'+' if offset > 0 else '-'} {abs(offset):.9g}"
     gain = "" if channel.gain == 1.0 else f", {channel.gain:g} {channel.unit} a reading"

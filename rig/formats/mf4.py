@@ -22,40 +22,29 @@ from rig.log.reader import RunFolder
 _CAN, _STEPS = "CAN_DataFrame", "steps"
 
 
-def _bus_dtype(name: str) -> np.dtype[np.void]:
-    fields = [
-        (f"{name}.BusChannel", "<u1"),
-        (f"{name}.ID", "<u4"),
-        (f"{name}.IDE", "<u1"),
-        (f"{name}.DLC", "<u1"),
-        (f"{name}.DataLength", "<u1"),
-        (f"{name}.DataBytes", "(64,)u1"),
-        (f"{name}.Dir", "<u1"),
-        (f"{name}.EDL", "<u1"),
-        (f"{name}.BRS", "<u1"),
-        (f"{name}.ESI", "<u1"),
-    ]
-    return np.dtype(fields)
-
-
 _FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 """Payload lengths by data length code."""
 
 
 def _records(frames: list[tuple[Frame, str]], name: str) -> NDArray[np.void]:
     """Frames as the MDF standard's bus logging lays them out."""
-    records = np.zeros(len(frames), dtype=_bus_dtype(name))
-    padded = b"".join(frame.data.ljust(64, b"\0") for frame, _ in frames)
-    records[f"{name}.BusChannel"] = 1
-    records[f"{name}.ID"] = [frame.arbitration_id for frame, _ in frames]
-    records[f"{name}.IDE"] = [frame.is_extended for frame, _ in frames]
     lengths = np.array([len(frame.data) for frame, _ in frames], dtype=np.int64)
-    records[f"{name}.DLC"] = np.searchsorted(_FD_LENGTHS, lengths)
-    records[f"{name}.DataLength"] = lengths
-    records[f"{name}.DataBytes"] = np.frombuffer(padded, dtype=np.uint8).reshape(-1, 64)
-    records[f"{name}.Dir"] = [direction == "T" for _, direction in frames]
-    records[f"{name}.EDL"] = [frame.is_fd for frame, _ in frames]
-    records[f"{name}.BRS"] = [frame.bitrate_switch for frame, _ in frames]
+    padded = b"".join(frame.data.ljust(64, b"\0") for frame, _ in frames)
+    fields: list[tuple[str, str, Any]] = [
+        ("BusChannel", "<u1", 1),
+        ("ID", "<u4", [frame.arbitration_id for frame, _ in frames]),
+        ("IDE", "<u1", [frame.is_extended for frame, _ in frames]),
+        ("DLC", "<u1", np.searchsorted(_FD_LENGTHS, lengths)),
+        ("DataLength", "<u1", lengths),
+        ("DataBytes", "(64,)u1", np.frombuffer(padded, dtype=np.uint8).reshape(-1, 64)),
+        ("Dir", "<u1", [direction == "T" for _, direction in frames]),
+        ("EDL", "<u1", [frame.is_fd for frame, _ in frames]),
+        ("BRS", "<u1", [frame.bitrate_switch for frame, _ in frames]),
+        ("ESI", "<u1", 0),
+    ]
+    records = np.zeros(len(frames), dtype=[(f"{name}.{key}", kind) for key, kind, _ in fields])
+    for key, _, values in fields:
+        records[f"{name}.{key}"] = values
     return records
 
 
@@ -106,7 +95,7 @@ def write_mf4(run: RunFolder, out: Path) -> list[Path]:
 
 def _append_signals(mdf: Any, dbc: Path, content: RunContent) -> None:
     """The signals of the frames, decoded by asammdf with the DBC."""
-    if not any(not frame.is_error for frame, _ in content.frames):
+    if all(frame.is_error for frame, _ in content.frames):
         return
     with closing(mdf.extract_bus_logging({"CAN": [(str(dbc), 0)]})) as decoded:
         for number in range(len(decoded.groups)):
@@ -186,16 +175,10 @@ def _read_frames(mdf: Any, name: str) -> Iterable[tuple[Frame, str]]:
 
 def _read_steps(mdf: Any) -> pa.Table:
     prefix = f"{_STEPS}."
-    group = next(
-        (
-            number
-            for number, group in enumerate(mdf.groups)
-            if group.channel_group.comment == _STEPS
-        ),
-        None,
-    )
-    if group is None:
+    comments = [group.channel_group.comment for group in mdf.groups]
+    if _STEPS not in comments:
         return pa.table({})
+    group = comments.index(_STEPS)
     names = [
         channel.name for channel in mdf.groups[group].channels if channel.name.startswith(prefix)
     ]

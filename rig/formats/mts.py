@@ -45,18 +45,27 @@ def is_mts(source: Path) -> bool:
         return False
 
 
+def read_whole(source: Path, most_bytes: int) -> bytes:
+    """Content of a file of limited size.
+
+    Raises:
+        InputError: It is larger, or cannot be read.
+    """
+    try:
+        if source.stat().st_size > most_bytes:
+            raise InputError(f"{source}: expected at most {most_bytes} bytes")
+        return source.read_bytes()
+    except OSError as error:
+        raise InputError(f"{source}: cannot be read: {error.strerror}") from error
+
+
 def read_mts(source: Path) -> tuple[dict[str, Array], dict[str, str]]:
     """Columns of all acquisitions of a file one after the other, and their units.
 
     Raises:
         InputError: One line that names file, line and what was expected.
     """
-    try:
-        if source.stat().st_size > _MAX_BYTES:
-            raise InputError(f"{source}: expected at most {_MAX_BYTES} bytes")
-        text = source.read_text("latin-1")
-    except OSError as error:
-        raise InputError(f"{source}: cannot be read: {error.strerror}") from error
+    text = read_whole(source, _MAX_BYTES).decode("latin-1")
     lines = text.splitlines()
     delimiter, comma = _read_layout(source, lines[0] if lines else "")
     if not text.endswith(("\n", "\r")):
@@ -140,13 +149,9 @@ def _read_heads(
 
 
 def mts_mapping(source: Path, rebound: str) -> TableMapping:
-    """The mapping that a file's own names and units give.
+    """The mapping that a file's own names and units give; displacement is positive in rebound.
 
-    Displacement counts as positive in rebound.
-
-    Args:
-        source: The file.
-        rebound: Sign of the force in rebound, where the damper pulls: `positive` or `negative`.
+    `rebound` is the sign of the force in rebound, where the damper pulls: `positive` or `negative`.
 
     Raises:
         InputError: It is no file of MTS, the sign is neither, a quantity is missing or ambiguous,

@@ -11,7 +11,9 @@ import io
 import logging
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from logging.handlers import QueueHandler
 from pathlib import Path
+from queue import SimpleQueue
 from types import MappingProxyType
 from typing import cast
 
@@ -21,7 +23,7 @@ from numpy.typing import NDArray
 from can_dbc.errors import InputError
 from rig.files.delimited_text import MAX_ROWS
 from rig.formats.mapping import ColumnName, OutputColumn, TableMapping
-from rig.formats.mts import is_mts, read_mts
+from rig.formats.mts import is_mts, read_mts, read_whole
 from rig.formats.text_table import Array, Columns, evenly_sampled, in_seconds
 
 _MAX_BYTES = 1_000_000_000
@@ -31,12 +33,7 @@ _MAX_BYTES = 1_000_000_000
 def read_named_columns(
     source: Path, mapping: TableMapping, outputs: Sequence[OutputColumn]
 ) -> Columns:
-    """Times and readings of a file that names its columns.
-
-    Args:
-        source: File whose suffix is one of `READERS`.
-        mapping: What its columns mean.
-        outputs: The columns of the CSV.
+    """Times and readings of a file of MTS, or of one whose suffix is in `READERS`.
 
     Raises:
         InputError: One line that names file, column and what was expected.
@@ -77,15 +74,9 @@ def read_named_columns(
 
 def _read_file(source: Path) -> Mapping[str, Array]:
     """Columns of a file by their names."""
+    content = read_whole(source, _MAX_BYTES)
     try:
-        if source.stat().st_size > _MAX_BYTES:
-            raise InputError(f"{source}: expected at most {_MAX_BYTES} bytes")
-        content = source.read_bytes()
-    except OSError as error:
-        raise InputError(f"{source}: cannot be read: {error.strerror}") from error
-    read = READERS[source.suffix.lower()]
-    try:
-        return read(content)
+        return READERS[source.suffix.lower()](content)
     except ImportError as error:
         raise InputError(
             f"{source}: requires the package {error.name}: pip install 'rig[tables]'"
@@ -150,29 +141,17 @@ def _cell_number(cell: object) -> float:
     return float(cast("float", cell)) if is_number else float("nan")
 
 
-class _FirstMessage(logging.Handler):
-    """A handler that keeps the first message of a reader."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.text: str | None = None
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Keep a message, if it is the first."""
-        self.text = self.text or record.getMessage()
-
-
 def _read_tdms(content: bytes) -> Mapping[str, Array]:
     """Channels of numbers, as `group/name`."""
     nptdms = importlib.import_module("nptdms")
-    warning = _FirstMessage()
+    warnings: SimpleQueue[logging.LogRecord] = SimpleQueue()
     logs = [logging.getLogger(name) for name in logging.root.manager.loggerDict if "nptdms" in name]
     # The reader only warns of a file that was cut; it is refused here, not read in part.
     for log in logs:
-        log.handlers, log.propagate = [warning], False
+        log.handlers, log.propagate = [QueueHandler(warnings)], False
     file = nptdms.TdmsFile.read(io.BytesIO(content))
-    if warning.text is not None:
-        raise ValueError(warning.text)
+    if not warnings.empty():
+        raise ValueError(warnings.get().getMessage())
     return {
         f"{group.name}/{channel.name}": numbers
         for group in file.groups()

@@ -51,14 +51,7 @@ _SINGULAR = 1e-9
 
 
 class _StrutColumns(NamedTuple):
-    """Columns of a run that belong to a strut, shape (ticks,) each.
-
-    Attributes:
-        virtual_n: Virtual force.
-        law_n: Force of the model's law.
-        innovation_m: Innovation.
-        measured_s: Time of the measurement; NaN in a tick without one.
-    """
+    """Columns of a strut, shape (ticks,) each; NaN in `measured_s` where nothing was measured."""
 
     virtual_n: Array
     law_n: Array
@@ -68,10 +61,6 @@ class _StrutColumns(NamedTuple):
 
 def read_with_smoothed_forces(folder: Path, progress: Progress) -> RunFolder:
     """A run whose steps also have `STRUT.smoothed_force_n` and `STRUT.smoothed_force_std_n`.
-
-    Args:
-        folder: The run's folder.
-        progress: Called with the name of the stage and the share that is done.
 
     Raises:
         InputError: The run is damaged, or its forces cannot be smoothed.
@@ -87,10 +76,7 @@ def read_with_smoothed_forces(folder: Path, progress: Progress) -> RunFolder:
 def smooth_forces(run: RunFolder, plan: Plan, progress: Progress) -> dict[str, tuple[Array, Array]]:
     """Force of each strut at each tick, and its standard deviation, by the strut's name.
 
-    Args:
-        run: The run.
-        plan: Its plan.
-        progress: Called with the name of the stage and the share that is done.
+    `progress` is called with the name of the stage and the share that is done.
 
     Returns:
         Two arrays in N of shape (ticks,); NaN where the bridge was not RUNNING, and of all struts

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
-from can_dbc.units import Dimension
+from can_dbc.units import Dimension, SiConversion
 from rig.files.delimited_text import (
     Column,
     Layout,
@@ -61,16 +61,14 @@ def read_text_columns(
         raise InputError(
             f"{source}: {count} rows from row {table.first_row} on, expected {table.rows}"
         )
-    assumptions = [_layout_words(table, names, count)]
     if time.column is None:
         t_s, words = evenly_sampled(time, count)
-        return t_s, columns, [*assumptions, words]
-    t_s = columns.pop()
-    if time.date_format is not None:
+    elif time.date_format is not None:
+        t_s = columns.pop()
         words = f"t_s from dates in column {time.column!r}, 0 at the first one"
-        return t_s, columns, [*assumptions, words]
-    t_s, words = in_seconds(time, t_s)
-    return t_s, columns, [*assumptions, words]
+    else:
+        t_s, words = in_seconds(time, columns.pop())
+    return t_s, columns, [_layout_words(table, names, count), words]
 
 
 def evenly_sampled(time: TimeColumn, count: int) -> tuple[Array, str]:
@@ -80,13 +78,17 @@ def evenly_sampled(time: TimeColumn, count: int) -> tuple[Array, str]:
     return np.arange(count) / rate_hz, words
 
 
+def _time_conversion(time: TimeColumn) -> SiConversion:
+    return unit_conversion(time.unit or "", Dimension.TIME, "time")
+
+
 def in_seconds(time: TimeColumn, readings: Array) -> tuple[Array, str]:
     """Times in s from readings in the mapping's unit, and the assumption in words.
 
     Raises:
         InputError: The unit is none of time.
     """
-    factor = unit_conversion(time.unit or "", Dimension.TIME, "time").factor
+    factor = _time_conversion(time).factor
     words = f"t_s = {factor:.9g} * column {time.column!r} (read in {time.unit})"
     return factor * readings, words
 
@@ -100,29 +102,31 @@ def _read_columns(
 ) -> list[Array]:
     """Readings of each output, then of the time where it has a column, shape (rows,) each."""
     name, time, decimal = str(source), mapping.time, mapping.table.decimal
-    indices = [_column_index(source, output.key, output.column, names) for output in outputs]
-    read_time: Callable[[Column], Array] | None = None
-    time_index = 0
+
+    def read_some(column: Column) -> Array:
+        return read_numbers(column, decimal)
+
+    def read_all(column: Column) -> Array:
+        readings = read_numbers(column, decimal)
+        refuse_missing(column, readings, "only heights may be missing")
+        return readings
+
+    readers: list[tuple[str, int, Callable[[Column], Array]]] = []
+    for output in outputs:
+        index = _column_index(source, output.key, output.column, names)
+        readers.append((output.key, index, read_all if readers else read_some))
     if time is not None and time.column is not None:
-        time_index = _column_index(source, "time", time.column, names)
-        read_time = _time_reader(time, decimal)
-    parts: list[list[Array]] = []
-    for piece in pieces(name, rows):
-        readings: list[Array] = []
-        for output, index in zip(outputs, indices, strict=True):
-            column = column_of(name, output.key, piece, index)
-            readings.append(read_numbers(column, decimal))
-            if output is not outputs[0]:
-                refuse_missing(column, readings[-1], _WHICH_MAY_BE_MISSING)
-        if read_time is not None:
-            readings.append(read_time(column_of(name, "time", piece, time_index)))
-        parts.append(readings)
+        index = _column_index(source, "time", time.column, names)
+        if time.date_format is None:
+            _time_conversion(time)  # refused before a long file is read
+        readers.append(("time", index, _Dates(time.date_format) if time.date_format else read_all))
+    parts = [
+        [read(column_of(name, key, piece, index)) for key, index, read in readers]
+        for piece in pieces(name, rows)
+    ]
     if not parts:
         raise InputError(f"{source}: no rows of data after the header, expected some")
     return [np.concatenate(readings) for readings in zip(*parts, strict=True)]
-
-
-_WHICH_MAY_BE_MISSING = "only heights may be missing"
 
 
 def _layout_words(table: TextLayout, names: list[str] | None, count: int) -> str:
@@ -164,25 +168,8 @@ def _column_index(source: Path, key: str, column: ColumnName, names: list[str] |
     return names.index(column)
 
 
-def _time_reader(time: TimeColumn, decimal: str) -> Callable[[Column], Array]:
-    if time.date_format is not None:
-        return _Dates(time.date_format)
-    unit_conversion(time.unit or "s", Dimension.TIME, "time")  # refused before a long file is read
-
-    def read_times(column: Column) -> Array:
-        readings = read_numbers(column, decimal)
-        refuse_missing(column, readings, _WHICH_MAY_BE_MISSING)
-        return readings
-
-    return read_times
-
-
 class _Dates:
-    """Reads cells as dates, and gives seconds since the first one, exact to the microsecond.
-
-    Args:
-        date_format: Format of the dates, as in the mapping.
-    """
+    """Reads cells as dates, and gives seconds since the first one, exact to the microsecond."""
 
     def __init__(self, date_format: str) -> None:
         self._format = date_format

@@ -8,7 +8,6 @@ import textwrap
 import types
 import typing
 from collections.abc import Iterator, Mapping
-from html import escape
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,6 +25,7 @@ from dart_model.spec import ModelSpec
 from rig.bridge.publications import STATUS, STRUT, TIMING
 from rig.channels.quantities import BENCH_QUANTITIES, HEIGHT
 from rig.observers import OBSERVERS
+from rig.pages.html import render
 from rig.plan.config import OneOf, RunConfig
 from rig.simulated_bench.effects import EFFECT_KINDS
 from rig.simulated_bench.schema import BenchConfig
@@ -53,26 +53,9 @@ _MOTION = Motion(
 )
 """Motion along which each effect is drawn, with the initial parameters of a search."""
 
-_STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;
-color:#1c1e21;background:#fff}
-h1,h2,h3{line-height:1.2}h2{margin-top:3rem;border-bottom:2px solid #d5d9e0}
-h3{margin:2.2rem 0 .4rem;font-family:ui-monospace,monospace}
-table{border-collapse:collapse;margin:.6rem 0;width:100%}
-td,th{border-bottom:1px solid #e3e6ea;padding:.25rem .6rem;text-align:left;vertical-align:top}
-code,pre{font-family:ui-monospace,monospace;font-size:.9em}pre{background:#f4f6f8;padding:.7rem;
-overflow-x:auto}img{max-width:100%}nav a{margin-right:1rem}.unit{color:#5b6470}
-@media(prefers-color-scheme:dark){body{color:#e4e6ea;background:#16181c}pre{background:#22262c}
-td,th{border-color:#333940}h2{border-color:#3a4048}img{background:#fff}}
-"""
-
 
 def write_reference(folder: Path, commands: Mapping[str, str]) -> Path:
-    """Write the reference as one page; returns the file.
-
-    Args:
-        folder: Where to write `index.html`.
-        commands: Help text of each command, by its name.
+    """Write the reference as `index.html`, with the help text of each command; returns the file.
 
     Raises:
         InputError: The folder cannot be written, or holds a reference.
@@ -80,71 +63,39 @@ def write_reference(folder: Path, commands: Mapping[str, str]) -> Path:
     path = folder / "index.html"
     if path.exists():
         raise InputError(f"{path}: exists, expected a folder without it")
-    text = _page(commands)
+    text = render(
+        "reference/page.html",
+        families={
+            words: [item for item in CATALOGUE.values() if item.family == family]
+            for family, words in FAMILY_WORDS.items()
+        },
+        formula=_formula,
+        picture_of=_picture,
+        keys_of=_rows,
+        bridge=RunConfig,
+        observers=OBSERVERS,
+        measured=[
+            (q.key, q.dimension.value, q.column, q.words) for q in (HEIGHT, *BENCH_QUANTITIES)
+        ],
+        published=[
+            (group, item.key, item.dimension.value, item.signal)
+            for group, items in (("publish", STRUT), ("status", STATUS), ("timing", TIMING))
+            for item in items
+        ],
+        model=ModelSpec,
+        bench=BenchConfig,
+        bench_effects=[
+            (name, ", ".join(parameter.name for parameter in kind.parameters))
+            for name, kind in EFFECT_KINDS.items()
+        ],
+        commands=commands,
+    )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         path.write_text(text, "utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
     return path
-
-
-def _page(commands: Mapping[str, str]) -> str:
-    parts = [
-        "<h1>rig: reference</h1><p>Made from the code by <code>rig docs</code>. SI everywhere; "
-        "every strut force is positive when it pushes its two bodies apart.</p>",
-        '<nav><a href="#effects">Effects</a><a href="#configuration">Configuration</a>'
-        '<a href="#bus">What is measured and published</a><a href="#model">Model file</a>'
-        '<a href="#bench">Simulated bench</a><a href="#commands">Commands</a></nav>',
-        '<h2 id="effects">Effects</h2><p>Each is drawn at the parameters with which a search '
-        "begins, over a stroke of 100 mm at 2.4 Hz: force over height, and over velocity.</p>",
-    ]
-    for family, words in FAMILY_WORDS.items():
-        effects = [item for item in CATALOGUE.values() if item.family == family]
-        if effects:
-            parts.append(f"<h2>{escape(family)}: {escape(words)}</h2>")
-            parts += map(_effect, effects)
-    parts.append('<h2 id="configuration">Configuration of the bridge</h2>')
-    parts.append(_keys(RunConfig))
-    for kind, observer in OBSERVERS.items():
-        parts.append(f"<h3>observers.&lt;strut&gt; of kind {escape(kind)}</h3>")
-        parts.append(_keys(observer))
-    parts.append('<h2 id="bus">What is measured and published</h2>')
-    parts.append(_bus())
-    parts.append('<h2 id="model">Model file</h2>')
-    parts.append(_keys(ModelSpec))
-    parts.append('<h2 id="bench">Configuration of a simulated bench</h2>')
-    parts.append(_keys(BenchConfig))
-    parts.append("<p>Undeclared effects, which share no code with those of a model:</p>")
-    parts.append(_table(("name", "parameters"), _bench_effects()))
-    parts.append('<h2 id="commands">Commands</h2>')
-    for name, text in commands.items():
-        parts.append(f"<h3>rig {escape(name)}</h3><pre>{escape(text)}</pre>")
-    return (
-        '<!doctype html><html lang="en"><meta charset="utf-8"><title>rig: reference</title>'
-        '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<style>{_STYLE}</style>{''.join(parts)}</html>"
-    )
-
-
-def _effect(item: Effect) -> str:
-    parameters = [
-        (p.name, p.unit or "-", f"{p.low:g} to {p.high:g}", p.meaning) for p in item.parameters
-    ]
-    shown = parameters[:12]
-    rest = f"<p>and {len(parameters) - 12} more</p>" if len(parameters) > 12 else ""
-    rate = ""
-    if item.rate is not None:
-        formula = _formula("rate", item.rate)
-        rate = f"<p>Rate of its internal states:</p><pre>{escape(formula)}</pre>"
-    simpler = f" Degenerates to {', '.join(item.simpler)}." if item.simpler else ""
-    return (
-        f'<h3 id="{item.name}">{item.name}</h3><p>{escape(item.words)}.{escape(simpler)} '
-        f"Seen with: {escape(item.excitation)}.</p>"
-        f"{_table(('parameter', 'unit', 'bounds', 'meaning'), shown)}{rest}"
-        f"<p>Force in N:</p><pre>{escape(_formula('force_n', item.force))}</pre>"
-        f"{rate}{_picture(item)}<p>{escape(item.reference)}</p>"
-    )
 
 
 def _formula(name: str, law: Force | Rate) -> str:
@@ -157,7 +108,7 @@ def _formula(name: str, law: Force | Rate) -> str:
 
 
 def _picture(item: Effect) -> str:
-    """Force of an effect along a harmonic motion, as an image within the page."""
+    """Force of an effect along a harmonic motion, a PNG in base64; empty if it has no start."""
     starts = item.starts(_MOTION)
     if not starts:
         return ""
@@ -172,8 +123,7 @@ def _picture(item: Effect) -> str:
         panel.grid(alpha=0.3)
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=80)
-    data = base64.b64encode(file.getvalue()).decode("ascii")
-    return f'<img alt="force of {item.name}" src="data:image/png;base64,{data}">'
+    return base64.b64encode(file.getvalue()).decode("ascii")
 
 
 def _loop(item: Effect, parameters: list[float]) -> tuple[Array, Array, Array]:
@@ -202,33 +152,7 @@ def _loop(item: Effect, parameters: list[float]) -> tuple[Array, Array, Array]:
     return height[half:], velocity[half:], force[half:]
 
 
-def _bus() -> str:
-    measured = [(q.key, q.dimension.value, q.column, q.words) for q in (HEIGHT, *BENCH_QUANTITIES)]
-    published = [
-        (group, item.key, item.dimension.value, item.signal)
-        for group, items in (("publish", STRUT), ("status", STATUS), ("timing", TIMING))
-        for item in items
-    ]
-    return (
-        _table(("key under signals", "unit", "column of the log", "meaning"), measured)
-        + "<p>Units of the DBC are converted. What is published:</p>"
-        + _table(("under", "key", "unit", "signal if only a message is given"), published)
-    )
-
-
-def _bench_effects() -> list[tuple[str, ...]]:
-    return [
-        (name, ", ".join(parameter.name for parameter in kind.parameters))
-        for name, kind in EFFECT_KINDS.items()
-    ]
-
-
-def _keys(model: type[object], prefix: str = "") -> str:
-    rows = list(_rows(model, prefix))
-    return _table(("key", "default", "meaning"), rows)
-
-
-def _rows(model: type[object], prefix: str) -> Iterator[tuple[str, str, str]]:
+def _rows(model: type[object], prefix: str = "") -> Iterator[tuple[str, str, str]]:
     """Key, default and meaning of every key of a configuration and of its sections."""
     meanings = _attributes(model)
     fields = cast("Mapping[str, FieldInfo]", getattr(model, _FIELDS))
@@ -275,16 +199,3 @@ def _attributes(model: type[object]) -> dict[str, str]:
         for name, text in re.findall(r"^ {4}(\w+):(.*(?:\n {5,}.*)*)", section, re.MULTILINE):
             meanings[name] = " ".join(text.split())
     return meanings
-
-
-def _table(heads: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    head = "".join(f"<th>{escape(cell)}</th>" for cell in heads)
-    body = "".join(
-        "<tr><td><code>"
-        + escape(first)
-        + "</code></td>"
-        + "".join(f"<td>{escape(cell)}</td>" for cell in rest)
-        + "</tr>"
-        for first, *rest in rows
-    )
-    return f"<table><tr>{head}</tr>{body}</table>"

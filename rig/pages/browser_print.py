@@ -36,11 +36,7 @@ def find_browser() -> str:
 
 
 def print_page(page: Path, pdf: Path) -> None:
-    """Print a page, which needs no network, to PDF.
-
-    Args:
-        page: HTML file.
-        pdf: File to write.
+    """Print an HTML page, which needs no network, to a PDF file.
 
     Raises:
         InputError: No browser is installed, it fails, or the file cannot be written.

@@ -1,21 +1,19 @@
 """Page of damper characteristics: PVP, CVP and F-x plots, and tables."""
 
-import base64
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rig.dyno.characterise import AtRest, Characteristics
+from rig.dyno.characterise import Characteristics
 from rig.dyno.faults import MasterComparison
-from rig.dyno.figures import SIDES, DynoStep
+from rig.dyno.figures import SIDES
 from rig.dyno.report import DamperReport
 from rig.dyno.stroke_force import ANGLES, Figure
 from rig.dyno.tolerance import PointVerdict
 from rig.files.pictures import new_figure
-from rig.pages.html import render_report, write_page
+from rig.pages.html import render_report, svg_url, write_page
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers and in grey print.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#a3458f", "#56b4e9", "#7f6000")
@@ -24,22 +22,18 @@ _SIGNS = (
     "rebound damping negative. Velocity and height are positive in rebound."
 )
 _MOST_SAMPLES = 4000
-_KINDS = {
+KIND_WORDS = {
     "warm_up": "warm-up",
     "quasi_static": "quasi-static",
     "velocity_step": "velocity step",
 }
+"""Name of a kind of step in a sentence."""
 
 
 def write_characteristics_page(
     reports: Sequence[DamperReport], path: Path, serial: str | None = None
 ) -> None:
-    """Write the page of one record, or of several superimposed.
-
-    Args:
-        reports: The records.
-        path: New HTML file.
-        serial: Serial number.
+    """Write the HTML page of one record, or of several superimposed, with their serial number.
 
     Raises:
         InputError: The file cannot be written.
@@ -49,17 +43,14 @@ def write_characteristics_page(
     text = render_report(
         "characteristics.html",
         names=[item.name for item in records],
-        headline=_headline(records),
         signs=_SIGNS,
-        picture="data:image/svg+xml;base64,"
-        + base64.b64encode(draw(records, points)).decode("ascii"),
+        picture=_draw(records, points),
         serial=serial,
         badge=_badge(points, [report.against_master for report in reports]),
-        records=[
-            _record(report.characteristics)
-            | {"points": report.points, "naming": report.against_master}
-            for report in reports
-        ],
+        reports=reports,
+        kinds=KIND_WORDS,
+        damper_rows=damper_rows,
+        with_half=with_half,
     )
     write_page(text, path)
 
@@ -79,10 +70,8 @@ def _badge(
     return ("good", "✓", "In tolerance") if verdicts == {"pass"} else ("part", "?", "Not proven")
 
 
-def draw(
-    records: Sequence[Characteristics], points: Sequence[Sequence[PointVerdict]] = ()
-) -> bytes:
-    """Peak force over peak velocity, force over velocity and force over displacement, as SVG."""
+def _draw(records: Sequence[Characteristics], points: Sequence[Sequence[PointVerdict]]) -> str:
+    """Peak force over peak velocity, force over velocity and force over displacement."""
     style = {
         "axes.grid": True,
         "grid.alpha": 0.3,
@@ -120,9 +109,7 @@ def draw(
             ylabel="force / N",
         )
         peaks.legend(fontsize="small")
-        image = io.BytesIO()
-        figure.savefig(image, format="svg", metadata={"Date": None})
-    return image.getvalue()
+        return svg_url(figure)
 
 
 def _draw_peaks(axes: Any, item: Characteristics, colour: str) -> None:
@@ -143,7 +130,7 @@ def _draw_peaks(axes: Any, item: Characteristics, colour: str) -> None:
 def _draw_band(axes: Any, points: Sequence[Sequence[PointVerdict]]) -> None:
     """Draw the tolerance band of each side."""
     for side in SIDES:
-        mine = [point for point in (points[0] if points else ()) if point.side == side]
+        mine = [point for point in points[0] if point.side == side]
         if mine:
             speeds = [point.velocity_m_per_s for point in mine]
             low, high = [point.low_n for point in mine], [point.high_n for point in mine]
@@ -172,58 +159,6 @@ def _draw_loops(
             heights.plot(x_mm, stroke.force_n, **style)
 
 
-def _headline(records: Sequence[Characteristics]) -> str:
-    parts: list[str] = []
-    for item in records:
-        fastest = max(item.steps, key=lambda step: step.peak_speed_m_per_s)
-        down, up = fastest.compression, fastest.rebound
-        steps = f"{len(item.steps)} steps" if len(item.steps) > 1 else "one step"
-        parts.append(
-            f"{item.name}: {steps}, {down.force_at_peak_velocity_n.value:.0f} N in compression and "
-            f"{up.force_at_peak_velocity_n.value:.0f} N in rebound at "
-            f"{fastest.peak_speed_m_per_s:.3g} m/s."
-        )
-    return " ".join(parts)
-
-
-def _record(item: Characteristics) -> dict[str, object]:
-    warm = any(step.temperature_c is not None for step in item.steps)
-    rows = [
-        {"kind": kind_words(kind), "cells": _cells(step, warm=warm)}
-        for kind, step in zip(item.damper.kinds, item.steps, strict=True)
-    ]
-    name = f"{item.name}, strut {item.record.strut}" if item.record.strut else item.name
-    return {
-        "name": f"{name} (force: {item.record.source})",
-        "warm": warm,
-        "rows": rows,
-        "damper": damper_rows(item),
-        "notes": (*item.quality, *item.damper.notes),
-    }
-
-
-def _cells(step: DynoStep, *, warm: bool) -> list[str]:
-    down, up = step.compression, step.rebound
-    speeds = dict.fromkeys(f"{side.peak_velocity_m_per_s.value:.3g}" for side in (down, up))
-    temperature = "—" if step.temperature_c is None else f"{step.temperature_c:.1f}"
-    return [
-        f"{step.cycles:g}",
-        f"±{1e3 * step.amplitude_m:.2f}",
-        "—" if step.frequency_hz is None else f"{step.frequency_hz:.3f}",
-        *([temperature] if warm else []),
-        " / ".join(speeds),
-        with_half(down.force_at_peak_velocity_n),
-        with_half(up.force_at_peak_velocity_n),
-        with_half(step.energy_per_cycle_j),
-        with_half(step.equivalent_damping_n_s_per_m),
-    ]
-
-
-def kind_words(kind: str) -> str:
-    """Name of a kind of step in a sentence."""
-    return _KINDS[kind]
-
-
 def damper_rows(item: Characteristics) -> list[tuple[str, str, str, str]]:
     """Figures over all steps and at rest: name, value, interval and method."""
     damper = item.damper
@@ -237,30 +172,32 @@ def damper_rows(item: Characteristics) -> list[tuple[str, str, str, str]]:
             (f"change per kelvin, {side}", figure, "N/K")
             for side, figure in damper.force_per_kelvin_n_per_k.items()
         ],
-        *[(_label_of(hold), hold.force_n, "N") for hold in item.holds],
+    ]
+    named += [
+        (f"force at rest, {1e3 * hold.height_m:.1f} mm, at {hold.begin_s:.1f} s", hold.force_n, "N")
+        for hold in item.holds
     ]
     return [_row(name, figure, unit) for name, figure, unit in named if figure is not None]
 
 
-def _label_of(hold: AtRest) -> str:
-    return f"force at rest, {1e3 * hold.height_m:.1f} mm, at {hold.begin_s:.1f} s"
-
-
 def _row(name: str, figure: Figure, unit: str) -> tuple[str, str, str, str]:
-    value = f"{_digits(figure.value, figure)} {unit}"
-    interval = f"{_digits(figure.low, figure)} to {_digits(figure.high, figure)}"
-    return name, value, interval, figure.method
+    half = _half(figure)
+    interval = f"{_digits(figure.low, half)} to {_digits(figure.high, half)}"
+    return name, f"{_digits(figure.value, half)} {unit}", interval, figure.method
 
 
 def with_half(figure: Figure) -> str:
     """A figure with half of its interval, with the digits that the interval justifies."""
-    half = 0.5 * (figure.high - figure.low)
-    return f"{_digits(figure.value, figure)} ± {half:.2g}"
+    half = _half(figure)
+    return f"{_digits(figure.value, half)} ± {half:.2g}"
 
 
-def _digits(value: float, figure: Figure) -> str:
-    """A value to a tenth of its interval."""
-    half = 0.5 * (figure.high - figure.low)
+def _half(figure: Figure) -> float:
+    return 0.5 * (figure.high - figure.low)
+
+
+def _digits(value: float, half: float) -> str:
+    """A value to a tenth of its interval, of which the half is given."""
     if not half > 0.0:
         return f"{value:.5g}"
     decimals = max(0, 1 - int(np.floor(np.log10(half))))

@@ -1,8 +1,5 @@
 """Page of a store of many runs: changes and drifts, with the series that show them."""
 
-import base64
-import io
-from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
 
@@ -11,7 +8,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from rig.files.pictures import new_figure
 from rig.fleet.overview import Overview, Series
 from rig.fleet.sentences import alarm_sentences, series_name
-from rig.pages.html import render_report, write_page
+from rig.pages.html import render_report, svg_url, write_page
 
 _MOST = 12
 """Series that are drawn, the most certain first."""
@@ -34,23 +31,13 @@ def write_fleet_page(overview: Overview, path: Path) -> None:
     drawn += [item for item in overview.series if item.is_drift]
     text = render_report(
         "fleet.html",
-        headline=overview.words,
         alarms=alarm_sentences(overview),
-        verdicts=[verdict.replace("_", " ") for verdict in verdicts],
-        benches=[
-            (bench, sum(counts.values()), [_share(counts, verdict) for verdict in verdicts])
-            for bench, counts in overview.verdicts.items()
-        ],
-        failed=list(overview.failed.items())[:10],
+        verdicts=verdicts,
+        overview=overview,
         pictures=[(series_name(item), _picture(overview, item)) for item in drawn[:_MOST]],
         left_out=max(0, len(drawn) - _MOST),
     )
     write_page(text, path)
-
-
-def _share(counts: Mapping[str, int], verdict: str) -> str:
-    count = counts.get(verdict, 0)
-    return f"{count} ({100 * count / sum(counts.values()):.0f} %)" if count else "0"
 
 
 def _picture(overview: Overview, item: Series) -> str:
@@ -68,9 +55,7 @@ def _picture(overview: Overview, item: Series) -> str:
         axes.plot(days, values, "o-", color=_COLOUR, markersize=3, linewidth=1, label=label)
         change = item.change
         if item.is_change and change is not None:
-            low, day, high = (
-                date.fromordinal(round(d)) for d in (change.low, change.day, change.high)
-            )
+            low, day, high = map(_date, (change.low, change.day, change.high))
             axes.axvspan(low, high, color=_CHANGED, alpha=0.15, linewidth=0)
             axes.axvline(day, color=_CHANGED, label=f"{change.kind}, with its 95 % interval")
         locator = AutoDateLocator()
@@ -78,14 +63,11 @@ def _picture(overview: Overview, item: Series) -> str:
         axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))
         axes.set_ylabel(item.quantity.parameter)
         axes.legend(fontsize="small", frameon=False, loc="upper left")
-        image = io.BytesIO()
-        figure.savefig(image, format="svg", metadata={"Date": None})
-    return "data:image/svg+xml;base64," + base64.b64encode(image.getvalue()).decode("ascii")
+        return svg_url(figure)
 
 
 def _columns(item: Series) -> tuple[list[date], list[float]]:
-    points = item.points
-    return [_date(p.day) for p in points], [p.value for p in points]
+    return [_date(point.day) for point in item.points], [point.value for point in item.points]
 
 
 def _date(day: float) -> date:

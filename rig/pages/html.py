@@ -2,7 +2,9 @@
 
 import base64
 import hashlib
+import io
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -18,22 +20,12 @@ _TEMPLATES = Environment(
 
 
 def render(template: str, **content: object) -> str:
-    """Text of a page.
-
-    Args:
-        template: File of the template, below the folder of this module.
-        content: Variables of the template.
-    """
+    """Text of a page, from a template below the folder of this module."""
     return _TEMPLATES.get_template(template).render(**content)
 
 
 def render_report(template: str, **content: object) -> str:
-    """Text of a report: a page that holds the scripts and styles of its charts.
-
-    Args:
-        template: File of the template in the folder ``report``.
-        content: Variables of the template.
-    """
+    """Text of a report, from a template in ``report``: it holds its charts' scripts and styles."""
     report = _HERE / "report"
     scripts = [path.read_text("utf-8") for path in (*charts.SCRIPTS, report / "page.js")]
     return render(
@@ -43,6 +35,13 @@ def render_report(template: str, **content: object) -> str:
         script_hashes=[_hash(script) for script in scripts],
         **content,
     )
+
+
+def svg_url(figure: Any) -> str:
+    """A drawing of matplotlib as an SVG in a data URL."""
+    image = io.BytesIO()
+    figure.savefig(image, format="svg", metadata={"Date": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(image.getvalue()).decode("ascii")
 
 
 def write_page(text: str, path: Path) -> None:

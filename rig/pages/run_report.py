@@ -38,11 +38,7 @@ _KILLED = ("part", "◐", "Killed, or still running")
 
 
 def write_run_report(folder: Path, path: Path) -> None:
-    """Write the report of a run.
-
-    Args:
-        folder: Folder of the run.
-        path: File to write.
+    """Write the report of a run's folder.
 
     Raises:
         InputError: The folder holds no run, or a run without a tick, or the file cannot be written.
@@ -63,7 +59,11 @@ def write_run_report(folder: Path, path: Path) -> None:
         sign=sign,
         badge=badge,
         headline=_headline(header, follower, ending),
-        facts=_facts(header, follower, ending),
+        start=np.datetime64(int(header.get("epoch_ns", 0)), "ns").astype("datetime64[s]"),
+        header=header,
+        ending=ending,
+        duration_s=follower.span_s[1] - follower.span_s[0],
+        steps=follower.steps,
         counts=_counts(ending),
         timing=_timing(ending) if header.get("granted") is not None else [],
         strut_plots=[
@@ -71,8 +71,6 @@ def write_run_report(folder: Path, path: Path) -> None:
             for index, strut in enumerate(struts)
         ],
         timing_plot=_timing_plot(folder),
-        versions=header.get("versions", {}),
-        files=header.get("files_sha256", {}),
     )
     write_page(text, path)
 
@@ -87,33 +85,6 @@ def _headline(header: RunHeader, follower: RunFollower, ending: Ending) -> str:
     missed = counts.pop("overruns", 0)
     faults = ", ".join(f"{count} {name}" for name, count in counts.items())
     return f"{text}, {missed or 'no'} ticks missed; counted: {faults or 'no fault'}."
-
-
-def _facts(header: RunHeader, follower: RunFollower, ending: Ending) -> list[tuple[str, str]]:
-    config = header.get("config", {})
-    bus = config.get("bus", {})
-    begin_s, end_s = follower.span_s
-    start = np.datetime64(int(header.get("epoch_ns", 0)), "ns").astype("datetime64[s]")
-    is_real = header.get("granted") is not None
-    facts = [
-        ("Start", f"{str(start).replace('T', ' ')} UTC" if is_real else "in simulated time"),
-        ("Duration", f"{end_s - begin_s:.3f} s, {follower.steps} ticks"),
-        ("Rate", f"{config.get('rate_hz', '?')} Hz"),
-        ("Model", str(config.get("model", "?"))),
-        (
-            "Bus",
-            f"{bus.get('interface', '?')} {bus.get('channel', '')}, {bus.get('bitrate')} bit/s",
-        ),
-        ("Configuration", str(header.get("config_source", "?"))),
-    ]
-    if log_fault := ending.get("log_fault"):
-        facts.append(("Log", f"{log_fault}; {ending.get('dropped_steps', 0)} ticks lost"))
-    diverged = ending.get("diverged")
-    if diverged:
-        facts.append(("Diverged", f"strut {diverged['strut']} at {diverged['t_s']:.3f} s"))
-    if header.get("forced"):
-        facts.append(("Forced", "errors of the check were ignored"))
-    return facts
 
 
 def _counts(ending: Ending) -> list[tuple[str, int]]:

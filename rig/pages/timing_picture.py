@@ -58,13 +58,9 @@ def draw_run(ended: Ended) -> Path:
 def draw_timing(
     path: Path, title: str, distributions: tuple[Distribution, ...], period_us: float
 ) -> None:
-    """Draw histograms in one column, on logarithmic axes.
+    """Draw histograms in one column, on logarithmic axes, with the period as a limit, as PNG.
 
-    Args:
-        path: PNG file.
-        title: Title of the picture.
-        distributions: The histograms; one without a tick is left empty.
-        period_us: Time between two ticks, drawn as a limit.
+    A histogram without a tick is left empty.
 
     Raises:
         OSError: The file cannot be written.

@@ -15,11 +15,7 @@ _TOTAL, _NOISE, _LAG, _PAPER = "#1b1f24", "#0072b2", "#d55e00", "#a3458f"
 
 
 def draw_tuning(tuned: Sequence[TunedStrut], path: Path) -> None:
-    """Draw the error by noise, by lag and in total, with the chosen and the published gains.
-
-    Args:
-        tuned: The struts.
-        path: PNG file.
+    """Draw the error by noise, by lag and in total, with chosen and published gains, as PNG.
 
     Raises:
         InputError: The file cannot be written.

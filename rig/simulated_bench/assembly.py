@@ -1,7 +1,7 @@
 """From the bench's configuration to its equations of motion and its state at the start."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,13 +31,17 @@ from rig.simulated_bench.schema import (
     AppliedForce,
     BenchConfig,
     BenchConfigError,
+    Component,
+    DamperCurve,
     ForceFile,
+    HeightComponent,
     HeightFile,
     HeightMultisine,
     HeightSine,
     HeightSweep,
     Multisine,
     Sine,
+    SpringCurve,
     StrutMotion,
     Sweep,
     UndeclaredEffect,
@@ -48,13 +52,7 @@ EQUILIBRIUM_TOLERANCE_M_PER_S2 = 1e-9
 
 
 class Assembly(NamedTuple):
-    """A bench ready to run.
-
-    Attributes:
-        mechanics: Its equations of motion.
-        drive: Its applied force and prescribed motion.
-        start: State at time zero, shape (states,).
-    """
+    """A bench ready to run, with its state at time zero, shape (states,)."""
 
     mechanics: BenchMechanics
     drive: BenchDrive
@@ -63,12 +61,6 @@ class Assembly(NamedTuple):
 
 def assemble(config: BenchConfig) -> Assembly:
     """Build the equations of motion and the state at the start.
-
-    Args:
-        config: The bench.
-
-    Returns:
-        The bench ready to run.
 
     Raises:
         BenchConfigError: It has no static equilibrium to start from, or an effect leaves a body no
@@ -85,16 +77,16 @@ def assemble(config: BenchConfig) -> Assembly:
 def _mechanics(config: BenchConfig) -> BenchMechanics:
     uppers = [strut.between[1] for strut in config.struts]
     lowers = [strut.between[0] for strut in config.struts]
-    thermal = config.temperature
+    thermal, motion = config.temperature, config.prescribed_motion
     return BenchMechanics(
         gravity_m_per_s2=config.gravity_m_per_s2,
         mass_kg=_masses(config, uppers),
         lower=np.array([-1 if name == WORLD else uppers.index(name) for name in lowers]),
         driven=uppers.index(config.applied_force.body or uppers[0]),
-        prescribed=_index_of_height_arrays(config),
+        prescribed=-1 if motion is None else _strut_index(config, motion.strut),
         free_length_m=np.array([strut.free_length_m for strut in config.struts]),
-        springs=_curves([(s.spring.height_m, s.spring.force_n) for s in config.struts]),
-        dampers=_curves([(s.damper.velocity_m_per_s, s.damper.force_n) for s in config.struts]),
+        springs=_curves([_by_points(strut.spring) for strut in config.struts]),
+        dampers=_curves([_by_points(strut.damper) for strut in config.struts]),
         effects=_effects(config),
         thermal=Thermal(
             warming_k_per_j=1.0 / (thermal.heat_capacity_j_per_k or math.inf),
@@ -104,18 +96,12 @@ def _mechanics(config: BenchConfig) -> BenchMechanics:
     )
 
 
-def _index_of_height_arrays(config: BenchConfig) -> int:
-    if config.prescribed_motion is None:
-        return -1
-    return [strut.name for strut in config.struts].index(config.prescribed_motion.strut)
-
-
 def _masses(config: BenchConfig, uppers: list[str]) -> Floats:
     by_name = {mass.name: mass.mass_kg for mass in config.masses}
     mass_kg = np.array([by_name[name] for name in uppers], dtype=np.float64)
     for index, effect in enumerate(config.undeclared_effects):
         if EFFECT_KINDS[effect.name].law == LawCode.ADDED_MASS:
-            body = _strut_index(config, effect)
+            body = _strut_index(config, effect.strut)
             mass_kg[body] += parameter_values(effect.name, effect.parameters)[0]
             if mass_kg[body] <= 0.0:
                 raise BenchConfigError(
@@ -125,40 +111,36 @@ def _masses(config: BenchConfig, uppers: list[str]) -> Floats:
     return mass_kg
 
 
-def _strut_index(config: BenchConfig, effect: UndeclaredEffect) -> int:
-    return [strut.name for strut in config.struts].index(effect.strut)
+def _strut_index(config: BenchConfig, name: str) -> int:
+    return [strut.name for strut in config.struts].index(name)
 
 
-def _curves(points: Sequence[tuple[Sequence[float], Sequence[float]]]) -> Curves:
-    segments = [_segments(np.array(at), np.array(force_n)) for at, force_n in points]
+def _curves(segments: Sequence[Floats]) -> Curves:
+    """Curves by the segments of each, shape (segments, 6)."""
     return Curves(
-        first=np.cumsum([0, *(len(part) for part in segments)]), segments=np.concatenate(segments)
+        first=np.cumsum([0, *(len(part) for part in segments)]),
+        segments=np.concatenate([np.empty((0, 6)), *segments]),
     )
 
 
-def _segments(at: Floats, force_n: Floats) -> Floats:
+def _by_points(curve: SpringCurve | DamperCurve) -> Floats:
     """Segments of a curve through points without overshoot, shape (segments, 6)."""
-    pchip = interpolate.PchipInterpolator(at, force_n)
-    cubic = np.asarray(pchip.c, dtype=np.float64).T
-    return np.column_stack([at[:-1], np.diff(at), cubic])
+    at, force_n = (np.array(points) for _, points in curve)
+    return _segments(at, interpolate.PchipInterpolator(at, force_n))
+
+
+def _segments(at: Floats, cubics: interpolate.PPoly) -> Floats:
+    return np.column_stack([at[:-1], np.diff(at), np.asarray(cubics.c, dtype=np.float64).T])
 
 
 def _force_arrays(force: AppliedForce, effects: tuple[UndeclaredEffect, ...]) -> DrivenForce:
-    sines: list[tuple[float, ...]] = []
-    sweeps: list[tuple[float, ...]] = []
+    sines, sweeps = _sines_and_sweeps(force.components)
     files = [part.samples for part in force.components if isinstance(part, ForceFile)]
-    for part in force.components:
-        if isinstance(part, Sine):
-            sines.append((part.amplitude_n, part.rate_rad_per_s, part.phase_rad))
-        elif isinstance(part, Multisine):
-            sines.extend(_multisine(part, part.rms_n))
-        elif isinstance(part, Sweep):
-            sweeps.append(_sweep(part, part.amplitude_n))
     return DrivenForce(
         gain=math.prod(_values(effects, LawCode.INPUT_GAIN)),
         delay_s=math.fsum(_values(effects, LawCode.DELAY)),
-        sines=_rows(sines, SINE_COLUMNS),
-        sweeps=_rows(sweeps, SWEEP_COLUMNS),
+        sines=sines,
+        sweeps=sweeps,
         file_first=np.cumsum([0, *(len(samples.t_s) for samples in files)]),
         file_t_s=np.concatenate([np.empty(0), *(samples.t_s for samples in files)]),
         file_force_n=np.concatenate([np.empty(0), *(samples.values for samples in files)]),
@@ -166,43 +148,39 @@ def _force_arrays(force: AppliedForce, effects: tuple[UndeclaredEffect, ...]) ->
 
 
 def _height_arrays(motion: StrutMotion | None) -> DrivenHeight:
-    sines: list[tuple[float, ...]] = []
-    sweeps: list[tuple[float, ...]] = []
-    files: list[Floats] = []
-    for part in motion.components if motion is not None else ():
-        if isinstance(part, HeightSine):
-            sines.append((part.amplitude_m, part.rate_rad_per_s, part.phase_rad))
-        elif isinstance(part, HeightMultisine):
-            sines.extend(_multisine(part, part.rms_m))
-        elif isinstance(part, HeightSweep):
-            sweeps.append(_sweep(part, part.amplitude_m))
-        else:
-            files.append(_spline(part))
+    components = () if motion is None else motion.components
+    sines, sweeps = _sines_and_sweeps(components)
+    files = [part.samples for part in components if isinstance(part, HeightFile)]
     return DrivenHeight(
         mean_height_m=0.0 if motion is None else motion.mean_height_m,
-        sines=_rows(sines, SINE_COLUMNS),
-        sweeps=_rows(sweeps, SWEEP_COLUMNS),
-        files=Curves(
-            first=np.cumsum([0, *(len(part) for part in files)]),
-            segments=np.concatenate([np.empty((0, 6)), *files]),
+        sines=sines,
+        sweeps=sweeps,
+        files=_curves(
+            [_segments(t_s, interpolate.CubicSpline(t_s, height_m)) for t_s, height_m in files]
         ),
     )
 
 
-def _spline(part: HeightFile) -> Floats:
-    """Segments of the cubic spline through the samples, shape (segments, 6)."""
-    t_s, height_m = part.samples
-    cubic = interpolate.CubicSpline(t_s, height_m)
-    return np.column_stack([t_s[:-1], np.diff(t_s), np.asarray(cubic.c, dtype=np.float64).T])
-
-
-def _rows(rows: list[tuple[float, ...]], columns: int) -> Floats:
-    return np.array(rows, dtype=np.float64).reshape(-1, columns)
-
-
-def _sweep(part: Sweep | HeightSweep, amplitude: float) -> tuple[float, ...]:
-    logarithmic = float(part.spacing == "logarithmic")
-    return amplitude, part.start_hz, part.end_hz, part.duration_s, logarithmic
+def _sines_and_sweeps(parts: Sequence[Component | HeightComponent]) -> tuple[Floats, Floats]:
+    """Rows of `SINE_COLUMNS` and of `SWEEP_COLUMNS`."""
+    sines: list[tuple[float, ...]] = []
+    sweeps: list[tuple[float, ...]] = []
+    for part in parts:
+        match part:
+            case Sine(amplitude_n=amplitude) | HeightSine(amplitude_m=amplitude):
+                sines.append((amplitude, part.rate_rad_per_s, part.phase_rad))
+            case Multisine(rms_n=rms) | HeightMultisine(rms_m=rms):
+                sines.extend(_multisine(part, rms))
+            case Sweep(amplitude_n=amplitude) | HeightSweep(amplitude_m=amplitude):
+                logarithmic = float(part.spacing == "logarithmic")
+                row = amplitude, part.start_hz, part.end_hz, part.duration_s, logarithmic
+                sweeps.append(row)
+            case ForceFile() | HeightFile():
+                pass
+    return (
+        np.array(sines, dtype=np.float64).reshape(-1, SINE_COLUMNS),
+        np.array(sweeps, dtype=np.float64).reshape(-1, SWEEP_COLUMNS),
+    )
 
 
 def _multisine(part: Multisine | HeightMultisine, rms: float) -> list[tuple[float, ...]]:
@@ -231,7 +209,7 @@ def _effects(config: BenchConfig) -> Effects:
         row[: len(values)] = values
     first_state = 2 * len(config.struts) + 1
     states = np.cumsum([first_state, *(kind.states for kind in kinds)])
-    struts = [_strut_index(config, effect) for effect in acting]
+    struts = [_strut_index(config, effect.strut) for effect in acting]
     indices = [[int(kind.law) for kind in kinds], struts, states[:-1]]
     return Effects(np.array(indices, dtype=np.int64).T.copy(), parameters)
 
@@ -286,7 +264,8 @@ def _heights(
         derivatives(mechanics, 0.0, at_start, state, rates)
         return rates[n : 2 * n][free]
 
-    resting_m = _root(accelerations, heights_m[free])
+    solution = optimize.root(accelerations, heights_m[free].copy(), tol=1e-13)
+    resting_m = np.asarray(solution.x, dtype=np.float64)
     residual_m_per_s2 = float(np.max(np.abs(accelerations(resting_m))))
     if not residual_m_per_s2 <= EQUILIBRIUM_TOLERANCE_M_PER_S2:
         raise BenchConfigError(
@@ -295,9 +274,3 @@ def _heights(
         )
     heights_m[free] = resting_m
     return heights_m
-
-
-def _root(function: Callable[[Floats], Floats], start: Floats) -> Floats:
-    """Solve `function(x) = 0` near `start`, shape as `start`."""
-    solution = optimize.root(function, start.copy(), tol=1e-13)
-    return np.asarray(solution.x, dtype=np.float64)

@@ -17,50 +17,21 @@ from can_dbc.frame import Frame
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from rig.simulated_bench.assembly import assemble
-from rig.simulated_bench.equations_of_motion import RECORD_COLUMNS, RECORD_EXTRA
-from rig.simulated_bench.schema import BenchConfig, BenchConfigError, Transmission
+from rig.simulated_bench.equations_of_motion import RECORD_COLUMNS
+from rig.simulated_bench.schema import (
+    BenchConfig,
+    BenchConfigError,
+    HeightSensor,
+    LoadCell,
+    Transmission,
+)
 from rig.simulated_bench.trajectory import BenchState, advance_records, regular_grid
 
 RECORDS_AHEAD = 4
 """Records computed in one go: few enough not to delay a loop, enough to share the overhead."""
 
-RECORDS_KEPT = 4096
-"""Records kept for `SimulatedBench.truth`."""
-
 SHORTEST_GRID_NS = 10_000
 """Smallest common divisor of all periods that is accepted."""
-
-
-class StrutTruth(NamedTuple):
-    """True motion and force of a strut at one time.
-
-    Attributes:
-        height_m: Height in m.
-        velocity_m_per_s: Rate of height in m/s.
-        strut_force_n: Total force in N, undeclared effects in the strut included.
-    """
-
-    height_m: float
-    velocity_m_per_s: float
-    strut_force_n: float
-
-
-class BenchTruth(NamedTuple):
-    """True state of the bench at one time.
-
-    Attributes:
-        t_ns: Time on the caller's clock.
-        struts: One entry a strut, in the order of the configuration.
-        applied_force_n: Force that the force sensor sees, without noise, in N.
-        acting_force_n: Force that reaches the driven body in N.
-        temperature_c: Temperature of the damper in degrees Celsius.
-    """
-
-    t_ns: int
-    struts: tuple[StrutTruth, ...]
-    applied_force_n: float
-    acting_force_n: float
-    temperature_c: float
 
 
 class _Channel(NamedTuple):
@@ -129,10 +100,7 @@ class _Sender:
 class SimulatedBench:
     """A bench that moves by its own laws and reports on the bus.
 
-    Args:
-        config: The bench.
-        database: What its messages mean.
-        start_ns: Time of its start on the caller's clock.
+    It starts at `start_ns` of the caller's clock.
 
     Raises:
         BenchConfigError: The bench sends nothing, or its periods have no useful common divisor.
@@ -155,8 +123,6 @@ class SimulatedBench:
         self._grid = regular_grid(config, period_ns)
         self._assembly = assemble(config)
         self._motion = BenchState(0, self._assembly.start)
-        columns = RECORD_COLUMNS * len(config.struts) + RECORD_EXTRA
-        self._records = np.empty((RECORDS_KEPT, columns))
         self._queue: list[tuple[int, int, int, Frame]] = []
         self._queued = 0
         self._advance()
@@ -167,10 +133,7 @@ class SimulatedBench:
         return sum(sender.saturated_frames for sender in self._senders)
 
     def update(self, now_ns: int) -> tuple[list[Frame], int]:
-        """The frames that were sent up to a time.
-
-        Args:
-            now_ns: Time on the caller's clock.
+        """The frames that were sent up to a time on the caller's clock.
 
         Returns:
             The frames in the order of their transmission, each stamped with its time, and the
@@ -188,56 +151,19 @@ class SimulatedBench:
             frames.append(heapq.heappop(self._queue)[3])
         return frames, self._next_due_ns()
 
-    def truth(self, t_ns: int) -> BenchTruth:
-        """True state of the bench at a time.
-
-        At the sensors' sample times the values are those that were sampled. Between, heights follow
-        a cubic and the rest a straight line.
-
-        Args:
-            t_ns: Time on the caller's clock, not before the start and not more than
-                `RECORDS_KEPT - RECORDS_AHEAD` records before the latest.
-
-        Returns:
-            The truth at that time.
-
-        Raises:
-            ValueError: The time is before the start, or its record was dropped.
-        """
-        period_ns = self._period_ns
-        index, rest_ns = divmod(t_ns - self._start_ns, period_ns)
-        oldest = max(self._motion.records - RECORDS_KEPT, 0)
-        if index < oldest:
-            raise ValueError(
-                f"t_ns = {t_ns}, expected at least {self._start_ns + oldest * period_ns}"
-            )
-        before = self._record(index * period_ns)
-        if rest_ns == 0:
-            return self._as_truth(t_ns, before)
-        after = self._record((index + 1) * period_ns)
-        return self._as_truth(t_ns, _between(before, after, rest_ns / period_ns, period_ns * 1e-9))
-
-    def _as_truth(self, t_ns: int, record: list[float]) -> BenchTruth:
-        extra = RECORD_COLUMNS * len(self.config.struts)
-        struts = tuple(
-            StrutTruth(*record[first : first + RECORD_COLUMNS])
-            for first in range(0, extra, RECORD_COLUMNS)
-        )
-        return BenchTruth(t_ns, struts, *record[extra:])
-
     def _record(self, elapsed_ns: int) -> list[float]:
+        """Record of a time that is not before that of the last call."""
         index = elapsed_ns // self._period_ns
         while index >= self._motion.records:
             self._advance()
-        record: list[float] = self._records[index % RECORDS_KEPT].tolist()
+        # Counted from the end: the newest record is the last.
+        record: list[float] = self._records[index - self._motion.records].tolist()
         return record
 
     def _advance(self) -> None:
-        first = self._motion.records % RECORDS_KEPT
-        self._motion, records = advance_records(
+        self._motion, self._records = advance_records(
             self._assembly, self._grid, self._motion, RECORDS_AHEAD
         )
-        self._records[first : first + RECORDS_AHEAD] = records
 
     def _next_sender(self) -> _Sender:
         return min(self._senders, key=lambda sender: sender.next_sample_ns)
@@ -263,41 +189,19 @@ def _channels(
 ) -> list[_Channel]:
     struts = [strut.name for strut in config.struts]
     extra = RECORD_COLUMNS * len(struts)
+    sensors = (
+        (sent.height, Dimension.LENGTH, 0),
+        (sent.applied_force, Dimension.FORCE, extra),
+        (sent.strut_force, Dimension.FORCE, 2),
+        (sent.temperature, Dimension.TEMPERATURE, extra + 2),
+    )
     channels: list[_Channel] = []
     # Each quantity has its own source, so that one sensor's noise does not depend on another's.
-    if sent.height is not None:
-        column = RECORD_COLUMNS * struts.index(sent.height.strut)
-        noise_std = sent.height.noise_std_m
-        channels.append(
-            _Channel(sent.height.signal, Dimension.LENGTH, column, noise_std, noises[0])
-        )
-    if sent.applied_force is not None:
-        noise_std = sent.applied_force.noise_std_n
-        channels.append(
-            _Channel(sent.applied_force.signal, Dimension.FORCE, extra, noise_std, noises[1])
-        )
-    if sent.strut_force is not None:
-        column = RECORD_COLUMNS * struts.index(sent.strut_force.strut) + 2
-        noise_std = sent.strut_force.noise_std_n
-        channels.append(
-            _Channel(sent.strut_force.signal, Dimension.FORCE, column, noise_std, noises[2])
-        )
-    if sent.temperature is not None:
-        noise_std = sent.temperature.noise_std_k
-        channels.append(
-            _Channel(
-                sent.temperature.signal, Dimension.TEMPERATURE, extra + 2, noise_std, noises[3]
+    for (sensor, dimension, column), noise in zip(sensors, noises, strict=True):
+        if sensor is not None:
+            is_of_strut = isinstance(sensor, HeightSensor | LoadCell)
+            first = RECORD_COLUMNS * struts.index(sensor.strut) if is_of_strut else 0
+            channels.append(
+                _Channel(sensor.signal, dimension, first + column, sensor.noise_std, noise)
             )
-        )
     return channels
-
-
-def _between(before: list[float], after: list[float], share: float, period_s: float) -> list[float]:
-    """Record at a share of the way: heights by their rates (Hermite), the rest straight."""
-    record = [a + share * (b - a) for a, b in zip(before, after, strict=True)]
-    rest = 1.0 - share
-    for i in range(0, len(record) - RECORD_EXTRA, RECORD_COLUMNS):
-        chord = after[i] - before[i]
-        bend = rest * (before[i + 1] * period_s - chord) - share * (after[i + 1] * period_s - chord)
-        record[i] += share * rest * bend
-    return record

@@ -10,13 +10,7 @@ __all__ = ["BenchConfig", "BenchConfigError", "load_bench_config"]
 
 
 def load_bench_config(path: Path) -> BenchConfig:
-    """Read a bench from its YAML file.
-
-    Args:
-        path: The file. Files that it names lie in its folder or below.
-
-    Returns:
-        The bench.
+    """Read a bench from its YAML file; files that it names lie in its folder or below.
 
     Raises:
         InputError: The file cannot be read or does not describe a bench; one line naming file,

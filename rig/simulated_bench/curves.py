@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+import numpy as np
+
 from rig.simulated_bench.compilation import Floats, Integers, compiled
 
 
@@ -21,15 +23,9 @@ class Curves(NamedTuple):
 @compiled
 def curve_segment(curves: Curves, curve: int, at: float) -> int:
     """Segment of a curve at, or nearest to, an abscissa."""
-    low = int(curves.first[curve])
-    high = int(curves.first[curve + 1]) - 1
-    while low < high:
-        middle = (low + high + 1) // 2
-        if curves.segments[middle, 0] <= at:
-            low = middle
-        else:
-            high = middle - 1
-    return low
+    first = int(curves.first[curve])
+    starts = curves.segments[first : int(curves.first[curve + 1]), 0]
+    return first + max(int(np.searchsorted(starts, at, side="right")) - 1, 0)
 
 
 @compiled

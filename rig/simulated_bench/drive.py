@@ -3,6 +3,8 @@
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from rig.simulated_bench.compilation import Floats, Integers, compiled
 from rig.simulated_bench.curves import Curves, curve_segment
 
@@ -51,12 +53,7 @@ class DrivenHeight(NamedTuple):
 
 
 class BenchDrive(NamedTuple):
-    """What drives the bench.
-
-    Attributes:
-        force: The applied force.
-        prescribed: The prescribed motion; unused where no strut has one.
-    """
+    """What drives the bench; `prescribed` is unused where no strut has a prescribed motion."""
 
     force: DrivenForce
     prescribed: DrivenHeight
@@ -97,19 +94,14 @@ def _sweep_turns(sweep: Floats, t_s: float) -> tuple[float, float]:
 
 
 @compiled
-def _interpolate(drive: DrivenForce, low: int, high: int, t_s: float) -> float:
+def _interpolate(drive: DrivenForce, first: int, last: int, t_s: float) -> float:
     t = drive.file_t_s
     force_n = drive.file_force_n
-    if t_s < t[low] or t_s > t[high]:
+    if t_s < t[first] or t_s > t[last]:
         return 0.0
-    while high - low > 1:
-        middle = (low + high) // 2
-        if t[middle] <= t_s:
-            low = middle
-        else:
-            high = middle
-    share = (t_s - t[low]) / (t[high] - t[low])
-    return force_n[low] + share * (force_n[high] - force_n[low])
+    low = first + int(np.searchsorted(t[first:last], t_s, side="right")) - 1
+    share = (t_s - t[low]) / (t[low + 1] - t[low])
+    return force_n[low] + share * (force_n[low + 1] - force_n[low])
 
 
 @compiled

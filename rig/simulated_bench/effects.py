@@ -31,17 +31,11 @@ class EffectParameter(NamedTuple):
 
 
 class EffectKind(NamedTuple):
-    """One kind of effect.
-
-    Attributes:
-        law: Code of the law.
-        parameters: Parameters in the order in which the law reads them.
-        states: Number of internal states of the law.
-    """
+    """One kind of effect: its law, parameters in the law's order, number of internal states."""
 
     law: LawCode
     parameters: tuple[EffectParameter, ...]
-    states: int = 0
+    states: int
 
 
 def _positive(name: str, default: float | None = None) -> EffectParameter:
@@ -52,141 +46,95 @@ def _not_negative(name: str, default: float | None = None) -> EffectParameter:
     return EffectParameter(name, low=0.0, default=default)
 
 
+_STOP = (
+    EffectParameter("contact_height_m"),
+    _positive("contact_stiffness_n_per_m1_5"),
+    _not_negative("dissipation_s_per_m", 0.0),
+)
+
+_PARAMETERS: dict[LawCode, tuple[EffectParameter, ...]] = {
+    LawCode.PRELOAD: (EffectParameter("force_n"),),
+    LawCode.LINEAR_STIFFNESS: (EffectParameter("stiffness_n_per_m"),),
+    LawCode.QUADRATIC_STIFFNESS: (EffectParameter("stiffness_n_per_m2"),),
+    LawCode.CUBIC_STIFFNESS: (EffectParameter("stiffness_n_per_m3"),),
+    LawCode.PROGRESSIVE_STIFFNESS: (EffectParameter("force_n"), _positive("length_m")),
+    LawCode.GAS_SPRING: (
+        EffectParameter("charge_force_n"),
+        _positive("gas_length_m"),
+        EffectParameter("polytropic_exponent", low=1.0, high=3.0, default=1.3),
+    ),
+    LawCode.BUMP_STOP: _STOP,
+    LawCode.REBOUND_STOP: _STOP,
+    LawCode.BACKLASH: (
+        EffectParameter("centre_height_m"),
+        _not_negative("gap_m"),
+        _positive("stiffness_n_per_m"),
+    ),
+    LawCode.LINEAR_DAMPING: (EffectParameter("damping_n_s_per_m"),),
+    LawCode.QUADRATIC_DAMPING: (EffectParameter("damping_n_s2_per_m2"),),
+    LawCode.ASYMMETRIC_DAMPING: (
+        EffectParameter("compression_n_s_per_m"),
+        EffectParameter("rebound_n_s_per_m"),
+    ),
+    LawCode.DIGRESSIVE_DAMPING: (
+        EffectParameter("damping_n_s_per_m"),
+        _positive("knee_velocity_m_per_s"),
+    ),
+    LawCode.POSITION_DEPENDENT_DAMPING: (
+        EffectParameter("damping_n_s_per_m"),
+        _positive("length_m"),
+    ),
+    LawCode.FRICTION: (
+        _positive("coulomb_force_n"),
+        _positive("presliding_m", 2e-4),
+        EffectParameter("static_to_coulomb", low=1.0, high=10.0, default=1.0),
+        _positive("stribeck_velocity_m_per_s", 0.05),
+        _not_negative("bristle_damping_n_s_per_m", 0.0),
+    ),
+    LawCode.BOUC_WEN: (
+        _positive("stiffness_n_per_m"),
+        _positive("yield_m"),
+        EffectParameter("exponent", low=1.0, high=20.0, default=1.0),
+        EffectParameter("shape", low=0.5, high=1.0, default=0.5),
+    ),
+    LawCode.MAXWELL: (_positive("stiffness_n_per_m"), _positive("relaxation_time_s")),
+    LawCode.PERIODIC_FORCE: (
+        EffectParameter("amplitude_n"),
+        _positive("frequency_hz"),
+        EffectParameter("phase_rad", default=0.0),
+    ),
+    LawCode.TEMPERATURE_FADE: (
+        EffectParameter("fraction_per_k"),
+        EffectParameter("reference_c", default=20.0),
+    ),
+    LawCode.TIME_FADE: (_not_negative("final_fraction"), _positive("time_constant_s")),
+    LawCode.HIDDEN_MASS: (
+        _positive("mass_kg"),
+        _positive("stiffness_n_per_m"),
+        _not_negative("damping_n_s_per_m", 0.0),
+    ),
+    LawCode.ADDED_MASS: (EffectParameter("mass_kg"),),
+    LawCode.INPUT_GAIN: (EffectParameter("gain"),),
+    LawCode.DELAY: (EffectParameter("delay_s", low=0.0, high=1.0),),
+}
+_STATES = {LawCode.FRICTION: 1, LawCode.BOUC_WEN: 1, LawCode.MAXWELL: 1, LawCode.HIDDEN_MASS: 2}
+
 EFFECT_KINDS: MappingProxyType[str, EffectKind] = MappingProxyType(
     {
-        "preload": EffectKind(LawCode.PRELOAD, (EffectParameter("force_n"),)),
-        "linear_stiffness": EffectKind(
-            LawCode.LINEAR_STIFFNESS, (EffectParameter("stiffness_n_per_m"),)
-        ),
-        "quadratic_stiffness": EffectKind(
-            LawCode.QUADRATIC_STIFFNESS, (EffectParameter("stiffness_n_per_m2"),)
-        ),
-        "cubic_stiffness": EffectKind(
-            LawCode.CUBIC_STIFFNESS, (EffectParameter("stiffness_n_per_m3"),)
-        ),
-        "progressive_stiffness": EffectKind(
-            LawCode.PROGRESSIVE_STIFFNESS, (EffectParameter("force_n"), _positive("length_m"))
-        ),
-        "gas_spring": EffectKind(
-            LawCode.GAS_SPRING,
-            (
-                EffectParameter("charge_force_n"),
-                _positive("gas_length_m"),
-                EffectParameter("polytropic_exponent", low=1.0, high=3.0, default=1.3),
-            ),
-        ),
-        "bump_stop": EffectKind(
-            LawCode.BUMP_STOP,
-            (
-                EffectParameter("contact_height_m"),
-                _positive("contact_stiffness_n_per_m1_5"),
-                _not_negative("dissipation_s_per_m", 0.0),
-            ),
-        ),
-        "rebound_stop": EffectKind(
-            LawCode.REBOUND_STOP,
-            (
-                EffectParameter("contact_height_m"),
-                _positive("contact_stiffness_n_per_m1_5"),
-                _not_negative("dissipation_s_per_m", 0.0),
-            ),
-        ),
-        "backlash": EffectKind(
-            LawCode.BACKLASH,
-            (
-                EffectParameter("centre_height_m"),
-                _not_negative("gap_m"),
-                _positive("stiffness_n_per_m"),
-            ),
-        ),
-        "linear_damping": EffectKind(
-            LawCode.LINEAR_DAMPING, (EffectParameter("damping_n_s_per_m"),)
-        ),
-        "quadratic_damping": EffectKind(
-            LawCode.QUADRATIC_DAMPING, (EffectParameter("damping_n_s2_per_m2"),)
-        ),
-        "asymmetric_damping": EffectKind(
-            LawCode.ASYMMETRIC_DAMPING,
-            (EffectParameter("compression_n_s_per_m"), EffectParameter("rebound_n_s_per_m")),
-        ),
-        "digressive_damping": EffectKind(
-            LawCode.DIGRESSIVE_DAMPING,
-            (EffectParameter("damping_n_s_per_m"), _positive("knee_velocity_m_per_s")),
-        ),
-        "position_dependent_damping": EffectKind(
-            LawCode.POSITION_DEPENDENT_DAMPING,
-            (EffectParameter("damping_n_s_per_m"), _positive("length_m")),
-        ),
-        "friction": EffectKind(
-            LawCode.FRICTION,
-            (
-                _positive("coulomb_force_n"),
-                _positive("presliding_m", 2e-4),
-                EffectParameter("static_to_coulomb", low=1.0, high=10.0, default=1.0),
-                _positive("stribeck_velocity_m_per_s", 0.05),
-                _not_negative("bristle_damping_n_s_per_m", 0.0),
-            ),
-            states=1,
-        ),
-        "bouc_wen": EffectKind(
-            LawCode.BOUC_WEN,
-            (
-                _positive("stiffness_n_per_m"),
-                _positive("yield_m"),
-                EffectParameter("exponent", low=1.0, high=20.0, default=1.0),
-                EffectParameter("shape", low=0.5, high=1.0, default=0.5),
-            ),
-            states=1,
-        ),
-        "maxwell": EffectKind(
-            LawCode.MAXWELL,
-            (_positive("stiffness_n_per_m"), _positive("relaxation_time_s")),
-            states=1,
-        ),
-        "periodic_force": EffectKind(
-            LawCode.PERIODIC_FORCE,
-            (
-                EffectParameter("amplitude_n"),
-                _positive("frequency_hz"),
-                EffectParameter("phase_rad", default=0.0),
-            ),
-        ),
-        "temperature_fade": EffectKind(
-            LawCode.TEMPERATURE_FADE,
-            (EffectParameter("fraction_per_k"), EffectParameter("reference_c", default=20.0)),
-        ),
-        "time_fade": EffectKind(
-            LawCode.TIME_FADE, (_not_negative("final_fraction"), _positive("time_constant_s"))
-        ),
-        "hidden_mass": EffectKind(
-            LawCode.HIDDEN_MASS,
-            (
-                _positive("mass_kg"),
-                _positive("stiffness_n_per_m"),
-                _not_negative("damping_n_s_per_m", 0.0),
-            ),
-            states=2,
-        ),
-        "added_mass": EffectKind(LawCode.ADDED_MASS, (EffectParameter("mass_kg"),)),
-        "input_gain": EffectKind(LawCode.INPUT_GAIN, (EffectParameter("gain"),)),
-        "delay": EffectKind(LawCode.DELAY, (EffectParameter("delay_s", low=0.0, high=1.0),)),
+        law.name.lower(): EffectKind(law, parameters, _STATES.get(law, 0))
+        for law, parameters in _PARAMETERS.items()
     }
 )
-"""Every kind of effect by its name in the configuration."""
+"""Every kind of effect by its name in the configuration, which is that of its law."""
 
 PARAMETER_COUNT = max(len(kind.parameters) for kind in EFFECT_KINDS.values())
 """Width of the parameter table that the compiled equations read."""
 
 
 def parameter_error(name: str, given: dict[str, float]) -> str | None:
-    """First error in an effect's parameters.
+    """First error in the parameters of one of `EFFECT_KINDS`, as configured; None without one.
 
-    Args:
-        name: Name of the effect, one of `EFFECT_KINDS`.
-        given: Parameters as configured.
-
-    Returns:
-        One line naming key, value and expectation, or None if nothing is wrong.
+    It is one line naming key, value and expectation.
     """
     parameters = {parameter.name: parameter for parameter in EFFECT_KINDS[name].parameters}
     for key, value in given.items():
@@ -204,14 +152,9 @@ def parameter_error(name: str, given: dict[str, float]) -> str | None:
 
 
 def parameter_values(name: str, given: dict[str, float]) -> tuple[float, ...]:
-    """An effect's parameters in the order in which its law reads them.
+    """Parameters of one of `EFFECT_KINDS` in the order in which its law reads them.
 
-    Args:
-        name: Name of the effect, one of `EFFECT_KINDS`.
-        given: Parameters as configured, without error.
-
-    Returns:
-        The values, defaults filled in.
+    Defaults are filled in; `given` is as configured, without error.
     """
     return tuple(
         given.get(parameter.name, parameter.default or 0.0)

@@ -19,47 +19,32 @@ from rig.simulated_bench.equations_of_motion import (
 )
 
 
-class IntegrationStep(NamedTuple):
-    """One step of the integrator.
+class RecordGrid(NamedTuple):
+    """Times of the records: record k is at `k * substeps * step_s`.
 
     Attributes:
-        t_s: Time at its start in s.
-        length_s: Length in s.
-    """
-
-    t_s: float
-    length_s: float
-
-
-class Span(NamedTuple):
-    """Consecutive records.
-
-    Attributes:
-        first: Index of the first record; record k is at `k * substeps * step_s`.
         substeps: Steps of the integrator between records.
         step_s: Length of a step in s.
     """
 
-    first: int
     substeps: int
     step_s: float
 
 
 @compiled
 def runge_kutta_step(
-    mechanics: BenchMechanics, step: IntegrationStep, inputs: Floats, y: Floats, work: Floats
+    mechanics: BenchMechanics, t_s: float, step_s: float, inputs: Floats, y: Floats, work: Floats
 ) -> None:
     """Advance the state by one step of the classical fourth-order method.
 
     Args:
         mechanics: The bench.
-        step: Time and length of the step.
+        t_s: Time at the start of the step in s.
+        step_s: Length of the step in s.
         inputs: Inputs at start, middle and end of the step, shape (3, INPUTS).
         y: State, shape (states,); changed in place.
         work: Scratch, shape (5, states).
     """
-    t_s = step.t_s
-    step_s = step.length_s
     half_s = 0.5 * step_s
     derivatives(mechanics, t_s, inputs[0], y, work[0])
     for j in range(y.shape[0]):
@@ -79,27 +64,33 @@ def runge_kutta_step(
 
 @compiled
 def advance(
-    mechanics: BenchMechanics, drive: BenchDrive, span: Span, y: Floats, records: Floats
+    mechanics: BenchMechanics,
+    drive: BenchDrive,
+    grid: RecordGrid,
+    first: int,
+    y: Floats,
+    records: Floats,
 ) -> None:
     """Write records at equal times, advancing the state to the time after the last one.
 
     Args:
         mechanics: The bench.
         drive: Applied force and prescribed motion.
-        span: The records, and the steps between them.
+        grid: Times of the records.
+        first: Index of the first record.
         y: State at the first record, shape (states,); changed in place.
         records: Receives the records, shape (records, RECORD_COLUMNS * n + RECORD_EXTRA).
     """
     work = np.zeros((5, y.shape[0]))
     inputs = np.zeros((3, INPUTS))
-    step_s = span.step_s
+    step_s = grid.step_s
     for row in range(records.shape[0]):
-        start = (span.first + row) * span.substeps
+        start = (first + row) * grid.substeps
         write_inputs(mechanics, drive, start * step_s, inputs[2])
         prescribe(mechanics, inputs[2], y)
         observe(mechanics, drive, start * step_s, y, records[row])
-        for i in range(start, start + span.substeps):
+        for i in range(start, start + grid.substeps):
             inputs[0] = inputs[2]
             write_inputs(mechanics, drive, (i + 0.5) * step_s, inputs[1])
             write_inputs(mechanics, drive, (i + 1) * step_s, inputs[2])
-            runge_kutta_step(mechanics, IntegrationStep(i * step_s, step_s), inputs, y, work)
+            runge_kutta_step(mechanics, i * step_s, step_s, inputs, y, work)

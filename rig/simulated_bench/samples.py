@@ -17,27 +17,14 @@ TIME_COLUMN = "t_s"
 
 
 class Samples(NamedTuple):
-    """Samples of a quantity.
-
-    Attributes:
-        t_s: Times in s, shape (samples,), increasing.
-        values: Value at each time, shape (samples,).
-    """
+    """Samples of a quantity: times in s, increasing, and a value at each, shape (samples,) each."""
 
     t_s: NDArray[np.float64]
     values: NDArray[np.float64]
 
 
 def read_samples(folder: Path, name: str, column: str) -> Samples:
-    """Read one column over time; other columns are ignored.
-
-    Args:
-        folder: Folder of the configuration; the file must lie in it or below.
-        name: Path of the file relative to `folder`.
-        column: Name of the column, with its unit.
-
-    Returns:
-        The samples.
+    """Read a column of the file `name` in `folder` or below it; other columns are ignored.
 
     Raises:
         InputError: The file is outside the folder, missing, too large, or not such a table; one

@@ -9,14 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    PrivateAttr,
-    ValidationInfo,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationInfo, model_validator
 
 from can_dbc.errors import InputError
 from rig.simulated_bench.effects import EFFECT_KINDS, parameter_error
@@ -50,7 +43,23 @@ class Mass(_Section):
     mass_kg: Positive
 
 
-class SpringCurve(_Section):
+class _Curve(_Section):
+    """A force by points: two fields, the abscissa and the force."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        (key, at), (_, force_n) = self
+        if len(at) != len(force_n):
+            raise ValueError(f"force_n has {len(force_n)} points, expected {len(at)} as {key}")
+        for before, after in pairwise(at):
+            if after <= before:
+                raise ValueError(
+                    f"{key} has {after:g} after {before:g}, expected increasing values"
+                )
+        return self
+
+
+class SpringCurve(_Curve):
     """Spring force over height, by points; monotone cubic between, straight beyond.
 
     Attributes:
@@ -61,13 +70,8 @@ class SpringCurve(_Section):
     height_m: Points
     force_n: Points
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        _check_curve("height_m", self.height_m, self.force_n)
-        return self
 
-
-class DamperCurve(_Section):
+class DamperCurve(_Curve):
     """Damper force over velocity, by points; monotone cubic between, straight beyond.
 
     Attributes:
@@ -77,11 +81,6 @@ class DamperCurve(_Section):
 
     velocity_m_per_s: Points
     force_n: Points
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        _check_curve("velocity_m_per_s", self.velocity_m_per_s, self.force_n)
-        return self
 
 
 class BenchStrut(_Section):
@@ -312,33 +311,41 @@ class UndeclaredEffect(_Section):
         return self
 
 
-class HeightSensor(_Section):
-    """A sensor of a strut's height; `noise_std_m` is the standard deviation of white noise."""
+class _Sensor(_Section):
+    """A sensor; its last field is the standard deviation of its white noise."""
 
     signal: str
+
+    @property
+    def noise_std(self) -> float:
+        """Standard deviation of the noise in the sensor's unit."""
+        *_, (_, value) = self
+        return value
+
+
+class HeightSensor(_Sensor):
+    """A sensor of a strut's height; `noise_std_m` is the standard deviation of white noise."""
+
     strut: Name
     noise_std_m: NotNegative = 0.0
 
 
-class AppliedForceSensor(_Section):
+class AppliedForceSensor(_Sensor):
     """A sensor of the applied force; `noise_std_n` is the standard deviation of white noise."""
 
-    signal: str
     noise_std_n: NotNegative = 0.0
 
 
-class LoadCell(_Section):
+class LoadCell(_Sensor):
     """A sensor of a strut's force; `noise_std_n` is the standard deviation of white noise."""
 
-    signal: str
     strut: Name
     noise_std_n: NotNegative = 0.0
 
 
-class Thermometer(_Section):
+class Thermometer(_Sensor):
     """A sensor of the damper's temperature; `noise_std_k` is that of white noise."""
 
-    signal: str
     noise_std_k: NotNegative = 0.0
 
 
@@ -424,14 +431,6 @@ class BenchConfig(_Section):
                 if sensor is not None:
                     _check_known(f"transmissions.{index}.{key}.strut", sensor.strut, struts)
         return self
-
-
-def _check_curve(key: str, at: tuple[float, ...], force_n: tuple[float, ...]) -> None:
-    if len(at) != len(force_n):
-        raise ValueError(f"force_n has {len(force_n)} points, expected {len(at)} as {key}")
-    for before, after in pairwise(at):
-        if after <= before:
-            raise ValueError(f"{key} has {after:g} after {before:g}, expected increasing values")
 
 
 def _unique(key: str, names: list[str]) -> list[str]:

@@ -7,7 +7,7 @@ import numpy as np
 from rig.simulated_bench.assembly import Assembly, assemble
 from rig.simulated_bench.compilation import Floats, Integers
 from rig.simulated_bench.equations_of_motion import RECORD_COLUMNS, RECORD_EXTRA
-from rig.simulated_bench.integrator import Span, advance
+from rig.simulated_bench.integrator import RecordGrid, advance
 from rig.simulated_bench.schema import BenchConfig, BenchConfigError
 
 NANOSECONDS = 1e-9
@@ -53,18 +53,6 @@ class BenchTrajectory(NamedTuple):
     temperature_c: Floats
 
 
-class RecordGrid(NamedTuple):
-    """Times of the records.
-
-    Attributes:
-        substeps: Steps of the integrator between records.
-        step_s: Length of a step in s.
-    """
-
-    substeps: int
-    step_s: float
-
-
 def regular_grid(config: BenchConfig, period_ns: int) -> RecordGrid:
     """Divide a period into steps no longer than the configured one."""
     substeps = -(-period_ns // config.step_ns)
@@ -74,17 +62,9 @@ def regular_grid(config: BenchConfig, period_ns: int) -> RecordGrid:
 def advance_records(
     assembly: Assembly, grid: RecordGrid, motion: BenchState, count: int
 ) -> tuple[BenchState, Floats]:
-    """Advance the bench.
+    """State of a bench after `count` records, and the records, shape (count, columns).
 
-    Args:
-        assembly: The bench.
-        grid: Times of the records.
-        motion: Its state.
-        count: Number of records to make.
-
-    Returns:
-        Its state after them, and the records, shape (count, columns); see
-        `rig.simulated_bench.equations_of_motion.observe`.
+    Their columns are those of `rig.simulated_bench.equations_of_motion.observe`.
 
     Raises:
         BenchDivergedError: The motion is no longer finite.
@@ -92,8 +72,7 @@ def advance_records(
     struts = len(assembly.mechanics.mass_kg)
     records = np.empty((count, RECORD_COLUMNS * struts + RECORD_EXTRA))
     y = motion.y.copy()
-    span = Span(motion.records, grid.substeps, grid.step_s)
-    advance(assembly.mechanics, assembly.drive, span, y, records)
+    advance(assembly.mechanics, assembly.drive, grid, motion.records, y, records)
     if not np.isfinite(records).all():
         raise BenchDivergedError(
             f"the motion is not finite after {motion.records * grid.substeps * grid.step_s:g} s, "
@@ -111,9 +90,6 @@ def simulate(config: BenchConfig, duration_ns: int, period_ns: int = 1_000_000) 
         config: The bench.
         duration_ns: Time of the last record; rounded down to a multiple of `period_ns`.
         period_ns: Time between records.
-
-    Returns:
-        The motion.
 
     Raises:
         BenchConfigError: The bench has no state to start from.

@@ -15,6 +15,7 @@ from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.config import load_bench_config
+from rig.simulated_bench.trajectory import simulate
 
 MS = 1_000_000
 BEGIN_NS = 300 * MS
@@ -91,11 +92,12 @@ class Trial:
     ) -> list[Tick]:
         """Run up to a time; returns all ticks so far."""
         first = len(self.ticks)
+        truth = simulate(self.bench.config, until_ms * MS, MS)
         for index in range(first, until_ms):
             t_ns = index * MS
             frames = inject(t_ns, self.bench.update(t_ns)[0])
             self.state, result = self.bridge.tick(self.state, t_ns, frames, conditions(t_ns))
-            truth_n = self.bench.truth(t_ns).struts[0].strut_force_n
+            truth_n = float(truth.strut_force_n[index, 0])
             self.ticks.append(Tick(t_ns, result, self.state.counts, truth_n))
         return self.ticks
 

@@ -1,4 +1,4 @@
-"""What the simulated bench sends: sensors, timing, counters and the truth beside them."""
+"""What the simulated bench sends: sensors, timing and counters."""
 
 import math
 
@@ -10,7 +10,7 @@ from can_dbc.codec import compile_decoder
 from can_dbc.database import DEFAULT_DATABASE, DatabaseError, load_database
 from can_dbc.protection import INITIAL, FrameStatus, check_crc, compile_checker, read_counter
 from can_dbc.units import Dimension
-from rig.simulated_bench.bench import RECORDS_KEPT, SimulatedBench
+from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.schema import BenchConfigError
 from rig.simulated_bench.trajectory import simulate
 from tests.rig_bench.linear_bench import linear_bench
@@ -209,39 +209,19 @@ def test_start_time_shifts_the_stamps(database):
     )
 
 
-def test_truth_is_the_motion_bit_for_bit(database):
+def test_a_sample_is_the_motion_bit_for_bit(database):
     config = _config(auxiliary=True)
     bench = SimulatedBench(config, database, start_ns=7)
     motion = simulate(config, SECOND_NS)
     for k in range(0, 1001, 37):
-        truth = bench.truth(7 + k * MS_NS)
-        assert truth.t_ns == 7 + k * MS_NS
-        assert truth.struts[0] == (
+        assert bench._record(k * MS_NS) == [
             motion.height_m[k, 0],
             motion.velocity_m_per_s[k, 0],
             motion.strut_force_n[k, 0],
-        )
-        assert truth.applied_force_n == motion.applied_force_n[k]
-        assert truth.temperature_c == motion.temperature_c[k]
-
-
-def test_truth_between_samples_is_interpolated(database):
-    config = _config()
-    bench = SimulatedBench(config, database)
-    fine = simulate(config, 300 * MS_NS, period_ns=100_000)
-    for k in range(1, 3000, 7):
-        truth = bench.truth(k * 100_000)
-        assert truth.struts[0].height_m == pytest.approx(fine.height_m[k, 0], abs=1e-10)
-        assert truth.struts[0].strut_force_n == pytest.approx(fine.strut_force_n[k, 0], abs=2e-3)
-
-
-def test_truth_that_is_gone_is_refused(database):
-    bench = SimulatedBench(_config(), database)
-    bench.truth((RECORDS_KEPT + 100) * MS_NS)
-    with pytest.raises(ValueError, match="expected at least"):
-        bench.truth(0)
-    with pytest.raises(ValueError, match="expected at least"):
-        SimulatedBench(_config(), database).truth(-1)
+            motion.applied_force_n[k],
+            motion.acting_force_n[k],
+            motion.temperature_c[k],
+        ]
 
 
 def test_value_beyond_its_range_is_held_and_counted(database):

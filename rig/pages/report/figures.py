@@ -20,7 +20,6 @@ from rig.pages.plotted_quantities import (
 )
 from rig.pages.report.series import Joined, cloud, envelope, excerpt, join, spectrum, surface
 
-_LONGEST_MARK = 60
 _WIDE_SIGMA = 2.0
 _SMOOTHED_BAND = f"grey: ±{_WIDE_SIGMA:.0f} standard deviations of the smoothed residual"
 _FLOOR_BAND = f"grey: ±{_WIDE_SIGMA:.0f} × noise floor"
@@ -103,11 +102,11 @@ def curves(*, corrected: bool) -> tuple[LineStyle, ...]:
 def residual_plot(
     key: str, series: Sequence[FittedSeries], shown: Sequence[LineStyle], points: int
 ) -> Plot:
-    """Residual force against height, velocity, time and frequency.
+    """Residual force of a strut, over height, velocity, time and frequency.
 
     Args:
         key: Unique name in the page.
-        series: One strut along all fitted recordings.
+        series: The strut along each fitted recording.
         shown: Curves, from `curves`.
         points: Points of a line; markers are half as many.
     """

@@ -53,11 +53,7 @@ _OF_A_FREE_RUN = ("The free-run simulation has the applied force as its only inp
 
 
 def write_report(result: Result, path: Path) -> None:
-    """Write the page as one file that needs no network.
-
-    Args:
-        result: The result of the diagnosis.
-        path: File to write; it is replaced in one step, never left half written.
+    """Write the page as one file that needs no network; a former one is replaced in one step.
 
     Raises:
         InputError: The file cannot be written.
@@ -83,44 +79,20 @@ def page(result: Result) -> str:
         tone=tone,
         sign=sign,
         badge=badge,
-        held_out=_held_out(diagnosis),
+        blocks=BLOCKS,
         struts=struts,
-        errors=tables.errors(diagnosis),
-        white=_white(diagnosis),
-        run_columns=tables.run_columns(diagnosis),
-        run_cells=tables.run_cells,
-        linear=tables.linear(diagnosis),
-        effects=tables.effects(diagnosis),
-        existing=tables.existing(diagnosis),
+        is_corrected=_has_corrections(diagnosis),
+        tables=tables,
         nearest=next((item for item in diagnosis.rejected if item.left is not None), None),
         strut_plots=_plots(result, struts),
         assumptions=_ASSUMPTIONS + (() if is_prescribed(diagnosis) else _OF_A_FREE_RUN),
-        capital=tables.capital,
         effect=effect,
         families=FAMILY_WORDS,
-        excitations=tables.excitations,
         percent=percent,
         sources=result.sources,
         split=_SPLITS[diagnosis.held_out.source],
         versions=[f"{name} {version(name)}" for name in _PACKAGES],
     )
-
-
-def _held_out(diagnosis: Diagnosis) -> str:
-    if diagnosis.held_out.source == "blocks":
-        return BLOCKS
-    return ", ".join(run.run for run in diagnosis.held_out.runs) or "–"
-
-
-def _white(diagnosis: Diagnosis) -> str:
-    white = diagnosis.residual_white
-    text = (
-        f"With the nominal model, the residual is {'' if white.before else 'not '}white by the test"
-    )
-    if not _has_corrections(diagnosis):
-        return f"{text}."
-    after = f"the residual is {'' if white.after else 'not '}white by the test"
-    return f"{text}; with the corrected model, {after}."
 
 
 def _has_corrections(diagnosis: Diagnosis) -> bool:

@@ -71,12 +71,7 @@ def check_series(series: FittedSeries | HeldOutSeries) -> None:
 
 
 def join(series: Sequence[FittedSeries | HeldOutSeries], columns: Sequence[Array]) -> Joined:
-    """Recordings one after another; a single one keeps its times.
-
-    Args:
-        series: The recordings.
-        columns: Values of each recording, shape (N, columns) each.
-    """
+    """Recordings one after another, with columns (N, columns) each; one alone keeps its times."""
     times: list[Array] = []
     values: list[Array] = []
     begins: list[float] = []

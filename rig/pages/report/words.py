@@ -78,12 +78,7 @@ def linear_label(item: LinearCorrection) -> str:
 
 
 def sentence(diagnosis: Diagnosis, struts: int) -> str:
-    """The diagnosis in one sentence.
-
-    Args:
-        diagnosis: The diagnosis.
-        struts: Number of struts in the model; with one, its name is left out.
-    """
+    """The diagnosis in one sentence; the strut is named if the model has several."""
     match diagnosis.verdict:
         case "nothing_missing":
             name, _, before, change = _error(diagnosis)

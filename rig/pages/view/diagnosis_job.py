@@ -12,23 +12,14 @@ from pathlib import Path
 
 from rig.diagnosis.outcome import DIAGNOSIS_FILE, REPORT_FILE
 from rig.files.folders import free_folder
-from rig.pages.view.diagnosis_worker import (
-    DiagnosisFailure,
-    DiagnosisOrder,
-    DiagnosisProgress,
-    run_diagnosis,
-)
+from rig.pages.view.diagnosis_worker import DiagnosisFailure, DiagnosisProgress, run_diagnosis
 
 _SPAWN = multiprocessing.get_context("spawn")
 _STARTING = DiagnosisProgress("starting", 0.0)
 
 
 class DiagnosisJob:
-    """The diagnosis of one run; its folder is next to that of the run.
-
-    Args:
-        folder: Folder of the run.
-    """
+    """The diagnosis of a run's folder; its own folder is next to it."""
 
     def __init__(self, folder: Path) -> None:
         self._run = folder.absolute()
@@ -39,23 +30,18 @@ class DiagnosisJob:
         self._is_cancelled = False
 
     def start(self, model: str, held_out: Sequence[Path]) -> None:
-        """Start the diagnosis, unless it is running.
-
-        Args:
-            model: File or name of the nominal model.
-            held_out: Folders of the held-out runs.
-        """
+        """Start the diagnosis, unless it is running; `model` is a file or a name."""
         with self._lock:
             if self._is_running():
                 return
             self._progress, self._reason, self._is_cancelled = _STARTING, "", False
             out = free_folder(self._first_folder())
-            others = tuple(path.absolute() for path in held_out)
+            others = [path.absolute() for path in held_out]
             receiver, sender = _SPAWN.Pipe(duplex=False)
             with sender:  # the worker keeps its copy alone, so that its end closes the pipe
                 self._process = _SPAWN.Process(
                     target=run_diagnosis,
-                    args=(DiagnosisOrder(self._run, model, others, out), sender),
+                    args=(self._run, model, others, out, sender),
                     daemon=True,
                 )
                 self._process.start()
@@ -86,11 +72,7 @@ class DiagnosisJob:
         return {"state": "done", "verdict": _read_verdict(folder), "folder": str(folder)}
 
     def wait(self) -> int | None:
-        """Wait for the end of the diagnosis.
-
-        Returns:
-            Exit code of its process; None if none was started.
-        """
+        """Wait for the end of the diagnosis; returns its exit code, or None if none was started."""
         if self._reader is not None:
             self._reader.join()
         return None if self._process is None else self._process.exitcode

@@ -4,6 +4,7 @@ import contextlib
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NamedTuple
@@ -13,22 +14,6 @@ from rig.diagnosis.outcome import REPORT_FILE
 
 _NICENESS = 19
 """The lowest priority: everything else on the machine goes first."""
-
-
-class DiagnosisOrder(NamedTuple):
-    """What to diagnose.
-
-    Attributes:
-        run: Folder of the run.
-        model: File or name of the nominal model.
-        held_out: Folders of the held-out runs.
-        out: Folder to write into.
-    """
-
-    run: Path
-    model: str
-    held_out: tuple[Path, ...]
-    out: Path
 
 
 class DiagnosisProgress(NamedTuple):
@@ -44,13 +29,13 @@ class DiagnosisFailure(NamedTuple):
     reason: str
 
 
-def run_diagnosis(order: DiagnosisOrder, reports: Connection) -> None:
-    """Diagnose a run, and write the results and their report.
+def run_diagnosis(
+    run: Path, model: str, held_out: Sequence[Path], out: Path, reports: Connection
+) -> None:
+    """Diagnose a run with a model, by file or name, and write results and report into `out`.
 
-    Args:
-        order: What to diagnose.
-        reports: Takes a `DiagnosisProgress` for each step, and a `DiagnosisFailure` at the end of a
-            diagnosis that fails.
+    `reports` takes a `DiagnosisProgress` for each step, and a `DiagnosisFailure` at the end of a
+    diagnosis that fails.
     """
     # Imported here: the server, which imports this module, needs none of it.
     from dart_model.spec import load_named_model
@@ -68,13 +53,13 @@ def run_diagnosis(order: DiagnosisOrder, reports: Connection) -> None:
 
     try:
         result = diagnose_runs(
-            [order.run],
-            load_named_model(order.model, Path()),
-            order.held_out,
-            order.out,
+            [run],
+            load_named_model(model, Path()),
+            held_out,
+            out,
             lambda stage, share: send(DiagnosisProgress(stage, share)),
         )
-        write_report(result, order.out / REPORT_FILE)
+        write_report(result, out / REPORT_FILE)
     except (InputError, OSError) as error:
         send(DiagnosisFailure(str(error)))
         sys.exit(1)

@@ -69,13 +69,7 @@ class Playback(NamedTuple):
 
 
 class Topic:
-    """A run, and the number of its steps that have been published.
-
-    Args:
-        run: The run.
-        name: Name of the topic.
-        new_channel: Makes a channel of the SDK.
-    """
+    """A run, and the number of its steps that have been published."""
 
     def __init__(self, run: WatchedRun, name: str, new_channel: "Callable[..., Channel]") -> None:
         self.run, self.name, self._new_channel = run, name, new_channel
@@ -273,6 +267,8 @@ class FoxgloveView:
                 and now_ns - self._subscribed_ns >= _PLAYBACK_DELAY_NS
             )
             self._playback = Playback(0, now_ns, is_playing=self._has_begun)
+            if not self._has_begun:
+                return  # without a subscription the first step would be lost
         if not self._playback.since_ns:  # requested before the first call
             self._playback = self._playback._replace(since_ns=now_ns)
         self._playback = self._playback.at(now_ns, self._end_ns)

@@ -26,11 +26,7 @@ progress."""
 
 
 class WatchedRun:
-    """A run's folder: absent, empty, being written, whole, cut off, or no run at all.
-
-    Args:
-        folder: The folder.
-    """
+    """A run's folder: absent, empty, being written, whole, cut off, or no run at all."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -72,18 +68,16 @@ class WatchedRun:
             self._stamp, self._error = stamp, None
             try:
                 header = read_header(self.folder)
-                if self.follower.is_another or header["epoch_ns"] != self.epoch_ns:
-                    self._reset()
-                self.header = header
+                if self.follower.is_another or header["epoch_ns"] != self._epoch_ns:
+                    # The folder holds another run.
+                    self.follower = RunFollower(self.folder)
+                    self.model, self.frame_times_s = None, {}
+                self.header, self._epoch_ns = header, header["epoch_ns"]
                 self._read_copies()
             except InputError as error:
                 self._error = str(error)
         if self._error is None:
             self.follower.update(_STEPS_AT_ONCE)
-
-    def _reset(self) -> None:
-        """Forget the former run: the folder holds another one."""
-        self.follower, self.model, self.frame_times_s = RunFollower(self.folder), None, {}
 
     def state(self) -> tuple[str, str]:
         """A word for the state of the run, and a sentence about it."""

@@ -50,11 +50,7 @@ def planes(
 ) -> dict[str, list[list[float]]]:
     """Points of force over velocity and over height: of the estimate, and of the load cell.
 
-    Args:
-        follower: The run.
-        rows: Steps, as `rows_between` gives them.
-        strut: Name of the strut.
-        with_cell: Whether the load cell is that strut's.
+    `rows` are of `rows_between`; `with_cell` if the load cell is that strut's.
     """
     columns = follower.columns
     force = _column(rows, columns, ESTIMATED_FORCE.column_of(strut))
