@@ -8,21 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
-from rig.diagnosis.recording import read_recording
+from rig.diagnosis.recording import Recording, read_recording
 from rig.dyno.damper import Damper, summarise_damper
-from rig.dyno.figures import DynoStep, compute_step
+from rig.dyno.figures import AtRest, DynoStep, compute_rest, compute_step
 from rig.dyno.quality import quality
-from rig.dyno.stroke_force import Figure
-from rig.dyno.strokes import Hold, find_blocks, find_holds, find_strokes
+from rig.dyno.strokes import find_blocks, find_holds, find_strokes
 from rig.log.reader import read_run
 
 Array = NDArray[np.float64]
 
 SCHEMA = 1
-
-_BATCHES = 10
-"""Parts of a hold whose means give the uncertainty of its mean: noise may be correlated within one
-(Law, Simulation Modeling and Analysis, 2015, 9.5.3)."""
 
 _LARGEST_N = 1e8
 """Ten times what the largest damper machines of civil engineering reach."""
@@ -50,24 +45,6 @@ class ForceRecord(NamedTuple):
     temperature_c: Array | None = None
     strut: str = ""
     source: str = "load cell"
-
-
-class AtRest(NamedTuple):
-    """A hold: the gas force, and what friction keeps.
-
-    Attributes:
-        begin_s: Its beginning.
-        end_s: Its end.
-        height_m: Mean height.
-        force_n: Mean force.
-        temperature_c: Mean temperature; None where none was measured.
-    """
-
-    begin_s: float
-    end_s: float
-    height_m: float
-    force_n: Figure
-    temperature_c: float | None
 
 
 @dataclass(frozen=True)
@@ -123,15 +100,19 @@ def characterise(path: Path, strut: str | None = None) -> Characteristics:
     Raises:
         InputError: There is no such record, or no cycle in it repeats.
     """
-    record = _read_record(path, strut)
-    good = np.isfinite(record.height_m) & np.isfinite(record.force_n)
-    warm_c = record.temperature_c
+    recording = read_recording(path)
+    name, height_m, force_n, source = _read_strut(path, recording, strut)
+    good = np.isfinite(height_m) & np.isfinite(force_n)
+    warm_c = None if recording.temperature_c is None else recording.temperature_c[good]
     return characterise_record(
-        record._replace(
-            t_s=record.t_s[good],
-            height_m=record.height_m[good],
-            force_n=record.force_n[good],
-            temperature_c=None if warm_c is None else warm_c[good],
+        ForceRecord(
+            recording.name,
+            recording.t_s[good],
+            height_m[good],
+            force_n[good],
+            warm_c,
+            name,
+            source,
         )
     )
 
@@ -156,22 +137,18 @@ def characterise_record(record: ForceRecord) -> Characteristics:
             f"amplitude with {_FEWEST_SAMPLES_A_CYCLE} samples a cycle, expected a test that "
             "repeats its cycles"
         )
-    holds = tuple(_at_rest(record, hold) for hold in find_holds(t_s, height_m, blocks))
-    rests = [(hold.begin_s, hold.height_m, hold.force_n) for hold in holds]
-    warnings = quality(t_s, force_n, steps, rests, len(strokes))
+    holds = tuple(
+        compute_rest(t_s, height_m, force_n, record.temperature_c, here)
+        for here in find_holds(t_s, height_m, blocks)
+    )
+    warnings = quality(t_s, force_n, steps, holds, len(strokes))
     return Characteristics(record, steps, holds, summarise_damper(steps), warnings)
 
 
-def _read_record(path: Path, strut: str | None) -> ForceRecord:
-    """Heights and forces of a strut; NaN where one is missing."""
-    recording = read_recording(path)
-    record = ForceRecord(
-        recording.name,
-        recording.t_s,
-        recording.heights_m[:, 0],
-        np.empty(0),
-        recording.temperature_c,
-    )
+def _read_strut(
+    path: Path, recording: Recording, strut: str | None
+) -> tuple[str, Array, Array, str]:
+    """Name of a strut, its heights and forces (NaN where one is missing), and their origin."""
     cells_n = recording.strut_forces_n
     if not path.is_dir():
         if strut is not None:
@@ -180,7 +157,7 @@ def _read_record(path: Path, strut: str | None) -> ForceRecord:
             raise InputError(f"{path}: holds several struts, expected a file of one")
         if cells_n is None:
             raise InputError(f"{path}: has no strut_force_n, expected a load cell's force")
-        return record._replace(force_n=cells_n[:, 0])
+        return "", recording.heights_m[:, 0], cells_n[:, 0], "load cell"
     run = read_run(path)
     config: Any = run.header.get("config", {})
     names = list(config.get("observers", {}))
@@ -190,9 +167,9 @@ def _read_record(path: Path, strut: str | None) -> ForceRecord:
     if name not in names:
         raise InputError(f"{path}: --strut {name}: expected one of {', '.join(names)}")
     index = list(config["signals"]["height"]).index(name)
-    record = record._replace(strut=name, height_m=recording.heights_m[:, index])
+    height_m = recording.heights_m[:, index]
     if cells_n is not None:
-        return record._replace(force_n=cells_n[:, index])
+        return name, height_m, cells_n[:, index], "load cell"
     tick_s = np.asarray(run.steps.column("t_ns").to_numpy(), np.float64) * 1e-9
     estimated = np.asarray(run.steps.column(f"{name}.force_n").to_numpy(), np.float64)
     known = np.isfinite(estimated)
@@ -200,23 +177,9 @@ def _read_record(path: Path, strut: str | None) -> ForceRecord:
         raise InputError(f"{path}: holds no estimated force of {name}, expected a run that ran")
     begin, end = tick_s[known][0], tick_s[known][-1]
     inside = (recording.t_s >= begin) & (recording.t_s <= end)
-    return record._replace(
-        height_m=np.where(inside, record.height_m, np.nan),
-        force_n=np.interp(recording.t_s, tick_s[known], estimated[known]),
-        source="estimated by the observer",
-    )
-
-
-def _at_rest(record: ForceRecord, hold: Hold) -> AtRest:
-    here = slice(hold.begin, hold.end)
-    values, warm_c = record.force_n[here], record.temperature_c
-    means = np.array([part.mean() for part in np.array_split(values, min(_BATCHES, len(values)))])
-    std = float(np.std(means, ddof=1)) / len(means) ** 0.5 if len(means) > 1 else float("nan")
-    mean, half = float(values.mean()), 2.26 * std  # Student's t of ten batches
-    return AtRest(
-        float(record.t_s[hold.begin]),
-        float(record.t_s[hold.end - 1]),
-        float(record.height_m[here].mean()),
-        Figure(mean, mean - half, mean + half, "mean at rest, ten batches"),
-        None if warm_c is None else float(warm_c[here].mean()),
+    return (
+        name,
+        np.where(inside, height_m, np.nan),
+        np.interp(recording.t_s, tick_s[known], estimated[known]),
+        "estimated by the observer",
     )

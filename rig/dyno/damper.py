@@ -206,22 +206,17 @@ def _force_row_at(speed: Array, value: float, offset: int) -> Array:
 
 def _per_kelvin(steps: Sequence[DynoStep], index: int) -> Figure | None:
     """Change of the force at peak velocity per kelvin over steps of one speed and amplitude."""
+    if any(step.temperature_c is None for step in steps):
+        return None
     groups: list[list[DynoStep]] = []
     for step in steps:
-        if step.temperature_c is None:
-            return None
-        for group in groups:
-            if _is_same_step(group[0], step):
-                group.append(step)
-                break
-        else:
+        alike = next((group for group in groups if _is_same_step(group[0], step)), None)
+        if alike is None:
             groups.append([step])
-    best: Figure | None = None
-    for group in groups:
-        figure = _slope(group, index)
-        if figure is not None and (best is None or figure.high - figure.low < best.high - best.low):
-            best = figure
-    return best
+        else:
+            alike.append(step)
+    slopes = [slope for group in groups if (slope := _slope(group, index)) is not None]
+    return min(slopes, key=lambda slope: slope.high - slope.low, default=None)
 
 
 def _is_same_step(a: DynoStep, b: DynoStep) -> bool:

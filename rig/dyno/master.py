@@ -99,12 +99,6 @@ class Master(NamedTuple):
         down, up = self.compression.force(speed), self.rebound.force(speed)
         return np.where(velocity_m_per_s < 0.0, down, -up)
 
-    def velocity(self, damping_n: Array) -> Array:
-        """Velocities at which the damping is some force."""
-        size = np.abs(damping_n)
-        down, up = -self.compression.speed(size), self.rebound.speed(size)
-        return np.where(damping_n > 0.0, down, up)
-
 
 def master_of(record: Characteristics) -> Master:
     """A good damper from its record.
@@ -166,10 +160,10 @@ def _curve(bare: Master, stroke: MeanStroke) -> DampingCurve:
     top = int(np.argmax(speed))
     peak = float(speed[top])
     nodes = np.linspace(0.0, peak, _NODES - 1)
-    halves = [
-        np.interp(nodes, *_by_speed(speed[part], damping_n[part]))
-        for part in (slice(None, top + 1), slice(top, None))
-    ]
+    halves: list[Array] = []
+    for part in (slice(None, top + 1), slice(top, None)):
+        order = np.argsort(speed[part])
+        halves.append(np.interp(nodes, speed[part][order], damping_n[part][order]))
     force = np.maximum.accumulate(np.maximum(0.5 * (halves[0] + halves[1]), 0.0))
     force[0] = 0.0
     force = force + 1e-6 * np.arange(len(force))  # rising, so that it can be turned round
@@ -178,11 +172,6 @@ def _curve(bare: Master, stroke: MeanStroke) -> DampingCurve:
     last = force[-1] + slope * (farther - peak)
     speeds: Array = np.append(nodes, farther).astype(np.float64)
     return DampingCurve(speeds, np.append(force, last).astype(np.float64))
-
-
-def _by_speed(speed: Array, force: Array) -> tuple[Array, Array]:
-    order = np.argsort(speed)
-    return speed[order], force[order]
 
 
 class Cycle(NamedTuple):

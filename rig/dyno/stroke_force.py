@@ -91,7 +91,6 @@ class MeanStroke(NamedTuple):
         covariance: Its covariance, shape (181, 181).
         freedom: Degrees of freedom.
         velocity_m_per_s: Velocity at `ANGLES`, shape (181,).
-        strokes: Number of strokes.
         samples: How many samples lie nearest to each of `FINE`, shape (361,).
         sums_n: Sums of their forces, shape (361,).
         noise_n: Standard deviation of a sample about the mean stroke.
@@ -104,7 +103,6 @@ class MeanStroke(NamedTuple):
     covariance: Array
     freedom: float
     velocity_m_per_s: Array
-    strokes: int
     samples: Array
     sums_n: Array
     noise_n: float
@@ -201,7 +199,6 @@ def mean_stroke(
         apart = forces - _design(ANGLES, other.pieces) @ other.weights
         covariance = covariance + np.outer(apart, apart)
     velocity = _mean_velocity(between, motion.between_m_per_s[along])
-    strokes = len(np.unique(number))
     nearest = np.round((theta + 0.5 * np.pi) / np.pi * (len(FINE) - 1)).astype(np.int64)
     samples = np.bincount(nearest, minlength=len(FINE)).astype(np.float64)
     sums: Array = np.bincount(nearest, weights=force_n, minlength=len(FINE)).astype(np.float64)
@@ -213,7 +210,6 @@ def mean_stroke(
         covariance,
         freedom,
         velocity,
-        strokes,
         samples,
         sums,
         float(np.sqrt(noise)),

@@ -10,9 +10,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure as Drawing
 
-from rig.dyno.characterise import AtRest, Characteristics
+from rig.dyno.characterise import Characteristics
 from rig.dyno.faults import MasterComparison
-from rig.dyno.figures import SIDES, DynoStep
+from rig.dyno.figures import SIDES, AtRest, DynoStep
 from rig.dyno.report import DamperReport
 from rig.dyno.stroke_force import ANGLES, Figure
 from rig.dyno.tolerance import PointVerdict
