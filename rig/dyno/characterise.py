@@ -29,13 +29,11 @@ class ForceRecord(NamedTuple):
     """Measured motion and force of a strut.
 
     Attributes:
-        name: Name of the record.
         t_s: Times, increasing, shape (N,).
         height_m: Heights, shape (N,).
         force_n: Strut forces, shape (N,), positive when the strut pushes.
         temperature_c: Temperatures, shape (N,), or None.
         strut: Name of the strut; empty where there is one.
-        source: Origin of the force.
     """
 
     name: str
@@ -52,10 +50,7 @@ class Characteristics:
     """Figures of a damper from one record.
 
     Attributes:
-        record: The record.
         steps: Its steps, in time.
-        holds: Its times at rest.
-        damper: Figures over all steps.
         quality: What in the record may mislead.
     """
 
@@ -93,9 +88,7 @@ class Characteristics:
 def characterise(path: Path, strut: str | None = None) -> Characteristics:
     """Figures of a damper from a run's folder or a CSV of measured data.
 
-    Args:
-        path: Folder or file.
-        strut: Name of the strut; may be None where there is one.
+    `strut` may be None where a run has only one.
 
     Raises:
         InputError: There is no such record, or no cycle in it repeats.

@@ -43,9 +43,6 @@ class Difference(NamedTuple):
 
     Attributes:
         figure: Name of the figure, with the speed of its step.
-        unit: Its unit.
-        before: In the first state.
-        after: In the second state.
         change: Second less first.
         differs: Whether the change is significant.
     """
@@ -62,8 +59,6 @@ class Trend(NamedTuple):
     """One figure over a dose.
 
     Attributes:
-        figure: Name of the figure.
-        unit: Its unit.
         slope: Its change per unit of the dose.
         at_zero: Value of the line at a dose of zero.
         differs: Whether the slope is significant.
@@ -97,10 +92,6 @@ def compare_dampers(before: Characteristics, after: Characteristics) -> list[Dif
 
 def trends_over_dose(items: Sequence[Characteristics], doses: Sequence[float]) -> list[Trend]:
     """Trends of the figures over a dose, significant ones first.
-
-    Args:
-        items: A state at each dose.
-        doses: The doses.
 
     Raises:
         InputError: There are fewer than three doses, all of one size, or no figure in common.

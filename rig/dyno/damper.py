@@ -59,11 +59,7 @@ class Damper(NamedTuple):
 
 
 def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
-    """Figures of a damper.
-
-    Args:
-        steps: Its steps, in time; one at least.
-    """
+    """Figures of a damper from its steps, in time; one at least."""
     notes: list[str] = []
     kinds = _kinds(steps)
     slow = [step for step, kind in zip(steps, kinds, strict=True) if kind == "quasi_static"]

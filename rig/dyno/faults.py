@@ -71,9 +71,7 @@ class Fault(NamedTuple):
     """A fault that can be simulated.
 
     Attributes:
-        name: Its name.
         quantity: Meaning of its size.
-        unit: Unit of the size.
         sizes: Sizes that are tried, rising, shape (K,).
         changes: What each changes of the stacked forces, shape (K, N).
         least: Smallest that can be.
@@ -93,9 +91,6 @@ class NamedFault(NamedTuple):
     """A fault with its size.
 
     Attributes:
-        name: Its name.
-        quantity: Meaning of its size.
-        unit: Unit of the size.
         size: Its size, with a 95 % interval.
         evidence: By how much it lowers chi-squared.
     """
@@ -184,12 +179,9 @@ def _bin_means(pairs: Sequence[_StrokePair], fine: Sequence[Array]) -> Array:
 
 
 def name_faults(tested: Characteristics, master: Master, scatter: float) -> MasterComparison:
-    """The comparison of a damper with its master.
+    """The comparison of a damper with its master, a good item in the same test.
 
-    Args:
-        tested: Figures of the damper.
-        master: The good item, of the same test.
-        scatter: Relative standard deviation that manufacturing leaves of each property.
+    `scatter` is the relative standard deviation that manufacturing leaves of each property.
 
     Raises:
         InputError: No step of item has a partner in the other.
@@ -254,10 +246,7 @@ of the study have 0.6 to 1.2."""
 def _fit_size(
     fault: Fault, residual_n: Array, covariance: Array, before: float
 ) -> tuple[NamedFault, Array]:
-    """A fault at its best size, and its share of the differences.
-
-    `before` is chi-squared without the fault.
-    """
+    """A fault at its best size, and its share of the differences; `before`: misfit without it."""
     nodes: Array = np.arange(len(fault.sizes), dtype=np.float64)
     tried: Array = np.linspace(0.0, float(nodes[-1]), _SIZES)
     sizes: Array = np.interp(tried, nodes, fault.sizes).astype(np.float64)
@@ -359,11 +348,7 @@ def _opening_loss(curve: DampingCurve, speed: Array, shares: Array) -> Array:
 
 
 def simulate_faults(master: Master, steps: Sequence[DynoStep]) -> list[Fault]:
-    """All faults that are known, run in the master.
-
-    Args:
-        master: The good damper.
-        steps: Steps of its record.
+    """All faults that are known, run in the master in steps of its record.
 
     Returns:
         Faults whose changes are those at `FINE` of all strokes of the steps, one after the other.

@@ -79,8 +79,6 @@ class AtRest(NamedTuple):
     """A hold: the gas force, and what friction keeps.
 
     Attributes:
-        begin_s: Its beginning.
-        end_s: Its end.
         height_m: Mean height.
         force_n: Mean force.
         temperature_c: Mean temperature; None where none was measured.
@@ -97,15 +95,11 @@ class DynoStep(NamedTuple):
     """Figures of a block: one step of a test.
 
     Attributes:
-        begin_s: Its beginning.
-        end_s: Its end.
         cycles: Cycles that were used.
         frequency_hz: Cycles a second; None where the motion is not periodic.
         amplitude_m: Half the stroke.
         middle_m: Height at mid-stroke.
         temperature_c: Mean temperature; None where none was measured.
-        compression: Figures of the compression strokes.
-        rebound: Figures of the rebound strokes.
         energy_per_cycle_j: Energy that the loop of force over height encloses.
         equivalent_damping_n_s_per_m: Linear damping that takes the same energy.
         spring_rate_n_per_m: Fall of the mean force per height.
@@ -153,12 +147,7 @@ def compute_step(
 ) -> DynoStep | None:
     """Figures of a block; None where it has too few samples for any, or does not repeat.
 
-    Args:
-        t_s: Times of the record, shape (N,).
-        height_m: Heights, shape (N,).
-        force_n: Strut forces, shape (N,).
-        temperature_c: Temperatures, shape (N,), or None.
-        block: The block.
+    Times, heights, forces and temperatures are those of the whole record, shape (N,).
     """
     here = slice(block.begin, block.end)
     force_n, warm_c = force_n[here], None if temperature_c is None else temperature_c[here]

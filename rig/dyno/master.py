@@ -72,13 +72,9 @@ class Master(NamedTuple):
     """A good damper.
 
     Attributes:
-        characteristics: Figures of its record.
         gas_n: Gas force at the middle of the slowest step.
         gas_rate_n_per_m: Its rise per compression.
         middle_m: That height.
-        friction_n: Its friction.
-        compression: Damping in compression.
-        rebound: Damping in rebound.
     """
 
     characteristics: Characteristics
@@ -198,15 +194,9 @@ def cycle_of(step: DynoStep) -> Cycle:
 
 
 def with_compliance(master: Master, cycle: Cycle, rates_n_per_m: Array) -> Array:
-    """Damping of the last cycle behind a column of oil that gives way.
+    """Damping of the last cycle behind a column of oil that gives way, shape (K, 720).
 
-    Args:
-        master: The good damper.
-        cycle: Its motion.
-        rates_n_per_m: Stiffnesses of the column, shape (K,).
-
-    Returns:
-        Damping forces, shape (K, 720).
+    The column has the stiffnesses `rates_n_per_m`, shape (K,).
     """
     # Implicit Euler: force + rate * dt * piston velocity(force) rises with the force.
     forces = np.concatenate([-master.rebound.force_n[:0:-1], master.compression.force_n])
@@ -226,15 +216,9 @@ def with_compliance(master: Master, cycle: Cycle, rates_n_per_m: Array) -> Array
 
 
 def with_play(master: Master, cycle: Cycle, plays_m: Array) -> Array:
-    """Force of the last cycle where the damper's eye has play.
+    """Force of the last cycle where the damper's eye has play, shape (K, 720).
 
-    Args:
-        master: The good damper.
-        cycle: The machine's motion.
-        plays_m: How far the eye may move without force, shape (K,).
-
-    Returns:
-        Forces, shape (K, 720).
+    The eye may move by `plays_m`, shape (K,), without force; the cycle is the machine's motion.
     """
     forces_n = np.empty((len(plays_m), _TIMES))
     gap = np.zeros_like(plays_m)  # from the side on which the strut pushes

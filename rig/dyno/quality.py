@@ -36,12 +36,7 @@ def quality(
 ) -> tuple[str, ...]:
     """Warnings of gaps, few samples, a coarse force, a wrong sign, unused strokes, a drift at rest.
 
-    Args:
-        t_s: Times, shape (N,).
-        force_n: Forces, shape (N,).
-        steps: Steps of the test.
-        holds: Times at rest.
-        strokes: How many strokes the record has.
+    Times and forces have the shape (N,); `strokes` is the number of strokes of the record.
     """
     return (
         *_sign(steps),
@@ -56,9 +51,7 @@ def quality(
 def preflight(t_s: Array, channels: Mapping[str, Array]) -> tuple[str, ...]:
     """Warnings of gaps, and of channels that were clipped at an end of their range.
 
-    Args:
-        t_s: Times, increasing, shape (N,).
-        channels: Measured values by their names, each of shape (N,); NaN where there is none.
+    Times increase, shape (N,); each channel has the same shape, and NaN where there is no value.
     """
     clipped = [
         f"{name} stays at its {plateau.extreme} value {plateau.limit:.6g}, "

@@ -19,7 +19,6 @@ class Criteria(NamedTuple):
     """What a damper has to keep to be good.
 
     Attributes:
-        band: Tolerance band, if there is one.
         master: Record of a good damper in the same test, if there is one.
         scatter: Relative standard deviation of each property among good dampers.
     """
@@ -38,10 +37,9 @@ class Check(NamedTuple):
 
 
 class DamperReport(NamedTuple):
-    """One record.
+    """The figures of one record, and its standing.
 
     Attributes:
-        characteristics: Its figures.
         points: Its verdict at each point of the band; empty without a band.
         against_master: Its comparison with the master; None without a master.
     """
@@ -78,12 +76,9 @@ class DamperReport(NamedTuple):
 def evaluate_records(
     paths: Sequence[Path], strut: str | None, criteria: Criteria
 ) -> list[DamperReport]:
-    """Reports of several records.
+    """Reports of several records: folders of runs, or CSV files.
 
-    Args:
-        paths: Folders of runs, or CSV files.
-        strut: Name of the strut; may be None where there is one.
-        criteria: Band and master, if any.
+    `strut` may be None where a run has only one.
 
     Raises:
         InputError: A record cannot be characterised, or not be compared with the master.

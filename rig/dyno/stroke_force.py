@@ -51,14 +51,7 @@ _FEWEST_CLUSTERS = 4
 
 
 class Figure(NamedTuple):
-    """A figure with its 95 % interval.
-
-    Attributes:
-        value: The figure.
-        low: Lower end.
-        high: Upper end.
-        method: Method that gave it.
-    """
+    """A figure with its 95 % interval, and the method that gave it."""
 
     value: float
     low: float
@@ -136,11 +129,8 @@ def combine(
 ) -> Figure:
     """A sum of functionals of several mean strokes, with its interval.
 
-    Args:
-        parts: Row and mean stroke of each.
-        method: Method that gives it.
-        factor: Of the sum.
-        relative_std: Relative standard deviation of the factor.
+    A part is a row over the forces of a mean stroke. The sum is multiplied by `factor`, whose
+    relative standard deviation is `relative_std`.
     """
     value = factor * sum(float(row @ stroke.force_n) for row, stroke in parts)
     variances = [factor**2 * float(row @ stroke.covariance @ row) for row, stroke in parts]
@@ -162,11 +152,8 @@ def mean_stroke(
 ) -> MeanStroke | None:
     """The mean of the strokes of one direction; None where there are too few samples.
 
-    Args:
-        motion: The motion of the block, of N samples.
-        force_n: Measured forces, shape (N,).
-        number: Which stroke each sample belongs to, shape (N,).
-        sign: 1 for rebound, -1 for compression.
+    The motion of the block has N samples; forces, and the stroke that each sample belongs to, have
+    the shape (N,). `sign` is 1 for rebound, -1 for compression.
     """
     mine = sign * motion.velocity_m_per_s > 0.0
     along = sign * motion.between_m_per_s > 0.0
@@ -244,13 +231,11 @@ class _Fit(NamedTuple):
 
     Attributes:
         criterion: Akaike's, corrected for few samples.
-        pieces: Its pieces.
         weights: Its coefficients.
         inverse: Their covariance under noise of one.
         variance: Variance of the residuals.
         freedom: Degrees of freedom of it.
         clustered: Covariance by what the strokes differ by; None of few strokes.
-        clusters: Number of strokes.
     """
 
     criterion: float

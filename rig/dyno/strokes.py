@@ -77,13 +77,10 @@ _PER_CYCLE, _BETWEEN = 1441, 8
 
 
 class Stroke(NamedTuple):
-    """Samples from one turning point to the next.
+    """Samples `first` to `last`, which is the next turning point.
 
     Attributes:
-        first: First sample.
-        last: Last sample, the next turning point.
         rise_m: Change of height: positive in rebound.
-        duration_s: Time that it takes.
     """
 
     first: int
@@ -113,13 +110,7 @@ class BlockMotion(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Like strokes in a row.
-
-    Attributes:
-        strokes: The strokes, alternately up and down.
-        begin: First sample.
-        end: Past the last sample.
-    """
+    """Like strokes in a row, alternately up and down: samples from `begin` to before `end`."""
 
     strokes: tuple[Stroke, ...]
     begin: int
@@ -127,12 +118,7 @@ class Block(NamedTuple):
 
 
 def find_strokes(t_s: Array, height_m: Array) -> list[Stroke]:
-    """All strokes of a record.
-
-    Args:
-        t_s: Times, increasing, shape (N,).
-        height_m: Heights, shape (N,).
-    """
+    """All strokes of a record: times, increasing, and heights, shape (N,)."""
     noise_m = _noise_m(height_m)
     low, high = np.percentile(height_m, (1.0, 99.0))
     least_m = max(_TURN_SHARE * float(high - low), _TURN_NOISE * noise_m)
@@ -200,10 +186,7 @@ def _without_ramps(run: list[Stroke]) -> list[Stroke]:
 def is_repetition(t_s: Array, height_m: Array, block: Block) -> bool:
     """Whether the strokes of a block are one motion again and again, and not alike by chance.
 
-    Args:
-        t_s: Times of the record, shape (N,).
-        height_m: Heights, shape (N,).
-        block: The block.
+    Times and heights are those of the whole record, shape (N,).
     """
     if len(block.strokes) < _FEWEST_UNLIKE_A_SERIES:
         return False
@@ -276,13 +259,7 @@ def _turns_slowly(height_m: Array, still_m: float) -> bool:
 
 
 def fit_motion(t_s: Array, height_m: Array, strokes: int) -> BlockMotion:
-    """Height and velocity of a block.
-
-    Args:
-        t_s: Its times, shape (N,).
-        height_m: Its measured heights, shape (N,).
-        strokes: Number of its strokes.
-    """
+    """Height and velocity of a block, from its times and measured heights, shape (N,)."""
     series = _fourier_series(t_s - t_s[0], height_m, strokes)
     if series is not None:
         return series

@@ -29,15 +29,7 @@ _COLUMNS = ("velocity_m_per_s", "compression_low_n", "compression_high_n", "rebo
 
 
 class BandPoint(BaseModel):
-    """Limits at one peak velocity.
-
-    Attributes:
-        velocity_m_per_s: The velocity.
-        compression_low_n: Smallest force in compression.
-        compression_high_n: Largest.
-        rebound_low_n: Smallest force in rebound, where damping is negative.
-        rebound_high_n: Largest.
-    """
+    """Limits at one peak velocity; damping is negative in rebound."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -57,12 +49,7 @@ class BandPoint(BaseModel):
 
 
 class ToleranceBand(BaseModel):
-    """A band about a master curve.
-
-    Attributes:
-        name: What it is for.
-        points: Limits by peak velocity, increasing.
-    """
+    """A band about a master curve: limits by peak velocity, increasing."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -78,15 +65,10 @@ class ToleranceBand(BaseModel):
 
 
 class PointVerdict(NamedTuple):
-    """A point of a damper.
+    """A damper's force at a peak velocity, in `compression` or `rebound`, against its limits.
 
     Attributes:
-        velocity_m_per_s: Peak velocity.
-        side: `compression` or `rebound`.
         force: Its force there; None where no step is near.
-        low_n: Smallest that is allowed.
-        high_n: Largest.
-        verdict: Whether the force lies inside.
     """
 
     velocity_m_per_s: float
@@ -142,12 +124,7 @@ def evaluate_band(
     A point belongs to the velocity step nearest to its speed within 1 %; the force is then less
     certain by what it may change over the difference. Between two steps the force of a damper lies
     between theirs, since it rises with speed: that is its interval. Beyond all steps it is not
-    measured. A warm-up is no step.
-
-    Args:
-        steps: The steps of a damper.
-        kinds: What each of them is, as `summarise_damper` says.
-        tolerance: The band.
+    measured. A warm-up is no step; `kinds` are those of `summarise_damper`.
     """
     used = [step for step, kind in zip(steps, kinds, strict=True) if kind != "warm_up"]
     ordered = sorted(used, key=lambda step: step.peak_speed_m_per_s)
