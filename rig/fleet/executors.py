@@ -38,10 +38,8 @@ def processes(jobs: int | None) -> Engine:
         jobs: How many; one a core that this program may use if None.
     """
     count = jobs or _cores()
-    for name in _THREADS:
-        os.environ.setdefault(
-            name, "1"
-        )  # Workers are as many as cores; theirs would be in the way.
+    for name in _THREADS:  # Workers are as many as cores; theirs would be in the way.
+        os.environ.setdefault(name, "1")
     context = multiprocessing.get_context("spawn")
 
     def make() -> Executor:

@@ -179,11 +179,15 @@ class Overview:
                 if item.is_drift and item.drift is not None
             ],
             "outliers": [
-                {**item.where._asdict(), **item.quantity._asdict(), "value": item.value,
-                 "usual": item.usual, "distance": item.distance}
+                {
+                    **_place(item),
+                    "value": item.value,
+                    "usual": item.usual,
+                    "distance": item.distance,
+                }
                 for item in self.outliers
             ],
-        }  # fmt: skip
+        }
 
 
 def date_of(day: float) -> str:
@@ -224,14 +228,21 @@ def read_overview(store: Path) -> Overview:
     finally:
         connection.close()
     jumps = _jumps(collected)
-    stepped_on = _step_days(collected, jumps)
-    cleared = _without_jumps(collected, stepped_on)
+    step_days = {jump.bench: jump.change.day for jump in jumps}
+    # Every series without the jump of its bench, whose size is its own best one.
+    cleared = {
+        quantity: {
+            where: without_step(points, _step_day(step_days, where, quantity))
+            for where, points in by_place.items()
+        }
+        for quantity, by_place in collected.items()
+    }
     words = f"{model} ({sha256[:8]}), rig {version}"
     return Overview(
         runs,
         failed,
         verdicts,
-        _series(cleared, stepped_on),
+        _series(cleared, step_days),
         jumps,
         _outliers(cleared),
         words,
@@ -288,41 +299,18 @@ def _jumps(collected: _Collected) -> tuple[Jump, ...]:
     return tuple(found.values())
 
 
-def _step_days(
-    collected: _Collected, jumps: Sequence[Jump]
-) -> dict[tuple[Where, SeriesQuantity], float]:
-    """Day of the bench's jump for each series that it is in."""
-    by_bench = {jump.bench: jump.change.day for jump in jumps}
-    return {
-        (where, quantity): by_bench[where.bench]
-        for quantity, by_place in collected.items()
-        for where in by_place
-        if where.bench in by_bench and _FORCE.search(quantity.parameter)
-    }
-
-
-def _without_jumps(
-    collected: _Collected, days: Mapping[tuple[Where, SeriesQuantity], float]
-) -> _Collected:
-    """Every series without the jump of its bench, whose size is its own best one."""
-    return {
-        quantity: {
-            where: without_step(points, days[where, quantity])
-            if (where, quantity) in days
-            else points
-            for where, points in by_place.items()
-        }
-        for quantity, by_place in collected.items()
-    }
+def _step_day(
+    step_days: Mapping[str, float], where: Where, quantity: SeriesQuantity
+) -> float | None:
+    """Day of the bench's jump, if it has one and the series is in it."""
+    return step_days.get(where.bench) if _FORCE.search(quantity.parameter) else None
 
 
 def _logarithms(points: Sequence[DatedValue]) -> list[DatedValue]:
     return [point._replace(value=math.log(point.value)) for point in points]
 
 
-def _series(
-    collected: _Collected, stepped_on: Mapping[tuple[Where, SeriesQuantity], float]
-) -> tuple[Series, ...]:
+def _series(collected: _Collected, step_days: Mapping[str, float]) -> tuple[Series, ...]:
     """Every series with what is significant among all of them."""
     every = [
         (where, quantity, points)
@@ -332,7 +320,7 @@ def _series(
     level = LEVEL / max(1, sum(len(points) >= FEWEST for _, _, points in every))
     found: list[Series] = []
     for where, quantity, points in every:
-        line = fit_drift(points, stepped_on.get((where, quantity)))
+        line = fit_drift(points, _step_day(step_days, where, quantity))
         change = find_change_point(points)
         is_change = change is not None and change.p < level
         is_drift = line is not None and len(points) >= FEWEST and line.p < level and not is_change
@@ -355,7 +343,7 @@ def _outliers(collected: _Collected) -> tuple[Outlier, ...]:
     return tuple(found)
 
 
-def _place(item: Series) -> dict[str, str]:
+def _place(item: Series | Outlier) -> dict[str, str]:
     return {**item.where._asdict(), **item.quantity._asdict()}
 
 

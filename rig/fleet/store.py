@@ -14,7 +14,7 @@ import glob
 import hashlib
 import importlib
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -24,7 +24,7 @@ from pyarrow import dataset, parquet
 
 from can_dbc.atomic_file import replacing
 from can_dbc.errors import InputError
-from rig.fleet.one_run import RunRow, RunValue
+from rig.fleet.one_run import RunRow
 
 _duckdb: Any = None
 with contextlib.suppress(ModuleNotFoundError):  # It only reads; the store is written without it.
@@ -119,9 +119,9 @@ def _write(store: Path, partition: str, rows: Sequence[RunRow]) -> None:
     content = "\0".join([partition, *(row.key for row in rows)])
     part = hashlib.sha256(content.encode("utf-8", "surrogateescape")).hexdigest()[:24]
     written = datetime.datetime.now(datetime.UTC).isoformat(timespec="microseconds")
-    runs = [{**row.as_dict(), "written": written, "part": part} for row in rows]
+    runs = [{**vars(row), "written": written, "part": part} for row in rows]
     values = [
-        {**_columns(value), "key": row.key, "damper": row.damper, "part": part}
+        {**vars(value), "key": row.key, "damper": row.damper, "part": part}
         for row in rows
         for value in row.values
     ]
@@ -131,10 +131,6 @@ def _write(store: Path, partition: str, rows: Sequence[RunRow]) -> None:
         kept = [{key: item[key] for key in schema.names} for item in content]
         with replacing(path) as temporary:
             _parquet.write_table(_pa.Table.from_pylist(kept, schema=schema), temporary)
-
-
-def _columns(value: RunValue) -> dict[str, Any]:
-    return {name: getattr(value, name) for name in _VALUE.names if hasattr(value, name)}
 
 
 def read_identities(store: Path, *, with_failed: bool) -> set[str]:
@@ -147,13 +143,12 @@ def read_identities(store: Path, *, with_failed: bool) -> set[str]:
     Raises:
         InputError: It cannot be read.
     """
-    found: set[str] = set()
-    for batch in _batches(store, ["identity", "error"]):
-        columns = batch.to_pydict()
-        for identity, error in zip(columns["identity"], columns["error"], strict=True):
-            if with_failed or not error:
-                found.add(identity)
-    return found
+    return {
+        row["identity"]
+        for batch in _batches(store, ["identity", "error"])
+        for row in batch.to_pylist()
+        if with_failed or not row["error"]
+    }
 
 
 def read_keys(store: Path) -> set[str]:
@@ -180,18 +175,12 @@ def _batches(store: Path, columns: Sequence[str]) -> Iterator[Any]:
 def sweep(store: Path) -> None:
     """Remove what a killed program left: files without a name, values without their runs."""
     now = time.time()
-    for path in _files(store, "values", ".*"):
-        runs = store / "runs" / path.relative_to(store / "values")
-        if (path.name.startswith(".") or not runs.exists()) and _age_s(path, now) > _ABANDONED_S:
-            path.unlink(missing_ok=True)
-    for path in _files(store, "runs", ".*"):
-        if path.name.startswith(".") and _age_s(path, now) > _ABANDONED_S:
-            path.unlink(missing_ok=True)
-
-
-def _files(store: Path, name: str, hidden: str) -> Iterable[Path]:
-    folder = store / name
-    return [*folder.rglob("*.parquet"), *folder.rglob(hidden)] if folder.is_dir() else []
+    for name in ("values", "runs"):
+        for path in [*(store / name).rglob("*.parquet"), *(store / name).rglob(".*")]:
+            runs = store / "runs" / path.relative_to(store / name)
+            is_left = path.name.startswith(".") or not runs.exists()
+            if is_left and _age_s(path, now) > _ABANDONED_S:
+                path.unlink(missing_ok=True)
 
 
 def _age_s(path: Path, now: float) -> float:

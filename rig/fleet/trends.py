@@ -148,13 +148,11 @@ def fit_drift(points: Sequence[DatedValue], stepped_on: float | None = None) -> 
     return Drift(slope, slope - half, slope + half, float(y.mean()), p)
 
 
-def without_step(points: Sequence[DatedValue], day: float) -> list[DatedValue]:
-    """A series without the step that it has on a day, its straight line kept."""
-    columns = _line_and_step(np.array([point.day for point in points]), day)
-    if columns.shape[1] < 3:
+def without_step(points: Sequence[DatedValue], day: float | None) -> list[DatedValue]:
+    """A series without the step that it has on a day, if any, its straight line kept."""
+    step = None if day is None else _step_at(points, day)
+    if day is None or step is None:
         return list(points)
-    y = np.array([point.value for point in points])
-    step = float(np.linalg.lstsq(columns, y, rcond=None)[0][2])
     return [p._replace(value=p.value - step) if p.day >= day else p for p in points]
 
 
