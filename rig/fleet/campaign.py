@@ -36,7 +36,6 @@ class CampaignProgress(NamedTuple):
         failed: Those of them that failed.
         todo: Runs that had to be evaluated.
         skipped: Runs that were in the store already.
-        elapsed_s: Time since the beginning.
         worked_s: Time that workers computed.
     """
 
@@ -88,14 +87,8 @@ def run_campaign(
     A worker that dies takes those with it that were being computed: they are tried again one by
     one, and the one that kills its worker a second time is a failed run.
 
-    Args:
-        sources: Runs.
-        model: The model.
-        out: The store.
-        make_executor: Makes an executor; called again when one broke.
-        window: Runs that are given to it at a time.
-        again: Whether runs that failed before are tried again.
-        progress: Called after each run.
+    An executor is given `window` runs at a time, and made again when it broke. With `again`, runs
+    that failed before are tried again. `progress` is called after each run.
 
     Raises:
         InputError: The store cannot be read or written.

@@ -22,7 +22,6 @@ class Engine(NamedTuple):
 
     Attributes:
         words: The executor as a phrase.
-        make: Makes an executor.
         window: Runs that it is given at a time.
     """
 
@@ -32,11 +31,7 @@ class Engine(NamedTuple):
 
 
 def processes(jobs: int | None) -> Engine:
-    """Processes of this machine.
-
-    Args:
-        jobs: How many; one a core that this program may use if None.
-    """
+    """Processes of this machine: `jobs`, or one for each core that this program may use."""
     count = jobs or _cores()
     for name in _THREADS:  # Workers are as many as cores; theirs would be in the way.
         os.environ.setdefault(name, "1")

@@ -54,17 +54,10 @@ class RunRow:
         key: Hash of its content, the model and the version: the same run counts once.
         identity: Hash of its location, size and time, the model and the version, by which an
             evaluated run is recognised without being read again.
-        source: Where it was.
-        bench: Bench.
-        damper: Damper.
-        date: Day.
         model: Name of the model.
         model_sha256: Hash of its file and of the files that it names.
-        version: Version of rig.
         verdict: Verdict of the diagnosis; empty where it failed.
         error: Why it failed; empty where it did not.
-        samples: Number of samples.
-        duration_s: Length.
         before: Error of the model on held-out blocks: of the height in m, or of the force in N on a
             prescribed motion.
         after: The same of the corrected model.
@@ -100,13 +93,10 @@ class RunValue:
     Attributes:
         kind: ``model``: a parameter of the model itself, as this run has it; ``found``: of an
             effect that the model lacks; ``figure``: of the damper, as `rig characterise` has it.
-        strut: Strut.
         effect: Effect in the catalogue; empty for the linear part and for figures.
-        family: Its family.
         parameter: Name with its unit.
         value: Value in SI.
         low: Lower end of its 95 % interval; NaN where the run does not bound it.
-        high: Upper end.
     """
 
     kind: str

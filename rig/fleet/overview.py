@@ -63,8 +63,6 @@ class Series(NamedTuple):
     """A quantity of a damper over time.
 
     Attributes:
-        where: Damper and bench.
-        quantity: What of it.
         points: Values by day.
         drift: Its straight line; None where it is too short.
         change: Its likeliest change-point; None where it is too short.
@@ -85,9 +83,7 @@ class Jump(NamedTuple):
     """A step that the dampers of a bench have in common.
 
     Attributes:
-        bench: The bench.
         parameter: What stepped.
-        factor: By what factor.
         change: When; its values are logarithms.
     """
 
@@ -101,8 +97,6 @@ class Outlier(NamedTuple):
     """A damper that is unlike the others.
 
     Attributes:
-        where: Damper and bench.
-        quantity: In what.
         value: Median of its last points.
         usual: Median of all.
         distance: From it, in robust standard deviations of the others.
@@ -120,12 +114,8 @@ class Overview:
     """A store as a whole.
 
     Attributes:
-        runs: Number of runs.
         failed: Those that could not be evaluated, by the words of their error.
         verdicts: By bench, how often each verdict was given.
-        series: Every quantity of every damper.
-        jumps: Of benches.
-        outliers: Dampers.
         model: Model and version of these runs: those that were evaluated last.
         others: Runs of other models or versions in the store.
     """

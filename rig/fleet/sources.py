@@ -37,9 +37,6 @@ class RunSource:
 
     Attributes:
         url: Where it is: a run's folder or a CSV file.
-        is_folder: Whether it is a folder.
-        bench: Bench that it ran on.
-        damper: Damper that was on it.
         date: Day as ``YYYY-MM-DD``; empty where only the run itself may know it.
         changed: Day on which it was last changed.
         size: Bytes of all its files.
