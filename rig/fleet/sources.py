@@ -92,13 +92,7 @@ def parse_shard(text: str) -> tuple[int, int]:
 
 
 def select_shard(sources: Sequence[RunSource], index: int, count: int) -> list[RunSource]:
-    """A share of the runs, of `count` shares; a run is in the same share whatever the others are.
-
-    Args:
-        sources: All runs.
-        index: Which part, from 1 on.
-        count: How many parts.
-    """
+    """Share `index`, from 1 on, of `count`; a run is in the same one whatever the others are."""
     return [item for item in sources if zlib.crc32(os.fsencode(item.url)) % count == index - 1]
 
 

@@ -134,11 +134,9 @@ def _write(store: Path, partition: str, rows: Sequence[RunRow]) -> None:
 
 
 def read_identities(store: Path, *, with_failed: bool) -> set[str]:
-    """What was evaluated already.
+    """Identities of the runs that were evaluated, with or without those that failed.
 
-    Args:
-        store: The store; it may not be there yet.
-        with_failed: Whether runs that failed count.
+    There are none where there is no store yet.
 
     Raises:
         InputError: It cannot be read.

@@ -53,12 +53,7 @@ _GAUSS = 1.4826
 
 
 class DatedValue(NamedTuple):
-    """A value on a day.
-
-    Attributes:
-        day: Days since any origin.
-        value: The value.
-    """
+    """A value on a day, which is counted from any origin."""
 
     day: float
     value: float
@@ -96,7 +91,6 @@ class Drift(NamedTuple):
     Attributes:
         per_day: Change per day.
         low: Lower end of its 95 % interval.
-        high: Upper end.
         level: Value of the line in the middle.
         p: Chance of a slope as large without a drift.
     """
@@ -109,11 +103,7 @@ class Drift(NamedTuple):
 
 
 def find_change_point(points: Sequence[DatedValue]) -> ChangePoint | None:
-    """The likeliest change of a series, significant or not; None where it is too short.
-
-    Args:
-        points: The series, by day.
-    """
+    """The likeliest change of a series by day, significant or not; None where it is too short."""
     days = np.array([point.day for point in points])
     if len(points) < FEWEST or np.ptp(days) <= 0.0:
         return None
@@ -125,11 +115,9 @@ def find_change_point(points: Sequence[DatedValue]) -> ChangePoint | None:
 
 
 def fit_drift(points: Sequence[DatedValue], stepped_on: float | None = None) -> Drift | None:
-    """The straight line through a series; None with too few days for it.
+    """The straight line through a series by day; None with too few days for it.
 
-    Args:
-        points: The series, by day.
-        stepped_on: Day of a step of unknown size that is not its own.
+    `stepped_on` is the day of a step of unknown size that is not its own.
     """
     days = np.array([point.day for point in points])
     columns = _line_and_step(days, stepped_on)
@@ -167,9 +155,8 @@ def _line_and_step(days: Array, day: float | None) -> Array:
 def find_outliers(values: Mapping[str, float], level: float) -> dict[str, float]:
     """How many robust standard deviations away from the others members are that stand out.
 
-    Args:
-        values: One value a member; up to a half of them may be bad.
-        level: Chance of any such member among so many alike.
+    Up to a half of the values, one a member, may be bad. `level` is the chance of any such member
+    among so many alike.
     """
     if len(values) < _ALONE:
         return {}
@@ -201,9 +188,8 @@ def _farthest(members: int, level: float) -> float:
 def find_bench_jump(series: Mapping[str, Sequence[DatedValue]], level: float) -> ChangePoint | None:
     """A step that the dampers of one bench have in common: of its calibration, not of theirs.
 
-    Args:
-        series: Of each damper the logarithm of a value that its force scales.
-        level: Chance of a jump where there is none.
+    The series are, of each damper, the logarithm of a value that its force scales; `level` is the
+    chance of a jump where there is none.
 
     Returns:
         The change, if it is significant and at least two dampers share it; ``before`` and
