@@ -132,6 +132,8 @@ def describe_device(objects: CanOpenObjects, node_id: int) -> CanOpenDevice | No
         return None
     vendor, product, revision, serial = (number(objects, 0x1018, item) for item in range(1, 5))
     emergency_id = number(objects, EMERGENCY)
+    if emergency_id is None or emergency_id & OFF:
+        emergency_id = 0
     pdos = tuple(_pdos(objects, device_type))
     notes = [
         f"TPDO {pdo.number}, {item.meaning.name}: {item.meaning.note}"
@@ -153,14 +155,10 @@ def describe_device(objects: CanOpenObjects, node_id: int) -> CanOpenDevice | No
         label=text(objects, 0x1008),
         identity=(vendor, product, revision, serial),
         heartbeat_s=(number(objects, HEARTBEAT) or 0) * 1e-3,
-        emergency_id=_eleven_bits(emergency_id) or 0x080 + node_id,
+        emergency_id=emergency_id & 0x7FF or 0x080 + node_id,
         pdos=pdos,
         notes=tuple(notes),
     )
-
-
-def _eleven_bits(cob_id: int | None) -> int:
-    return 0 if cob_id is None or cob_id & OFF else cob_id & 0x7FF
 
 
 def _pdos(objects: CanOpenObjects, device_type: int) -> Iterator[Pdo]:

@@ -172,7 +172,7 @@ def configuration_text(
             lines.append(_signal_line(key, sources))
             used.append(sources[0])
     lines += _devices_block(devices, groups, claims, used)
-    cycle_s = _cycle_s(devices, groups, heights[0]) or 0.0
+    cycle_s = heights[0].cycle_s or 0.0
     if cycle_s * _STALE_CYCLES > 0.01:
         stale_s = cycle_s * _STALE_CYCLES
         lines.append(
@@ -191,7 +191,7 @@ def _pdo_message(
     signals: list[Signal] = []
     for item in pdo.mapped:
         scale, offset = item.meaning.scale, 0.0
-        if zero is not None and height == (name, names[item], device.node_id, item):
+        if zero is not None and height is not None and height[:2] == (name, names[item]):
             scale = -scale if zero.is_reversed else scale
             reading_m = -zero.reading_m if zero.is_reversed else zero.reading_m
             metre = si_conversion(item.meaning.unit, Dimension.LENGTH).factor
@@ -310,12 +310,3 @@ def _device_entry(device: CanOpenDevice) -> dict[str, object]:
         entry["heartbeat_s"] = round(_HEARTBEATS_MISSED * device.heartbeat_s, 4)  # up to 164 s
     signals = [{"message": item.message, "signal": item.signal} for item in alarms(device)]
     return entry | ({"alarms": signals} if signals else {})
-
-
-def _cycle_s(
-    devices: Sequence[CanOpenDevice], groups: Sequence[GroupMessage], location: SignalLocation
-) -> float | None:
-    """Time between two messages of a location; None where it is not known."""
-    cycles_s = {message_name(device, pdo): pdo.cycle_s for device in devices for pdo in device.pdos}
-    cycles_s |= {item.message_name: item.group.cycle_s for item in groups}
-    return cycles_s.get(location.message)
