@@ -33,9 +33,7 @@ class Traffic:
     """Frames of one id on the bus.
 
     Attributes:
-        arbitration_id: The id.
         is_extended: Whether it has 29 bits.
-        count: Number of frames.
         length_bytes: Length of the payload of the last one.
         interval_s: Median time between two; None where there were too few.
     """
@@ -101,13 +99,10 @@ class _DeviceObjects:
 
 
 def scan(network: CanOpenNetwork, listen_s: float, *, progress: Progress) -> BusSurvey:
-    """Survey of a bus.
+    """Survey of a bus; where the network only listens, no request is sent.
 
-    Args:
-        network: The bus; where it only listens, no request is sent.
-        listen_s: Time of listening before the first request; longer than the slowest heartbeat
-            finds all devices that send one.
-        progress: Called with the stage and the share that is done.
+    Listening before the first request for longer than the slowest heartbeat, `listen_s`, finds all
+    devices that send one.
 
     Raises:
         BusError: The bus fails.
@@ -152,10 +147,7 @@ def scan(network: CanOpenNetwork, listen_s: float, *, progress: Progress) -> Bus
 
 
 def survey_of_files(files: Mapping[int, Path]) -> BusSurvey:
-    """Survey of devices that are not on a bus, by their EDS files.
-
-    Args:
-        files: EDS or DCF file of each node id.
+    """Survey of devices that are not on a bus, by the EDS or DCF file of each node id.
 
     Raises:
         InputError: A file cannot be read, or is no EDS file.

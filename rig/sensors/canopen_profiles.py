@@ -44,7 +44,6 @@ class Meaning:
 
     Attributes:
         name: Name of its signal in a DBC.
-        is_signed: Whether it is a signed integer.
         is_float: Whether it is a REAL32 or REAL64.
         scale: Physical value of one raw step, in `unit`.
         unit: Unit as a DBC has it, empty if not known.
@@ -67,14 +66,7 @@ class Meaning:
 
 
 def meaning(objects: CanOpenObjects, device_type: int, index: int, subindex: int) -> Meaning:
-    """Meaning of an object that is mapped into a PDO.
-
-    Args:
-        objects: The device's objects.
-        device_type: Content of 1000h.
-        index: Index of the object.
-        subindex: Its subindex.
-    """
+    """Meaning of an object that a device of some type (content of 1000h) maps into a PDO."""
     profile = device_type & 0xFFFF
     known = None
     if profile == ENCODER:

@@ -31,13 +31,7 @@ def read_height_zero(
     *,
     is_reversed: bool,
 ) -> HeightZero:
-    """The first position sensor read at a known height.
-
-    Args:
-        network: Bus of the devices.
-        devices: CANopen devices on it.
-        height_m: Height of the strut now.
-        is_reversed: Whether the sensor counts up while the strut gets shorter.
+    """The first position sensor of the devices read while the strut has a known height.
 
     Raises:
         InputError: The height is none of a strut, or no device reports a length.

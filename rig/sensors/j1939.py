@@ -14,12 +14,7 @@ _DESTINATION_BELOW = 240
 
 
 class AddressClaim(NamedTuple):
-    """Claim of an address by a device.
-
-    Attributes:
-        address: Source address.
-        name: Its NAME, 64 bits.
-    """
+    """Claim of an address by a device with a NAME of 64 bits."""
 
     address: int
     name: int
@@ -48,7 +43,6 @@ class GroupParameter(NamedTuple):
         byte: Its first byte, from 0 on.
         scale: Value of one raw step.
         offset: Value of raw 0.
-        unit: Unit.
     """
 
     name: str
@@ -64,8 +58,6 @@ class ParameterGroup(NamedTuple):
     Attributes:
         number: PGN.
         name: Name of its messages in a DBC.
-        cycle_s: Time between two messages.
-        parameters: Its parameters.
     """
 
     number: int
@@ -106,7 +98,6 @@ class GroupMessage(NamedTuple):
     """A known group that a device sends.
 
     Attributes:
-        group: The group.
         arbitration_id: Id of the last frame.
         address: Address of its sender.
     """

@@ -47,11 +47,7 @@ def write_proposal(
 ) -> tuple[Path, Path]:
     """Write a DBC and a configuration for the devices on a bus; returns their files.
 
-    Args:
-        folder: New folder.
-        survey: Devices on the bus.
-        bus: The bus.
-        zero: Zero of the first position sensor; heights are its readings if None.
+    The folder is new. Without a zero, heights are the readings of the first position sensor.
 
     Raises:
         InputError: No device measures a length, two devices send under one id, or the folder cannot
@@ -76,10 +72,7 @@ def dbc_text(
 ) -> str:
     """A DBC of the devices' messages, with those that the bridge publishes.
 
-    Args:
-        devices: CANopen devices.
-        groups: Known groups of J1939.
-        zero: Zero of the first position sensor; heights are its readings if None.
+    Without a zero, heights are the readings of the first position sensor.
 
     Raises:
         InputError: Two devices send under one id.
@@ -140,13 +133,7 @@ def configuration_text(
     claims: Sequence[AddressClaim],
     bus: BusConfig,
 ) -> str:
-    """A configuration for the devices on a bus.
-
-    Args:
-        devices: CANopen devices.
-        groups: Known groups of J1939.
-        claims: J1939 devices that claim an address.
-        bus: The bus.
+    """A configuration for the devices on a bus, with the known groups and the claims of J1939.
 
     Raises:
         InputError: No device measures a length.

@@ -13,8 +13,6 @@ class SignalLocation(NamedTuple):
     """Location of a measured quantity on the bus.
 
     Attributes:
-        message: Name of the message.
-        signal: Name of the signal.
         node_id: Node that sends it; None for J1939.
         mapped: The object; None for J1939.
         cycle_s: Time between two messages; None where it is not known.
