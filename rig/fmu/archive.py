@@ -10,13 +10,11 @@ from uuid import UUID
 
 from rig.fmu.binaries import TARGETS, Target, compile_for
 from rig.fmu.component import Component
-from rig.fmu.description import Provenance, build_description, description_2, description_3
+from rig.fmu.description import build_description, description_2, description_3
 from rig.fmu.source import Fmi, select_c_files, sources
 
 _FILE_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of every file in the archive, so that the same model gives the same bytes."""
-
-_EXPERIMENT_S, _STEP_S = 10.0, 0.001
 
 
 def archive(
@@ -42,12 +40,11 @@ def archive(
     token = _token(component, version, tool)
     code = sources(component, version, token)
     c_files = select_c_files(code)
-    provenance = Provenance(tool, token, _EXPERIMENT_S, _STEP_S)
     files: dict[str, bytes | str] = {}
     if version == "2.0":
-        files["modelDescription.xml"] = description_2(component, provenance, c_files)
+        files["modelDescription.xml"] = description_2(component, tool, token, c_files)
     else:
-        files["modelDescription.xml"] = description_3(component, provenance)
+        files["modelDescription.xml"] = description_3(component, tool, token)
         files["sources/buildDescription.xml"] = build_description(component, c_files)
     files |= {f"sources/{name}": text for name, text in code.items()}
     files["resources/model.yaml"] = model

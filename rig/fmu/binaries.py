@@ -1,7 +1,6 @@
 """The C of an FMU, compiled for this system and for others, with the compiler of `ziglang`."""
 
 import importlib.util
-import platform
 import subprocess
 import sys
 import tempfile
@@ -57,23 +56,6 @@ _FLAGS = (
 )
 _TIMEOUT_S = 300.0
 """Time that a compiler may take: far longer than one needs, so that one that hangs is ended."""
-
-
-def this_system() -> Target:
-    """The target of this program's own system.
-
-    Raises:
-        InputError: It is none of them.
-    """
-    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(
-        platform.machine().lower(), platform.machine().lower()
-    )
-    name = {"linux": "linux", "win32": "windows", "darwin": "darwin"}.get(sys.platform, "")
-    for target in TARGETS:
-        if target.fmi_3 == f"{machine}-{name}":
-            return target
-    choices = ", ".join(target.fmi_3 for target in TARGETS)
-    raise InputError(f"{machine} {sys.platform}: expected one of {choices}")
 
 
 def compile_for(

@@ -15,15 +15,6 @@ VERSIONS: Mapping[Fmi, tuple[str, ...]] = {
 """Files of each version of the interface."""
 
 _COMMON = ("component.c", "component.h", "switches.h")
-_COUNTED: Mapping[Kind, str] = {
-    "input": "INPUT",
-    "parameter": "PARAMETER",
-    "fixed": "FIXED",
-    "state": "STATE",
-    "rate": "RATE",
-    "output": "OUTPUT",
-    "indicator": "INDICATOR",
-}
 _COUNTS: Mapping[Kind, str] = {
     "input": "INPUTS",
     "parameter": "PARAMETERS",
@@ -64,8 +55,8 @@ def _header(component: Component, token: str, version: Fmi) -> str:
     first = 0
     lines: list[str] = []
     for kind in KINDS:
-        if kind in _COUNTED:
-            lines.append(f"#define FIRST_{_COUNTED[kind]} {first}")
+        if kind != "time":
+            lines.append(f"#define FIRST_{kind.upper()} {first}")
         if kind in _COUNTS:
             lines.append(f"#define {_COUNTS[kind]} {kinds.count(kind)}")
         first += kinds.count(kind)
