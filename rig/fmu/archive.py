@@ -26,12 +26,8 @@ def archive(
 ) -> bytes:
     """An FMU for Model Exchange and Co-Simulation.
 
-    Args:
-        component: What it computes.
-        version: Version of the interface, ``2.0`` or ``3.0``.
-        model: Text of the model file, which the archive contains too.
-        targets: Systems to compile for, except those that the version has no name for.
-        done: Called after each system.
+    It contains `model`, the text of the model file, too, and no binaries for systems that its
+    version has no name for. `done` is called after each system.
 
     Raises:
         InputError: There is no compiler, or it refuses.

@@ -16,11 +16,9 @@ class Target(NamedTuple):
     """A system that an FMU runs on.
 
     Attributes:
-        words: Its name.
         triple: Its name for the compiler, with the oldest C library of Linux that is still in use.
         fmi_2: Its folder in an FMU of FMI 2.0, or None where that has no name for it.
         fmi_3: The same of FMI 3.0.
-        suffix: Suffix of a shared library.
     """
 
     words: str
@@ -64,13 +62,9 @@ def compile_for(
     identifier: str,
     done: Callable[[Target], None] = lambda _: None,
 ) -> dict[Target, bytes]:
-    """Shared libraries compiled from C files, by target.
+    """Shared libraries, compiled from C files by their names, for each target.
 
-    Args:
-        targets: Systems to compile for.
-        sources: Content of each file, by its name.
-        identifier: Name of the library, without its suffix.
-        done: Called after each system.
+    `identifier` is a library's name without its suffix; `done` is called after each system.
 
     Raises:
         InputError: The package `ziglang` is not installed, or its compiler refuses.

@@ -38,9 +38,6 @@ class Variable(NamedTuple):
     """A value of an FMU.
 
     Attributes:
-        name: Its name.
-        unit: Its unit; empty if it has none.
-        kind: What it is.
         meaning: One line.
         start: Its value at the beginning, if it is declared.
         nominal: Its usual size.
@@ -61,7 +58,6 @@ class Component:
     """An FMU without its wrapping.
 
     Attributes:
-        name: Name of the model.
         identifier: The same as a C identifier, and as the name of the file.
         meaning: What it is, in a sentence or two.
         variables: All variables, in the order of `KINDS`; a value reference is an index into it.
@@ -82,12 +78,7 @@ class Component:
 
 
 def strut_component(spec: ModelSpec, strut: StrutSpec) -> Component:
-    """A strut as a force element.
-
-    Args:
-        spec: The model.
-        strut: Its strut.
-    """
+    """A strut as a force element."""
     made = _Build()
     made.add("height_m", "m", "input", "height of the strut", strut.free_length_m)
     made.add("velocity_m_per_s", "m/s", "input", "its derivative; positive is rebound", 0.0)
@@ -165,12 +156,7 @@ def bench_component(spec: ModelSpec) -> Component:
 
 
 class _Placed(NamedTuple):
-    """An effect of a strut.
-
-    Attributes:
-        effect: The effect.
-        prefix: Before the names of its variables.
-    """
+    """An effect of a strut, and the prefix of the names of its variables."""
 
     effect: Effect
     prefix: str

@@ -41,11 +41,7 @@ _EXPERIMENT_S, _STEP_S = 10.0, 0.001
 def description_2(component: Component, tool: str, token: str, files: list[str]) -> str:
     """``modelDescription.xml`` of FMI 2.0.
 
-    Args:
-        component: What the FMU computes.
-        tool: Program that writes it, and version.
-        token: Identifies its content.
-        files: C files that a compiler is given.
+    `tool` writes it, `token` identifies the content, and a compiler is given the C files `files`.
     """
     root = Element(
         "fmiModelDescription",

@@ -27,15 +27,9 @@ _PROPORTIONAL = 1e-6
 def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: Path) -> ModelSpec:
     """Make a model of an FMU, which from then on may run on this machine.
 
-    Args:
-        source: The FMU.
-        mapping: Roles of its variables, as in the `fmu` of a model file; without it, they are
-            called as in an FMU of `rig export`.
-        mass_kg: Mass that the strut carries; of a bench it is computed if it is None.
-        out: New folder for the model file and the FMU.
-
-    Returns:
-        The model.
+    The file `mapping` gives the roles of its variables, as in the `fmu` of a model file; without
+    it, they are called as in an FMU of `rig export`. The mass is what the strut carries; of a bench
+    it is computed if it is None. The model file and the FMU are written into the new folder `out`.
 
     Raises:
         InputError: The FMU, the mapping or the folder is wrong, or a mass is missing.

@@ -71,11 +71,7 @@ class InC(NamedTuple):
 
 
 def in_c(law: Force | Rate, name: str) -> InC:
-    """A law as a C function.
-
-    Args:
-        law: The force or the rate of an effect.
-        name: Name of the C function.
+    """The force or the rate of an effect as a C function of some name.
 
     Raises:
         NoLawError: It uses what no law may use.
@@ -87,13 +83,7 @@ def in_c(law: Force | Rate, name: str) -> InC:
 
 
 class _Loop(NamedTuple):
-    """A loop that is being translated.
-
-    Attributes:
-        variable: Its variable.
-        first: Its first switch.
-        each: Switches of each round.
-    """
+    """A loop that is being translated: its first switch, and the switches of each round."""
 
     variable: str
     first: int

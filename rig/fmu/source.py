@@ -28,10 +28,7 @@ _COUNTS: Mapping[Kind, str] = {
 def sources(component: Component, version: Fmi, token: str) -> dict[str, str]:
     """Every C file of an FMU by its name.
 
-    Args:
-        component: What it computes.
-        version: Version of the interface.
-        token: Token in the description, so that no other binary is taken for it.
+    The token is that of the description, so that no other binary is taken for it.
     """
     code = {name: read_common_source(name) for name in (*_COMMON, *VERSIONS[version])}
     code["model.h"] = _header(component, token, version)
