@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.bridge.values import Mode
-from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise, smooth
+from rig.diagnosis.numerics.smoother import estimate_noise, smooth
 from rig.log.reader import read_run
 
 Array = NDArray[np.float64]
@@ -51,20 +51,6 @@ class FollowedStretch(NamedTuple):
     law_force_n: Array
     height_m: Array
     velocity_m_per_s: Array
-
-
-class ResidualForce(NamedTuple):
-    """Residual force of a stretch, smoothed over all of it.
-
-    Attributes:
-        noise_std_m: Standard deviation of the measured height.
-        t_s: Times, shape (N,).
-        force_n: Residual force, shape (N,).
-    """
-
-    noise_std_m: float
-    t_s: Array
-    force_n: Array
 
 
 class Expectation(NamedTuple):
@@ -138,15 +124,11 @@ def free_error(tick_s: Array, by_force: Array, t_s: Array, innovation_m: Array) 
     return free_m - line(t_s)
 
 
-def residual_force(stretch: FollowedStretch, mobility_per_kg: float) -> ResidualForce:
-    """The residual force of a stretch, smoothed, and the noise of its height sensor."""
+def residual_force(stretch: FollowedStretch, mobility_per_kg: float) -> tuple[float, Array]:
+    """Noise of a stretch's heights, and its residual force smoothed over all of it, shape (N,)."""
     noise = estimate_noise(stretch.t_s, stretch.free_error_m)
-    smoothed: Smoothed = smooth(stretch.t_s, stretch.free_error_m, noise)
-    return ResidualForce(
-        float(np.sqrt(noise.variance)),
-        stretch.t_s,
-        smoothed.states[:, 2] / mobility_per_kg,
-    )
+    smoothed = smooth(stretch.t_s, stretch.free_error_m, noise)
+    return float(np.sqrt(noise.variance)), smoothed.states[:, 2] / mobility_per_kg
 
 
 def expectation_from_run(folder: Path, strut: str, mobility_per_kg: float) -> Expectation:
@@ -161,8 +143,8 @@ def expectation_from_run(folder: Path, strut: str, mobility_per_kg: float) -> Ex
         InputError: It is no run, has no such strut, or is too short.
     """
     stretch = longest_stretch(read_run(folder).steps, folder, strut, mobility_per_kg)
-    force = residual_force(stretch, mobility_per_kg)
-    return Expectation(force.noise_std_m, *spectrum(force.t_s, force.force_n), str(folder))
+    noise_std_m, force_n = residual_force(stretch, mobility_per_kg)
+    return Expectation(noise_std_m, *spectrum(stretch.t_s, force_n), str(folder))
 
 
 def expectation_from_noise(noise_std_m: float, rms_n: float, up_to_hz: float) -> Expectation:

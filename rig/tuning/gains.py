@@ -35,6 +35,8 @@ _EVALUATIONS = 250
 _LARGEST_COST = 1e12
 """Cost of an observer that is unstable or cannot be made."""
 
+_LARGEST_MARGIN = 20.0
+
 
 class Aim(NamedTuple):
     """What the loop must keep.
@@ -128,13 +130,10 @@ class TuningProblem(NamedTuple):
                 to have.
         """
         plant: Any = self.plant if factor == 1.0 else _StrongerPlant(self.plant, factor)
-        observers = self.with_observer(observer)
-        loop = Loop(plant, observers, self.heights_m, self.rhythm, self.responses)
-        return loop.linear(self.strut)
-
-    def with_observer(self, observer: AnyObserver) -> tuple[AnyObserver, ...]:
-        """All observers, with another one of this strut."""
-        return (*self.observers[: self.strut], observer, *self.observers[self.strut + 1 :])
+        observers = (*self.observers[: self.strut], observer, *self.observers[self.strut + 1 :])
+        return Loop(plant, observers, self.heights_m, self.rhythm, self.responses).linear(
+            self.strut
+        )
 
 
 class _StrongerPlant:
@@ -156,22 +155,19 @@ def expect_error(problem: TuningProblem, observer: AnyObserver) -> ExpectedError
     poles = poles_of(linear.a, linear.interval_s)
     if not _is_stable(poles):
         return ExpectedError(math.inf, math.inf, poles)
-    return ExpectedError(*_parts(linear, problem.expectation), poles)
+    noise_n = linear.noise_gain_n_per_m() * problem.expectation.noise_std_m
+    share = linear.lag_gain(problem.expectation.frequency_hz)
+    lag_n = float(np.sqrt(np.sum(share**2 * problem.expectation.power_n2)))
+    return ExpectedError(noise_n, lag_n, poles)
 
 
-def gain_margin(problem: TuningProblem, observer: AnyObserver, most: float = 20.0) -> float:
-    """Gain margin of the closed loop, upwards and downwards, dimensionless.
-
-    Args:
-        problem: The strut.
-        observer: Its observer.
-        most: Where the search ends.
-    """
+def gain_margin(problem: TuningProblem, observer: AnyObserver) -> float:
+    """Gain margin of the closed loop, upwards and downwards, dimensionless; 20 at most."""
     if not _is_stable_at(problem, observer, 1.0):
         return 1.0
-    low, high = 1.0, most
-    if _has_margin(problem, observer, most):
-        return most
+    low, high = 1.0, _LARGEST_MARGIN
+    if _has_margin(problem, observer, high):
+        return high
     while high / low > 1.01:
         middle = math.sqrt(low * high)
         low, high = (middle, high) if _has_margin(problem, observer, middle) else (low, middle)
@@ -243,13 +239,6 @@ def sweep_bandwidth(
         (other.bandwidth_hz(problem.mobility_per_kg), expect_error(problem, other))
         for other in others
     ]
-
-
-def _parts(linear: LinearLoop, expectation: Expectation) -> tuple[float, float]:
-    """Error by the sensor's noise and error by the lag, in N."""
-    noise_n = linear.noise_gain_n_per_m() * expectation.noise_std_m
-    share = linear.lag_gain(expectation.frequency_hz)
-    return noise_n, float(np.sqrt(np.sum(share**2 * expectation.power_n2)))
 
 
 def _is_stable(poles: Sequence[Pole]) -> bool:
