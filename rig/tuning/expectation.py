@@ -74,11 +74,8 @@ def longest_stretch(
 ) -> FollowedStretch:
     """The longest stretch of a run in which the observer followed its bench.
 
-    Args:
-        steps: Its steps, as an Arrow table.
-        folder: Folder of the run, to name it.
-        strut: Name of the strut.
-        mobility_per_kg: Acceleration of its height per newton in it.
+    The steps are an Arrow table; the folder names the run in an error. The mobility is the
+    acceleration of the strut's height per newton in it.
 
     Raises:
         InputError: It has no such strut, or is too short.
@@ -133,11 +130,6 @@ def residual_force(stretch: FollowedStretch, mobility_per_kg: float) -> tuple[fl
 
 def expectation_from_run(folder: Path, strut: str, mobility_per_kg: float) -> Expectation:
     """Expectation of a strut from a run of its bench.
-
-    Args:
-        folder: Folder of the run.
-        strut: Name of the strut.
-        mobility_per_kg: Acceleration of its height per newton in it.
 
     Raises:
         InputError: It is no run, has no such strut, or is too short.
