@@ -140,13 +140,7 @@ def expectation_from_run(folder: Path, strut: str, mobility_per_kg: float) -> Ex
 
 
 def expectation_from_noise(noise_std_m: float, rms_n: float, up_to_hz: float) -> Expectation:
-    """Expectation of a residual force whose mean square is even over frequency.
-
-    Args:
-        noise_std_m: Standard deviation of the measured height.
-        rms_n: Root mean square of the residual force.
-        up_to_hz: The highest frequency.
-    """
+    """Expectation of a residual force whose mean square is even up to a highest frequency."""
     frequency_hz = np.asarray(up_to_hz * (np.arange(20) + 0.5) / 20.0, dtype=np.float64)
     power_n2 = np.full(20, rms_n**2 / 20.0)
     source = f"{rms_n:g} N up to {up_to_hz:g} Hz, as stated"
@@ -172,12 +166,7 @@ def _integrate_twice(tick_s: Array, acceleration: Array, t_s: Array) -> Array:
 def spectrum(t_s: Array, force_n: Array) -> tuple[Array, Array]:
     """Mean square over frequency, gathered into some lines; a Hann window keeps the ends apart.
 
-    Args:
-        t_s: Times, shape (N,).
-        force_n: Force, shape (N,).
-
-    Returns:
-        Frequencies in Hz and mean squares in N².
+    Times and forces have the shape (N,). Frequencies are in Hz, mean squares in N².
     """
     even_s = np.linspace(t_s[0], t_s[-1], len(t_s))
     even_n = np.interp(even_s, t_s, force_n)

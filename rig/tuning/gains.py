@@ -81,8 +81,6 @@ class Tuned(NamedTuple):
     """An observer that was tuned.
 
     Attributes:
-        observer: The observer.
-        expected: Its expected error.
         gain_margin: Gain margin of its loop, upwards and downwards; 20 means that or more.
         required_margin: The gain margin that it was to keep.
     """
@@ -97,10 +95,8 @@ class TuningProblem(NamedTuple):
     """A strut whose observer is to be tuned.
 
     Attributes:
-        plant: The model.
         observers: Observers of all its struts.
         strut: Index of the strut.
-        responses: Responses of the model's struts.
         heights_m: Heights at which the bench rests.
         rhythm: When the loop is closed.
         expectation: Noise and residual force that are expected of the strut.
@@ -124,10 +120,8 @@ class TuningProblem(NamedTuple):
     def linear(self, observer: AnyObserver, factor: float = 1.0) -> LinearLoop:
         """The loop with another observer of this strut.
 
-        Args:
-            observer: The observer.
-            factor: Response of the model to a virtual force, over that which the observers take it
-                to have.
+        The model responds to a virtual force more strongly, by a factor, than the observers take it
+        to.
         """
         plant: Any = self.plant if factor == 1.0 else _StrongerPlant(self.plant, factor)
         observers = (*self.observers[: self.strut], observer, *self.observers[self.strut + 1 :])
@@ -175,13 +169,7 @@ def gain_margin(problem: TuningProblem, observer: AnyObserver) -> float:
 
 
 def tune_observer(problem: TuningProblem, kind: str, aim: Aim) -> Tuned:
-    """Tune an observer: that of a kind with the smallest expected error of the force.
-
-    Args:
-        problem: The strut.
-        kind: One of `KINDS`.
-        aim: What the loop must keep.
-    """
+    """Tune an observer: that of a kind of `KINDS` with the smallest expected error of the force."""
     task = TuningTask(
         1.0 / problem.mobility_per_kg,
         problem.expectation.noise_std_m,
@@ -228,11 +216,8 @@ def sweep_bandwidth(
 ) -> list[tuple[float, ExpectedError]]:
     """Expected errors of an observer at other bandwidths, by their frequencies in Hz.
 
-    Args:
-        problem: The strut.
-        observer: The observer.
-        factors: Factors of its bandwidth: gains of the innovation go with the square, those of its
-            rate linearly.
+    With a factor of the bandwidth, gains of the innovation go with its square, those of its rate
+    linearly.
     """
     others = [observer.with_bandwidth(factor) for factor in factors]
     return [

@@ -50,7 +50,6 @@ class Latency(NamedTuple):
     """A delay.
 
     Attributes:
-        delay_s: Its value.
         std_s: Its standard deviation; infinite where the run does not determine it.
     """
 
@@ -105,13 +104,9 @@ def estimate_latency(
 ) -> Latency:
     """The delay of a strut's height.
 
-    Args:
-        folder: Folder of the run.
-        plan: Its plan.
-        strut: Name of the strut.
-        mobility_per_kg: Acceleration of its height per newton in it.
-        observer: A noise-aware observer that fits its noise and its residual force.
-        progress: Called with the share that is done.
+    The observer is a noise-aware one, which fits the strut's noise and residual force; the mobility
+    is the acceleration of its height per newton in it. `progress` is called with the share that is
+    done.
 
     Raises:
         InputError: The run is damaged or too short.

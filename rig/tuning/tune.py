@@ -55,7 +55,6 @@ class TunedStrut:
     """A strut whose observer was tuned.
 
     Attributes:
-        name: Its name.
         expectation: What it was tuned for.
         latency: Delay of its height as the run shows it; None where it was given.
         delay_s: Delay that it was tuned with.
@@ -78,14 +77,9 @@ class TunedStrut:
 def tune(
     plan: Plan, source: Path | StatedExpectation, kind: str, aim: Aim, progress: Progress
 ) -> list[TunedStrut]:
-    """Tune the observer of every strut.
+    """Tune the observer of every strut for a run of the bench, or for what is expected of it.
 
-    Args:
-        plan: The configuration.
-        source: A run of the bench, or what is expected of it.
-        kind: One of `rig.tuning.gains.KINDS`.
-        aim: What the loops must keep.
-        progress: Called with what is being done, and the share that is done.
+    The kind is one of `rig.tuning.gains.KINDS`.
 
     Raises:
         InputError: The run cannot be used.
@@ -189,10 +183,7 @@ def _find_delay(
 def write_config(plan: Plan, tuned: list[TunedStrut], path: Path) -> None:
     """Write the configuration with the tuned observers; comments are lost.
 
-    Args:
-        plan: The configuration.
-        tuned: The observers.
-        path: New file, in the folder of the configuration, whose other files it names.
+    The file is a new one in the folder of the configuration, whose other files it names.
 
     Raises:
         InputError: The file exists, lies elsewhere or cannot be written.
