@@ -5,17 +5,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.diagnosis.recording import Recording, read_recording
 from rig.dyno.damper import Damper, summarise_damper
 from rig.dyno.figures import AtRest, DynoStep, compute_rest, compute_step
 from rig.dyno.quality import quality
-from rig.dyno.strokes import find_blocks, find_holds, find_strokes
+from rig.dyno.strokes import Array, find_blocks, find_holds, find_strokes
 from rig.log.reader import read_run
-
-Array = NDArray[np.float64]
 
 SCHEMA = 1
 
@@ -47,12 +44,7 @@ class ForceRecord(NamedTuple):
 
 @dataclass(frozen=True)
 class Characteristics:
-    """Figures of a damper from one record.
-
-    Attributes:
-        steps: Its steps, in time.
-        quality: What in the record may mislead.
-    """
+    """Figures of a damper from one record, whose quality is what in it may mislead."""
 
     record: ForceRecord
     steps: tuple[DynoStep, ...]

@@ -39,13 +39,7 @@ called bent."""
 
 
 class Difference(NamedTuple):
-    """One figure in two states.
-
-    Attributes:
-        figure: Name of the figure, with the speed of its step.
-        change: Second less first.
-        differs: Whether the change is significant.
-    """
+    """One figure in two states, and whether the change, second less first, is significant."""
 
     figure: str
     unit: str
@@ -56,12 +50,9 @@ class Difference(NamedTuple):
 
 
 class Trend(NamedTuple):
-    """One figure over a dose.
+    """One figure over a dose: its line, and whether the slope per unit is significant.
 
     Attributes:
-        slope: Its change per unit of the dose.
-        at_zero: Value of the line at a dose of zero.
-        differs: Whether the slope is significant.
         is_straight: Whether a straight line explains the points.
     """
 

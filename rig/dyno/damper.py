@@ -4,12 +4,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.dyno.figures import QUASI_STATIC_M_PER_S, DynoStep
 from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, student_factor
-
-Array = NDArray[np.float64]
+from rig.dyno.strokes import Array
 
 _ALIKE_SPEED = 0.05
 """Relative difference of speed and amplitude up to which steps are repetitions of each other."""

@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve  # pyright: ignore[reportUnknownVariableType]
 
 from can_dbc.errors import InputError
@@ -32,8 +31,7 @@ from rig.dyno.master import (
     with_play,
 )
 from rig.dyno.stroke_force import FINE, Figure, MeanStroke
-
-Array = NDArray[np.float64]
+from rig.dyno.strokes import Array
 
 _NAMED = 32.0
 """Fall of chi-squared from which on a fault is named. Of differences that are normal one in a
@@ -68,14 +66,11 @@ _FALL = 3.84
 
 
 class Fault(NamedTuple):
-    """A fault that can be simulated.
+    """A fault that can be simulated, in sizes from the least to the most that there can be.
 
     Attributes:
-        quantity: Meaning of its size.
         sizes: Sizes that are tried, rising, shape (K,).
         changes: What each changes of the stacked forces, shape (K, N).
-        least: Smallest that can be.
-        most: Largest.
     """
 
     name: str
@@ -88,12 +83,7 @@ class Fault(NamedTuple):
 
 
 class NamedFault(NamedTuple):
-    """A fault with its size.
-
-    Attributes:
-        size: Its size, with a 95 % interval.
-        evidence: By how much it lowers chi-squared.
-    """
+    """A fault with its size, a 95 % interval, and by how much it lowers chi-squared."""
 
     name: str
     quantity: str

@@ -27,9 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, combine, mean_stroke
-from rig.dyno.strokes import Block, BlockMotion, fit_motion, is_repetition
-
-Array = NDArray[np.float64]
+from rig.dyno.strokes import Array, Block, BlockMotion, fit_motion, is_repetition
 
 QUASI_STATIC_M_PER_S = 5e-3
 """Peak speed up to which a step gives friction and gas force: seals and bleed alone damp there."""
@@ -76,13 +74,7 @@ class Side(NamedTuple):
 
 
 class AtRest(NamedTuple):
-    """A hold: the gas force, and what friction keeps.
-
-    Attributes:
-        height_m: Mean height.
-        force_n: Mean force.
-        temperature_c: Mean temperature; None where none was measured.
-    """
+    """Means over a hold: the gas force, and what friction keeps."""
 
     begin_s: float
     end_s: float

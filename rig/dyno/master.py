@@ -12,14 +12,12 @@ stiffness of the oil column.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.dyno.characterise import Characteristics
 from rig.dyno.figures import DynoStep
 from rig.dyno.stroke_force import ANGLES, MeanStroke
-
-Array = NDArray[np.float64]
+from rig.dyno.strokes import Array
 
 _NODES = 120
 """Speeds at which a curve is kept."""

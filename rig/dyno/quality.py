@@ -4,12 +4,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.diagnosis.clipping import find_sudden_plateaus
 from rig.dyno.figures import AtRest, DynoStep
-
-Array = NDArray[np.float64]
+from rig.dyno.strokes import Array
 
 _GAP = 2.5
 """Times the usual time between samples: one is missing at least, however the clock jitters."""

@@ -37,12 +37,7 @@ class Check(NamedTuple):
 
 
 class DamperReport(NamedTuple):
-    """The figures of one record, and its standing.
-
-    Attributes:
-        points: Its verdict at each point of the band; empty without a band.
-        against_master: Its comparison with the master; None without a master.
-    """
+    """The figures of one record, its verdict at each point of a band, and against a master."""
 
     characteristics: Characteristics
     points: Sequence[PointVerdict] = ()

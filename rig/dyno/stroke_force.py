@@ -22,9 +22,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.special import stdtrit  # pyright: ignore[reportUnknownVariableType]
 
-from rig.dyno.strokes import BlockMotion
-
-Array = NDArray[np.float64]
+from rig.dyno.strokes import Array, BlockMotion
 
 _DEGREE = 3
 _PIECES = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
@@ -231,10 +229,7 @@ class _Fit(NamedTuple):
 
     Attributes:
         criterion: Akaike's, corrected for few samples.
-        weights: Its coefficients.
         inverse: Their covariance under noise of one.
-        variance: Variance of the residuals.
-        freedom: Degrees of freedom of it.
         clustered: Covariance by what the strokes differ by; None of few strokes.
     """
 

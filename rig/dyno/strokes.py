@@ -77,11 +77,7 @@ _PER_CYCLE, _BETWEEN = 1441, 8
 
 
 class Stroke(NamedTuple):
-    """Samples `first` to `last`, which is the next turning point.
-
-    Attributes:
-        rise_m: Change of height: positive in rebound.
-    """
+    """Samples `first` to `last`, the next turning point; the rise is positive in rebound."""
 
     first: int
     last: int

@@ -65,11 +65,7 @@ class ToleranceBand(BaseModel):
 
 
 class PointVerdict(NamedTuple):
-    """A damper's force at a peak velocity, in `compression` or `rebound`, against its limits.
-
-    Attributes:
-        force: Its force there; None where no step is near.
-    """
+    """A damper at a point of a band, in `compression` or `rebound`; the force may be unknown."""
 
     velocity_m_per_s: float
     side: str

@@ -18,12 +18,7 @@ _AHEAD = 4
 
 
 class Engine(NamedTuple):
-    """What computes.
-
-    Attributes:
-        words: The executor as a phrase.
-        window: Runs that it is given at a time.
-    """
+    """What makes an executor, in words too, and the runs that it is given at a time."""
 
     words: str
     make: Callable[[], Executor]

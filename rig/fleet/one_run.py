@@ -33,13 +33,7 @@ _PIECE = 1 << 20
 
 
 class FleetModel(NamedTuple):
-    """A model as workers are given it.
-
-    Attributes:
-        text: The model file.
-        folder: Folder of the files that it names.
-        sha256: Of all of them.
-    """
+    """A model file, the folder of the files that it names, and the hash of all of them."""
 
     text: str
     folder: str

@@ -3,7 +3,7 @@
 import datetime
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,10 +36,7 @@ _RECENT = 5
 class SeriesQuantity(NamedTuple):
     """What a series is of.
 
-    Attributes:
-        strut: Strut; empty for a figure.
-        effect: Effect; empty for the linear part and for figures.
-        parameter: Name with its unit.
+    A figure has neither strut nor effect, and the linear part of a strut no effect.
     """
 
     strut: str
@@ -80,11 +77,9 @@ class Series(NamedTuple):
 
 
 class Jump(NamedTuple):
-    """A step that the dampers of a bench have in common.
+    """A step by a factor that the dampers of a bench have in common.
 
-    Attributes:
-        parameter: What stepped.
-        change: When; its values are logarithms.
+    The values of its change are logarithms.
     """
 
     bench: str
@@ -94,12 +89,9 @@ class Jump(NamedTuple):
 
 
 class Outlier(NamedTuple):
-    """A damper that is unlike the others.
+    """A damper that is unlike the others: the median of its last points, and the usual one.
 
-    Attributes:
-        value: Median of its last points.
-        usual: Median of all.
-        distance: From it, in robust standard deviations of the others.
+    The distance is in robust standard deviations of the others.
     """
 
     where: Where
@@ -278,7 +270,7 @@ def _jumps(collected: _Collected) -> tuple[Jump, ...]:
     for bench in benches:
         for quantity, by_place in usable.items():
             logs = {
-                where.damper: _logarithms(points)
+                where.damper: [point._replace(value=math.log(point.value)) for point in points]
                 for where, points in by_place.items()
                 if where.bench == bench and all(point.value > 0.0 for point in points)
             }
@@ -294,10 +286,6 @@ def _step_day(
 ) -> float | None:
     """Day of the bench's jump, if it has one and the series is in it."""
     return step_days.get(where.bench) if _FORCE.search(quantity.parameter) else None
-
-
-def _logarithms(points: Sequence[DatedValue]) -> list[DatedValue]:
-    return [point._replace(value=math.log(point.value)) for point in points]
 
 
 def _series(collected: _Collected, step_days: Mapping[str, float]) -> tuple[Series, ...]:
@@ -325,11 +313,9 @@ def _outliers(collected: _Collected) -> tuple[Outlier, ...]:
             where: sorted(point.value for point in points[-_RECENT:])[len(points[-_RECENT:]) // 2]
             for where, points in by_place.items()
         }
-        names = {f"{where.bench}\0{where.damper}": where for where in latest}
         usual = sorted(latest.values())[len(latest) // 2]
-        values = {key: latest[where] for key, where in names.items()}
-        for name, distance in find_outliers(values, LEVEL / len(collected)).items():
-            found.append(Outlier(names[name], quantity, latest[names[name]], usual, distance))
+        for where, distance in find_outliers(latest, LEVEL / len(collected)).items():
+            found.append(Outlier(where, quantity, latest[where], usual, distance))
     return tuple(found)
 
 

@@ -101,16 +101,13 @@ def _find_in(
 ) -> Iterator[RunSource]:
     files, protocol, root = _list_files(location)
     folders = {str(PurePosixPath(p).parent) for p in files if PurePosixPath(p).name == RUN_FILE}
-    sizes: dict[str, int] = {}
-    stamps: dict[str, str] = {}
+    runs: dict[str, list[Mapping[str, Any]]] = {}
     for path, info in files.items():
         run = next((str(up) for up in PurePosixPath(path).parents if str(up) in folders), None)
-        if run is None and not path.lower().endswith(".csv"):
-            continue
-        run = run or path
-        sizes[run] = sizes.get(run, 0) + int(info.get("size") or 0)
-        stamps[run] = max(stamps.get(run, ""), _stamp(info))
-    for run, size in sizes.items():
+        if run is not None or path.lower().endswith(".csv"):
+            runs.setdefault(run or path, []).append(info)
+    for run, infos in runs.items():
+        stamp = max(map(_stamp, infos))
         inside = (
             str(PurePosixPath(run).relative_to(root)) if run != root else PurePosixPath(run).name
         )
@@ -125,9 +122,9 @@ def _find_in(
             printable(fields.get("bench") or UNKNOWN),
             printable(fields.get("damper") or UNKNOWN),
             day,
-            stamps[run][:10],
-            size,
-            stamps[run],
+            stamp[:10],
+            sum(int(info.get("size") or 0) for info in infos),
+            stamp,
         )
 
 

@@ -33,40 +33,26 @@ _pa: Any = pa
 _dataset: Any = dataset
 _parquet: Any = parquet
 
+_TEXT, _REAL = _pa.string(), _pa.float64()
+_RUN_TEXTS = (
+    *("key", "identity", "source", "damper", "model", "model_sha256", "version", "written"),
+    *("verdict", "error"),
+)
+_RUN_NUMBERS = ("duration_s", "before", "after", "floor", "took_s")
 _RUN = _pa.schema(
     [
-        ("key", _pa.string()),
-        ("identity", _pa.string()),
-        ("source", _pa.string()),
-        ("damper", _pa.string()),
-        ("model", _pa.string()),
-        ("model_sha256", _pa.string()),
-        ("version", _pa.string()),
-        ("written", _pa.string()),
-        ("verdict", _pa.string()),
-        ("error", _pa.string()),
+        *((name, _TEXT) for name in _RUN_TEXTS),
         ("samples", _pa.int64()),
-        ("duration_s", _pa.float64()),
-        ("before", _pa.float64()),
-        ("after", _pa.float64()),
-        ("floor", _pa.float64()),
-        ("took_s", _pa.float64()),
-        ("part", _pa.string()),
+        *((name, _REAL) for name in _RUN_NUMBERS),
+        ("part", _TEXT),
     ]
 )
+_VALUE_TEXTS = ("key", "damper", "kind", "strut", "effect", "family", "parameter")
 _VALUE = _pa.schema(
     [
-        ("key", _pa.string()),
-        ("damper", _pa.string()),
-        ("kind", _pa.string()),
-        ("strut", _pa.string()),
-        ("effect", _pa.string()),
-        ("family", _pa.string()),
-        ("parameter", _pa.string()),
-        ("value", _pa.float64()),
-        ("low", _pa.float64()),
-        ("high", _pa.float64()),
-        ("part", _pa.string()),
+        *((name, _TEXT) for name in _VALUE_TEXTS),
+        *((name, _REAL) for name in ("value", "low", "high")),
+        ("part", _TEXT),
     ]
 )
 _VIEWS = """

@@ -8,7 +8,7 @@ here; a level for a whole fleet is divided among its series (Bonferroni).
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 Array = NDArray[np.float64]
+Member = TypeVar("Member")
 
 LEVEL = 0.01
 """Chance of one false alarm of a kind in a whole fleet without any change."""
@@ -152,7 +153,7 @@ def _line_and_step(days: Array, day: float | None) -> Array:
     return columns[:, : 3 if has_step else 2]
 
 
-def find_outliers(values: Mapping[str, float], level: float) -> dict[str, float]:
+def find_outliers(values: Mapping[Member, float], level: float) -> dict[Member, float]:
     """How many robust standard deviations away from the others members are that stand out.
 
     Up to a half of the values, one a member, may be bad. `level` is the chance of any such member

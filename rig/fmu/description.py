@@ -43,16 +43,8 @@ def description_2(component: Component, tool: str, token: str, files: list[str])
 
     `tool` writes it, `token` identifies the content, and a compiler is given the C files `files`.
     """
-    root = Element(
-        "fmiModelDescription",
-        fmiVersion="2.0",
-        modelName=component.name,
-        guid=token,
-        description=component.meaning,
-        generationTool=tool,
-        variableNamingConvention="structured",
-        numberOfEventIndicators=str(len(component.of("indicator"))),
-    )
+    root = _root(component, tool, "2.0", {"guid": token})
+    root.set("numberOfEventIndicators", str(len(component.of("indicator"))))
     states = {"canGetAndSetFMUstate": "true", "canSerializeFMUstate": "true"}
     exchange = SubElement(root, "ModelExchange", {"modelIdentifier": component.identifier} | states)
     simulation = SubElement(
@@ -93,15 +85,7 @@ def description_2(component: Component, tool: str, token: str, files: list[str])
 
 def description_3(component: Component, tool: str, token: str) -> str:
     """``modelDescription.xml`` of FMI 3.0; arguments as of `description_2`."""
-    root = Element(
-        "fmiModelDescription",
-        fmiVersion="3.0",
-        modelName=component.name,
-        instantiationToken=token,
-        description=component.meaning,
-        generationTool=tool,
-        variableNamingConvention="structured",
-    )
+    root = _root(component, tool, "3.0", {"instantiationToken": token})
     able = {
         "modelIdentifier": component.identifier,
         "canGetAndSetFMUState": "true",
@@ -137,6 +121,17 @@ def build_description(component: Component, files: list[str]) -> str:
     for name in files:
         SubElement(source_files, "SourceFile", name=name)
     return _text(root)
+
+
+def _root(component: Component, tool: str, version: str, token: dict[str, str]) -> Element:
+    return Element(
+        "fmiModelDescription",
+        {"fmiVersion": version, "modelName": component.name},
+        **token,
+        description=component.meaning,
+        generationTool=tool,
+        variableNamingConvention="structured",
+    )
 
 
 def _add_definitions(root: Element, component: Component) -> None:

@@ -39,7 +39,11 @@ def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: P
     refuse_full(out)
     content = read_program(source)
     description = read_description(content, source)
-    roles = _roles_by_name(description, source) if mapping is None else _read_roles(mapping)
+    if mapping is None:
+        roles = _roles_by_name(description, source)
+    else:
+        given = parse_mapping(read_text(mapping), str(mapping))
+        roles = validate(FmuSpec, {**given, "file": FMU_FILE}, str(mapping))
     _refuse_contradictions(roles, mapping or source)
     if roles.force is not None and mass_kg is None:
         raise InputError(f"{source}: a strut alone, expected --mass-kg with what it carries")
@@ -61,11 +65,6 @@ def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: P
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror})") from error
     return spec.model_copy(update={"folder": out})
-
-
-def _read_roles(mapping: Path) -> FmuSpec:
-    roles = parse_mapping(read_text(mapping), str(mapping))
-    return validate(FmuSpec, {**roles, "file": FMU_FILE}, str(mapping))
 
 
 def variables_of(roles: FmuSpec) -> dict[str, str]:

@@ -101,8 +101,8 @@ class _Translation:
             item.arg: ast.unparse(item.annotation) if item.annotation else ""
             for item in tree.args.args
         }
-        self._whole: set[str] = set()
-        self._declared: list[str] = []
+        self._declared: dict[str, bool] = {}
+        """Its variables, and whether each is a whole number."""
         self._switches = 0
         self._loop: _Loop | None = None
 
@@ -120,7 +120,8 @@ class _Translation:
         writes = returns != "float"
         head = f"static {'void' if writes else 'double'} {self._name}({', '.join(arguments)}) {{"
         declared = [
-            f"    {'long' if name in self._whole else 'double'} {name};" for name in self._declared
+            f"    {'long' if is_whole else 'double'} {name};"
+            for name, is_whole in self._declared.items()
         ]
         lines = [head, *declared, "    (void)s;", *body, "}"]
         return InC("\n".join(lines) + "\n", self._switches, writes)
@@ -186,11 +187,7 @@ class _Translation:
     def _declare(self, name: str, *, whole: bool) -> None:
         if name in self._arguments:
             raise NoLawError(f"{self._name}: {name}: an argument is given another value")
-        if name not in self._declared:
-            self._declared.append(name)
-            if whole:
-                self._whole.add(name)
-        elif whole != (name in self._whole):
+        if self._declared.setdefault(name, whole) != whole:
             raise NoLawError(f"{self._name}: {name}: a whole number and a real one")
 
     def _is_row(self, name: str) -> bool:
@@ -202,7 +199,7 @@ class _Translation:
             case ast.Constant(value=value):
                 return isinstance(value, int)
             case ast.Name(id=name) if name in self._declared or name in self._arguments:
-                return name in self._whole
+                return self._declared.get(name, False)
             case ast.Name(id=name):
                 return isinstance(self._global(name, node), int)
             case ast.BinOp(left=left, op=ast.Add() | ast.Sub() | ast.Mult(), right=right):

@@ -30,13 +30,7 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Traffic:
-    """Frames of one id on the bus.
-
-    Attributes:
-        is_extended: Whether it has 29 bits.
-        length_bytes: Length of the payload of the last one.
-        interval_s: Median time between two; None where there were too few.
-    """
+    """Frames of one id: their number, the length of the last, and the median interval, if known."""
 
     arbitration_id: int
     is_extended: bool

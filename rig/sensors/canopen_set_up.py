@@ -63,13 +63,7 @@ class ObjectChange(BaseModel):
 
 @dataclass
 class DeviceWriter:
-    """Writes objects of a device and records their content before, even if it fails on the way.
-
-    Attributes:
-        network: Bus of the device.
-        node_id: Its node id.
-        changes: Recorded changes, in order.
-    """
+    """Writes objects of a device and records their content before, even if it fails on the way."""
 
     network: CanOpenNetwork
     node_id: int

@@ -53,12 +53,7 @@ class GroupParameter(NamedTuple):
 
 
 class ParameterGroup(NamedTuple):
-    """A parameter group.
-
-    Attributes:
-        number: PGN.
-        name: Name of its messages in a DBC.
-    """
+    """A parameter group by its number, the PGN, with its name in a DBC."""
 
     number: int
     name: str
@@ -95,12 +90,7 @@ LARGEST_VALUE = 0xFAFF
 
 
 class GroupMessage(NamedTuple):
-    """A known group that a device sends.
-
-    Attributes:
-        arbitration_id: Id of the last frame.
-        address: Address of its sender.
-    """
+    """A known group that a device sends, with the id of its last frame."""
 
     group: ParameterGroup
     arbitration_id: int

@@ -10,13 +10,7 @@ from rig.sensors.j1939 import GroupMessage
 
 
 class SignalLocation(NamedTuple):
-    """Location of a measured quantity on the bus.
-
-    Attributes:
-        node_id: Node that sends it; None for J1939.
-        mapped: The object; None for J1939.
-        cycle_s: Time between two messages; None where it is not known.
-    """
+    """Location of a measured quantity on the bus; one of J1939 has no node id and no object."""
 
     message: str
     signal: str

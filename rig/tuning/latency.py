@@ -17,14 +17,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.observers.kalman import KalmanObserver
 from rig.plan.plan import Plan
 from rig.run.replay import replay
-from rig.tuning.expectation import longest_stretch, residual_force
-
-Array = NDArray[np.float64]
+from rig.tuning.expectation import Array, longest_stretch, residual_force
 
 _DEGREE = 7
 """Of the polynomials in height and in velocity: enough for a knee or a progressive spring."""
@@ -47,11 +44,7 @@ _SETTLED_S = 0.3
 
 
 class Latency(NamedTuple):
-    """A delay.
-
-    Attributes:
-        std_s: Its standard deviation; infinite where the run does not determine it.
-    """
+    """A delay, and its standard deviation: infinite where the run does not determine it."""
 
     delay_s: float
     std_s: float

@@ -37,11 +37,9 @@ _FACTORS = tuple(2.0 ** (step / 6.0) for step in range(-15, 16))
 
 
 class StatedExpectation(NamedTuple):
-    """Expectation of the residual force as the user states it, where there is no run.
+    """RMS and highest frequency of the residual force, as the user states them without a run.
 
     Attributes:
-        rms_n: Its root mean square.
-        up_to_hz: Its highest frequency.
         noise_std_m: Standard deviation of the height; by the DBC's resolution if None.
     """
 
