@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from importlib.resources import files
+from string import Template
 
 from rig.fmu.component import KINDS, LONGEST_STEP, Component, Kind
 
@@ -47,8 +48,8 @@ def select_c_files(names: Iterable[str]) -> list[str]:
 
 
 def _header(component: Component, token: str, version: Fmi) -> str:
+    """The file `model.h`, from its template."""
     kinds = [item.kind for item in component.variables]
-    fmi = f"FMI{version[0]}"
     first = 0
     lines: list[str] = []
     for kind in KINDS:
@@ -57,59 +58,22 @@ def _header(component: Component, token: str, version: Fmi) -> str:
         if kind in _COUNTS:
             lines.append(f"#define {_COUNTS[kind]} {kinds.count(kind)}")
         first += kinds.count(kind)
-    longest = [item.name for item in component.variables].index(LONGEST_STEP)
-    return "\n".join(
-        [
-            "/* The values of this model: time, inputs, parameters that may be tuned, fixed ones,",
-            "   states, their rates, outputs and indicators of switches, one after another. */",
-            "#ifndef MODEL_H",
-            "#define MODEL_H",
-            "",
-            "/* Linked from their sources, FMUs differ in the names of their functions; a",
-            "   shared library has those of the standard. */",
-            f"#ifndef {fmi}_OVERRIDE_FUNCTION_PREFIX",
-            f"#define {fmi}_FUNCTION_PREFIX {component.identifier}_",
-            "#endif",
-            "",
-            f'#define MODEL_TOKEN "{token}"',
-            *lines,
-            f"#define VALUES {first}",
-            f"#define LONGEST_STEP {longest}",
-            "",
-            "extern const double model_start[VALUES];",
-            "extern const double model_nominals[STATES + 1];",
-            "",
-            "/* Compute rates, outputs and indicators from the other values. */",
-            "void model_evaluate(double *value, long *answer, int is_held);",
-            "",
-            "#endif",
-            "",
-        ]
+    return Template(read_common_source("model.h.template")).substitute(
+        fmi=f"FMI{version[0]}",
+        identifier=component.identifier,
+        token=token,
+        counts="\n".join(lines),
+        values=first,
+        longest_step=[item.name for item in component.variables].index(LONGEST_STEP),
     )
 
 
 def _model(component: Component) -> str:
-    starts = ", ".join(repr(item.start or 0.0) for item in component.variables)
-    nominals = ", ".join(repr(item.nominal) for _, item in component.of("state"))
-    body = "\n".join(f"    {line}" for line in component.evaluation.splitlines())
-    return "\n".join(
-        [
-            '#include "model.h"',
-            "",
-            '#include "switches.h"',
-            "",
-            f"const double model_start[VALUES] = {{{starts}}};",
-            "",
-            f"const double model_nominals[STATES + 1] = {{{nominals or '0.0'}}};",
-            "",
-            component.laws,
-            "void model_evaluate(double *value, long *answer, int is_held) {",
-            "    int k;",
-            "    /* Of a switch that is not asked. */",
-            "    for (k = 0; k < SWITCHES; ++k)",
-            "        value[FIRST_INDICATOR + k] = answer[k] ? 1.0 : -1.0;",
-            body,
-            "}",
-            "",
-        ]
+    """The file `model.c`, from its template."""
+    nominals = [repr(item.nominal) for _, item in component.of("state")]
+    return Template(read_common_source("model.c.template")).substitute(
+        starts=", ".join(repr(item.start or 0.0) for item in component.variables),
+        nominals=", ".join(nominals) or "0.0",
+        laws=component.laws,
+        evaluation="\n".join(f"    {line}" for line in component.evaluation.splitlines()),
     )
