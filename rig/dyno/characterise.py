@@ -2,14 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from can_dbc.errors import InputError
 from rig.diagnosis.recording import Recording, read_recording
 from rig.dyno.damper import Damper, summarise_damper
-from rig.dyno.figures import AtRest, DynoStep, compute_rest, compute_step
+from rig.dyno.figures import AtRest, DynoStep, ForceRecord, compute_rest, compute_step
 from rig.dyno.quality import quality
 from rig.dyno.strokes import Array, find_blocks, find_holds, find_strokes
 from rig.log.reader import read_run
@@ -20,26 +20,6 @@ _LARGEST_N = 1e8
 """Ten times what the largest damper machines of civil engineering reach."""
 
 _FEWEST_SAMPLES_A_CYCLE = 10
-
-
-class ForceRecord(NamedTuple):
-    """Measured motion and force of a strut.
-
-    Attributes:
-        t_s: Times, increasing, shape (N,).
-        height_m: Heights, shape (N,).
-        force_n: Strut forces, shape (N,), positive when the strut pushes.
-        temperature_c: Temperatures, shape (N,), or None.
-        strut: Name of the strut; empty where there is one.
-    """
-
-    name: str
-    t_s: Array
-    height_m: Array
-    force_n: Array
-    temperature_c: Array | None = None
-    strut: str = ""
-    source: str = "load cell"
 
 
 @dataclass(frozen=True)
@@ -114,7 +94,7 @@ def characterise_record(record: ForceRecord) -> Characteristics:
         raise InputError(f"{name}: a force of {largest_n:.3g} N, expected at most {_LARGEST_N:g}")
     strokes = find_strokes(t_s, height_m)
     blocks = find_blocks(strokes)
-    computed = [compute_step(t_s, height_m, force_n, record.temperature_c, item) for item in blocks]
+    computed = [compute_step(record, item) for item in blocks]
     steps = tuple(step for step in computed if step is not None)
     if not steps:
         raise InputError(
@@ -122,11 +102,8 @@ def characterise_record(record: ForceRecord) -> Characteristics:
             f"amplitude with {_FEWEST_SAMPLES_A_CYCLE} samples a cycle, expected a test that "
             "repeats its cycles"
         )
-    holds = tuple(
-        compute_rest(t_s, height_m, force_n, record.temperature_c, here)
-        for here in find_holds(t_s, height_m, blocks)
-    )
-    warnings = quality(t_s, force_n, steps, holds, len(strokes))
+    holds = tuple(compute_rest(record, here) for here in find_holds(t_s, height_m, blocks))
+    warnings = quality(record, steps, holds, len(strokes))
     return Characteristics(record, steps, holds, summarise_damper(steps), warnings)
 
 

@@ -53,6 +53,26 @@ _BATCHES = 10
 SIDES = ("compression", "rebound")
 
 
+class ForceRecord(NamedTuple):
+    """Measured motion and force of a strut.
+
+    Attributes:
+        t_s: Times, increasing, shape (N,).
+        height_m: Heights, shape (N,).
+        force_n: Strut forces, shape (N,), positive when the strut pushes.
+        temperature_c: Temperatures, shape (N,), or None.
+        strut: Name of the strut; empty where there is one.
+    """
+
+    name: str
+    t_s: Array
+    height_m: Array
+    force_n: Array
+    temperature_c: Array | None = None
+    strut: str = ""
+    source: str = "load cell"
+
+
 class Side(NamedTuple):
     """Figures of one direction.
 
@@ -134,15 +154,11 @@ class DynoStep(NamedTuple):
         )
 
 
-def compute_step(
-    t_s: Array, height_m: Array, force_n: Array, temperature_c: Array | None, block: Block
-) -> DynoStep | None:
-    """Figures of a block; None where it has too few samples for any, or does not repeat.
-
-    Times, heights, forces and temperatures are those of the whole record, shape (N,).
-    """
-    here = slice(block.begin, block.end)
-    force_n, warm_c = force_n[here], None if temperature_c is None else temperature_c[here]
+def compute_step(record: ForceRecord, block: Block) -> DynoStep | None:
+    """Figures of a block; None where it has too few samples for any, or does not repeat."""
+    t_s, height_m, here = record.t_s, record.height_m, slice(block.begin, block.end)
+    force_n = record.force_n[here]
+    warm_c = None if record.temperature_c is None else record.temperature_c[here]
     motion = fit_motion(t_s[here], height_m[here], len(block.strokes))
     if np.isnan(motion.period_s) and not is_repetition(t_s, height_m, block):
         return None
@@ -172,20 +188,18 @@ def compute_step(
     )
 
 
-def compute_rest(
-    t_s: Array, height_m: Array, force_n: Array, temperature_c: Array | None, here: slice
-) -> AtRest:
+def compute_rest(record: ForceRecord, here: slice) -> AtRest:
     """Mean height, force and temperature of the samples `here`, at which the strut rests."""
-    values = force_n[here]
+    values, warm_c = record.force_n[here], record.temperature_c
     means = np.array([part.mean() for part in np.array_split(values, min(_BATCHES, len(values)))])
     std = float(np.std(means, ddof=1)) / len(means) ** 0.5 if len(means) > 1 else float("nan")
     mean, half = float(values.mean()), 2.26 * std  # Student's t of ten batches
     return AtRest(
-        float(t_s[here][0]),
-        float(t_s[here][-1]),
-        float(height_m[here].mean()),
+        float(record.t_s[here][0]),
+        float(record.t_s[here][-1]),
+        float(record.height_m[here].mean()),
         Figure(mean, mean - half, mean + half, "mean at rest, ten batches"),
-        None if temperature_c is None else float(temperature_c[here].mean()),
+        None if warm_c is None else float(warm_c[here].mean()),
     )
 
 

@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 
 from rig.diagnosis.clipping import find_sudden_plateaus
-from rig.dyno.figures import AtRest, DynoStep
+from rig.dyno.figures import AtRest, DynoStep, ForceRecord
 from rig.dyno.strokes import Array
 
 _GAP = 2.5
@@ -26,16 +26,13 @@ _COARSE = 2.0
 
 
 def quality(
-    t_s: Array,
-    force_n: Array,
-    steps: Sequence[DynoStep],
-    holds: Sequence[AtRest],
-    strokes: int,
+    record: ForceRecord, steps: Sequence[DynoStep], holds: Sequence[AtRest], strokes: int
 ) -> tuple[str, ...]:
     """Warnings of gaps, few samples, a coarse force, a wrong sign, unused strokes, a drift at rest.
 
-    Times and forces have the shape (N,); `strokes` is the number of strokes of the record.
+    `strokes` is the number of strokes of the record.
     """
+    t_s, force_n = record.t_s, record.force_n
     return (
         *_sign(steps),
         *_strokes_outside_steps(steps, strokes),

@@ -94,8 +94,9 @@ def run_campaign(
         InputError: The store cannot be read or written.
     """
     store.sweep(out)
-    known = store.read_identities(out, with_failed=not again)
-    keys = store.read_keys(out)
+    evaluated = store.read_evaluated(out)
+    keys = {key for key, _, _ in evaluated}
+    known = {identity for _, identity, error in evaluated if not (again and error)}
     todo = [s for s in sources if identity_of(s, model.sha256) not in known]
     begun = last_s = time.monotonic()
     held: list[RunRow] = []

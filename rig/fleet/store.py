@@ -14,7 +14,7 @@ import glob
 import hashlib
 import importlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -114,46 +114,26 @@ def _write(store: Path, partition: str, rows: Sequence[RunRow]) -> None:
     for name, schema, content in (("values", _VALUE, values), ("runs", _RUN, runs)):
         path = store / name / partition / f"{part}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
-        kept = [{key: item[key] for key in schema.names} for item in content]
         with replacing(path) as temporary:
-            _parquet.write_table(_pa.Table.from_pylist(kept, schema=schema), temporary)
+            _parquet.write_table(_pa.Table.from_pylist(content, schema=schema), temporary)
 
 
-def read_identities(store: Path, *, with_failed: bool) -> set[str]:
-    """Identities of the runs that were evaluated, with or without those that failed.
-
-    There are none where there is no store yet.
+def read_evaluated(store: Path) -> list[tuple[str, str, str]]:
+    """Key, identity and error of every run of a store; none where there is no store yet.
 
     Raises:
         InputError: It cannot be read.
     """
-    return {
-        row["identity"]
-        for batch in _batches(store, ["identity", "error"])
-        for row in batch.to_pylist()
-        if with_failed or not row["error"]
-    }
-
-
-def read_keys(store: Path) -> set[str]:
-    """Keys of all runs of a store.
-
-    Raises:
-        InputError: It cannot be read.
-    """
-    return {key for batch in _batches(store, ["key"]) for key in batch.column("key").to_pylist()}
-
-
-def _batches(store: Path, columns: Sequence[str]) -> Iterator[Any]:
     folder = store / "runs"
     if not folder.is_dir():
-        return
+        return []
     try:
         there = _dataset.dataset(folder, format="parquet", partitioning="hive")
-        if there.files:
-            yield from there.to_batches(columns=list(columns))
+        columns = ["key", "identity", "error"]
+        rows = there.to_table(columns=columns).to_pylist() if there.files else []
     except (OSError, _pa.ArrowException, ValueError) as error:
         raise InputError(f"{folder}: cannot be read ({error})") from error
+    return [(row["key"], row["identity"], row["error"]) for row in rows]
 
 
 def sweep(store: Path) -> None:

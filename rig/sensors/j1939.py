@@ -62,25 +62,20 @@ class ParameterGroup(NamedTuple):
 
 
 _CORNERS = ("FRONT_LEFT", "FRONT_RIGHT", "REAR_LEFT", "REAR_RIGHT")
-GROUPS = (
+GROUPS = tuple(
     ParameterGroup(
-        65112,
-        "ASC4",
+        number,
+        name,
         0.1,
         tuple(
-            GroupParameter(f"BELLOW_PRESSURE_{corner}", 2 * index, 0.1, 0.0, "kPa")
+            GroupParameter(f"{label}_{corner}", 2 * index, 0.1, offset, unit)
             for index, corner in enumerate(_CORNERS)
         ),
-    ),
-    ParameterGroup(
-        65113,
-        "ASC3",
-        0.1,
-        tuple(
-            GroupParameter(f"RELATIVE_LEVEL_{corner}", 2 * index, 0.1, -3200.0, "mm")
-            for index, corner in enumerate(_CORNERS)
-        ),
-    ),
+    )
+    for number, name, label, offset, unit in (
+        (65112, "ASC4", "BELLOW_PRESSURE", 0.0, "kPa"),
+        (65113, "ASC3", "RELATIVE_LEVEL", -3200.0, "mm"),
+    )
 )
 """Groups of the air suspension control that J1939-71 gives a position or a pressure to. Other
 sensors send groups of Proprietary B, whose layout only the manufacturer knows."""

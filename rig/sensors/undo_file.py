@@ -36,7 +36,14 @@ def configure_with_undo(
         InputError: The file cannot be written, or the device cannot do it.
     """
     writer = DeviceWriter(network, node_id)
-    begin_undo(undo)
+    try:  # before any change, so that a file that cannot be written prevents it
+        undo.open("x").close()
+    except FileExistsError:
+        raise InputError(
+            f"--before {undo}: exists, expected a new file (or --restore it first)"
+        ) from None
+    except OSError as error:
+        raise InputError(f"--before {undo}: cannot be written: {error.strerror}") from error
     try:
         configure_device(writer, settings)
     except InputError as error:
@@ -51,7 +58,7 @@ def configure_with_undo(
 
 
 def write_undo(path: Path, changes: Sequence[ObjectChange]) -> None:
-    """Write the contents before changes, over what `begin_undo` made.
+    """Write the contents before changes.
 
     Raises:
         InputError: The file cannot be written.
@@ -62,22 +69,6 @@ def write_undo(path: Path, changes: Sequence[ObjectChange]) -> None:
         path.write_text(text, "utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}: {text!r}") from error
-
-
-def begin_undo(path: Path) -> None:
-    """Create the file before any change, so that a file that cannot be written prevents it.
-
-    Raises:
-        InputError: The file exists, or cannot be written.
-    """
-    try:
-        path.open("x").close()
-    except FileExistsError:
-        raise InputError(
-            f"--before {path}: exists, expected a new file (or --restore it first)"
-        ) from None
-    except OSError as error:
-        raise InputError(f"--before {path}: cannot be written: {error.strerror}") from error
 
 
 def read_undo(path: Path) -> list[ObjectChange]:
