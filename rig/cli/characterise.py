@@ -130,9 +130,9 @@ def _print_steps(record: "Characteristics") -> None:
         "N·s/m",
         title=f"{record.name} (force: {record.record.source})",
     )
-    for kind, step in zip(record.damper.kinds, record.steps, strict=True):
+    for step in record.steps:
         shown.add_row(
-            kind_words(kind),
+            kind_words(step.kind),
             f"±{1e3 * step.amplitude_m:.2f}",
             f"{step.peak_speed_m_per_s:.3g}",
             with_half(step.compression.force_at_peak_velocity_n),

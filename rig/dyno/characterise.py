@@ -8,7 +8,7 @@ import numpy as np
 
 from can_dbc.errors import InputError
 from rig.diagnosis.recording import Recording, read_recording
-from rig.dyno.damper import Damper, summarise_damper
+from rig.dyno.damper import Damper, mark_warm_up, summarise_damper
 from rig.dyno.figures import AtRest, DynoStep, ForceRecord, compute_rest, compute_step
 from rig.dyno.quality import quality
 from rig.dyno.strokes import Array, find_blocks, find_holds, find_strokes
@@ -40,16 +40,13 @@ class Characteristics:
     def as_dict(self) -> dict[str, object]:
         """For `characteristics.json`."""
         figures = self.damper._asdict()
-        kinds, notes = figures.pop("kinds"), figures.pop("notes")
+        notes = figures.pop("notes")
         return {
             "record": self.name,
             "strut": self.record.strut or None,
             "force": self.record.source,
             "signs": "positive when the strut pushes: damping of compression positive",
-            "steps": [
-                {"kind": kind} | step.figures()
-                for kind, step in zip(kinds, self.steps, strict=True)
-            ],
+            "steps": [step.figures() for step in self.steps],
             "holds": self.holds,
             **figures,
             "quality": self.quality,
@@ -94,8 +91,7 @@ def characterise_record(record: ForceRecord) -> Characteristics:
         raise InputError(f"{name}: a force of {largest_n:.3g} N, expected at most {_LARGEST_N:g}")
     strokes = find_strokes(t_s, height_m)
     blocks = find_blocks(strokes)
-    computed = [compute_step(record, item) for item in blocks]
-    steps = tuple(step for step in computed if step is not None)
+    steps = [step for item in blocks if (step := compute_step(record, item)) is not None]
     if not steps:
         raise InputError(
             f"{name}: no steady cycle in {len(strokes)} strokes: never three in a row of equal "
@@ -103,8 +99,9 @@ def characterise_record(record: ForceRecord) -> Characteristics:
             "repeats its cycles"
         )
     holds = tuple(compute_rest(record, here) for here in find_holds(t_s, height_m, blocks))
-    warnings = quality(record, steps, holds, len(strokes))
-    return Characteristics(record, steps, holds, summarise_damper(steps), warnings)
+    marked = mark_warm_up(steps)
+    warnings = quality(record, marked, holds, len(strokes))
+    return Characteristics(record, marked, holds, summarise_damper(marked), warnings)
 
 
 def _read_strut(

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rig.dyno.figures import QUASI_STATIC_M_PER_S, DynoStep
+from rig.dyno.figures import SIDES, DynoStep
 from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, student_factor
 from rig.dyno.strokes import Array
 
@@ -36,7 +36,6 @@ class Damper(NamedTuple):
     """Figures over all steps; None where the test does not determine them.
 
     Attributes:
-        kinds: Of each step `warm_up`, `quasi_static` or `velocity_step`.
         gas_force_n: At mid-stroke of the slowest step.
         gas_rate_n_per_m: Its rise per compression there.
         friction_n: Half the difference of both directions there.
@@ -46,7 +45,6 @@ class Damper(NamedTuple):
         notes: Why a figure is missing, and what was assumed.
     """
 
-    kinds: tuple[str, ...]
     gas_force_n: Figure | None
     gas_rate_n_per_m: Figure | None
     friction_n: Figure | None
@@ -59,8 +57,7 @@ class Damper(NamedTuple):
 def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
     """Figures of a damper from its steps, in time; one at least."""
     notes: list[str] = []
-    kinds = _kinds(steps)
-    slow = [step for step, kind in zip(steps, kinds, strict=True) if kind == "quasi_static"]
+    slow = [step for step in steps if step.kind == "quasi_static"]
     gas_force = gas_rate = friction = None
     if slow:
         slowest = min(slow, key=lambda step: step.peak_speed_m_per_s)
@@ -83,10 +80,7 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
             "asymmetry is that of whole forces"
         )
     fastest = max(steps, key=lambda step: step.peak_speed_m_per_s)
-    knee = {
-        name: _knee(stroke)
-        for name, stroke in zip(("compression", "rebound"), fastest.strokes, strict=True)
-    }
+    knee = {name: _knee(stroke) for name, stroke in zip(SIDES, fastest.strokes, strict=True)}
     if any(stroke.is_constant for stroke in fastest.strokes):
         notes.append("no knee: the fastest step has a single speed")
     elif not any(knee.values()):
@@ -95,7 +89,6 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
     if not any(per_kelvin.values()):
         notes.append(f"no change per kelvin: no speed was run over {_LEAST_WARMING_K:g} K or more")
     return Damper(
-        kinds,
         gas_force,
         gas_rate,
         friction,
@@ -106,16 +99,14 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
     )
 
 
-def _kinds(steps: Sequence[DynoStep]) -> tuple[str, ...]:
-    kinds = [
-        "quasi_static" if step.peak_speed_m_per_s <= QUASI_STATIC_M_PER_S else "velocity_step"
-        for step in steps
-    ]
-    others = [step.cycles for step in steps[1:]]
-    is_longer = len(others) >= 2 and steps[0].cycles >= _WARM_UP * float(np.median(others))
-    if kinds[0] == "velocity_step" and is_longer:
-        kinds[0] = "warm_up"
-    return tuple(kinds)
+def mark_warm_up(steps: Sequence[DynoStep]) -> tuple[DynoStep, ...]:
+    """The steps, in time, of which the first one is a warm-up if it is longer than the others."""
+    first, *others = steps
+    cycles = [step.cycles for step in others]
+    is_longer = len(cycles) >= 2 and first.cycles >= _WARM_UP * float(np.median(cycles))
+    if first.kind == "velocity_step" and is_longer:
+        first = first._replace(kind="warm_up")
+    return (first, *others)
 
 
 def _asymmetry(step: DynoStep, gas: Figure | None) -> Figure | None:

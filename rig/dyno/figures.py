@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, combine, mean_stroke
 from rig.dyno.strokes import Array, Block, BlockMotion, fit_motion, is_repetition
 
-QUASI_STATIC_M_PER_S = 5e-3
+_QUASI_STATIC_M_PER_S = 5e-3
 """Peak speed up to which a step gives friction and gas force: seals and bleed alone damp there."""
 
 _WINDOW = 0.1
@@ -107,6 +107,7 @@ class DynoStep(NamedTuple):
     """Figures of a block: one step of a test.
 
     Attributes:
+        kind: `warm_up`, `quasi_static` or `velocity_step`.
         cycles: Cycles that were used.
         frequency_hz: Cycles a second; None where the motion is not periodic.
         amplitude_m: Half the stroke.
@@ -123,6 +124,7 @@ class DynoStep(NamedTuple):
         warmth: Of both directions the temperature of each stroke and its force about mid-stroke.
     """
 
+    kind: str
     begin_s: float
     end_s: float
     cycles: float
@@ -169,7 +171,10 @@ def compute_step(record: ForceRecord, block: Block) -> DynoStep | None:
     if down is None or up is None:
         return None
     speed_std = motion.velocity_std_m_per_s
+    sides = _side(down, down, up, speed_std), _side(up, down, up, speed_std)
+    speed = max(side.peak_velocity_m_per_s.value for side in sides)
     return DynoStep(
+        "quasi_static" if speed <= _QUASI_STATIC_M_PER_S else "velocity_step",
         float(t_s[block.begin]),
         float(t_s[block.end - 1]),
         0.5 * len(block.strokes),
@@ -177,8 +182,7 @@ def compute_step(record: ForceRecord, block: Block) -> DynoStep | None:
         0.5 * (down.amplitude_m + up.amplitude_m),
         0.5 * (down.middle_m + up.middle_m),
         None if warm_c is None else float(np.mean(warm_c)),
-        _side(down, down, up, speed_std),
-        _side(up, down, up, speed_std),
+        *sides,
         *_of_both(down, up, speed_std / float(np.abs(velocity).max())),
         (down, up),
         (

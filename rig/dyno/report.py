@@ -84,7 +84,7 @@ def evaluate_records(
     return [
         DamperReport(
             record,
-            () if band is None else evaluate_band(record.steps, record.damper.kinds, band),
+            () if band is None else evaluate_band(record.steps, band),
             None if good is None else name_faults(record, good, criteria.scatter),
         )
         for record in records

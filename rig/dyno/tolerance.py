@@ -112,17 +112,15 @@ def _check_header(path: Path, header: Sequence[str]) -> Sequence[str]:
     return header
 
 
-def evaluate_band(
-    steps: Sequence[DynoStep], kinds: Sequence[str], tolerance: ToleranceBand
-) -> list[PointVerdict]:
+def evaluate_band(steps: Sequence[DynoStep], tolerance: ToleranceBand) -> list[PointVerdict]:
     """Every point of a band, compression and rebound.
 
     A point belongs to the velocity step nearest to its speed within 1 %; the force is then less
     certain by what it may change over the difference. Between two steps the force of a damper lies
     between theirs, since it rises with speed: that is its interval. Beyond all steps it is not
-    measured. A warm-up is no step; `kinds` are those of `summarise_damper`.
+    measured. A warm-up is no step.
     """
-    used = [step for step, kind in zip(steps, kinds, strict=True) if kind != "warm_up"]
+    used = [step for step in steps if step.kind != "warm_up"]
     ordered = sorted(used, key=lambda step: step.peak_speed_m_per_s)
     verdicts: list[PointVerdict] = []
     for point in tolerance.points:

@@ -191,8 +191,7 @@ def _headline(records: Sequence[Characteristics]) -> str:
 def _record(item: Characteristics) -> dict[str, object]:
     warm = any(step.temperature_c is not None for step in item.steps)
     rows = [
-        {"kind": kind_words(kind), "cells": _cells(step, warm=warm)}
-        for kind, step in zip(item.damper.kinds, item.steps, strict=True)
+        {"kind": kind_words(step.kind), "cells": _cells(step, warm=warm)} for step in item.steps
     ]
     name = f"{item.name}, strut {item.record.strut}" if item.record.strut else item.name
     return {
