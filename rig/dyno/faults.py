@@ -354,32 +354,14 @@ def simulate_faults(master: Master, steps: Sequence[DynoStep]) -> list[Fault]:
     gives = _compliances(master)
     plays = np.concatenate([[0.0], np.geomspace(2e-5, 8e-3, 32)])
     rates = 1e6 / np.maximum(gives, 1e-3 * gives[1])
+    by_air = _changes_by_cycle(steps, lambda cycle: with_compliance(master, cycle, rates))
+    by_play = _changes_by_cycle(steps, lambda cycle: with_play(master, cycle, plays))
+    least_n = -master.friction_n
     return [
         Fault("gas pressure", "share of it lost", "", lost, -lost[:, None] * gas, most=1.0),
-        Fault(
-            "seal friction",
-            "more by",
-            "N",
-            more_n,
-            more_n[:, None] * against,
-            least=-master.friction_n,
-        ),
-        Fault(
-            "air in the oil",
-            "the oil gives by",
-            "mm/kN",
-            gives,
-            _changes_by_cycle(steps, lambda cycle: with_compliance(master, cycle, rates)),
-            least=0.0,
-        ),
-        Fault(
-            "play",
-            "of",
-            "mm",
-            1e3 * plays,
-            _changes_by_cycle(steps, lambda cycle: with_play(master, cycle, plays)),
-            least=0.0,
-        ),
+        Fault("seal friction", "more by", "N", more_n, more_n[:, None] * against, least=least_n),
+        Fault("air in the oil", "the oil gives by", "mm/kN", gives, by_air, least=0.0),
+        Fault("play", "of", "mm", 1e3 * plays, by_play, least=0.0),
         *[_early_opening(master, strokes, sides) for sides in _SIDES if _bend(master, sides)],
         *[_other_damping(master, strokes, sides) for sides in _SIDES],
     ]

@@ -84,10 +84,10 @@ def strut_component(spec: ModelSpec, strut: StrutSpec) -> Component:
     made.add("velocity_m_per_s", "m/s", "input", "its derivative; positive is rebound", 0.0)
     made.add("temperature_c", "degC", "input", "temperature of the damper", AMBIENT_C)
     effects, text = made.strut(strut, "", spec.gravity_m_per_s2)
-    if any("applied_force_n" in _argument_names(item.effect) for item in effects):
+    if any("applied_force_n" in _argument_names(law) for law, _ in effects):
         made.add("applied_force_n", "N", "input", "force that is applied to the bench", 0.0)
     made.add(LONGEST_STEP, "s", "fixed", "longest step of co-simulation", _STRUT_STEP_S)
-    carried = [item.effect.words for item in effects if item.effect.adds_mass]
+    carried = [law.words for law, _ in effects if law.adds_mass]
     meaning = (
         f"Strut {strut.name} of {spec.name}: force over height, velocity and temperature, positive "
         "when it pushes the two bodies apart."
@@ -137,9 +137,9 @@ def bench_component(spec: ModelSpec) -> Component:
         effects, laws = made.strut(strut, prefix, None)
         text.append(laws)
         forces.append(f"{ratio!r} * {_ref(prefix + 'force_n')}")
-        for item in effects:
-            if item.effect.adds_mass:
-                mass = _ref(item.prefix + item.effect.parameters[0].name)
+        for law, own_prefix in effects:
+            if law.adds_mass:
+                mass = _ref(own_prefix + law.parameters[0].name)
                 inertia, weight_n_per_kg = next(added)
                 masses.append(f"{inertia!r} * {mass}")
                 weights.append(f"{weight_n_per_kg!r} * {mass}")
@@ -153,13 +153,6 @@ def bench_component(spec: ModelSpec) -> Component:
         "positive upwards. Strut forces are positive when they push the two bodies apart."
     )
     return made.component(spec.name, f"{spec.name}_bench", meaning, "\n".join(text))
-
-
-class _Placed(NamedTuple):
-    """An effect of a strut, and the prefix of the names of its variables."""
-
-    effect: Effect
-    prefix: str
 
 
 _References = Mapping[Origin, Sequence[str]]
@@ -198,8 +191,8 @@ class _Build:
 
     def strut(
         self, spec: StrutSpec, prefix: str, gravity_m_per_s2: float | None
-    ) -> tuple[list[_Placed], str]:
-        """Add a strut, its names behind a prefix; returns its effects, and C that evaluates them.
+    ) -> tuple[list[tuple[Effect, str]], str]:
+        """Add a strut; returns its effects, with prefixes of their names, and C that evaluates it.
 
         Gravity is a separate parameter unless it is None: a bench has it already.
         """
@@ -214,7 +207,7 @@ class _Build:
         add(prefix + "spring.part_n", "N", "output", "part of the linear spring")
         add(prefix + "damper.part_n", "N", "output", "part of the linear damper")
         items = [
-            _Placed(effect(item.name), prefix + name)
+            (effect(item.name), prefix + name)
             for item, name in zip(spec.effects, _own_names(spec.effects), strict=True)
         ]
         constants = [_ref(prefix + name) for name in STRUT[:-1]] + [_ref("gravity_m_per_s2")]
@@ -230,12 +223,13 @@ class _Build:
             f"    {_ref(prefix + 'damper.part_n')} = -{damper};",
         ]
         for item, values in zip(items, spec.effects, strict=True):
-            lines += self._effect(item, values, constants)
+            lines += self._effect(*item, values, constants)
         lines += [f"    {_ref(prefix + 'force_n')} = force;", "}"]
         return items, "\n".join(lines)
 
-    def _effect(self, item: _Placed, values: EffectSpec, constants: Sequence[str]) -> list[str]:
-        law, prefix = item.effect, item.prefix
+    def _effect(
+        self, law: Effect, prefix: str, values: EffectSpec, constants: Sequence[str]
+    ) -> list[str]:
         for parameter, value in zip(law.parameters, values.values(), strict=True):
             unit = _plain_unit(parameter.unit)
             self.add(prefix + parameter.name, unit, "parameter", parameter.meaning, value)

@@ -123,7 +123,7 @@ def scan(network: CanOpenNetwork, listen_s: float, *, progress: Progress) -> Bus
         try:
             device = describe_device(objects, node_id)
         except BusError:
-            device = None  # it is listed as silent
+            continue  # it is listed as silent
         if device is not None:
             notes = [f"object {name}: no answer, taken as absent" for name in objects.unanswered]
             device = replace(device, notes=(*device.notes, *notes))
