@@ -213,10 +213,10 @@ def find_bench_jump(series: Mapping[str, Sequence[DatedValue]], level: float) ->
     if change is None or change.kind != "step" or change.p > level:
         return None
     size = change.after - change.before
-    moved = [_step_at(points, change.day) for points in usable.values()]
-    shared = [step for step in moved if step is not None and 0.5 < step / size < 2.0]
-    both = [step for step in moved if step is not None]
-    return change if len(shared) >= max(_SHARED, 0.5 * len(both)) else None
+    tried = [_step_at(points, change.day) for points in usable.values()]
+    steps = [step for step in tried if step is not None]
+    shared = [step for step in steps if 0.5 < step / size < 2.0]
+    return change if len(shared) >= max(_SHARED, 0.5 * len(steps)) else None
 
 
 def _step_at(points: Sequence[DatedValue], day: float) -> float | None:

@@ -104,10 +104,9 @@ def _roles_by_name(description: Any, source: Path) -> FmuSpec:
         own = {"height": "height_m", "velocity": "velocity_m_per_s", "force": "force_n"}
         return validate(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
     rates = {item.variable.derivative.name: item.variable.name for item in description.derivatives}
-    prefixes = [name.removesuffix("height_m") for name in rates if name.endswith(".height_m")]
-    for prefix in prefixes:
-        height, velocity = f"{prefix}height_m", f"{prefix}velocity_m_per_s"
-        if velocity in rates and further["applied_force"]:
+    for height in rates:
+        velocity = height.removesuffix("height_m") + "velocity_m_per_s"
+        if height.endswith(".height_m") and velocity in rates and further["applied_force"]:
             own = {"height": height, "velocity": velocity, "acceleration": rates[velocity]}
             return validate(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
     names = ", ".join(n for n, kind in causality.items() if kind in ("input", "output"))

@@ -35,7 +35,7 @@ _BY_DIMENSION = {
     Dimension.VELOCITY: "SPEED",
     Dimension.ACCELERATION: "ACCELERATION",
 }
-_BY_UNIT = {"Pa": "PRESSURE", "bar": "PRESSURE", "psi": "PRESSURE"}
+_PRESSURES = ("Pa", "bar", "psi")
 
 
 @dataclass(frozen=True)
@@ -140,9 +140,9 @@ def _channel_meaning(objects: CanOpenObjects, index: int, subindex: int) -> Mean
 
 def _channel_name(unit: str) -> str:
     dimension = _dimension(unit)
-    if dimension in _BY_DIMENSION:
+    if dimension is not None:
         return _BY_DIMENSION[dimension]
-    return next((name for ending, name in _BY_UNIT.items() if unit.endswith(ending)), "VALUE")
+    return "PRESSURE" if unit.endswith(_PRESSURES) else "VALUE"
 
 
 def _dimension(unit: str) -> Dimension | None:
