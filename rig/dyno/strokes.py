@@ -48,9 +48,7 @@ _FEWEST_UNLIKE_A_SERIES = 4
 _FEWEST_STROKES = 3
 """Of a block: a single stroke has no repetition, and one by which a machine gets there is none."""
 
-_HOLD_S = 0.5
-"""Shortest hold."""
-
+_SHORTEST_HOLD_S = 0.5
 _STILL_SHARE = 1e-3
 """Of the record's stroke: a height that moves less within the shortest hold is at rest; of 50 mm
 that is 0.1 mm/s, a fifth of the slowest step that machines run."""
@@ -65,9 +63,7 @@ that passes for still rises by all of it, a rest with the ends of strokes next t
 _FEWEST_AT_REST = 20
 """Samples of a hold: two for each of the batches whose means give its uncertainty."""
 
-_HARMONICS = 6
-"""Most harmonics of a motion."""
-
+_MOST_HARMONICS = 6
 _SERIES_SHARE = 0.01
 """Residual of a series over the amplitude above which the motion is smoothed instead."""
 
@@ -217,7 +213,7 @@ def find_holds(t_s: Array, height_m: Array, blocks: list[Block]) -> list[slice]:
     """Samples at rest, one stretch between two blocks at the most."""
     ends = [0, *(edge for block in blocks for edge in (block.begin, block.end - 1)), len(t_s) - 1]
     usual_s = float(np.median(np.diff(t_s)))
-    window = max(int(np.ceil(_HOLD_S / usual_s)), _FEWEST_AT_REST)
+    window = max(int(np.ceil(_SHORTEST_HOLD_S / usual_s)), _FEWEST_AT_REST)
     still_m = max(_STILL_SHARE * float(np.ptp(height_m)), _TURN_NOISE * _noise_m(height_m))
     holds: list[slice] = []
     for begin, end in zip(ends[::2], ends[1::2], strict=True):
@@ -288,7 +284,7 @@ def _fourier_series(t_s: Array, height_m: Array, strokes: int) -> BlockMotion | 
     """A Fourier series through a block; None where the motion is none."""
     span_s = float(t_s[-1])
     per_cycle = 2.0 * len(t_s) / strokes
-    harmonics = int(min(_HARMONICS, (per_cycle - 2.0) / 2.0))
+    harmonics = int(min(_MOST_HARMONICS, (per_cycle - 2.0) / 2.0))
     if harmonics < 1:
         return None
     coarse_hz = strokes / (2.0 * span_s)

@@ -11,7 +11,7 @@ from uuid import UUID
 from rig.fmu.binaries import TARGETS, Target, compile_for
 from rig.fmu.component import Component
 from rig.fmu.description import build_description, description_2, description_3
-from rig.fmu.source import Fmi, select_c_files, sources
+from rig.fmu.source import select_c_files, sources
 
 _FILE_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of every file in the archive, so that the same model gives the same bytes."""
@@ -19,7 +19,7 @@ _FILE_TIME = (1980, 1, 1, 0, 0, 0)
 
 def archive(
     component: Component,
-    version: Fmi,
+    version: str,
     model: str,
     targets: Iterable[Target] = TARGETS,
     done: Callable[[Target], None] = lambda _: None,
@@ -53,7 +53,7 @@ def archive(
     return _zip_files(files)
 
 
-def _token(component: Component, version: Fmi, tool: str) -> str:
+def _token(component: Component, version: str, tool: str) -> str:
     """A token that only the same content has."""
     code = sources(component, version, "")
     text = "\0".join([tool, version, *(f"{name}\0{code[name]}" for name in sorted(code))])

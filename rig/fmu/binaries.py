@@ -39,7 +39,6 @@ TARGETS = (
     Target("macOS", "x86_64-macos", "darwin64", "x86_64-darwin", ".dylib"),
     Target("macOS on ARM", "aarch64-macos", None, "aarch64-darwin", ".dylib"),
 )
-"""Every system that binaries are made for."""
 
 # No contraction: one rounding for a product and a sum would not be what Python computes.
 _FLAGS = (

@@ -6,10 +6,7 @@ from string import Template
 
 from rig.fmu.component import KINDS, LONGEST_STEP, Component, Kind
 
-Fmi = str
-"""Version of the interface: ``2.0`` or ``3.0``."""
-
-VERSIONS: Mapping[Fmi, tuple[str, ...]] = {
+VERSIONS: Mapping[str, tuple[str, ...]] = {
     "2.0": ("fmi2.c", "fmi2.h"),
     "3.0": ("fmi3.c", "fmi3.h"),
 }
@@ -26,7 +23,7 @@ _COUNTS: Mapping[Kind, str] = {
 }
 
 
-def sources(component: Component, version: Fmi, token: str) -> dict[str, str]:
+def sources(component: Component, version: str, token: str) -> dict[str, str]:
     """Every C file of an FMU by its name.
 
     The token is that of the description, so that no other binary is taken for it.
@@ -47,7 +44,7 @@ def select_c_files(names: Iterable[str]) -> list[str]:
     return sorted(name for name in names if name.endswith(".c"))
 
 
-def _header(component: Component, token: str, version: Fmi) -> str:
+def _header(component: Component, token: str, version: str) -> str:
     """The file `model.h`, from its template."""
     kinds = [item.kind for item in component.variables]
     first = 0
