@@ -125,15 +125,15 @@ class MasterComparison(NamedTuple):
 
     def words(self) -> str:
         """The same in a sentence."""
-        if self.not_compared:
-            said = self._replace(not_compared=()).words()
-            return f"{said}; not compared: {', '.join(self.not_compared)}"
         if self.is_good:
-            return "as its master, within what manufacturing scatters"
-        if not self.named:
-            return "not as its master, and no fault that is known explains it"
-        faults = "; ".join(item.words() for item in self.named)
-        return f"{faults}: explains {100 * self.explained:.0f} % of what differs"
+            text = "as its master, within what manufacturing scatters"
+        elif not self.named:
+            text = "not as its master, and no fault that is known explains it"
+        else:
+            faults = "; ".join(item.words() for item in self.named)
+            text = f"{faults}: explains {100 * self.explained:.0f} % of what differs"
+        missing = f"; not compared: {', '.join(self.not_compared)}" if self.not_compared else ""
+        return text + missing
 
 
 class _StrokePair(NamedTuple):

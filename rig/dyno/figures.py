@@ -74,14 +74,10 @@ class ForceRecord(NamedTuple):
 
 
 class Side(NamedTuple):
-    """Figures of one direction.
+    """Figures of one direction, as the module describes them.
 
     Attributes:
         peak_velocity_m_per_s: Largest speed, positive.
-        force_at_peak_velocity_n: Force there.
-        force_window_n: Mean about mid-stroke.
-        force_zero_crossing_n: Force at mid-stroke.
-        peak_force_n: Largest force against the motion.
         hysteresis_n: By share of the peak speed: force speeding up less force slowing down.
     """
 
@@ -104,7 +100,7 @@ class AtRest(NamedTuple):
 
 
 class DynoStep(NamedTuple):
-    """Figures of a block: one step of a test.
+    """Figures of a block, one step of a test, as the module describes them.
 
     Attributes:
         kind: `warm_up`, `quasi_static` or `velocity_step`.
@@ -113,13 +109,9 @@ class DynoStep(NamedTuple):
         amplitude_m: Half the stroke.
         middle_m: Height at mid-stroke.
         temperature_c: Mean temperature; None where none was measured.
-        energy_per_cycle_j: Energy that the loop of force over height encloses.
-        equivalent_damping_n_s_per_m: Linear damping that takes the same energy.
-        spring_rate_n_per_m: Fall of the mean force per height.
         mean_force_n: Mean of both strokes at mid-stroke: the gas force where it is slow.
         half_difference_n: Half of compression less rebound at mid-stroke: the friction where it is
             slow.
-        hysteresis_at_zero_n: Compression less rebound stroke at the turning points.
         strokes: The mean strokes, compression and rebound.
         warmth: Of both directions the temperature of each stroke and its force about mid-stroke.
     """

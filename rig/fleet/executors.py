@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, NamedTuple
 
 from can_dbc.errors import InputError
@@ -30,11 +31,14 @@ def processes(jobs: int | None) -> Engine:
     count = jobs or _cores()
     for name in _THREADS:  # Workers are as many as cores; theirs would be in the way.
         os.environ.setdefault(name, "1")
-    context = multiprocessing.get_context("spawn")
-
-    def make() -> Executor:
-        return ProcessPoolExecutor(count, mp_context=context, initializer=_worker)
-
+    make = partial(
+        ProcessPoolExecutor,
+        count,
+        mp_context=multiprocessing.get_context("spawn"),
+        # Ctrl-C is the parent's: it ends in order, and with it its workers.
+        initializer=signal.signal,
+        initargs=(signal.SIGINT, signal.SIG_IGN),
+    )
     return Engine(f"{count} processes", make, _AHEAD * count)
 
 
@@ -43,11 +47,6 @@ def _cores() -> int:
     if sys.platform == "linux":
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _worker() -> None:
-    """Ctrl-C is the parent's: it ends in order, and with it its workers."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager
@@ -70,11 +69,8 @@ def dask(address: str) -> Generator[Engine]:
     threads = sum(client.nthreads().values())
     if not threads:
         raise InputError(f"--dask {address}: a scheduler without workers")
-
-    def make() -> Executor:
-        return client.get_executor(pure=False)
-
+    words = f"Dask at {address}, {threads} threads of workers"
     try:
-        yield Engine(f"Dask at {address}, {threads} threads of workers", make, _AHEAD * threads)
+        yield Engine(words, partial(client.get_executor, pure=False), _AHEAD * threads)
     finally:
         client.close()

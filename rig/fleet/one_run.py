@@ -56,8 +56,6 @@ class RunRow:
             prescribed motion.
         after: The same of the corrected model.
         floor: What a right model leaves there.
-        took_s: Time of computation.
-        values: Parameters and figures.
     """
 
     key: str

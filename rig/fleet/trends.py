@@ -87,11 +87,10 @@ class ChangePoint(NamedTuple):
 
 
 class Drift(NamedTuple):
-    """Slope of the straight line through a series.
+    """Slope of the straight line through a series, with its 95 % interval.
 
     Attributes:
         per_day: Change per day.
-        low: Lower end of its 95 % interval.
         level: Value of the line in the middle.
         p: Chance of a slope as large without a drift.
     """

@@ -38,7 +38,6 @@ class Variable(NamedTuple):
     """A value of an FMU.
 
     Attributes:
-        meaning: One line.
         start: Its value at the beginning, if it is declared.
         nominal: Its usual size.
         is_output: Whether a state is an output as well.
@@ -61,7 +60,6 @@ class Component:
         identifier: The same as a C identifier, and as the name of the file.
         meaning: What it is, in a sentence or two.
         variables: All variables, in the order of `KINDS`; a value reference is an index into it.
-        laws: C of the laws.
         evaluation: C of the body of `model_evaluate`.
     """
 

@@ -211,8 +211,10 @@ class _Translation:
         match node:
             case ast.Constant(value=int() | float()) if not isinstance(node.value, bool):
                 return repr(node.value)
+            case ast.Name(id=name) if name in self._declared or name in self._arguments:
+                return name
             case ast.Name(id=name):
-                return self._variable(name, node)
+                return repr(self._global(name, node))
             case ast.Attribute() if ast.unparse(node) in _CONSTANTS:
                 return _CONSTANTS[ast.unparse(node)]
             case ast.UnaryOp(op=ast.USub(), operand=operand):
@@ -255,11 +257,6 @@ class _Translation:
             variable, each = self._loop
             index += f" + {each} * {variable}"
         return f"{function}(s, {index}, {', '.join(self._real(item) for item in arguments)})"
-
-    def _variable(self, name: str, node: ast.AST) -> str:
-        if name in self._declared or name in self._arguments:
-            return name
-        return repr(self._global(name, node))
 
     def _global(self, name: str, node: ast.AST) -> float:
         value = self._globals.get(name)

@@ -49,7 +49,6 @@ class BusSurvey:
         unconfigured: Identity of a device without a node id; None if there is none.
         claims: J1939 devices that claim an address.
         groups: Known parameter groups of J1939 that are sent, with their senders.
-        traffic: All frames, by id.
     """
 
     devices: tuple[CanOpenDevice, ...]

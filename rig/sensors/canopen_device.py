@@ -52,7 +52,6 @@ class Pdo:
     Attributes:
         number: Its number, from 1 on.
         cycle_s: Time between two frames; None where the device does not report it.
-        mapped: Objects in its frame.
         note: Entry of its mapping that cannot be read, empty if none.
     """
 

@@ -56,9 +56,7 @@ class TunedStrut:
         expectation: What it was tuned for.
         latency: Delay of its height as the run shows it; None where it was given.
         delay_s: Delay that it was tuned with.
-        tuned: The observer.
         published: Expected error of the published gains, scaled by the effective mass.
-        bandwidth_hz: Bandwidth of the observer.
         sweep: Expected errors at other bandwidths, by their frequencies in Hz.
     """
 
