@@ -4,8 +4,10 @@ import datetime
 import math
 import re
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median_high
 from typing import Any, NamedTuple
 
 from rig.fleet.sources import UNKNOWN
@@ -183,8 +185,7 @@ def read_overview(store: Path) -> Overview:
     Raises:
         InputError: There is none, or it cannot be read.
     """
-    connection = connect(store)
-    try:
+    with closing(connect(store)) as connection:
         model, sha256, version = connection.execute(
             "SELECT model, model_sha256, version FROM runs ORDER BY written DESC LIMIT 1"
         ).fetchall()[0]
@@ -207,8 +208,6 @@ def read_overview(store: Path) -> Overview:
         ).fetchall():
             verdicts.setdefault(bench, {})[verdict] = count
         collected = _read_series(connection)
-    finally:
-        connection.close()
     jumps = _jumps(collected)
     step_days = {jump.bench: jump.change.day for jump in jumps}
     # Every series without the jump of its bench, whose size is its own best one.
@@ -310,10 +309,10 @@ def _outliers(collected: _Collected) -> tuple[Outlier, ...]:
     found: list[Outlier] = []
     for quantity, by_place in sorted(collected.items()):
         latest = {
-            where: sorted(point.value for point in points[-_RECENT:])[len(points[-_RECENT:]) // 2]
+            where: median_high(point.value for point in points[-_RECENT:])
             for where, points in by_place.items()
         }
-        usual = sorted(latest.values())[len(latest) // 2]
+        usual = median_high(latest.values())
         for where, distance in find_outliers(latest, LEVEL / len(collected)).items():
             found.append(Outlier(where, quantity, latest[where], usual, distance))
     return tuple(found)

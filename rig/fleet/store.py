@@ -184,15 +184,12 @@ def query(store: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
     Raises:
         InputError: There is no store, or DuckDB refuses the query.
     """
-    connection = connect(store)
-    try:
-        answer = connection.execute(sql)
-        if answer is None or answer.description is None:
-            raise InputError(f"{store}: {sql!r}: expected a query")
-        names = [item[0] for item in answer.description or ()]
-        return names, answer.fetchall() if names else []
-    except _duckdb.Error as error:
-        first = str(error).splitlines()[0]
-        raise InputError(f"{store}: {first}") from error
-    finally:
-        connection.close()
+    with contextlib.closing(connect(store)) as connection:
+        try:
+            answer = connection.execute(sql)
+            if answer is None or answer.description is None:
+                raise InputError(f"{store}: {sql!r}: expected a query")
+            names = [item[0] for item in answer.description]
+            return names, answer.fetchall() if names else []
+        except _duckdb.Error as error:
+            raise InputError(f"{store}: {str(error).splitlines()[0]}") from error
