@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -151,7 +150,7 @@ def _bench(effect: UndeclaredEffect, excitation: int) -> BenchConfig:
 
 
 def _virtual_force_rms_n(ended: Ended) -> float:
-    steps: Any = read_run(ended.folder).steps
+    steps = read_run(ended.folder).steps
     t_ns = np.asarray(steps.column("t_ns").to_numpy(), dtype=np.int64)
     force = np.asarray(steps.column(f"{_STRUT}.virtual_force_n").to_numpy(), dtype=np.float64)
     force = force[t_ns >= SETTLED_NS]

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -118,14 +117,14 @@ def _read_strut(
             raise InputError(f"{path}: has no strut_force_n, expected a load cell's force")
         return "", recording.heights_m[:, 0], cells_n[:, 0], "load cell"
     run = read_run(path)
-    config: Any = run.header.get("config", {})
+    config = run.header.get("config", {})
     names = list(config.get("observers", {}))
     if strut is None and len(names) > 1:
         raise InputError(f"{path}: has the struts {', '.join(names)}, expected --strut")
     name = strut or names[0]
     if name not in names:
         raise InputError(f"{path}: --strut {name}: expected one of {', '.join(names)}")
-    index = list(config["signals"]["height"]).index(name)
+    index = list(config.get("signals", {})["height"]).index(name)
     height_m = recording.heights_m[:, index]
     if cells_n is not None:
         return name, height_m, cells_n[:, index], "load cell"

@@ -12,7 +12,7 @@ best size of each fault is found, and what it lowers the chi-squared by is held 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve  # pyright: ignore[reportUnknownVariableType]
@@ -246,8 +246,8 @@ def _fit_size(
     ]
     changes: Array = np.array(columns).T
     apart = residual_n - changes
-    factor = cast("Any", cho_factor)(covariance, lower=True)
-    solved = cast("Any", cho_solve)(factor, apart.T).T
+    factor = cho_factor(covariance, lower=True)
+    solved = cho_solve(factor, apart.T).T
     chi: Array = np.einsum("ij,ij->i", apart, solved)
     best = int(np.argmin(chi))
     within = sizes[chi <= float(chi[best]) + _FALL]
@@ -270,8 +270,8 @@ def _fit_size(
 
 
 def _misfit(residual_n: Array, covariance: Array) -> float:
-    factor = cast("Any", cho_factor)(covariance, lower=True)
-    return float(residual_n @ cast("Any", cho_solve)(factor, residual_n))
+    factor = cho_factor(covariance, lower=True)
+    return float(residual_n @ cho_solve(factor, residual_n))
 
 
 def _covariance(pairs: Sequence[_StrokePair], master: Master, scatter: float) -> Array:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from can_dbc.errors import InputError
 
@@ -57,7 +57,7 @@ def dask(address: str) -> Generator[Engine]:
         InputError: Dask is not installed, or there is no scheduler.
     """
     try:
-        library: Any = importlib.import_module("distributed")
+        library = importlib.import_module("distributed")
     except ModuleNotFoundError as error:
         raise InputError(
             "distributed is not installed, expected `pip install dask[distributed]`"

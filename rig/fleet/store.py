@@ -16,7 +16,7 @@ import importlib
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from urllib.parse import quote
 
 import pyarrow as pa
@@ -26,29 +26,27 @@ from can_dbc.atomic_file import replacing
 from can_dbc.errors import InputError
 from rig.fleet.one_run import RunRow
 
+_parquet = cast("Any", parquet)  # its stubs are incomplete
 _duckdb: Any = None
 with contextlib.suppress(ModuleNotFoundError):  # It only reads; the store is written without it.
     _duckdb = importlib.import_module("duckdb")
-_pa: Any = pa
-_dataset: Any = dataset
-_parquet: Any = parquet
 
-_TEXT, _REAL = _pa.string(), _pa.float64()
+_TEXT, _REAL = pa.string(), pa.float64()
 _RUN_TEXTS = (
     *("key", "identity", "source", "damper", "model", "model_sha256", "version", "written"),
     *("verdict", "error"),
 )
 _RUN_NUMBERS = ("duration_s", "before", "after", "floor", "took_s")
-_RUN = _pa.schema(
+_RUN = pa.schema(
     [
         *((name, _TEXT) for name in _RUN_TEXTS),
-        ("samples", _pa.int64()),
+        ("samples", pa.int64()),
         *((name, _REAL) for name in _RUN_NUMBERS),
         ("part", _TEXT),
     ]
 )
 _VALUE_TEXTS = ("key", "damper", "kind", "strut", "effect", "family", "parameter")
-_VALUE = _pa.schema(
+_VALUE = pa.schema(
     [
         *((name, _TEXT) for name in _VALUE_TEXTS),
         *((name, _REAL) for name in ("value", "low", "high")),
@@ -115,7 +113,7 @@ def _write(store: Path, partition: str, rows: Sequence[RunRow]) -> None:
         path = store / name / partition / f"{part}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary:
-            _parquet.write_table(_pa.Table.from_pylist(content, schema=schema), temporary)
+            _parquet.write_table(pa.Table.from_pylist(content, schema=schema), temporary)
 
 
 def read_evaluated(store: Path) -> list[tuple[str, str, str]]:
@@ -128,10 +126,10 @@ def read_evaluated(store: Path) -> list[tuple[str, str, str]]:
     if not folder.is_dir():
         return []
     try:
-        there = _dataset.dataset(folder, format="parquet", partitioning="hive")
+        there = dataset.dataset(folder, format="parquet", partitioning="hive")
         columns = ["key", "identity", "error"]
         rows = there.to_table(columns=columns).to_pylist() if there.files else []
-    except (OSError, _pa.ArrowException, ValueError) as error:
+    except (OSError, pa.ArrowException, ValueError) as error:
         raise InputError(f"{folder}: cannot be read ({error})") from error
     return [(row["key"], row["identity"], row["error"]) for row in rows]
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import ModuleType
 from typing import Any, cast
 
 import numpy as np
@@ -18,12 +19,11 @@ from rig.formats.run_content import RunContent, read_content
 from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
 from rig.log.reader import RunFolder
 
-_pa = cast("Any", pa)
 _CAN, _STEPS = "CAN_DataFrame", "steps"
 
 
 def _bus_dtype(name: str) -> np.dtype[np.void]:
-    fields: list[Any] = [
+    fields = [
         (f"{name}.BusChannel", "<u1"),
         (f"{name}.ID", "<u4"),
         (f"{name}.IDE", "<u1"),
@@ -59,7 +59,7 @@ def _records(frames: list[tuple[Frame, str]], name: str) -> NDArray[np.void]:
     return records
 
 
-def _asammdf() -> Any:
+def _asammdf() -> ModuleType:
     try:
         return importlib.import_module("asammdf")
     except ImportError as error:
@@ -127,7 +127,7 @@ def _rename_columns(signal: Any) -> Any:
     return signal
 
 
-def _append_steps(asammdf: Any, mdf: Any, steps: Any) -> None:
+def _append_steps(asammdf: ModuleType, mdf: Any, steps: pa.Table) -> None:
     if steps.num_rows == 0:
         return
     t_s = steps.column("t_ns").to_numpy() * 1e-9
@@ -168,14 +168,14 @@ def _read_frames(mdf: Any, name: str) -> Iterable[tuple[Frame, str]]:
     if name not in mdf:
         return
     signal = mdf.get(name)
-    records: Any = signal.samples
+    records = signal.samples
     t_s: NDArray[np.float64] = signal.timestamps
     t_ns = np.rint(t_s * 1e9).astype(np.int64).tolist()
     columns = [
         records[f"{name}.{field}"].tolist()
         for field in ("ID", "DataLength", "IDE", "EDL", "BRS", "Dir")
     ]
-    payloads: Any = records[f"{name}.DataBytes"]
+    payloads = records[f"{name}.DataBytes"]
     for row, (t, number, length, extended, fd, switched, sent) in enumerate(
         zip(t_ns, *columns, strict=True)
     ):
@@ -184,7 +184,7 @@ def _read_frames(mdf: Any, name: str) -> Iterable[tuple[Frame, str]]:
         yield frame, "T" if sent else "R"
 
 
-def _read_steps(mdf: Any) -> Any:
+def _read_steps(mdf: Any) -> pa.Table:
     prefix = f"{_STEPS}."
     group = next(
         (
@@ -195,9 +195,10 @@ def _read_steps(mdf: Any) -> Any:
         None,
     )
     if group is None:
-        return _pa.table({})
+        return pa.table({})
     names = [
         channel.name for channel in mdf.groups[group].channels if channel.name.startswith(prefix)
     ]
-    arrays = [_pa.array(mdf.get(name, group=group).samples) for name in names]
-    return _pa.Table.from_arrays(arrays, names=[name.removeprefix(prefix) for name in names])
+    return pa.table(
+        {name.removeprefix(prefix): mdf.get(name, group=group).samples for name in names}
+    )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from scipy import interpolate, optimize
@@ -138,7 +138,7 @@ def _curves(points: Sequence[tuple[Sequence[float], Sequence[float]]]) -> Curves
 
 def _segments(at: Floats, force_n: Floats) -> Floats:
     """Segments of a curve through points without overshoot, shape (segments, 6)."""
-    pchip = cast("Any", interpolate).PchipInterpolator(at, force_n)
+    pchip = interpolate.PchipInterpolator(at, force_n)
     cubic = np.asarray(pchip.c, dtype=np.float64).T
     return np.column_stack([at[:-1], np.diff(at), cubic])
 
@@ -192,7 +192,7 @@ def _height_arrays(motion: StrutMotion | None) -> DrivenHeight:
 def _spline(part: HeightFile) -> Floats:
     """Segments of the cubic spline through the samples, shape (segments, 6)."""
     t_s, height_m = part.samples
-    cubic = cast("Any", interpolate).CubicSpline(t_s, height_m)
+    cubic = interpolate.CubicSpline(t_s, height_m)
     return np.column_stack([t_s[:-1], np.diff(t_s), np.asarray(cubic.c, dtype=np.float64).T])
 
 
@@ -299,5 +299,5 @@ def _heights(
 
 def _root(function: Callable[[Floats], Floats], start: Floats) -> Floats:
     """Solve `function(x) = 0` near `start`, shape as `start`."""
-    solution = cast("Any", optimize).root(function, start.copy(), tol=1e-13)
+    solution = optimize.root(function, start.copy(), tol=1e-13)
     return np.asarray(solution.x, dtype=np.float64)
