@@ -74,7 +74,7 @@ def characterise_command(
     tolerance the exit code is 1 unless every point of the band is proven to be kept, with a master
     unless the damper is as good as it.
     """
-    from rig.dyno.report import Criteria, content_of, evaluate_records, write_content
+    from rig.dyno.report import content_of, evaluate_records, write_content
     from rig.dyno.tolerance import load_tolerance
     from rig.files.folders import refuse_full
 
@@ -85,7 +85,7 @@ def characterise_command(
         if tolerance is None and master is None:
             raise InputError("--junit: expected --tolerance or --master, which it reports on")
     band = None if tolerance is None else load_tolerance(tolerance)
-    reports = evaluate_records(runs, strut, Criteria(band, master, scatter))
+    reports = evaluate_records(runs, strut, band, master, scatter)
     content = content_of(reports, serial, band)
     if out is not None:
         from rig.pages.characteristics_page import write_characteristics_page

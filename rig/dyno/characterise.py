@@ -13,8 +13,6 @@ from rig.dyno.quality import quality
 from rig.dyno.strokes import Array, find_blocks, find_holds, find_strokes
 from rig.log.reader import read_run
 
-SCHEMA = 1
-
 _LARGEST_N = 1e8
 """Ten times what the largest damper machines of civil engineering reach."""
 
