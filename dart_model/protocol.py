@@ -46,7 +46,7 @@ class LoadedModel(Protocol[StateT_co]):
         ...
 
 
-LoadedT = TypeVar("LoadedT", bound=LoadedModel[Any])
+LoadedT = TypeVar("LoadedT", bound=LoadedModel[ModelState])
 
 
 class Plant(Protocol[StateT, LoadedT]):

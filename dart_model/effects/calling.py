@@ -73,7 +73,7 @@ def arguments(law: Force | Rate, effect: Effect) -> tuple[Argument, ...]:
     Raises:
         ArgumentError: One has a name that stands for nothing, or they are in another order.
     """
-    known = _known(effect)
+    known = _list_arguments(effect)
     names = list(inspect.signature(law).parameters)
     unknown = [name for name in names if name not in known]
     if unknown:
@@ -91,7 +91,7 @@ def arguments(law: Force | Rate, effect: Effect) -> tuple[Argument, ...]:
     return found
 
 
-def _known(effect: Effect) -> Mapping[str, Argument]:
+def _list_arguments(effect: Effect) -> Mapping[str, Argument]:
     known = {name: Argument(name, "motion", index) for index, name in enumerate(MOTION)}
     known |= {name: Argument(name, "strut", index) for index, name in enumerate(STRUT)}
     known |= _own("states", [(state.name, state.group) for state in effect.states])

@@ -8,7 +8,7 @@ def _none_beyond_dart() -> float:
     return 0.0
 
 
-def _weight_returned(gravity_m_per_s2: float, inertance_kg: float) -> float:
+def _weight_compensation(gravity_m_per_s2: float, inertance_kg: float) -> float:
     # DART carries the mass with its weight, which an inerter does not have.
     return inertance_kg * gravity_m_per_s2
 
@@ -34,7 +34,7 @@ INERTER = Effect(
     parameters=(
         Parameter("inertance_kg", "kg", -1e9, 1e9, "force per acceleration, without weight"),
     ),
-    force=_weight_returned,
+    force=_weight_compensation,
     excitation="frequencies above and below the resonance, so that mass and stiffness differ",
     reference="Smith, Synthesis of mechanical networks: the inerter, IEEE TAC 47 (2002)",
     adds_mass=True,

@@ -3,7 +3,7 @@
 from dart_model.effects.law import Effect, Parameter
 
 
-def _amplified(applied_force_n: float, gain: float) -> float:
+def _gain_force(applied_force_n: float, gain: float) -> float:
     return gain * applied_force_n
 
 
@@ -12,7 +12,7 @@ INPUT_GAIN = Effect(
     family="input_gain",
     words="the right gain of the applied force",
     parameters=(Parameter("gain", "", -0.99, 10.0, "share of the applied force that is missing"),),
-    force=_amplified,
+    force=_gain_force,
     excitation="an applied force of several frequencies or levels",
     reference="Ljung, System Identification (1999), 14.1",
     linear=True,

@@ -15,7 +15,6 @@ Reference: Featherstone, "Rigid Body Dynamics Algorithms" (2008).
 """
 
 from collections.abc import Sequence
-from typing import Any, cast
 
 import numpy as np
 from scipy.linalg import null_space  # pyright: ignore[reportUnknownVariableType]
@@ -152,7 +151,7 @@ class DartPlant:
         start = q
         for _ in range(_RESTING_STEPS):
             given = self._geometry.at(q).struts[np.isfinite(heights_m)]
-            free: Array = cast("Any", null_space)(given)
+            free: Array = null_space(given)
             if not free.size:
                 return q
             force = free.T @ self._force_at_rest(q)

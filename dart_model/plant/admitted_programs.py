@@ -22,7 +22,7 @@ def admit(content: bytes) -> bool:
         ModelError: The user's settings cannot be read or written.
     """
     fingerprint = _fingerprint(content)
-    admitted = _read_admitted()
+    admitted = _read_list()
     if fingerprint in admitted:
         return False
     _write([*admitted, fingerprint])
@@ -36,7 +36,7 @@ def withdraw(content: bytes) -> None:
         ModelError: The user's settings cannot be read or written.
     """
     fingerprint = _fingerprint(content)
-    _write([item for item in _read_admitted() if item != fingerprint])
+    _write([item for item in _read_list() if item != fingerprint])
 
 
 def require_admission(content: bytes, path: Path) -> None:
@@ -49,7 +49,7 @@ def require_admission(content: bytes, path: Path) -> None:
     Raises:
         ModelError: It was not admitted, or the user's settings cannot be read.
     """
-    if _fingerprint(content) not in _read_admitted():
+    if _fingerprint(content) not in _read_list():
         raise ModelError(
             f"{path}: a program that was not imported on this machine, expected `rig import "
             f"{path.name} --fmu` first, by someone who trusts it"
@@ -69,7 +69,7 @@ def _write(fingerprints: Sequence[str]) -> None:
         raise ModelError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-def _read_admitted() -> list[str]:
+def _read_list() -> list[str]:
     try:
         text = _list().read_text("utf-8")
     except FileNotFoundError:

@@ -24,7 +24,7 @@ Value = TypeVar("Value", float, Array)
 class Backend(Protocol[Value]):
     """Joint coordinates and their dynamics."""
 
-    def value(self, numbers: Sequence[float] | Array) -> Value:
+    def value(self, numbers: Sequence[float], /) -> Value:
         """One number a coordinate, from a sequence."""
         ...
 
@@ -53,6 +53,7 @@ class OneCoordinate:
     """The only coordinate of a skeleton, as a float."""
 
     dot = staticmethod(operator.mul)
+    value = staticmethod(operator.itemgetter(0))
 
     def __init__(self, skeleton: Skeleton) -> None:
         coordinate = skeleton.dart.getDof(0)
@@ -63,9 +64,6 @@ class OneCoordinate:
         self._acceleration: Callable[[], float] = coordinate.getAcceleration
         self._only_force_matters = False
         self._only_force_matters = self._depends_on_force_alone()
-
-    def value(self, numbers: Sequence[float] | Array) -> float:
-        return float(numbers[0])
 
     def numbers(self, value: float) -> tuple[float, ...]:
         return (value,)
@@ -113,7 +111,7 @@ class ManyCoordinates:
         self._solve: Callable[[], None] = skeleton.dart.computeForwardDynamics
         self._adds_up = coordinates_add_up(skeleton)
 
-    def value(self, numbers: Sequence[float] | Array) -> Array:
+    def value(self, numbers: Sequence[float], /) -> Array:
         return np.array(numbers, dtype=np.float64)
 
     def numbers(self, value: Array) -> tuple[float, ...]:

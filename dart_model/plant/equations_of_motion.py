@@ -171,10 +171,10 @@ class EquationsOfMotion(Generic[Value]):
         rows = tuple(
             _StrutRow(strut, offset_m, value(row))
             for strut, offset_m, row in zip(
-                self._struts, jacobians.offsets_m.tolist(), jacobians.struts, strict=True
+                self._struts, jacobians.offsets_m.tolist(), jacobians.struts.tolist(), strict=True
             )
         )
-        return _Configuration(rows, value(jacobians.applied))
+        return _Configuration(rows, value(jacobians.applied.tolist()))
 
 
 def count_steps(dt_s: float, longest_s: float) -> int:

@@ -84,9 +84,9 @@ def advance(
         Coordinates, rates and internal states at the end.
     """
     (q, v, internal), (a1, rates1) = start, first
-    t_s, duration_s, steps = course.t_s, course.duration_s, course.steps
+    t_s, steps = course.t_s, course.steps
     given, end = course.inputs
-    h = duration_s / steps
+    h = course.duration_s / steps
     half, sixth = 0.5 * h, h / 6.0
     rise = (end - given) / steps
     while True:

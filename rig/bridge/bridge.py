@@ -8,11 +8,11 @@ from msgspec.structs import replace
 from can_dbc.addressing import Directory, Filter
 from can_dbc.frame import Frame
 from can_dbc.protection import SequenceState
+from rig.bridge.counts import Conditions, Counts, Report
 from rig.bridge.devices import CLAIM, CLAIM_MASK, Device, faults
 from rig.bridge.gates import GateMemory, Gates, Reception
 from rig.bridge.incoming import Incoming
 from rig.bridge.outgoing import Outgoing
-from rig.bridge.report import Conditions, Counts, Report
 from rig.bridge.supervisor import NO_REPORTS, Reports, SupervisedState, Supervision, Supervisor
 from rig.bridge.values import Mode, StepInput, StepOutput
 from rig.channels.channel import Channel, Role, Sample
@@ -199,10 +199,8 @@ class Bridge:
                 supervised, samples = self._catch_up(supervised, samples)
                 measured = 0
             arrived_ns = min(frame_ns, t_ns)
-            samples += [
-                Sample(channel, values[value], arrived_ns - delay_ns)
-                for value, channel, delay_ns in incoming.deliveries
-            ]
+            for value, channel, delay_ns in incoming.deliveries:
+                samples.append(Sample(channel, values[value], arrived_ns - delay_ns))
             measured |= incoming.struts
         return supervised, samples
 
@@ -236,7 +234,8 @@ class Bridge:
         """State of the outgoing messages, frames to send, counts, and counts as reported."""
         frames: list[Frame] = []
         sendings, reported = state.sendings, state.reported
-        if not output.struts:  # nothing is sent before the first valid measurement
+        # Nothing is sent before the first valid measurement.
+        if not (sendings and output.struts):
             return sendings, frames, counts, reported
         after = list(sendings)
         for index, item in enumerate(self._outgoing):

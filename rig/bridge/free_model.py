@@ -2,14 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
 from dart_model.effects import AMBIENT_C
-from dart_model.protocol import AnyPlant, LoadedModel
+from dart_model.protocol import AnyPlant, LoadedModel, ModelState
 from rig.bridge.estimator import Estimate, find_divergence, is_sensible
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
@@ -40,11 +39,11 @@ class FreeModelState(Struct, frozen=True, gc=False):
     temperature_c: float
     first: tuple[tuple[Sample, ...], ...]
     observers: tuple[ObserverState, ...] = ()
-    model: LoadedModel[Any] | None = None
+    model: LoadedModel[ModelState] | None = None
     past: tuple[Instant, ...] = ()
 
 
-class _Received(NamedTuple):
+class _Received(Struct, frozen=True, gc=False):
     """Samples of a step, by what they are used for.
 
     Attributes:
@@ -191,7 +190,7 @@ class FreeModelEstimator:
             start = Start(
                 measured_ns,
                 mobility_per_kg,
-                *self._rhythm(strut),
+                *self._sample_timing(strut),
                 stiffness_per_s2,
                 damping_per_s,
                 self._sensors[strut],
@@ -200,7 +199,7 @@ class FreeModelEstimator:
         newest_ns = min(samples[-1].t_ns for samples in first if samples)
         return self._estimate(t_ns, tuple(observers), loaded, newest_ns, ())
 
-    def _rhythm(self, strut: int) -> tuple[int, int]:
+    def _sample_timing(self, strut: int) -> tuple[int, int]:
         """Interval and delay of a strut's heights in ns; zero where none is measured."""
         channel = self._heights.get(strut)
         return (0, 0) if channel is None else (channel.interval_ns, channel.delay_ns)
@@ -216,17 +215,18 @@ class FreeModelEstimator:
             if len(samples) != required[strut]:
                 return False
             if samples and samples[-1].t_ns - samples[0].t_ns > (
-                2 * len(samples) * self._rhythm(strut)[0]
+                2 * len(samples) * self._sample_timing(strut)[0]
             ):
                 return False
         newest_ns = min(samples[-1].t_ns for samples in first if samples)
         return t_ns - newest_ns <= self._stale_after_ns
 
     def _observe(
-        self, state: FreeModelState, loaded: LoadedModel[Any], t_ns: int, received: _Received
+        self, state: FreeModelState, loaded: LoadedModel[ModelState], t_ns: int, received: _Received
     ) -> tuple[FreeModelState, Estimate]:
         """Advance the model to the tick and correct it with what was measured."""
-        heights, readings, applied_n, temperature_c = received
+        heights, readings = received.heights, received.readings
+        applied_n, temperature_c = received.applied_n, received.temperature_c
         if applied_n is None:
             applied_n = loaded.applied_force_n
         if temperature_c is None:
@@ -264,7 +264,7 @@ class FreeModelEstimator:
         return self._estimate(t_ns, tuple(observers), loaded, oldest_ns, past)
 
     def _recent_instants(
-        self, state: FreeModelState, before: LoadedModel[Any], now: Instant
+        self, state: FreeModelState, before: LoadedModel[ModelState], now: Instant
     ) -> tuple[Instant, ...]:
         """The model now and before, as far back as a measurement may be old."""
         oldest_ns = now.t_ns - self._oldest_ns
@@ -293,7 +293,7 @@ class FreeModelEstimator:
         self,
         t_ns: int,
         observers: tuple[ObserverState, ...],
-        loaded: LoadedModel[Any],
+        loaded: LoadedModel[ModelState],
         measured_ns: int,
         past: tuple[Instant, ...],
     ) -> tuple[FreeModelState, Estimate]:

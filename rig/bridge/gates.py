@@ -21,6 +21,7 @@ from msgspec.structs import replace
 from can_dbc.addressing import Directory
 from can_dbc.frame import Frame
 from can_dbc.protection import INITIAL, FrameStatus, SequenceState
+from rig.bridge.counts import Counts
 from rig.bridge.devices import (
     CLAIM,
     CLAIM_MASK,
@@ -36,7 +37,6 @@ from rig.bridge.devices import (
 )
 from rig.bridge.incoming import Incoming, Values
 from rig.bridge.limits import Action, Limit, Plausibility, judge_height
-from rig.bridge.report import Counts
 
 # Looking up a member of an enum costs as much as the CRC of a frame.
 _OK = FrameStatus.OK
@@ -101,7 +101,7 @@ class Reception:
         more = {name: getattr(counts, name) + number for name, number in increments.items()}
         self.memory = replace(self.memory, counts=counts._replace(**more))
 
-    def refuse(self, cause: str) -> None:
+    def count_refusal(self, cause: str) -> None:
         """Count a refused frame, and its cause: the name of one of `Counts`."""
         self.count(**{"refused": 1, cause: 1})
 
@@ -213,7 +213,7 @@ class Gates:
         elif status.is_accepted:
             reception.count(lost=reception.sequences[index].lost)
         else:
-            reception.refuse(status.value)
+            reception.count_refusal(status.value)
         if status is FrameStatus.OUT_OF_SEQUENCE:
             self._count_stray(reception, index, t_ns)
 
@@ -272,7 +272,7 @@ def _healthy_sender(incoming: Incoming, index: int, device: Device) -> Gate:
             reception.set_health(alarm.device, update_by_alarm(health, alarm.alarm, raw))
         if fault(device, reception.memory.healths[index], frame.t_ns) is None:
             return values
-        reception.refuse("from_faulty_device")
+        reception.count_refusal("from_faulty_device")
         return None
 
     return gate
@@ -293,7 +293,7 @@ def _plausible(incoming: Incoming, limits: Sequence[Limit]) -> Gate:
         if action < Action.REFUSE:
             reception.memory = replace(reception.memory, heights=tuple(heights))
             return values
-        reception.refuse("implausible")
+        reception.count_refusal("implausible")
         return None
 
     return gate

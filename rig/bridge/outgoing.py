@@ -9,8 +9,8 @@ from can_dbc.codec import compile_encoder, si_range
 from can_dbc.database import Message
 from can_dbc.frame import Frame
 from can_dbc.protection import compile_protector
+from rig.bridge.counts import Report
 from rig.bridge.publications import STATUS, Publication
-from rig.bridge.report import Report
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ class PrescribedMotionState(Struct, frozen=True, gc=False):
     t_ns: int
     temperature_c: float
     motion: TrackedMotion | None = None
-    model: Any = None
+    model: object = None
     cell_n: float | None = None
     cell_ns: int = 0
     is_moving: bool = False

@@ -6,7 +6,7 @@ from math import inf, isnan
 from operator import attrgetter
 
 from can_dbc.units import Dimension
-from rig.bridge.report import Report, TimingFigures
+from rig.bridge.counts import Report, TimingFigures
 from rig.bridge.values import Mode
 
 

@@ -25,7 +25,7 @@ _QUEUE_BYTES, _SO_RCVBUFFORCE = 4_000_000, 33
 _MOST_KNOWN = 10_000
 """Identifiers remembered as accepted or not; a flood of others must not fill the memory."""
 
-_LISTEN_ONLY_OPTIONS: dict[str, dict[str, Any]] = {
+_LISTEN_ONLY_OPTIONS: dict[str, dict[str, object]] = {
     "pcan": {"state": can.BusState.PASSIVE},
     "slcan": {"listen_only": True},
     "vector": {"listen_only": True},
@@ -62,7 +62,7 @@ class BusConfig:
     channel: _Name = "rig"
     bitrate: _BitRate = 1_000_000
     data_bitrate: _BitRate | None = None
-    options: dict[str, Any] = field(default_factory=dict[str, Any])
+    options: dict[str, object] = field(default_factory=dict[str, object])
 
 
 class Bus:
@@ -88,7 +88,7 @@ class Bus:
         epoch_ns: int = 0,
     ) -> None:
         self._filters = None if filters is None else frozenset(filters)
-        self._known: dict[tuple[int, bool], bool] = {}
+        self._list_arguments: dict[tuple[int, bool], bool] = {}
         self.epoch_ns = epoch_ns
         """Unix time that stamps are relative to; to be updated when the system's clock was set."""
         self._bus = open_bus(config, self._filters, listen_only=listen_only)
@@ -121,15 +121,15 @@ class Bus:
         if self._filters is None:
             return True
         key = (message.arbitration_id, message.is_extended_id)
-        known = self._known.get(key)
+        known = self._list_arguments.get(key)
         if known is None:
-            known = self._known[key] = any(
+            known = self._list_arguments[key] = any(
                 item.is_extended == message.is_extended_id
                 and message.arbitration_id & item.mask == item.arbitration_id & item.mask
                 for item in self._filters
             )
-            if len(self._known) > _MOST_KNOWN:
-                self._known.clear()
+            if len(self._list_arguments) > _MOST_KNOWN:
+                self._list_arguments.clear()
         return known
 
     def _frame(self, message: can.Message) -> Frame:
@@ -206,7 +206,7 @@ def open_bus(
     Raises:
         BusError: The interface cannot be opened.
     """
-    options: dict[str, Any] = dict(config.options)
+    options: dict[str, object] = dict(config.options)
     if listen_only:
         options |= _LISTEN_ONLY_OPTIONS.get(config.interface, {})
     if config.interface == "virtual":

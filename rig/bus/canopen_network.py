@@ -8,7 +8,8 @@ import importlib
 import logging
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import Any, cast
 
 import can
@@ -28,7 +29,7 @@ OPERATIONAL, STOPPED, PRE_OPERATIONAL = 1, 2, 128
 """Commands of network management."""
 
 
-def package() -> Any:
+def package() -> ModuleType:
     """The package `canopen`.
 
     Raises:
@@ -68,7 +69,7 @@ class CanOpenNetwork:
         """Received frames in their order, the first ones of very many."""
         self._bus = open_bus(config, listen_only=listen_only)
         self._network: Any = self._package.Network(self._bus)
-        self._network.listeners = [_Listener(self._network, self.received)]
+        self._network.listeners = [_Listener(self._network.notify, self.received)]
         self._network.NOTIFIER_CYCLE = 0.1
         self._network.connect()
         self._clients: dict[int, Any] = {}
@@ -130,7 +131,7 @@ class CanOpenNetwork:
 
         It takes some 15 s where there is one, and a tenth of a second where there is none.
         """
-        lss: Any = self._network.lss
+        lss = self._network.lss
         lss.RESPONSE_TIMEOUT = _LSS_ANSWER_WITHIN_S
         try:
             is_there, identity = lss.fast_scan()
@@ -144,7 +145,7 @@ class CanOpenNetwork:
         Raises:
             BusError: It does not take it.
         """
-        lss: Any = self._network.lss
+        lss = self._network.lss
         lss.RESPONSE_TIMEOUT = _ANSWER_WITHIN_S
         try:
             lss.configure_node_id(node_id)
@@ -180,8 +181,10 @@ class CanOpenNetwork:
 class _Listener(can.Listener):
     """Keeps received frames, and passes on what can be CANopen: never J1939's ids of 29 bits."""
 
-    def __init__(self, network: Any, received: list[Frame]) -> None:
-        self._network = network
+    def __init__(
+        self, notify: Callable[[int, bytearray, float], None], received: list[Frame]
+    ) -> None:
+        self._notify = notify
         self._received = received
 
     def on_message_received(self, msg: can.Message) -> None:
@@ -192,7 +195,7 @@ class _Listener(can.Listener):
             t_ns, data = round(msg.timestamp * 1e9), bytes(msg.data)
             self._received.append(Frame(t_ns, msg.arbitration_id, data, msg.is_extended_id))
         if not msg.is_extended_id:
-            self._network.notify(msg.arbitration_id, msg.data, msg.timestamp)
+            self._notify(msg.arbitration_id, msg.data, msg.timestamp)
 
     def stop(self) -> None:
         """Release nothing: there is nothing to release."""

@@ -171,7 +171,7 @@ class Link:
         return frames
 
     @property
-    def unauthenticated(self) -> int:
+    def authentication_failures(self) -> int:
         """Frames refused so far because they are not authentic or not new."""
         return self.figures.unauthentic + self.figures.replayed
 

@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, cast
+from typing import IO, cast
 
 import can
 from can.io.blf import BLFParseError
@@ -80,14 +80,14 @@ def read_log(path: Path) -> Iterator[tuple[int, Frame]]:
         raise BusLogError(f"{path}: is not such a log, or is damaged: {reason}") from error
 
 
-def _open(path: Path) -> Any:
+def _open(path: Path) -> IO[str] | IO[bytes]:
     if path.suffix.lower() in _TEXT:
         return path.open(encoding="utf-8", errors="replace")
     return path.open("rb")
 
 
-def _messages(path: Path, file: Any) -> Iterable[can.Message]:
-    reader = cast("Callable[[Any], Any]", {**_TEXT, **_BINARY}[path.suffix.lower()])
+def _messages(path: Path, file: IO[str] | IO[bytes]) -> Iterable[can.Message]:
+    reader = cast("Callable[[object], object]", {**_TEXT, **_BINARY}[path.suffix.lower()])
     return cast("Iterable[can.Message]", reader(file))
 
 
@@ -96,7 +96,7 @@ def _reader_errors(path: Path) -> tuple[type[Exception], ...]:
     if path.suffix.lower() != ".mf4":
         return _READER_ERRORS
     try:
-        module = cast("Any", importlib.import_module("asammdf.blocks.utils"))
+        module = importlib.import_module("asammdf.blocks.utils")
     except ImportError as error:
         raise BusLogError(
             f"{path}: requires the package asammdf: pip install 'rig[mf4]'"

@@ -14,7 +14,7 @@ import importlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 from msgspec.structs import replace
 
@@ -81,8 +81,8 @@ def cmac(key: bytes) -> Callable[[bytes], bytes]:
         AuthenticationError: The package that computes it is not installed.
     """
     try:
-        module = cast("Any", importlib.import_module("cryptography.hazmat.primitives.cmac"))
-        ciphers = cast("Any", importlib.import_module("cryptography.hazmat.primitives.ciphers"))
+        module = importlib.import_module("cryptography.hazmat.primitives.cmac")
+        ciphers = importlib.import_module("cryptography.hazmat.primitives.ciphers")
     except ImportError as error:
         raise AuthenticationError(
             "authentication: requires the package cryptography: pip install 'rig[secoc]'"
@@ -141,17 +141,17 @@ class Authenticator:
             if frame.is_error:
                 accepted.append(frame)
                 continue
-            payload = self._verified_payload(frame)
+            payload = self._payload_if_authentic(frame)
             if payload is not None:
                 accepted.append(replace(frame, data=payload))
         return accepted
 
     @property
-    def unauthenticated(self) -> int:
+    def authentication_failures(self) -> int:
         """Frames refused: unauthentic and replayed ones."""
         return self.unauthentic + self.replayed
 
-    def _verified_payload(self, frame: Frame) -> bytes | None:
+    def _payload_if_authentic(self, frame: Frame) -> bytes | None:
         """Payload of a frame without its trailer; None if it is refused."""
         how = self._how
         end = len(frame.data) - how.trailer_bytes

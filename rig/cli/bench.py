@@ -38,7 +38,7 @@ def bench(
 ) -> None:
     """Run a simulated bench on a bus, in real time."""
     from rig.bus.bus import BusConfig
-    from rig.plan.load import load_authentication, load_plan
+    from rig.plan.load import load_plan
     from rig.run.live import run_bench
     from rig.run.loop import RunControl
     from rig.simulated_bench.config import load_bench_config
@@ -48,7 +48,7 @@ def bench(
     if bridge is not None:
         plan = load_plan(bridge)
         bus, dbc = plan.config.bus, plan.database.path
-        authentication = load_authentication(plan)
+        authentication = plan.authentication
     with stoppable() as stop, progress_line(duration_s) as progress:
         frames = run_bench(
             bench_config,

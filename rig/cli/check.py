@@ -12,7 +12,7 @@ from rig.cli.terminal import FAILED, ConfigFile, JsonFlag, print_json, print_tab
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rig.plan.check import Finding
+    from rig.plan.preflight_checks import Finding
 
 EXAMPLES = "Examples: `rig check rig.yaml` · `rig check rig.yaml --junit check.xml`"
 
@@ -24,8 +24,8 @@ def check_command(
     junit: JUnitFile = None,
 ) -> None:
     """Say what is wrong before a bench moves: signals, units, rate, bus load, poles."""
-    from rig.plan.check import Severity, check
     from rig.plan.load import load_plan
+    from rig.plan.preflight_checks import Severity, check
 
     findings = check(load_plan(config))
     as_dicts = [finding.as_dict() for finding in findings]
@@ -44,7 +44,7 @@ def check_command(
 
 
 def _print(config: Path, findings: "Sequence[Finding]") -> None:
-    from rig.plan.check import Severity
+    from rig.plan.preflight_checks import Severity
 
     styles = {Severity.OK: "green", Severity.WARNING: "yellow", Severity.ERROR: "red"}
     rows = [

@@ -87,8 +87,8 @@ def _run_one(
     trace: bool,
     as_json: bool,
 ) -> None:
-    from rig.plan.check import errors
     from rig.plan.load import load_plan
+    from rig.plan.preflight_checks import errors
     from rig.run.live import live
     from rig.run.loop import RunControl
     from rig.run.trace import Trace

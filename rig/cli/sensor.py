@@ -103,7 +103,7 @@ def scan_command(
     from rig.bus.canopen_network import CanOpenNetwork
     from rig.sensors.bus_scan import scan, survey_of_files
     from rig.sensors.height_zero import read_height_zero
-    from rig.sensors.proposal import write_proposal
+    from rig.sensors.proposed_config import write_proposal
 
     if out is not None and out.exists():
         raise InputError(f"--out {out}: exists, expected a new folder")

@@ -41,4 +41,4 @@ def set_command(
         console.print("Acknowledged.")
         return
     found = ask(run, {"set": parse_assignments(assignments or ())}, force=force)
-    console.print(f"Changed from {found['t_ns'] * 1e-9:.3f} s on.")
+    console.print(f"Changed from {found.get('t_ns', 0) * 1e-9:.3f} s on.")

@@ -10,7 +10,8 @@ import threading
 from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import TypedDict
 
 from rich.markup import escape
 
@@ -95,7 +96,7 @@ def _pass_on(name: str, bridge: "subprocess.Popen[str]") -> None:
 def _end_together(bridges: Mapping[str, "subprocess.Popen[str]"]) -> Generator[None]:
     """Ctrl-C, an end that is asked for and a closed terminal go to every bridge, and an error."""
 
-    def forward(_number: int, _frame: Any) -> None:
+    def forward(_number: int, _frame: FrameType | None) -> None:
         for bridge in list(bridges.values()):
             if bridge.poll() is None:
                 bridge.send_signal(signal.SIGINT)
@@ -109,14 +110,22 @@ def _end_together(bridges: Mapping[str, "subprocess.Popen[str]"]) -> Generator[N
             raise
 
 
-def _summary(folder: Path) -> dict[str, Any]:
+class _Summary(TypedDict, total=False):
+    """What is shown of the summary of a run."""
+
+    mode: str
+    ticks: int
+    counts: dict[str, int]
+
+
+def _summary(folder: Path) -> _Summary:
     try:
         return json.loads((folder / "summary.json").read_text("utf-8"))
     except (OSError, ValueError):
         return {}
 
 
-def _print(codes: dict[str, int], summaries: dict[str, dict[str, Any]], folder: Path) -> None:
+def _print(codes: dict[str, int], summaries: dict[str, _Summary], folder: Path) -> None:
     rows: list[tuple[str, ...]] = []
     for name, code in codes.items():
         summary = summaries[name]

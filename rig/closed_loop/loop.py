@@ -8,7 +8,7 @@ Reference: Åström and Wittenmark, "Computer-Controlled Systems" (1997), chapte
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant
 from rig.closed_loop.derivatives import central_differences
 from rig.closed_loop.strut_response import StrutResponse, strut_responses
-from rig.observers.protocol import AnyObserver, Innovation, Start
+from rig.observers.protocol import AnyObserver, Innovation, Observer, Start, StateT
 
 Array = NDArray[np.float64]
 
@@ -29,8 +29,8 @@ _ACCELERATION_STEP_M_PER_S2 = 1e-2
 """Step of the residual force, over the effective mass."""
 
 
-class Rhythm(NamedTuple):
-    """When a loop is closed.
+class SampleTiming(NamedTuple):
+    """How often a loop is closed, and on measurements how old.
 
     Attributes:
         period_ns: Time between two ticks.
@@ -43,8 +43,8 @@ class Rhythm(NamedTuple):
     delay: int = 0
 
     @classmethod
-    def of(cls, period_ns: int, interval_ns: int, delay_ns: int) -> "Rhythm":
-        """The rhythm of a tick and of its measurements, in whole ticks and measurement periods."""
+    def of(cls, period_ns: int, interval_ns: int, delay_ns: int) -> "SampleTiming":
+        """Timing in whole ticks and measurement periods."""
         every = max(1, round(interval_ns / period_ns))
         return cls(period_ns, every, round(delay_ns / (every * period_ns)))
 
@@ -95,7 +95,8 @@ class LinearLoop(NamedTuple):
         response = np.empty(len(frequency_hz), np.complex128)
         for index, frequency in enumerate(frequency_hz):
             z = np.exp(2j * np.pi * frequency * self.interval_s)
-            before = cast("Any", np.linalg.solve(z * eye - self.a, self.b[:, column]))
+            shifted: NDArray[np.complex128] = z * eye - self.a
+            before = np.linalg.solve(shifted, self.b[:, column])
             response[index] = self.c @ before + self.d[column]
         return response
 
@@ -107,7 +108,7 @@ class Loop:
         plant: The model.
         observers: One for each of its struts.
         heights_m: Strut heights at which the bench is assumed to rest.
-        rhythm: When the loop is closed.
+        timing: How often the loop is closed.
         responses: Responses that the observers take the model to have; by differences on it if
             absent.
     """
@@ -117,10 +118,10 @@ class Loop:
         plant: AnyPlant,
         observers: Sequence[AnyObserver],
         heights_m: Sequence[float],
-        rhythm: Rhythm,
+        timing: SampleTiming,
         responses: Sequence[StrutResponse] | None = None,
     ) -> None:
-        self._plant, self._observers, self._rhythm = plant, tuple(observers), rhythm
+        self._plant, self._observers, self._timing = plant, tuple(observers), timing
         self._heights_m = list(heights_m)
         start = plant.init(heights_m)
         self._law_n = plant.load(start, [0.0] * plant.struts, 0.0, AMBIENT_C).forces_n
@@ -135,7 +136,7 @@ class Loop:
                 list(observer.numbers(state))
                 for observer, state in zip(self._observers, self._states, strict=True)
             ),
-            self._heights_m * rhythm.delay,
+            self._heights_m * timing.delay,
         ]
         # Where the numbers of the model, of each observer and of the past heights end.
         self._ends = [0, *itertools.accumulate(len(part) for part in parts)]
@@ -162,25 +163,25 @@ class Loop:
                 self._observers, self._states, parts[1:-1], strict=True
             )
         ]
-        rhythm, seen = self._rhythm, parts[-1]
+        timing, seen = self._timing, parts[-1]
         count = len(self._observers)
-        for tick in range(1, rhythm.measured_every + 1):
+        for tick in range(1, timing.measured_every + 1):
             acting = [state.virtual_force_n for state in states]
             acting[strut] -= residual_n
             loaded = self._plant.load(model, acting, 0.0, AMBIENT_C)
-            model = self._plant.step(loaded, rhythm.period_ns * 1e-9, 0.0)
+            model = self._plant.step(loaded, timing.period_ns * 1e-9, 0.0)
             now = [height_m for height_m, _ in model.struts]
-            if tick < rhythm.measured_every:
+            if tick < timing.measured_every:
                 innovations: list[float | None] = [None] * count
             else:
-                compared = seen[-count:] if rhythm.delay else now
+                compared = seen[-count:] if timing.delay else now
                 innovations = [
                     bench_m - model_m + (noise_m if index == strut else 0.0)
                     for index, (bench_m, model_m) in enumerate(
                         zip(self._heights_m, compared, strict=True)
                     )
                 ]
-                seen = (now + seen)[: count * rhythm.delay]
+                seen = (now + seen)[: count * timing.delay]
             states = [
                 self._step_observer(observer, state, tick, innovation)
                 for observer, state, innovation in zip(
@@ -206,32 +207,32 @@ class Loop:
 
         slopes = central_differences(after, [*widths, _STEP, step_n])
         a, b, c, d = slopes[:-1, :size], slopes[:-1, size:], slopes[-1, :size], slopes[-1, size:]
-        return LinearLoop(a, b, c, d, self._rhythm.interval_ns * 1e-9)
+        return LinearLoop(a, b, c, d, self._timing.interval_ns * 1e-9)
 
-    def _steady_state(self, observer: AnyObserver, response: StrutResponse) -> Any:
+    def _steady_state(self, observer: Observer[StateT], response: StrutResponse) -> StateT:
         """An observer that has followed a bench at rest for long, its last tick at time zero."""
-        rhythm = self._rhythm
-        delay_ns, ticks = rhythm.delay * rhythm.interval_ns, rhythm.delay + 2
-        begin_ns = -ticks * rhythm.interval_ns
+        timing = self._timing
+        delay_ns, ticks = timing.delay * timing.interval_ns, timing.delay + 2
+        begin_ns = -ticks * timing.interval_ns
         mobility, stiffness, damping = response
         start = Start(
-            begin_ns - delay_ns, mobility, rhythm.interval_ns, delay_ns, stiffness, damping
+            begin_ns - delay_ns, mobility, timing.interval_ns, delay_ns, stiffness, damping
         )
         state = observer.steady_state(start)
         for number in range(1 - ticks, 1):
-            for tick in range(1 - rhythm.measured_every, 1):
-                t_ns = number * rhythm.interval_ns + tick * rhythm.period_ns
+            for tick in range(1 - timing.measured_every, 1):
+                t_ns = number * timing.interval_ns + tick * timing.period_ns
                 innovation = Innovation(0.0, t_ns - delay_ns) if tick == 0 else None
                 state = observer.step(state, t_ns, innovation)
         return state
 
     def _step_observer(
-        self, observer: AnyObserver, state: Any, tick: int, innovation_m: float | None
-    ) -> Any:
+        self, observer: Observer[StateT], state: StateT, tick: int, innovation_m: float | None
+    ) -> StateT:
         """State of an observer at a tick after time zero."""
-        rhythm = self._rhythm
-        t_ns = tick * rhythm.period_ns
+        timing = self._timing
+        t_ns = tick * timing.period_ns
         if innovation_m is None:
             return observer.step(state, t_ns, None)
-        measured_ns = t_ns - rhythm.delay * rhythm.interval_ns
+        measured_ns = t_ns - timing.delay * timing.interval_ns
         return observer.step(state, t_ns, Innovation(innovation_m, measured_ns))

@@ -15,7 +15,7 @@ Francis and Wonham, The internal model principle of control theory, Automatica 1
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,14 +117,14 @@ def observability(
     seen = linear.heights[list(measured)]
     columns = [_column(unknown, by_force, measured, len(seen)) for unknown in unknowns]
     base = np.vstack([model - np.eye(len(model)), seen])
-    scaled = base / np.maximum(np.linalg.norm(base, axis=0), 1e-300)
+    scaled: Array = base / np.maximum(np.linalg.norm(base, axis=0), 1e-300)
 
     def is_observable(*which: int) -> bool:
         # The model's own motion must not explain it: only what it leaves of the columns counts.
-        rest: Any = np.column_stack([columns[i] / np.linalg.norm(columns[i]) for i in which])
-        explained: Any = cast("Any", np.linalg.lstsq)(scaled, rest, rcond=1e-10)[0]
+        rest: Array = np.column_stack([columns[i] / np.linalg.norm(columns[i]) for i in which])
+        explained = np.linalg.lstsq(scaled, rest, rcond=1e-10)[0]
         rest = rest - scaled @ explained
-        least = cast("Any", np.linalg.svd)(rest, compute_uv=False)[-1]
+        least = np.linalg.svd(rest, compute_uv=False)[-1]
         return bool(least > _INDEPENDENT)
 
     alone = [bool(columns[i].any()) and is_observable(i) for i in range(len(unknowns))]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dart_model.protocol import AnyPlant
-from rig.closed_loop.loop import Loop, Rhythm
+from rig.closed_loop.loop import Loop, SampleTiming
 from rig.observers.protocol import AnyObserver
 
 
@@ -30,7 +30,10 @@ class Pole(NamedTuple):
 
 
 def closed_loop_poles(
-    plant: AnyPlant, observers: Sequence[AnyObserver], heights_m: Sequence[float], rhythm: Rhythm
+    plant: AnyPlant,
+    observers: Sequence[AnyObserver],
+    heights_m: Sequence[float],
+    timing: SampleTiming,
 ) -> list[Pole]:
     """Poles of model and observers.
 
@@ -38,13 +41,13 @@ def closed_loop_poles(
         plant: The model.
         observers: One for each of its struts.
         heights_m: Strut heights at which the bench is assumed to rest.
-        rhythm: When the loop is closed.
+        timing: How often the loop is closed.
 
     Returns:
         Poles, the slowest to decay first.
     """
-    loop = Loop(plant, observers, heights_m, rhythm)
-    return poles_of(loop.linear().a, rhythm.interval_ns * 1e-9)
+    loop = Loop(plant, observers, heights_m, timing)
+    return poles_of(loop.linear().a, timing.interval_ns * 1e-9)
 
 
 def poles_of(a: NDArray[np.float64], interval_s: float) -> list[Pole]:

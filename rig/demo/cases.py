@@ -4,13 +4,12 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
+import pyarrow as pa
 from numpy.typing import NDArray
 
+from rig.files.pictures import new_figure
 from rig.log.reader import read_run
 from rig.observers.pi import PiObserver
 from rig.plan.config import CONFIGS
@@ -170,7 +169,7 @@ def compare_with_bench(ended: Ended, plan: Plan, bench: BenchConfig) -> Case:
     return Case(ended, struts)
 
 
-def _free_run(ended: Ended, plan: Plan, observed: Any) -> dict[str, NDArray[np.float64]]:
+def _free_run(ended: Ended, plan: Plan, observed: pa.Table) -> dict[str, NDArray[np.float64]]:
     """Height and force of every strut of the model without virtual force."""
     names = plan.strut_names
     if plan.is_prescribed:
@@ -184,7 +183,7 @@ def _free_run(ended: Ended, plan: Plan, observed: Any) -> dict[str, NDArray[np.f
     return {name: _height_and_force(steps, name) for name in names}
 
 
-def _height_and_force(steps: Any, strut: str) -> NDArray[np.float64]:
+def _height_and_force(steps: pa.Table, strut: str) -> NDArray[np.float64]:
     columns = [steps.column(f"{strut}.{name}").to_numpy() for name in ("height_m", "force_n")]
     return np.column_stack(columns)
 
@@ -194,8 +193,7 @@ def draw(case: StrutCase, path: Path) -> None:
     last = case.t_s >= case.t_s[-1] - 2.0
     t_s = case.t_s[last]
     style = {"axes.grid": True, "grid.alpha": 0.3, "legend.frameon": False}
-    with cast("Any", mpl).rc_context(style):
-        figure = cast("Any", Figure)(figsize=(10, 7), layout="constrained")
+    with new_figure((10, 7), style) as figure:
         panels = figure.subplots(2, 2, sharex=True)
         for column, (title, of_truth, of_model, scale, unit) in enumerate(
             (("Height", 0, 0, 1e3, "mm"), ("Spring-damper force", 2, 1, 1.0, "N"))

@@ -33,7 +33,7 @@ def evaluate_held_out(problems: Problems, linear: Fit, corrected: Fit) -> tuple[
     held_out = problems.held_out
     nominal = nominal_model(problems.learnt, linear.parts.starts)
     models = ComparedModels(
-        *(_with_fitted_starts(problems, m) for m in (nominal, linear.model, corrected.model))
+        *(_fit_starts(problems, m) for m in (nominal, linear.model, corrected.model))
     )
     fitted_rms_n = problems.learnt.residual_force_rms_n(corrected.mean_square)
     return tuple(
@@ -42,7 +42,7 @@ def evaluate_held_out(problems: Problems, linear: Fit, corrected: Fit) -> tuple[
     )
 
 
-def _with_fitted_starts(problems: Problems, model: CandidateModel) -> CandidateModel:
+def _fit_starts(problems: Problems, model: CandidateModel) -> CandidateModel:
     """A model with initial states fitted to held-out runs; to blocks, from those of its fit."""
     problem, (candidate, parts) = problems.held_out, model
     if not problems.by_blocks:

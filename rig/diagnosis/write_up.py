@@ -123,7 +123,7 @@ def compose_result(
         verdict,
         linear_corrections(problem, estimates),
         _effects(problem, estimates, after) or _linear_effects(problem, estimates, after),
-        _changed_effects(problem, search, estimates),
+        _list_changes_of_effects(problem, search, estimates),
         search.rejected + _effects_hidden_from_bench(problem),
         _other_families(search) if ambiguous else (),
         _suggestion(search) if ambiguous else None,
@@ -140,7 +140,7 @@ def compose_result(
         tuple(grid.name for grid in problem.grids),
         problem.spec.name,
     )
-    series = (_fitted_series(problem, before[k], after[k]) for k in recordings)
+    series = (_collect_series(problem, before[k], after[k]) for k in recordings)
     return Result(
         diagnosis,
         corrected_model(problem, chosen.model),
@@ -253,7 +253,7 @@ def _linear_effects(
     result = estimates.fit
     effects: list[FoundEffect] = []
     indices = np.flatnonzero(result.free)
-    implied = _implied_preloads(problem, estimates)
+    implied = _find_preload_of_springs(problem, estimates)
     for variable, (index, p) in enumerate(zip(indices, _free(problem, result), strict=True)):
         if variable in implied or p.kind not in EFFECTS:
             continue
@@ -276,7 +276,7 @@ def _linear_effects(
     return tuple(sorted(effects, key=lambda item: -item.force_rms_n))
 
 
-def _implied_preloads(problem: Problem, estimates: FitEstimates) -> set[int]:
+def _find_preload_of_springs(problem: Problem, estimates: FitEstimates) -> set[int]:
     """Preloads about mid-stroke that a change of stiffness about the free length implies."""
     free = _free(problem, estimates.fit)
     implied: set[int] = set()
@@ -300,7 +300,7 @@ def _implied_preloads(problem: Problem, estimates: FitEstimates) -> set[int]:
     return implied
 
 
-def _changed_effects(
+def _list_changes_of_effects(
     problem: Problem, search: SearchResult, estimates: FitEstimates
 ) -> tuple[ExistingEffect, ...]:
     """Existing effects that are superfluous, or whose file values lie outside their intervals."""
@@ -366,7 +366,7 @@ def _held_out(evaluations: Sequence[RunEvaluation], *, by_blocks: bool) -> HeldO
     )
 
 
-def _fitted_series(
+def _collect_series(
     problem: Problem, before: ResidualForces | None, after: ResidualForces | None
 ) -> list[FittedSeries]:
     if before is None or after is None:

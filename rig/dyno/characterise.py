@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,14 +182,14 @@ def _read_record(path: Path, strut: str | None) -> ForceRecord:
             raise InputError(f"{path}: has no strut_force_n, expected a load cell's force")
         return record._replace(force_n=cells_n[:, 0])
     run = read_run(path)
-    config: Any = run.header.get("config", {})
+    config = run.header.get("config", {})
     names = list(config.get("observers", {}))
     if strut is None and len(names) > 1:
         raise InputError(f"{path}: has the struts {', '.join(names)}, expected --strut")
     name = strut or names[0]
     if name not in names:
         raise InputError(f"{path}: --strut {name}: expected one of {', '.join(names)}")
-    index = list(config["signals"]["height"]).index(name)
+    index = list(config.get("signals", {})["height"]).index(name)
     record = record._replace(strut=name, height_m=recording.heights_m[:, index])
     if cells_n is not None:
         return record._replace(force_n=cells_n[:, index])

@@ -12,7 +12,7 @@ best size of each fault is found, and what it lowers the chi-squared by is held 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -284,8 +284,8 @@ def _fit_size(fault: Fault, residual_n: Array, covariance: Array) -> _FaultFit:
     ]
     changes: Array = np.array(columns).T
     apart = residual_n - changes
-    factor = cast("Any", cho_factor)(covariance, lower=True)
-    solved = cast("Any", cho_solve)(factor, apart.T).T
+    factor = cho_factor(covariance, lower=True)
+    solved = cho_solve(factor, apart.T).T
     chi: Array = np.einsum("ij,ij->i", apart, solved)
     best = int(np.argmin(chi))
     within = sizes[chi <= float(chi[best]) + _FALL]
@@ -307,8 +307,8 @@ def _fit_size(fault: Fault, residual_n: Array, covariance: Array) -> _FaultFit:
 
 
 def _misfit(residual_n: Array, covariance: Array) -> float:
-    factor = cast("Any", cho_factor)(covariance, lower=True)
-    return float(residual_n @ cast("Any", cho_solve)(factor, residual_n))
+    factor = cho_factor(covariance, lower=True)
+    return float(residual_n @ cho_solve(factor, residual_n))
 
 
 def _covariance(stack: _Stack, master: Master, scatter: float) -> Array:

@@ -15,7 +15,7 @@ References:
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,7 +156,7 @@ def combine(
 
 def student_factor(freedom: float) -> float:
     """Half width of a 95 % interval in standard deviations, by Student's t."""
-    return float(cast("Any", stdtrit)(freedom, 0.5 + 0.5 * _COVERAGE))
+    return float(stdtrit(freedom, 0.5 + 0.5 * _COVERAGE))
 
 
 def mean_stroke(
@@ -239,7 +239,7 @@ def _design(theta: Array, pieces: int) -> Array:
     half = 0.5 * np.pi
     inner = np.linspace(-half, half, pieces + 1)
     knots = np.concatenate([[-half] * _DEGREE, inner, [half] * _DEGREE])
-    spline: Array = cast("Any", BSpline).design_matrix(theta, knots, _DEGREE).toarray()
+    spline: Array = BSpline.design_matrix(theta, knots, _DEGREE).toarray()
     return np.column_stack([spline, sine, cosine])
 
 

@@ -11,7 +11,7 @@ machines; else it is smoothed.
 
 import itertools
 from collections.abc import Iterator
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -302,7 +302,7 @@ def fit_motion(t_s: Array, height_m: Array, strokes: int) -> BlockMotion:
     smoothed = smooth(t_s, height_m, estimate_noise(t_s, height_m))
     height, velocity = smoothed.states[:, 0].copy(), smoothed.states[:, 1].copy()
     fine_s: Array = np.linspace(float(t_s[0]), float(t_s[-1]), _BETWEEN * len(t_s))
-    curve: Any = CubicHermiteSpline(t_s, height, velocity)
+    curve = CubicHermiteSpline(t_s, height, velocity)
     between, rate = curve(fine_s), curve.derivative()(fine_s)
     # Positions in a stroke are relative to its middle, which may wander.
     height = height - _wander(t_s, t_s, height)
@@ -341,7 +341,7 @@ def _fourier_series(t_s: Array, height_m: Array, strokes: int) -> BlockMotion | 
     best, count, chosen = np.inf, 1, coarse_hz
     for tried in range(1, harmonics + 1):
         width = 0.35 / span_s
-        minimum = cast("Any", minimize_scalar)(
+        minimum = minimize_scalar(
             misfit,
             bounds=(coarse_hz - width, coarse_hz + width),
             args=(tried,),

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from can_dbc.errors import InputError
 
@@ -70,7 +70,7 @@ def dask(address: str) -> Generator[Engine]:
         InputError: Dask is not installed, or there is no scheduler.
     """
     try:
-        library: Any = importlib.import_module("distributed")
+        library = importlib.import_module("distributed")
     except ModuleNotFoundError as error:
         raise InputError(
             "distributed is not installed, expected `pip install dask[distributed]`"

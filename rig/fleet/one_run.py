@@ -13,7 +13,6 @@ from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from fsspec.core import url_to_fs
 
@@ -95,7 +94,7 @@ class RunRow:
     took_s: float = math.nan
     values: tuple["RunValue", ...] = ()
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """The columns, without the values."""
         return {
             item.name: getattr(self, item.name) for item in fields(self) if item.name != "values"

@@ -151,7 +151,7 @@ class Overview:
             f"{self.model}{left_out}"
         )
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For JSON; series without their points."""
         return {
             "runs": self.runs,
@@ -359,6 +359,6 @@ def _place(item: Series) -> dict[str, str]:
     return {**item.where._asdict(), **item.quantity._asdict()}
 
 
-def _change_dict(change: ChangePoint) -> dict[str, Any]:
+def _change_dict(change: ChangePoint) -> dict[str, object]:
     dates = {key: date_of(getattr(change, key)) for key in ("day", "low", "high")}
     return {**change._asdict(), **dates}

@@ -16,7 +16,7 @@ import importlib
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from urllib.parse import quote
 
 import pyarrow as pa
@@ -26,47 +26,45 @@ from can_dbc.atomic_file import replacing
 from can_dbc.errors import InputError
 from rig.fleet.one_run import RunRow, RunValue
 
+_parquet = cast("Any", parquet)  # its stubs are incomplete
 _duckdb: Any = None
 with contextlib.suppress(ModuleNotFoundError):  # It only reads; the store is written without it.
     _duckdb = importlib.import_module("duckdb")
-_pa: Any = pa
-_dataset: Any = dataset
-_parquet: Any = parquet
 
-_RUN = _pa.schema(
+_RUN = pa.schema(
     [
-        ("key", _pa.string()),
-        ("identity", _pa.string()),
-        ("source", _pa.string()),
-        ("damper", _pa.string()),
-        ("model", _pa.string()),
-        ("model_sha256", _pa.string()),
-        ("version", _pa.string()),
-        ("written", _pa.string()),
-        ("verdict", _pa.string()),
-        ("error", _pa.string()),
-        ("samples", _pa.int64()),
-        ("duration_s", _pa.float64()),
-        ("before", _pa.float64()),
-        ("after", _pa.float64()),
-        ("floor", _pa.float64()),
-        ("took_s", _pa.float64()),
-        ("part", _pa.string()),
+        ("key", pa.string()),
+        ("identity", pa.string()),
+        ("source", pa.string()),
+        ("damper", pa.string()),
+        ("model", pa.string()),
+        ("model_sha256", pa.string()),
+        ("version", pa.string()),
+        ("written", pa.string()),
+        ("verdict", pa.string()),
+        ("error", pa.string()),
+        ("samples", pa.int64()),
+        ("duration_s", pa.float64()),
+        ("before", pa.float64()),
+        ("after", pa.float64()),
+        ("floor", pa.float64()),
+        ("took_s", pa.float64()),
+        ("part", pa.string()),
     ]
 )
-_VALUE = _pa.schema(
+_VALUE = pa.schema(
     [
-        ("key", _pa.string()),
-        ("damper", _pa.string()),
-        ("kind", _pa.string()),
-        ("strut", _pa.string()),
-        ("effect", _pa.string()),
-        ("family", _pa.string()),
-        ("parameter", _pa.string()),
-        ("value", _pa.float64()),
-        ("low", _pa.float64()),
-        ("high", _pa.float64()),
-        ("part", _pa.string()),
+        ("key", pa.string()),
+        ("damper", pa.string()),
+        ("kind", pa.string()),
+        ("strut", pa.string()),
+        ("effect", pa.string()),
+        ("family", pa.string()),
+        ("parameter", pa.string()),
+        ("value", pa.float64()),
+        ("low", pa.float64()),
+        ("high", pa.float64()),
+        ("part", pa.string()),
     ]
 )
 _VIEWS = """
@@ -130,10 +128,10 @@ def _write(store: Path, partition: str, rows: Sequence[RunRow]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         kept = [{key: item[key] for key in schema.names} for item in content]
         with replacing(path) as temporary:
-            _parquet.write_table(_pa.Table.from_pylist(kept, schema=schema), temporary)
+            _parquet.write_table(pa.Table.from_pylist(kept, schema=schema), temporary)
 
 
-def _columns(value: RunValue) -> dict[str, Any]:
+def _columns(value: RunValue) -> dict[str, object]:
     return {name: getattr(value, name) for name in _VALUE.names if hasattr(value, name)}
 
 
@@ -162,18 +160,19 @@ def read_keys(store: Path) -> set[str]:
     Raises:
         InputError: It cannot be read.
     """
-    return {key for batch in _batches(store, ["key"]) for key in batch.column("key").to_pylist()}
+    batches = _batches(store, ["key"])
+    return {key for batch in batches for key in cast("list[str]", batch.column("key").to_pylist())}
 
 
-def _batches(store: Path, columns: Sequence[str]) -> Iterator[Any]:
+def _batches(store: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
     folder = store / "runs"
     if not folder.is_dir():
         return
     try:
-        there = _dataset.dataset(folder, format="parquet", partitioning="hive")
+        there = dataset.dataset(folder, format="parquet", partitioning="hive")
         if there.files:
             yield from there.to_batches(columns=list(columns))
-    except (OSError, _pa.ArrowException, ValueError) as error:
+    except (OSError, pa.ArrowException, ValueError) as error:
         raise InputError(f"{folder}: cannot be read ({error})") from error
 
 

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from can_dbc.addressing import Directory
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.bridge.report import Conditions
+from rig.bridge.counts import Conditions
 from rig.bus.link import LinkFigures
 from rig.bus.log_files import read_log
 from rig.formats.import_report import ImportReport

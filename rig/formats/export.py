@@ -14,7 +14,6 @@ import contextlib
 import shutil
 from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import Any, cast
 
 import pyarrow as pa
 import pyarrow.csv
@@ -29,9 +28,6 @@ from rig.formats.run_content import channel_of, path_inside
 from rig.log.candump import format_frame
 from rig.log.file_names import FRAMES_FILE, RUN_FILE, STEPS_FILE
 from rig.log.reader import RunFolder, read_run
-
-_pa = cast("Any", pa)
-_csv = cast("Any", pyarrow.csv)
 
 
 def export_run(
@@ -105,8 +101,8 @@ def import_run(source: Path, folder: Path) -> None:
                 for frame, direction in content.frames
             )
         with (
-            _pa.OSFile(str(folder / STEPS_FILE), "wb") as sink,
-            _pa.ipc.new_stream(sink, content.steps.schema) as stream,
+            pa.OSFile(str(folder / STEPS_FILE), "wb") as sink,
+            pa.ipc.new_stream(sink, content.steps.schema) as stream,
         ):
             stream.write_table(content.steps)
     except OSError as error:
@@ -126,8 +122,8 @@ def _write_candump(run: RunFolder, out: Path) -> list[Path]:
 
 def _write_csv(run: RunFolder, out: Path) -> list[Path]:
     steps = run.steps
-    t_s = _pa.array(steps.column("t_ns").to_numpy() * 1e-9)
-    _csv.write_csv(steps.add_column(0, "t_s", t_s), str(out))
+    t_s = pa.array(steps.column("t_ns").to_numpy() * 1e-9)
+    pyarrow.csv.write_csv(steps.add_column(0, "t_s", t_s), str(out))
     return [out]
 
 

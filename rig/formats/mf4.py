@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import ModuleType
 from typing import Any, cast
 
 import numpy as np
@@ -18,7 +19,6 @@ from rig.formats.run_content import RunContent, read_content
 from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
 from rig.log.reader import RunFolder
 
-_pa = cast("Any", pa)
 _CAN, _STEPS = "CAN_DataFrame", "steps"
 
 
@@ -30,7 +30,7 @@ def _records(frames: list[tuple[Frame, str]], name: str) -> NDArray[np.void]:
     """Frames as the MDF standard's bus logging lays them out."""
     lengths = np.array([len(frame.data) for frame, _ in frames], dtype=np.int64)
     padded = b"".join(frame.data.ljust(64, b"\0") for frame, _ in frames)
-    fields: list[tuple[str, str, Any]] = [
+    fields: list[tuple[str, str, object]] = [
         ("BusChannel", "<u1", 1),
         ("ID", "<u4", [frame.arbitration_id for frame, _ in frames]),
         ("IDE", "<u1", [frame.is_extended for frame, _ in frames]),
@@ -48,7 +48,7 @@ def _records(frames: list[tuple[Frame, str]], name: str) -> NDArray[np.void]:
     return records
 
 
-def _asammdf() -> Any:
+def _asammdf() -> ModuleType:
     try:
         return importlib.import_module("asammdf")
     except ImportError as error:
@@ -116,7 +116,7 @@ def _rename_columns(signal: Any) -> Any:
     return signal
 
 
-def _append_steps(asammdf: Any, mdf: Any, steps: Any) -> None:
+def _append_steps(asammdf: ModuleType, mdf: Any, steps: pa.Table) -> None:
     if steps.num_rows == 0:
         return
     t_s = steps.column("t_ns").to_numpy() * 1e-9
@@ -157,14 +157,14 @@ def _read_frames(mdf: Any, name: str) -> Iterable[tuple[Frame, str]]:
     if name not in mdf:
         return
     signal = mdf.get(name)
-    records: Any = signal.samples
+    records = signal.samples
     t_s: NDArray[np.float64] = signal.timestamps
     t_ns = np.rint(t_s * 1e9).astype(np.int64).tolist()
     columns = [
         records[f"{name}.{field}"].tolist()
         for field in ("ID", "DataLength", "IDE", "EDL", "BRS", "Dir")
     ]
-    payloads: Any = records[f"{name}.DataBytes"]
+    payloads = records[f"{name}.DataBytes"]
     for row, (t, number, length, extended, fd, switched, sent) in enumerate(
         zip(t_ns, *columns, strict=True)
     ):
@@ -173,14 +173,15 @@ def _read_frames(mdf: Any, name: str) -> Iterable[tuple[Frame, str]]:
         yield frame, "T" if sent else "R"
 
 
-def _read_steps(mdf: Any) -> Any:
+def _read_steps(mdf: Any) -> pa.Table:
     prefix = f"{_STEPS}."
     comments = [group.channel_group.comment for group in mdf.groups]
     if _STEPS not in comments:
-        return _pa.table({})
+        return pa.table({})
     group = comments.index(_STEPS)
     names = [
         channel.name for channel in mdf.groups[group].channels if channel.name.startswith(prefix)
     ]
-    arrays = [_pa.array(mdf.get(name, group=group).samples) for name in names]
-    return _pa.Table.from_arrays(arrays, names=[name.removeprefix(prefix) for name in names])
+    return pa.table(
+        {name.removeprefix(prefix): mdf.get(name, group=group).samples for name in names}
+    )

@@ -22,7 +22,7 @@ def read_mf4_channels(
         InputError: The package asammdf is missing, the file is damaged, or a channel is not there.
     """
     try:
-        asammdf = cast("Any", importlib.import_module("asammdf"))  # optional, and slow to import
+        asammdf = importlib.import_module("asammdf")  # optional, and slow to import
         damaged = cast("type[Exception]", asammdf.blocks.utils.MdfException)
     except ImportError as error:
         raise InputError(

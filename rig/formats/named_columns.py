@@ -15,7 +15,7 @@ from logging.handlers import QueueHandler
 from pathlib import Path
 from queue import SimpleQueue
 from types import MappingProxyType
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,7 +113,7 @@ def _read_worksheet(content: bytes) -> Mapping[str, Array]:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         if sum(item.file_size for item in archive.infolist()) > _MAX_BYTES:
             raise ValueError(f"more than {_MAX_BYTES} bytes within")
-    openpyxl = cast("Any", importlib.import_module("openpyxl"))
+    openpyxl = importlib.import_module("openpyxl")
     book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True)
     rows = book.worksheets[0].iter_rows(values_only=True)
     names = [str(cell).strip() if cell is not None else "" for cell in next(rows, ())]
@@ -143,7 +143,7 @@ def _cell_number(cell: object) -> float:
 
 def _read_tdms(content: bytes) -> Mapping[str, Array]:
     """Channels of numbers, as `group/name`."""
-    nptdms = cast("Any", importlib.import_module("nptdms"))
+    nptdms = importlib.import_module("nptdms")
     warnings: SimpleQueue[logging.LogRecord] = SimpleQueue()
     logs = [logging.getLogger(name) for name in logging.root.manager.loggerDict if "nptdms" in name]
     # The reader only warns of a file that was cut; it is refused here, not read in part.

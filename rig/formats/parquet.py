@@ -14,21 +14,20 @@ from rig.formats.run_content import RunContent, read_content
 from rig.log.file_names import RUN_FILE
 from rig.log.reader import RunFolder
 
+_parquet = cast("Any", pyarrow.parquet)  # its stubs are incomplete
+
 _STEPS_PARQUET, _FRAMES_PARQUET = "steps.parquet", "frames.parquet"
 _KEY = b"rig.run"
-_pa = cast("Any", pa)
-_parquet = cast("Any", pyarrow.parquet)
-
-_FRAME_SCHEMA = _pa.schema(
+_FRAME_SCHEMA = pa.schema(
     [
-        ("t_ns", _pa.int64()),
-        ("arbitration_id", _pa.uint32()),
-        ("data", _pa.binary()),
-        ("is_extended", _pa.bool_()),
-        ("is_fd", _pa.bool_()),
-        ("bitrate_switch", _pa.bool_()),
-        ("is_error", _pa.bool_()),
-        ("sent", _pa.bool_()),
+        ("t_ns", pa.int64()),
+        ("arbitration_id", pa.uint32()),
+        ("data", pa.binary()),
+        ("is_extended", pa.bool_()),
+        ("is_fd", pa.bool_()),
+        ("bitrate_switch", pa.bool_()),
+        ("is_error", pa.bool_()),
+        ("sent", pa.bool_()),
     ]
 )
 
@@ -37,12 +36,14 @@ def write_parquet(run: RunFolder, out: Path) -> list[Path]:
     """Write a run into a new folder; returns the files."""
     content = read_content(run)
     rows = [(*astuple(frame), direction == "T") for frame, direction in content.frames]
-    columns = [list(column) for column in zip(*rows, strict=True)] or [[] for _ in _FRAME_SCHEMA]
-    arrays = [
-        _pa.array(column, type=field.type)
-        for column, field in zip(columns, _FRAME_SCHEMA, strict=True)
+    columns = [list(column) for column in zip(*rows, strict=True)] or [
+        [] for _ in _FRAME_SCHEMA.names
     ]
-    frames = _pa.Table.from_arrays(arrays, schema=_FRAME_SCHEMA)
+    arrays = [
+        pa.array(column, type=kind)
+        for column, kind in zip(columns, _FRAME_SCHEMA.types, strict=True)
+    ]
+    frames = pa.Table.from_arrays(arrays, schema=_FRAME_SCHEMA)
     texts = {name: data.decode("utf-8", "surrogateescape") for name, data in content.files.items()}
     metadata = {_KEY: json.dumps(texts).encode("ascii")}
     out.mkdir()
@@ -61,7 +62,7 @@ def read_parquet(source: Path) -> RunContent:
     try:
         steps = _parquet.read_table(str(source / _STEPS_PARQUET))
         frames = _parquet.read_table(str(source / _FRAMES_PARQUET))
-    except (OSError, _pa.ArrowInvalid) as error:
+    except (OSError, pa.ArrowInvalid) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{source}: is no run in Parquet: {reason}") from error
     try:

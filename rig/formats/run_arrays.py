@@ -1,15 +1,19 @@
 """A run as arrays, for a notebook or a script."""
 
+import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.log.reader import read_run
+
+if TYPE_CHECKING:
+    import pandas
 
 Array = NDArray[np.float64]
 
@@ -37,11 +41,9 @@ class Run:
         except KeyError:
             raise KeyError(f"{name}: expected one of {', '.join(self.columns)}") from None
 
-    def to_pandas(self) -> Any:
+    def to_pandas(self) -> "pandas.DataFrame":
         """The columns as a DataFrame over `t_s`; requires the package pandas."""
-        import pandas as pd  # noqa: PLC0415 - optional # pyright: ignore
-
-        table: Any = pd
+        table = importlib.import_module("pandas")
         return table.DataFrame(dict(self.columns), index=table.Index(self.t_s, name="t_s"))
 
 

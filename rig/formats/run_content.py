@@ -1,8 +1,10 @@
 """All that a run holds, on its way into another format and back."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+
+import pyarrow as pa
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
@@ -25,10 +27,10 @@ class RunContent:
 
     files: dict[str, bytes]
     frames: list[tuple[Frame, str]]
-    steps: Any
+    steps: pa.Table
 
 
-def channel_of(header: dict[str, object]) -> str:
+def channel_of(header: Mapping[str, object]) -> str:
     """Channel of the bus by the header of a run, for the lines of `frames.log`."""
     match header:
         case {"config": {"bus": {"channel": str(channel)}}} if channel and " " not in channel:

@@ -20,7 +20,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -69,7 +69,7 @@ def read_with_smoothed_forces(folder: Path, progress: Progress) -> RunFolder:
     steps = run.steps
     for name, (force_n, std_n) in smooth_forces(run, plan, progress).items():
         for key, values in (("smoothed_force_n", force_n), ("smoothed_force_std_n", std_n)):
-            steps = steps.append_column(f"{name}.{key}", cast("Any", pa).array(values))
+            steps = steps.append_column(f"{name}.{key}", pa.array(values))
     return replace(run, steps=steps)
 
 

@@ -13,7 +13,8 @@ from typing import Any, cast
 
 import numpy as np
 from matplotlib.figure import Figure
-from pydantic import BaseModel
+from numpy.typing import NDArray
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from can_dbc.errors import InputError
@@ -28,6 +29,11 @@ from rig.pages.html import render
 from rig.plan.config import OneOf, RunConfig
 from rig.simulated_bench.effects import EFFECT_KINDS
 from rig.simulated_bench.schema import BenchConfig
+
+Array = NDArray[np.float64]
+
+_FIELDS = "__pydantic_fields__"
+"""Attribute of a configuration's section, with its keys."""
 
 _MOTION = Motion(
     low_m=0.35,
@@ -107,7 +113,7 @@ def _picture(item: Effect) -> str:
     if not starts:
         return ""
     height, velocity, force = _loop(item, list(starts[0]))
-    figure = cast("Any", Figure)(figsize=(8, 2.6), layout="constrained")
+    figure: Any = Figure(figsize=(8, 2.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.plot(height * 1e3, force, color="tab:blue")
     left.set(xlabel="height / mm", ylabel="force / N")
@@ -120,9 +126,7 @@ def _picture(item: Effect) -> str:
     return base64.b64encode(file.getvalue()).decode("ascii")
 
 
-def _loop(
-    item: Effect, parameters: list[float]
-) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+def _loop(item: Effect, parameters: list[float]) -> tuple[Array, Array, Array]:
     """Height, velocity and force of the second of two periods."""
     motion, omega = _MOTION, 2.0 * np.pi * 2.4
     t_s = np.linspace(0.0, 4.0 * np.pi / omega, 8001)
@@ -148,12 +152,10 @@ def _loop(
     return height[half:], velocity[half:], force[half:]
 
 
-def _rows(model: type[Any], prefix: str = "") -> Iterator[tuple[str, str, str]]:
+def _rows(model: type[object], prefix: str = "") -> Iterator[tuple[str, str, str]]:
     """Key, default and meaning of every key of a configuration and of its sections."""
     meanings = _attributes(model)
-    fields: Mapping[str, Any] = (
-        model.model_fields if issubclass(model, BaseModel) else model.__pydantic_fields__
-    )
+    fields = cast("Mapping[str, FieldInfo]", getattr(model, _FIELDS))
     for name, field in fields.items():
         if getattr(field, "exclude", False):
             continue
@@ -176,9 +178,9 @@ def _default_text(default: object) -> str:
     return str(default) if isinstance(default, str | int | float | bool) else ""
 
 
-def _sections(annotation: Any) -> list[type[Any]]:
+def _sections(annotation: object) -> list[type[object]]:
     """Sections that a key may hold, also in unions, tuples and mappings."""
-    if isinstance(annotation, type) and hasattr(annotation, "__pydantic_fields__"):
+    if isinstance(annotation, type) and hasattr(annotation, _FIELDS):
         return [annotation]
     kinds = [item for item in getattr(annotation, "__metadata__", ()) if isinstance(item, OneOf)]
     if kinds:
@@ -189,7 +191,7 @@ def _sections(annotation: Any) -> list[type[Any]]:
     return []
 
 
-def _attributes(model: type[Any]) -> dict[str, str]:
+def _attributes(model: type[object]) -> dict[str, str]:
     """Meanings of the keys: sections "Attributes" in the docstrings of a class and its bases."""
     meanings: dict[str, str] = {}
     for base in reversed(model.__mro__):

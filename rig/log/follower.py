@@ -10,7 +10,7 @@ import contextlib
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -20,8 +20,6 @@ from rig.log.file_names import STEPS_FILE, part_name
 from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, END_OF_STREAM, LOG_FAULT, step_schema
 
 Array = NDArray[np.float64]
-_pa = cast("Any", pa)
-
 BUCKET = 64
 """Steps of which the extremes are kept: a screen's width of them is a minute at 1 kHz."""
 
@@ -63,7 +61,7 @@ class RunFollower:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._part, self._offset = 0, 0
-        self._schema: Any = None
+        self._schema = step_schema()
         self.columns: tuple[str, ...] = ()
         """Names of the columns, `t_ns` first; none before the stream has begun."""
         self.steps = 0
@@ -109,8 +107,8 @@ class RunFollower:
             most_steps: About how many steps are taken; the rest is for the next call.
         """
         end = self.steps + most_steps
-        while self.steps < end and (batches := self._written()):
-            self._add(_matrix(_pa.Table.from_batches(batches)))
+        while self.steps < end and (batches := self._read_batches()):
+            self._add(_matrix(pa.Table.from_batches(batches)))
 
     def window(self, names: Sequence[str], begin_s: float, end_s: float, points: int) -> Stretch:
         """A stretch of the run.
@@ -158,39 +156,39 @@ class RunFollower:
             return np.zeros((0, max(len(self.columns), 1)))
         kept_from = self.steps - sum(map(len, self._newest))
         if begin >= kept_from:
-            return self._kept(begin - kept_from, end - kept_from)
+            return self._newest_rows(begin - kept_from, end - kept_from)
         first = bisect.bisect_right(self._begins, begin) - 1
         last = bisect.bisect_left(self._begins, end)
         batches = [self._read_again(*self._places[i]) for i in range(first, last)]
         offset = self._begins[first]
-        return _matrix(_pa.Table.from_batches(batches))[begin - offset : end - offset]
+        return _matrix(pa.Table.from_batches(batches))[begin - offset : end - offset]
 
     @property
     def _path(self) -> Path:
         return self._folder / part_name(STEPS_FILE, self._part)
 
-    def _written(self) -> list[Any]:
+    def _read_batches(self) -> list[pa.RecordBatch]:
         """The next batches that are whole; none where nothing more has been written."""
         self._go_on()
         if not self.unread_bytes:
             return []
-        batches: list[Any] = []
+        batches: list[pa.RecordBatch] = []
         # Behind the last whole batch may stand one that is still on its way to the disk.
         with (
-            contextlib.suppress(_pa.ArrowException, EOFError, OSError),
+            contextlib.suppress(pa.ArrowException, EOFError, OSError),
             # No mapping: a piece that the disk did not take is cut off again under it.
-            _pa.OSFile(str(self._path)) as source,
+            pa.OSFile(str(self._path), "r") as source,
         ):
             if self._offset == 0:
-                schema = _pa.ipc.open_stream(source).schema
+                schema = pa.ipc.open_stream(source).schema
                 common = step_schema()
                 if schema.names[: len(common)] != common.names:
                     return []  # not a run's steps
                 self._schema, self._offset = schema, source.tell()
             source.seek(self._offset)
             while len(batches) < _AT_ONCE:
-                message = _pa.ipc.read_message(source)
-                batch = _pa.ipc.read_record_batch(message, self._schema)
+                message = pa.ipc.read_message(source)
+                batch = pa.ipc.read_record_batch(message, self._schema)
                 self._begins.append(self._following)
                 self._places.append((self._part, self._offset))
                 self._following += batch.num_rows
@@ -206,10 +204,10 @@ class RunFollower:
             if following.stat().st_size and self.unread_bytes <= len(END_OF_STREAM):
                 self._part, self._offset = self._part + 1, 0
 
-    def _read_again(self, part: int, offset: int) -> Any:
-        with _pa.OSFile(str(self._folder / part_name(STEPS_FILE, part))) as source:
+    def _read_again(self, part: int, offset: int) -> pa.RecordBatch:
+        with pa.OSFile(str(self._folder / part_name(STEPS_FILE, part)), "r") as source:
             source.seek(offset)
-            return _pa.ipc.read_record_batch(_pa.ipc.read_message(source), self._schema)
+            return pa.ipc.read_record_batch(pa.ipc.read_message(source), self._schema)
 
     def _add(self, rows: Array) -> None:
         if not self.columns:
@@ -230,15 +228,15 @@ class RunFollower:
             self._largest.add(np.fmax.reduce(buckets, axis=1))
         self._open = rows[whole:].copy()
 
-    def _kept(self, begin: int, end: int) -> Array:
-        """Of the newest steps."""
-        found: list[Array] = []
+    def _newest_rows(self, begin: int, end: int) -> Array:
+        """Rows of the newest steps."""
+        rows: list[Array] = []
         first = 0
         for piece in self._newest:
             if first < end and first + len(piece) > begin:
-                found.append(piece[max(begin - first, 0) : end - first])
+                rows.append(piece[max(begin - first, 0) : end - first])
             first += len(piece)
-        return np.concatenate(found)
+        return np.concatenate(rows)
 
     def _bucket(self, t_ns: float) -> int:
         """Number of the bucket that a time is in."""
@@ -268,10 +266,12 @@ class _Growing:
         self._count = count
 
 
-def _matrix(table: Any) -> Array:
+def _matrix(table: pa.Table) -> Array:
     columns = [np.asarray(column.to_numpy(), np.float64) for column in table.columns]
     flags = table.column("flags").to_numpy()
-    return np.column_stack([*columns, *((flags & bit > 0) for bit in FLAGS.values())])
+    return np.column_stack(
+        [*columns, *((flags & bit > 0).astype(np.float64) for bit in FLAGS.values())]
+    )
 
 
 def _select_columns(rows: Array, columns: Sequence[int]) -> Array:

@@ -17,7 +17,7 @@ from can_dbc.frame import Frame
 from rig.log.candump import LATEST_S, line_error, parse_frame
 from rig.log.errors import LogError
 
-_pa, _pc = cast("Any", pa), cast("Any", pc)
+_pc = cast("Any", pc)  # its stubs know no patterns of bytes
 
 _BLOCK_BYTES = 2 * 1024 * 1024
 
@@ -94,8 +94,8 @@ def read_frame_columns(paths: Sequence[Path], epoch_ns: int) -> FrameColumns:
         for text, first_line in _whole_lines(path)
     ] or [_empty(0, 0)]
     width = max(part.payload.shape[1] for part in parts)
-    *others, payloads = cast("Any", zip(*parts, strict=True))
-    padded = [np.pad(payload, ((0, 0), (0, width - payload.shape[1]))) for payload in payloads]
+    others = zip(*(part[:-1] for part in parts), strict=True)
+    padded = [np.pad(part.payload, ((0, 0), (0, width - part.payload.shape[1]))) for part in parts]
     return FrameColumns._make([*map(np.concatenate, others), np.concatenate(padded)])
 
 
@@ -125,14 +125,14 @@ def _empty(count: int, width: int) -> FrameColumns:
 
 
 def _read_block(text: bytes, first_line: int, epoch_ns: int, path: Path) -> FrameColumns:
-    lines = _pc.split_pattern(_pa.array([text], _pa.binary()), b"\n")[0].values[:-1]
+    lines = _pc.split_pattern(pa.array([text], pa.binary()), b"\n")[0].values[:-1]
     numbers = np.flatnonzero(_numpy(_pc.invert(_pc.ends_with(lines, b"T"))))
-    lines = lines.take(_pa.array(numbers))
+    lines = lines.take(pa.array(numbers))
     columns = _empty(len(numbers), _MOST_FD_DIGITS // 2)
     groups = _pc.extract_regex(lines, _LINE)
     is_read = _numpy(groups.is_valid()).copy()
     rows = np.flatnonzero(is_read)
-    is_read[rows] = _read_usual(groups.filter(_pa.array(is_read)), rows, epoch_ns, columns)
+    is_read[rows] = _read_usual(groups.filter(pa.array(is_read)), rows, epoch_ns, columns)
     for row in np.flatnonzero(~is_read).tolist():
         line = lines[row].as_py().decode("ascii", "replace")
         _read_line(line, row, epoch_ns, f"{path}: line {first_line + numbers[row]}", columns)
@@ -156,13 +156,13 @@ def _read_usual(
     Returns:
         Whether each line is a frame, shape (n,); the others are not written.
     """
-    stamp, identifier, flags, data = (group.cast(_pa.string()) for group in groups.flatten())
-    stamp_ns = _numpy(_pc.replace_substring(stamp, ".", "").cast(_pa.uint64()))
+    stamp, identifier, flags, data = (group.cast(pa.string()) for group in groups.flatten())
+    stamp_ns = _numpy(_pc.replace_substring(stamp, ".", "").cast(pa.uint64()))
     digits, is_fd = _numpy(_pc.binary_length(data)), _numpy(_pc.binary_length(flags)) > 0
     is_frame = (digits % 2 == 0) & (digits <= np.where(is_fd, _MOST_FD_DIGITS, _MOST_DIGITS))
     is_frame &= stamp_ns < LATEST_S * 1_000_000_000
     rows, length = rows[is_frame], digits[is_frame] // 2
-    number = _numpy(_pc.binary_join_element_wise("0x", identifier, "").cast(_pa.int64()))[is_frame]
+    number = _numpy(_pc.binary_join_element_wise("0x", identifier, "").cast(pa.int64()))[is_frame]
     is_long = _numpy(_pc.binary_length(identifier))[is_frame] == 8
     columns.t_ns[rows] = stamp_ns[is_frame].astype(np.int64) - epoch_ns
     columns.arbitration_id[rows] = number & 0x1FFFFFFF
@@ -171,7 +171,7 @@ def _read_usual(
     columns.length[rows] = length
     columns.is_fd[rows] = is_fd[is_frame]
     payload = np.zeros((len(rows), length.max(initial=0)), dtype=np.uint8)
-    content = bytes.fromhex("".join(data.filter(_pa.array(is_frame)).to_pylist()))
+    content = bytes.fromhex("".join(data.filter(pa.array(is_frame)).to_pylist()))
     payload[np.arange(payload.shape[1]) < length[:, None]] = np.frombuffer(content, np.uint8)
     columns.payload[rows, : payload.shape[1]] = payload
     return is_frame

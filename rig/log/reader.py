@@ -5,10 +5,10 @@ A replay computes the steps that a kill cut off again from the frames.
 
 import contextlib
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Required, TypedDict, cast
 
 import pyarrow as pa
 
@@ -25,7 +25,58 @@ _TAIL_BYTES = 4096
 RUN_SCHEMA = 2
 """Version of the folder's layout, in `run.yaml`."""
 
-_pa = cast("Any", pa)
+
+class BusEntry(TypedDict, total=False):
+    """The bus in a run's configuration; see `rig.bus.bus.BusConfig`."""
+
+    interface: str
+    channel: str
+    bitrate: int
+    data_bitrate: int | None
+
+
+class ConfigEntry(TypedDict, total=False):
+    """Parts of a run's configuration that are read as written; see `rig.plan.config.RunConfig`."""
+
+    model: str
+    rate_hz: float
+    bus: BusEntry
+    signals: dict[str, dict[str, object]]
+    observers: dict[str, object]
+    supervision: dict[str, object]
+
+
+class Divergence(TypedDict):
+    """Where the model diverged last, and when."""
+
+    strut: str
+    t_s: float
+
+
+class Ending(TypedDict, total=False):
+    """How a run ended, as far as it is read; see `rig.run.logged_run`."""
+
+    status: str
+    counts: dict[str, int]
+    diverged: Divergence | None
+    timing: dict[str, dict[str, float]]
+    log_fault: str | None
+    dropped_steps: int
+
+
+class RunHeader(TypedDict, total=False):
+    """Content of `run.yaml`; `schema` and `epoch_ns` are checked, the others are as written."""
+
+    schema: Required[int]
+    epoch_ns: Required[int]
+    config: ConfigEntry
+    config_source: str
+    files_sha256: dict[str, str]
+    versions: dict[str, str]
+    granted: dict[str, object] | None
+    forced: Sequence[object]
+    ending: Ending
+    capture: dict[str, object]
 
 
 @dataclass(frozen=True)
@@ -40,8 +91,8 @@ class RunFolder:
     """
 
     folder: Path
-    header: dict[str, object]
-    steps: Any
+    header: RunHeader
+    steps: pa.Table
     epoch_ns: int
 
     @property
@@ -84,11 +135,10 @@ def read_run(folder: Path) -> RunFolder:
         if not (folder / name).is_file():
             raise LogError(f"{folder}: {name} is missing, expected a run")
     header = read_header(folder)
-    epoch_ns = cast("int", header["epoch_ns"])
-    return RunFolder(folder, header, _read_steps(parts(folder, STEPS_FILE)), epoch_ns)
+    return RunFolder(folder, header, _read_steps(parts(folder, STEPS_FILE)), header["epoch_ns"])
 
 
-def read_header(folder: Path) -> dict[str, object]:
+def read_header(folder: Path) -> RunHeader:
     """Content of a run's `run.yaml`.
 
     Raises:
@@ -104,7 +154,7 @@ def read_header(folder: Path) -> dict[str, object]:
     epoch_ns = header.get("epoch_ns")
     if not isinstance(epoch_ns, int) or not 0 <= epoch_ns < LATEST_S * 1_000_000_000:
         raise LogError(f"{path}: epoch_ns: {str(epoch_ns)[:40]}: expected a Unix time in ns")
-    return header
+    return cast("RunHeader", header)
 
 
 def find_changed_files(folder: Path) -> list[str]:
@@ -147,41 +197,44 @@ def last_frame_ns(folder: Path, epoch_ns: int) -> int:
     return -1
 
 
-def _read_steps(paths: list[Path]) -> Any:
+def _read_steps(paths: list[Path]) -> pa.Table:
     tables = [_read_part(path) for path in paths]
     first = tables[0]
     for path, table in zip(paths, tables, strict=True):
         if table.num_rows and table.schema != first.schema:
             raise LogError(f"{path}: its columns are not those of {paths[0].name}")
-    return _pa.concat_tables([first, *[table for table in tables[1:] if table.num_rows]])
+    return pa.concat_tables([first, *[table for table in tables[1:] if table.num_rows]])
 
 
-def _read_part(path: Path) -> Any:
-    batches: list[Any] = []
+def _read_part(path: Path) -> pa.Table:
+    batches: list[pa.RecordBatch] = []
     try:
-        with _pa.memory_map(str(path)) as source:
+        with pa.memory_map(str(path)) as source:
             if source.size() < _schema_bytes(bytes(source.read(8))):
                 return step_schema().empty_table()
             source.seek(0)
-            stream = _pa.ipc.open_stream(source)
+            stream = pa.ipc.open_stream(source)
             # Behind the last whole batch stands what a kill cut off.
-            with contextlib.suppress(_pa.ArrowException, OSError):
+            with contextlib.suppress(pa.ArrowException, OSError):
                 batches.extend(stream)
-            table = _pa.Table.from_batches(batches, schema=stream.schema)
+            table = pa.Table.from_batches(batches, schema=stream.schema)
             table.validate(full=True)
             _check_columns(table, path)
             return table
     except LogError:
         raise
-    except (_pa.ArrowException, OSError, UnicodeDecodeError) as error:
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise LogError(f"{path}: is no Arrow stream of steps: {reason}") from error
 
 
-def _check_columns(table: Any, path: Path) -> None:
-    common = step_schema()
-    for number, column in enumerate(table.schema):
-        expected = common[number] if number < len(common) else _pa.field(column.name, _pa.float64())
+def _check_columns(table: pa.Table, path: Path) -> None:
+    common, columns = (
+        cast("list[pa.Field[pa.DataType]]", list(schema))
+        for schema in (step_schema(), table.schema)
+    )
+    for number, column in enumerate(columns):
+        expected = common[number] if number < len(common) else pa.field(column.name, pa.float64())
         if (column.name, column.type) != (expected.name, expected.type):
             raise LogError(
                 f"{path}: column {number + 1} is {str(column)[:60]!r}, expected '{expected}'"
@@ -189,7 +242,9 @@ def _check_columns(table: Any, path: Path) -> None:
         if table.column(number).null_count:
             raise LogError(f"{path}: column {column.name[:60]!r} has gaps, expected none")
     if table.num_columns < len(common):
-        raise LogError(f"{path}: expected columns {', '.join(common.names)} at least")
+        raise LogError(
+            f"{path}: expected columns {', '.join(field.name for field in common)} at least"
+        )
 
 
 def _schema_bytes(head: bytes) -> int:

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+
+import pyarrow as pa
 
 from rig.log.file_names import FRAMES_FILE, STEPS_FILE, part_name
 from rig.log.steps import END_OF_STREAM
@@ -35,7 +36,7 @@ class Part:
         OSError: A file cannot be created.
     """
 
-    def __init__(self, folder: Path, number: int, schema: Any, begin_ns: int) -> None:
+    def __init__(self, folder: Path, number: int, schema: pa.Schema, begin_ns: int) -> None:
         self.number = number
         self.begin_ns = begin_ns
         self.frames = WholeFile(folder / part_name(FRAMES_FILE, number))

@@ -1,12 +1,19 @@
-"""The record of a tick, and its columns in `steps.arrow`."""
+"""`steps.arrow`: the columns that the log keeps of a tick, the record of one, and a batch of them.
+
+What it holds of a channel or a strut is declared here; the frames of a tick are in `frames.log`.
+"""
 
 import struct
 from collections.abc import Sequence
-from typing import Any, cast
+from math import nan
 
 import numpy as np
 import pyarrow as pa
 from msgspec import Struct
+from msgspec.structs import astuple
+
+from rig.bridge.values import StepInput, StepOutput, StrutOutput
+from rig.channels.channel import Channel, Role
 
 ACKNOWLEDGED, BUS_FAULT, LOG_FAULT = 1, 2, 4
 """Bits of `Step.flags`."""
@@ -14,7 +21,11 @@ ACKNOWLEDGED, BUS_FAULT, LOG_FAULT = 1, 2, 4
 END_OF_STREAM = b"\xff\xff\xff\xff\0\0\0\0"
 """Last bytes of an Arrow stream that was closed."""
 
-_pa = cast("Any", pa)
+_MEASURED = ("measured_height_m", "measured_t_ns")
+_PUBLISHED = StrutOutput.__struct_fields__
+
+STRUT_COLUMNS = (*_MEASURED, *_PUBLISHED)
+"""Columns of each strut, prefixed with its name and a dot; NaN where there is no value."""
 
 
 class Step(Struct, frozen=True, gc=False):
@@ -34,23 +45,73 @@ class Step(Struct, frozen=True, gc=False):
     received: int
     mode: int
     flags: int
-    numbers: tuple[float, ...]
+    numbers: Sequence[float]
 
 
-def step_schema(columns: Sequence[str] = ()) -> Any:
+class LogColumns:
+    """Columns of a run's log, and the numbers of a tick in their order.
+
+    First stand the quantities of the bench, then the struts, then the further sensors.
+
+    Args:
+        struts: Names of the struts.
+        channels: Channels of the bench; their indices are their positions.
+    """
+
+    def __init__(self, struts: Sequence[str], channels: Sequence[Channel]) -> None:
+        bench = [channel for channel in channels if channel.role is Role.BENCH]
+        sensors = [channel for channel in channels if channel.role is Role.SENSOR]
+        first = [len(bench) + i * len(STRUT_COLUMNS) for i in range(len(struts))]
+        begin_of_sensors = len(bench) + len(struts) * len(STRUT_COLUMNS)
+        published = [begin + len(_MEASURED) for begin in first]
+        self._published = [slice(begin, begin + len(_PUBLISHED)) for begin in published]
+        self._column_of = [0] * len(channels)
+        for column, channel in enumerate(bench):
+            self._column_of[channel.index] = column
+        for column, channel in enumerate(sensors):
+            self._column_of[channel.index] = begin_of_sensors + 2 * column
+        for channel in channels:
+            if channel.role is Role.HEIGHT:
+                self._column_of[channel.index] = first[channel.strut]
+        self._is_height = [channel.role is Role.HEIGHT for channel in channels]
+        self._blank = [nan] * begin_of_sensors + [nan, 0.0] * len(sensors)
+        self.names: tuple[str, ...] = (
+            *(channel.column for channel in bench),
+            *(f"{strut}.{name}" for strut in struts for name in STRUT_COLUMNS),
+            *(name for channel in sensors for name in (channel.column, f"{channel.name}.left_out")),
+        )
+        """Names of the columns."""
+
+    def numbers(self, step_input: StepInput, output: StepOutput) -> list[float]:
+        """Numbers of a tick; NaN where nothing arrived or nothing was published."""
+        numbers, column_of = self._blank.copy(), self._column_of
+        for sample in step_input.samples:
+            column = column_of[sample.channel]
+            numbers[column] = sample.value
+            if self._is_height[sample.channel]:
+                numbers[column + 1] = sample.t_ns
+        if output.struts:
+            for columns, strut in zip(self._published, output.struts, strict=True):
+                numbers[columns] = astuple(strut)
+        for channel in output.left_out:
+            numbers[column_of[channel] + 1] = 1.0
+        return numbers
+
+
+def step_schema(columns: Sequence[str] = ()) -> pa.Schema:
     """Arrow schema of `steps.arrow`.
 
     Args:
         columns: Names of `Step.numbers`.
     """
     fields = [
-        ("t_ns", _pa.int64()),
-        ("overruns", _pa.int32()),
-        ("received", _pa.int32()),
-        ("mode", _pa.int8()),
-        ("flags", _pa.int8()),
+        ("t_ns", pa.int64()),
+        ("overruns", pa.int32()),
+        ("received", pa.int32()),
+        ("mode", pa.int8()),
+        ("flags", pa.int8()),
     ]
-    return _pa.schema([*fields, *((name, _pa.float64()) for name in columns)])
+    return pa.schema([*fields, *((name, pa.float64()) for name in columns)])
 
 
 class StepRows:
@@ -65,39 +126,45 @@ class StepRows:
 
     def __init__(self, columns: Sequence[str]) -> None:
         self.schema = step_schema(columns)
-        self._packer = struct.Struct(f"<qiibb{len(columns)}d")
+        self._pack = struct.Struct(f"<qiibb{len(columns)}d").pack
         self._columns = np.dtype(
-            [(field.name, field.type.to_pandas_dtype()) for field in self.schema]
+            [
+                (name, kind.to_pandas_dtype())
+                for name, kind in zip(self.schema.names, self.schema.types, strict=True)
+            ]
         )
         self._rows = bytearray()
-        self._first_ns = 0
-        self.last_ns = 0
-        """Time of the last one."""
-        self.count = 0
-        """How many they are."""
+
+    @property
+    def count(self) -> int:
+        """Number of steps."""
+        return len(self._rows) // self._columns.itemsize
+
+    @property
+    def last_ns(self) -> int:
+        """Time of the last one; 0 if there is none."""
+        return self._time_at(len(self._rows) - self._columns.itemsize)
 
     @property
     def span_ns(self) -> int:
         """Time from the first one to the last."""
-        return self.last_ns - self._first_ns if self._rows else 0
+        return self.last_ns - self._time_at(0)
 
     def append(self, step: Step) -> None:
         """Add a step."""
-        if not self._rows:
-            self._first_ns = step.t_ns
-        self.last_ns = step.t_ns
-        self.count += 1
-        self._rows += self._packer.pack(
+        self._rows += self._pack(
             step.t_ns, step.overruns, step.received, step.mode, step.flags, *step.numbers
         )
 
-    def batch(self) -> Any:
+    def _time_at(self, begin: int) -> int:
+        return int.from_bytes(self._rows[begin : begin + 8], "little") if self._rows else 0
+
+    def batch(self) -> pa.RecordBatch:
         """All steps as an Arrow record batch."""
         table = np.frombuffer(self._rows, self._columns)
-        arrays = [_pa.array(np.ascontiguousarray(table[name])) for name in self.schema.names]
-        return _pa.RecordBatch.from_arrays(arrays, schema=self.schema)
+        arrays = [pa.array(np.ascontiguousarray(table[name])) for name in self.schema.names]
+        return pa.record_batch(arrays, schema=self.schema)
 
     def clear(self) -> None:
         """Remove all steps."""
         self._rows = bytearray()
-        self.count = 0

@@ -11,12 +11,10 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
 
-import pyarrow as pa
 import yaml
 
 from can_dbc.atomic_file import write_whole
@@ -25,6 +23,7 @@ from rig.log.candump import format_frame
 from rig.log.captures import Capture, Captures, CaptureWindow, Entry
 from rig.log.errors import LogError
 from rig.log.file_names import CAPTURES_FOLDER, DBC_FILE, MODEL_FILE, RUN_FILE
+from rig.log.reader import RunHeader
 from rig.log.rotation import Part, Rotation
 from rig.log.steps import Step, StepRows
 from rig.log.whole_file import WholeFile
@@ -64,8 +63,6 @@ _CLOSING_S = 30.0
 _RESERVE_FILE, _RESERVE_BYTES = "reserve.tmp", 65_536
 """Space kept back, so that a full disk still takes how the run ended."""
 
-_pa = cast("Any", pa)
-
 
 @dataclass(frozen=True)
 class LogOptions:
@@ -104,7 +101,7 @@ class RunWriter:
     def __init__(
         self,
         folder: Path,
-        header: dict[str, object],
+        header: RunHeader,
         columns: Sequence[str],
         channel: str,
         loop_priority: int | None,
@@ -120,7 +117,7 @@ class RunWriter:
         self.is_busy = False
         """Whether ticks are being written now."""
         self._header = header
-        self._epoch_ns = cast("int", header["epoch_ns"])
+        self._epoch_ns = header["epoch_ns"]
         # A line of the log holds no blanks in its parts, nor anything beyond ASCII.
         self._channel = re.sub(r"[^!-~]", "_", channel)
         self._columns = tuple(columns)
@@ -352,5 +349,5 @@ def _serialize(rows: StepRows) -> bytes:
     return bytes(rows.batch().serialize())
 
 
-def _write_yaml(path: Path, content: dict[str, object]) -> None:
+def _write_yaml(path: Path, content: Mapping[str, object]) -> None:
     write_whole(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True))

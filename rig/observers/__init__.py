@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
 
 from rig.observers.kalman import KalmanObserver
 from rig.observers.none import NoObserver
 from rig.observers.pi import PiObserver
+from rig.observers.protocol import AnyObserver
 
-OBSERVERS: Mapping[str, type[Any]] = MappingProxyType(
+OBSERVERS: Mapping[str, type[AnyObserver]] = MappingProxyType(
     {"pi": PiObserver, "kalman": KalmanObserver, "none": NoObserver}
 )
 """`kind` in a configuration -> a frozen pydantic dataclass that is an `Observer`."""

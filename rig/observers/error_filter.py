@@ -26,7 +26,7 @@ References:
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from msgspec import Struct
@@ -485,7 +485,8 @@ def _transition(time: float, stiffness: float, damping: float) -> tuple[Array, A
     rates[1, :2] = -stiffness, -damping
     driven = np.zeros((ORDER, ORDER))
     driven[-1, -1] = 1.0
-    both = cast("Any", expm)(short * np.block([[-rates, driven], [np.zeros((5, 5)), rates.T]]))
+    generator: Array = short * np.block([[-rates, driven], [np.zeros((5, 5)), rates.T]])
+    both = expm(generator)
     transition = np.ascontiguousarray(both[ORDER:, ORDER:].T)
     noise = transition @ both[:ORDER, ORDER:]
     for _ in range(doublings):

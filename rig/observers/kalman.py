@@ -34,6 +34,7 @@ from rig.observers.protocol import (
     SensorStep,
     Start,
     TuningTask,
+    Vector,
 )
 from rig.observers.sensor_fusion import FusionMemory, fuse_samples, initial_memory
 
@@ -200,7 +201,7 @@ class KalmanObserver:
         """Search over the logarithm of the filter's corner in rad/s."""
         low, high = ErrorFilter.corners(task.interval_s)
 
-        def observer(x: Sequence[float]) -> KalmanObserver:
+        def observer(x: Vector) -> KalmanObserver:
             corner = math.exp(float(x[0]))
             return cls("kalman", ErrorFilter.with_corner(corner, task), task.force_limit_n)
 

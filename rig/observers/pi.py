@@ -31,6 +31,7 @@ from rig.observers.protocol import (
     SensorStep,
     Start,
     TuningTask,
+    Vector,
 )
 
 _COARSE_OF_WEIGHT = 0.01
@@ -215,7 +216,7 @@ class PiObserver:
         """Search over the logarithms of natural frequency, damping ratio and filter corner."""
         low, high = ErrorFilter.corners(task.interval_s)
 
-        def observer(x: Sequence[float]) -> PiObserver:
+        def observer(x: Vector) -> PiObserver:
             natural, damping, corner = (float(value) for value in x)
             proportional = task.mass_kg * math.exp(2.0 * natural)
             return PiObserver(

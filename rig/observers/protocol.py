@@ -3,7 +3,9 @@
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
+import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from rig.channels.channel import Channel
 
@@ -186,6 +188,9 @@ AnyObserver = Observer[Any]
 """An observer of whatever kind: its states come from it alone and go back to it alone."""
 
 
+Vector = Sequence[float] | NDArray[np.float64]
+
+
 class Search(NamedTuple):
     """How the parameters of a kind of observer are searched; vectors are of any length.
 
@@ -196,7 +201,7 @@ class Search(NamedTuple):
         gain_margin: Gain margin that the loop must keep unless the user states another.
     """
 
-    observer: Callable[[Sequence[float]], Any]
+    observer: Callable[[Vector], "AnyTunableObserver"]
     candidates: Sequence[Sequence[float]]
     starts: int
     gain_margin: float

@@ -17,8 +17,9 @@ References:
     Simon, Optimal State Estimation (2006), 6.1 (scalar measurements one after another).
 """
 
+import bisect
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -138,9 +139,7 @@ def fuse_samples(
     used, health, measured_ns = list(memory.used), dict(memory.health), memory.measured_ns
     own_ns = memory.own_ns
     for item in sorted(new, key=lambda entry: entry.t_ns):
-        at = len(used)
-        while at and used[at - 1][1].t_ns > item.t_ns:
-            at -= 1
+        at = bisect.bisect_right(used, item.t_ns, key=lambda entry: entry[1].t_ns)
         before = used[at][0] if at < len(used) else error
         before = replace(before, inputs=inputs)
         if item.t_ns < before.t_ns:  # older than all of the memory
@@ -170,14 +169,21 @@ def fuse_samples(
     while used and used[0][1].t_ns < oldest_ns:
         used.pop(0)
     from_ns = used[0][0].t_ns if used else error.t_ns
-    left_out = tuple(
+    left_out = _find_left_out(health, sensors, t_ns)
+    inputs = inputs_since(inputs, from_ns)
+    after_tick = FusionMemory(tuple(used), inputs, health, measured_ns, own_ns, left_out)
+    return replace(error, inputs=inputs_since(inputs, error.t_ns)), after_tick
+
+
+def _find_left_out(
+    health: Mapping[int, SensorHealth], sensors: Mapping[int, Channel], t_ns: int
+) -> tuple[int, ...]:
+    """Sensors that are not to be trusted, or silent."""
+    return tuple(
         channel
         for channel, state in health.items()
         if state.is_out or t_ns - state.t_ns > _silent_ns(sensors[channel])
     )
-    inputs = inputs_since(inputs, from_ns)
-    after_tick = FusionMemory(tuple(used), inputs, health, measured_ns, own_ns, left_out)
-    return replace(error, inputs=inputs_since(inputs, error.t_ns)), after_tick
 
 
 def _join_inputs(

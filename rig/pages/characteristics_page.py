@@ -2,11 +2,9 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure as Drawing
 
 from rig.dyno.characterise import Characteristics
 from rig.dyno.faults import MasterComparison
@@ -14,6 +12,7 @@ from rig.dyno.figures import SIDES
 from rig.dyno.report import DamperReport
 from rig.dyno.stroke_force import ANGLES, Figure
 from rig.dyno.tolerance import PointVerdict
+from rig.files.pictures import new_figure
 from rig.pages.html import render_report, svg_url, write_page
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers and in grey print.
@@ -80,8 +79,7 @@ def _draw(records: Sequence[Characteristics], points: Sequence[Sequence[PointVer
         "svg.hashsalt": "rig",
         "font.size": 9,
     }
-    with cast("Any", mpl).rc_context(style):
-        figure = cast("Any", Drawing(figsize=(12.5, 4.4), layout="constrained"))
+    with new_figure((12.5, 4.4), style) as figure:
         peaks, velocities, heights = figure.subplots(1, 3)
         for index, item in enumerate(records):
             colour = _COLOURS[index % len(_COLOURS)]

@@ -2,12 +2,10 @@
 
 from datetime import date
 from pathlib import Path
-from typing import Any, cast
 
-import matplotlib as mpl
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
-from matplotlib.figure import Figure as Drawing
 
+from rig.files.pictures import new_figure
 from rig.fleet.overview import Overview, Series
 from rig.fleet.sentences import alarm_sentences, series_name
 from rig.pages.html import render_report, svg_url, write_page
@@ -45,8 +43,7 @@ def write_fleet_page(overview: Overview, path: Path) -> None:
 def _picture(overview: Overview, item: Series) -> str:
     """A series and those of the other dampers, as an SVG in a data URL."""
     style = {"axes.grid": True, "grid.alpha": 0.3, "svg.hashsalt": "rig", "font.size": 9}
-    with cast("Any", mpl).rc_context(style):
-        figure = cast("Any", Drawing(figsize=(9.0, 2.8), layout="constrained"))
+    with new_figure((9.0, 2.8), style) as figure:
         axes = figure.subplots()
         others = [s for s in overview.series if s.quantity == item.quantity and s is not item]
         others = others[:: -(-len(others) // _OTHERS_DRAWN)] if others else []

@@ -1,15 +1,13 @@
 """The report of a run: configuration, timing, faults and curves. One file, no network."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.log.follower import RunFollower
-from rig.log.reader import read_header
+from rig.log.reader import Ending, RunHeader, read_header
 from rig.pages.html import render_report, write_page
 from rig.pages.plotted_quantities import TICK_CURVES, TICK_TIME, TIME, TIME_PLOTS, Origin
 from rig.pages.report.figures import LineStyle, Panel, Plot, plot
@@ -45,14 +43,13 @@ def write_run_report(folder: Path, path: Path) -> None:
     Raises:
         InputError: The folder holds no run, or a run without a tick, or the file cannot be written.
     """
-    header = cast("Mapping[str, Any]", read_header(folder))
+    header = read_header(folder)
     follower = RunFollower(folder)
     follower.update(_ALL_STEPS)
     if not follower.steps:
         raise InputError(f"{folder}: holds no tick, expected a run to report on")
-    config = cast("Mapping[str, Any]", header.get("config", {}))
-    struts = list(cast("Mapping[str, Any]", config.get("observers", {})))
-    ending = cast("Mapping[str, Any]", header.get("ending") or {})
+    struts = list(header.get("config", {}).get("observers", {}))
+    ending = header.get("ending") or {}
     tone, sign, badge = _STATUS.get(str(ending.get("status")), _KILLED)
     text = render_report(
         "run.html",
@@ -78,9 +75,9 @@ def write_run_report(folder: Path, path: Path) -> None:
     write_page(text, path)
 
 
-def _headline(header: Mapping[str, Any], follower: RunFollower, ending: Mapping[str, Any]) -> str:
+def _headline(header: RunHeader, follower: RunFollower, ending: Ending) -> str:
     begin_s, end_s = follower.span_s
-    rate_hz = cast("Mapping[str, Any]", header.get("config", {})).get("rate_hz", "?")
+    rate_hz = header.get("config", {}).get("rate_hz", "?")
     text = f"{end_s - begin_s:.1f} s at {rate_hz} Hz"
     if not ending:
         return f"{text}; its end is not recorded."
@@ -90,9 +87,9 @@ def _headline(header: Mapping[str, Any], follower: RunFollower, ending: Mapping[
     return f"{text}, {missed or 'no'} ticks missed; counted: {faults or 'no fault'}."
 
 
-def _counts(ending: Mapping[str, Any]) -> list[tuple[str, int]]:
+def _counts(ending: Ending) -> list[tuple[str, int]]:
     """Faults that occurred, with their counts, the most frequent first."""
-    counts = cast("Mapping[str, int]", ending.get("counts") or {})
+    counts = ending.get("counts") or {}
     occurred = [
         (name.replace("_", " "), count)
         for name, count in counts.items()
@@ -101,8 +98,8 @@ def _counts(ending: Mapping[str, Any]) -> list[tuple[str, int]]:
     return sorted(occurred, key=lambda item: -item[1])
 
 
-def _timing(ending: Mapping[str, Any]) -> list[tuple[str, dict[str, float]]]:
-    timing = cast("Mapping[str, Any]", ending.get("timing") or {})
+def _timing(ending: Ending) -> list[tuple[str, dict[str, float]]]:
+    timing = ending.get("timing") or {}
     keys = {name: f"{name}_us" for name in TICK_CURVES}
     return [(name.capitalize(), timing[key]) for name, key in keys.items() if timing.get(key)]
 

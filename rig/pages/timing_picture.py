@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -66,7 +66,7 @@ def draw_timing(
         OSError: The file cannot be written.
     """
     size = (8.0, 2.4 * len(distributions) + 1.0)
-    figure = cast("Any", Figure(figsize=size, layout="constrained"))
+    figure: Any = Figure(figsize=size, layout="constrained")
     every = figure.subplots(len(distributions), 1, sharex=True, squeeze=False)[:, 0]
     largest_us = [max(item.levels_us.values(), default=0.0) for item in distributions]
     for axes, item in zip(every, distributions, strict=True):

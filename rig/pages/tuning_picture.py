@@ -2,13 +2,12 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 
 from can_dbc.errors import InputError
+from rig.files.pictures import new_figure
 from rig.tuning.gains import PAPER_HZ
 from rig.tuning.tune import TunedStrut
 
@@ -22,8 +21,7 @@ def draw_tuning(tuned: Sequence[TunedStrut], path: Path) -> None:
         InputError: The file cannot be written.
     """
     style = {"axes.grid": True, "grid.alpha": 0.3, "legend.frameon": False}
-    with cast("Any", mpl).rc_context(style):
-        figure = cast("Any", Figure(figsize=(7.5, 4.2 * len(tuned)), layout="constrained"))
+    with new_figure((7.5, 4.2 * len(tuned)), style) as figure:
         panels = figure.subplots(len(tuned), 1, squeeze=False)[:, 0]
         for axes, strut in zip(panels, tuned, strict=True):
             _draw(axes, strut)

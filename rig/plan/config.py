@@ -60,7 +60,7 @@ class OneOf:
         default: Value where the key is absent.
     """
 
-    def __init__(self, key: str, choices: Mapping[str, type[Any]], default: str | None) -> None:
+    def __init__(self, key: str, choices: Mapping[str, type[object]], default: str | None) -> None:
         self._key, self.choices, self._default = key, choices, default
 
     def _kind(self, data: object) -> str:
@@ -340,7 +340,7 @@ class RunConfig(_Frozen):
 
     @model_validator(mode="before")
     @classmethod
-    def _one_strut(cls, data: Any) -> Any:
+    def _one_strut(cls, data: Any) -> object:
         """Let a model of one strut be measured and published without the strut's name."""
         match data:
             case {"signals": {"height": {"message": _, "signal": _} as height, **others}, **rest}:

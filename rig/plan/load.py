@@ -1,12 +1,13 @@
 """Plans read from files: of a configuration, and of a run."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import load_yaml, validate
 from dart_model.spec import load_model, load_named_model
-from rig.bus.secoc import Authentication, read_key
+from rig.bus.secoc import read_key
 from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
 from rig.log.reader import read_header
 from rig.plan.config import RunConfig
@@ -35,11 +36,16 @@ def load_plan(path: Path, *, model: str | None = None, duration_s: float | None 
     else:
         spec = load_named_model(model, Path())
     database = load_database(DEFAULT_DATABASE if config.dbc is None else path.parent / config.dbc)
-    return resolve(config, path, spec, database)
+    plan = resolve(config, path, spec, database)
+    settings = config.authentication
+    if settings is None:
+        return plan
+    key = read_key(path.parent / settings.key_file)
+    return replace(plan, authentication=settings.with_key(key))
 
 
 def plan_of_run(folder: Path) -> Plan:
-    """The plan that a run follows, or followed, from the files in its folder.
+    """The plan that a run follows, or followed, from the files in its folder; without its key.
 
     Raises:
         InputError: A file of the run is missing or damaged.
@@ -49,15 +55,3 @@ def plan_of_run(folder: Path) -> Plan:
     config = validate(RunConfig, read_header(folder).get("config"), f"{source}: config")
     model, database = load_model(folder / MODEL_FILE), load_database(folder / DBC_FILE)
     return resolve(config, source, model, database)
-
-
-def load_authentication(plan: Plan) -> Authentication | None:
-    """How frames are authenticated, with its key; None without authentication.
-
-    Raises:
-        InputError: The key cannot be read.
-    """
-    settings = plan.config.authentication
-    if settings is None:
-        return None
-    return settings.with_key(read_key(plan.source.parent / settings.key_file))

@@ -4,7 +4,7 @@ Below it nothing looks up a name or opens a file.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -23,7 +23,7 @@ from rig.bridge.publications import (
     UNCERTAINTY,
     Publication,
 )
-from rig.bus.secoc import FD_LENGTHS
+from rig.bus.secoc import FD_LENGTHS, Authentication
 from rig.channels.channel import Channel, Role, SignalName
 from rig.channels.quantities import HEIGHT, LOAD_CELL_FORCE, Quantity
 from rig.observers.pi import PiObserver
@@ -83,6 +83,8 @@ class Plan:
         outgoing: Messages that the bridge sends.
         devices: Devices that it watches.
         alarms: Messages with alarms of the devices, and the alarms.
+        authentication: How frames are authenticated; None where they are not, and for the plan of
+            a run, whose folder contains no key.
     """
 
     source: Path
@@ -94,6 +96,7 @@ class Plan:
     outgoing: tuple[PlannedMessage, ...]
     devices: tuple[Device, ...]
     alarms: tuple[tuple[Message, Alarm], ...]
+    authentication: Authentication | None = None
 
     @property
     def period_ns(self) -> int:
@@ -148,7 +151,8 @@ class Plan:
         Raises:
             InputError: The configuration does not fit them.
         """
-        return resolve(config, self.source, self.model, self.database)
+        plan = resolve(config, self.source, self.model, self.database)
+        return replace(plan, authentication=self.authentication)
 
     def with_model(self, model: ModelSpec) -> "Plan":
         """The plan with another model of the same struts, such as a corrected one.
@@ -156,7 +160,8 @@ class Plan:
         Raises:
             InputError: The configuration does not fit it.
         """
-        return resolve(self.config, self.source, model, self.database)
+        plan = resolve(self.config, self.source, model, self.database)
+        return replace(plan, authentication=self.authentication)
 
     def with_observers(self, observers: Mapping[str, AnyObserver]) -> "Plan":
         """The plan with other observers, by strut name.

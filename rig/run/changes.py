@@ -8,7 +8,7 @@ replay changes there too.
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import parse_mapping, read_text, validate
@@ -96,7 +96,7 @@ def _assign(section: object, names: Sequence[str], value: object, source: str, k
     if others:
         _assign(holder[index], others, value, source, key)
     elif isinstance(holder[index], dict):
-        keys = ", ".join(f"{key}.{item}" for item in cast("dict[str, Any]", holder[index]))
+        keys = ", ".join(f"{key}.{item}" for item in cast("dict[str, object]", holder[index]))
         raise InputError(f"{source}: {key}: expected one of {keys}")
     else:
         holder[index] = value
@@ -124,7 +124,7 @@ def read_changes(folder: Path) -> list[tuple[int, dict[str, object]]]:
     changes: list[tuple[int, dict[str, object]]] = []
     for number, line in enumerate(read_text(path).splitlines(keepends=True), start=1):
         try:
-            entry = cast("dict[str, Any]", json.loads(line))
+            entry = json.loads(line)
             changes.append((int(entry["t_ns"]), dict(entry["set"])))
         except (ValueError, TypeError, KeyError) as error:
             if not line.endswith("\n"):

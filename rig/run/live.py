@@ -17,7 +17,6 @@ from rig.machine.clock import Clock, RealClock, VirtualClock
 from rig.machine.realtime import Granted, realtime
 from rig.plan.build import build_bridge
 from rig.plan.config import RunConfig
-from rig.plan.load import load_authentication
 from rig.plan.plan import Plan
 from rig.run.logged_run import Ended, Endpoint, on_signal, run_logged
 from rig.run.loop import RunControl
@@ -95,7 +94,7 @@ def _open_link(plan: Plan, bridge: Bridge, clock: Clock, *, listen_only: bool = 
             epoch_ns=clock.epoch_ns,
         )
 
-    authenticator = _authenticator(load_authentication(plan), clock)
+    authenticator = _authenticator(plan.authentication, clock)
     return Link(open_bus, clock.epoch_now_ns, authenticator=authenticator)
 
 
@@ -139,7 +138,7 @@ def with_bench(
         stack.callback(link.close)
         bench_bus = Bus(plan.config.bus, epoch_ns=clock.epoch_ns)
         stack.callback(bench_bus.close)
-        authenticator = _authenticator(load_authentication(plan), clock)
+        authenticator = _authenticator(plan.authentication, clock)
         port = BusPort(link)
         on_bus = BenchOnBus(bench, bench_bus, port, authenticator)
         endpoint = Endpoint(on_bus, clock, link.figures, while_waiting=(on_bus.send_up_to,))

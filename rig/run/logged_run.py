@@ -11,18 +11,18 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from typing import cast
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from dart_model.spec import copy_files, dump_model
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
-from rig.bridge.log_columns import LogColumns
 from rig.bridge.values import Mode
 from rig.bus.link import LinkFigures
 from rig.files.folders import refuse_full
 from rig.log.file_names import CHANGES_FILE, DBC_FILE, HISTOGRAMS_FILE, MODEL_FILE
-from rig.log.reader import RUN_SCHEMA
-from rig.log.steps import Step
+from rig.log.reader import RUN_SCHEMA, ConfigEntry, RunHeader
+from rig.log.steps import LogColumns, Step
 from rig.log.writer import LogOptions, RunWriter
 from rig.machine.clock import Clock, OccupiedClock
 from rig.machine.realtime import Granted
@@ -161,7 +161,7 @@ class _LoggedRun:
         self._priority = config.realtime.fifo_priority if granted and granted.fifo else 0
         self._log = RunWriter(
             folder,
-            _header(plan, endpoint.clock.epoch_ns, granted, folder) | _notes(control),
+            _header(plan, endpoint.clock.epoch_ns, granted, folder, control),
             self._columns.names,
             config.bus.channel,
             None if granted is None else self._priority,
@@ -273,20 +273,17 @@ class _LoggedRun:
         return {"strut": strut, "t_s": divergence.t_ns * 1e-9}
 
 
-def _notes(control: RunControl) -> dict[str, object]:
-    """What `run.yaml` notes of how the run was started."""
-    return {"forced": [dict(finding) for finding in control.forced]} if control.forced else {}
-
-
-def _header(plan: Plan, epoch_ns: int, granted: Granted | None, folder: Path) -> dict[str, object]:
+def _header(
+    plan: Plan, epoch_ns: int, granted: Granted | None, folder: Path, control: RunControl
+) -> RunHeader:
     files = {
         name: hashlib.sha256((folder / name).read_bytes()).hexdigest()
         for name in (MODEL_FILE, DBC_FILE)
     }
-    return {
+    header: RunHeader = {
         "schema": RUN_SCHEMA,
         "epoch_ns": epoch_ns,
-        "config": plan.config.model_dump(mode="json"),
+        "config": cast("ConfigEntry", plan.config.model_dump(mode="json")),
         "config_source": str(plan.source),
         "files_sha256": files,
         "versions": {
@@ -296,6 +293,9 @@ def _header(plan: Plan, epoch_ns: int, granted: Granted | None, folder: Path) ->
         },
         "granted": None if granted is None else granted.as_dict(),
     }
+    if control.forced:
+        header["forced"] = [dict(finding) for finding in control.forced]
+    return header
 
 
 def _copy_inputs(plan: Plan, folder: Path) -> None:

@@ -8,10 +8,9 @@ from msgspec import Struct
 
 from can_dbc.frame import Frame
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
-from rig.bridge.log_columns import LogColumns
-from rig.bridge.report import Conditions, Counts
+from rig.bridge.counts import Conditions, Counts
 from rig.bridge.values import Mode, StepOutput
-from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step
+from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, LogColumns, Step
 from rig.machine.clock import Clock
 from rig.run.changes import Changes, no_changes
 from rig.run.timing import BINS, Timing
@@ -177,14 +176,16 @@ def run(
             conditions = conditions._replace(overruns=tick.overruns)
         state, result = bridge.tick(state, tick.t_ns, frames, conditions)
         sent = port.send(result.frames)
-        numbers = columns.numbers(result.step_input, result.output)
-        flags, mode = _flags(conditions), result.output.mode
-        step = Step(tick.t_ns, tick.overruns, len(frames), mode, flags, numbers)
+        output = result.output
+        numbers = columns.numbers(result.step_input, output)
+        step = Step(tick.t_ns, tick.overruns, len(frames), output.mode, _flags(conditions), numbers)
         sink(frames, sent, result, step)
     return state
 
 
 def _flags(conditions: Conditions) -> int:
+    if not (conditions.acknowledged or conditions.bus_fault or conditions.log_fault):
+        return 0
     return (
         ACKNOWLEDGED * conditions.acknowledged
         + BUS_FAULT * conditions.bus_fault

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import cast
 
 from can_dbc.frame import Frame
-from rig.bridge.report import NO_TIMING, Conditions, Levels, TimingFigures
+from rig.bridge.counts import NO_TIMING, Conditions, Levels, TimingFigures
 from rig.bus.bus import Bus
 from rig.bus.link import Link
 from rig.bus.secoc import Authenticator
@@ -38,10 +38,11 @@ class BusPort:
         """Frames that have come since the last tick."""
         link = self.link
         frames = link.receive(t_ns)
-        if link.fault is None and not self._acknowledged and link.unauthenticated == self._refused:
+        failures = link.authentication_failures
+        if link.fault is None and not self._acknowledged and failures == self._refused:
             return frames, _NO_CONDITIONS
-        bus_fault = link.fault is not None or link.unauthenticated > self._refused
-        self._refused = link.unauthenticated
+        bus_fault = link.fault is not None or failures > self._refused
+        self._refused = failures
         acknowledged, self._acknowledged = self._acknowledged, False
         return frames, Conditions(acknowledged=acknowledged, bus_fault=bus_fault)
 

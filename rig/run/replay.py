@@ -3,10 +3,9 @@
 The ticks, the frames of each and what the loop knew come from the log; nothing is sent.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -15,11 +14,10 @@ from numpy.typing import NDArray
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.bridge.bridge import TickResult
-from rig.bridge.log_columns import LogColumns
-from rig.bridge.report import Conditions
+from rig.bridge.counts import Conditions
 from rig.log.frame_columns import FrameColumns, read_frame_columns
 from rig.log.reader import RunFolder, last_frame_ns, read_run
-from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, Step, StepRows
+from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, LogColumns, Step, StepRows
 from rig.plan.build import build_bridge
 from rig.plan.load import plan_of_run
 from rig.plan.plan import Plan
@@ -34,8 +32,6 @@ _MOST_LOST_A_FRAME = 1000
 
 _NO_CONDITIONS = Conditions()
 
-_pa = cast("Any", pa)
-
 
 @dataclass(frozen=True)
 class Replay:
@@ -49,7 +45,7 @@ class Replay:
         refused_frames: Frames refused in the replay.
     """
 
-    steps: Any
+    steps: pa.Table
     logged: int
     different: int
     first_different_ns: int | None
@@ -93,23 +89,23 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
     ticks = _ticks(run_folder, frames, plan.period_ns)
     columns = LogColumns(plan.strut_names, plan.channels)
     rows = StepRows(columns.names)
-    batches: list[Any] = []
+    batches: list[pa.RecordBatch] = []
 
     def keep(
         _received: Sequence[Frame], _sent: Sequence[Frame], result: TickResult, step: Step
     ) -> None:
         rows.append(step)
-        if rows.count == _TICKS_AT_ONCE:
-            batches.append(rows.batch())
-            rows.clear()
         progress(step.t_ns, result.output.mode)
+
+    def make_batch() -> None:
+        batches.append(rows.batch())
+        rows.clear()
 
     port = _LogPort(frames, ticks)
     # With another plan the run's own changes would undo what is tried.
     changes = changes_for_replay(folder, own, bridge) if plan is own else no_changes
-    state = run(bridge, bridge.init(0), port.ticks(), port, keep, columns, changes)
-    batches.append(rows.batch())
-    steps = _pa.Table.from_batches(batches, schema=rows.schema)
+    state = run(bridge, bridge.init(0), port.ticks(make_batch), port, keep, columns, changes)
+    steps = pa.Table.from_batches(batches, schema=rows.schema)
     different = _find_differences(run_folder.steps, steps)
     return Replay(
         steps,
@@ -126,43 +122,46 @@ class _LogPort:
     def __init__(self, frames: FrameColumns, ticks: LoggedTicks) -> None:
         self._frames = frames
         self._ticks = ticks
-        self._waiting: Iterator[tuple[Sequence[Frame], Conditions]] = iter(())
+        self._current: tuple[Sequence[Frame], Conditions] = (), _NO_CONDITIONS
 
-    def ticks(self) -> Iterator[Tick]:
-        """The ticks; frames and conditions of some are made ready at a time."""
-        ticks, begin = self._ticks, 0
-        for first in range(0, len(ticks.t_ns), _TICKS_AT_ONCE):
+    def ticks(self, end_part: Callable[[], None]) -> Iterator[Tick]:
+        """The ticks, in parts whose frames are in memory at once.
+
+        Args:
+            end_part: Called after the last tick of each part.
+        """
+        logged = self._ticks
+        begins = np.concatenate([[0], np.cumsum(logged.received)])
+        for first in range(0, len(logged.t_ns), _TICKS_AT_ONCE):
             part = slice(first, first + _TICKS_AT_ONCE)
-            received = ticks.received[part].tolist()
-            frames = list(self._frames.between(begin, begin + sum(received)))
-            begin += sum(received)
-            self._waiting = _frames_by_tick(frames, received, ticks.flags[part].tolist())
-            yield from map(Tick, ticks.t_ns[part].tolist(), ticks.overruns[part].tolist())
+            ends = begins[1:][part]
+            begin = int(begins[first])
+            frames = list(self._frames.between(begin, int(ends[-1])))
+            columns = (logged.t_ns[part], logged.overruns[part], logged.flags[part], ends - begin)
+            begin = 0
+            for t_ns, overruns, flags, end in zip(*(c.tolist() for c in columns), strict=True):
+                conditions = _conditions(flags) if flags else _NO_CONDITIONS
+                self._current = frames[begin:end], conditions
+                begin = end
+                yield Tick(t_ns, overruns)
+            end_part()
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
         """Frames that the tick received, and what the loop knew."""
         _ = t_ns  # the ticks come in their order
-        return next(self._waiting)
+        return self._current
 
     def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
         """Nothing is sent."""
         return frames
 
 
-def _frames_by_tick(
-    frames: list[Frame], received: list[int], flags: list[int]
-) -> Iterator[tuple[Sequence[Frame], Conditions]]:
-    begin = 0
-    for count, known in zip(received, flags, strict=True):
-        conditions = _NO_CONDITIONS
-        if known:
-            conditions = Conditions(
-                acknowledged=bool(known & ACKNOWLEDGED),
-                bus_fault=bool(known & BUS_FAULT),
-                log_fault=bool(known & LOG_FAULT),
-            )
-        yield frames[begin : begin + count], conditions
-        begin += count
+def _conditions(flags: int) -> Conditions:
+    return Conditions(
+        acknowledged=bool(flags & ACKNOWLEDGED),
+        bus_fault=bool(flags & BUS_FAULT),
+        log_fault=bool(flags & LOG_FAULT),
+    )
 
 
 def _ticks(log: RunFolder, frames: FrameColumns, period_ns: int) -> LoggedTicks:
@@ -202,7 +201,7 @@ def _ticks(log: RunFolder, frames: FrameColumns, period_ns: int) -> LoggedTicks:
     )
 
 
-def _find_differences(logged: Any, again: Any) -> NDArray[np.intp]:
+def _find_differences(logged: pa.Table, again: pa.Table) -> NDArray[np.intp]:
     """Indices of logged steps that are not the same bit for bit."""
     count = min(logged.num_rows, again.num_rows)
     unequal = np.zeros(count, dtype=np.bool_)

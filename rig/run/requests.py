@@ -12,7 +12,7 @@ import time
 import uuid
 from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import TypedDict, cast
 
 from can_dbc.atomic_file import write_whole
 from can_dbc.errors import InputError
@@ -20,9 +20,9 @@ from rig.bridge.bridge import Bridge
 from rig.log.file_names import RUN_FILE
 from rig.log.reader import read_header
 from rig.machine.realtime import follow
-from rig.plan.check import errors
 from rig.plan.load import plan_of_run
 from rig.plan.plan import Plan
+from rig.plan.preflight_checks import errors
 from rig.run.changes import Assignments, assign, bridge_with_settings, change_line, read_changes
 
 _FOLDER = "requests"
@@ -34,8 +34,13 @@ _ANSWER_S = 5.0
 
 _MOST_BYTES = 100_000
 
-Answer = Mapping[str, Any]
-"""`t_ns` of the first tick with the change; or `error`."""
+
+class Answer(TypedDict, total=False):
+    """`t_ns` of the first tick with the change, or `acknowledged`; or `error`."""
+
+    t_ns: int
+    acknowledged: bool
+    error: str
 
 
 class Requests:
@@ -110,7 +115,7 @@ class Requests:
     def _answer(self, path: Path) -> Answer:
         try:
             with path.open("rb") as file:
-                content: Any = json.loads(file.read(_MOST_BYTES))
+                content = json.loads(file.read(_MOST_BYTES))
             if content == {"acknowledge": True}:
                 self._acknowledge()
                 return {"acknowledged": True}

@@ -4,7 +4,7 @@ import contextlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,9 +78,9 @@ def _percentiles(histogram: NDArray[np.int64], largest_ns: int) -> dict[str, flo
     return {**result, "max": largest_ns / 1000}
 
 
-def read_histograms(folder: Path) -> dict[str, Any] | None:
+def read_histograms(folder: Path) -> dict[str, object] | None:
     """Content of a run's `HISTOGRAMS_FILE`; None if it has none."""
     with contextlib.suppress(OSError, ValueError):
         content: object = json.loads((folder / HISTOGRAMS_FILE).read_text("utf-8"))
-        return cast("dict[str, Any]", content) if isinstance(content, dict) else None
+        return cast("dict[str, object]", content) if isinstance(content, dict) else None
     return None

@@ -8,13 +8,13 @@ import os
 import resource
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, cast
+from typing import NamedTuple, Protocol
 
 import pyarrow as pa
 
 from can_dbc.frame import Frame
 from rig.bridge.bridge import TickResult
-from rig.bridge.report import Conditions
+from rig.bridge.counts import Conditions
 from rig.log.errors import LogError
 from rig.log.file_names import TRACE_FILE
 from rig.log.steps import Step
@@ -32,8 +32,6 @@ _TYPICAL_ROWS = 1000
 
 _MARKS = 7
 """Times in a row."""
-
-_pa = cast("Any", pa)
 
 
 class TraceRow(NamedTuple):
@@ -158,11 +156,11 @@ class Trace:
             OSError: It cannot be written.
         """
         columns = list(zip(*self.rows, strict=True)) or [()] * len(TraceRow._fields)
-        arrays = [_pa.array(column, type=_pa.int64()) for column in columns]
-        table = _pa.Table.from_arrays(arrays, names=list(TraceRow._fields))
+        arrays = [pa.array(column, type=pa.int64()) for column in columns]
+        table = pa.Table.from_arrays(arrays, names=list(TraceRow._fields))
         with (
-            _pa.OSFile(str(folder / TRACE_FILE), "wb") as file,
-            _pa.ipc.new_file(file, table.schema) as writer,
+            pa.OSFile(str(folder / TRACE_FILE), "wb") as file,
+            pa.ipc.new_file(file, table.schema) as writer,
         ):
             writer.write_table(table)
         for descriptor in (self._schedstat, self._stat):
@@ -237,10 +235,10 @@ def read_trace(folder: Path) -> list[TraceRow]:
     if not path.is_file():
         raise LogError(f"{path}: no such file, expected a run made with --trace")
     try:
-        with _pa.memory_map(str(path)) as source:
-            table = _pa.ipc.open_file(source).read_all()
+        with pa.memory_map(str(path)) as source:
+            table = pa.ipc.open_file(source).read_all()
             columns = [table.column(name).to_pylist() for name in TraceRow._fields]
-    except (_pa.ArrowException, OSError, KeyError) as error:
+    except (pa.ArrowException, OSError, KeyError) as error:
         reason = " ".join(str(error).split())[:200]
         raise LogError(f"{path}: is not a trace: {reason}") from error
     return [TraceRow(*values) for values in zip(*columns, strict=True)]

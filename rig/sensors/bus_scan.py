@@ -74,7 +74,7 @@ class _DeviceObjects:
     def __init__(self, network: CanOpenNetwork, node_id: int) -> None:
         self._network = network
         self._node_id = node_id
-        self._known: dict[tuple[int, int], bytes | None] = {}
+        self._list_arguments: dict[tuple[int, int], bytes | None] = {}
         self.unanswered: list[str] = []
         """Objects for which the device gave no answer."""
 
@@ -85,15 +85,15 @@ class _DeviceObjects:
             BusError: The device answers no request.
         """
         key = index, subindex
-        if key not in self._known:
+        if key not in self._list_arguments:
             try:
-                self._known[key] = self._network.read(self._node_id, index, subindex)
+                self._list_arguments[key] = self._network.read(self._node_id, index, subindex)
             except BusError:
-                self._known[key] = None
+                self._list_arguments[key] = None
                 self.unanswered.append(f"{index:04X}h.{subindex}")
                 if index == _DEVICE_TYPE or len(self.unanswered) > _MOST_UNANSWERED:
                     raise
-        return self._known[key]
+        return self._list_arguments[key]
 
     def is_signed(self, index: int, subindex: int) -> bool | None:
         """None: a device does not report it."""

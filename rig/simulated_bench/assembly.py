@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from scipy import interpolate, optimize
@@ -126,10 +126,12 @@ def _curves(segments: Sequence[Floats]) -> Curves:
 def _by_points(curve: SpringCurve | DamperCurve) -> Floats:
     """Segments of a curve through points without overshoot, shape (segments, 6)."""
     at, force_n = (np.array(points) for _, points in curve)
-    return _segments(at, cast("Any", interpolate).PchipInterpolator(at, force_n))
+    return _segments(at, interpolate.PchipInterpolator(at, force_n))
 
 
-def _segments(at: Floats, cubics: Any) -> Floats:
+def _segments(
+    at: Floats, cubics: interpolate.CubicSpline | interpolate.PchipInterpolator
+) -> Floats:
     return np.column_stack([at[:-1], np.diff(at), np.asarray(cubics.c, dtype=np.float64).T])
 
 
@@ -151,7 +153,7 @@ def _height_arrays(motion: StrutMotion | None) -> DrivenHeight:
     components = () if motion is None else motion.components
     sines, sweeps = _sines_and_sweeps(components)
     files = [part.samples for part in components if isinstance(part, HeightFile)]
-    spline = cast("Any", interpolate).CubicSpline
+    spline = interpolate.CubicSpline
     return DrivenHeight(
         mean_height_m=0.0 if motion is None else motion.mean_height_m,
         sines=sines,
@@ -263,7 +265,7 @@ def _heights(
         derivatives(mechanics, 0.0, at_start, state, rates)
         return rates[n : 2 * n][free]
 
-    solution = cast("Any", optimize).root(accelerations, heights_m[free].copy(), tol=1e-13)
+    solution = optimize.root(accelerations, heights_m[free].copy(), tol=1e-13)
     resting_m = np.asarray(solution.x, dtype=np.float64)
     residual_m_per_s2 = float(np.max(np.abs(accelerations(resting_m))))
     if not residual_m_per_s2 <= EQUILIBRIUM_TOLERANCE_M_PER_S2:

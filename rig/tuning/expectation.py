@@ -7,9 +7,10 @@ over that mass, smoothed as in a diagnosis, which also finds the sensor's noise.
 
 import itertools
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
@@ -84,7 +85,7 @@ class Expectation(NamedTuple):
 
 
 def longest_stretch(
-    steps: Any, folder: Path, strut: str, mobility_per_kg: float
+    steps: pa.Table, folder: Path, strut: str, mobility_per_kg: float
 ) -> FollowedStretch:
     """The longest stretch of a run in which the observer followed its bench.
 
@@ -205,16 +206,17 @@ def spectrum(t_s: Array, force_n: Array) -> tuple[Array, Array]:
     Returns:
         Frequencies in Hz and mean squares in N².
     """
-    even_s = np.linspace(t_s[0], t_s[-1], len(t_s))
+    begin_s, end_s = float(t_s[0]), float(t_s[-1])
+    even_s = np.linspace(begin_s, end_s, len(t_s))
     even_n = np.interp(even_s, t_s, force_n)
     window = np.hanning(len(even_n))
-    transform: Any = np.fft.rfft((even_n - np.average(even_n, weights=window)) * window)
+    transform = np.fft.rfft((even_n - np.average(even_n, weights=window)) * window)
     power = 2.0 * np.abs(transform) ** 2 / (len(even_n) * np.sum(window**2))
-    frequency: Any = np.fft.rfftfreq(len(even_n), (t_s[-1] - t_s[0]) / (len(t_s) - 1))
+    frequency = np.fft.rfftfreq(len(even_n), (end_s - begin_s) / (len(t_s) - 1))
     edges = np.unique(np.geomspace(1, len(frequency), _LINES).astype(int))
     lines = [slice(a, b) for a, b in itertools.pairwise(edges)]
     powers = np.array([np.sum(power[line]) for line in lines])
     centres = np.array(
-        [np.average(frequency[line], weights=power[line] + 1e-300) for line in lines]
+        [float(np.average(frequency[line], weights=power[line] + 1e-300)) for line in lines]
     )
     return centres, powers

@@ -9,18 +9,18 @@ margin.
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from scipy.optimize import minimize
 
-from dart_model.protocol import AnyPlant
-from rig.closed_loop.loop import LinearLoop, Loop, Rhythm
+from dart_model.protocol import AnyPlant, LoadedModel, ModelState
+from rig.closed_loop.loop import LinearLoop, Loop, SampleTiming
 from rig.closed_loop.poles import Pole, poles_of
 from rig.closed_loop.strut_response import StrutResponse
 from rig.observers import OBSERVERS
 from rig.observers.pi import PUBLISHED_PER_S2
-from rig.observers.protocol import AnyObserver, AnyTunableObserver, Search, TuningTask
+from rig.observers.protocol import AnyObserver, AnyTunableObserver, TuningTask, Vector
 from rig.tuning.expectation import Expectation
 
 KINDS = tuple(kind for kind, observer in OBSERVERS.items() if hasattr(observer, "search"))
@@ -100,7 +100,7 @@ class TuningProblem(NamedTuple):
         strut: Index of the strut.
         responses: Responses of the model's struts.
         heights_m: Heights at which the bench rests.
-        rhythm: When the loop is closed.
+        timing: How often the loop is closed.
         expectation: Noise and residual force that are expected of the strut.
         force_limit_n: Limit of the virtual force.
     """
@@ -110,7 +110,7 @@ class TuningProblem(NamedTuple):
     strut: int
     responses: Sequence[StrutResponse]
     heights_m: Sequence[float]
-    rhythm: Rhythm
+    timing: SampleTiming
     expectation: Expectation
     force_limit_n: float
 
@@ -127,9 +127,11 @@ class TuningProblem(NamedTuple):
             factor: Response of the model to a virtual force, over that which the observers take it
                 to have.
         """
-        plant: Any = self.plant if factor == 1.0 else _StrongerPlant(self.plant, factor)
+        plant = self.plant
+        if factor != 1.0:
+            plant = cast("AnyPlant", _StrongerPlant(plant, factor))
         observers = self.with_observer(observer)
-        loop = Loop(plant, observers, self.heights_m, self.rhythm, self.responses)
+        loop = Loop(plant, observers, self.heights_m, self.timing, self.responses)
         return loop.linear(self.strut)
 
     def with_observer(self, observer: AnyObserver) -> tuple[AnyObserver, ...]:
@@ -143,10 +145,12 @@ class _StrongerPlant:
     def __init__(self, plant: AnyPlant, factor: float) -> None:
         self._plant, self._factor = plant, factor
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         return getattr(self._plant, name)
 
-    def load(self, state: Any, virtual_forces_n: Sequence[float], *others: float) -> Any:
+    def load(
+        self, state: ModelState, virtual_forces_n: Sequence[float], *others: float
+    ) -> LoadedModel[ModelState]:
         return self._plant.load(state, [self._factor * f for f in virtual_forces_n], *others)
 
 
@@ -189,13 +193,13 @@ def tune_observer(problem: TuningProblem, kind: str, aim: Aim) -> Tuned:
     task = TuningTask(
         1.0 / problem.mobility_per_kg,
         problem.expectation.noise_std_m,
-        problem.rhythm.interval_ns * 1e-9,
+        problem.timing.interval_ns * 1e-9,
         problem.force_limit_n,
     )
-    search: Search = OBSERVERS[kind].search(task)
+    search = cast("type[AnyTunableObserver]", OBSERVERS[kind]).search(task)
     margin = search.gain_margin if aim.gain_margin is None else aim.gain_margin
 
-    def cost(x: Any) -> float:
+    def cost(x: Vector) -> float:
         try:
             observer = search.observer(x)
         except (OverflowError, ValueError):
@@ -218,11 +222,11 @@ def tune_observer(problem: TuningProblem, kind: str, aim: Aim) -> Tuned:
                 method="Nelder-Mead",
                 options={"maxfev": _EVALUATIONS // search.starts, "xatol": 0.01, "fatol": 1e-3},
             )
-            for index in np.argsort(costs, kind="stable")[: search.starts]
+            for index in sorted(range(len(costs)), key=costs.__getitem__)[: search.starts]
         ),
         key=lambda item: item.fun,
     )
-    observer: AnyTunableObserver = search.observer(best.x).to_four_digits()
+    observer = search.observer(best.x).to_four_digits()
     error = expect_error(problem, observer)
     return Tuned(observer, error, gain_margin(problem, observer), margin)
 

@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace as replaced
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -185,7 +185,7 @@ def _long_run_variance(values: Array) -> float:
     """Variance of the sum of a correlated series, lags up to a tenth of it, Bartlett weights."""
     count = len(values)
     lags = max(1, count // 10)
-    spectrum: Any = np.fft.rfft(values, 2 * count)
+    spectrum = np.fft.rfft(values, 2 * count)
     correlation = np.fft.irfft(np.abs(spectrum) ** 2)[: lags + 1]
     weights = 1.0 - np.arange(lags + 1) / (lags + 1)
     return float(correlation[0] + 2.0 * np.sum(weights[1:] * correlation[1:]))

@@ -3,15 +3,18 @@
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import yaml
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 from can_dbc.codec import si_step
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import parse_mapping, read_text
 from rig.channels.channel import Channel
-from rig.closed_loop.loop import Rhythm
+from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.strut_response import strut_responses
 from rig.diagnosis.progress import Progress, within
 from rig.observers.kalman import KalmanObserver
@@ -138,7 +141,7 @@ def tune(
             index,
             responses,
             heights_m,
-            Rhythm.of(plan.period_ns, strut.interval_ns, round(height.delay_s * 1e9)),
+            SampleTiming.of(plan.period_ns, strut.interval_ns, round(height.delay_s * 1e9)),
             expectations[index],
             cast("AnyTunableObserver", strut.observer).force_limit_n,
         )
@@ -211,14 +214,14 @@ def write_config(plan: Plan, tuned: list[TunedStrut], path: Path) -> None:
     content["observers"] = {strut.name: settings_of(strut.tuned.observer) for strut in tuned}
     late = {strut.name: strut.delay_s for strut in tuned if strut.latency and strut.delay_s}
     if late:
-        signals = cast("dict[str, Any]", content["signals"])
+        signals = cast("dict[str, object]", content["signals"])
         signals["height"] = {
             name: entry.model_dump(exclude_defaults=True)
             | ({"delay_s": late[name]} if name in late else {})
             for name, entry in plan.config.signals.height.items()
         }
         supervision = with_delay(plan, max(late.values())).config.supervision
-        content["supervision"] = cast("dict[str, Any]", content.get("supervision") or {}) | {
+        content["supervision"] = cast("dict[str, object]", content.get("supervision") or {}) | {
             "stale_after_s": round(supervision.stale_after_s, 9),
             "safe_after_s": round(supervision.safe_after_s, 9),
         }
@@ -229,9 +232,11 @@ def write_config(plan: Plan, tuned: list[TunedStrut], path: Path) -> None:
         raise InputError(f"--out {path}: {os.strerror(error.errno or 0)}") from error
 
 
-def settings_of(observer: AnyObserver) -> dict[str, Any]:
+def settings_of(observer: AnyObserver) -> dict[str, object]:
     """An observer as it stands in a configuration; what is absent or zero there is left out."""
-    return {key: value for key, value in asdict(cast("Any", observer)).items() if value}
+    return {
+        key: value for key, value in asdict(cast("DataclassInstance", observer)).items() if value
+    }
 
 
 def _quantisation_m(height: Channel) -> float:

@@ -7,15 +7,15 @@ from can_dbc.database import DEFAULT_DATABASE
 from can_dbc.frame import Frame
 from rig.bridge import (
     bridge,
+    counts,
     estimator,
     free_model,
     gates,
     prescribed_motion,
-    report,
     supervisor,
     values,
 )
-from rig.bridge.report import Conditions
+from rig.bridge.counts import Conditions
 from rig.bridge.values import Mode
 from rig.simulated_bench.trajectory import simulate
 from tests.faults.trial import BEGIN_NS, MS, Trial, after
@@ -69,7 +69,7 @@ def test_a_count_beyond_its_signal_stays_at_the_largest_value():
 
 
 def test_a_state_of_the_core_cannot_be_changed():
-    modules = [bridge, estimator, free_model, gates, prescribed_motion, report, supervisor, values]
+    modules = [bridge, estimator, free_model, gates, prescribed_motion, counts, supervisor, values]
     structs = {
         value
         for module in modules

@@ -13,7 +13,7 @@ from rig.bridge.supervisor import Supervision
 from rig.bridge.values import StepInput
 from rig.channels.channel import Sample
 from rig.channels.quantities import APPLIED_FORCE
-from rig.closed_loop.loop import Loop, Rhythm
+from rig.closed_loop.loop import Loop, SampleTiming
 from rig.closed_loop.poles import closed_loop_poles
 from rig.closed_loop.strut_response import strut_responses
 from rig.observers.error_filter import ErrorFilter
@@ -134,7 +134,7 @@ def test_the_noise_aware_loop_is_stable_and_damped(delay, every):
     plant = DartPlant(load_model(MODELS / "reference.yaml"))
     corner = ErrorFilter(bandwidth_hz=20.0 / every, noise_std_m=2e-5)
     observers = (KalmanObserver("kalman", corner),)
-    poles = closed_loop_poles(plant, observers, (0.3,), Rhythm(MS, every, delay))
+    poles = closed_loop_poles(plant, observers, (0.3,), SampleTiming(MS, every, delay))
     assert max(pole.magnitude for pole in poles) < 1.0
     # The filter knows nothing of the law: at 5 Hz the model's own damper takes part.
     assert min(pole.damping_ratio for pole in poles) > (0.15 if every == 1 else 0.05)
@@ -145,7 +145,7 @@ def test_noise_and_lag_of_the_linear_loop_are_those_of_the_simulated_one(observe
     """A bench at rest with sensor noise; a bench at rest whose strut carries a sine more."""
     plant = DartPlant(load_model(MODELS / "reference.yaml"))
     rest_m = 0.5 - 98.1 / 500.0
-    loop = Loop(plant, (observer,), (rest_m,), Rhythm(MS))
+    loop = Loop(plant, (observer,), (rest_m,), SampleTiming(MS))
     linear = loop.linear()
     rng = np.random.default_rng(5)
     x, errors = loop.at_rest, []

@@ -8,7 +8,7 @@ import pytest
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model, parse_model
 from rig.bridge.supervisor import Supervision
-from rig.closed_loop.loop import Rhythm
+from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.poles import Pole, closed_loop_poles
 from rig.observers.pi import PiObserver
 from tests.bridge.cores import GAINS, MS, gains, measured, run, supervised
@@ -22,7 +22,7 @@ def reference() -> DartPlant:
 
 
 def poles(observer: PiObserver, every: int = 1, delay: int = 0) -> list[Pole]:
-    return closed_loop_poles(reference(), (observer,), (REST_M,), Rhythm(MS, every, delay))
+    return closed_loop_poles(reference(), (observer,), (REST_M,), SampleTiming(MS, every, delay))
 
 
 def ringing(observer: PiObserver, every: int) -> tuple[float, float]:
@@ -100,7 +100,7 @@ def test_a_slow_measurement_that_runs_away_does_so_at_the_speed_of_its_pole():
 
 def test_each_strut_of_the_quarter_car_brings_its_poles():
     plant = DartPlant(load_model(MODELS / "quarter_car.yaml"))
-    found = closed_loop_poles(plant, (GAINS, GAINS), (0.29, 0.35), Rhythm(MS))
+    found = closed_loop_poles(plant, (GAINS, GAINS), (0.29, 0.35), SampleTiming(MS))
     # Position, velocity and integral of each; what is held is determined by them.
     assert len(found) == 6
     assert max(pole.magnitude for pole in found) < 1.0
@@ -110,7 +110,7 @@ def test_the_memory_of_effects_has_poles_too():
     text = (MODELS / "reference.yaml").read_text("utf-8")
     law = "{name: maxwell, parameters: {stiffness_n_per_m: 1000.0, relaxation_time_s: 0.02}}"
     spec = parse_model(text.replace("effects: []", f"effects: [{law}]"), "maxwell.yaml")
-    found = closed_loop_poles(DartPlant(spec), (gains(0.0, 0.0, 1.0),), (0.3,), Rhythm(MS))
+    found = closed_loop_poles(DartPlant(spec), (gains(0.0, 0.0, 1.0),), (0.3,), SampleTiming(MS))
     # The branch relaxes in 20 ms, a little faster for the mass that it drives: a real, fast pole.
     fast = min(pole.magnitude for pole in found)
     assert 0.9 < fast < 0.97

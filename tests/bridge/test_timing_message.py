@@ -4,7 +4,7 @@ import cantools.database
 import pytest
 
 from can_dbc.database import DEFAULT_DATABASE
-from rig.bridge.report import Conditions, TimingFigures
+from rig.bridge.counts import Conditions, TimingFigures
 from tests.faults.trial import Trial
 
 TIMING = 0x310

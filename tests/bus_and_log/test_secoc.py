@@ -1,5 +1,6 @@
 """Authenticated frames: what is forged, replayed or out of order gets no further."""
 
+import dataclasses
 from collections.abc import Callable
 
 import pytest
@@ -13,9 +14,9 @@ from can_dbc.frame import Frame
 from rig.bus.link import Link
 from rig.bus.secoc import Authentication, Authenticator, cmac, read_key
 from rig.log.file_names import STEPS_FILE
-from rig.plan.check import Severity, check
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
+from rig.plan.preflight_checks import Severity, check
 from rig.run.live import with_bench
 from rig.run.loop import RunControl
 from rig.run.ports import BusPort
@@ -236,6 +237,17 @@ def test_the_check_tells_of_it(configured):
     (path.parent / "bench.key").chmod(0o644)
     assert found().severity is Severity.ERROR
     assert KEY.hex() not in found().text
+
+
+def test_the_plan_of_a_run_is_checked_without_its_key(configured):
+    path = configured()
+    plan = load_plan(path)
+    assert plan.authentication.key == KEY
+    assert KEY.hex() not in repr(plan)
+    assert plan.with_config(plan.config).authentication == plan.authentication
+    (path.parent / "bench.key").unlink()  # the folder of a run contains none
+    findings = check(dataclasses.replace(plan, authentication=None))
+    assert not [item for item in findings if item.severity is Severity.ERROR]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from rig.bridge.report import Counts
+from rig.bridge.counts import Counts
 from rig.bridge.values import Mode, StepOutput, StrutOutput
 from rig.cli.main import main
 from rig.cli.progress import status_line

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rig.bridge.report import Conditions
+from rig.bridge.counts import Conditions
 from rig.bridge.values import Mode
 from rig.log.reader import read_run
 from rig.log.whole_file import WholeFile

@@ -14,7 +14,7 @@ import yaml
 from msgspec.structs import replace
 
 from can_dbc.frame import Frame
-from rig.bridge.report import Conditions
+from rig.bridge.counts import Conditions
 from rig.bridge.values import Mode
 from rig.bus.bus import BusError
 from rig.bus.link import Link

@@ -8,8 +8,8 @@ from can_dbc.errors import InputError
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from can_dbc.yaml_file import load_yaml
+from rig.bridge.counts import Conditions
 from rig.bridge.limits import Action, Limit, LimitedValue, judge_height
-from rig.bridge.report import Conditions
 from rig.bridge.supervisor import TRANSITIONS, Event, next_mode
 from rig.bridge.values import Mode
 from rig.plan.config import CONFIGS, RunConfig

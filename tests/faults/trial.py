@@ -7,7 +7,7 @@ import numpy as np
 
 from can_dbc.frame import Frame
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
-from rig.bridge.report import Conditions, Counts
+from rig.bridge.counts import Conditions, Counts
 from rig.bridge.values import Mode, StepInput
 from rig.channels.channel import Sample
 from rig.plan.build import build_bridge

@@ -17,9 +17,9 @@ from rig.fmu.component import bench_component, strut_component
 from rig.fmu.export import export_fmu
 from rig.fmu.import_fmu import FMU_FILE, MODEL_FILE, import_fmu
 from rig.log.reader import read_run
-from rig.plan.check import check
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
+from rig.plan.preflight_checks import check
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config

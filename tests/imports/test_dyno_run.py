@@ -11,9 +11,9 @@ from dart_model.spec import load_model
 from rig.demo.cases import DemoOptions, run_case
 from rig.diagnosis.files import diagnose_runs
 from rig.diagnosis.recording import read_recording
-from rig.plan.check import check
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
+from rig.plan.preflight_checks import check
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config

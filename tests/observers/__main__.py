@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
-from rig.closed_loop.loop import Rhythm
+from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.strut_response import strut_responses
 from rig.demo.cases import compare_with_bench
 from rig.log.reader import read_run
@@ -60,9 +60,9 @@ def point(given):
     expectation = Expectation(
         smoothed.noise_std_m, *spectrum(smoothed.t_s, smoothed.force_n), "its run"
     )
-    rhythm = Rhythm(truth.period_ns)
+    timing = SampleTiming(truth.period_ns)
     bench = TuningProblem(
-        truth.plant, (start,), 0, answers, [truth.rest_m], rhythm, expectation, 1e7
+        truth.plant, (start,), 0, answers, [truth.rest_m], timing, expectation, 1e7
     )
     settled = round(min(2.0, 0.25 * len(fresh) / rate_hz) * rate_hz)
     row = {"given": given, "noise_std_m": smoothed.noise_std_m}

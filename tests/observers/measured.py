@@ -14,7 +14,7 @@ import numpy as np
 
 from dart_model.plant import DartPlant
 from dart_model.spec import parse_model
-from rig.closed_loop.loop import Rhythm
+from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.strut_response import strut_responses
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
 from rig.observers.error_filter import ErrorFilter
@@ -61,9 +61,9 @@ def compare(name, record, force_n=None):
     first = len(record.height_m) - len(seen.tick_s)
     truth = smoothed if force_n is None else force_n[first : first + len(smoothed)]
     expectation = Expectation(found.noise_std_m, *spectrum(found.t_s, found.force_n), name)
-    rhythm = Rhythm(record.period_ns)
+    timing = SampleTiming(record.period_ns)
     bench = TuningProblem(
-        record.plant, (start,), 0, answers, [record.rest_m], rhythm, expectation, 1e6
+        record.plant, (start,), 0, answers, [record.rest_m], timing, expectation, 1e6
     )
     settled = round(0.5e9 / record.period_ns)
     deviation = np.std(truth[settled:])

@@ -3,9 +3,9 @@
 import pytest
 
 from can_dbc.errors import InputError
-from rig.plan.check import Severity, check
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
+from rig.plan.preflight_checks import Severity, check
 
 FILTER = "{kind: kalman, filter: {bandwidth_hz: %s, noise_std_m: %s}}"
 

@@ -125,7 +125,7 @@ build.ENGINES = {**build.ENGINES, "toy": ToyPlant}
 
 from rig.simulated_bench.config import load_bench_config
 from rig.log.reader import read_run
-from rig.plan.check import check
+from rig.plan.preflight_checks import check
 from rig.plan.config import CONFIGS
 from rig.run.live import with_bench
 from rig.run.replay import replay

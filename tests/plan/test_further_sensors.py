@@ -9,9 +9,9 @@ import yaml
 from can_dbc.errors import InputError
 from rig.bridge.values import Mode
 from rig.log.reader import read_run
-from rig.plan.check import check
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
+from rig.plan.preflight_checks import check
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config

@@ -10,10 +10,10 @@ from pydantic import TypeAdapter
 
 from dart_model.plant import DartPlant, PrescribedStrut
 from dart_model.spec import MODELS, load_model
+from rig.bridge.counts import Conditions, Counts, Report
 from rig.bridge.free_model import FreeModelEstimator
 from rig.bridge.prescribed_motion import PrescribedMotionEstimator
 from rig.bridge.publications import STATUS, STRUT, TIMING
-from rig.bridge.report import Conditions, Counts, Report
 from rig.bridge.values import Mode, StepInput, StepOutput, StrutOutput
 from rig.channels.channel import Sample
 from rig.channels.quantities import BENCH_QUANTITIES, LOAD_CELL_FORCE, STRUT_QUANTITIES

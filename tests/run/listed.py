@@ -10,7 +10,7 @@ from can_dbc.codec import compile_encoder
 from can_dbc.frame import Frame
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
-from rig.bridge.report import Conditions
+from rig.bridge.counts import Conditions
 from rig.bus.link import LinkFigures
 from rig.machine.clock import VirtualClock
 from rig.plan.build import build_bridge

@@ -15,7 +15,7 @@ from rig.bus.bus import BusConfig
 from rig.plan.build import build_bridge
 from rig.plan.load import load_plan
 from rig.sensors.j1939 import AddressClaim, address_claims, group_messages, group_number
-from rig.sensors.proposal import configuration_text, dbc_text
+from rig.sensors.proposed_config import configuration_text, dbc_text
 from tests.faults.trial import height_of
 
 MS = 1_000_000

@@ -16,13 +16,13 @@ from can_dbc.units import Dimension, si_conversion
 from rig.bus.bus import BusConfig
 from rig.bus.canopen_network import CanOpenNetwork
 from rig.cli.main import app
-from rig.plan.check import check
 from rig.plan.load import load_plan
+from rig.plan.preflight_checks import check
 from rig.sensors.bus_scan import scan
 from rig.sensors.canopen_device import describe_device
 from rig.sensors.canopen_set_up import CanOpenSettings, DeviceWriter, configure_device, restore
 from rig.sensors.height_zero import HeightZero
-from rig.sensors.proposal import dbc_text
+from rig.sensors.proposed_config import dbc_text
 from rig.sensors.undo_file import read_undo, write_undo
 from tests.sensors.peer import KILONEWTON, amplifier, encoder, with_timer
 

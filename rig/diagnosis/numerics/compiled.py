@@ -8,48 +8,57 @@ Reference: Hairer, Nørsett, Wanner, Solving Ordinary Differential Equations I (
 classical Runge-Kutta method.
 """
 
-# numba ships no types, and what it compiles is read by numba, not by a type checker.
-# pyright: basic, reportCallIssue=false
-
 import functools
 import warnings
-from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from collections.abc import Callable, MutableSequence, Sequence
+from typing import NamedTuple, ParamSpec, TypeVar, cast
 
 import numba
 import numpy as np
 from numba import types
 from numba.core.errors import NumbaExperimentalFeatureWarning
+from numba.core.typing.templates import Signature
 from numba.typed import List
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
-from dart_model.effects.calling import force_over_arrays, rates_over_arrays
+from dart_model.effects.calling import (
+    ForceOverArrays,
+    RatesOverArrays,
+    force_over_arrays,
+    rates_over_arrays,
+)
+from dart_model.effects.law import Writable
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Cube = NDArray[np.float64]
+Forces = MutableSequence[ForceOverArrays]
+Rates = MutableSequence[RatesOverArrays]
+_Arrays = tuple[Array, ...]
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 SLOTS = 10
 """Most effects that a simulation carries: the loops know their number when they are compiled."""
 
-_F8: Any = types.float64
-_I8: Any = types.int64
-_VECTOR: Any = types.Array(types.float64, 1, "C")
-_MATRIX: Any = types.Array(types.float64, 2, "C")
-_CUBE: Any = types.Array(types.float64, 3, "C")
-_INTEGERS: Any = types.Array(types.int64, 1, "C")
-_INDEX: Any = types.Array(types.int64, 2, "C")
-_POINTER: Any = types.CPointer(types.float64)
-_FORCE_SIGNATURE: Any = _F8(*(_F8,) * 5, *(_POINTER,) * 3)
-_RATE_SIGNATURE: Any = types.void(*(_F8,) * 5, *(_POINTER,) * 4)
-_FORCE: Any = types.FunctionType(_FORCE_SIGNATURE)
-_RATE: Any = types.FunctionType(_RATE_SIGNATURE)
-_FORCES: Any = types.ListType(_FORCE)
-_RATES: Any = types.ListType(_RATE)
-_TEN_FORCES: Any = types.UniTuple(_FORCE, SLOTS)
-_TEN_RATES: Any = types.UniTuple(_RATE, SLOTS)
-_TEN_POINTERS: Any = types.UniTuple(_POINTER, SLOTS)
+_F8 = types.float64
+_I8 = types.int64
+_VECTOR = types.Array(types.float64, 1, "C")
+_MATRIX = types.Array(types.float64, 2, "C")
+_CUBE = types.Array(types.float64, 3, "C")
+_INTEGERS = types.Array(types.int64, 1, "C")
+_POINTER = types.CPointer(types.float64)
+_FORCE_SIGNATURE = _F8(*(_F8,) * 5, *(_POINTER,) * 3)
+_RATE_SIGNATURE = types.void(*(_F8,) * 5, *(_POINTER,) * 4)
+_FORCE = types.FunctionType(_FORCE_SIGNATURE)
+_RATE = types.FunctionType(_RATE_SIGNATURE)
+_FORCES = types.ListType(_FORCE)
+_RATES = types.ListType(_RATE)
+_TEN_FORCES = types.UniTuple(_FORCE, SLOTS)
+_TEN_RATES = types.UniTuple(_RATE, SLOTS)
+_TEN_POINTERS = types.UniTuple(_POINTER, SLOTS)
 
 
 class Laws(NamedTuple):
@@ -60,23 +69,25 @@ class Laws(NamedTuple):
         rates: Rates of their internal states, likewise.
     """
 
-    forces: Any
-    rates: Any
+    forces: Forces
+    rates: Rates
 
 
-def compile_loop(function: Callable[..., Any], signature: Any) -> Any:
+def compile_loop(
+    function: Callable[_P, _R], signature: Signature | list[Signature]
+) -> Callable[_P, _R]:
     """A function as machine code for one signature, kept on disk, without the global lock."""
-    compiler = cast("Any", numba.njit)
-    return compiler(signature, cache=True, error_model="numpy", nogil=True)(function)
+    return numba.njit(signature, cache=True, error_model="numpy", nogil=True)(function)
 
 
-def _inline(function: Callable[..., Any]) -> Any:
+def _inline(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """A part of a loop: compiled with the loop that calls it, and never on its own.
 
     It allocates nothing, and counts no references: an array would be held and released at each
     call, and so would every array of a structure.
     """
-    compiler = cast("Any", numba.njit)
+    # numba's types have no name for the last three options.
+    compiler = cast("Callable[..., Callable[[Callable[_P, _R]], Callable[_P, _R]]]", numba.njit)
     return compiler(
         error_model="numpy",
         forceinline=True,
@@ -86,28 +97,27 @@ def _inline(function: Callable[..., Any]) -> Any:
     )(function)
 
 
-def _compile_law(function: Callable[..., Any], signature: Any) -> Any:
+def _compile_law(function: Callable[_P, _R], signature: Signature) -> Callable[_P, _R]:
     # A law only reads and writes by index, so bare pointers do, which cost least in a call.
-    compiler = cast("Any", numba.cfunc)
-    return compiler(signature, cache=True, error_model="numpy")(function)
+    return numba.cfunc(signature, cache=True, error_model="numpy")(function)
 
 
 # The lists of laws hold addresses, not references: the caches keep the machine code.
 @functools.cache
-def _force(name: str) -> Any:
+def _force(name: str) -> ForceOverArrays:
     return _compile_law(force_over_arrays(effect(name)), _FORCE_SIGNATURE)
 
 
 @functools.cache
-def _rate(name: str) -> Any:
+def _rate(name: str) -> RatesOverArrays:
     return _compile_law(rates_over_arrays(effect(name)), _RATE_SIGNATURE)
 
 
-def _empty() -> tuple[Any, Any]:
+def _empty() -> tuple[Forces, Rates]:
     return List.empty_list(_FORCE), List.empty_list(_RATE)
 
 
-def _append(forces: Any, rates: Any, force: Any, rate: Any) -> None:
+def _append(forces: Forces, rates: Rates, force: ForceOverArrays, rate: RatesOverArrays) -> None:
     forces.append(force)
     rates.append(rate)
 
@@ -204,7 +214,7 @@ def slots(effects: tuple[tuple[int, str], ...]) -> Slots:
     return Slots(_laws(names), placement, tuple(each), state)
 
 
-def _ten(f: Any) -> Any:
+def _ten(f: Sequence[_R]) -> tuple[_R, ...]:
     return f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9]
 
 
@@ -214,11 +224,11 @@ with warnings.catch_warnings():
     _ten = compile_loop(_ten, [_TEN_FORCES(_FORCES), _TEN_RATES(_RATES)])
 
 
-def _pointer(array: Array, first: int) -> Any:
+def _ctypes_of(array: Array, first: int) -> object:
     return array[first:].ctypes
 
 
-def _pointers(a: Array, at: Integers) -> Any:
+def _ten_ctypes_of(a: Array, at: Integers) -> object:
     return (
         a[at[0] :].ctypes, a[at[1] :].ctypes, a[at[2] :].ctypes, a[at[3] :].ctypes,
         a[at[4] :].ctypes, a[at[5] :].ctypes, a[at[6] :].ctypes, a[at[7] :].ctypes,
@@ -227,8 +237,13 @@ def _pointers(a: Array, at: Integers) -> Any:
 
 
 # An array's `ctypes` becomes a bare pointer only where a signature asks for one.
-_pointer = compile_loop(_pointer, _POINTER(_VECTOR, _I8))
-_pointers = compile_loop(_pointers, _TEN_POINTERS(_VECTOR, _INTEGERS))
+_pointer = cast(
+    "Callable[[Array, int], Writable]", compile_loop(_ctypes_of, _POINTER(_VECTOR, _I8))
+)
+_pointers = cast(
+    "Callable[[Array, Integers], tuple[Writable, ...]]",
+    compile_loop(_ten_ctypes_of, _TEN_POINTERS(_VECTOR, _INTEGERS)),
+)
 
 
 class Equations(NamedTuple):
@@ -392,12 +407,12 @@ class _Calls(NamedTuple):
         struts: Pointers to the constants of the strut.
     """
 
-    forces: Any
-    rates: Any
-    states: Any
-    slopes: Any
-    parameters: Any
-    struts: Any
+    forces: tuple[ForceOverArrays, ...]
+    rates: tuple[RatesOverArrays, ...]
+    states: tuple[Writable, ...]
+    slopes: tuple[Writable, ...]
+    parameters: tuple[Writable, ...]
+    struts: tuple[Writable, ...]
 
 
 class _Instant(NamedTuple):
@@ -536,7 +551,7 @@ def _add_effects(placement: Placement, calls: _Calls, at: _Instant, work: _Work)
         # A fixed number of turns is unrolled, so that no tuple is searched.
         if slot >= placement.struts.shape[0]:
             break
-        i = placement.struts[slot]
+        i: int = placement.struts[slot]
         if placement.first_states[slot] >= 0:
             calls.rates[slot](
                 at.t_s, work.heights_m[i], work.velocities[i], at.applied_n, at.temperature_c,
@@ -619,7 +634,7 @@ def _end_stage(stage: int, h: float, step: _Step, work: _Work) -> None:
 
 
 @_inline
-def _jumped(h: float, steps: Steps, step: _Step, work: _Work) -> bool:
+def _has_jump(h: float, steps: Steps, step: _Step, work: _Work) -> bool:
     """Whether a force jumped within a step, as it does where a contact closes or friction turns."""
     n = step.twist.shape[0]
     worst = 0.0
@@ -677,7 +692,7 @@ def _march(
                             return True
                     _end_stage(stage, h, step, work)
                 piece += 1
-                if pieces < _MOST_PIECES and _jumped(h, steps, step, work):
+                if pieces < _MOST_PIECES and _has_jump(h, steps, step, work):
                     # Again, in parts.
                     for i in range(step.x.shape[0]):
                         step.x[i] = step.began[i]
@@ -699,7 +714,12 @@ _TRAJECTORY = types.UniTuple(_MATRIX, 3)
 
 
 def _simulate(
-    forces: Any, rates: Any, model_parts: Any, scenario_parts: Any, steps: Any, out: Any
+    forces: Forces,
+    rates: Rates,
+    model_parts: tuple[tuple[Integers, ...], Array, Array, _Arrays],
+    scenario_parts: _Arrays,
+    steps: tuple[int, float, float],
+    out: _Arrays,
 ) -> bool:
     # Pointers hold nothing: what they lead to is held by this function or by its caller.
     placement, equations = Placement(*model_parts[0]), Equations(*model_parts[3])
@@ -744,7 +764,7 @@ def simulate(laws: Laws, model: Model, scenario: Scenario, steps: Steps, out: Tr
         out: Where the motion is written.
     """
     parts = (tuple(model.placement), model.parameters, model.struts, tuple(model.equations))
-    return _simulate(*laws, parts, tuple(scenario), tuple(steps), tuple(out))
+    return _simulate(*laws, parts, tuple(scenario), steps[:], tuple(out))
 
 
 class StrutMotion(NamedTuple):
@@ -771,7 +791,9 @@ class LawValues(NamedTuple):
     start: Array
 
 
-def _along(forces: Any, rates: Any, values: Any, motion: Any, substeps: int, out: Array) -> None:
+def _along(
+    forces: Forces, rates: Rates, values: _Arrays, motion: _Arrays, substeps: int, out: Array
+) -> None:
     force = forces[0]
     rate = rates[0]
     t, z, w, applied, temperature = motion

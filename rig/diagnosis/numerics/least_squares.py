@@ -213,7 +213,7 @@ def solve(
     jacobian, fresh = differences.jacobian(x, r, space, 1), True
     for _ in range(effort.steps):
         point = _Point(x, r, known.centre, level * known.weight**2)
-        accepted = _damped_step(differences.residual_of, point, space, (jacobian, fresh), damping)
+        accepted = _lower_cost(differences.residual_of, point, space, (jacobian, fresh), damping)
         if accepted is None:
             if fresh:
                 break
@@ -254,7 +254,7 @@ class _Point(NamedTuple):
         return float(self.residual @ self.residual + offset @ (self.precision * offset))
 
 
-def _damped_step(
+def _lower_cost(
     residual_of: ResidualOf,
     point: _Point,
     space: Space,

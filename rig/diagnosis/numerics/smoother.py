@@ -12,7 +12,7 @@ References:
     concentrated likelihood.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import types
@@ -75,10 +75,10 @@ def _transition(h: float, a: Array, q: Array) -> None:
     q[3, 3] = h
 
 
-_F8: Any = types.float64
-_V: Any = types.Array(types.float64, 1, "C")
-_M: Any = types.Array(types.float64, 2, "C")
-_T3: Any = types.Array(types.float64, 3, "C")
+_F8 = types.float64
+_V = types.Array(types.float64, 1, "C")
+_M = types.Array(types.float64, 2, "C")
+_T3 = types.Array(types.float64, 3, "C")
 _transition_c = compile_loop(_transition, types.void(_F8, _M, _M))
 
 
@@ -186,8 +186,8 @@ def _smooth(t: Array, ratio: float, means: Array, covariances: Array) -> None:
         if abs(h - last) > 1e-12:
             _transition_c(h, a, q)
             last = h
-        p = covariances[k].copy()
-        m = means[k].copy()
+        p: Array = covariances[k].copy()
+        m: Array = means[k].copy()
         ap = a @ p
         ahead = ap @ a.T + ratio * q
         # Scale to unit diagonal: the states differ by many orders of magnitude.
@@ -240,7 +240,7 @@ def estimate_noise(t_s: Array, y: Array) -> Noise:
     # Where the likelihood hardly differs, the smoothest: a white signal has no best one.
     best = int(np.argmax(np.array(values) <= min(values) + _AS_LIKELY))
     left, right = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-    optimum: Any = minimize_scalar(
+    optimum = minimize_scalar(
         deviance, bounds=(left, right), method="bounded", options={"xatol": 0.02}
     )
     log_ratio = float(optimum.x)

@@ -58,11 +58,11 @@ from rig.diagnosis.problem.problem import (
     ResidualForces,
     RunEvaluation,
     Segment,
-    evaluated_nodes,
     first_starts,
     nominal,
     nominal_model,
     rms,
+    select_nodes,
     slots_of,
     state_scales,
     strut_constants,
@@ -351,20 +351,20 @@ class FreeRunProblem(Problem):
         every = dynamics.finer
         weight = 1.0 / self.noise_m
 
-        def whitened_heights(forces: Array) -> Array:
+        def whiten_heights(forces: Array) -> Array:
             """Whitened heights (m,) under generalised forces (N, n)."""
             return (dynamics.heights(forces)[rows * every] * weight).ravel()
 
         mechanism = FilterMechanism(run.mechanism.cut(cut), grid.t_s[cut], t_s)
 
         def respond_to(strut: int, force: Array) -> Array:
-            return whitened_heights(mechanism.jacobian[:, strut] * force[:, np.newaxis])
+            return whiten_heights(mechanism.jacobian[:, strut] * force[:, np.newaxis])
 
         raw = grid.heights_m[cut] - simulated.heights_m[cut]
         held = dynamics.holding_forces(states[0], states[1], grid.t_s[cut], t_s)
-        target = (raw[rows] * weight).ravel() - whitened_heights(held)
+        target = (raw[rows] * weight).ravel() - whiten_heights(held)
         columns = [
-            whitened_heights(mechanism.unit_force(parameter, along, acceleration, self.motions))
+            whiten_heights(mechanism.unit_force(parameter, along, acceleration, self.motions))
             for parameter in self.linear
         ]
         initial = [(h[rows * every] * weight).ravel() for h in dynamics.free_motions(len(t_s))]
@@ -395,7 +395,7 @@ class FreeRunProblem(Problem):
         """Figures of a held-out recording: heights are DART's, with the applied force as input."""
         del fitted_rms_n
         run = self.runs[k]
-        grid, rows = run.grid, evaluated_nodes(run.grid, blocks=blocks)
+        grid, rows = run.grid, select_nodes(run.grid, blocks=blocks)
         measured = np.where(rows[:, np.newaxis], grid.heights_m, np.nan)
         simulated = [self.simulate(run, model, model.parts.starts[k]) for model in models]
         motions = [motion for motion in simulated if motion is not None]

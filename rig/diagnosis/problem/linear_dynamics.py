@@ -79,7 +79,7 @@ class LinearDynamics:
         self, m: LinearisedMechanism, constants: Array, duration_s: float, coarse_s: float
     ) -> None:
         n = m.coordinates
-        jacobian = m.jacobian.mean(axis=0)
+        jacobian: Array = m.jacobian.mean(axis=0)
         mass = m.mass.mean(axis=0)
         stiffness = jacobian.T @ np.diag(constants[:, 1]) @ jacobian - m.bias_q.mean(axis=0)
         damping = jacobian.T @ np.diag(constants[:, 2]) @ jacobian - m.bias_v.mean(axis=0)
@@ -109,7 +109,8 @@ class LinearDynamics:
     def heights(self, forces: Array) -> Array:
         """Heights (N, struts) from rest under generalised forces (N, n)."""
         out = np.empty((len(forces), len(self._jacobian)))
-        respond(*self._parts, np.ascontiguousarray(forces), out)
+        transition, early, late, output = self._parts
+        respond(transition, early, late, output, np.ascontiguousarray(forces), out)
         return out
 
     def holding_forces(self, z: Array, w: Array, nodes_s: Array, t_s: Array) -> Array:

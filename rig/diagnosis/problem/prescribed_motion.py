@@ -35,10 +35,10 @@ from rig.diagnosis.problem.problem import (
     ResidualForces,
     RunEvaluation,
     Segment,
-    evaluated_nodes,
     nominal,
     nominal_model,
     rms,
+    select_nodes,
     state_scales,
     strut_effects,
 )
@@ -285,7 +285,7 @@ class PrescribedProblem(Problem):
     ) -> RunEvaluation:
         """Figures of a held-out recording: forces along the smoothed motion."""
         run = self.runs[k]
-        rows = evaluated_nodes(run.grid, blocks=blocks) & run.certain
+        rows = select_nodes(run.grid, blocks=blocks) & run.certain
         measured = np.where(rows, run.cells_n, np.nan)
         forces = [
             track.strut_forces(self, model, run.along, self.states(k, model)) for model in models

@@ -343,7 +343,7 @@ class Problem(ABC):
         )
 
 
-def evaluated_nodes(grid: RecordingGrid, *, blocks: bool) -> Flags:
+def select_nodes(grid: RecordingGrid, *, blocks: bool) -> Flags:
     """Nodes of a recording that are evaluated on: its held-out blocks, or all, shape (N,)."""
     return grid.held_out if blocks else np.ones_like(grid.held_out)
 

@@ -63,7 +63,7 @@ def _search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
     if pool.at_floor(pool.linear):
         return None
     first = _screen_single_laws(pool, progress)
-    best = _best_refined([first.screenings])[:1]
+    best = _refine_best_of_each([first.screenings])[:1]
     if not any(_gains(pool, pool.linear_stage, first.nothing, screening) for screening in best):
         pool.take_every_sample()
         first = _screen_single_laws(pool, progress)
@@ -76,7 +76,7 @@ def _search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
         if levels:
             beam = _diverse(levels[-1], criteria.beam)
             rounds = _screen_rounds(pool, stage, beam, within(progress, begin, 0.5 * (begin + end)))
-        level = _best_refined(rounds)
+        level = _refine_best_of_each(rounds)
         if not level or not _gains(pool, stage, min(beam, key=_cost), level[0]):
             break
         chosen = _choose_for_fitting(pool, level) + _remove_laws(pool, levels, level[:2])
@@ -135,7 +135,7 @@ def _expand_along_motion(pool: Pool, reference: ValidatedModel, progress: Progre
     """Fit single laws in the order of the regression about a model's motion."""
     stage = stage_of(pool.problem, reference.fit.model)
     rounds = _screen_rounds(pool, stage, [no_law(stage)], within(progress, 0.0, 0.5))
-    level = [s for s in _best_refined(rounds) if s.laws != reference.fit.candidate.new]
+    level = [s for s in _refine_best_of_each(rounds) if s.laws != reference.fit.candidate.new]
     _fit_all(pool, stage, reference, _choose_for_fitting(pool, level), within(progress, 0.5, 1.0))
 
 
@@ -175,7 +175,7 @@ def _screen_rounds(
     return rounds
 
 
-def _best_refined(rounds: Sequence[Sequence[Screening]]) -> list[Screening]:
+def _refine_best_of_each(rounds: Sequence[Sequence[Screening]]) -> list[Screening]:
     """Combinations that were refined along the motion, each at its best, best first."""
     return best_of_each(
         screening for screenings in rounds for screening in screenings if screening.values

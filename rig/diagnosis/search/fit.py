@@ -108,7 +108,7 @@ class Fit(NamedTuple):
         return float(np.mean(self.residual**2))
 
 
-def whitened_residual(problem: Problem, model: CandidateModel) -> Array | None:
+def whiten_residual(problem: Problem, model: CandidateModel) -> Array | None:
     """Whitened residual of all recordings, shape (m,), or None where the model runs away."""
     residuals: list[Array] = []
     for k in range(problem.recordings):
@@ -233,7 +233,7 @@ class _Layout:
         return self.problem.residual(k, self.model(x))
 
     def residual(self, x: Array) -> Array | None:
-        return whitened_residual(self.problem, self.model(x))
+        return whiten_residual(self.problem, self.model(x))
 
     def rows(self, blocks: list[Integers]) -> dict[int, Rows]:
         """The rows that depend on each variable of an initial vector: those of its recording."""
@@ -380,7 +380,7 @@ def fit_covariance(result: Fit) -> FitCovariance:
 def _sandwich(result: Fit) -> FitCovariance:
     jacobian, residual = result.solution.jacobian, result.solution.residual
     prior = result.solution.prior
-    size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + prior, _TINY))
+    size: Array = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + prior, _TINY))
     scaled = jacobian / size
     inverse = np.linalg.pinv(scaled.T @ scaled + np.diag(prior / size**2), rcond=1e-13)
     count = int(result.blocks.max()) + 1

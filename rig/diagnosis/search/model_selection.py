@@ -86,7 +86,7 @@ def select_model(
     lawless = _with_few_corrections(pool, pool.linear)[0] if final.size else final
     rejected = ()
     if first_round is not None:
-        rejected = _rejected_effects(first, first_round, pool.linear, final, rivals)
+        rejected = _list_rejections(first, first_round, pool.linear, final, rivals)
     return SearchResult(
         pool.given, pool.linear, lawless, final, rivals, superfluous, rejected, alike
     )
@@ -334,7 +334,7 @@ def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] |
 # --- rejected laws ----------------------------------------------------------------------------
 
 
-def _rejected_effects(
+def _list_rejections(
     first: Pool,
     first_round: FirstRound,
     linear: ValidatedModel,
@@ -356,14 +356,16 @@ def _rejected_effects(
         why = (
             "these data cannot distinguish it from the chosen model"
             if law in tied
-            else _why_rejected(first, chosen.size, share, law, residual)
+            else _reason_of_rejection(first, chosen.size, share, law, residual)
         )
         strut, name = first.problem.spec.struts[law[0]].name, law[1]
         rejected[law] = RejectedEffect(effect(name).family, name, strut, why, min(residual, 1.0))
     return tuple(sorted(rejected.values(), key=lambda r: 1.0 if r.left is None else r.left))
 
 
-def _why_rejected(first: Pool, laws: int, share: float, law: StrutEffect, residual: float) -> str:
+def _reason_of_rejection(
+    first: Pool, laws: int, share: float, law: StrutEffect, residual: float
+) -> str:
     candidate = nominal(first.problem).with_effects(law)
     if candidate in first.invalid:
         return first.invalid[candidate]

@@ -176,15 +176,11 @@ class Pool:
             linear = linear + shift * np.array(shifted)
         least = np.array([p.least for p in self.problem.linear])
         candidate = base.with_effects(*screening.laws)
-        model = self._with_fitted_starts(
-            candidate, np.maximum(linear, least), np.concatenate(values)
-        )
+        model = self._fit_starts(candidate, np.maximum(linear, least), np.concatenate(values))
         # Priors weigh as in the regression: a free run may begin far off with right parameters.
         self.attempt(model, effort, max(1.0, screening.cost / len(stage.target)))
 
-    def _with_fitted_starts(
-        self, candidate: Candidate, linear: Array, effects: Array
-    ) -> CandidateModel:
+    def _fit_starts(self, candidate: Candidate, linear: Array, effects: Array) -> CandidateModel:
         """A model with fitted initial states; those of a poorer model compensate its error."""
         parts = Parts(linear, effects, first_starts(self.problem, candidate))
         model, none_free = CandidateModel(candidate, parts), np.zeros(len(linear), dtype=np.bool_)
@@ -194,7 +190,7 @@ class Pool:
     def adopt(self, result: Fit) -> None:
         """Fit the laws of a model of other recordings, starting from its parameters."""
         parts = result.parts
-        self.attempt(self._with_fitted_starts(result.candidate, parts.linear, parts.effects))
+        self.attempt(self._fit_starts(result.candidate, parts.linear, parts.effects))
 
     def reject(self, candidate: Candidate, why: str) -> None:
         """Mark a candidate as invalid, for a reason that its last fit shows."""

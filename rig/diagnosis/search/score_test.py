@@ -31,7 +31,7 @@ from rig.diagnosis.problem.problem import (
     strut_constants,
 )
 from rig.diagnosis.problem.track import law_force, linear_forces
-from rig.diagnosis.search.fit import Fit, law_space, law_values, model_for, whitened_residual
+from rig.diagnosis.search.fit import Fit, law_space, law_values, model_for, whiten_residual
 from rig.diagnosis.search.screen import candidate_laws, is_compatible, law_starts, scale_law
 
 Array = NDArray[np.float64]
@@ -116,7 +116,7 @@ def find_changes(
     exchanges = list(_exchanges(base))
     for _, name in [*laws, *(at for at, _ in (*additions, *exchanges))]:
         compile_law(name)  # Compiled here: numba's compiler is not thread-safe.
-    replaced = {at: _replaced_law(base, at) for at in laws}
+    replaced = {at: _remove_law_force(base, at) for at in laws}
     with ThreadPoolExecutor(cpu_count()) as pool:
         tested = [
             *pool.map(lambda job: _test_addition(base, *job), additions),
@@ -173,7 +173,7 @@ def _test_addition(base: _Base, at: StrutEffect, start: Array) -> ModelChange | 
     return None if values is None else _change(base, candidate, at, values, size * column)
 
 
-def _replaced_law(base: _Base, at: StrutEffect) -> _ReplacedLaw:
+def _remove_law_force(base: _Base, at: StrutEffect) -> _ReplacedLaw:
     values = law_values(base.problem, base.fit)[at]
     linear, force_n = linear_forces(base.tracks, at[0]), _forces(base, at, values)
     return _ReplacedLaw(at, values, linear, force_n - linear @ (linear.T @ force_n))
@@ -225,7 +225,7 @@ def _response(base: _Base, candidate: Candidate, at: StrutEffect, values: Array)
 
     None where the model runs away.
     """
-    residual = whitened_residual(
+    residual = whiten_residual(
         base.problem, model_for(base.problem, base.fit, candidate, {at: values})
     )
     if residual is None:

@@ -3,8 +3,8 @@
 import base64
 import json
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -71,7 +71,7 @@ class Panel(NamedTuple):
     x: Array
     curves: Sequence[LineStyle]
     values: Sequence[Array]
-    extra: dict[str, Any]
+    extra: Mapping[str, object]
 
 
 class Plot(NamedTuple):
@@ -261,7 +261,7 @@ def _spectra(series: Sequence[FittedSeries], shown: Sequence[LineStyle]) -> list
     if mean is None:
         return []
     densities = (mean.before_n_per_sqrt_hz, mean.after_n_per_sqrt_hz)[: len(shown)]
-    extra: dict[str, Any] = {"log": True}
+    extra: dict[str, object] = {"log": True}
     highest = max(_largest(density) for density in densities)
     if highest > 0.0:
         # Far below the peak, a smoothed residual only shows the smoother's own roll-off.
@@ -285,7 +285,7 @@ def _over_time(
     kept = np.unique(
         np.concatenate([envelope(column, points // len(columns)) for column in columns])
     )
-    extra: dict[str, Any] = {"reach": _finite(reach)}
+    extra: dict[str, object] = {"reach": _finite(reach)}
     if several:
         ends = (*joined.begins[1:], float(joined.t_s[-1]))
         extra["marks"] = [

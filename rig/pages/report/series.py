@@ -9,7 +9,7 @@ References:
 
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,8 +141,7 @@ def spectrum(series: Sequence[FittedSeries]) -> Spectrum | None:
     size = min(size, _LONGEST_SEGMENT)
     # A constant part is the preload, which the other panels show; here it would leak.
     densities = [
-        cast("Any", signal).welch(run, 1.0 / step_s, nperseg=size, axis=0, detrend="constant")
-        for run in runs
+        signal.welch(run, 1.0 / step_s, nperseg=size, axis=0, detrend="constant") for run in runs
     ]
     weights = [len(run) for run in runs]
     mean: Array = np.average([density for _, density in densities], axis=0, weights=weights)
@@ -174,9 +173,7 @@ def surface(series: Sequence[FittedSeries]) -> Surface | None:
     if len(height) < 2 or np.ptp(height) <= 0.0 or np.ptp(velocity) <= 0.0:
         return None
     values = [before[there], after[there], np.ones_like(height)]
-    binned = cast("Any", stats).binned_statistic_2d(
-        velocity, height, values, statistic="sum", bins=_CELLS
-    )
+    binned = stats.binned_statistic_2d(velocity, height, values, statistic="sum", bins=_CELLS)
     before_n, after_n, count = cast("Array", binned.statistic)
     rows, columns = cast("Array", binned.x_edge), cast("Array", binned.y_edge)
     least = max(3, len(height) // 20_000)

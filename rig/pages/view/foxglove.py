@@ -12,7 +12,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,10 @@ from numpy.typing import NDArray
 from can_dbc.errors import InputError
 from rig.pages.view.run_status import WatchedRun
 from rig.run.changes import read_changes
+
+if TYPE_CHECKING:
+    from foxglove import Channel, Parameter
+    from foxglove.websocket import PlaybackControlRequest, PlaybackState
 
 HOST = "127.0.0.1"
 
@@ -66,17 +71,16 @@ class Playback(NamedTuple):
 class Topic:
     """A run, and the number of its steps that have been published."""
 
-    def __init__(self, run: WatchedRun, name: str, new_channel: Callable[..., Any]) -> None:
+    def __init__(self, run: WatchedRun, name: str, new_channel: "Callable[..., Channel]") -> None:
         self.run, self.name, self._new_channel = run, name, new_channel
-        self._channel: Any = None
+        self._channel: Channel | None = None
         self._paths: tuple[tuple[str, ...], ...] = ()
         self._published = 0
 
     @property
     def epoch_ns(self) -> int | None:
         """Epoch of the run; None before it has begun."""
-        epoch_ns = self.run.header.get("epoch_ns")
-        return None if epoch_ns is None else int(epoch_ns)
+        return self.run.epoch_ns
 
     @property
     def is_subscribed(self) -> bool:
@@ -119,7 +123,7 @@ class Topic:
 
     def parameters(self) -> dict[str, object]:
         """Numbers and texts of the configuration, with the changes during the run."""
-        parameters = dict(_flat(self.name, self.run.header.get("config", {})))
+        parameters = dict(_flat(self.name, self.run.config))
         for _, changes in read_changes(self.run.folder):
             parameters |= {f"{self.name}.{key}": value for key, value in changes.items()}
         return parameters
@@ -195,7 +199,7 @@ class FoxgloveView:
             time.sleep(_PUBLISH_EVERY_S)
         self.close()
 
-    def play(self, request: Any) -> Any:
+    def play(self, request: "PlaybackControlRequest") -> "PlaybackState":
         """Carry out a client's request to the playback; a thread of the SDK calls it."""
         with self._lock:
             epoch_ns, before = cast("int", self._epoch_ns()), self._playback
@@ -214,7 +218,7 @@ class FoxgloveView:
             self._has_begun = True
             return self._state(epoch_ns, request.seek_time is not None, request.request_id)
 
-    def parameters(self, names: Sequence[str]) -> list[Any]:
+    def parameters(self, names: Sequence[str]) -> "list[Parameter]":
         """Parameters by name, or all of them."""
         values = self._all_parameters()
         return [
@@ -273,7 +277,7 @@ class FoxgloveView:
         if before.is_playing != self._playback.is_playing:
             self._server.broadcast_playback_state(self._state(epoch_ns, did_seek=False))
 
-    def _state(self, epoch_ns: int, did_seek: bool, request: str | None = None) -> Any:
+    def _state(self, epoch_ns: int, did_seek: bool, request: str | None = None) -> "PlaybackState":
         playback, words = self._playback, self._sdk.websocket.PlaybackStatus
         at_rest = words.Paused if playback.position_ns < self._end_ns else words.Ended
         return self._sdk.websocket.PlaybackState(
@@ -296,24 +300,28 @@ class FoxgloveView:
         self._parameters = now
 
 
-def _listener(sdk: Any, view: FoxgloveView) -> Any:
+def _listener(sdk: ModuleType, view: FoxgloveView) -> object:
     """Callbacks for the SDK, whose threads call them."""
 
     class Listener(sdk.websocket.ServerListener):
-        def on_get_parameters(self, _client: Any, names: list[str], _id: str | None = None) -> Any:
+        def on_get_parameters(
+            self, _client: object, names: list[str], _id: str | None = None
+        ) -> "list[Parameter]":
             return view.parameters(names)
 
-        def on_set_parameters(self, _client: Any, given: list[Any], _id: str | None = None) -> Any:
+        def on_set_parameters(
+            self, _client: object, given: "list[Parameter]", _id: str | None = None
+        ) -> "list[Parameter]":
             # A client cannot change anything: it gets the current values.
             return view.parameters([parameter.name for parameter in given])
 
-        def on_playback_control_request(self, request: Any) -> Any:
+        def on_playback_control_request(self, request: "PlaybackControlRequest") -> "PlaybackState":
             return view.play(request)
 
     return Listener()
 
 
-def _sdk() -> Any:
+def _sdk() -> ModuleType:
     try:
         foxglove = importlib.import_module("foxglove")  # an extra that may not be there
         importlib.import_module("foxglove.websocket")
@@ -368,7 +376,7 @@ def _message(paths: Sequence[Sequence[str]], row: NDArray[np.float64]) -> dict[s
 
 def _flat(key: str, value: object) -> list[tuple[str, object]]:
     if isinstance(value, Mapping):
-        items: Any = cast("Mapping[str, object]", value).items()
+        items = cast("Mapping[object, object]", value).items()
     elif isinstance(value, list):
         items = enumerate(cast("list[object]", value))
     else:

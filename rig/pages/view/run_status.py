@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
 
 from can_dbc.bus_load import frame_time_s
 from can_dbc.database import load_database
@@ -13,7 +12,7 @@ from can_dbc.errors import InputError
 from dart_model.spec import ModelSpec, load_model
 from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
 from rig.log.follower import RunFollower
-from rig.log.reader import read_header
+from rig.log.reader import ConfigEntry, Ending, RunHeader, read_header
 
 _SILENT_S = 2.0
 """Time without a write after which a run without an ending counts as killed."""
@@ -34,15 +33,29 @@ class WatchedRun:
         self.follower = RunFollower(folder)
         self.lock = threading.Lock()
         """Guards the follower."""
-        self.header: Mapping[str, Any] = {}
-        """Content of `run.yaml`; empty before it exists."""
+        self.header: RunHeader | None = None
+        """Content of `run.yaml`; None before it exists."""
         self.model: ModelSpec | None = None
         """The model that ran; None before its copy exists."""
         self.frame_times_s: Mapping[tuple[int, bool], float] = {}
         """Time that a frame occupies the bus, by identifier and whether that is extended."""
         self._stamp = -1.0
-        self._epoch_ns: object = None
         self._error: str | None = None
+
+    @property
+    def epoch_ns(self) -> int | None:
+        """Unix time of the run's start; None before its header exists."""
+        return None if self.header is None else self.header["epoch_ns"]
+
+    @property
+    def config(self) -> ConfigEntry:
+        """Configuration of the run; empty before its header exists."""
+        return {} if self.header is None else self.header.get("config", {})
+
+    @property
+    def ending(self) -> Ending:
+        """How the run ended; empty before it did."""
+        return {} if self.header is None else self.header.get("ending") or {}
 
     def update(self) -> None:
         """Read what has been written since the last call."""
@@ -55,11 +68,11 @@ class WatchedRun:
             self._stamp, self._error = stamp, None
             try:
                 header = read_header(self.folder)
-                if self.follower.is_another or header["epoch_ns"] != self._epoch_ns:
+                if self.follower.is_another or header["epoch_ns"] != self.epoch_ns:
                     # The folder holds another run.
                     self.follower = RunFollower(self.folder)
                     self.model, self.frame_times_s = None, {}
-                self.header, self._epoch_ns = header, header["epoch_ns"]
+                self.header = header
                 self._read_copies()
             except InputError as error:
                 self._error = str(error)
@@ -70,12 +83,12 @@ class WatchedRun:
         """A word for the state of the run, and a sentence about it."""
         if self._error is not None:
             return "unreadable", self._error
-        if not self.header:
+        if self.header is None:
             return self._without_header()
         if self.follower.unread_bytes > _MUCH_BYTES:
             return "reading", f"Reading: {self.follower.share_read:.0%}"
         if "ending" in self.header or "capture" in self.header:
-            return self._end_state()
+            return self._end_state(self.header)
         if self._age_s() < _SILENT_S:
             return "live", "Being written."
         return "killed", (
@@ -90,11 +103,11 @@ class WatchedRun:
             return "unreadable", f"{self.folder}: is no folder, expected a run"
         return "absent", f"{self.folder}: holds no run yet; it is shown once it does."
 
-    def _end_state(self) -> tuple[str, str]:
-        capture = cast("Mapping[str, Any] | None", self.header.get("capture"))
+    def _end_state(self, header: RunHeader) -> tuple[str, str]:
+        capture = header.get("capture")
         if capture is not None:
             return "done", f"A window around a fault: {capture.get('why')}."
-        status = str(cast("Mapping[str, Any]", self.header["ending"]).get("status"))
+        status = str(header.get("ending", {}).get("status"))
         if not self.follower.steps:
             return "empty", f"Ended ({status}) without a single tick."
         words = {"done": "Ended in order.", "safe": "Ended in its safe state."}
@@ -114,7 +127,7 @@ class WatchedRun:
         if self.model is None and model.exists():
             self.model = load_model(model)
         if not self.frame_times_s and dbc.exists():
-            bus = cast("Mapping[str, Any]", self.header.get("config", {})).get("bus", {})
+            bus = self.config.get("bus", {})
             bitrate, data_bitrate = bus.get("bitrate", 500_000), bus.get("data_bitrate")
             self.frame_times_s = {
                 message.key: frame_time_s(message, bitrate, data_bitrate)

@@ -6,6 +6,7 @@ a page that lost its connection repeats its request. The server keeps no state o
 
 import json
 import secrets
+import socket
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -116,7 +117,9 @@ class ViewServer(ThreadingHTTPServer):
         for diagnosis in getattr(self, "diagnoses", ()):
             diagnosis.cancel()
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
+    def handle_error(
+        self, request: socket.socket | tuple[bytes, socket.socket], client_address: object
+    ) -> None:
         """Report an error, unless a browser closed its connection during an answer."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
@@ -137,7 +140,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _view(self) -> ViewServer:
         return cast("ViewServer", self.server)
 
-    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - the base's name
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - the base's name
         """Print nothing: a page makes twenty requests a second."""
 
     def do_GET(self) -> None:
@@ -271,12 +274,12 @@ def _runs(view: ViewServer, _query: _Query) -> Answer:
     return _json([_describe_run(view, run) for run in view.runs])
 
 
-def _describe_run(view: ViewServer, run: WatchedRun) -> dict[str, Any]:
+def _describe_run(view: ViewServer, run: WatchedRun) -> dict[str, object]:
     with run.lock:
         run.update()
         state, words = run.state()
-        config = cast("Mapping[str, Any]", run.header.get("config", {}))
-        ending = cast("Mapping[str, Any]", run.header.get("ending") or {})
+        config = run.config
+        ending = run.ending
         return {
             "name": run.folder.name or str(run.folder),
             "folder": str(run.folder),
@@ -285,7 +288,7 @@ def _describe_run(view: ViewServer, run: WatchedRun) -> dict[str, Any]:
             "model": run.model.name if run.model is not None else None,
             "struts": [strut.name for strut in run.model.struts] if run.model is not None else [],
             "rate_hz": config.get("rate_hz"),
-            "epoch_ns": str(run.header.get("epoch_ns", "")),
+            "epoch_ns": "" if run.epoch_ns is None else str(run.epoch_ns),
             "columns": list(run.follower.columns),
             "span_s": run.follower.span_s,
             "steps": run.follower.steps,
@@ -342,7 +345,7 @@ def _closely(view: ViewServer, query: _Query) -> Answer:
                 "laws": visible_stretch.laws({**models, **view.models}, run.follower, rows, strut),
                 "spectrum": visible_stretch.spectrum(run.follower, rows, strut),
                 "bus": visible_stretch.bus_load(
-                    run.folder, run.header.get("epoch_ns", 0), run.frame_times_s, end_s
+                    run.folder, run.epoch_ns or 0, run.frame_times_s, end_s
                 ),
                 "timing": read_histograms(run.folder),
             }
@@ -371,11 +374,11 @@ _ANSWERS: Mapping[str, Callable[[ViewServer, _Query], Answer]] = {
 _Body = dict[str, Any]
 
 
-def _set(view: ViewServer, query: _Query, body: _Body) -> Mapping[str, Any]:
+def _set(view: ViewServer, query: _Query, body: _Body) -> Mapping[str, object]:
     return ask(query.run(view).folder, body)
 
 
-def _diagnose(view: ViewServer, query: _Query, body: _Body) -> Mapping[str, Any]:
+def _diagnose(view: ViewServer, query: _Query, body: _Body) -> Mapping[str, object]:
     """Start a diagnosis; `held_out` are indices of runs, `model` one of the view's or empty."""
     index = query.index(view)
     others = [_index(view, number) for number in body.get("held_out", [])]
@@ -400,13 +403,13 @@ def _state(run: WatchedRun) -> str:
         return run.state()[0]
 
 
-def _cancel(view: ViewServer, query: _Query, _body: _Body) -> Mapping[str, Any]:
+def _cancel(view: ViewServer, query: _Query, _body: _Body) -> Mapping[str, object]:
     diagnosis = view.diagnoses[query.index(view)]
     diagnosis.cancel()
     return diagnosis.state()
 
 
-_ACTIONS: Mapping[str, Callable[[ViewServer, _Query, _Body], Mapping[str, Any]]] = {
+_ACTIONS: Mapping[str, Callable[[ViewServer, _Query, _Body], Mapping[str, object]]] = {
     "/set": _set,
     "/diagnose": _diagnose,
     "/cancel": _cancel,

@@ -3,7 +3,6 @@
 import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,9 +109,7 @@ def spectrum(follower: RunFollower, rows: Array, strut: str) -> dict[str, list[f
     step_s = float(np.median(np.diff(t_s)))
     even = np.arange(t_s[0], t_s[-1], step_s)
     force = np.interp(even, t_s[valid], force[valid])
-    frequency, power = cast("Any", signal).welch(
-        force, 1.0 / step_s, nperseg=min(_SPECTRUM_POINTS, len(force))
-    )
+    frequency, power = signal.welch(force, 1.0 / step_s, nperseg=min(_SPECTRUM_POINTS, len(force)))
     return {
         "frequency_hz": _numbers(frequency[1:]),
         "density": _numbers(np.sqrt(np.maximum(power[1:], 1e-30))),

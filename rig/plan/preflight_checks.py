@@ -11,12 +11,11 @@ from dart_model.protocol import AnyPlant
 from dart_model.spec import InlineSkeleton
 from rig.channels.channel import Channel
 from rig.channels.quantities import LOAD_CELL_FORCE
-from rig.closed_loop.loop import Rhythm
+from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import Pole, closed_loop_poles
 from rig.observers.protocol import SensorStep
 from rig.plan.build import build_bridge, build_plant
-from rig.plan.load import load_authentication
 from rig.plan.plan import Plan
 
 LITTLE_DAMPING = 0.02
@@ -189,13 +188,13 @@ def _authentication(plan: Plan) -> list[Finding]:
     settings = plan.config.authentication
     if settings is None:
         return []
-    load_authentication(plan)
     text = (
         f"AES-128 CMAC, {settings.mac_bits} bits, freshness {settings.freshness_bits} bits, "
         f"clocks within {settings.clock_tolerance_s:g} s"
     )
     path = plan.source.parent / settings.key_file
-    if path.stat().st_mode & _OTHERS_MAY_READ:
+    is_loaded = plan.authentication is not None
+    if is_loaded and path.stat().st_mode & _OTHERS_MAY_READ:
         text += f"; {path} can be read by others, expected mode 0600"
         return [Finding(Severity.ERROR, "authentication", text)]
     return [Finding(Severity.OK, "authentication", text)]
@@ -223,14 +222,14 @@ def _load(plan: Plan) -> Finding:
 
 def _stability(plan: Plan, plant: AnyPlant) -> list[Finding]:
     rest = tuple(strut.free_length_m for strut in plan.struts)
-    rhythm = Rhythm.of(
+    timing = SampleTiming.of(
         plan.period_ns,
         max(strut.interval_ns for strut in plan.struts),
         max(strut.delay_ns for strut in plan.struts),
     )
-    poles = closed_loop_poles(plant, plan.observers, rest, rhythm)
+    poles = closed_loop_poles(plant, plan.observers, rest, timing)
     findings = [_worst(poles), *_bandwidths(plan)]
-    late = closed_loop_poles(plant, plan.observers, rest, rhythm._replace(delay=rhythm.delay + 1))
+    late = closed_loop_poles(plant, plan.observers, rest, timing._replace(delay=timing.delay + 1))
     worst = max(pole.magnitude for pole in late)
     text = f"largest |z| {worst:.5f} with measurements one cycle late"
     if worst < 1.0:

@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from math import ceil
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import cantools.database
 from cantools.database.can import Database, Message, Node, Signal
@@ -85,7 +85,7 @@ def dbc_text(
         InputError: Two devices send under one id.
     """
     own = cast(
-        "Any", cantools.database.load_file(DEFAULT_DATABASE, database_format="dbc")
+        "Database", cantools.database.load_file(DEFAULT_DATABASE, database_format="dbc")
     )  # with its attributes
     height = next(iter(locations(devices, Dimension.LENGTH)), None)
     messages: dict[tuple[int, bool], Message] = {}
