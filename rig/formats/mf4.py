@@ -30,7 +30,7 @@ def _records(frames: list[tuple[Frame, str]], name: str) -> NDArray[np.void]:
     """Frames as the MDF standard's bus logging lays them out."""
     lengths = np.array([len(frame.data) for frame, _ in frames], dtype=np.int64)
     padded = b"".join(frame.data.ljust(64, b"\0") for frame, _ in frames)
-    fields: list[tuple[str, str, Any]] = [
+    fields: list[tuple[str, str, object]] = [
         ("BusChannel", "<u1", 1),
         ("ID", "<u4", [frame.arbitration_id for frame, _ in frames]),
         ("IDE", "<u1", [frame.is_extended for frame, _ in frames]),

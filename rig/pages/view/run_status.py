@@ -68,11 +68,11 @@ class WatchedRun:
             self._stamp, self._error = stamp, None
             try:
                 header = read_header(self.folder)
-                if self.follower.is_another or header["epoch_ns"] != self._epoch_ns:
+                if self.follower.is_another or header["epoch_ns"] != self.epoch_ns:
                     # The folder holds another run.
                     self.follower = RunFollower(self.folder)
                     self.model, self.frame_times_s = None, {}
-                self.header, self._epoch_ns = header, header["epoch_ns"]
+                self.header = header
                 self._read_copies()
             except InputError as error:
                 self._error = str(error)
