@@ -14,9 +14,10 @@ import importlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import Annotated, Literal, NamedTuple, cast
 
 from msgspec.structs import replace
+from pydantic import BaseModel, ConfigDict, Field
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
@@ -55,6 +56,45 @@ class Authentication:
     def trailer_bytes(self) -> int:
         """Bytes added to a frame."""
         return self.freshness_bytes + self.mac_bytes
+
+
+class AuthenticationSettings(BaseModel):
+    """Authentication of all frames after AUTOSAR SecOC, on CAN FD.
+
+    Attributes:
+        key_file: File with 32 hexadecimal digits, in the folder of the configuration.
+        freshness_bits: Bits of the freshness value in a frame.
+        mac_bits: Bits of the CMAC in a frame.
+        clock_tolerance_s: How far bench's and bridge's clocks may be apart. A frame that was
+            recorded longer ago is refused also by a bridge that has just been started.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    key_file: Annotated[str, Field(min_length=1, max_length=255)]
+    freshness_bits: Literal[8, 16, 24, 32] = 8
+    mac_bits: Literal[24, 32, 40, 48, 56, 64, 96, 128] = 24
+    clock_tolerance_s: Annotated[float, Field(ge=0.001, le=10.0, allow_inf_nan=False)] = 0.1
+
+    def load(self, folder: Path) -> Authentication:
+        """Authentication with the key of a file in the configuration's folder.
+
+        Raises:
+            FileError: The file cannot be read.
+            AuthenticationError: It contains no key.
+        """
+        tolerance_ns = round(self.clock_tolerance_s * 1e9)
+        return Authentication(
+            read_key(folder / self.key_file),
+            self.freshness_bits // 8,
+            self.mac_bits // 8,
+            tolerance_ns,
+        )
+
+    @property
+    def trailer_bytes(self) -> int:
+        """How much longer a frame becomes."""
+        return (self.freshness_bits + self.mac_bits) // 8
 
 
 def read_key(path: Path) -> bytes:

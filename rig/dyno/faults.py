@@ -181,8 +181,8 @@ def name_faults(tested: Characteristics, master: Master, scatter: float) -> Mast
     compared = [theirs for theirs, mine in steps if mine is not None]
     if not compared:
         raise InputError(
-            f"{tested.name}, {master.characteristics.name}: no step of equal speed and amplitude in "
-            "common, expected the same test as the master's"
+            f"{tested.name}, {master.characteristics.name}: no step of equal speed and amplitude "
+            "in common, expected the same test as the master's"
         )
     pairs = [
         _pair_strokes(own, good)

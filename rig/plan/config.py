@@ -21,7 +21,7 @@ from rig.bridge.devices import DeviceSettings
 from rig.bridge.publications import STATUS, STRUT, TIMING, Publication
 from rig.bridge.supervisor import Supervision
 from rig.bus.bus import BusConfig
-from rig.bus.secoc import Authentication
+from rig.bus.secoc import AuthenticationSettings
 from rig.channels.channel import SignalName
 from rig.channels.quantities import (
     APPLIED_FORCE,
@@ -231,33 +231,6 @@ def _mapping(choices: Sequence[Publication]) -> Callable[[object], object]:
     return read
 
 
-class AuthenticationConfig(_Frozen):
-    """Authentication of all frames after AUTOSAR SecOC, on CAN FD.
-
-    Attributes:
-        key_file: File with 32 hexadecimal digits, in the folder of the configuration.
-        freshness_bits: Bits of the freshness value in a frame.
-        mac_bits: Bits of the CMAC in a frame.
-        clock_tolerance_s: How far bench's and bridge's clocks may be apart. A frame that was
-            recorded longer ago is refused also by a bridge that has just been started.
-    """
-
-    key_file: Text
-    freshness_bits: Literal[8, 16, 24, 32] = 8
-    mac_bits: Literal[24, 32, 40, 48, 56, 64, 96, 128] = 24
-    clock_tolerance_s: Annotated[float, Field(ge=0.001, le=10.0, allow_inf_nan=False)] = 0.1
-
-    def with_key(self, key: bytes) -> Authentication:
-        """Authentication with its key, for the bus."""
-        tolerance_ns = round(self.clock_tolerance_s * 1e9)
-        return Authentication(key, self.freshness_bits // 8, self.mac_bits // 8, tolerance_ns)
-
-    @property
-    def trailer_bytes(self) -> int:
-        """How much longer a frame becomes."""
-        return (self.freshness_bits + self.mac_bits) // 8
-
-
 class LogConfig(_Frozen):
     """How the log of a run is kept.
 
@@ -324,7 +297,7 @@ class RunConfig(_Frozen):
     engine: Text = "dart"
     dbc: Text | None = None
     bus: BusConfig = BusConfig()
-    authentication: AuthenticationConfig | None = None
+    authentication: AuthenticationSettings | None = None
     signals: Signals
     devices: dict[SensorName, DeviceSettings] = Field(default_factory=dict[str, DeviceSettings])
     prescribed_motion: PrescribedMotion | None = None

@@ -7,7 +7,6 @@ from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import load_yaml, validate
 from dart_model.spec import load_model, load_named_model
-from rig.bus.secoc import read_key
 from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
 from rig.log.reader import read_header
 from rig.plan.config import RunConfig
@@ -40,8 +39,7 @@ def load_plan(path: Path, *, model: str | None = None, duration_s: float | None 
     settings = config.authentication
     if settings is None:
         return plan
-    key = read_key(path.parent / settings.key_file)
-    return replace(plan, authentication=settings.with_key(key))
+    return replace(plan, authentication=settings.load(path.parent))
 
 
 def plan_of_run(folder: Path) -> Plan:

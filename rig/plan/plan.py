@@ -23,12 +23,12 @@ from rig.bridge.publications import (
     UNCERTAINTY,
     Publication,
 )
-from rig.bus.secoc import FD_LENGTHS, Authentication
+from rig.bus.secoc import FD_LENGTHS, Authentication, AuthenticationSettings
 from rig.channels.channel import Channel, Role, SignalName
 from rig.channels.quantities import HEIGHT, LOAD_CELL_FORCE, Quantity
 from rig.observers.pi import PiObserver
 from rig.observers.protocol import AnyObserver
-from rig.plan.config import AuthenticationConfig, Mapped, RunConfig
+from rig.plan.config import Mapped, RunConfig
 
 _LARGEST_DELAY_DIFFERENCE_S = 0.02
 """Between the sensors of one strut: a filter that goes back by more at every reading takes half a
@@ -550,7 +550,7 @@ def _check_ids(device: Device, taken: dict[int, str], key: str) -> None:
 
 
 def _check_authentication(
-    config: RunConfig, settings: AuthenticationConfig, messages: list[Message], source: Path
+    config: RunConfig, settings: AuthenticationSettings, messages: list[Message], source: Path
 ) -> None:
     """Refuse messages that have no room for authentication."""
     if config.bus.data_bitrate is None:
