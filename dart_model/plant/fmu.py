@@ -24,6 +24,8 @@ from dart_model.errors import ModelError
 from dart_model.plant.admitted_programs import require_admission
 from dart_model.spec import FmuSpec
 
+_Doubles = ctypes.Array[ctypes.c_double]
+
 _MOST_ITERATIONS = 20
 """Most event iterations at one time."""
 
@@ -59,7 +61,7 @@ class MockUp:
         self.state_scales = self._unit.nominals
         self._mass_kg, self._gravity = spec.mass_kg, gravity_m_per_s2
         self._is_bench = spec.acceleration is not None
-        self._arguments: tuple[Any, ...] = ()
+        self._arguments: tuple[object, ...] = ()
         self._result: tuple[float, list[float]] = (math.nan, [])
 
     def force(self, *arguments: Any) -> float:
@@ -203,7 +205,7 @@ class _Calls:
             self.begin()
 
     def move(
-        self, t_s: float, x: Any, count: int, references: list[int], inputs: list[float]
+        self, t_s: float, x: _Doubles, count: int, references: list[int], inputs: list[float]
     ) -> None:
         """Set time, states and inputs."""
         self._it.setTime(t_s)
@@ -246,7 +248,7 @@ class _Calls:
         return list(x[:count])
 
 
-def _doubles(count: int) -> Any:
+def _doubles(count: int) -> _Doubles:
     return (ctypes.c_double * max(count, 1))()
 
 
@@ -286,9 +288,8 @@ def read_description(content: bytes, path: Path) -> Any:
         raise ModelError("the package fmpy is not installed, expected `pip install 'rig[fmu]'`")
     import fmpy
 
-    reader: Any = fmpy
     try:
-        description = reader.read_model_description(io.BytesIO(content))
+        description = cast("Any", fmpy).read_model_description(io.BytesIO(content))
     except Exception as error:  # of any library that a hostile archive may upset
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ModelError(f"{path}: is no FMU of FMI 2.0 or 3.0 ({reason[:200]})") from error
@@ -358,9 +359,8 @@ def _start(content: bytes, path: Path, description: Any, parameters: Mapping[int
     is_3 = description.fmiVersion == "3.0"
     messages: deque[str] = deque(maxlen=_MESSAGES)
     folder = tempfile.mkdtemp(prefix="rig-fmu-")
-    extract: Any = cast("Any", fmpy).extract
     try:
-        extract(io.BytesIO(content), folder)
+        cast("Any", fmpy).extract(io.BytesIO(content), folder)
         instance: Any = (FMU3Model if is_3 else FMU2Model)(
             guid=description.guid,
             unzipDirectory=folder,

@@ -94,7 +94,7 @@ def _loaded_body_name(spec: ModelSpec, bodies: dict[str, DartBody]) -> str:
 
 def _inline_skeleton(name: str, spec: InlineSkeleton) -> DartSkeleton:
     skeleton = _dart.dynamics.Skeleton(name)
-    bodies: dict[str, Any] = {}
+    bodies: dict[str, DartBody] = {}
     for body in spec.bodies:
         create, properties = _joint(body, skeleton)
         _, node = create(bodies.get(body.joint.parent), properties)
@@ -106,7 +106,7 @@ def _inline_skeleton(name: str, spec: InlineSkeleton) -> DartSkeleton:
     return skeleton
 
 
-def _joint(body: BodySpec, skeleton: Any) -> tuple[Callable[..., Any], Any]:
+def _joint(body: BodySpec, skeleton: object) -> tuple[Callable[..., Any], object]:
     kinds = {
         "prismatic": (_dart.dynamics.PrismaticJointProperties, "Prismatic"),
         "revolute": (_dart.dynamics.RevoluteJointProperties, "Revolute"),

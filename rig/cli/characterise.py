@@ -74,7 +74,7 @@ def characterise_command(
     tolerance the exit code is 1 unless every point of the band is proven to be kept, with a master
     unless the damper is as good as it.
     """
-    from rig.dyno.report import Criteria, content_of, evaluate_records, write_content
+    from rig.dyno.report import content_of, evaluate_records, write_content
     from rig.dyno.tolerance import load_tolerance
     from rig.files.folders import refuse_full
 
@@ -84,7 +84,7 @@ def characterise_command(
     if junit is not None and tolerance is None and master is None:
         raise InputError("--junit: expected --tolerance or --master, which it reports on")
     band = None if tolerance is None else load_tolerance(tolerance)
-    reports = evaluate_records(runs, strut, Criteria(band, master, scatter))
+    reports = evaluate_records(runs, strut, band, master, scatter)
     content = content_of(reports, serial, band)
     if out is not None:
         from rig.pages.characteristics_page import write_characteristics_page
@@ -121,7 +121,7 @@ def _print_steps(record: "Characteristics") -> None:
     heads = ("step", "± mm", "m/s", "compression N", "rebound N", "J a cycle", "N·s/m")
     steps = [
         (
-            KIND_WORDS[kind],
+            KIND_WORDS[step.kind],
             f"±{1e3 * step.amplitude_m:.2f}",
             f"{step.peak_speed_m_per_s:.3g}",
             with_half(step.compression.force_at_peak_velocity_n),
@@ -129,7 +129,7 @@ def _print_steps(record: "Characteristics") -> None:
             with_half(step.energy_per_cycle_j),
             with_half(step.equivalent_damping_n_s_per_m),
         )
-        for kind, step in zip(record.damper.kinds, record.steps, strict=True)
+        for step in record.steps
     ]
     print_table(heads, steps, f"{record.name} (force: {record.record.source})")
     rows = damper_rows(record)

@@ -39,16 +39,7 @@ called bent."""
 
 
 class Difference(NamedTuple):
-    """One figure in two states.
-
-    Attributes:
-        figure: Name of the figure, with the speed of its step.
-        unit: Its unit.
-        before: In the first state.
-        after: In the second state.
-        change: Second less first.
-        differs: Whether the change is significant.
-    """
+    """One figure in two states, and whether the change, second less first, is significant."""
 
     figure: str
     unit: str
@@ -59,14 +50,9 @@ class Difference(NamedTuple):
 
 
 class Trend(NamedTuple):
-    """One figure over a dose.
+    """One figure over a dose: its line, and whether the slope per unit is significant.
 
     Attributes:
-        figure: Name of the figure.
-        unit: Its unit.
-        slope: Its change per unit of the dose.
-        at_zero: Value of the line at a dose of zero.
-        differs: Whether the slope is significant.
         is_straight: Whether a straight line explains the points.
     """
 
@@ -84,24 +70,19 @@ def compare_dampers(before: Characteristics, after: Characteristics) -> list[Dif
     Raises:
         InputError: They have no figure in common.
     """
-    pairs = _common_figures([before, after])
-    changes = [_difference(second, first) for _, (first, second) in pairs.values()]
-    differs = _holm_procedure([_p_value(change) for change in changes])
     differences = [
-        Difference(name, unit, first, second, change, differ)
-        for (name, (unit, (first, second))), change, differ in zip(
-            pairs.items(), changes, differs, strict=True
-        )
+        Difference(name, unit, first, second, _difference(second, first), differs=False)
+        for name, (unit, (first, second)) in _common_figures([before, after]).items()
     ]
-    return sorted(differences, key=lambda item: not item.differs)
+    differs = _holm_procedure([item.change for item in differences])
+    marked = [
+        item._replace(differs=differ) for item, differ in zip(differences, differs, strict=True)
+    ]
+    return sorted(marked, key=lambda item: not item.differs)
 
 
 def trends_over_dose(items: Sequence[Characteristics], doses: Sequence[float]) -> list[Trend]:
     """Trends of the figures over a dose, significant ones first.
-
-    Args:
-        items: A state at each dose.
-        doses: The doses.
 
     Raises:
         InputError: There are fewer than three doses, all of one size, or no figure in common.
@@ -113,54 +94,52 @@ def trends_over_dose(items: Sequence[Characteristics], doses: Sequence[float]) -
             f"--dose: {len(doses)} for {len(items)} records, expected one each and at least three "
             "different ones"
         )
-    fits = {
-        name: (unit, _fit_line(np.array(doses), figures))
-        for name, (unit, figures) in _common_figures(items).items()
-    }
-    differs = _holm_procedure([_p_value(slope) for _, (slope, _, _) in fits.values()])
     trends = [
-        Trend(name, unit, slope, at_zero, differ, straight)
-        for (name, (unit, (slope, at_zero, straight))), differ in zip(
-            fits.items(), differs, strict=True
-        )
+        _fit_trend(name, unit, np.array(doses), figures)
+        for name, (unit, figures) in _common_figures(items).items()
     ]
-    return sorted(trends, key=lambda item: not item.differs)
+    differs = _holm_procedure([item.slope for item in trends])
+    marked = [item._replace(differs=differ) for item, differ in zip(trends, differs, strict=True)]
+    return sorted(marked, key=lambda item: not item.differs)
 
 
 def pair_steps(
     reference: Characteristics, item: Characteristics
-) -> list[tuple[DynoStep, DynoStep]]:
-    """Steps of one speed and amplitude: of the reference, and of the other record."""
-    pairs: list[tuple[DynoStep, DynoStep]] = []
-    taken: set[int] = set()
+) -> list[tuple[DynoStep, DynoStep | None]]:
+    """Steps of the reference, each with the other record's of its speed and amplitude, if any."""
+    pairs: list[tuple[DynoStep, DynoStep | None]] = []
+    free = list(item.steps)
     for step in reference.steps:
-        index = _find_nearest(step, item.steps, taken)
-        if index is not None:
-            taken.add(index)
-            pairs.append((step, item.steps[index]))
+        apart = [_relative_difference(other, step) for other in free]
+        nearest = min(apart, default=np.inf)
+        partner = free.pop(apart.index(nearest)) if nearest <= _ALIKE else None
+        pairs.append((step, partner))
     return pairs
+
+
+def _relative_difference(step: DynoStep, reference: DynoStep) -> float:
+    """Larger relative difference of the peak speeds and of the amplitudes."""
+    return max(
+        abs(step.peak_speed_m_per_s / reference.peak_speed_m_per_s - 1.0),
+        abs(step.amplitude_m / reference.amplitude_m - 1.0),
+    )
 
 
 def steps_without_partner(items: Sequence[Characteristics]) -> list[str]:
     """Steps that have no partner of their speed and amplitude in every other record, in words."""
-    texts: list[str] = []
-    for item in items:
-        for other in items:
-            taken: set[int] = set()
-            for step in item.steps if other is not item else ():
-                index = _find_nearest(step, other.steps, taken)
-                if index is not None:
-                    taken.add(index)
-                    continue
-                texts.append(
-                    f"{item.name}, ±{1e3 * step.amplitude_m:.3g} mm at "
-                    f"{step.peak_speed_m_per_s:.3g} m/s: no such step in {other.name}"
-                )
-    return texts
+    return [
+        f"{item.name}, ±{1e3 * step.amplitude_m:.3g} mm at {step.peak_speed_m_per_s:.3g} m/s: no "
+        f"such step in {other.name}"
+        for item in items
+        for other in items
+        if other is not item
+        for step, partner in pair_steps(item, other)
+        if partner is None
+    ]
 
 
-def _fit_line(doses: "np.ndarray", figures: Sequence[Figure]) -> tuple[Figure, float, bool]:
-    """Slope, value at zero, and whether a line explains the points, by weighted least squares."""
+def _fit_trend(name: str, unit: str, doses: "np.ndarray", figures: Sequence[Figure]) -> Trend:
+    """Trend of a figure by weighted least squares; whether it differs is not yet determined."""
     values = np.array([figure.value for figure in figures])
     stds = np.array([_standard_deviation(figure) for figure in figures])
     design = np.column_stack([np.ones_like(doses), doses]) / stds[:, None]
@@ -172,7 +151,7 @@ def _fit_line(doses: "np.ndarray", figures: Sequence[Figure]) -> tuple[Figure, f
     half = (student_factor(freedom) if misfit > 1.0 else _STDS) * float(np.sqrt(covariance[1, 1]))
     at_zero, slope = (float(value) for value in weights)
     figure = Figure(slope, slope - half, slope + half, f"line through {len(doses)} doses")
-    return figure, at_zero, misfit < _MISFIT
+    return Trend(name, unit, figure, at_zero, differs=False, is_straight=misfit < _MISFIT)
 
 
 def _common_figures(items: Sequence[Characteristics]) -> dict[str, tuple[str, list[Figure]]]:
@@ -201,13 +180,10 @@ def _figures_by_name(
         "rebound over compression": ("", damper.asymmetry),
         **{f"knee, {side}": ("m/s", figure) for side, figure in damper.knee_m_per_s.items()},
     }
-    taken: set[int] = set()
-    for sought in reference.steps:
-        index = _find_nearest(sought, item.steps, taken)
-        if index is None:
+    for sought, step in pair_steps(reference, item):
+        if step is None:
             continue
-        taken.add(index)
-        step, at = item.steps[index], f"at {sought.peak_speed_m_per_s:.3g} m/s"
+        at = f"at {sought.peak_speed_m_per_s:.3g} m/s"
         figures |= {
             f"compression force {at}": ("N", step.compression.force_at_peak_velocity_n),
             f"rebound force {at}": ("N", step.rebound.force_at_peak_velocity_n),
@@ -216,21 +192,6 @@ def _figures_by_name(
             f"hysteresis at the turning points {at}": ("N", step.hysteresis_at_zero_n),
         }
     return {name: (unit, figure) for name, (unit, figure) in figures.items() if figure is not None}
-
-
-def _find_nearest(sought: DynoStep, steps: Sequence[DynoStep], taken: set[int]) -> int | None:
-    """Index of the step that is most like another, if any is alike."""
-
-    def apart(step: DynoStep) -> float:
-        pairs = (
-            (step.peak_speed_m_per_s, sought.peak_speed_m_per_s),
-            (step.amplitude_m, sought.amplitude_m),
-        )
-        return max(abs(own / other - 1.0) for own, other in pairs)
-
-    free = [index for index in range(len(steps)) if index not in taken]
-    best = min(free, key=lambda index: apart(steps[index]), default=None)
-    return best if best is not None and apart(steps[best]) <= _ALIKE else None
 
 
 def _standard_deviation(figure: Figure) -> float:
@@ -243,13 +204,13 @@ def _difference(second: Figure, first: Figure) -> Figure:
     return Figure(value, value - half, value + half, second.method)
 
 
-def _p_value(figure: Figure) -> float:
-    """Probability of a value as far from zero, if the true value is zero."""
-    return 2.0 * float(ndtr(-abs(figure.value) / _standard_deviation(figure)))  # pyright: ignore[reportUnknownArgumentType]
-
-
-def _holm_procedure(p_values: Sequence[float]) -> list[bool]:
-    """Whether each is significant, at one level for all of them together."""
+def _holm_procedure(figures: Sequence[Figure]) -> list[bool]:
+    """Whether each differs from zero, at one level for all of them together."""
+    # Probabilities of values as far from zero, if the true ones are zero.
+    p_values = [
+        2.0 * float(ndtr(-abs(figure.value) / _standard_deviation(figure)))  # pyright: ignore[reportUnknownArgumentType]
+        for figure in figures
+    ]
     order = sorted(range(len(p_values)), key=lambda index: p_values[index])
     significant = [False] * len(p_values)
     for rank, index in enumerate(order):

@@ -4,12 +4,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rig.dyno.figures import QUASI_STATIC_M_PER_S, DynoStep
+from rig.dyno.figures import SIDES, DynoStep
 from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, student_factor
-
-Array = NDArray[np.float64]
+from rig.dyno.strokes import Array
 
 _ALIKE_SPEED = 0.05
 """Relative difference of speed and amplitude up to which steps are repetitions of each other."""
@@ -38,7 +36,6 @@ class Damper(NamedTuple):
     """Figures over all steps; None where the test does not determine them.
 
     Attributes:
-        kinds: Of each step `warm_up`, `quasi_static` or `velocity_step`.
         gas_force_n: At mid-stroke of the slowest step.
         gas_rate_n_per_m: Its rise per compression there.
         friction_n: Half the difference of both directions there.
@@ -48,7 +45,6 @@ class Damper(NamedTuple):
         notes: Why a figure is missing, and what was assumed.
     """
 
-    kinds: tuple[str, ...]
     gas_force_n: Figure | None
     gas_rate_n_per_m: Figure | None
     friction_n: Figure | None
@@ -59,14 +55,9 @@ class Damper(NamedTuple):
 
 
 def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
-    """Figures of a damper.
-
-    Args:
-        steps: Its steps, in time; one at least.
-    """
+    """Figures of a damper from its steps, in time; one at least."""
     notes: list[str] = []
-    kinds = _kinds(steps)
-    slow = [step for step, kind in zip(steps, kinds, strict=True) if kind == "quasi_static"]
+    slow = [step for step in steps if step.kind == "quasi_static"]
     gas_force = gas_rate = friction = None
     if slow:
         slowest = min(slow, key=lambda step: step.peak_speed_m_per_s)
@@ -89,10 +80,7 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
             "asymmetry is that of whole forces"
         )
     fastest = max(steps, key=lambda step: step.peak_speed_m_per_s)
-    knee = {
-        name: _knee(stroke)
-        for name, stroke in zip(("compression", "rebound"), fastest.strokes, strict=True)
-    }
+    knee = {name: _knee(stroke) for name, stroke in zip(SIDES, fastest.strokes, strict=True)}
     if any(stroke.is_constant for stroke in fastest.strokes):
         notes.append("no knee: the fastest step has a single speed")
     elif not any(knee.values()):
@@ -101,7 +89,6 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
     if not any(per_kelvin.values()):
         notes.append(f"no change per kelvin: no speed was run over {_LEAST_WARMING_K:g} K or more")
     return Damper(
-        kinds,
         gas_force,
         gas_rate,
         friction,
@@ -112,16 +99,14 @@ def summarise_damper(steps: Sequence[DynoStep]) -> Damper:
     )
 
 
-def _kinds(steps: Sequence[DynoStep]) -> tuple[str, ...]:
-    kinds = [
-        "quasi_static" if step.peak_speed_m_per_s <= QUASI_STATIC_M_PER_S else "velocity_step"
-        for step in steps
-    ]
-    others = [step.cycles for step in steps[1:]]
-    is_longer = len(others) >= 2 and steps[0].cycles >= _WARM_UP * float(np.median(others))
-    if kinds[0] == "velocity_step" and is_longer:
-        kinds[0] = "warm_up"
-    return tuple(kinds)
+def mark_warm_up(steps: Sequence[DynoStep]) -> tuple[DynoStep, ...]:
+    """The steps, in time, of which the first one is a warm-up if it is longer than the others."""
+    first, *others = steps
+    cycles = [step.cycles for step in others]
+    is_longer = len(cycles) >= 2 and first.cycles >= _WARM_UP * float(np.median(cycles))
+    if first.kind == "velocity_step" and is_longer:
+        first = first._replace(kind="warm_up")
+    return (first, *others)
 
 
 def _asymmetry(step: DynoStep, gas: Figure | None) -> Figure | None:
@@ -206,22 +191,17 @@ def _force_row_at(speed: Array, value: float, offset: int) -> Array:
 
 def _per_kelvin(steps: Sequence[DynoStep], index: int) -> Figure | None:
     """Change of the force at peak velocity per kelvin over steps of one speed and amplitude."""
+    if any(step.temperature_c is None for step in steps):
+        return None
     groups: list[list[DynoStep]] = []
     for step in steps:
-        if step.temperature_c is None:
-            return None
-        for group in groups:
-            if _is_same_step(group[0], step):
-                group.append(step)
-                break
-        else:
+        alike = next((group for group in groups if _is_same_step(group[0], step)), None)
+        if alike is None:
             groups.append([step])
-    best: Figure | None = None
-    for group in groups:
-        figure = _slope(group, index)
-        if figure is not None and (best is None or figure.high - figure.low < best.high - best.low):
-            best = figure
-    return best
+        else:
+            alike.append(step)
+    slopes = [slope for group in groups if (slope := _slope(group, index)) is not None]
+    return min(slopes, key=lambda slope: slope.high - slope.low, default=None)
 
 
 def _is_same_step(a: DynoStep, b: DynoStep) -> bool:

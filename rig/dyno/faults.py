@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve  # pyright: ignore[reportUnknownVariableType]
 
 from can_dbc.errors import InputError
@@ -32,8 +31,7 @@ from rig.dyno.master import (
     with_play,
 )
 from rig.dyno.stroke_force import FINE, Figure, MeanStroke
-
-Array = NDArray[np.float64]
+from rig.dyno.strokes import Array
 
 _NAMED = 32.0
 """Fall of chi-squared from which on a fault is named. Of differences that are normal one in a
@@ -68,16 +66,11 @@ _FALL = 3.84
 
 
 class Fault(NamedTuple):
-    """A fault that can be simulated.
+    """A fault that can be simulated, in sizes from the least to the most that there can be.
 
     Attributes:
-        name: Its name.
-        quantity: Meaning of its size.
-        unit: Unit of the size.
         sizes: Sizes that are tried, rising, shape (K,).
         changes: What each changes of the stacked forces, shape (K, N).
-        least: Smallest that can be.
-        most: Largest.
     """
 
     name: str
@@ -90,15 +83,7 @@ class Fault(NamedTuple):
 
 
 class NamedFault(NamedTuple):
-    """A fault with its size.
-
-    Attributes:
-        name: Its name.
-        quantity: Meaning of its size.
-        unit: Unit of the size.
-        size: Its size, with a 95 % interval.
-        evidence: By how much it lowers chi-squared.
-    """
+    """A fault with its size, a 95 % interval, and by how much it lowers chi-squared."""
 
     name: str
     quantity: str
@@ -140,111 +125,102 @@ class MasterComparison(NamedTuple):
 
     def words(self) -> str:
         """The same in a sentence."""
-        if self.not_compared:
-            said = self._replace(not_compared=()).words()
-            return f"{said}; not compared: {', '.join(self.not_compared)}"
         if self.is_good:
-            return "as its master, within what manufacturing scatters"
-        if not self.named:
-            return "not as its master, and no fault that is known explains it"
-        faults = "; ".join(item.words() for item in self.named)
-        return f"{faults}: explains {100 * self.explained:.0f} % of what differs"
+            text = "as its master, within what manufacturing scatters"
+        elif not self.named:
+            text = "not as its master, and no fault that is known explains it"
+        else:
+            faults = "; ".join(item.words() for item in self.named)
+            text = f"{faults}: explains {100 * self.explained:.0f} % of what differs"
+        missing = f"; not compared: {', '.join(self.not_compared)}" if self.not_compared else ""
+        return text + missing
 
 
-class _Stack(NamedTuple):
-    """The forces of a damper less the master's, part by part of every stroke.
+class _StrokePair(NamedTuple):
+    """The forces of a damper less the master's, part by part of a stroke.
 
     Attributes:
-        strokes: The master's strokes, in their order.
-        gathers: Of each stroke the means over its parts as rows over `FINE`, shape (parts, 361).
-        less_n: Differences, shape (N,).
-        noise_n: Standard deviation of each by the noise of its samples, shape (N,).
+        good: The master's stroke.
+        gather: Means over its parts as rows over `FINE`, shape (parts, 361).
+        less_n: Differences, shape (parts,).
+        noise_n: Standard deviation of each by the noise of its samples, shape (parts,).
     """
 
-    strokes: tuple[MeanStroke, ...]
-    gathers: tuple[Array, ...]
+    good: MeanStroke
+    gather: Array
     less_n: Array
     noise_n: Array
 
-    def bin_means(self, fine: Sequence[Array]) -> Array:
-        """Curves over `FINE` of every stroke, shape (..., 361), as means over its parts."""
-        parts = [curve @ rows.T for curve, rows in zip(fine, self.gathers, strict=True)]
-        return np.concatenate(parts, axis=-1)
+
+def _pair_strokes(own: MeanStroke, good: MeanStroke) -> _StrokePair:
+    part = np.arange(len(FINE)) * _BINS // len(FINE)
+    counts = np.bincount(part, weights=own.samples, minlength=_BINS)
+    filled = np.flatnonzero(counts)
+    rows = (part == filled[:, None]) * own.samples / counts[filled, None]
+    means = np.bincount(part, weights=own.sums_n, minlength=_BINS)[filled] / counts[filled]
+    less_n = means - rows @ (good.row(FINE) @ good.force_n)
+    return _StrokePair(good, rows, less_n, good.noise_n / np.sqrt(counts[filled]))
 
 
-def _stack(steps: Sequence[tuple[DynoStep, DynoStep]]) -> _Stack:
-    strokes: list[MeanStroke] = []
-    gathers: list[Array] = []
-    less: list[Array] = []
-    noise: list[Array] = []
-    for theirs, mine in steps:
-        for own, good in zip(mine.strokes, theirs.strokes, strict=True):
-            part = np.arange(len(FINE)) * _BINS // len(FINE)
-            counts = np.bincount(part, weights=own.samples, minlength=_BINS)
-            filled = np.flatnonzero(counts)
-            rows = (part == filled[:, None]) * own.samples / counts[filled, None]
-            means = np.bincount(part, weights=own.sums_n, minlength=_BINS)[filled] / counts[filled]
-            strokes.append(good)
-            gathers.append(rows)
-            less.append(means - rows @ _fine(good))
-            noise.append(good.noise_n / np.sqrt(counts[filled]))
-    return _Stack(tuple(strokes), tuple(gathers), np.concatenate(less), np.concatenate(noise))
-
-
-def _fine(stroke: MeanStroke) -> Array:
-    return stroke.row(FINE) @ stroke.force_n
+def _bin_means(pairs: Sequence[_StrokePair], fine: Sequence[Array]) -> Array:
+    """Curves over `FINE` of every stroke, shape (..., 361), as means over its parts."""
+    parts = [curve @ pair.gather.T for curve, pair in zip(fine, pairs, strict=True)]
+    return np.concatenate(parts, axis=-1)
 
 
 def name_faults(tested: Characteristics, master: Master, scatter: float) -> MasterComparison:
-    """The comparison of a damper with its master.
+    """The comparison of a damper with its master, a good item in the same test.
 
-    Args:
-        tested: Figures of the damper.
-        master: The good item, of the same test.
-        scatter: Relative standard deviation that manufacturing leaves of each property.
+    `scatter` is the relative standard deviation that manufacturing leaves of each property.
 
     Raises:
         InputError: No step of item has a partner in the other.
     """
     refuse_unsuitable(tested)
     steps = pair_steps(master.characteristics, tested)
-    if not steps:
+    compared = [theirs for theirs, mine in steps if mine is not None]
+    if not compared:
         raise InputError(
             f"{tested.name}, {master.characteristics.name}: no step of item speed and amplitude in "
             "common, expected the same test as the master's"
         )
-    stack = _stack(steps)
-    faults = [
-        fault._replace(changes=stack.bin_means(np.split(fault.changes, len(stack.strokes), axis=1)))
-        for fault in simulate_faults(master, [theirs for theirs, _ in steps])
+    pairs = [
+        _pair_strokes(own, good)
+        for theirs, mine in steps
+        if mine is not None
+        for own, good in zip(mine.strokes, theirs.strokes, strict=True)
     ]
-    covariance, residual_n = _covariance(stack, master, scatter), stack.less_n
+    faults = [
+        fault._replace(changes=_bin_means(pairs, np.split(fault.changes, len(pairs), axis=1)))
+        for fault in simulate_faults(master, compared)
+    ]
+    covariance = _covariance(pairs, master, scatter)
+    residual_n = np.concatenate([pair.less_n for pair in pairs])
     count = len(residual_n)
     before = _misfit(residual_n, covariance)
     beyond = max(before - count, 1.0)
     kept: list[NamedFault] = []
     for _ in range(_MOST_FAULTS):
-        rest = [item for item in faults if item.name not in {named.name for named in kept}]
-        best = min(
-            (_fit_size(item, residual_n, covariance) for item in rest), key=lambda item: item.misfit
-        )
-        if before - best.misfit < _NAMED:
+        names = [item.name for item in kept]
+        fits = [
+            _fit_size(item, residual_n, covariance, before)
+            for item in faults
+            if item.name not in names
+        ]
+        best, explained_n = max(fits, key=lambda fit: fit[0].evidence)
+        if best.evidence < _NAMED:
             break
-        fault = best.fault
-        kept.append(
-            NamedFault(fault.name, fault.quantity, fault.unit, best.size, before - best.misfit)
-        )
+        kept.append(best)
         # The uncertainty of a simulated fault grows with its size.
-        residual_n = residual_n - best.explained_n
-        covariance = covariance + np.diag((_MODEL_SHARE * best.explained_n) ** 2)
+        residual_n = residual_n - explained_n
+        covariance = covariance + np.diag((_MODEL_SHARE * explained_n) ** 2)
         before = _misfit(residual_n, covariance)
     remains = max(before - count, 0.0)
     is_good = not kept and remains <= (_WORST_MISFIT - 1.0) * count
-    compared = [theirs for theirs, _ in steps]
     lacking = tuple(
         f"±{1e3 * step.amplitude_m:.3g} mm at {step.peak_speed_m_per_s:.3g} m/s"
-        for step in master.characteristics.steps
-        if not any(step is other for other in compared)
+        for step, partner in steps
+        if partner is None
     )
     if kept and remains > (1.0 - _EXPLAINED) * beyond:
         kept = []  # the nearest fault does not explain enough
@@ -257,24 +233,10 @@ _WORST_MISFIT = 1.5
 of the study have 0.6 to 1.2."""
 
 
-class _FaultFit(NamedTuple):
-    """A fault at its best size.
-
-    Attributes:
-        fault: The fault.
-        size: Its best size, with its interval.
-        misfit: Chi-squared there.
-        explained_n: Its share of the differences.
-    """
-
-    fault: Fault
-    size: Figure
-    misfit: float
-    explained_n: Array
-
-
-def _fit_size(fault: Fault, residual_n: Array, covariance: Array) -> _FaultFit:
-    """A fault at its best size."""
+def _fit_size(
+    fault: Fault, residual_n: Array, covariance: Array, before: float
+) -> tuple[NamedFault, Array]:
+    """A fault at its best size, and its share of the differences; `before`: misfit without it."""
     nodes: Array = np.arange(len(fault.sizes), dtype=np.float64)
     tried: Array = np.linspace(0.0, float(nodes[-1]), _SIZES)
     sizes: Array = np.interp(tried, nodes, fault.sizes).astype(np.float64)
@@ -303,7 +265,8 @@ def _fit_size(fault: Fault, residual_n: Array, covariance: Array) -> _FaultFit:
         float(min(high, fault.most)),
         "profile of the likelihood, and what the run in the master is known by",
     )
-    return _FaultFit(fault, size, float(chi[best]), changes[best])
+    evidence = before - float(chi[best])
+    return NamedFault(fault.name, fault.quantity, fault.unit, size, evidence), changes[best]
 
 
 def _misfit(residual_n: Array, covariance: Array) -> float:
@@ -311,24 +274,21 @@ def _misfit(residual_n: Array, covariance: Array) -> float:
     return float(residual_n @ cho_solve(factor, residual_n))
 
 
-def _covariance(stack: _Stack, master: Master, scatter: float) -> Array:
+def _covariance(pairs: Sequence[_StrokePair], master: Master, scatter: float) -> Array:
     """Covariance of the differences between two good dampers."""
-    whole = np.diag(stack.noise_n**2)
-    parts: dict[str, list[Array]] = {}
+    whole = np.diag(np.concatenate([pair.noise_n for pair in pairs]) ** 2)
+    properties = [_property_forces(pair.good, master) for pair in pairs]
     begin = 0
-    for stroke, rows in zip(stack.strokes, stack.gathers, strict=True):
+    for (stroke, rows, *_), forces in zip(pairs, properties, strict=True):
         here = slice(begin, begin + len(rows))
         begin += len(rows)
-        columns = _property_forces(stroke, master)
-        damping = rows @ (columns["compression"] + columns["rebound"])
+        damping = rows @ (forces["compression"] + forces["rebound"])
         largest = float(np.abs(stroke.force_n).max())
         extra = (_OWN_SHARE * largest) ** 2 + (_DAMPING_SHARE * damping) ** 2
         of_master = rows @ stroke.row(FINE)
         whole[here, here] += of_master @ stroke.covariance @ of_master.T + np.diag(extra)
-        for name, column in columns.items():
-            parts.setdefault(name, []).append(column)
-    for curves in parts.values():
-        column = stack.bin_means(curves)
+    for name in properties[0]:
+        column = _bin_means(pairs, [forces[name] for forces in properties])
         # The master is one of them too.
         whole += 2.0 * scatter**2 * np.outer(column, column)
     return whole
@@ -378,11 +338,7 @@ def _opening_loss(curve: DampingCurve, speed: Array, shares: Array) -> Array:
 
 
 def simulate_faults(master: Master, steps: Sequence[DynoStep]) -> list[Fault]:
-    """All faults that are known, run in the master.
-
-    Args:
-        master: The good damper.
-        steps: Steps of its record.
+    """All faults that are known, run in the master in steps of its record.
 
     Returns:
         Faults whose changes are those at `FINE` of all strokes of the steps, one after the other.
@@ -398,32 +354,14 @@ def simulate_faults(master: Master, steps: Sequence[DynoStep]) -> list[Fault]:
     gives = _compliances(master)
     plays = np.concatenate([[0.0], np.geomspace(2e-5, 8e-3, 32)])
     rates = 1e6 / np.maximum(gives, 1e-3 * gives[1])
+    by_air = _changes_by_cycle(steps, lambda cycle: with_compliance(master, cycle, rates))
+    by_play = _changes_by_cycle(steps, lambda cycle: with_play(master, cycle, plays))
+    least_n = -master.friction_n
     return [
         Fault("gas pressure", "share of it lost", "", lost, -lost[:, None] * gas, most=1.0),
-        Fault(
-            "seal friction",
-            "more by",
-            "N",
-            more_n,
-            more_n[:, None] * against,
-            least=-master.friction_n,
-        ),
-        Fault(
-            "air in the oil",
-            "the oil gives by",
-            "mm/kN",
-            gives,
-            _changes_by_cycle(steps, lambda cycle: with_compliance(master, cycle, rates)),
-            least=0.0,
-        ),
-        Fault(
-            "play",
-            "of",
-            "mm",
-            1e3 * plays,
-            _changes_by_cycle(steps, lambda cycle: with_play(master, cycle, plays)),
-            least=0.0,
-        ),
+        Fault("seal friction", "more by", "N", more_n, more_n[:, None] * against, least=least_n),
+        Fault("air in the oil", "the oil gives by", "mm/kN", gives, by_air, least=0.0),
+        Fault("play", "of", "mm", 1e3 * plays, by_play, least=0.0),
         *[_early_opening(master, strokes, sides) for sides in _SIDES if _bend(master, sides)],
         *[_other_damping(master, strokes, sides) for sides in _SIDES],
     ]
@@ -447,14 +385,9 @@ def _early_opening(master: Master, strokes: Sequence[MeanStroke], sides: Sequenc
     shares = np.linspace(0.0, 0.9, 31)
     rows: list[Array] = []
     for stroke in strokes:
-        side, curve = (
-            ("compression", master.compression) if stroke.sign < 0 else ("rebound", master.rebound)
-        )
-        if side not in sides:
-            rows.append(np.zeros((len(shares), len(FINE))))
-            continue
-        less = _opening_loss(curve, np.abs(_velocity(stroke)), shares)
-        rows.append(-stroke.sign * less)
+        side = "compression" if stroke.sign < 0 else "rebound"
+        less = _opening_loss(getattr(master, side), np.abs(_velocity(stroke)), shares)
+        rows.append(-stroke.sign * less * (side in sides))
     name = f"blow-off early in {' and '.join(sides)}"
     changes = np.concatenate(rows, axis=1)
     quantity = "speed of opening lower by the share"

@@ -1,4 +1,4 @@
-"""The figures of a block, each a functional of its two mean strokes.
+"""The figures of a block, each a functional of its two mean strokes, and those of a rest.
 
 Signs are those of the project: a force is positive when the strut pushes, so that damping is
 positive in compression and negative in rebound. What a figure is:
@@ -27,11 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.dyno.stroke_force import ANGLES, Figure, MeanStroke, combine, mean_stroke
-from rig.dyno.strokes import Block, BlockMotion, fit_motion, is_repetition
+from rig.dyno.strokes import Array, Block, BlockMotion, fit_motion, is_repetition
 
-Array = NDArray[np.float64]
-
-QUASI_STATIC_M_PER_S = 5e-3
+_QUASI_STATIC_M_PER_S = 5e-3
 """Peak speed up to which a step gives friction and gas force: seals and bleed alone damp there."""
 
 _WINDOW = 0.1
@@ -48,18 +46,38 @@ _RULE: tuple[Array, Array] = np.polynomial.legendre.leggauss(400)
 _ANGLE_NODES, _WEIGHT = 0.5 * np.pi * _RULE[0], 0.5 * np.pi * _RULE[1]
 """Angles and weights of an integral over a stroke."""
 
+_BATCHES = 10
+"""Parts of a rest whose means give the uncertainty of its mean: noise may be correlated within one
+(Law, Simulation Modeling and Analysis, 2015, 9.5.3)."""
+
 SIDES = ("compression", "rebound")
 
 
+class ForceRecord(NamedTuple):
+    """Measured motion and force of a strut.
+
+    Attributes:
+        t_s: Times, increasing, shape (N,).
+        height_m: Heights, shape (N,).
+        force_n: Strut forces, shape (N,), positive when the strut pushes.
+        temperature_c: Temperatures, shape (N,), or None.
+        strut: Name of the strut; empty where there is one.
+    """
+
+    name: str
+    t_s: Array
+    height_m: Array
+    force_n: Array
+    temperature_c: Array | None = None
+    strut: str = ""
+    source: str = "load cell"
+
+
 class Side(NamedTuple):
-    """Figures of one direction.
+    """Figures of one direction, as the module describes them.
 
     Attributes:
         peak_velocity_m_per_s: Largest speed, positive.
-        force_at_peak_velocity_n: Force there.
-        force_window_n: Mean about mid-stroke.
-        force_zero_crossing_n: Force at mid-stroke.
-        peak_force_n: Largest force against the motion.
         hysteresis_n: By share of the peak speed: force speeding up less force slowing down.
     """
 
@@ -71,30 +89,34 @@ class Side(NamedTuple):
     hysteresis_n: Mapping[str, Figure]
 
 
+class AtRest(NamedTuple):
+    """Means over a hold: the gas force, and what friction keeps."""
+
+    begin_s: float
+    end_s: float
+    height_m: float
+    force_n: Figure
+    temperature_c: float | None
+
+
 class DynoStep(NamedTuple):
-    """Figures of a block: one step of a test.
+    """Figures of a block, one step of a test, as the module describes them.
 
     Attributes:
-        begin_s: Its beginning.
-        end_s: Its end.
+        kind: `warm_up`, `quasi_static` or `velocity_step`.
         cycles: Cycles that were used.
         frequency_hz: Cycles a second; None where the motion is not periodic.
         amplitude_m: Half the stroke.
         middle_m: Height at mid-stroke.
         temperature_c: Mean temperature; None where none was measured.
-        compression: Figures of the compression strokes.
-        rebound: Figures of the rebound strokes.
-        energy_per_cycle_j: Energy that the loop of force over height encloses.
-        equivalent_damping_n_s_per_m: Linear damping that takes the same energy.
-        spring_rate_n_per_m: Fall of the mean force per height.
         mean_force_n: Mean of both strokes at mid-stroke: the gas force where it is slow.
         half_difference_n: Half of compression less rebound at mid-stroke: the friction where it is
             slow.
-        hysteresis_at_zero_n: Compression less rebound stroke at the turning points.
         strokes: The mean strokes, compression and rebound.
         warmth: Of both directions the temperature of each stroke and its force about mid-stroke.
     """
 
+    kind: str
     begin_s: float
     end_s: float
     cycles: float
@@ -126,50 +148,54 @@ class DynoStep(NamedTuple):
         )
 
 
-def compute_step(
-    t_s: Array, height_m: Array, force_n: Array, temperature_c: Array | None, block: Block
-) -> DynoStep | None:
-    """Figures of a block; None where it has too few samples for any, or does not repeat.
-
-    Args:
-        t_s: Times of the record, shape (N,).
-        height_m: Heights, shape (N,).
-        force_n: Strut forces, shape (N,).
-        temperature_c: Temperatures, shape (N,), or None.
-        block: The block.
-    """
-    here = slice(block.begin, block.end)
+def compute_step(record: ForceRecord, block: Block) -> DynoStep | None:
+    """Figures of a block; None where it has too few samples for any, or does not repeat."""
+    t_s, height_m, here = record.t_s, record.height_m, slice(block.begin, block.end)
+    force_n = record.force_n[here]
+    warm_c = None if record.temperature_c is None else record.temperature_c[here]
     motion = fit_motion(t_s[here], height_m[here], len(block.strokes))
     if np.isnan(motion.period_s) and not is_repetition(t_s, height_m, block):
         return None
     velocity = motion.velocity_m_per_s
     # A stroke ends where the velocity turns, which the samples hardly ever hit.
     turned = np.concatenate([[0], np.cumsum(np.diff(np.sign(velocity)) != 0)])
-    means: list[MeanStroke] = []
-    for sign in (-1, 1):
-        stroke = mean_stroke(motion, force_n[here], turned, sign)
-        if stroke is None:
-            return None
-        means.append(stroke)
-    down, up = means
+    down, up = (mean_stroke(motion, force_n, turned, sign) for sign in (-1, 1))
+    if down is None or up is None:
+        return None
     speed_std = motion.velocity_std_m_per_s
-    warm = None if temperature_c is None else float(np.mean(temperature_c[here]))
+    sides = _side(down, down, up, speed_std), _side(up, down, up, speed_std)
+    speed = max(side.peak_velocity_m_per_s.value for side in sides)
     return DynoStep(
+        "quasi_static" if speed <= _QUASI_STATIC_M_PER_S else "velocity_step",
         float(t_s[block.begin]),
         float(t_s[block.end - 1]),
         0.5 * len(block.strokes),
         None if np.isnan(motion.period_s) else 1.0 / motion.period_s,
         0.5 * (down.amplitude_m + up.amplitude_m),
         0.5 * (down.middle_m + up.middle_m),
-        warm,
-        _side(down, down, up, speed_std),
-        _side(up, down, up, speed_std),
+        None if warm_c is None else float(np.mean(warm_c)),
+        *sides,
         *_of_both(down, up, speed_std / float(np.abs(velocity).max())),
         (down, up),
         (
-            _warmth(down, motion, force_n[here], turned, temperature_c, here),
-            _warmth(up, motion, force_n[here], turned, temperature_c, here),
+            _warmth(down, motion, force_n, turned, warm_c),
+            _warmth(up, motion, force_n, turned, warm_c),
         ),
+    )
+
+
+def compute_rest(record: ForceRecord, here: slice) -> AtRest:
+    """Mean height, force and temperature of the samples `here`, at which the strut rests."""
+    values, warm_c = record.force_n[here], record.temperature_c
+    means = np.array([part.mean() for part in np.array_split(values, min(_BATCHES, len(values)))])
+    std = float(np.std(means, ddof=1)) / len(means) ** 0.5 if len(means) > 1 else float("nan")
+    mean, half = float(values.mean()), 2.26 * std  # Student's t of ten batches
+    return AtRest(
+        float(record.t_s[here][0]),
+        float(record.t_s[here][-1]),
+        float(record.height_m[here].mean()),
+        Figure(mean, mean - half, mean + half, "mean at rest, ten batches"),
+        None if warm_c is None else float(warm_c[here].mean()),
     )
 
 
@@ -178,32 +204,27 @@ def _warmth(
     motion: BlockMotion,
     force_n: Array,
     number: NDArray[np.int64],
-    temperature_c: Array | None,
-    here: slice,
+    warm_c: Array | None,
 ) -> tuple[Array, Array]:
     """Temperature of each stroke, and its force about mid-stroke as the mean stroke's and more."""
-    if temperature_c is None:
-        return np.empty(0), np.empty(0)
     position = stroke.sign * (motion.height_m - stroke.middle_m) / stroke.amplitude_m
     central = (np.abs(position) < _CENTRAL) & (stroke.sign * motion.velocity_m_per_s > 0.0)
-    if not central.any():
+    if warm_c is None or not central.any():
         return np.empty(0), np.empty(0)
-    theta = np.arcsin(position[central])
-    more_n = force_n[central] - stroke.row(theta) @ stroke.force_n
+    more_n = force_n[central] - stroke.row(np.arcsin(position[central])) @ stroke.force_n
     middle_n = float((stroke.row(0.0) @ stroke.force_n)[0])
     numbers = number[central]
     of_stroke = [numbers == n for n in np.unique(numbers)]
-    warm = temperature_c[here][central]
     return (
-        np.array([warm[mine].mean() for mine in of_stroke]),
+        np.array([warm_c[central][mine].mean() for mine in of_stroke]),
         np.array([middle_n + more_n[mine].mean() for mine in of_stroke]),
     )
 
 
 def _side(stroke: MeanStroke, down: MeanStroke, up: MeanStroke, speed_std: float) -> Side:
-    speed = np.abs(stroke.velocity_m_per_s)
+    speed, unit = np.abs(stroke.velocity_m_per_s), np.eye(len(ANGLES))
     peak = float(speed.max())
-    row, what = np.eye(len(ANGLES))[int(np.argmax(speed))], "mean stroke at the largest speed"
+    row, what = unit[int(np.argmax(speed))], "mean stroke at the largest speed"
     method = "largest slope of the fitted motion"
     if stroke.is_constant:
         # Overshoot of the smoothed motion near its turning points is no larger speed.
@@ -213,7 +234,6 @@ def _side(stroke: MeanStroke, down: MeanStroke, up: MeanStroke, speed_std: float
         method = "speed about mid-stroke, where it is constant"
     middle = np.arcsin(np.linspace(-_WINDOW, _WINDOW, 21))
     against = int(np.argmax(-stroke.sign * stroke.force_n))
-    unit = np.eye(len(ANGLES))
     half = 1.96 * speed_std
     return Side(
         Figure(peak, peak - half, peak + half, method),
@@ -231,24 +251,24 @@ def _hysteresis(stroke: MeanStroke, down: MeanStroke, up: MeanStroke, speed: flo
     """Speeding up less slowing down at a speed, without the spring."""
     fast = np.flatnonzero(np.abs(stroke.velocity_m_per_s) >= speed)
     first, last = ANGLES[fast[0]], ANGLES[fast[-1]]
-    rows = {id(item): np.zeros(len(ANGLES)) for item in (down, up)}
-    rows[id(stroke)] += (stroke.row(first) - stroke.row(last))[0]
+    own = (stroke.row(first) - stroke.row(last))[0]
     # The spring's share: its rate times the heights between, towards lower forces upwards.
     apart_m = stroke.sign * stroke.amplitude_m * float(np.sin(last) - np.sin(first))
-    for item, row in _spring(down, up):
-        rows[id(item)] -= apart_m * row
-    parts = [(rows[id(item)], item) for item in (down, up)]
+    parts = [
+        (own - apart_m * row if item is stroke else -apart_m * row, item)
+        for row, item in _spring(down, up)
+    ]
     return combine(parts, "same speed, speeding up less slowing down, spring removed")
 
 
-def _spring(down: MeanStroke, up: MeanStroke) -> list[tuple[MeanStroke, Array]]:
+def _spring(down: MeanStroke, up: MeanStroke) -> list[tuple[Array, MeanStroke]]:
     """The spring rate as rows: the least-squares slope of both strokes' mean, with its sign."""
-    angles = _ANGLE_NODES
-    inside = np.abs(angles) <= np.arcsin(0.9)
-    u, w = np.sin(angles[inside]), (_WEIGHT * np.cos(angles))[inside]
+    inside = np.abs(_ANGLE_NODES) <= np.arcsin(0.9)
+    angles = _ANGLE_NODES[inside]
+    u, w = np.sin(angles), (_WEIGHT * np.cos(_ANGLE_NODES))[inside]
     slope = w * u / float(np.sum(w * u * u))
     return [
-        (item, -0.5 * item.sign / item.amplitude_m * (slope @ item.row(angles[inside])))
+        (-0.5 * item.sign / item.amplitude_m * (slope @ item.row(angles)), item)
         for item in (down, up)
     ]
 
@@ -265,18 +285,19 @@ def _of_both(
         item.amplitude_m * float(along @ np.abs(item.row(angles) @ item.velocity_m_per_s))
         for item in (down, up)
     )
-    spring = [(row, item) for item, row in _spring(down, up)]
     mid_down, mid_up = down.row(0.0)[0], up.row(0.0)[0]
-    last, first = 0.5 * np.pi, -0.5 * np.pi
     # The upper turning point ends the rebound and begins the compression, the lower one the other.
-    turning_down = (down.row(first) + down.row(last))[0]
-    turning_up = (up.row(first) + up.row(last))[0]
+    turning_down, turning_up = (
+        (item.row(-0.5 * np.pi) + item.row(0.5 * np.pi))[0] for item in (down, up)
+    )
     return (
         combine(work, "area of the loop", 1.0, relative_std),
         combine(
             work, "energy over that of a linear damper of 1 N·s/m", 1.0 / squared, relative_std
         ),
-        combine(spring, "slope of the mean of both strokes, inner 90 %", 1.0, relative_std),
+        combine(
+            _spring(down, up), "slope of the mean of both strokes, inner 90 %", 1.0, relative_std
+        ),
         combine([(mid_down, down), (mid_up, up)], "mean of both strokes at mid-stroke", 0.5),
         combine(
             [(mid_down, down), (-mid_up, up)], "half the difference of both at mid-stroke", 0.5

@@ -12,14 +12,12 @@ stiffness of the oil column.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.dyno.characterise import Characteristics
 from rig.dyno.figures import DynoStep
 from rig.dyno.stroke_force import ANGLES, MeanStroke
-
-Array = NDArray[np.float64]
+from rig.dyno.strokes import Array
 
 _NODES = 120
 """Speeds at which a curve is kept."""
@@ -72,13 +70,9 @@ class Master(NamedTuple):
     """A good damper.
 
     Attributes:
-        characteristics: Figures of its record.
         gas_n: Gas force at the middle of the slowest step.
         gas_rate_n_per_m: Its rise per compression.
         middle_m: That height.
-        friction_n: Its friction.
-        compression: Damping in compression.
-        rebound: Damping in rebound.
     """
 
     characteristics: Characteristics
@@ -98,12 +92,6 @@ class Master(NamedTuple):
         speed = np.abs(velocity_m_per_s)
         down, up = self.compression.force(speed), self.rebound.force(speed)
         return np.where(velocity_m_per_s < 0.0, down, -up)
-
-    def velocity(self, damping_n: Array) -> Array:
-        """Velocities at which the damping is some force."""
-        size = np.abs(damping_n)
-        down, up = -self.compression.speed(size), self.rebound.speed(size)
-        return np.where(damping_n > 0.0, down, up)
 
 
 def master_of(record: Characteristics) -> Master:
@@ -166,10 +154,10 @@ def _curve(bare: Master, stroke: MeanStroke) -> DampingCurve:
     top = int(np.argmax(speed))
     peak = float(speed[top])
     nodes = np.linspace(0.0, peak, _NODES - 1)
-    halves = [
-        np.interp(nodes, *_by_speed(speed[part], damping_n[part]))
-        for part in (slice(None, top + 1), slice(top, None))
-    ]
+    halves: list[Array] = []
+    for part in (slice(None, top + 1), slice(top, None)):
+        order = np.argsort(speed[part])
+        halves.append(np.interp(nodes, speed[part][order], damping_n[part][order]))
     force = np.maximum.accumulate(np.maximum(0.5 * (halves[0] + halves[1]), 0.0))
     force[0] = 0.0
     force = force + 1e-6 * np.arange(len(force))  # rising, so that it can be turned round
@@ -178,11 +166,6 @@ def _curve(bare: Master, stroke: MeanStroke) -> DampingCurve:
     last = force[-1] + slope * (farther - peak)
     speeds: Array = np.append(nodes, farther).astype(np.float64)
     return DampingCurve(speeds, np.append(force, last).astype(np.float64))
-
-
-def _by_speed(speed: Array, force: Array) -> tuple[Array, Array]:
-    order = np.argsort(speed)
-    return speed[order], force[order]
 
 
 class Cycle(NamedTuple):
@@ -209,15 +192,9 @@ def cycle_of(step: DynoStep) -> Cycle:
 
 
 def with_compliance(master: Master, cycle: Cycle, rates_n_per_m: Array) -> Array:
-    """Damping of the last cycle behind a column of oil that gives way.
+    """Damping of the last cycle behind a column of oil that gives way, shape (K, 720).
 
-    Args:
-        master: The good damper.
-        cycle: Its motion.
-        rates_n_per_m: Stiffnesses of the column, shape (K,).
-
-    Returns:
-        Damping forces, shape (K, 720).
+    The column has the stiffnesses `rates_n_per_m`, shape (K,).
     """
     # Implicit Euler: force + rate * dt * piston velocity(force) rises with the force.
     forces = np.concatenate([-master.rebound.force_n[:0:-1], master.compression.force_n])
@@ -237,15 +214,9 @@ def with_compliance(master: Master, cycle: Cycle, rates_n_per_m: Array) -> Array
 
 
 def with_play(master: Master, cycle: Cycle, plays_m: Array) -> Array:
-    """Force of the last cycle where the damper's eye has play.
+    """Force of the last cycle where the damper's eye has play, shape (K, 720).
 
-    Args:
-        master: The good damper.
-        cycle: The machine's motion.
-        plays_m: How far the eye may move without force, shape (K,).
-
-    Returns:
-        Forces, shape (K, 720).
+    The eye may move by `plays_m`, shape (K,), without force; the cycle is the machine's motion.
     """
     forces_n = np.empty((len(plays_m), _TIMES))
     gap = np.zeros_like(plays_m)  # from the side on which the strut pushes

@@ -6,27 +6,13 @@ from typing import NamedTuple
 
 from can_dbc.atomic_file import write_whole
 from can_dbc.errors import InputError
-from rig.dyno.characterise import SCHEMA, Characteristics, characterise
+from rig.dyno.characterise import Characteristics, characterise
 from rig.dyno.faults import MasterComparison, name_faults
 from rig.dyno.master import master_of
 from rig.dyno.tolerance import PointVerdict, ToleranceBand, evaluate_band
 from rig.files.json_text import json_text
 
 CHARACTERISTICS_FILE = "characteristics.json"
-
-
-class Criteria(NamedTuple):
-    """What a damper has to keep to be good.
-
-    Attributes:
-        band: Tolerance band, if there is one.
-        master: Record of a good damper in the same test, if there is one.
-        scatter: Relative standard deviation of each property among good dampers.
-    """
-
-    band: ToleranceBand | None = None
-    master: Path | None = None
-    scatter: float = 0.03
 
 
 class Check(NamedTuple):
@@ -38,13 +24,7 @@ class Check(NamedTuple):
 
 
 class DamperReport(NamedTuple):
-    """One record.
-
-    Attributes:
-        characteristics: Its figures.
-        points: Its verdict at each point of the band; empty without a band.
-        against_master: Its comparison with the master; None without a master.
-    """
+    """The figures of one record, its verdict at each point of a band, and against a master."""
 
     characteristics: Characteristics
     points: Sequence[PointVerdict] = ()
@@ -76,26 +56,27 @@ class DamperReport(NamedTuple):
 
 
 def evaluate_records(
-    paths: Sequence[Path], strut: str | None, criteria: Criteria
+    paths: Sequence[Path],
+    strut: str | None,
+    band: ToleranceBand | None,
+    master: Path | None,
+    scatter: float,
 ) -> list[DamperReport]:
-    """Reports of several records.
+    """Reports of several records, folders of runs or CSV files, against a band and a master.
 
-    Args:
-        paths: Folders of runs, or CSV files.
-        strut: Name of the strut; may be None where there is one.
-        criteria: Band and master, if any.
+    `strut` may be None where a run has only one. The master is the record of a good damper in the
+    same test, `scatter` the relative standard deviation of each property among good dampers.
 
     Raises:
         InputError: A record cannot be characterised, or not be compared with the master.
     """
     records = [characterise(path, strut) for path in paths]
-    band = criteria.band
-    good = None if criteria.master is None else master_of(characterise(criteria.master, strut))
+    good = None if master is None else master_of(characterise(master, strut))
     return [
         DamperReport(
             record,
-            () if band is None else evaluate_band(record.steps, record.damper.kinds, band),
-            None if good is None else name_faults(record, good, criteria.scatter),
+            () if band is None else evaluate_band(record.steps, band),
+            None if good is None else name_faults(record, good, scatter),
         )
         for record in records
     ]
@@ -106,7 +87,7 @@ def content_of(
 ) -> dict[str, object]:
     """Content of `characteristics.json`."""
     return {
-        "schema": SCHEMA,
+        "schema": 1,
         "serial": serial,
         "tolerance": None if band is None else band.name,
         "records": [report.as_dict() for report in reports],

@@ -22,9 +22,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.special import stdtrit  # pyright: ignore[reportUnknownVariableType]
 
-from rig.dyno.strokes import BlockMotion
-
-Array = NDArray[np.float64]
+from rig.dyno.strokes import Array, BlockMotion
 
 _DEGREE = 3
 _PIECES = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
@@ -51,14 +49,7 @@ _FEWEST_CLUSTERS = 4
 
 
 class Figure(NamedTuple):
-    """A figure with its 95 % interval.
-
-    Attributes:
-        value: The figure.
-        low: Lower end.
-        high: Upper end.
-        method: Method that gave it.
-    """
+    """A figure with its 95 % interval, and the method that gave it."""
 
     value: float
     low: float
@@ -91,7 +82,6 @@ class MeanStroke(NamedTuple):
         covariance: Its covariance, shape (181, 181).
         freedom: Degrees of freedom.
         velocity_m_per_s: Velocity at `ANGLES`, shape (181,).
-        strokes: Number of strokes.
         samples: How many samples lie nearest to each of `FINE`, shape (361,).
         sums_n: Sums of their forces, shape (361,).
         noise_n: Standard deviation of a sample about the mean stroke.
@@ -104,7 +94,6 @@ class MeanStroke(NamedTuple):
     covariance: Array
     freedom: float
     velocity_m_per_s: Array
-    strokes: int
     samples: Array
     sums_n: Array
     noise_n: float
@@ -138,11 +127,8 @@ def combine(
 ) -> Figure:
     """A sum of functionals of several mean strokes, with its interval.
 
-    Args:
-        parts: Row and mean stroke of each.
-        method: Method that gives it.
-        factor: Of the sum.
-        relative_std: Relative standard deviation of the factor.
+    A part is a row over the forces of a mean stroke. The sum is multiplied by `factor`, whose
+    relative standard deviation is `relative_std`.
     """
     value = factor * sum(float(row @ stroke.force_n) for row, stroke in parts)
     variances = [factor**2 * float(row @ stroke.covariance @ row) for row, stroke in parts]
@@ -164,11 +150,8 @@ def mean_stroke(
 ) -> MeanStroke | None:
     """The mean of the strokes of one direction; None where there are too few samples.
 
-    Args:
-        motion: The motion of the block, of N samples.
-        force_n: Measured forces, shape (N,).
-        number: Which stroke each sample belongs to, shape (N,).
-        sign: 1 for rebound, -1 for compression.
+    The motion of the block has N samples; forces, and the stroke that each sample belongs to, have
+    the shape (N,). `sign` is 1 for rebound, -1 for compression.
     """
     mine = sign * motion.velocity_m_per_s > 0.0
     along = sign * motion.between_m_per_s > 0.0
@@ -201,7 +184,6 @@ def mean_stroke(
         apart = forces - _design(ANGLES, other.pieces) @ other.weights
         covariance = covariance + np.outer(apart, apart)
     velocity = _mean_velocity(between, motion.between_m_per_s[along])
-    strokes = len(np.unique(number))
     nearest = np.round((theta + 0.5 * np.pi) / np.pi * (len(FINE) - 1)).astype(np.int64)
     samples = np.bincount(nearest, minlength=len(FINE)).astype(np.float64)
     sums: Array = np.bincount(nearest, weights=force_n, minlength=len(FINE)).astype(np.float64)
@@ -213,7 +195,6 @@ def mean_stroke(
         covariance,
         freedom,
         velocity,
-        strokes,
         samples,
         sums,
         float(np.sqrt(noise)),
@@ -248,13 +229,8 @@ class _Fit(NamedTuple):
 
     Attributes:
         criterion: Akaike's, corrected for few samples.
-        pieces: Its pieces.
-        weights: Its coefficients.
         inverse: Their covariance under noise of one.
-        variance: Variance of the residuals.
-        freedom: Degrees of freedom of it.
         clustered: Covariance by what the strokes differ by; None of few strokes.
-        clusters: Number of strokes.
     """
 
     criterion: float

@@ -48,9 +48,7 @@ _FEWEST_UNLIKE_A_SERIES = 4
 _FEWEST_STROKES = 3
 """Of a block: a single stroke has no repetition, and one by which a machine gets there is none."""
 
-_HOLD_S = 0.5
-"""Shortest hold."""
-
+_SHORTEST_HOLD_S = 0.5
 _STILL_SHARE = 1e-3
 """Of the record's stroke: a height that moves less within the shortest hold is at rest; of 50 mm
 that is 0.1 mm/s, a fifth of the slowest step that machines run."""
@@ -65,9 +63,7 @@ that passes for still rises by all of it, a rest with the ends of strokes next t
 _FEWEST_AT_REST = 20
 """Samples of a hold: two for each of the batches whose means give its uncertainty."""
 
-_HARMONICS = 6
-"""Most harmonics of a motion."""
-
+_MOST_HARMONICS = 6
 _SERIES_SHARE = 0.01
 """Residual of a series over the amplitude above which the motion is smoothed instead."""
 
@@ -77,14 +73,7 @@ _PER_CYCLE, _BETWEEN = 1441, 8
 
 
 class Stroke(NamedTuple):
-    """Samples from one turning point to the next.
-
-    Attributes:
-        first: First sample.
-        last: Last sample, the next turning point.
-        rise_m: Change of height: positive in rebound.
-        duration_s: Time that it takes.
-    """
+    """Samples `first` to `last`, the next turning point; the rise is positive in rebound."""
 
     first: int
     last: int
@@ -113,33 +102,15 @@ class BlockMotion(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Like strokes in a row.
-
-    Attributes:
-        strokes: The strokes, alternately up and down.
-        begin: First sample.
-        end: Past the last sample.
-    """
+    """Like strokes in a row, alternately up and down: samples from `begin` to before `end`."""
 
     strokes: tuple[Stroke, ...]
     begin: int
     end: int
 
 
-class Hold(NamedTuple):
-    """Samples at rest: first, and past the last one."""
-
-    begin: int
-    end: int
-
-
 def find_strokes(t_s: Array, height_m: Array) -> list[Stroke]:
-    """All strokes of a record.
-
-    Args:
-        t_s: Times, increasing, shape (N,).
-        height_m: Heights, shape (N,).
-    """
+    """All strokes of a record: times, increasing, and heights, shape (N,)."""
     noise_m = _noise_m(height_m)
     low, high = np.percentile(height_m, (1.0, 99.0))
     least_m = max(_TURN_SHARE * float(high - low), _TURN_NOISE * noise_m)
@@ -194,25 +165,20 @@ def find_blocks(strokes: list[Stroke]) -> list[Block]:
 def _without_ramps(run: list[Stroke]) -> list[Stroke]:
     """A run without strokes at its ends that a machine takes to get there, or back."""
     usual_m = float(np.median([abs(stroke.rise_m) for stroke in run]))
-
-    def is_of_it(stroke: Stroke) -> bool:
-        return abs(abs(stroke.rise_m) - usual_m) <= _SETTLED * usual_m
-
     kept = list(run)
-    while len(kept) > _FEWEST_STROKES and not is_of_it(kept[0]):
-        kept = kept[1:]
-    while len(kept) > _FEWEST_STROKES and not is_of_it(kept[-1]):
-        kept = kept[:-1]
+    for end in (0, -1):
+        while (
+            len(kept) > _FEWEST_STROKES
+            and abs(abs(kept[end].rise_m) - usual_m) > _SETTLED * usual_m
+        ):
+            kept.pop(end)
     return kept
 
 
 def is_repetition(t_s: Array, height_m: Array, block: Block) -> bool:
     """Whether the strokes of a block are one motion again and again, and not alike by chance.
 
-    Args:
-        t_s: Times of the record, shape (N,).
-        height_m: Heights, shape (N,).
-        block: The block.
+    Times and heights are those of the whole record, shape (N,).
     """
     if len(block.strokes) < _FEWEST_UNLIKE_A_SERIES:
         return False
@@ -234,21 +200,22 @@ def is_repetition(t_s: Array, height_m: Array, block: Block) -> bool:
 
 def _is_alike(run: list[Stroke], stroke: Stroke) -> bool:
     """Whether a stroke is like the last one of its direction, or returns as far."""
-    before = run[-2] if len(run) > 1 else run[-1]
-    same_size = abs(abs(stroke.rise_m) - abs(run[-1].rise_m)) <= _ALIKE * abs(run[-1].rise_m)
-    if len(run) == 1:
-        return same_size and stroke.first == run[-1].last
-    same_time = abs(stroke.duration_s - before.duration_s) <= _ALIKE * before.duration_s
-    return same_size and same_time and stroke.first == run[-1].last
+    last = run[-1]
+    same_size = abs(abs(stroke.rise_m) - abs(last.rise_m)) <= _ALIKE * abs(last.rise_m)
+    if not same_size or stroke.first != last.last:
+        return False
+    return len(run) == 1 or (
+        abs(stroke.duration_s - run[-2].duration_s) <= _ALIKE * run[-2].duration_s
+    )
 
 
-def find_holds(t_s: Array, height_m: Array, blocks: list[Block]) -> list[Hold]:
-    """Times at rest between the blocks."""
+def find_holds(t_s: Array, height_m: Array, blocks: list[Block]) -> list[slice]:
+    """Samples at rest, one stretch between two blocks at the most."""
     ends = [0, *(edge for block in blocks for edge in (block.begin, block.end - 1)), len(t_s) - 1]
     usual_s = float(np.median(np.diff(t_s)))
-    window = max(int(np.ceil(_HOLD_S / usual_s)), _FEWEST_AT_REST)
+    window = max(int(np.ceil(_SHORTEST_HOLD_S / usual_s)), _FEWEST_AT_REST)
     still_m = max(_STILL_SHARE * float(np.ptp(height_m)), _TURN_NOISE * _noise_m(height_m))
-    holds: list[Hold] = []
+    holds: list[slice] = []
     for begin, end in zip(ends[::2], ends[1::2], strict=True):
         part = height_m[begin : end + 1]
         if len(part) < window:
@@ -261,24 +228,19 @@ def find_holds(t_s: Array, height_m: Array, blocks: list[Block]) -> list[Hold]:
         if not len(inside):
             continue
         runs = np.split(inside, np.flatnonzero(np.diff(inside) > 1) + 1)
-        candidates = [Hold(begin + int(run[0]), begin + int(run[-1]) + window) for run in runs]
-        rests = [
-            hold
-            for hold in candidates
-            if not _turns_slowly(height_m[hold.begin : hold.end], still_m)
-        ]
+        stretches = [slice(begin + run[0], begin + run[-1] + window) for run in runs]
+        rests = [rest for rest in stretches if not _turns_slowly(height_m[rest], still_m)]
         if rests:  # the longest without a break
-            longest = max(rests, key=lambda hold: hold.end - hold.begin)
+            longest = max(rests, key=lambda rest: rest.stop - rest.start)
             holds.append(_trim(longest, height_m, still_m))
     return holds
 
 
-def _trim(hold: Hold, height_m: Array, still_m: float) -> Hold:
+def _trim(rest: slice, height_m: Array, still_m: float) -> slice:
     """A rest without the ends of the adjacent strokes."""
-    part = height_m[hold.begin : hold.end]
-    apart = np.abs(part - np.median(part))
+    apart = np.abs(height_m[rest] - np.median(height_m[rest]))
     inside = np.flatnonzero(apart <= max(_TAIL_SHARE * still_m, 4.0 * _noise_m(height_m)))
-    return Hold(hold.begin + int(inside[0]), hold.begin + int(inside[-1]) + 1)
+    return slice(rest.start + int(inside[0]), rest.start + int(inside[-1]) + 1)
 
 
 def _turns_slowly(height_m: Array, still_m: float) -> bool:
@@ -289,13 +251,7 @@ def _turns_slowly(height_m: Array, still_m: float) -> bool:
 
 
 def fit_motion(t_s: Array, height_m: Array, strokes: int) -> BlockMotion:
-    """Height and velocity of a block.
-
-    Args:
-        t_s: Its times, shape (N,).
-        height_m: Its measured heights, shape (N,).
-        strokes: Number of its strokes.
-    """
+    """Height and velocity of a block, from its times and measured heights, shape (N,)."""
     series = _fourier_series(t_s - t_s[0], height_m, strokes)
     if series is not None:
         return series
@@ -328,7 +284,7 @@ def _fourier_series(t_s: Array, height_m: Array, strokes: int) -> BlockMotion | 
     """A Fourier series through a block; None where the motion is none."""
     span_s = float(t_s[-1])
     per_cycle = 2.0 * len(t_s) / strokes
-    harmonics = int(min(_HARMONICS, (per_cycle - 2.0) / 2.0))
+    harmonics = int(min(_MOST_HARMONICS, (per_cycle - 2.0) / 2.0))
     if harmonics < 1:
         return None
     coarse_hz = strokes / (2.0 * span_s)

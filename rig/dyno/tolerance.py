@@ -5,6 +5,7 @@ the interval crosses a limit: the measurement then proves neither (ISO 14253-1, 
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -13,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.errors import InputError
 from can_dbc.yaml_file import load_yaml, validate
-from rig.dyno.figures import DynoStep
+from rig.dyno.figures import SIDES, DynoStep, Side
 from rig.dyno.stroke_force import Figure
 from rig.files.delimited_text import read_csv_columns
 
@@ -28,15 +29,7 @@ _COLUMNS = ("velocity_m_per_s", "compression_low_n", "compression_high_n", "rebo
 
 
 class BandPoint(BaseModel):
-    """Limits at one peak velocity.
-
-    Attributes:
-        velocity_m_per_s: The velocity.
-        compression_low_n: Smallest force in compression.
-        compression_high_n: Largest.
-        rebound_low_n: Smallest force in rebound, where damping is negative.
-        rebound_high_n: Largest.
-    """
+    """Limits at one peak velocity; damping is negative in rebound."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -48,7 +41,7 @@ class BandPoint(BaseModel):
 
     @model_validator(mode="after")
     def _in_order(self) -> "BandPoint":
-        for side in ("compression", "rebound"):
+        for side in SIDES:
             low, high = getattr(self, f"{side}_low_n"), getattr(self, f"{side}_high_n")
             if low >= high:
                 raise ValueError(f"{side}_low_n {low}: expected less than {side}_high_n ({high})")
@@ -56,12 +49,7 @@ class BandPoint(BaseModel):
 
 
 class ToleranceBand(BaseModel):
-    """A band about a master curve.
-
-    Attributes:
-        name: What it is for.
-        points: Limits by peak velocity, increasing.
-    """
+    """A band about a master curve: limits by peak velocity, increasing."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -77,16 +65,7 @@ class ToleranceBand(BaseModel):
 
 
 class PointVerdict(NamedTuple):
-    """A point of a damper.
-
-    Attributes:
-        velocity_m_per_s: Peak velocity.
-        side: `compression` or `rebound`.
-        force: Its force there; None where no step is near.
-        low_n: Smallest that is allowed.
-        high_n: Largest.
-        verdict: Whether the force lies inside.
-    """
+    """A damper at a point of a band, in `compression` or `rebound`; the force may be unknown."""
 
     velocity_m_per_s: float
     side: str
@@ -133,29 +112,20 @@ def _check_header(path: Path, header: Sequence[str]) -> Sequence[str]:
     return header
 
 
-def evaluate_band(
-    steps: Sequence[DynoStep], kinds: Sequence[str], tolerance: ToleranceBand
-) -> list[PointVerdict]:
+def evaluate_band(steps: Sequence[DynoStep], tolerance: ToleranceBand) -> list[PointVerdict]:
     """Every point of a band, compression and rebound.
 
     A point belongs to the velocity step nearest to its speed within 1 %; the force is then less
     certain by what it may change over the difference. Between two steps the force of a damper lies
     between theirs, since it rises with speed: that is its interval. Beyond all steps it is not
     measured. A warm-up is no step.
-
-    Args:
-        steps: The steps of a damper.
-        kinds: What each of them is, as `summarise_damper` says.
-        tolerance: The band.
     """
-    used = [step for step, kind in zip(steps, kinds, strict=True) if kind != "warm_up"]
+    used = [step for step in steps if step.kind != "warm_up"]
     ordered = sorted(used, key=lambda step: step.peak_speed_m_per_s)
     verdicts: list[PointVerdict] = []
     for point in tolerance.points:
-        for side, low, high in (
-            ("compression", point.compression_low_n, point.compression_high_n),
-            ("rebound", point.rebound_low_n, point.rebound_high_n),
-        ):
+        for side in SIDES:
+            low, high = getattr(point, f"{side}_low_n"), getattr(point, f"{side}_high_n")
             force = _force_at(ordered, side, point.velocity_m_per_s)
             verdict = _verdict(force, low, high)
             verdicts.append(PointVerdict(point.velocity_m_per_s, side, force, low, high, verdict))
@@ -170,11 +140,9 @@ _STEEPEST = 2.0
 
 
 def _force_at(ordered: Sequence[DynoStep], side: str, speed: float) -> Figure | None:
-    sides = [step.compression if side == "compression" else step.rebound for step in ordered]
-    speeds = [side_figures.peak_velocity_m_per_s.value for side_figures in sides]
-    figures = [side_figures.force_at_peak_velocity_n for side_figures in sides]
-    if not speeds:
-        return None
+    sides: list[Side] = [getattr(step, side) for step in ordered]
+    speeds = [item.peak_velocity_m_per_s.value for item in sides]
+    figures = [item.force_at_peak_velocity_n for item in sides]
     nearest = min(range(len(speeds)), key=lambda index: abs(speeds[index] / speed - 1.0))
     apart = abs(speeds[nearest] / speed - 1.0)
     if apart <= _SAME:
@@ -182,13 +150,12 @@ def _force_at(ordered: Sequence[DynoStep], side: str, speed: float) -> Figure | 
         more = _STEEPEST * apart * abs(figure.value)
         method = f"step at {speeds[nearest]:.4g} m/s"
         return Figure(figure.value, figure.low - more, figure.high + more, method)
-    for index in range(len(speeds) - 1):
-        if speeds[index] <= speed <= speeds[index + 1]:
-            share = (speed - speeds[index]) / (speeds[index + 1] - speeds[index])
-            below, above = figures[index], figures[index + 1]
+    for (slow, below), (fast, above) in pairwise(zip(speeds, figures, strict=True)):
+        if slow <= speed <= fast:
+            share = (speed - slow) / (fast - slow)
             value = (1.0 - share) * below.value + share * above.value
             low, high = min(below.low, above.low), max(below.high, above.high)
-            method = f"between steps at {speeds[index]:.3g} and {speeds[index + 1]:.3g} m/s"
+            method = f"between steps at {slow:.3g} and {fast:.3g} m/s"
             return Figure(value, low, high, method)
     return None
 

@@ -5,6 +5,7 @@ not computed again, so that a campaign that was ended is gone on with by startin
 """
 
 import hashlib
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
@@ -17,7 +18,7 @@ from can_dbc.errors import InputError
 from can_dbc.yaml_file import read_text
 from dart_model.spec import files_of, load_model
 from rig.fleet import store
-from rig.fleet.one_run import RunRow, Task, evaluate_run, identity_of, lost_row
+from rig.fleet.one_run import FleetModel, RunRow, evaluate_run, identity_of, row_without_result
 from rig.fleet.sources import RunSource
 
 PART_ROWS = 500
@@ -35,7 +36,6 @@ class CampaignProgress(NamedTuple):
         failed: Those of them that failed.
         todo: Runs that had to be evaluated.
         skipped: Runs that were in the store already.
-        elapsed_s: Time since the beginning.
         worked_s: Time that workers computed.
     """
 
@@ -54,20 +54,6 @@ class CampaignProgress(NamedTuple):
             f"{self.done} evaluated in {self.elapsed_s:.1f} s ({rate:.2f} a second), "
             f"{self.failed} of them failed; {self.skipped} were in the store"
         )
-
-
-class FleetModel(NamedTuple):
-    """A model as workers are given it.
-
-    Attributes:
-        text: The model file.
-        folder: Folder of the files that it names.
-        sha256: Of all of them.
-    """
-
-    text: str
-    folder: str
-    sha256: str
 
 
 def load_fleet_model(file: Path) -> FleetModel:
@@ -101,46 +87,38 @@ def run_campaign(
     A worker that dies takes those with it that were being computed: they are tried again one by
     one, and the one that kills its worker a second time is a failed run.
 
-    Args:
-        sources: Runs.
-        model: The model.
-        out: The store.
-        make_executor: Makes an executor; called again when one broke.
-        window: Runs that are given to it at a time.
-        again: Whether runs that failed before are tried again.
-        progress: Called after each run.
+    An executor is given `window` runs at a time, and made again when it broke. With `again`, runs
+    that failed before are tried again. `progress` is called after each run.
 
     Raises:
         InputError: The store cannot be read or written.
     """
     store.sweep(out)
-    known = store.read_identities(out, with_failed=not again)
-    keys = store.read_keys(out)
+    evaluated = store.read_evaluated(out)
+    keys = {key for key, _, _ in evaluated}
+    known = {identity for _, identity, error in evaluated if not (again and error)}
     todo = [s for s in sources if identity_of(s, model.sha256) not in known]
-    tasks = (Task(source, *model) for source in todo)
     begun = last_s = time.monotonic()
     held: list[RunRow] = []
-    done = failed = 0
-    worked_s = 0.0
     now = CampaignProgress(0, 0, len(todo), len(sources) - len(todo), 0.0, 0.0)
     progress(now)
     if not todo:
         return now
     try:
-        for row in _rows(tasks, make_executor, window):
+        for row in _rows(todo, model, make_executor, window):
             if time.monotonic() - last_s > PART_S or len(held) >= PART_ROWS:
                 store.append(out, held)
                 held, last_s = [], time.monotonic()
             if row is None:
                 continue
-            done += 1
-            failed += bool(row.error)
-            worked_s += row.took_s if row.took_s == row.took_s else 0.0
             # A copy is known from now on, and counted once: its values are there already.
             held.append(replace(row, values=()) if row.key in keys else row)
             keys.add(row.key)
             now = now._replace(
-                done=done, failed=failed, elapsed_s=time.monotonic() - begun, worked_s=worked_s
+                done=now.done + 1,
+                failed=now.failed + bool(row.error),
+                elapsed_s=time.monotonic() - begun,
+                worked_s=now.worked_s + (0.0 if math.isnan(row.took_s) else row.took_s),
             )
             progress(now)
     finally:
@@ -149,16 +127,22 @@ def run_campaign(
 
 
 def _rows(
-    tasks: Iterator[Task], make_executor: Callable[[], Executor], window: int
+    sources: Iterable[RunSource],
+    model: FleetModel,
+    make_executor: Callable[[], Executor],
+    window: int,
 ) -> Iterator[RunRow | None]:
     """Rows in the order in which they are ready; None where none was for a while."""
+    waiting = iter(sources)
     executor = make_executor()
-    pending: dict[Future[RunRow], Task] = {}
+    pending: dict[Future[RunRow], RunSource] = {}
     ready: SimpleQueue[Future[RunRow]] = SimpleQueue()
     try:
         while True:
-            while len(pending) < window and (task := next(tasks, None)) is not None:
-                _submit(executor, task, pending, ready)
+            while len(pending) < window and (source := next(waiting, None)) is not None:
+                future = _submit(executor, source, model)
+                pending[future] = source
+                future.add_done_callback(ready.put)
             if not pending:
                 return
             try:
@@ -166,20 +150,21 @@ def _rows(
             except Empty:
                 yield None
                 continue
-            task = pending.pop(future)
+            source = pending.pop(future)
             try:
                 row = future.result()
             except (BrokenExecutor, CancelledError):
                 # No worker is left: those that were computed are under suspicion, one by one.
-                suspects = [task, *pending.values()]
+                suspects = [source, *pending.values()]
                 _end(executor, pending)
                 pending, ready = {}, SimpleQueue()
                 for suspect in suspects:
-                    yield _alone(suspect, make_executor)
+                    yield _alone(suspect, model, make_executor)
                 executor = make_executor()
                 continue
             except Exception as error:  # of an engine elsewhere, e.g. a killed worker
-                row = lost_row(task, f"no worker gave it back: {type(error).__name__}: {error}")
+                why = f"no worker gave it back: {type(error).__name__}: {error}"
+                row = row_without_result(source, model, why)
             yield row
     finally:
         _end(executor, pending)
@@ -192,30 +177,23 @@ def _end(executor: Executor, pending: Iterable[Future[RunRow]]) -> None:
     executor.shutdown(wait=False)
 
 
-def _submit(
-    executor: Executor,
-    task: Task,
-    pending: dict[Future[RunRow], Task],
-    ready: "SimpleQueue[Future[RunRow]]",
-) -> None:
-    future: Future[RunRow]
+def _submit(executor: Executor, source: RunSource, model: FleetModel) -> Future[RunRow]:
     try:
-        future = executor.submit(evaluate_run, task)
+        return executor.submit(evaluate_run, source, model)
     except BrokenExecutor as error:
-        future = Future()
+        future: Future[RunRow] = Future()
         future.set_exception(error)
+        return future
     except Exception as error:  # of an engine elsewhere
         raise InputError(f"the engine takes no more runs ({error})") from error
-    pending[future] = task
-    future.add_done_callback(ready.put)
 
 
-def _alone(task: Task, make_executor: Callable[[], Executor]) -> RunRow:
+def _alone(source: RunSource, model: FleetModel, make_executor: Callable[[], Executor]) -> RunRow:
     """A run in a separate executor, which it may break."""
     executor = make_executor()
     try:
-        return executor.submit(evaluate_run, task).result()
+        return executor.submit(evaluate_run, source, model).result()
     except (BrokenExecutor, CancelledError):
-        return lost_row(task, "killed its worker, alone as well")
+        return row_without_result(source, model, "killed its worker, alone as well")
     finally:
         _end(executor, ())

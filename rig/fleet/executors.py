@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from typing import NamedTuple
 
 from can_dbc.errors import InputError
@@ -18,13 +19,7 @@ _AHEAD = 4
 
 
 class Engine(NamedTuple):
-    """What computes.
-
-    Attributes:
-        words: The executor as a phrase.
-        make: Makes an executor.
-        window: Runs that it is given at a time.
-    """
+    """What makes an executor, in words too, and the runs that it is given at a time."""
 
     words: str
     make: Callable[[], Executor]
@@ -32,21 +27,18 @@ class Engine(NamedTuple):
 
 
 def processes(jobs: int | None) -> Engine:
-    """Processes of this machine.
-
-    Args:
-        jobs: How many; one a core that this program may use if None.
-    """
+    """Processes of this machine: `jobs`, or one for each core that this program may use."""
     count = jobs or _cores()
-    for name in _THREADS:
-        os.environ.setdefault(
-            name, "1"
-        )  # Workers are as many as cores; theirs would be in the way.
-    context = multiprocessing.get_context("spawn")
-
-    def make() -> Executor:
-        return ProcessPoolExecutor(count, mp_context=context, initializer=_worker)
-
+    for name in _THREADS:  # Workers are as many as cores; theirs would be in the way.
+        os.environ.setdefault(name, "1")
+    make = partial(
+        ProcessPoolExecutor,
+        count,
+        mp_context=multiprocessing.get_context("spawn"),
+        # Ctrl-C is the parent's: it ends in order, and with it its workers.
+        initializer=signal.signal,
+        initargs=(signal.SIGINT, signal.SIG_IGN),
+    )
     return Engine(f"{count} processes", make, _AHEAD * count)
 
 
@@ -55,11 +47,6 @@ def _cores() -> int:
     if sys.platform == "linux":
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _worker() -> None:
-    """Ctrl-C is the parent's: it ends in order, and with it its workers."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager
@@ -82,11 +69,8 @@ def dask(address: str) -> Generator[Engine]:
     threads = sum(client.nthreads().values())
     if not threads:
         raise InputError(f"--dask {address}: a scheduler without workers")
-
-    def make() -> Executor:
-        return client.get_executor(pure=False)
-
+    words = f"Dask at {address}, {threads} threads of workers"
     try:
-        yield Engine(f"Dask at {address}, {threads} threads of workers", make, _AHEAD * threads)
+        yield Engine(words, partial(client.get_executor, pure=False), _AHEAD * threads)
     finally:
         client.close()

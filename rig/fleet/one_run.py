@@ -9,10 +9,11 @@ import re
 import tempfile
 import time
 from collections.abc import Generator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
+from typing import NamedTuple
 
 from fsspec.core import url_to_fs
 
@@ -31,21 +32,12 @@ from rig.log.file_names import RUN_FILE
 _PIECE = 1 << 20
 
 
-@dataclass(frozen=True)
-class Task:
-    """What a worker is given.
+class FleetModel(NamedTuple):
+    """A model file, the folder of the files that it names, and the hash of all of them."""
 
-    Attributes:
-        source: The run.
-        model: Text of the model file.
-        folder: Where the files that it names lie.
-        model_sha256: Of the file and of those.
-    """
-
-    source: RunSource
-    model: str
+    text: str
     folder: str
-    model_sha256: str
+    sha256: str
 
 
 @dataclass(frozen=True)
@@ -56,23 +48,14 @@ class RunRow:
         key: Hash of its content, the model and the version: the same run counts once.
         identity: Hash of its location, size and time, the model and the version, by which an
             evaluated run is recognised without being read again.
-        source: Where it was.
-        bench: Bench.
-        damper: Damper.
-        date: Day.
         model: Name of the model.
         model_sha256: Hash of its file and of the files that it names.
-        version: Version of rig.
         verdict: Verdict of the diagnosis; empty where it failed.
         error: Why it failed; empty where it did not.
-        samples: Number of samples.
-        duration_s: Length.
         before: Error of the model on held-out blocks: of the height in m, or of the force in N on a
             prescribed motion.
         after: The same of the corrected model.
         floor: What a right model leaves there.
-        took_s: Time of computation.
-        values: Parameters and figures.
     """
 
     key: str
@@ -94,12 +77,6 @@ class RunRow:
     took_s: float = math.nan
     values: tuple["RunValue", ...] = ()
 
-    def as_dict(self) -> dict[str, object]:
-        """The columns, without the values."""
-        return {
-            item.name: getattr(self, item.name) for item in fields(self) if item.name != "values"
-        }
-
 
 @dataclass(frozen=True)
 class RunValue:
@@ -108,13 +85,10 @@ class RunValue:
     Attributes:
         kind: ``model``: a parameter of the model itself, as this run has it; ``found``: of an
             effect that the model lacks; ``figure``: of the damper, as `rig characterise` has it.
-        strut: Strut.
         effect: Effect in the catalogue; empty for the linear part and for figures.
-        family: Its family.
         parameter: Name with its unit.
         value: Value in SI.
         low: Lower end of its 95 % interval; NaN where the run does not bound it.
-        high: Upper end.
     """
 
     kind: str
@@ -127,26 +101,20 @@ class RunValue:
     high: float
 
 
-def evaluate_run(task: Task) -> RunRow:
+def evaluate_run(source: RunSource, model: FleetModel) -> RunRow:
     """Diagnose a run by itself; what goes wrong is in the row."""
     begun = time.perf_counter()
-    source = task.source
     try:
-        row = _diagnose_run(task)
+        row = _diagnose_run(source, model)
     except InputError as error:
-        row = _error_row(task, str(error))
+        row = row_without_result(source, model, str(error))
     except Exception as error:  # one bad run never stops the rest
-        row = _error_row(task, f"unexpected: {type(error).__name__}: {error}")
+        row = row_without_result(source, model, f"unexpected: {type(error).__name__}: {error}")
     took_s = time.perf_counter() - begun
     # Without the run's own name and place: alike errors are counted as one.
     name = re.escape(source.url.rsplit("/", 1)[-1])
     error = re.sub(rf"[^\s:]*{name}", "run", row.error.replace(source.url, "run"))
     return replace(row, took_s=took_s, error=printable(error)[:500])
-
-
-def lost_row(task: Task, why: str) -> RunRow:
-    """The row of a run that came back from no worker."""
-    return _error_row(task, why)
 
 
 def identity_of(source: RunSource, model_sha256: str) -> str:
@@ -156,8 +124,9 @@ def identity_of(source: RunSource, model_sha256: str) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
 
-def _error_row(task: Task, why: str) -> RunRow:
-    source, identity = task.source, identity_of(task.source, task.model_sha256)
+def row_without_result(source: RunSource, model: FleetModel, error: str) -> RunRow:
+    """The row of a run that could not be evaluated, or is not evaluated yet."""
+    identity = identity_of(source, model.sha256)
     return RunRow(
         identity,
         identity,
@@ -165,10 +134,10 @@ def _error_row(task: Task, why: str) -> RunRow:
         source.bench,
         source.damper,
         source.date or source.changed,
-        _model(task.model, task.folder).name,
-        task.model_sha256,
+        _parse(model).name,
+        model.sha256,
         rig_version(),
-        error=why,
+        error=error,
     )
 
 
@@ -179,14 +148,14 @@ def rig_version() -> str:
 
 
 @lru_cache(maxsize=4)
-def _model(text: str, folder: str) -> ModelSpec:
-    return parse_model(text, "model", Path(folder))
+def _parse(model: FleetModel) -> ModelSpec:
+    return parse_model(model.text, "model", Path(model.folder))
 
 
-def _diagnose_run(task: Task) -> RunRow:
-    source, spec = task.source, _model(task.model, task.folder)
+def _diagnose_run(source: RunSource, model: FleetModel) -> RunRow:
+    spec = _parse(model)
     with _local(source) as path:
-        key = _key(path, task)
+        key = _key(path, model)
         names = [strut.name for strut in spec.struts]
         recording = read_recording(path, names)
         figures = _figures(path, recording)
@@ -204,17 +173,11 @@ def _diagnose_run(task: Task) -> RunRow:
         if math.isfinite(heights.after)
         else (forces, found.noise_floor.residual_force_rmse_n)
     )
-    return RunRow(
-        key,
-        identity_of(source, task.model_sha256),
-        printable(source.url),
-        source.bench,
-        source.damper,
-        day,
-        spec.name,
-        task.model_sha256,
-        rig_version(),
-        found.verdict,
+    return replace(
+        row_without_result(source, model, ""),
+        key=key,
+        date=day,
+        verdict=found.verdict,
         samples=len(recording.t_s),
         duration_s=recording.duration_s,
         before=counted.before,
@@ -281,9 +244,9 @@ def _local(source: RunSource) -> Generator[Path]:
         yield target
 
 
-def _key(path: Path, task: Task) -> str:
+def _key(path: Path, model: FleetModel) -> str:
     """Hash of a run's content, the model and the version."""
-    found = hashlib.sha256(f"{task.model_sha256}\0{rig_version()}\0".encode())
+    found = hashlib.sha256(f"{model.sha256}\0{rig_version()}\0".encode())
     files = sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]
     for file in files:
         found.update(os.fsencode(f"{file.name}\0") if path.is_dir() else b"")

@@ -3,9 +3,11 @@
 import datetime
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median_high
 from typing import Any, NamedTuple
 
 from rig.fleet.sources import UNKNOWN
@@ -36,10 +38,7 @@ _RECENT = 5
 class SeriesQuantity(NamedTuple):
     """What a series is of.
 
-    Attributes:
-        strut: Strut; empty for a figure.
-        effect: Effect; empty for the linear part and for figures.
-        parameter: Name with its unit.
+    A figure has neither strut nor effect, and the linear part of a strut no effect.
     """
 
     strut: str
@@ -63,8 +62,6 @@ class Series(NamedTuple):
     """A quantity of a damper over time.
 
     Attributes:
-        where: Damper and bench.
-        quantity: What of it.
         points: Values by day.
         drift: Its straight line; None where it is too short.
         change: Its likeliest change-point; None where it is too short.
@@ -82,13 +79,9 @@ class Series(NamedTuple):
 
 
 class Jump(NamedTuple):
-    """A step that the dampers of a bench have in common.
+    """A step by a factor that the dampers of a bench have in common.
 
-    Attributes:
-        bench: The bench.
-        parameter: What stepped.
-        factor: By what factor.
-        change: When; its values are logarithms.
+    The values of its change are logarithms.
     """
 
     bench: str
@@ -98,14 +91,9 @@ class Jump(NamedTuple):
 
 
 class Outlier(NamedTuple):
-    """A damper that is unlike the others.
+    """A damper that is unlike the others: the median of its last points, and the usual one.
 
-    Attributes:
-        where: Damper and bench.
-        quantity: In what.
-        value: Median of its last points.
-        usual: Median of all.
-        distance: From it, in robust standard deviations of the others.
+    The distance is in robust standard deviations of the others.
     """
 
     where: Where
@@ -120,12 +108,8 @@ class Overview:
     """A store as a whole.
 
     Attributes:
-        runs: Number of runs.
         failed: Those that could not be evaluated, by the words of their error.
         verdicts: By bench, how often each verdict was given.
-        series: Every quantity of every damper.
-        jumps: Of benches.
-        outliers: Dampers.
         model: Model and version of these runs: those that were evaluated last.
         others: Runs of other models or versions in the store.
     """
@@ -179,11 +163,15 @@ class Overview:
                 if item.is_drift and item.drift is not None
             ],
             "outliers": [
-                {**item.where._asdict(), **item.quantity._asdict(), "value": item.value,
-                 "usual": item.usual, "distance": item.distance}
+                {
+                    **_place(item),
+                    "value": item.value,
+                    "usual": item.usual,
+                    "distance": item.distance,
+                }
                 for item in self.outliers
             ],
-        }  # fmt: skip
+        }
 
 
 def date_of(day: float) -> str:
@@ -197,8 +185,7 @@ def read_overview(store: Path) -> Overview:
     Raises:
         InputError: There is none, or it cannot be read.
     """
-    connection = connect(store)
-    try:
+    with closing(connect(store)) as connection:
         model, sha256, version = connection.execute(
             "SELECT model, model_sha256, version FROM runs ORDER BY written DESC LIMIT 1"
         ).fetchall()[0]
@@ -221,17 +208,22 @@ def read_overview(store: Path) -> Overview:
         ).fetchall():
             verdicts.setdefault(bench, {})[verdict] = count
         collected = _read_series(connection)
-    finally:
-        connection.close()
     jumps = _jumps(collected)
-    stepped_on = _step_days(collected, jumps)
-    cleared = _without_jumps(collected, stepped_on)
+    step_days = {jump.bench: jump.change.day for jump in jumps}
+    # Every series without the jump of its bench, whose size is its own best one.
+    cleared = {
+        quantity: {
+            where: without_step(points, _step_day(step_days, where, quantity))
+            for where, points in by_place.items()
+        }
+        for quantity, by_place in collected.items()
+    }
     words = f"{model} ({sha256[:8]}), rig {version}"
     return Overview(
         runs,
         failed,
         verdicts,
-        _series(cleared, stepped_on),
+        _series(cleared, step_days),
         jumps,
         _outliers(cleared),
         words,
@@ -277,7 +269,7 @@ def _jumps(collected: _Collected) -> tuple[Jump, ...]:
     for bench in benches:
         for quantity, by_place in usable.items():
             logs = {
-                where.damper: _logarithms(points)
+                where.damper: [point._replace(value=math.log(point.value)) for point in points]
                 for where, points in by_place.items()
                 if where.bench == bench and all(point.value > 0.0 for point in points)
             }
@@ -288,41 +280,14 @@ def _jumps(collected: _Collected) -> tuple[Jump, ...]:
     return tuple(found.values())
 
 
-def _step_days(
-    collected: _Collected, jumps: Sequence[Jump]
-) -> dict[tuple[Where, SeriesQuantity], float]:
-    """Day of the bench's jump for each series that it is in."""
-    by_bench = {jump.bench: jump.change.day for jump in jumps}
-    return {
-        (where, quantity): by_bench[where.bench]
-        for quantity, by_place in collected.items()
-        for where in by_place
-        if where.bench in by_bench and _FORCE.search(quantity.parameter)
-    }
+def _step_day(
+    step_days: Mapping[str, float], where: Where, quantity: SeriesQuantity
+) -> float | None:
+    """Day of the bench's jump, if it has one and the series is in it."""
+    return step_days.get(where.bench) if _FORCE.search(quantity.parameter) else None
 
 
-def _without_jumps(
-    collected: _Collected, days: Mapping[tuple[Where, SeriesQuantity], float]
-) -> _Collected:
-    """Every series without the jump of its bench, whose size is its own best one."""
-    return {
-        quantity: {
-            where: without_step(points, days[where, quantity])
-            if (where, quantity) in days
-            else points
-            for where, points in by_place.items()
-        }
-        for quantity, by_place in collected.items()
-    }
-
-
-def _logarithms(points: Sequence[DatedValue]) -> list[DatedValue]:
-    return [point._replace(value=math.log(point.value)) for point in points]
-
-
-def _series(
-    collected: _Collected, stepped_on: Mapping[tuple[Where, SeriesQuantity], float]
-) -> tuple[Series, ...]:
+def _series(collected: _Collected, step_days: Mapping[str, float]) -> tuple[Series, ...]:
     """Every series with what is significant among all of them."""
     every = [
         (where, quantity, points)
@@ -332,7 +297,7 @@ def _series(
     level = LEVEL / max(1, sum(len(points) >= FEWEST for _, _, points in every))
     found: list[Series] = []
     for where, quantity, points in every:
-        line = fit_drift(points, stepped_on.get((where, quantity)))
+        line = fit_drift(points, _step_day(step_days, where, quantity))
         change = find_change_point(points)
         is_change = change is not None and change.p < level
         is_drift = line is not None and len(points) >= FEWEST and line.p < level and not is_change
@@ -344,18 +309,16 @@ def _outliers(collected: _Collected) -> tuple[Outlier, ...]:
     found: list[Outlier] = []
     for quantity, by_place in sorted(collected.items()):
         latest = {
-            where: sorted(point.value for point in points[-_RECENT:])[len(points[-_RECENT:]) // 2]
+            where: median_high(point.value for point in points[-_RECENT:])
             for where, points in by_place.items()
         }
-        names = {f"{where.bench}\0{where.damper}": where for where in latest}
-        usual = sorted(latest.values())[len(latest) // 2]
-        values = {key: latest[where] for key, where in names.items()}
-        for name, distance in find_outliers(values, LEVEL / len(collected)).items():
-            found.append(Outlier(names[name], quantity, latest[names[name]], usual, distance))
+        usual = median_high(latest.values())
+        for where, distance in find_outliers(latest, LEVEL / len(collected)).items():
+            found.append(Outlier(where, quantity, latest[where], usual, distance))
     return tuple(found)
 
 
-def _place(item: Series) -> dict[str, str]:
+def _place(item: Series | Outlier) -> dict[str, str]:
     return {**item.where._asdict(), **item.quantity._asdict()}
 
 

@@ -1,6 +1,6 @@
 """What a store says, in sentences."""
 
-from rig.fleet.overview import Jump, Overview, Series, date_of
+from rig.fleet.overview import Jump, Outlier, Overview, Series, date_of
 from rig.fleet.trends import ChangePoint, Drift
 
 
@@ -12,14 +12,13 @@ def alarm_sentences(found: Overview) -> list[str]:
     lines += [_change_sentence(s, change) for _, s, change in sorted(changes)]
     lines += [_drift_sentence(s, line) for _, s, line in sorted(drifts)]
     lines += [
-        f"Damper {item.where.damper} on {item.where.bench}: {item.quantity.words} is "
-        f"{item.value:.4g}, usual is {item.usual:.4g}"
+        f"{series_name(item)} is {item.value:.4g}, usual is {item.usual:.4g}"
         for item in found.outliers
     ]
     return lines
 
 
-def series_name(item: Series) -> str:
+def series_name(item: Series | Outlier) -> str:
     """Which damper, and what of it."""
     return f"Damper {item.where.damper} on {item.where.bench}: {item.quantity.words}"
 

@@ -37,9 +37,6 @@ class RunSource:
 
     Attributes:
         url: Where it is: a run's folder or a CSV file.
-        is_folder: Whether it is a folder.
-        bench: Bench that it ran on.
-        damper: Damper that was on it.
         date: Day as ``YYYY-MM-DD``; empty where only the run itself may know it.
         changed: Day on which it was last changed.
         size: Bytes of all its files.
@@ -95,13 +92,7 @@ def parse_shard(text: str) -> tuple[int, int]:
 
 
 def select_shard(sources: Sequence[RunSource], index: int, count: int) -> list[RunSource]:
-    """A share of the runs, of `count` shares; a run is in the same share whatever the others are.
-
-    Args:
-        sources: All runs.
-        index: Which part, from 1 on.
-        count: How many parts.
-    """
+    """Share `index`, from 1 on, of `count`; a run is in the same one whatever the others are."""
     return [item for item in sources if zlib.crc32(os.fsencode(item.url)) % count == index - 1]
 
 
@@ -110,16 +101,13 @@ def _find_in(
 ) -> Iterator[RunSource]:
     files, protocol, root = _list_files(location)
     folders = {str(PurePosixPath(p).parent) for p in files if PurePosixPath(p).name == RUN_FILE}
-    sizes: dict[str, int] = {}
-    stamps: dict[str, str] = {}
+    runs: dict[str, list[Mapping[str, Any]]] = {}
     for path, info in files.items():
         run = next((str(up) for up in PurePosixPath(path).parents if str(up) in folders), None)
-        if run is None and not path.lower().endswith(".csv"):
-            continue
-        run = run or path
-        sizes[run] = sizes.get(run, 0) + int(info.get("size") or 0)
-        stamps[run] = max(stamps.get(run, ""), _stamp(info))
-    for run, size in sizes.items():
+        if run is not None or path.lower().endswith(".csv"):
+            runs.setdefault(run or path, []).append(info)
+    for run, infos in runs.items():
+        stamp = max(map(_stamp, infos))
         inside = (
             str(PurePosixPath(run).relative_to(root)) if run != root else PurePosixPath(run).name
         )
@@ -134,9 +122,9 @@ def _find_in(
             printable(fields.get("bench") or UNKNOWN),
             printable(fields.get("damper") or UNKNOWN),
             day,
-            stamps[run][:10],
-            size,
-            stamps[run],
+            stamp[:10],
+            sum(int(info.get("size") or 0) for info in infos),
+            stamp,
         )
 
 

@@ -14,7 +14,7 @@ import glob
 import hashlib
 import importlib
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 from urllib.parse import quote
@@ -24,47 +24,33 @@ from pyarrow import dataset, parquet
 
 from can_dbc.atomic_file import replacing
 from can_dbc.errors import InputError
-from rig.fleet.one_run import RunRow, RunValue
+from rig.fleet.one_run import RunRow
 
 _parquet = cast("Any", parquet)  # its stubs are incomplete
 _duckdb: Any = None
 with contextlib.suppress(ModuleNotFoundError):  # It only reads; the store is written without it.
     _duckdb = importlib.import_module("duckdb")
 
+_TEXT, _REAL = pa.string(), pa.float64()
+_RUN_TEXTS = (
+    *("key", "identity", "source", "damper", "model", "model_sha256", "version", "written"),
+    *("verdict", "error"),
+)
+_RUN_NUMBERS = ("duration_s", "before", "after", "floor", "took_s")
 _RUN = pa.schema(
     [
-        ("key", pa.string()),
-        ("identity", pa.string()),
-        ("source", pa.string()),
-        ("damper", pa.string()),
-        ("model", pa.string()),
-        ("model_sha256", pa.string()),
-        ("version", pa.string()),
-        ("written", pa.string()),
-        ("verdict", pa.string()),
-        ("error", pa.string()),
+        *((name, _TEXT) for name in _RUN_TEXTS),
         ("samples", pa.int64()),
-        ("duration_s", pa.float64()),
-        ("before", pa.float64()),
-        ("after", pa.float64()),
-        ("floor", pa.float64()),
-        ("took_s", pa.float64()),
-        ("part", pa.string()),
+        *((name, _REAL) for name in _RUN_NUMBERS),
+        ("part", _TEXT),
     ]
 )
+_VALUE_TEXTS = ("key", "damper", "kind", "strut", "effect", "family", "parameter")
 _VALUE = pa.schema(
     [
-        ("key", pa.string()),
-        ("damper", pa.string()),
-        ("kind", pa.string()),
-        ("strut", pa.string()),
-        ("effect", pa.string()),
-        ("family", pa.string()),
-        ("parameter", pa.string()),
-        ("value", pa.float64()),
-        ("low", pa.float64()),
-        ("high", pa.float64()),
-        ("part", pa.string()),
+        *((name, _TEXT) for name in _VALUE_TEXTS),
+        *((name, _REAL) for name in ("value", "low", "high")),
+        ("part", _TEXT),
     ]
 )
 _VIEWS = """
@@ -117,80 +103,46 @@ def _write(store: Path, partition: str, rows: Sequence[RunRow]) -> None:
     content = "\0".join([partition, *(row.key for row in rows)])
     part = hashlib.sha256(content.encode("utf-8", "surrogateescape")).hexdigest()[:24]
     written = datetime.datetime.now(datetime.UTC).isoformat(timespec="microseconds")
-    runs = [{**row.as_dict(), "written": written, "part": part} for row in rows]
+    runs = [{**vars(row), "written": written, "part": part} for row in rows]
     values = [
-        {**_columns(value), "key": row.key, "damper": row.damper, "part": part}
+        {**vars(value), "key": row.key, "damper": row.damper, "part": part}
         for row in rows
         for value in row.values
     ]
     for name, schema, content in (("values", _VALUE, values), ("runs", _RUN, runs)):
         path = store / name / partition / f"{part}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
-        kept = [{key: item[key] for key in schema.names} for item in content]
         with replacing(path) as temporary:
-            _parquet.write_table(pa.Table.from_pylist(kept, schema=schema), temporary)
+            _parquet.write_table(pa.Table.from_pylist(content, schema=schema), temporary)
 
 
-def _columns(value: RunValue) -> dict[str, object]:
-    return {name: getattr(value, name) for name in _VALUE.names if hasattr(value, name)}
-
-
-def read_identities(store: Path, *, with_failed: bool) -> set[str]:
-    """What was evaluated already.
-
-    Args:
-        store: The store; it may not be there yet.
-        with_failed: Whether runs that failed count.
+def read_evaluated(store: Path) -> list[tuple[str, str, str]]:
+    """Key, identity and error of every run of a store; none where there is no store yet.
 
     Raises:
         InputError: It cannot be read.
     """
-    found: set[str] = set()
-    for batch in _batches(store, ["identity", "error"]):
-        columns = batch.to_pydict()
-        for identity, error in zip(columns["identity"], columns["error"], strict=True):
-            if with_failed or not error:
-                found.add(identity)
-    return found
-
-
-def read_keys(store: Path) -> set[str]:
-    """Keys of all runs of a store.
-
-    Raises:
-        InputError: It cannot be read.
-    """
-    batches = _batches(store, ["key"])
-    return {key for batch in batches for key in cast("list[str]", batch.column("key").to_pylist())}
-
-
-def _batches(store: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
     folder = store / "runs"
     if not folder.is_dir():
-        return
+        return []
     try:
         there = dataset.dataset(folder, format="parquet", partitioning="hive")
-        if there.files:
-            yield from there.to_batches(columns=list(columns))
+        columns = ["key", "identity", "error"]
+        rows = there.to_table(columns=columns).to_pylist() if there.files else []
     except (OSError, pa.ArrowException, ValueError) as error:
         raise InputError(f"{folder}: cannot be read ({error})") from error
+    return [(row["key"], row["identity"], row["error"]) for row in rows]
 
 
 def sweep(store: Path) -> None:
     """Remove what a killed program left: files without a name, values without their runs."""
     now = time.time()
-    for path in _files(store, "values", ".*"):
-        runs = store / "runs" / path.relative_to(store / "values")
-        if (path.name.startswith(".") or not runs.exists()) and _age_s(path, now) > _ABANDONED_S:
-            path.unlink(missing_ok=True)
-    for path in _files(store, "runs", ".*"):
-        if path.name.startswith(".") and _age_s(path, now) > _ABANDONED_S:
-            path.unlink(missing_ok=True)
-
-
-def _files(store: Path, name: str, hidden: str) -> Iterable[Path]:
-    folder = store / name
-    return [*folder.rglob("*.parquet"), *folder.rglob(hidden)] if folder.is_dir() else []
+    for name in ("values", "runs"):
+        for path in [*(store / name).rglob("*.parquet"), *(store / name).rglob(".*")]:
+            runs = store / "runs" / path.relative_to(store / name)
+            is_left = path.name.startswith(".") or not runs.exists()
+            if is_left and _age_s(path, now) > _ABANDONED_S:
+                path.unlink(missing_ok=True)
 
 
 def _age_s(path: Path, now: float) -> float:
@@ -230,15 +182,12 @@ def query(store: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
     Raises:
         InputError: There is no store, or DuckDB refuses the query.
     """
-    connection = connect(store)
-    try:
-        answer = connection.execute(sql)
-        if answer is None or answer.description is None:
-            raise InputError(f"{store}: {sql!r}: expected a query")
-        names = [item[0] for item in answer.description or ()]
-        return names, answer.fetchall() if names else []
-    except _duckdb.Error as error:
-        first = str(error).splitlines()[0]
-        raise InputError(f"{store}: {first}") from error
-    finally:
-        connection.close()
+    with contextlib.closing(connect(store)) as connection:
+        try:
+            answer = connection.execute(sql)
+            if answer is None or answer.description is None:
+                raise InputError(f"{store}: {sql!r}: expected a query")
+            names = [item[0] for item in answer.description]
+            return names, answer.fetchall() if names else []
+        except _duckdb.Error as error:
+            raise InputError(f"{store}: {str(error).splitlines()[0]}") from error

@@ -8,7 +8,7 @@ here; a level for a whole fleet is divided among its series (Bonferroni).
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 Array = NDArray[np.float64]
+Member = TypeVar("Member")
 
 LEVEL = 0.01
 """Chance of one false alarm of a kind in a whole fleet without any change."""
@@ -53,12 +54,7 @@ _GAUSS = 1.4826
 
 
 class DatedValue(NamedTuple):
-    """A value on a day.
-
-    Attributes:
-        day: Days since any origin.
-        value: The value.
-    """
+    """A value on a day, which is counted from any origin."""
 
     day: float
     value: float
@@ -91,12 +87,10 @@ class ChangePoint(NamedTuple):
 
 
 class Drift(NamedTuple):
-    """Slope of the straight line through a series.
+    """Slope of the straight line through a series, with its 95 % interval.
 
     Attributes:
         per_day: Change per day.
-        low: Lower end of its 95 % interval.
-        high: Upper end.
         level: Value of the line in the middle.
         p: Chance of a slope as large without a drift.
     """
@@ -109,11 +103,7 @@ class Drift(NamedTuple):
 
 
 def find_change_point(points: Sequence[DatedValue]) -> ChangePoint | None:
-    """The likeliest change of a series, significant or not; None where it is too short.
-
-    Args:
-        points: The series, by day.
-    """
+    """The likeliest change of a series by day, significant or not; None where it is too short."""
     days = np.array([point.day for point in points])
     if len(points) < FEWEST or np.ptp(days) <= 0.0:
         return None
@@ -125,11 +115,9 @@ def find_change_point(points: Sequence[DatedValue]) -> ChangePoint | None:
 
 
 def fit_drift(points: Sequence[DatedValue], stepped_on: float | None = None) -> Drift | None:
-    """The straight line through a series; None with too few days for it.
+    """The straight line through a series by day; None with too few days for it.
 
-    Args:
-        points: The series, by day.
-        stepped_on: Day of a step of unknown size that is not its own.
+    `stepped_on` is the day of a step of unknown size that is not its own.
     """
     days = np.array([point.day for point in points])
     columns = _line_and_step(days, stepped_on)
@@ -148,13 +136,11 @@ def fit_drift(points: Sequence[DatedValue], stepped_on: float | None = None) -> 
     return Drift(slope, slope - half, slope + half, float(y.mean()), p)
 
 
-def without_step(points: Sequence[DatedValue], day: float) -> list[DatedValue]:
-    """A series without the step that it has on a day, its straight line kept."""
-    columns = _line_and_step(np.array([point.day for point in points]), day)
-    if columns.shape[1] < 3:
+def without_step(points: Sequence[DatedValue], day: float | None) -> list[DatedValue]:
+    """A series without the step that it has on a day, if any, its straight line kept."""
+    step = None if day is None else _step_at(points, day)
+    if day is None or step is None:
         return list(points)
-    y = np.array([point.value for point in points])
-    step = float(np.linalg.lstsq(columns, y, rcond=None)[0][2])
     return [p._replace(value=p.value - step) if p.day >= day else p for p in points]
 
 
@@ -166,12 +152,11 @@ def _line_and_step(days: Array, day: float | None) -> Array:
     return columns[:, : 3 if has_step else 2]
 
 
-def find_outliers(values: Mapping[str, float], level: float) -> dict[str, float]:
+def find_outliers(values: Mapping[Member, float], level: float) -> dict[Member, float]:
     """How many robust standard deviations away from the others members are that stand out.
 
-    Args:
-        values: One value a member; up to a half of them may be bad.
-        level: Chance of any such member among so many alike.
+    Up to a half of the values, one a member, may be bad. `level` is the chance of any such member
+    among so many alike.
     """
     if len(values) < _ALONE:
         return {}
@@ -203,9 +188,8 @@ def _farthest(members: int, level: float) -> float:
 def find_bench_jump(series: Mapping[str, Sequence[DatedValue]], level: float) -> ChangePoint | None:
     """A step that the dampers of one bench have in common: of its calibration, not of theirs.
 
-    Args:
-        series: Of each damper the logarithm of a value that its force scales.
-        level: Chance of a jump where there is none.
+    The series are, of each damper, the logarithm of a value that its force scales; `level` is the
+    chance of a jump where there is none.
 
     Returns:
         The change, if it is significant and at least two dampers share it; ``before`` and
@@ -228,10 +212,10 @@ def find_bench_jump(series: Mapping[str, Sequence[DatedValue]], level: float) ->
     if change is None or change.kind != "step" or change.p > level:
         return None
     size = change.after - change.before
-    moved = [_step_at(points, change.day) for points in usable.values()]
-    shared = [step for step in moved if step is not None and 0.5 < step / size < 2.0]
-    both = [step for step in moved if step is not None]
-    return change if len(shared) >= max(_SHARED, 0.5 * len(both)) else None
+    tried = [_step_at(points, change.day) for points in usable.values()]
+    steps = [step for step in tried if step is not None]
+    shared = [step for step in steps if 0.5 < step / size < 2.0]
+    return change if len(shared) >= max(_SHARED, 0.5 * len(steps)) else None
 
 
 def _step_at(points: Sequence[DatedValue], day: float) -> float | None:

@@ -10,30 +10,24 @@ from uuid import UUID
 
 from rig.fmu.binaries import TARGETS, Target, compile_for
 from rig.fmu.component import Component
-from rig.fmu.description import Provenance, build_description, description_2, description_3
-from rig.fmu.source import Fmi, select_c_files, sources
+from rig.fmu.description import build_description, description_2, description_3
+from rig.fmu.source import select_c_files, sources
 
 _FILE_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of every file in the archive, so that the same model gives the same bytes."""
 
-_EXPERIMENT_S, _STEP_S = 10.0, 0.001
-
 
 def archive(
     component: Component,
-    version: Fmi,
+    version: str,
     model: str,
     targets: Iterable[Target] = TARGETS,
     done: Callable[[Target], None] = lambda _: None,
 ) -> bytes:
     """An FMU for Model Exchange and Co-Simulation.
 
-    Args:
-        component: What it computes.
-        version: Version of the interface, ``2.0`` or ``3.0``.
-        model: Text of the model file, which the archive contains too.
-        targets: Systems to compile for, except those that the version has no name for.
-        done: Called after each system.
+    It contains `model`, the text of the model file, too, and no binaries for systems that its
+    version has no name for. `done` is called after each system.
 
     Raises:
         InputError: There is no compiler, or it refuses.
@@ -42,12 +36,11 @@ def archive(
     token = _token(component, version, tool)
     code = sources(component, version, token)
     c_files = select_c_files(code)
-    provenance = Provenance(tool, token, _EXPERIMENT_S, _STEP_S)
     files: dict[str, bytes | str] = {}
     if version == "2.0":
-        files["modelDescription.xml"] = description_2(component, provenance, c_files)
+        files["modelDescription.xml"] = description_2(component, tool, token, c_files)
     else:
-        files["modelDescription.xml"] = description_3(component, provenance)
+        files["modelDescription.xml"] = description_3(component, tool, token)
         files["sources/buildDescription.xml"] = build_description(component, c_files)
     files |= {f"sources/{name}": text for name, text in code.items()}
     files["resources/model.yaml"] = model
@@ -60,7 +53,7 @@ def archive(
     return _zip_files(files)
 
 
-def _token(component: Component, version: Fmi, tool: str) -> str:
+def _token(component: Component, version: str, tool: str) -> str:
     """A token that only the same content has."""
     code = sources(component, version, "")
     text = "\0".join([tool, version, *(f"{name}\0{code[name]}" for name in sorted(code))])

@@ -1,7 +1,6 @@
 """The C of an FMU, compiled for this system and for others, with the compiler of `ziglang`."""
 
 import importlib.util
-import platform
 import subprocess
 import sys
 import tempfile
@@ -17,11 +16,9 @@ class Target(NamedTuple):
     """A system that an FMU runs on.
 
     Attributes:
-        words: Its name.
         triple: Its name for the compiler, with the oldest C library of Linux that is still in use.
         fmi_2: Its folder in an FMU of FMI 2.0, or None where that has no name for it.
         fmi_3: The same of FMI 3.0.
-        suffix: Suffix of a shared library.
     """
 
     words: str
@@ -42,7 +39,6 @@ TARGETS = (
     Target("macOS", "x86_64-macos", "darwin64", "x86_64-darwin", ".dylib"),
     Target("macOS on ARM", "aarch64-macos", None, "aarch64-darwin", ".dylib"),
 )
-"""Every system that binaries are made for."""
 
 # No contraction: one rounding for a product and a sum would not be what Python computes.
 _FLAGS = (
@@ -59,36 +55,15 @@ _TIMEOUT_S = 300.0
 """Time that a compiler may take: far longer than one needs, so that one that hangs is ended."""
 
 
-def this_system() -> Target:
-    """The target of this program's own system.
-
-    Raises:
-        InputError: It is none of them.
-    """
-    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(
-        platform.machine().lower(), platform.machine().lower()
-    )
-    name = {"linux": "linux", "win32": "windows", "darwin": "darwin"}.get(sys.platform, "")
-    for target in TARGETS:
-        if target.fmi_3 == f"{machine}-{name}":
-            return target
-    choices = ", ".join(target.fmi_3 for target in TARGETS)
-    raise InputError(f"{machine} {sys.platform}: expected one of {choices}")
-
-
 def compile_for(
     targets: Iterable[Target],
     sources: dict[str, str],
     identifier: str,
     done: Callable[[Target], None] = lambda _: None,
 ) -> dict[Target, bytes]:
-    """Shared libraries compiled from C files, by target.
+    """Shared libraries, compiled from C files by their names, for each target.
 
-    Args:
-        targets: Systems to compile for.
-        sources: Content of each file, by its name.
-        identifier: Name of the library, without its suffix.
-        done: Called after each system.
+    `identifier` is a library's name without its suffix; `done` is called after each system.
 
     Raises:
         InputError: The package `ziglang` is not installed, or its compiler refuses.

@@ -8,7 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -21,16 +21,7 @@ from dart_model.spec import EffectSpec, ModelSpec, StrutSpec
 from rig.fmu.law_in_c import InC, in_c
 
 Kind = Literal["time", "input", "parameter", "fixed", "state", "rate", "output", "indicator"]
-KINDS: tuple[Kind, ...] = (
-    "time",
-    "input",
-    "parameter",
-    "fixed",
-    "state",
-    "rate",
-    "output",
-    "indicator",
-)
+KINDS: tuple[Kind, ...] = get_args(Kind)
 """Of variables, in the order in which they lie in memory; `parameter` may be tuned in a run."""
 
 LONGEST_STEP = "longest_step_s"
@@ -47,10 +38,6 @@ class Variable(NamedTuple):
     """A value of an FMU.
 
     Attributes:
-        name: Its name.
-        unit: Its unit; empty if it has none.
-        kind: What it is.
-        meaning: One line.
         start: Its value at the beginning, if it is declared.
         nominal: Its usual size.
         is_output: Whether a state is an output as well.
@@ -70,11 +57,9 @@ class Component:
     """An FMU without its wrapping.
 
     Attributes:
-        name: Name of the model.
         identifier: The same as a C identifier, and as the name of the file.
         meaning: What it is, in a sentence or two.
         variables: All variables, in the order of `KINDS`; a value reference is an index into it.
-        laws: C of the laws.
         evaluation: C of the body of `model_evaluate`.
     """
 
@@ -91,21 +76,16 @@ class Component:
 
 
 def strut_component(spec: ModelSpec, strut: StrutSpec) -> Component:
-    """A strut as a force element.
-
-    Args:
-        spec: The model.
-        strut: Its strut.
-    """
+    """A strut as a force element."""
     made = _Build()
     made.add("height_m", "m", "input", "height of the strut", strut.free_length_m)
     made.add("velocity_m_per_s", "m/s", "input", "its derivative; positive is rebound", 0.0)
     made.add("temperature_c", "degC", "input", "temperature of the damper", AMBIENT_C)
-    laws = made.strut(strut, "", spec.gravity_m_per_s2)
-    if laws.reads_applied_force:
+    effects, text = made.strut(strut, "", spec.gravity_m_per_s2)
+    if any("applied_force_n" in _argument_names(law) for law, _ in effects):
         made.add("applied_force_n", "N", "input", "force that is applied to the bench", 0.0)
     made.add(LONGEST_STEP, "s", "fixed", "longest step of co-simulation", _STRUT_STEP_S)
-    carried = [item.effect.words for item in laws.items if item.effect.adds_mass]
+    carried = [law.words for law, _ in effects if law.adds_mass]
     meaning = (
         f"Strut {strut.name} of {spec.name}: force over height, velocity and temperature, positive "
         "when it pushes the two bodies apart."
@@ -115,7 +95,7 @@ def strut_component(spec: ModelSpec, strut: StrutSpec) -> Component:
             f" Not in the force: {', '.join(carried)}; add the mass to the body that the strut "
             "carries."
         )
-    return made.component(spec.name, f"{spec.name}_{strut.name}", meaning, laws.text)
+    return made.component(spec.name, f"{spec.name}_{strut.name}", meaning, text)
 
 
 def bench_component(spec: ModelSpec) -> Component:
@@ -139,32 +119,33 @@ def bench_component(spec: ModelSpec) -> Component:
     made.add(velocity, "m/s", "state", "its derivative; positive is rebound", 0.0, is_output=True)
     made.add(f"der({height})", "m/s", "rate", "derivative of the height")
     made.add(f"der({velocity})", "m/s2", "rate", "second derivative of the height")
+    added = iter(guide.added)
     text: list[str] = []
     forces: list[str] = []
-    masses = [f"[{made.ref('mass_kg')}]"]
-    weights = [f"{guide.weight_n_per_kg!r} * [{made.ref('mass_kg')}]"]
+    masses = [_ref("mass_kg")]
+    weights = [f"{guide.weight_n_per_kg!r} * {_ref('mass_kg')}"]
     for strut, ratio, offset_m in zip(spec.struts, guide.ratios, guide.offsets_m, strict=True):
         prefix = f"{_identifier(strut.name)}."
         if prefix != first:
             made.add(prefix + "height_m", "m", "output", "height of the strut")
             made.add(prefix + "velocity_m_per_s", "m/s", "output", "positive is rebound")
             for name, zero_m in (("height_m", offset_m), ("velocity_m_per_s", 0.0)):
-                state = made.ref(first + name)
-                text.append(f"[{made.ref(prefix + name)}] = {zero_m!r} + {ratio!r} * [{state}];")
-        laws = made.strut(strut, prefix, None)
-        text.append(laws.text)
-        forces.append(f"{ratio!r} * [{made.ref(prefix + 'force_n')}]")
-        for item in laws.items:
-            if item.effect.adds_mass:
-                mass = made.ref(item.prefix + item.effect.parameters[0].name)
-                by_mass = guide.added[len(masses) - 1]
-                masses.append(f"{by_mass.inertia!r} * [{mass}]")
-                weights.append(f"{by_mass.weight_n_per_kg!r} * [{mass}]")
-    applied = f"{guide.applied!r} * [{made.ref('applied_force_n')}]"
-    weight = f"[{made.ref('gravity_m_per_s2')}] * ({' + '.join(weights)})"
+                state = _ref(first + name)
+                text.append(f"{_ref(prefix + name)} = {zero_m!r} + {ratio!r} * {state};")
+        effects, laws = made.strut(strut, prefix, None)
+        text.append(laws)
+        forces.append(f"{ratio!r} * {_ref(prefix + 'force_n')}")
+        for law, own_prefix in effects:
+            if law.adds_mass:
+                mass = _ref(own_prefix + law.parameters[0].name)
+                inertia, weight_n_per_kg = next(added)
+                masses.append(f"{inertia!r} * {mass}")
+                weights.append(f"{weight_n_per_kg!r} * {mass}")
+    applied = f"{guide.applied!r} * {_ref('applied_force_n')}"
+    weight = f"{_ref('gravity_m_per_s2')} * ({' + '.join(weights)})"
     total = " + ".join([applied, *forces, weight])
-    text.append(f"[{made.ref(f'der({height})')}] = [{made.ref(velocity)}];")
-    text.append(f"[{made.ref(f'der({velocity})')}] = ({total}) / ({' + '.join(masses)});")
+    text.append(f"{_ref(f'der({height})')} = {_ref(velocity)};")
+    text.append(f"{_ref(f'der({velocity})')} = ({total}) / ({' + '.join(masses)});")
     meaning = (
         f"Bench {spec.name}: one guided degree of freedom under an applied force, which is "
         "positive upwards. Strut forces are positive when they push the two bodies apart."
@@ -172,34 +153,13 @@ def bench_component(spec: ModelSpec) -> Component:
     return made.component(spec.name, f"{spec.name}_bench", meaning, "\n".join(text))
 
 
-class _Placed(NamedTuple):
-    """An effect of a strut.
-
-    Attributes:
-        effect: The effect.
-        prefix: Before the names of its variables.
-    """
-
-    effect: Effect
-    prefix: str
-
-
-class _Laws(NamedTuple):
-    """A strut's part of an evaluation.
-
-    Attributes:
-        text: The C, with references to variables in brackets.
-        items: The effects.
-        reads_applied_force: Whether one of them depends on the applied force.
-    """
-
-    text: str
-    items: list[_Placed]
-    reads_applied_force: bool
-
-
 _References = Mapping[Origin, Sequence[str]]
 """References to the variables behind a law's arguments, by their origin."""
+
+
+def _ref(name: str) -> str:
+    """A reference to a variable in C, until its index is known."""
+    return f"[<{name}>]"
 
 
 class _Build:
@@ -227,53 +187,47 @@ class _Build:
             raise InputError(f"{name}: two variables of this name, expected struts of other names")
         self._variables[name] = Variable(name, unit, kind, meaning, start, nominal, is_output)
 
-    def ref(self, name: str) -> str:
-        """The reference to a variable, to be put in brackets."""
-        return f"<{name}>"
+    def strut(
+        self, spec: StrutSpec, prefix: str, gravity_m_per_s2: float | None
+    ) -> tuple[list[tuple[Effect, str]], str]:
+        """Add a strut; returns its effects, with prefixes of their names, and C that evaluates it.
 
-    def strut(self, spec: StrutSpec, prefix: str, gravity_m_per_s2: float | None) -> _Laws:
-        """Add a strut.
-
-        Args:
-            spec: The strut.
-            prefix: Before the names of its variables.
-            gravity_m_per_s2: Gravity as a separate parameter; None where the bench has it.
+        Gravity is a separate parameter unless it is None: a bench has it already.
         """
-        add, ref = self.add, self.ref
+        add = self.add
         add(prefix + "free_length_m", "m", "parameter", "height without force", spec.free_length_m)
         stiffness, damping = spec.stiffness_n_per_m, spec.damping_n_s_per_m
         add(prefix + "stiffness_n_per_m", "N/m", "parameter", "linear stiffness", stiffness)
         add(prefix + "damping_n_s_per_m", "N.s/m", "parameter", "linear damping", damping)
         if gravity_m_per_s2 is not None:
-            g = gravity_m_per_s2
-            add("gravity_m_per_s2", "m/s2", "parameter", "standard gravity", g)
+            add("gravity_m_per_s2", "m/s2", "parameter", "standard gravity", gravity_m_per_s2)
         add(prefix + "force_n", "N", "output", "force of the strut")
         add(prefix + "spring.part_n", "N", "output", "part of the linear spring")
         add(prefix + "damper.part_n", "N", "output", "part of the linear damper")
         items = [
-            _Placed(effect(item.name), prefix + name)
+            (effect(item.name), prefix + name)
             for item, name in zip(spec.effects, _own_names(spec.effects), strict=True)
         ]
-        constants = [ref(prefix + name) for name in STRUT[:-1]] + [ref("gravity_m_per_s2")]
-        free_length, stiffness, damping = (f"[{name}]" for name in constants[:-1])
+        constants = [_ref(prefix + name) for name in STRUT[:-1]] + [_ref("gravity_m_per_s2")]
+        free_length, stiffness, damping = constants[:-1]
         spring = f"{stiffness} * ({free_length} - height_m)"
         damper = f"{damping} * velocity_m_per_s"
         lines = [
             "{",
-            f"    const double height_m = [{ref(prefix + 'height_m')}];",
-            f"    const double velocity_m_per_s = [{ref(prefix + 'velocity_m_per_s')}];",
+            f"    const double height_m = {_ref(prefix + 'height_m')};",
+            f"    const double velocity_m_per_s = {_ref(prefix + 'velocity_m_per_s')};",
             f"    double force = {spring} - {damper};",
-            f"    [{ref(prefix + 'spring.part_n')}] = {spring};",
-            f"    [{ref(prefix + 'damper.part_n')}] = -{damper};",
+            f"    {_ref(prefix + 'spring.part_n')} = {spring};",
+            f"    {_ref(prefix + 'damper.part_n')} = -{damper};",
         ]
         for item, values in zip(items, spec.effects, strict=True):
-            lines += self._effect(item, values, constants)
-        reads = any("applied_force_n" in _argument_names(item.effect) for item in items)
-        lines += [f"    [{ref(prefix + 'force_n')}] = force;", "}"]
-        return _Laws("\n".join(lines), items, reads)
+            lines += self._effect(*item, values, constants)
+        lines += [f"    {_ref(prefix + 'force_n')} = force;", "}"]
+        return items, "\n".join(lines)
 
-    def _effect(self, item: _Placed, values: EffectSpec, constants: Sequence[str]) -> list[str]:
-        law, prefix = item.effect, item.prefix
+    def _effect(
+        self, law: Effect, prefix: str, values: EffectSpec, constants: Sequence[str]
+    ) -> list[str]:
         for parameter, value in zip(law.parameters, values.values(), strict=True):
             unit = _plain_unit(parameter.unit)
             self.add(prefix + parameter.name, unit, "parameter", parameter.meaning, value)
@@ -283,22 +237,22 @@ class _Build:
             self.add(name, "", "state", f"internal state of {law.words}", 0.0, scale)
             self.add(f"der({name})", "", "rate", "its derivative")
         references: _References = {
-            "states": [self.ref(name) for name in states],
-            "parameters": [self.ref(prefix + parameter.name) for parameter in law.parameters],
+            "states": [_ref(name) for name in states],
+            "parameters": [_ref(prefix + parameter.name) for parameter in law.parameters],
             "strut": constants,
-            "rates": [self.ref(f"der({name})") for name in states],
+            "rates": [_ref(f"der({name})") for name in states],
         }
         force, call = self._call(law.name, law.force, law, references)
         lines = [
             *self._switches(force.switches),
             f"        const double part = {call};",
             "        force += part;",
-            f"        [{self.ref(prefix + 'part_n')}] = part;",
+            f"        {_ref(prefix + 'part_n')} = part;",
             "    }",
         ]
         if law.rate is not None:
             rate, call = self._call(f"{law.name}_rate", law.rate, law, references)
-            result = "" if rate.writes else f"[{references['rates'][0]}] = "
+            result = "" if rate.writes else f"{references['rates'][0]} = "
             lines += [*self._switches(rate.switches), f"        {result}{call};", "    }"]
         return lines
 
@@ -314,9 +268,9 @@ class _Build:
                 given.append(item.name)
             elif item.origin != "rates":
                 row = "" if item.size is None else "&"
-                given.append(f"{row}[{references[item.origin][item.first]}]")
+                given.append(f"{row}{references[item.origin][item.first]}")
         if self._laws[name].writes:
-            given.append(f"&[{references['rates'][0]}]")
+            given.append(f"&{references['rates'][0]}")
         return self._laws[name], f"{name}({', '.join(given)})"
 
     def _switches(self, count: int) -> list[str]:
@@ -357,25 +311,14 @@ def _argument_names(law: Effect) -> set[str]:
     return {item.name for function in functions for item in arguments(function, law)}
 
 
-class _Added(NamedTuple):
-    """What a kilogram of an effect's mass does to the equation of motion.
-
-    Attributes:
-        inertia: Mass in parallel with the first strut per kilogram.
-        weight_n_per_kg: Force along it per kilogram, for a gravity of one.
-    """
-
-    inertia: float
-    weight_n_per_kg: float
-
-
 class _Guide(NamedTuple):
     """The equation of motion along the height of the first strut.
 
     Attributes:
         mass_kg: Mass, without that of effects.
         weight_n_per_kg: Weight per mass, for a gravity of one; -1 for a vertical guide.
-        added: The same of each effect with a mass, strut after strut.
+        added: Of each effect with a mass, strut after strut: per kilogram the mass in parallel
+            with the first strut, and the force along it for a gravity of one.
         applied: Force along the height per newton of applied force.
         ratios: Travel of each strut per travel of the first one.
         offsets_m: Height of each strut where the first one's is zero.
@@ -385,7 +328,7 @@ class _Guide(NamedTuple):
 
     mass_kg: float
     weight_n_per_kg: float
-    added: list[_Added]
+    added: list[tuple[float, float]]
     applied: float
     ratios: list[float]
     offsets_m: list[float]
@@ -402,10 +345,10 @@ def _guide(spec: ModelSpec) -> _Guide:
         )
     count = sum(effect(item.name).adds_mass for strut in spec.struts for item in strut.effects)
     mass_kg, weight = _along_height(spec, [0.0] * count)
-    added: list[_Added] = []
+    added: list[tuple[float, float]] = []
     for k in range(count):
         more_kg, more = _along_height(spec, [float(k == other) for other in range(count)])
-        added.append(_Added(more_kg - mass_kg, more - weight))
+        added.append((more_kg - mass_kg, more - weight))
     jacobians = plant.jacobians(np.zeros(1))
     rows, offsets = jacobians.struts[:, 0], jacobians.offsets_m
     ratios = rows / rows[0]
@@ -425,19 +368,17 @@ def _guide(spec: ModelSpec) -> _Guide:
 def _along_height(spec: ModelSpec, masses_kg: Sequence[float]) -> tuple[float, float]:
     """Mass, and weight for a gravity of one, along the first strut's height.
 
-    Args:
-        spec: The model.
-        masses_kg: Mass of each effect that has one, strut after strut.
+    The masses are those of each effect that has one, strut after strut.
     """
     given = iter(masses_kg)
     struts: list[StrutSpec] = []
     for strut in spec.struts:
-        effects = [
-            EffectSpec(name=item.name, parameters=_with_mass(item, next(given)))
-            if effect(item.name).adds_mass
-            else item
-            for item in strut.effects
-        ]
+        effects: list[EffectSpec] = []
+        for item in strut.effects:
+            parameters = dict(item.parameters)
+            if effect(item.name).adds_mass:
+                parameters[effect(item.name).parameters[0].name] = next(given)
+            effects.append(EffectSpec(name=item.name, parameters=parameters))
         struts.append(strut.model_copy(update={"effects": tuple(effects)}))
     update = {"gravity_m_per_s2": 1.0, "struts": tuple(struts)}
     plant = DartPlant(spec.model_copy(update=update))
@@ -452,10 +393,6 @@ def _along_height(spec: ModelSpec, masses_kg: Sequence[float]) -> tuple[float, f
             "for a bench as an FMU (a strut alone can always be exported)"
         )
     return found[0]
-
-
-def _with_mass(item: EffectSpec, mass_kg: float) -> dict[str, float]:
-    return {**item.parameters, effect(item.name).parameters[0].name: mass_kg}
 
 
 def _own_names(effects: Iterable[EffectSpec]) -> list[str]:

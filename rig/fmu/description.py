@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Mapping
-from typing import NamedTuple
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from rig.fmu.component import Component, Variable
@@ -35,41 +34,17 @@ _BASE: Mapping[str, Mapping[str, int]] = {
 }
 """Units as products of base units; any other unit has a name alone."""
 
-
-class Provenance(NamedTuple):
-    """Tool and defaults that an FMU's description contains.
-
-    Attributes:
-        tool: Program and version.
-        token: Identifies the FMU's content.
-        experiment_s: Length of a usual simulation.
-        step_s: Its step.
-    """
-
-    tool: str
-    token: str
-    experiment_s: float
-    step_s: float
+_EXPERIMENT_S, _STEP_S = 10.0, 0.001
+"""Length of a usual simulation, and its step."""
 
 
-def description_2(component: Component, provenance: Provenance, files: list[str]) -> str:
+def description_2(component: Component, tool: str, token: str, files: list[str]) -> str:
     """``modelDescription.xml`` of FMI 2.0.
 
-    Args:
-        component: What the FMU computes.
-        provenance: Tool and defaults.
-        files: C files that a compiler is given.
+    `tool` writes it, `token` identifies the content, and a compiler is given the C files `files`.
     """
-    root = Element(
-        "fmiModelDescription",
-        fmiVersion="2.0",
-        modelName=component.name,
-        guid=provenance.token,
-        description=component.meaning,
-        generationTool=provenance.tool,
-        variableNamingConvention="structured",
-        numberOfEventIndicators=str(len(component.of("indicator"))),
-    )
+    root = _root(component, tool, "2.0", {"guid": token})
+    root.set("numberOfEventIndicators", str(len(component.of("indicator"))))
     states = {"canGetAndSetFMUstate": "true", "canSerializeFMUstate": "true"}
     exchange = SubElement(root, "ModelExchange", {"modelIdentifier": component.identifier} | states)
     simulation = SubElement(
@@ -87,19 +62,14 @@ def description_2(component: Component, provenance: Provenance, files: list[str]
         source_files = SubElement(parent, "SourceFiles")
         for name in files:
             SubElement(source_files, "File", name=name)
-    _add_definitions(root, component, provenance)
+    _add_definitions(root, component)
     listed = [item for item in component.variables if item.kind != "indicator"]
     variables = SubElement(root, "ModelVariables")
     states = _state_of_rate(component)
     for index, item in enumerate(listed):
         scalar = SubElement(variables, "ScalarVariable", _attributes(item, index))
-        real = SubElement(scalar, "Real", _unit(item))
-        if item.start is not None:
-            real.set("start", repr(float(item.start)))
-        if item.kind == "state":
-            real.set("nominal", repr(float(item.nominal)))
-        if index in states:
-            real.set("derivative", str(states[index] + 1))
+        derivative = states[index] + 1 if index in states else None
+        SubElement(scalar, "Real", _number_attributes(item, derivative))
     structure = SubElement(root, "ModelStructure")
     for tag, indices in (
         ("Outputs", _outputs(component)),
@@ -113,17 +83,9 @@ def description_2(component: Component, provenance: Provenance, files: list[str]
     return _text(root)
 
 
-def description_3(component: Component, provenance: Provenance) -> str:
+def description_3(component: Component, tool: str, token: str) -> str:
     """``modelDescription.xml`` of FMI 3.0; arguments as of `description_2`."""
-    root = Element(
-        "fmiModelDescription",
-        fmiVersion="3.0",
-        modelName=component.name,
-        instantiationToken=provenance.token,
-        description=component.meaning,
-        generationTool=provenance.tool,
-        variableNamingConvention="structured",
-    )
+    root = _root(component, tool, "3.0", {"instantiationToken": token})
     able = {
         "modelIdentifier": component.identifier,
         "canGetAndSetFMUState": "true",
@@ -131,18 +93,12 @@ def description_3(component: Component, provenance: Provenance) -> str:
     }
     SubElement(root, "ModelExchange", able)
     SubElement(root, "CoSimulation", able | {"canHandleVariableCommunicationStepSize": "true"})
-    _add_definitions(root, component, provenance)
+    _add_definitions(root, component)
     variables = SubElement(root, "ModelVariables")
     states = _state_of_rate(component)
     for index, item in enumerate(component.variables):
-        attributes = _attributes(item, index) | _unit(item)
-        if item.start is not None:
-            attributes["start"] = repr(float(item.start))
-        if item.kind == "state":
-            attributes["nominal"] = repr(float(item.nominal))
-        if index in states:
-            attributes["derivative"] = str(states[index])
-        SubElement(variables, "Float64", attributes)
+        number = _number_attributes(item, states.get(index))
+        SubElement(variables, "Float64", _attributes(item, index) | number)
     structure = SubElement(root, "ModelStructure")
     for tag, indices in (
         ("Output", _outputs(component)),
@@ -167,7 +123,18 @@ def build_description(component: Component, files: list[str]) -> str:
     return _text(root)
 
 
-def _add_definitions(root: Element, component: Component, provenance: Provenance) -> None:
+def _root(component: Component, tool: str, version: str, token: dict[str, str]) -> Element:
+    return Element(
+        "fmiModelDescription",
+        {"fmiVersion": version, "modelName": component.name},
+        **token,
+        description=component.meaning,
+        generationTool=tool,
+        variableNamingConvention="structured",
+    )
+
+
+def _add_definitions(root: Element, component: Component) -> None:
     """Add units, log categories and the default experiment."""
     units = SubElement(root, "UnitDefinitions")
     for name in sorted({item.unit for item in component.variables if item.unit}):
@@ -181,8 +148,8 @@ def _add_definitions(root: Element, component: Component, provenance: Provenance
         root,
         "DefaultExperiment",
         startTime="0",
-        stopTime=repr(provenance.experiment_s),
-        stepSize=repr(provenance.step_s),
+        stopTime=repr(_EXPERIMENT_S),
+        stepSize=repr(_STEP_S),
     )
 
 
@@ -213,8 +180,16 @@ def _attributes(item: Variable, reference: int) -> dict[str, str]:
     return attributes if initial is None else attributes | {"initial": initial}
 
 
-def _unit(item: Variable) -> dict[str, str]:
-    return {"unit": item.unit} if item.unit else {}
+def _number_attributes(item: Variable, derivative: int | None) -> dict[str, str]:
+    """Unit, start, nominal size, and the state whose derivative it is."""
+    attributes = {"unit": item.unit} if item.unit else {}
+    if item.start is not None:
+        attributes["start"] = repr(float(item.start))
+    if item.kind == "state":
+        attributes["nominal"] = repr(float(item.nominal))
+    if derivative is not None:
+        attributes["derivative"] = str(derivative)
+    return attributes
 
 
 def _outputs(component: Component) -> list[int]:

@@ -19,18 +19,10 @@ def export_fmu(
     bench: bool,
     report_compiled: Callable[[str], None] = lambda _: None,
 ) -> Component:
-    """Write a strut, or the whole bench, as an FMU.
+    """Write a strut, or the whole bench, as an FMU of version ``2.0`` or ``3.0``.
 
-    Args:
-        spec: The model.
-        out: New file.
-        fmi: Version of the interface, ``2.0`` or ``3.0``.
-        strut: Name of the strut; None for the only one.
-        bench: Whether to write the whole bench.
-        report_compiled: Called with the name of each system, once its binary is compiled.
-
-    Returns:
-        The component that was written.
+    The strut may be None where the model has only one. `report_compiled` is called with the name of
+    each system, once its binary is compiled. What was written is returned.
 
     Raises:
         InputError: The file is there or cannot be written, there is no such version or strut, the

@@ -27,15 +27,9 @@ _PROPORTIONAL = 1e-6
 def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: Path) -> ModelSpec:
     """Make a model of an FMU, which from then on may run on this machine.
 
-    Args:
-        source: The FMU.
-        mapping: Roles of its variables, as in the `fmu` of a model file; without it, they are
-            called as in an FMU of `rig export`.
-        mass_kg: Mass that the strut carries; of a bench it is computed if it is None.
-        out: New folder for the model file and the FMU.
-
-    Returns:
-        The model.
+    The file `mapping` gives the roles of its variables, as in the `fmu` of a model file; without
+    it, they are called as in an FMU of `rig export`. The mass is what the strut carries; of a bench
+    it is computed if it is None. The model file and the FMU are written into the new folder `out`.
 
     Raises:
         InputError: The FMU, the mapping or the folder is wrong, or a mass is missing.
@@ -45,7 +39,11 @@ def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: P
     refuse_full(out)
     content = read_program(source)
     description = read_description(content, source)
-    roles = _roles_by_name(description, source) if mapping is None else _read_roles(mapping)
+    if mapping is None:
+        roles = _roles_by_name(description, source)
+    else:
+        given = parse_mapping(read_text(mapping), str(mapping))
+        roles = validate(FmuSpec, {**given, "file": FMU_FILE}, str(mapping))
     _refuse_contradictions(roles, mapping or source)
     if roles.force is not None and mass_kg is None:
         raise InputError(f"{source}: a strut alone, expected --mass-kg with what it carries")
@@ -67,11 +65,6 @@ def import_fmu(source: Path, mapping: Path | None, mass_kg: float | None, out: P
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror})") from error
     return spec.model_copy(update={"folder": out})
-
-
-def _read_roles(mapping: Path) -> FmuSpec:
-    roles = parse_mapping(read_text(mapping), str(mapping))
-    return validate(FmuSpec, {**roles, "file": FMU_FILE}, str(mapping))
 
 
 def variables_of(roles: FmuSpec) -> dict[str, str]:
@@ -111,10 +104,9 @@ def _roles_by_name(description: Any, source: Path) -> FmuSpec:
         own = {"height": "height_m", "velocity": "velocity_m_per_s", "force": "force_n"}
         return validate(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
     rates = {item.variable.derivative.name: item.variable.name for item in description.derivatives}
-    prefixes = [name.removesuffix("height_m") for name in rates if name.endswith(".height_m")]
-    for prefix in prefixes:
-        height, velocity = f"{prefix}height_m", f"{prefix}velocity_m_per_s"
-        if velocity in rates and further["applied_force"]:
+    for height in rates:
+        velocity = height.removesuffix("height_m") + "velocity_m_per_s"
+        if height.endswith(".height_m") and velocity in rates and further["applied_force"]:
             own = {"height": height, "velocity": velocity, "acceleration": rates[velocity]}
             return validate(FmuSpec, {"file": FMU_FILE, **own, **further}, str(source))
     names = ", ".join(n for n, kind in causality.items() if kind in ("input", "output"))

@@ -37,6 +37,7 @@ _FUNCTIONS: Mapping[str, str] = {
     "math.atan": "atan",
 }
 _SWITCHING: Mapping[str, tuple[str, int]] = {
+    "int": ("whole_part", 1),
     "max": ("larger", 2),
     "min": ("smaller", 2),
     "abs": ("magnitude", 1),
@@ -71,11 +72,7 @@ class InC(NamedTuple):
 
 
 def in_c(law: Force | Rate, name: str) -> InC:
-    """A law as a C function.
-
-    Args:
-        law: The force or the rate of an effect.
-        name: Name of the C function.
+    """The force or the rate of an effect as a C function of some name.
 
     Raises:
         NoLawError: It uses what no law may use.
@@ -84,20 +81,6 @@ def in_c(law: Force | Rate, name: str) -> InC:
     if not isinstance(tree, ast.FunctionDef):
         raise NoLawError(f"{name}: expected a function")
     return _Translation(law.__globals__, tree, name).function()
-
-
-class _Loop(NamedTuple):
-    """A loop that is being translated.
-
-    Attributes:
-        variable: Its variable.
-        first: Its first switch.
-        each: Switches of each round.
-    """
-
-    variable: str
-    first: int
-    each: int
 
 
 class _Translation:
@@ -111,14 +94,15 @@ class _Translation:
             item.arg: ast.unparse(item.annotation) if item.annotation else ""
             for item in tree.args.args
         }
-        self._whole: set[str] = set()
-        self._declared: list[str] = []
+        self._declared: dict[str, bool] = {}
+        """Its variables, and whether each is a whole number."""
         self._switches = 0
-        self._loop: _Loop | None = None
+        self._loop: tuple[str, int] | None = None
+        """Variable of the loop that is being translated, and the switches of each of its rounds."""
 
     def function(self) -> InC:
         """The function in C."""
-        body = self._block(self._tree.body, 1)
+        body = self._block(self._tree.body)
         returns = ast.unparse(self._tree.returns) if self._tree.returns else ""
         arguments = ["const Switches *s"]
         for name, annotation in self._arguments.items():
@@ -130,56 +114,55 @@ class _Translation:
         writes = returns != "float"
         head = f"static {'void' if writes else 'double'} {self._name}({', '.join(arguments)}) {{"
         declared = [
-            f"    {'long' if name in self._whole else 'double'} {name};" for name in self._declared
+            f"    {'long' if is_whole else 'double'} {name};"
+            for name, is_whole in self._declared.items()
         ]
         lines = [head, *declared, "    (void)s;", *body, "}"]
         return InC("\n".join(lines) + "\n", self._switches, writes)
 
-    def _block(self, statements: list[ast.stmt], depth: int) -> list[str]:
-        return [line for item in statements for line in self._statement(item, depth)]
+    def _block(self, statements: list[ast.stmt]) -> list[str]:
+        return [f"    {line}" for item in statements for line in self._statement(item)]
 
-    def _statement(self, node: ast.stmt, depth: int) -> list[str]:
-        before = "    " * depth
+    def _statement(self, node: ast.stmt) -> list[str]:
         match node:
             case ast.Return(value=ast.Tuple(elts=values)):
                 written = (f"rates[{k}] = {self._real(item)};" for k, item in enumerate(values))
-                return [f"{before}{line}" for line in (*written, "return;")]
+                return [*written, "return;"]
             case ast.Return(value=value) if value is not None:
-                return [f"{before}return {self._real(value)};"]
+                return [f"return {self._real(value)};"]
             case ast.Assign(targets=[target], value=value):
-                return [f"{before}{self._assign(target, value)};"]
+                return [f"{self._assign(target, value)};"]
             case ast.AugAssign(target=ast.Name(id=name), op=op, value=value):
-                return [f"{before}{name} {self._operator(op, node)}= {self._real(value)};"]
+                return [f"{name} {self._operator(op, node)}= {self._real(value)};"]
             case ast.If(test=test, body=body, orelse=orelse):
-                lines = [f"{before}if ({self._expression(test)}) {{", *self._block(body, depth + 1)]
+                lines = [f"if ({self._expression(test)}) {{", *self._block(body)]
                 if orelse:
-                    lines += [f"{before}}} else {{", *self._block(orelse, depth + 1)]
-                return [*lines, f"{before}}}"]
+                    lines += ["} else {", *self._block(orelse)]
+                return [*lines, "}"]
             case ast.For(
                 target=ast.Name(id=name),
                 iter=ast.Call(func=ast.Name(id="range"), args=[ast.Name(id=rounds)]),
                 body=body,
                 orelse=[],
             ) if self._loop is None:
-                return self._for(name, int(self._global(rounds, node)), body, depth)
+                return self._for(name, int(self._global(rounds, node)), body)
             case ast.Expr(value=ast.Constant(value=str())):
                 return []
             case _:
                 raise self._refusal(node)
 
-    def _for(self, name: str, rounds: int, body: list[ast.stmt], depth: int) -> list[str]:
-        before = "    " * depth
+    def _for(self, name: str, rounds: int, body: list[ast.stmt]) -> list[str]:
         self._declare(name, whole=True)
         first = self._switches
-        self._loop = _Loop(name, first, 0)
-        self._block(body, depth)  # counts the switches of a round
-        self._loop = _Loop(name, first, self._switches - first)
+        self._loop = name, 0
+        self._block(body)  # counts the switches of a round
+        each = self._switches - first
+        self._loop = name, each
         self._switches = first
-        lines = self._block(body, depth + 1)
-        self._switches = first + rounds * self._loop.each
+        lines = self._block(body)
+        self._switches = first + rounds * each
         self._loop = None
-        head = f"{before}for ({name} = 0; {name} < {rounds}; ++{name}) {{"
-        return [head, *lines, f"{before}}}"]
+        return [f"for ({name} = 0; {name} < {rounds}; ++{name}) {{", *lines, "}"]
 
     def _assign(self, target: ast.expr, value: ast.expr) -> str:
         match target:
@@ -196,11 +179,7 @@ class _Translation:
     def _declare(self, name: str, *, whole: bool) -> None:
         if name in self._arguments:
             raise NoLawError(f"{self._name}: {name}: an argument is given another value")
-        if name not in self._declared:
-            self._declared.append(name)
-            if whole:
-                self._whole.add(name)
-        elif whole != (name in self._whole):
+        if self._declared.setdefault(name, whole) != whole:
             raise NoLawError(f"{self._name}: {name}: a whole number and a real one")
 
     def _is_row(self, name: str) -> bool:
@@ -212,7 +191,7 @@ class _Translation:
             case ast.Constant(value=value):
                 return isinstance(value, int)
             case ast.Name(id=name) if name in self._declared or name in self._arguments:
-                return name in self._whole
+                return self._declared.get(name, False)
             case ast.Name(id=name):
                 return isinstance(self._global(name, node), int)
             case ast.BinOp(left=left, op=ast.Add() | ast.Sub() | ast.Mult(), right=right):
@@ -232,8 +211,10 @@ class _Translation:
         match node:
             case ast.Constant(value=int() | float()) if not isinstance(node.value, bool):
                 return repr(node.value)
+            case ast.Name(id=name) if name in self._declared or name in self._arguments:
+                return name
             case ast.Name(id=name):
-                return self._variable(name, node)
+                return repr(self._global(name, node))
             case ast.Attribute() if ast.unparse(node) in _CONSTANTS:
                 return _CONSTANTS[ast.unparse(node)]
             case ast.UnaryOp(op=ast.USub(), operand=operand):
@@ -263,8 +244,6 @@ class _Translation:
         return f"({side(left)} {self._operator(op, left)} {side(right)})"
 
     def _call(self, called: str, arguments: list[ast.expr], node: ast.expr) -> str:
-        if called == "int" and len(arguments) == 1:
-            return self._switch("whole_part", arguments)
         if called in _SWITCHING and len(arguments) == _SWITCHING[called][1]:
             return self._switch(_SWITCHING[called][0], arguments)
         if called in _FUNCTIONS and len(arguments) == 1:
@@ -272,17 +251,12 @@ class _Translation:
         raise self._refusal(node)
 
     def _switch(self, function: str, arguments: list[ast.expr]) -> str:
-        number, loop = self._switches, self._loop
+        index = str(self._switches)
         self._switches += 1
-        index = str(number)
-        if loop is not None:
-            index = f"{number} + {loop.each} * {loop.variable}"
+        if self._loop is not None:
+            variable, each = self._loop
+            index += f" + {each} * {variable}"
         return f"{function}(s, {index}, {', '.join(self._real(item) for item in arguments)})"
-
-    def _variable(self, name: str, node: ast.AST) -> str:
-        if name in self._declared or name in self._arguments:
-            return name
-        return repr(self._global(name, node))
 
     def _global(self, name: str, node: ast.AST) -> float:
         value = self._globals.get(name)

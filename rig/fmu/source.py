@@ -2,28 +2,17 @@
 
 from collections.abc import Iterable, Mapping
 from importlib.resources import files
+from string import Template
 
 from rig.fmu.component import KINDS, LONGEST_STEP, Component, Kind
 
-Fmi = str
-"""Version of the interface: ``2.0`` or ``3.0``."""
-
-VERSIONS: Mapping[Fmi, tuple[str, ...]] = {
+VERSIONS: Mapping[str, tuple[str, ...]] = {
     "2.0": ("fmi2.c", "fmi2.h"),
     "3.0": ("fmi3.c", "fmi3.h"),
 }
 """Files of each version of the interface."""
 
 _COMMON = ("component.c", "component.h", "switches.h")
-_COUNTED: Mapping[Kind, str] = {
-    "input": "INPUT",
-    "parameter": "PARAMETER",
-    "fixed": "FIXED",
-    "state": "STATE",
-    "rate": "RATE",
-    "output": "OUTPUT",
-    "indicator": "INDICATOR",
-}
 _COUNTS: Mapping[Kind, str] = {
     "input": "INPUTS",
     "parameter": "PARAMETERS",
@@ -34,13 +23,10 @@ _COUNTS: Mapping[Kind, str] = {
 }
 
 
-def sources(component: Component, version: Fmi, token: str) -> dict[str, str]:
+def sources(component: Component, version: str, token: str) -> dict[str, str]:
     """Every C file of an FMU by its name.
 
-    Args:
-        component: What it computes.
-        version: Version of the interface.
-        token: Token in the description, so that no other binary is taken for it.
+    The token is that of the description, so that no other binary is taken for it.
     """
     code = {name: read_common_source(name) for name in (*_COMMON, *VERSIONS[version])}
     code["model.h"] = _header(component, token, version)
@@ -58,70 +44,33 @@ def select_c_files(names: Iterable[str]) -> list[str]:
     return sorted(name for name in names if name.endswith(".c"))
 
 
-def _header(component: Component, token: str, version: Fmi) -> str:
+def _header(component: Component, token: str, version: str) -> str:
+    """The file `model.h`, from its template."""
     kinds = [item.kind for item in component.variables]
-    fmi = f"FMI{version[0]}"
     first = 0
     lines: list[str] = []
     for kind in KINDS:
-        if kind in _COUNTED:
-            lines.append(f"#define FIRST_{_COUNTED[kind]} {first}")
+        if kind != "time":
+            lines.append(f"#define FIRST_{kind.upper()} {first}")
         if kind in _COUNTS:
             lines.append(f"#define {_COUNTS[kind]} {kinds.count(kind)}")
         first += kinds.count(kind)
-    longest = [item.name for item in component.variables].index(LONGEST_STEP)
-    return "\n".join(
-        [
-            "/* The values of this model: time, inputs, parameters that may be tuned, fixed ones,",
-            "   states, their rates, outputs and indicators of switches, one after another. */",
-            "#ifndef MODEL_H",
-            "#define MODEL_H",
-            "",
-            "/* Linked from their sources, FMUs differ in the names of their functions; a",
-            "   shared library has those of the standard. */",
-            f"#ifndef {fmi}_OVERRIDE_FUNCTION_PREFIX",
-            f"#define {fmi}_FUNCTION_PREFIX {component.identifier}_",
-            "#endif",
-            "",
-            f'#define MODEL_TOKEN "{token}"',
-            *lines,
-            f"#define VALUES {first}",
-            f"#define LONGEST_STEP {longest}",
-            "",
-            "extern const double model_start[VALUES];",
-            "extern const double model_nominals[STATES + 1];",
-            "",
-            "/* Compute rates, outputs and indicators from the other values. */",
-            "void model_evaluate(double *value, long *answer, int is_held);",
-            "",
-            "#endif",
-            "",
-        ]
+    return Template(read_common_source("model.h.template")).substitute(
+        fmi=f"FMI{version[0]}",
+        identifier=component.identifier,
+        token=token,
+        counts="\n".join(lines),
+        values=first,
+        longest_step=[item.name for item in component.variables].index(LONGEST_STEP),
     )
 
 
 def _model(component: Component) -> str:
-    starts = ", ".join(repr(item.start or 0.0) for item in component.variables)
-    nominals = ", ".join(repr(item.nominal) for _, item in component.of("state"))
-    body = "\n".join(f"    {line}" for line in component.evaluation.splitlines())
-    return "\n".join(
-        [
-            '#include "model.h"',
-            "",
-            '#include "switches.h"',
-            "",
-            f"const double model_start[VALUES] = {{{starts}}};",
-            "",
-            f"const double model_nominals[STATES + 1] = {{{nominals or '0.0'}}};",
-            "",
-            component.laws,
-            "void model_evaluate(double *value, long *answer, int is_held) {",
-            "    int k;",
-            "    /* Of a switch that is not asked. */",
-            "    for (k = 0; k < SWITCHES; ++k)",
-            "        value[FIRST_INDICATOR + k] = answer[k] ? 1.0 : -1.0;",
-            body,
-            "}",
-            "",
-        ]
+    """The file `model.c`, from its template."""
+    nominals = [repr(item.nominal) for _, item in component.of("state")]
+    return Template(read_common_source("model.c.template")).substitute(
+        starts=", ".join(repr(item.start or 0.0) for item in component.variables),
+        nominals=", ".join(nominals) or "0.0",
+        laws=component.laws,
+        evaluation="\n".join(f"    {line}" for line in component.evaluation.splitlines()),
     )

@@ -30,15 +30,7 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Traffic:
-    """Frames of one id on the bus.
-
-    Attributes:
-        arbitration_id: The id.
-        is_extended: Whether it has 29 bits.
-        count: Number of frames.
-        length_bytes: Length of the payload of the last one.
-        interval_s: Median time between two; None where there were too few.
-    """
+    """Frames of one id: their number, the length of the last, and the median interval, if known."""
 
     arbitration_id: int
     is_extended: bool
@@ -57,7 +49,6 @@ class BusSurvey:
         unconfigured: Identity of a device without a node id; None if there is none.
         claims: J1939 devices that claim an address.
         groups: Known parameter groups of J1939 that are sent, with their senders.
-        traffic: All frames, by id.
     """
 
     devices: tuple[CanOpenDevice, ...]
@@ -101,13 +92,10 @@ class _DeviceObjects:
 
 
 def scan(network: CanOpenNetwork, listen_s: float, *, progress: Progress) -> BusSurvey:
-    """Survey of a bus.
+    """Survey of a bus; where the network only listens, no request is sent.
 
-    Args:
-        network: The bus; where it only listens, no request is sent.
-        listen_s: Time of listening before the first request; longer than the slowest heartbeat
-            finds all devices that send one.
-        progress: Called with the stage and the share that is done.
+    Listening before the first request for longer than the slowest heartbeat, `listen_s`, finds all
+    devices that send one.
 
     Raises:
         BusError: The bus fails.
@@ -134,7 +122,7 @@ def scan(network: CanOpenNetwork, listen_s: float, *, progress: Progress) -> Bus
         try:
             device = describe_device(objects, node_id)
         except BusError:
-            device = None  # it is listed as silent
+            continue  # it is listed as silent
         if device is not None:
             notes = [f"object {name}: no answer, taken as absent" for name in objects.unanswered]
             device = replace(device, notes=(*device.notes, *notes))
@@ -152,10 +140,7 @@ def scan(network: CanOpenNetwork, listen_s: float, *, progress: Progress) -> Bus
 
 
 def survey_of_files(files: Mapping[int, Path]) -> BusSurvey:
-    """Survey of devices that are not on a bus, by their EDS files.
-
-    Args:
-        files: EDS or DCF file of each node id.
+    """Survey of devices that are not on a bus, by the EDS or DCF file of each node id.
 
     Raises:
         InputError: A file cannot be read, or is no EDS file.

@@ -36,15 +36,7 @@ _PROFILES = {ENCODER: "encoder (CiA 406)", MEASURING_DEVICE: "measuring device (
 
 @dataclass(frozen=True)
 class MappedObject:
-    """An object in the frame of a PDO.
-
-    Attributes:
-        index: Index of the object.
-        subindex: Its subindex.
-        start: Its lowest bit in the frame.
-        bits: Number of its bits.
-        meaning: Its meaning.
-    """
+    """An object in the frame of a PDO, in which `start` is its lowest bit."""
 
     index: int
     subindex: int
@@ -59,11 +51,7 @@ class Pdo:
 
     Attributes:
         number: Its number, from 1 on.
-        arbitration_id: Id of its frames.
-        is_extended: Whether the id has 29 bits.
-        transmission: Transmission type.
         cycle_s: Time between two frames; None where the device does not report it.
-        mapped: Objects in its frame.
         note: Entry of its mapping that cannot be read, empty if none.
     """
 
@@ -86,13 +74,11 @@ class CanOpenDevice:
     """A CANopen device as it describes itself.
 
     Attributes:
-        node_id: CANopen node id.
         device_type: Content of 1000h.
         label: Name that its manufacturer gives it.
         identity: Vendor, product, revision and serial number; None for one that it does not report.
         heartbeat_s: Time between two heartbeats; 0 for none.
         emergency_id: Arbitration id of its emergency frames.
-        pdos: Process data objects that it sends.
         notes: Remarks for the reader of a scan.
     """
 
@@ -118,20 +104,14 @@ class CanOpenDevice:
 
 
 def describe_device(objects: CanOpenObjects, node_id: int) -> CanOpenDevice | None:
-    """Description of a device by its objects.
-
-    Args:
-        objects: Its objects.
-        node_id: Its node id.
-
-    Returns:
-        The device; None if it has no device type, which is no CANopen device.
-    """
+    """A device by its objects; None without a device type: it is no CANopen device then."""
     device_type = number(objects, 0x1000)
     if device_type is None:
         return None
     vendor, product, revision, serial = (number(objects, 0x1018, item) for item in range(1, 5))
     emergency_id = number(objects, EMERGENCY)
+    if emergency_id is None or emergency_id & OFF:
+        emergency_id = 0
     pdos = tuple(_pdos(objects, device_type))
     notes = [
         f"TPDO {pdo.number}, {item.meaning.name}: {item.meaning.note}"
@@ -153,14 +133,10 @@ def describe_device(objects: CanOpenObjects, node_id: int) -> CanOpenDevice | No
         label=text(objects, 0x1008),
         identity=(vendor, product, revision, serial),
         heartbeat_s=(number(objects, HEARTBEAT) or 0) * 1e-3,
-        emergency_id=_eleven_bits(emergency_id) or 0x080 + node_id,
+        emergency_id=emergency_id & 0x7FF or 0x080 + node_id,
         pdos=pdos,
         notes=tuple(notes),
     )
-
-
-def _eleven_bits(cob_id: int | None) -> int:
-    return 0 if cob_id is None or cob_id & OFF else cob_id & 0x7FF
 
 
 def _pdos(objects: CanOpenObjects, device_type: int) -> Iterator[Pdo]:

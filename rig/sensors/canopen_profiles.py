@@ -35,7 +35,7 @@ _BY_DIMENSION = {
     Dimension.VELOCITY: "SPEED",
     Dimension.ACCELERATION: "ACCELERATION",
 }
-_BY_UNIT = {"Pa": "PRESSURE", "bar": "PRESSURE", "psi": "PRESSURE"}
+_PRESSURES = ("Pa", "bar", "psi")
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,6 @@ class Meaning:
 
     Attributes:
         name: Name of its signal in a DBC.
-        is_signed: Whether it is a signed integer.
         is_float: Whether it is a REAL32 or REAL64.
         scale: Physical value of one raw step, in `unit`.
         unit: Unit as a DBC has it, empty if not known.
@@ -67,14 +66,7 @@ class Meaning:
 
 
 def meaning(objects: CanOpenObjects, device_type: int, index: int, subindex: int) -> Meaning:
-    """Meaning of an object that is mapped into a PDO.
-
-    Args:
-        objects: The device's objects.
-        device_type: Content of 1000h.
-        index: Index of the object.
-        subindex: Its subindex.
-    """
+    """Meaning of an object that a device of some type (content of 1000h) maps into a PDO."""
     profile = device_type & 0xFFFF
     known = None
     if profile == ENCODER:
@@ -90,12 +82,15 @@ def _encoder_meaning(
     ending = f"_{subindex}" if subindex > 1 else ""
     known = objects.is_signed(index, subindex)
     if index in _POSITIONS and kind in _LINEAR:
-        return _position(objects, f"POSITION{ending}", is_signed=known is not False)
+        step = number(objects, _STEPS, 1) or number(objects, _STEP_OF_DISPLAY)
+        missing = "measuring step (6005h)"
+        return _stepped(f"POSITION{ending}", known is not False, step, _NM, "mm", missing)
     if index in _POSITIONS:
         return _angle(objects, f"POSITION{ending}", is_signed=bool(known))
     if index == _SPEED:
         step = number(objects, _STEPS, 2) if kind in _LINEAR else None
-        return _speed_meaning(f"SPEED{ending}", step)
+        missing = "speed step (6005h.2)"
+        return _stepped(f"SPEED{ending}", True, step, _SPEED_STEP_MM_PER_S, "mm/s", missing)
     if index == _ACCELERATION:
         return Meaning(f"ACCELERATION{ending}", True, note="its unit is not known")
     if index in (_ALARMS, _WARNINGS):
@@ -104,11 +99,13 @@ def _encoder_meaning(
     return None
 
 
-def _position(objects: CanOpenObjects, name: str, *, is_signed: bool) -> Meaning:
-    step = number(objects, _STEPS, 1) or number(objects, _STEP_OF_DISPLAY)
+def _stepped(
+    name: str, is_signed: bool, step: int | None, size: float, unit: str, missing: str
+) -> Meaning:
+    """Meaning of a value in steps of so many times a size."""
     if step:
-        return Meaning(name, is_signed, scale=step * _NM, unit="mm")
-    return Meaning(name, is_signed, note="the device reports no measuring step (6005h)")
+        return Meaning(name, is_signed, scale=step * size, unit=unit)
+    return Meaning(name, is_signed, note=f"the device reports no {missing}")
 
 
 def _angle(objects: CanOpenObjects, name: str, *, is_signed: bool) -> Meaning:
@@ -117,12 +114,6 @@ def _angle(objects: CanOpenObjects, name: str, *, is_signed: bool) -> Meaning:
     if steps:
         return Meaning(name, is_signed, scale=1.0 / steps, unit="turn", note=note)
     return Meaning(name, is_signed, note=note)
-
-
-def _speed_meaning(name: str, step: int | None) -> Meaning:
-    if step:
-        return Meaning(name, True, scale=step * _SPEED_STEP_MM_PER_S, unit="mm/s")
-    return Meaning(name, True, note="the device reports no speed step (6005h.2)")
 
 
 def _channel_meaning(objects: CanOpenObjects, index: int, subindex: int) -> Meaning | None:
@@ -149,9 +140,9 @@ def _channel_meaning(objects: CanOpenObjects, index: int, subindex: int) -> Mean
 
 def _channel_name(unit: str) -> str:
     dimension = _dimension(unit)
-    if dimension in _BY_DIMENSION:
+    if dimension is not None:
         return _BY_DIMENSION[dimension]
-    return next((name for ending, name in _BY_UNIT.items() if unit.endswith(ending)), "VALUE")
+    return "PRESSURE" if unit.endswith(_PRESSURES) else "VALUE"
 
 
 def _dimension(unit: str) -> Dimension | None:

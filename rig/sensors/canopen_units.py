@@ -30,10 +30,7 @@ _OF_MASS = {"kg": "kgf", "g": "gf"}
 
 
 def unit_name(code: int) -> str | None:
-    """Name of a unit as a DBC has it.
-
-    Args:
-        code: Content of an object such as 6131h.
+    """Name of a unit as a DBC has it, from the content of an object such as 6131h.
 
     Returns:
         Such as ``mm``, ``kN`` or ``m/s``; ``kgf`` for a mass; None if the code is not known.

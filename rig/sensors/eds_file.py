@@ -21,11 +21,9 @@ _ENDINGS = (".eds", ".dcf")
 
 
 class EdsObjects:
-    """Objects with their default values.
+    """Objects with their default values, from an EDS or DCF file.
 
-    Args:
-        path: An EDS or DCF file.
-        node_id: Node id, for values such as ``$NODEID+0x180``.
+    The node id is for values such as ``$NODEID+0x180``.
 
     Raises:
         InputError: The file cannot be read, or is no EDS.

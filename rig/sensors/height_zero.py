@@ -11,12 +11,9 @@ from rig.sensors.signal_locations import locations
 
 
 class HeightZero(NamedTuple):
-    """Height at a reading of a position sensor, and the direction in which the sensor counts.
+    """Height of the strut at a reading of its position sensor.
 
-    Attributes:
-        height_m: Height of the strut where the sensor reads `reading_m`.
-        reading_m: Reading of the sensor.
-        is_reversed: Whether it counts up while the strut gets shorter.
+    A reversed sensor counts up while the strut gets shorter.
     """
 
     height_m: float
@@ -31,13 +28,7 @@ def read_height_zero(
     *,
     is_reversed: bool,
 ) -> HeightZero:
-    """The first position sensor read at a known height.
-
-    Args:
-        network: Bus of the devices.
-        devices: CANopen devices on it.
-        height_m: Height of the strut now.
-        is_reversed: Whether the sensor counts up while the strut gets shorter.
+    """The first position sensor of the devices read while the strut has a known height.
 
     Raises:
         InputError: The height is none of a strut, or no device reports a length.

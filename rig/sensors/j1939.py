@@ -14,12 +14,7 @@ _DESTINATION_BELOW = 240
 
 
 class AddressClaim(NamedTuple):
-    """Claim of an address by a device.
-
-    Attributes:
-        address: Source address.
-        name: Its NAME, 64 bits.
-    """
+    """Claim of an address by a device with a NAME of 64 bits."""
 
     address: int
     name: int
@@ -48,7 +43,6 @@ class GroupParameter(NamedTuple):
         byte: Its first byte, from 0 on.
         scale: Value of one raw step.
         offset: Value of raw 0.
-        unit: Unit.
     """
 
     name: str
@@ -59,14 +53,7 @@ class GroupParameter(NamedTuple):
 
 
 class ParameterGroup(NamedTuple):
-    """A parameter group.
-
-    Attributes:
-        number: PGN.
-        name: Name of its messages in a DBC.
-        cycle_s: Time between two messages.
-        parameters: Its parameters.
-    """
+    """A parameter group by its number, the PGN, with its name in a DBC."""
 
     number: int
     name: str
@@ -75,25 +62,20 @@ class ParameterGroup(NamedTuple):
 
 
 _CORNERS = ("FRONT_LEFT", "FRONT_RIGHT", "REAR_LEFT", "REAR_RIGHT")
-GROUPS = (
+GROUPS = tuple(
     ParameterGroup(
-        65112,
-        "ASC4",
+        number,
+        name,
         0.1,
         tuple(
-            GroupParameter(f"BELLOW_PRESSURE_{corner}", 2 * index, 0.1, 0.0, "kPa")
+            GroupParameter(f"{label}_{corner}", 2 * index, 0.1, offset, unit)
             for index, corner in enumerate(_CORNERS)
         ),
-    ),
-    ParameterGroup(
-        65113,
-        "ASC3",
-        0.1,
-        tuple(
-            GroupParameter(f"RELATIVE_LEVEL_{corner}", 2 * index, 0.1, -3200.0, "mm")
-            for index, corner in enumerate(_CORNERS)
-        ),
-    ),
+    )
+    for number, name, label, offset, unit in (
+        (65112, "ASC4", "BELLOW_PRESSURE", 0.0, "kPa"),
+        (65113, "ASC3", "RELATIVE_LEVEL", -3200.0, "mm"),
+    )
 )
 """Groups of the air suspension control that J1939-71 gives a position or a pressure to. Other
 sensors send groups of Proprietary B, whose layout only the manufacturer knows."""
@@ -103,13 +85,7 @@ LARGEST_VALUE = 0xFAFF
 
 
 class GroupMessage(NamedTuple):
-    """A known group that a device sends.
-
-    Attributes:
-        group: The group.
-        arbitration_id: Id of the last frame.
-        address: Address of its sender.
-    """
+    """A known group that a device sends, with the id of its last frame."""
 
     group: ParameterGroup
     arbitration_id: int

@@ -47,11 +47,7 @@ def write_proposal(
 ) -> tuple[Path, Path]:
     """Write a DBC and a configuration for the devices on a bus; returns their files.
 
-    Args:
-        folder: New folder.
-        survey: Devices on the bus.
-        bus: The bus.
-        zero: Zero of the first position sensor; heights are its readings if None.
+    The folder is new. Without a zero, heights are the readings of the first position sensor.
 
     Raises:
         InputError: No device measures a length, two devices send under one id, or the folder cannot
@@ -76,10 +72,7 @@ def dbc_text(
 ) -> str:
     """A DBC of the devices' messages, with those that the bridge publishes.
 
-    Args:
-        devices: CANopen devices.
-        groups: Known groups of J1939.
-        zero: Zero of the first position sensor; heights are its readings if None.
+    Without a zero, heights are the readings of the first position sensor.
 
     Raises:
         InputError: Two devices send under one id.
@@ -140,13 +133,7 @@ def configuration_text(
     claims: Sequence[AddressClaim],
     bus: BusConfig,
 ) -> str:
-    """A configuration for the devices on a bus.
-
-    Args:
-        devices: CANopen devices.
-        groups: Known groups of J1939.
-        claims: J1939 devices that claim an address.
-        bus: The bus.
+    """A configuration for the devices on a bus, with the known groups and the claims of J1939.
 
     Raises:
         InputError: No device measures a length.
@@ -172,7 +159,7 @@ def configuration_text(
             lines.append(_signal_line(key, sources))
             used.append(sources[0])
     lines += _devices_block(devices, groups, claims, used)
-    cycle_s = _cycle_s(devices, groups, heights[0]) or 0.0
+    cycle_s = heights[0].cycle_s or 0.0
     if cycle_s * _STALE_CYCLES > 0.01:
         stale_s = cycle_s * _STALE_CYCLES
         lines.append(
@@ -191,7 +178,7 @@ def _pdo_message(
     signals: list[Signal] = []
     for item in pdo.mapped:
         scale, offset = item.meaning.scale, 0.0
-        if zero is not None and height == (name, names[item], device.node_id, item):
+        if zero is not None and height is not None and height[:2] == (name, names[item]):
             scale = -scale if zero.is_reversed else scale
             reading_m = -zero.reading_m if zero.is_reversed else zero.reading_m
             metre = si_conversion(item.meaning.unit, Dimension.LENGTH).factor
@@ -310,12 +297,3 @@ def _device_entry(device: CanOpenDevice) -> dict[str, object]:
         entry["heartbeat_s"] = round(_HEARTBEATS_MISSED * device.heartbeat_s, 4)  # up to 164 s
     signals = [{"message": item.message, "signal": item.signal} for item in alarms(device)]
     return entry | ({"alarms": signals} if signals else {})
-
-
-def _cycle_s(
-    devices: Sequence[CanOpenDevice], groups: Sequence[GroupMessage], location: SignalLocation
-) -> float | None:
-    """Time between two messages of a location; None where it is not known."""
-    cycles_s = {message_name(device, pdo): pdo.cycle_s for device in devices for pdo in device.pdos}
-    cycles_s |= {item.message_name: item.group.cycle_s for item in groups}
-    return cycles_s.get(location.message)

@@ -1,65 +1,54 @@
 """Messages and signals in which the devices on a bus send what they measure."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from can_dbc.units import Dimension
 from rig.sensors.canopen_device import CanOpenDevice, MappedObject, Pdo
+from rig.sensors.canopen_profiles import Meaning
 from rig.sensors.j1939 import GroupMessage
 
 
 class SignalLocation(NamedTuple):
-    """Location of a measured quantity on the bus.
-
-    Attributes:
-        message: Name of the message.
-        signal: Name of the signal.
-        node_id: Node that sends it; None for J1939.
-        mapped: The object; None for J1939.
-    """
+    """Location of a measured quantity on the bus; one of J1939 has no node id and no object."""
 
     message: str
     signal: str
     node_id: int | None
     mapped: MappedObject | None
+    cycle_s: float | None
 
 
 def locations(devices: Sequence[CanOpenDevice], dimension: Dimension) -> list[SignalLocation]:
     """Locations of a dimension that CANopen devices send, in the order of devices and objects."""
+    return _select_locations(devices, lambda meaning: meaning.dimension is dimension)
+
+
+def alarms(device: CanOpenDevice) -> list[SignalLocation]:
+    """Locations of the alarms of a device."""
+    return _select_locations([device], lambda meaning: meaning.is_alarm)
+
+
+def _select_locations(
+    devices: Sequence[CanOpenDevice], is_sought: Callable[[Meaning], bool]
+) -> list[SignalLocation]:
     return [
-        SignalLocation(message_name(device, pdo), names[item], device.node_id, item)
-        for device, pdo, names in _pdos(devices)
-        for item in pdo.mapped
-        if item.meaning.dimension is dimension
+        SignalLocation(message_name(device, pdo), name, device.node_id, item, pdo.cycle_s)
+        for device in devices
+        for pdo in device.pdos
+        for item, name in signal_names(pdo).items()
+        if is_sought(item.meaning)
     ]
 
 
 def levels(groups: Sequence[GroupMessage]) -> list[SignalLocation]:
     """Locations of levels that J1939 devices send."""
     return [
-        SignalLocation(item.message_name, parameter.name, None, None)
+        SignalLocation(item.message_name, parameter.name, None, None, item.group.cycle_s)
         for item in groups
         for parameter in item.group.parameters
         if parameter.unit == "mm"
     ]
-
-
-def alarms(device: CanOpenDevice) -> list[SignalLocation]:
-    """Locations of the alarms of a device."""
-    return [
-        SignalLocation(message_name(device, pdo), names[item], device.node_id, item)
-        for _, pdo, names in _pdos([device])
-        for item in pdo.mapped
-        if item.meaning.is_alarm
-    ]
-
-
-def _pdos(
-    devices: Sequence[CanOpenDevice],
-) -> Iterator[tuple[CanOpenDevice, Pdo, dict[MappedObject, str]]]:
-    for device in devices:
-        for pdo in device.pdos:
-            yield device, pdo, signal_names(pdo)
 
 
 def signal_names(pdo: Pdo) -> dict[MappedObject, str]:

@@ -129,9 +129,7 @@ def _by_points(curve: SpringCurve | DamperCurve) -> Floats:
     return _segments(at, interpolate.PchipInterpolator(at, force_n))
 
 
-def _segments(
-    at: Floats, cubics: interpolate.CubicSpline | interpolate.PchipInterpolator
-) -> Floats:
+def _segments(at: Floats, cubics: interpolate.PPoly) -> Floats:
     return np.column_stack([at[:-1], np.diff(at), np.asarray(cubics.c, dtype=np.float64).T])
 
 
@@ -153,12 +151,13 @@ def _height_arrays(motion: StrutMotion | None) -> DrivenHeight:
     components = () if motion is None else motion.components
     sines, sweeps = _sines_and_sweeps(components)
     files = [part.samples for part in components if isinstance(part, HeightFile)]
-    spline = interpolate.CubicSpline
     return DrivenHeight(
         mean_height_m=0.0 if motion is None else motion.mean_height_m,
         sines=sines,
         sweeps=sweeps,
-        files=_curves([_segments(t_s, spline(t_s, height_m)) for t_s, height_m in files]),
+        files=_curves(
+            [_segments(t_s, interpolate.CubicSpline(t_s, height_m)) for t_s, height_m in files]
+        ),
     )
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.bridge.values import Mode
-from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise, smooth
+from rig.diagnosis.numerics.smoother import estimate_noise, smooth
 from rig.log.reader import read_run
 
 Array = NDArray[np.float64]
@@ -54,20 +54,6 @@ class FollowedStretch(NamedTuple):
     velocity_m_per_s: Array
 
 
-class ResidualForce(NamedTuple):
-    """Residual force of a stretch, smoothed over all of it.
-
-    Attributes:
-        noise_std_m: Standard deviation of the measured height.
-        t_s: Times, shape (N,).
-        force_n: Residual force, shape (N,).
-    """
-
-    noise_std_m: float
-    t_s: Array
-    force_n: Array
-
-
 class Expectation(NamedTuple):
     """Noise and residual force that an observer has to expect.
 
@@ -89,11 +75,8 @@ def longest_stretch(
 ) -> FollowedStretch:
     """The longest stretch of a run in which the observer followed its bench.
 
-    Args:
-        steps: Its steps, as an Arrow table.
-        folder: Folder of the run, to name it.
-        strut: Name of the strut.
-        mobility_per_kg: Acceleration of its height per newton in it.
+    The steps are an Arrow table; the folder names the run in an error. The mobility is the
+    acceleration of the strut's height per newton in it.
 
     Raises:
         InputError: It has no such strut, or is too short.
@@ -139,41 +122,26 @@ def free_error(tick_s: Array, by_force: Array, t_s: Array, innovation_m: Array) 
     return free_m - line(t_s)
 
 
-def residual_force(stretch: FollowedStretch, mobility_per_kg: float) -> ResidualForce:
-    """The residual force of a stretch, smoothed, and the noise of its height sensor."""
+def residual_force(stretch: FollowedStretch, mobility_per_kg: float) -> tuple[float, Array]:
+    """Noise of a stretch's heights, and its residual force smoothed over all of it, shape (N,)."""
     noise = estimate_noise(stretch.t_s, stretch.free_error_m)
-    smoothed: Smoothed = smooth(stretch.t_s, stretch.free_error_m, noise)
-    return ResidualForce(
-        float(np.sqrt(noise.variance)),
-        stretch.t_s,
-        smoothed.states[:, 2] / mobility_per_kg,
-    )
+    smoothed = smooth(stretch.t_s, stretch.free_error_m, noise)
+    return float(np.sqrt(noise.variance)), smoothed.states[:, 2] / mobility_per_kg
 
 
 def expectation_from_run(folder: Path, strut: str, mobility_per_kg: float) -> Expectation:
     """Expectation of a strut from a run of its bench.
 
-    Args:
-        folder: Folder of the run.
-        strut: Name of the strut.
-        mobility_per_kg: Acceleration of its height per newton in it.
-
     Raises:
         InputError: It is no run, has no such strut, or is too short.
     """
     stretch = longest_stretch(read_run(folder).steps, folder, strut, mobility_per_kg)
-    force = residual_force(stretch, mobility_per_kg)
-    return Expectation(force.noise_std_m, *spectrum(force.t_s, force.force_n), str(folder))
+    noise_std_m, force_n = residual_force(stretch, mobility_per_kg)
+    return Expectation(noise_std_m, *spectrum(stretch.t_s, force_n), str(folder))
 
 
 def expectation_from_noise(noise_std_m: float, rms_n: float, up_to_hz: float) -> Expectation:
-    """Expectation of a residual force whose mean square is even over frequency.
-
-    Args:
-        noise_std_m: Standard deviation of the measured height.
-        rms_n: Root mean square of the residual force.
-        up_to_hz: The highest frequency.
-    """
+    """Expectation of a residual force whose mean square is even up to a highest frequency."""
     frequency_hz = np.asarray(up_to_hz * (np.arange(20) + 0.5) / 20.0, dtype=np.float64)
     power_n2 = np.full(20, rms_n**2 / 20.0)
     source = f"{rms_n:g} N up to {up_to_hz:g} Hz, as stated"
@@ -199,12 +167,7 @@ def _integrate_twice(tick_s: Array, acceleration: Array, t_s: Array) -> Array:
 def spectrum(t_s: Array, force_n: Array) -> tuple[Array, Array]:
     """Mean square over frequency, gathered into some lines; a Hann window keeps the ends apart.
 
-    Args:
-        t_s: Times, shape (N,).
-        force_n: Force, shape (N,).
-
-    Returns:
-        Frequencies in Hz and mean squares in N².
+    Times and forces have the shape (N,). Frequencies are in Hz, mean squares in N².
     """
     begin_s, end_s = float(t_s[0]), float(t_s[-1])
     even_s = np.linspace(begin_s, end_s, len(t_s))

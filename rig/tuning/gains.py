@@ -35,6 +35,8 @@ _EVALUATIONS = 250
 _LARGEST_COST = 1e12
 """Cost of an observer that is unstable or cannot be made."""
 
+_LARGEST_MARGIN = 20.0
+
 
 class Aim(NamedTuple):
     """What the loop must keep.
@@ -79,8 +81,6 @@ class Tuned(NamedTuple):
     """An observer that was tuned.
 
     Attributes:
-        observer: The observer.
-        expected: Its expected error.
         gain_margin: Gain margin of its loop, upwards and downwards; 20 means that or more.
         required_margin: The gain margin that it was to keep.
     """
@@ -95,10 +95,8 @@ class TuningProblem(NamedTuple):
     """A strut whose observer is to be tuned.
 
     Attributes:
-        plant: The model.
         observers: Observers of all its struts.
         strut: Index of the strut.
-        responses: Responses of the model's struts.
         heights_m: Heights at which the bench rests.
         timing: How often the loop is closed.
         expectation: Noise and residual force that are expected of the strut.
@@ -122,21 +120,15 @@ class TuningProblem(NamedTuple):
     def linear(self, observer: AnyObserver, factor: float = 1.0) -> LinearLoop:
         """The loop with another observer of this strut.
 
-        Args:
-            observer: The observer.
-            factor: Response of the model to a virtual force, over that which the observers take it
-                to have.
+        The model responds to a virtual force more strongly, by a factor, than the observers take it
+        to.
         """
         plant = self.plant
         if factor != 1.0:
             plant = cast("AnyPlant", _StrongerPlant(plant, factor))
-        observers = self.with_observer(observer)
+        observers = (*self.observers[: self.strut], observer, *self.observers[self.strut + 1 :])
         loop = Loop(plant, observers, self.heights_m, self.timing, self.responses)
         return loop.linear(self.strut)
-
-    def with_observer(self, observer: AnyObserver) -> tuple[AnyObserver, ...]:
-        """All observers, with another one of this strut."""
-        return (*self.observers[: self.strut], observer, *self.observers[self.strut + 1 :])
 
 
 class _StrongerPlant:
@@ -160,22 +152,19 @@ def expect_error(problem: TuningProblem, observer: AnyObserver) -> ExpectedError
     poles = poles_of(linear.a, linear.interval_s)
     if not _is_stable(poles):
         return ExpectedError(math.inf, math.inf, poles)
-    return ExpectedError(*_parts(linear, problem.expectation), poles)
+    noise_n = linear.noise_gain_n_per_m() * problem.expectation.noise_std_m
+    share = linear.lag_gain(problem.expectation.frequency_hz)
+    lag_n = float(np.sqrt(np.sum(share**2 * problem.expectation.power_n2)))
+    return ExpectedError(noise_n, lag_n, poles)
 
 
-def gain_margin(problem: TuningProblem, observer: AnyObserver, most: float = 20.0) -> float:
-    """Gain margin of the closed loop, upwards and downwards, dimensionless.
-
-    Args:
-        problem: The strut.
-        observer: Its observer.
-        most: Where the search ends.
-    """
+def gain_margin(problem: TuningProblem, observer: AnyObserver) -> float:
+    """Gain margin of the closed loop, upwards and downwards, dimensionless; 20 at most."""
     if not _is_stable_at(problem, observer, 1.0):
         return 1.0
-    low, high = 1.0, most
-    if _has_margin(problem, observer, most):
-        return most
+    low, high = 1.0, _LARGEST_MARGIN
+    if _has_margin(problem, observer, high):
+        return high
     while high / low > 1.01:
         middle = math.sqrt(low * high)
         low, high = (middle, high) if _has_margin(problem, observer, middle) else (low, middle)
@@ -183,13 +172,7 @@ def gain_margin(problem: TuningProblem, observer: AnyObserver, most: float = 20.
 
 
 def tune_observer(problem: TuningProblem, kind: str, aim: Aim) -> Tuned:
-    """Tune an observer: that of a kind with the smallest expected error of the force.
-
-    Args:
-        problem: The strut.
-        kind: One of `KINDS`.
-        aim: What the loop must keep.
-    """
+    """Tune an observer: that of a kind of `KINDS` with the smallest expected error of the force."""
     task = TuningTask(
         1.0 / problem.mobility_per_kg,
         problem.expectation.noise_std_m,
@@ -236,24 +219,14 @@ def sweep_bandwidth(
 ) -> list[tuple[float, ExpectedError]]:
     """Expected errors of an observer at other bandwidths, by their frequencies in Hz.
 
-    Args:
-        problem: The strut.
-        observer: The observer.
-        factors: Factors of its bandwidth: gains of the innovation go with the square, those of its
-            rate linearly.
+    With a factor of the bandwidth, gains of the innovation go with its square, those of its rate
+    linearly.
     """
     others = [observer.with_bandwidth(factor) for factor in factors]
     return [
         (other.bandwidth_hz(problem.mobility_per_kg), expect_error(problem, other))
         for other in others
     ]
-
-
-def _parts(linear: LinearLoop, expectation: Expectation) -> tuple[float, float]:
-    """Error by the sensor's noise and error by the lag, in N."""
-    noise_n = linear.noise_gain_n_per_m() * expectation.noise_std_m
-    share = linear.lag_gain(expectation.frequency_hz)
-    return noise_n, float(np.sqrt(np.sum(share**2 * expectation.power_n2)))
 
 
 def _is_stable(poles: Sequence[Pole]) -> bool:

@@ -13,19 +13,15 @@ height and velocity there. The interval is infinite then.
 
 import math
 from collections.abc import Callable
-from dataclasses import replace as replaced
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rig.observers.kalman import KalmanObserver
 from rig.plan.plan import Plan
 from rig.run.replay import replay
-from rig.tuning.expectation import longest_stretch, residual_force
-
-Array = NDArray[np.float64]
+from rig.tuning.expectation import Array, longest_stretch, residual_force
 
 _DEGREE = 7
 """Of the polynomials in height and in velocity: enough for a knee or a progressive spring."""
@@ -40,17 +36,15 @@ is in the run, they leave 0.02 and the delay comes out 2 ms wrong; of three sine
 _STEP_S = 0.5e-3
 """Step of the derivative by the delay."""
 
+_LONGEST_S = 0.05
+"""Longest delay searched for: an older height is of no use in a closed loop."""
+
 _SETTLED_S = 0.3
 """Time after the start from which the observer follows."""
 
 
 class Latency(NamedTuple):
-    """A delay.
-
-    Attributes:
-        delay_s: Its value.
-        std_s: Its standard deviation; infinite where the run does not determine it.
-    """
+    """A delay, and its standard deviation: infinite where the run does not determine it."""
 
     delay_s: float
     std_s: float
@@ -93,61 +87,44 @@ def with_delay(plan: Plan, delay_s: float) -> Plan:
     return plan.with_config(config)
 
 
-class LatencyTask(NamedTuple):
-    """The strut whose height's delay is estimated.
-
-    Attributes:
-        strut: Name of the strut.
-        mobility_per_kg: Acceleration of its height per newton in it.
-        observer: A noise-aware observer that fits its noise and its residual force.
-    """
-
-    strut: str
-    mobility_per_kg: float
-    observer: KalmanObserver
-
-
 def estimate_latency(
     folder: Path,
     plan: Plan,
-    task: LatencyTask,
-    longest_s: float,
-    progress: Callable[[float], None] = lambda _share: None,
+    strut: str,
+    mobility_per_kg: float,
+    observer: KalmanObserver,
+    progress: Callable[[float], None],
 ) -> Latency:
     """The delay of a strut's height.
 
-    Args:
-        folder: Folder of the run.
-        plan: Its plan.
-        task: The strut.
-        longest_s: Longest delay searched for.
-        progress: Called with the share that is done.
+    The observer is a noise-aware one, which fits the strut's noise and residual force; the mobility
+    is the acceleration of its height per newton in it. `progress` is called with the share that is
+    done.
 
     Raises:
         InputError: The run is damaged or too short.
     """
-    plan = plan.with_observers({task.strut: replaced(task.observer)})
-    mobility_per_kg = task.mobility_per_kg
+    plan = plan.with_observers({strut: observer})
 
     def series(delay_s: float) -> _Series:
         steps = replay(folder, plan=with_delay(plan, delay_s)).steps
-        stretch = longest_stretch(steps, folder, task.strut, mobility_per_kg)
-        residual = residual_force(stretch, mobility_per_kg)
-        is_settled = residual.t_s > stretch.tick_s[0] + _SETTLED_S
-        is_used = is_settled & (residual.t_s <= stretch.tick_s[-1])
-        t_s = residual.t_s[is_used]
+        stretch = longest_stretch(steps, folder, strut, mobility_per_kg)
+        _, residual_n = residual_force(stretch, mobility_per_kg)
+        is_settled = stretch.t_s > stretch.tick_s[0] + _SETTLED_S
+        is_used = is_settled & (stretch.t_s <= stretch.tick_s[-1])
+        t_s = stretch.t_s[is_used]
         law_n, height, velocity = (
             np.interp(t_s, stretch.tick_s, column)
             for column in (stretch.law_force_n, stretch.height_m, stretch.velocity_m_per_s)
         )
-        return _Series(t_s + delay_s, height, velocity, law_n + residual.force_n[is_used])
+        return _Series(t_s + delay_s, height, velocity, law_n + residual_n[is_used])
 
     delay_s, std_s = 0.0, math.inf
     for number in range(_ITERATIONS):
         step_s, std_s = _delay_step(series(delay_s), series(delay_s + _STEP_S))
         progress((number + 1) / _ITERATIONS)
         before_s = delay_s
-        delay_s = min(max(delay_s + step_s, 0.0), longest_s)
+        delay_s = min(max(delay_s + step_s, 0.0), _LONGEST_S)
         if not math.isfinite(std_s) or abs(delay_s - before_s) < 0.1 * std_s:
             break
     return Latency(delay_s, std_s)

@@ -33,21 +33,16 @@ from rig.tuning.gains import (
     sweep_bandwidth,
     tune_observer,
 )
-from rig.tuning.latency import Latency, LatencyTask, estimate_latency, with_delay
+from rig.tuning.latency import Latency, estimate_latency, with_delay
 
 _FACTORS = tuple(2.0 ** (step / 6.0) for step in range(-15, 16))
 """Of the bandwidths that are plotted: from a sixth to six times the choice."""
 
-_LONGEST_DELAY_S = 0.05
-"""Searched for: an older height is of no use in a closed loop."""
-
 
 class StatedExpectation(NamedTuple):
-    """Expectation of the residual force as the user states it, where there is no run.
+    """RMS and highest frequency of the residual force, as the user states them without a run.
 
     Attributes:
-        rms_n: Its root mean square.
-        up_to_hz: Its highest frequency.
         noise_std_m: Standard deviation of the height; by the DBC's resolution if None.
     """
 
@@ -61,13 +56,10 @@ class TunedStrut:
     """A strut whose observer was tuned.
 
     Attributes:
-        name: Its name.
         expectation: What it was tuned for.
         latency: Delay of its height as the run shows it; None where it was given.
         delay_s: Delay that it was tuned with.
-        tuned: The observer.
         published: Expected error of the published gains, scaled by the effective mass.
-        bandwidth_hz: Bandwidth of the observer.
         sweep: Expected errors at other bandwidths, by their frequencies in Hz.
     """
 
@@ -81,29 +73,12 @@ class TunedStrut:
     sweep: list[tuple[float, ExpectedError]]
 
 
-class _Height(NamedTuple):
-    """Delay of a height.
-
-    Attributes:
-        latency: The delay as the run shows it; None where it was given.
-        delay_s: The delay to tune with.
-    """
-
-    latency: Latency | None
-    delay_s: float
-
-
 def tune(
     plan: Plan, source: Path | StatedExpectation, kind: str, aim: Aim, progress: Progress
 ) -> list[TunedStrut]:
-    """Tune the observer of every strut.
+    """Tune the observer of every strut for a run of the bench, or for what is expected of it.
 
-    Args:
-        plan: The configuration.
-        source: A run of the bench, or what is expected of it.
-        kind: One of `rig.tuning.gains.KINDS`.
-        aim: What the loops must keep.
-        progress: Called with what is being done, and the share that is done.
+    The kind is one of `rig.tuning.gains.KINDS`.
 
     Raises:
         InputError: The run cannot be used.
@@ -133,40 +108,36 @@ def tune(
     for index, strut in enumerate(plan.struts):
         share = index / len(plan.struts), (index + 1) / len(plan.struts)
         part = within(progress, *share, of=strut.name)
-        task = LatencyTask(strut.name, responses[index].mobility_per_kg, others[index])
-        height = _find_delay(plan, source, task, part)
+        latency, delay_s = _find_delay(
+            plan, source, strut.name, responses[index].mobility_per_kg, others[index], part
+        )
         problem = TuningProblem(
             plant,
             others,
             index,
             responses,
             heights_m,
-            SampleTiming.of(plan.period_ns, strut.interval_ns, round(height.delay_s * 1e9)),
+            SampleTiming.of(plan.period_ns, strut.interval_ns, round(delay_s * 1e9)),
             expectations[index],
             cast("AnyTunableObserver", strut.observer).force_limit_n,
         )
-        tuned.append(_tune_strut(strut.name, problem, kind, aim, height, part))
+        part("gains", 0.7)
+        chosen = tune_observer(problem, kind, aim)
+        part("other bandwidths", 0.9)
+        published = paper_observer(problem.mobility_per_kg, problem.force_limit_n)
+        tuned.append(
+            TunedStrut(
+                strut.name,
+                problem.expectation,
+                latency,
+                delay_s,
+                chosen,
+                expect_error(problem, published),
+                chosen.observer.bandwidth_hz(problem.mobility_per_kg),
+                sweep_bandwidth(problem, chosen.observer, _FACTORS),
+            )
+        )
     return tuned
-
-
-def _tune_strut(
-    name: str, problem: TuningProblem, kind: str, aim: Aim, height: _Height, progress: Progress
-) -> TunedStrut:
-    """Tune the observer of one strut, and compare it with the published gains."""
-    progress("gains", 0.7)
-    tuned = tune_observer(problem, kind, aim)
-    progress("other bandwidths", 0.9)
-    published = paper_observer(problem.mobility_per_kg, problem.force_limit_n)
-    return TunedStrut(
-        name,
-        problem.expectation,
-        height.latency,
-        height.delay_s,
-        tuned,
-        expect_error(problem, published),
-        tuned.observer.bandwidth_hz(problem.mobility_per_kg),
-        sweep_bandwidth(problem, tuned.observer, _FACTORS),
-    )
 
 
 def _expectation(
@@ -179,29 +150,39 @@ def _expectation(
 
 
 def _find_delay(
-    plan: Plan, source: Path | StatedExpectation, task: LatencyTask, progress: Progress
-) -> _Height:
-    """Delay of a height: the configuration's, or what the run shows where that gives none."""
-    delay_s = plan.config.signals.height[task.strut].delay_s
+    plan: Plan,
+    source: Path | StatedExpectation,
+    strut: str,
+    mobility_per_kg: float,
+    observer: KalmanObserver,
+    progress: Progress,
+) -> tuple[Latency | None, float]:
+    """Latency of a height as the run shows it, None where it is given, and the delay to tune with.
+
+    The configuration gives the delay, or the run does where that gives none.
+    """
+    delay_s = plan.config.signals.height[strut].delay_s
     if delay_s or not isinstance(source, Path):
-        return _Height(None, delay_s)
+        return None, delay_s
     # The run's own signals and bus, with the model that is tuned.
     own = plan_of_run(source).with_model(plan.model)
     latency = estimate_latency(
-        source, own, task, _LONGEST_DELAY_S, lambda share: progress("latency", 0.7 * share)
+        source,
+        own,
+        strut,
+        mobility_per_kg,
+        observer,
+        lambda share: progress("latency", 0.7 * share),
     )
     if latency.low_s > 0.0:
         delay_s = float(f"{latency.delay_s:.3g}")
-    return _Height(latency, delay_s)
+    return latency, delay_s
 
 
 def write_config(plan: Plan, tuned: list[TunedStrut], path: Path) -> None:
     """Write the configuration with the tuned observers; comments are lost.
 
-    Args:
-        plan: The configuration.
-        tuned: The observers.
-        path: New file, in the folder of the configuration, whose other files it names.
+    The file is a new one in the folder of the configuration, whose other files it names.
 
     Raises:
         InputError: The file exists, lies elsewhere or cannot be written.

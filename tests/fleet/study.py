@@ -19,7 +19,7 @@ import psutil
 from rig.fleet import store
 from rig.fleet.campaign import CampaignProgress, FleetModel, load_fleet_model, run_campaign
 from rig.fleet.executors import Engine, dask, processes
-from rig.fleet.one_run import Task, evaluate_run
+from rig.fleet.one_run import evaluate_run
 from rig.fleet.sources import RunSource, find_sources
 from tests.fleet.cluster import cluster
 from tests.fleet.population import Piece, write_fleet, write_model
@@ -36,13 +36,13 @@ def scattered(_damper, _week, rng):
     )
 
 
-def plain_loop(tasks: Sequence[Task]) -> float:
+def plain_loop(sources: Sequence[RunSource], model: FleetModel) -> float:
     """Diagnoses a second, one after another, after the first one, which imports and compiles."""
-    evaluate_run(tasks[0])
+    evaluate_run(sources[0], model)
     begun = time.perf_counter()
-    for task in tasks:
-        evaluate_run(task)
-    return len(tasks) / (time.perf_counter() - begun)
+    for source in sources:
+        evaluate_run(source, model)
+    return len(sources) / (time.perf_counter() - begun)
 
 
 def single_rate(sources: Sequence[RunSource], model: FleetModel) -> float:
@@ -50,11 +50,10 @@ def single_rate(sources: Sequence[RunSource], model: FleetModel) -> float:
 
     A loop on one core while the other one rests is faster on a machine that is shared.
     """
-    tasks = [Task(source, *model) for source in sources]
-    parts = [tasks[k : CORES * SINGLE : CORES] for k in range(CORES)]
+    parts = [sources[k : CORES * SINGLE : CORES] for k in range(CORES)]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(CORES, mp_context=context) as pool:
-        return sum(pool.map(plain_loop, parts)) / CORES
+        return sum(pool.map(plain_loop, parts, [model] * CORES)) / CORES
 
 
 def through(

@@ -14,7 +14,7 @@ from can_dbc.errors import InputError
 from rig.fleet import campaign as campaigns
 from rig.fleet import store
 from rig.fleet.campaign import load_fleet_model, run_campaign
-from rig.fleet.one_run import RunRow, Task, evaluate_run
+from rig.fleet.one_run import RunRow, evaluate_run
 from rig.fleet.overview import read_overview
 from rig.fleet.sources import RunSource, find_sources, select_shard
 from tests.fleet.population import Piece, write_fleet, write_model, write_run
@@ -154,18 +154,18 @@ def test_what_nobody_foresaw_is_an_error_of_its_run(fleet, monkeypatch):
 
     monkeypatch.setattr("rig.fleet.one_run.diagnose", broken)
     (source, *_) = find_sources([str(fleet / "runs")], PATTERN)
-    row = evaluate_run(Task(source, *given(fleet)))
+    row = evaluate_run(source, given(fleet))
     assert row.error == "unexpected: ZeroDivisionError: by nobody"
 
 
-def killed(task):
+def killed(source, model):
     """A worker that dies of one run, once or always."""
-    mark = Path(task.folder)
-    if "poison" in task.source.url or ("once" in task.source.url and not mark.exists()):
+    mark = Path(model.folder)
+    if "poison" in source.url or ("once" in source.url and not mark.exists()):
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return RunRow(
-        task.source.url, task.source.url, task.source.url, "b", "d", "2026-01-05", "m", "h", "v",
+        source.url, source.url, source.url, "b", "d", "2026-01-05", "m", "h", "v",
         verdict="explained",
     )  # fmt: skip
 
@@ -264,16 +264,16 @@ def test_what_is_ready_is_written_though_nothing_follows(fleet, tmp_path, monkey
     seen = []
 
     class Slow(ThreadPoolExecutor):
-        def submit(self, call, task):
-            if "2026-01-26" in task.source.url:
-                return super().submit(lambda: (time.sleep(0.5), call(task))[1])
-            return super().submit(call, task)
+        def submit(self, call, source, model):
+            if "2026-01-26" in source.url:
+                return super().submit(lambda: (time.sleep(0.5), call(source, model))[1])
+            return super().submit(call, source, model)
 
     sources = find_sources([str(fleet / "runs" / "bench_0")], None)
 
     def look(now):
         if now.done == len(sources):
-            seen.append(len(store.read_keys(tmp_path)))
+            seen.append(len(store.read_evaluated(tmp_path)))
 
     run_campaign(sources, given(fleet), tmp_path, lambda: Slow(2), 8, progress=look)
     assert seen[0] >= len(sources) - 1

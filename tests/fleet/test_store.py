@@ -50,14 +50,16 @@ def test_a_run_that_failed_is_forgotten_when_it_succeeds(tmp_path):
     store.append(tmp_path, [row(1, error="unreadable")])
     assert store.query(tmp_path, "SELECT error FROM runs")[1] == [("unreadable",)]
     again = row(1)
-    store.append(tmp_path, [RunRow(**{**again.as_dict(), "key": "other", "values": again.values})])
+    store.append(tmp_path, [RunRow(**{**vars(again), "key": "other"})])
     assert store.query(tmp_path, "SELECT key, error FROM runs")[1] == [("other", "")]
-    assert store.read_identities(tmp_path, with_failed=False) == {"id1"}
+    assert {identity for _, identity, error in store.read_evaluated(tmp_path) if not error} == {
+        "id1"
+    }
 
 
 def test_a_success_of_another_model_hides_no_failure(tmp_path):
     store.append(tmp_path, [row(1)])
-    failed = row(1, error="unreadable").as_dict() | {"key": "k", "model_sha256": "other"}
+    failed = vars(row(1, error="unreadable")) | {"key": "k", "model_sha256": "other"}
     store.append(tmp_path, [RunRow(**failed)])
     found = store.query(tmp_path, "SELECT error FROM runs ORDER BY error")[1]
     assert found == [("",), ("unreadable",)]
@@ -66,7 +68,7 @@ def test_a_success_of_another_model_hides_no_failure(tmp_path):
 def test_a_copy_under_another_bench_counts_once_with_its_values(tmp_path):
     store.append(tmp_path, [row(1, bench="b")])
     again = row(1, bench="c")
-    copy = RunRow(**{**again.as_dict(), "source": "elsewhere", "values": again.values})
+    copy = RunRow(**{**vars(again), "source": "elsewhere"})
     store.append(tmp_path, [copy])
     assert store.query(tmp_path, "SELECT count(*) FROM runs")[1] == [(1,)]
     assert store.query(tmp_path, "SELECT count(*) FROM effects")[1] == [(1,)]
@@ -127,4 +129,4 @@ def test_what_is_no_store_is_said(tmp_path):
     with pytest.raises(InputError):
         store.query(tmp_path, "SELECT * FROM runs")
     with pytest.raises(InputError):
-        store.read_identities(tmp_path, with_failed=True)
+        store.read_evaluated(tmp_path)

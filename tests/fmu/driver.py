@@ -1,7 +1,9 @@
 """FMUs written for this system alone, and FMPy as their master."""
 
 import itertools
+import platform
 import shutil
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,12 +17,21 @@ from numpy.typing import NDArray
 
 from dart_model.spec import ModelSpec, dump_model
 from rig.fmu.archive import archive
-from rig.fmu.binaries import this_system
+from rig.fmu.binaries import TARGETS, Target
 from rig.fmu.component import Component
 
 Array = NDArray[np.float64]
 
 _NUMBERS = itertools.count()
+
+
+def this_system() -> Target:
+    """The target of this program's own system."""
+    machine = platform.machine().lower()
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(machine, machine)
+    name = {"linux": "linux", "win32": "windows", "darwin": "darwin"}[sys.platform]
+    (target,) = [item for item in TARGETS if item.fmi_3 == f"{machine}-{name}"]
+    return target
 
 
 def written(folder: Path, component: Component, version: str, spec: ModelSpec) -> Path:

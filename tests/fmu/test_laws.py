@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from dart_model.effects import CATALOGUE, Effect
 from dart_model.effects.calling import arguments, force_over_arrays, rates_over_arrays
 from dart_model.effects.law import Floats
-from rig.fmu.binaries import compile_for, this_system
+from rig.fmu.binaries import compile_for
 from rig.fmu.law_in_c import NoLawError, in_c
 from rig.fmu.source import read_common_source
+from tests.fmu.driver import this_system
 
 DOUBLES = ctypes.POINTER(ctypes.c_double)
 LAWS = sorted(CATALOGUE)

@@ -56,16 +56,14 @@ def point(given):
     answers = strut_responses(truth.plant, [truth.rest_m])
     [(mobility, *_)] = answers
     seen = longest_stretch(follow(truth, first, start), Path("grid"), STRUT, mobility)
-    smoothed = residual_force(seen, mobility)
-    expectation = Expectation(
-        smoothed.noise_std_m, *spectrum(smoothed.t_s, smoothed.force_n), "its run"
-    )
+    noise_std_m, residual_n = residual_force(seen, mobility)
+    expectation = Expectation(noise_std_m, *spectrum(seen.t_s, residual_n), "its run")
     timing = SampleTiming(truth.period_ns)
     bench = TuningProblem(
         truth.plant, (start,), 0, answers, [truth.rest_m], timing, expectation, 1e7
     )
     settled = round(min(2.0, 0.25 * len(fresh) / rate_hz) * rate_hz)
-    row = {"given": given, "noise_std_m": smoothed.noise_std_m}
+    row = {"given": given, "noise_std_m": noise_std_m}
     for name, observer in (
         ("paper", paper_observer(bench.mobility_per_kg, bench.force_limit_n)),
         *((kind, tune_observer(bench, kind, Aim()).observer) for kind in ("pi", "kalman")),
@@ -156,10 +154,10 @@ def share(case):
 def smoothed_share(case, folder):
     """The same of the force that is smoothed over the whole run."""
     seen = longest_stretch(open_steps(folder), folder, STRUT, 0.1)
-    found = residual_force(seen, 0.1)
-    force_n = found.force_n + np.interp(found.t_s, seen.tick_s, seen.law_force_n)
-    settled = found.t_s >= 0.5
-    truth = np.interp(found.t_s, case.t_s, case.truth[:, 2])
+    _, residual_n = residual_force(seen, 0.1)
+    force_n = residual_n + np.interp(seen.t_s, seen.tick_s, seen.law_force_n)
+    settled = seen.t_s >= 0.5
+    truth = np.interp(seen.t_s, case.t_s, case.truth[:, 2])
     missed = (force_n - truth)[settled]
     return float(np.sqrt(np.mean(missed**2)) / case.figures(case.observed).force_peak_n)
 

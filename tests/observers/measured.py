@@ -56,18 +56,18 @@ def compare(name, record, force_n=None):
     corner_hz = 0.1 / (record.period_ns * 1e-9) / 6.2832
     start = KalmanObserver("kalman", ErrorFilter(bandwidth_hz=corner_hz, noise_std_m=1e-5), 1e6)
     seen = longest_stretch(follow(record, record.height_m, start), Path(name), STRUT, mobility)
-    found = residual_force(seen, mobility)
-    smoothed = np.interp(seen.tick_s, found.t_s, found.force_n) + seen.law_force_n
+    noise_std_m, residual_n = residual_force(seen, mobility)
+    smoothed = np.interp(seen.tick_s, seen.t_s, residual_n) + seen.law_force_n
     first = len(record.height_m) - len(seen.tick_s)
     truth = smoothed if force_n is None else force_n[first : first + len(smoothed)]
-    expectation = Expectation(found.noise_std_m, *spectrum(found.t_s, found.force_n), name)
+    expectation = Expectation(noise_std_m, *spectrum(seen.t_s, residual_n), name)
     timing = SampleTiming(record.period_ns)
     bench = TuningProblem(
         record.plant, (start,), 0, answers, [record.rest_m], timing, expectation, 1e6
     )
     settled = round(0.5e9 / record.period_ns)
     deviation = np.std(truth[settled:])
-    figures = [f"noise {1e6 * found.noise_std_m:.2g} um"]
+    figures = [f"noise {1e6 * noise_std_m:.2g} um"]
     for kind, observer in (
         ("published", paper_observer(bench.mobility_per_kg, bench.force_limit_n)),
         *((kind, tune_observer(bench, kind, Aim()).observer) for kind in ("pi", "kalman")),

@@ -148,8 +148,8 @@ def test_a_timer_of_its_own_is_set_and_put_back(bus, network, tmp_path):
     node = encoder(bus(), 5)
     with_timer(node, 10)
     objects = node.object_dictionary
-    setting = DeviceWriter(network)
-    configure_device(setting, 5, CanOpenSettings(cycle_ms=2, heartbeat_ms=100))
+    setting = DeviceWriter(network, 5)
+    configure_device(setting, CanOpenSettings(cycle_ms=2, heartbeat_ms=100))
     assert objects.read(0x1800, 5) == 2
     assert objects.read(0x1017, 0) == 100
     assert objects.read(0x1800, 1) & ~NO_REMOTE_REQUEST == 0x185
@@ -165,8 +165,8 @@ def test_a_timer_of_its_own_is_set_and_put_back(bus, network, tmp_path):
 
 def test_an_encoder_without_an_event_timer_has_its_own(bus, network):
     node = encoder(bus(), 5, cycle_ms=10)
-    setting = DeviceWriter(network)
-    configure_device(setting, 5, CanOpenSettings(cycle_ms=3))
+    setting = DeviceWriter(network, 5)
+    configure_device(setting, CanOpenSettings(cycle_ms=3))
     assert node.object_dictionary.read(0x6200, 0) == 3
     assert [(item.index, item.before) for item in setting.changes] == [(0x6200, "0a00")]
 
