@@ -20,7 +20,7 @@ from can_dbc.codec import decode_log
 from can_dbc.database import load_database
 from can_dbc.units import Dimension
 from rig.log.file_names import DBC_FILE, FRAMES_FILE, RUN_FILE, STEPS_FILE, parts
-from rig.log.frame_columns import read_frame_columns
+from rig.log.received_frames import read_frame_columns
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.live import with_bench

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from can_dbc.addressing import Directory, Filter
 from can_dbc.frame import Frame
 from can_dbc.protection import SequenceState
-from rig.bridge.counts import Conditions, Counts, Report
+from rig.bridge.counts import Conditions, Counts, Report, count_tick
 from rig.bridge.devices import CLAIM, CLAIM_MASK, Device, faults
 from rig.bridge.gates import GateMemory, Gates, Reception
 from rig.bridge.incoming import Incoming
@@ -172,7 +172,7 @@ class Bridge:
             is_faulty = any(self._devices[index].is_vital for index, _ in wrong)
             reports = Reports(reception.action, is_faulty)
         supervised, output, action = self._supervisor.step(supervised, step_input, reports)
-        counts = _count_tick(memory.counts, output, action, conditions, len(wrong))
+        counts = count_tick(memory.counts, output, action, conditions, len(wrong))
         sent = self._send(state, t_ns, output, counts, conditions)
         sendings, sent_frames, counts, reported = sent
         if counts is not memory.counts:
@@ -266,24 +266,6 @@ def _filters(
     by_name = any(device.j1939_name is not None for device in devices)
     claims = (Filter(CLAIM, CLAIM_MASK, is_extended=True),) if by_name else ()
     return (*of_messages, *of_devices, *claims)
-
-
-def _count_tick(
-    counts: Counts, output: StepOutput, action: int, conditions: Conditions, faulty_devices: int
-) -> Counts:
-    """Counts after a tick; most ticks are as they should be."""
-    is_held = output.mode is Mode.HOLD
-    is_unusual = conditions.overruns or conditions.bus_fault or output.left_out or faulty_devices
-    if not (action or is_held or is_unusual):
-        return counts
-    return counts._replace(
-        overruns=counts.overruns + conditions.overruns,
-        stale=counts.stale + is_held,
-        limited=counts.limited + (action > 0),
-        bus_faulty=counts.bus_faulty + conditions.bus_fault,
-        left_out=counts.left_out + len(output.left_out),
-        device_faulty=counts.device_faulty + faulty_devices,
-    )
 
 
 def _next_due_ns(due_ns: int, t_ns: int, period_ns: int) -> int:

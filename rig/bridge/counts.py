@@ -1,10 +1,14 @@
-"""What has been counted, what the loop knows, and what an outgoing message reports of both."""
+"""What is counted of frames and ticks, and what an outgoing message can report.
+
+A frame is counted by the gate that refuses it (`rig.bridge.gates`), under the value of its
+`FrameStatus`; a tick at its end.
+"""
 
 from typing import NamedTuple
 
 from msgspec import Struct
 
-from rig.bridge.values import StepOutput
+from rig.bridge.values import Mode, StepOutput
 
 
 class Counts(NamedTuple):
@@ -54,6 +58,15 @@ class Counts(NamedTuple):
     from_faulty_device: int = 0
     no_value: int = 0
 
+    def plus(self, **increments: int) -> "Counts":
+        """Counts with increments, by their names."""
+        more = {name: getattr(self, name) + number for name, number in increments.items()}
+        return self._replace(**more)
+
+    def plus_refusal(self, cause: str) -> "Counts":
+        """Counts with a refused frame; its cause is the name of a count, such as `wrong_crc`."""
+        return self.plus(**{"refused": 1, cause: 1})
+
 
 Levels = tuple[float, float, float, float]
 """Median, 99th and 99.9th percentile, largest."""
@@ -92,6 +105,24 @@ class Conditions(NamedTuple):
     bus_fault: bool = False
     log_fault: bool = False
     timing: TimingFigures = NO_TIMING
+
+
+def count_tick(
+    counts: Counts, output: StepOutput, action: int, conditions: Conditions, faulty_devices: int
+) -> Counts:
+    """Counts after a tick; most ticks are as they should be."""
+    is_held = output.mode is Mode.HOLD
+    is_unusual = conditions.overruns or conditions.bus_fault or output.left_out or faulty_devices
+    if not (action or is_held or is_unusual):
+        return counts
+    return counts.plus(
+        overruns=conditions.overruns,
+        stale=is_held,
+        limited=action > 0,
+        bus_faulty=conditions.bus_fault,
+        left_out=len(output.left_out),
+        device_faulty=faulty_devices,
+    )
 
 
 class Report(Struct, frozen=True, gc=False):

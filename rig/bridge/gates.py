@@ -2,14 +2,15 @@
 
 1. addressed: it is a frame of a message that the bridge reads (`Gates.receive`). What is not may be
    a heartbeat, an emergency or an address claim of a device, or a second sender.
-2. protected: its length, CRC and counter are right, and its signals hold values (`Incoming.read`).
+2. protected: its length, CRC and counter are right (`can_dbc.protection`), and its signals hold
+   values (`Incoming.read`).
 3. sent by its device: its sender is the configured device (`_sent_by_device`).
 4. healthy sender: that device is not at fault (`_healthy_sender`).
 5. plausible: no limit refuses its heights (`_plausible`).
 
-Whether a frame is authentic is decided before, on the bus (`rig.bus.secoc`). No part of a
-refused frame is used. It is counted where it was refused; that of another sender than the device
-is none of the message's frames, and is not.
+Whether a frame is authentic is decided before, on the bus (`rig.bus.secoc`). No measurement of a
+refused frame is used; alarms in it count. It is counted where it was refused (`rig.bridge.counts`);
+that of another sender than the device is none of the message's frames, and is not.
 """
 
 from collections.abc import Callable, Sequence
@@ -97,13 +98,11 @@ class Reception:
 
     def count(self, **increments: int) -> None:
         """Add to counts, by the names of `Counts`."""
-        counts = self.memory.counts
-        more = {name: getattr(counts, name) + number for name, number in increments.items()}
-        self.memory = replace(self.memory, counts=counts._replace(**more))
+        self.memory = replace(self.memory, counts=self.memory.counts.plus(**increments))
 
     def count_refusal(self, cause: str) -> None:
         """Count a refused frame, and its cause: the name of one of `Counts`."""
-        self.count(**{"refused": 1, cause: 1})
+        self.memory = replace(self.memory, counts=self.memory.counts.plus_refusal(cause))
 
     def set_health(self, index: int, health: DeviceHealth) -> None:
         """Replace the health of a device."""

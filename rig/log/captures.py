@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from can_dbc.frame import Frame
-from rig.log.steps import BUS_FAULT, LOG_FAULT, Step
+from rig.log.step_columns import BUS_FAULT, LOG_FAULT, Step
 
 
 class Entry(NamedTuple):

@@ -17,7 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from rig.log.file_names import STEPS_FILE, part_name
-from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, END_OF_STREAM, LOG_FAULT, step_schema
+from rig.log.step_columns import ACKNOWLEDGED, BUS_FAULT, END_OF_STREAM, LOG_FAULT, step_schema
 
 Array = NDArray[np.float64]
 BUCKET = 64

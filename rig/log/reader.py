@@ -17,7 +17,7 @@ from can_dbc.yaml_file import parse_mapping, read_text
 from rig.log.candump import LATEST_S, line_error, parse_frame
 from rig.log.errors import LogError
 from rig.log.file_names import FRAMES_FILE, RUN_FILE, STEPS_FILE, parts
-from rig.log.steps import step_schema
+from rig.log.step_columns import step_schema
 
 _TAIL_BYTES = 4096
 """More than the longest line of `frames.log`."""

@@ -6,7 +6,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from rig.log.file_names import FRAMES_FILE, STEPS_FILE, part_name
-from rig.log.steps import END_OF_STREAM
+from rig.log.step_columns import END_OF_STREAM
 from rig.log.whole_file import WholeFile
 
 

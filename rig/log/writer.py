@@ -25,7 +25,7 @@ from rig.log.errors import LogError
 from rig.log.file_names import CAPTURES_FOLDER, DBC_FILE, MODEL_FILE, RUN_FILE
 from rig.log.reader import RunHeader
 from rig.log.rotation import Part, Rotation
-from rig.log.steps import Step, StepRows
+from rig.log.step_columns import Step, StepRows
 from rig.log.whole_file import WholeFile
 from rig.machine.realtime import follow
 

@@ -75,7 +75,7 @@ def realtime(request: Realtime) -> Generator[Granted]:
     """Context with real-time conditions, which are released at its end.
 
     Args:
-        request: Realtimeed conditions.
+        request: Requested conditions.
 
     Yields:
         Granted conditions.

@@ -22,15 +22,15 @@ from rig.bus.link import LinkFigures
 from rig.files.folders import refuse_full
 from rig.log.file_names import CHANGES_FILE, DBC_FILE, HISTOGRAMS_FILE, MODEL_FILE
 from rig.log.reader import RUN_SCHEMA, ConfigEntry, RunHeader
-from rig.log.steps import LogColumns, Step
+from rig.log.step_columns import LogColumns, Step
 from rig.log.writer import LogOptions, RunWriter
 from rig.machine.clock import Clock, OccupiedClock
 from rig.machine.realtime import Granted
 from rig.plan.plan import Plan
 from rig.run.changes import Changes, no_changes
+from rig.run.live_changes import Requests
 from rig.run.loop import SHOWN_EVERY_NS, Look, Port, RunControl, Sink, regular_ticks, run
 from rig.run.ports import InformedPort
-from rig.run.requests import Requests
 from rig.run.timing import Timing
 from rig.run.trace import Trace
 

@@ -10,7 +10,7 @@ from can_dbc.frame import Frame
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
 from rig.bridge.counts import Conditions, Counts
 from rig.bridge.values import Mode, StepOutput
-from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, LogColumns, Step
+from rig.log.step_columns import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, LogColumns, Step
 from rig.machine.clock import Clock
 from rig.run.changes import Changes, no_changes
 from rig.run.timing import BINS, Timing

@@ -15,9 +15,9 @@ from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.bridge.bridge import TickResult
 from rig.bridge.counts import Conditions
-from rig.log.frame_columns import FrameColumns, read_frame_columns
 from rig.log.reader import RunFolder, last_frame_ns, read_run
-from rig.log.steps import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, LogColumns, Step, StepRows
+from rig.log.received_frames import FrameColumns, read_frame_columns
+from rig.log.step_columns import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, LogColumns, Step, StepRows
 from rig.plan.build import build_bridge
 from rig.plan.load import plan_of_run
 from rig.plan.plan import Plan

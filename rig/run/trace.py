@@ -17,7 +17,7 @@ from rig.bridge.bridge import TickResult
 from rig.bridge.counts import Conditions
 from rig.log.errors import LogError
 from rig.log.file_names import TRACE_FILE
-from rig.log.steps import Step
+from rig.log.step_columns import Step
 from rig.machine.clock import Clock, WrappedClock
 from rig.run.loop import Port, Sink
 

@@ -129,9 +129,7 @@ def _by_points(curve: SpringCurve | DamperCurve) -> Floats:
     return _segments(at, interpolate.PchipInterpolator(at, force_n))
 
 
-def _segments(
-    at: Floats, cubics: interpolate.CubicSpline | interpolate.PchipInterpolator
-) -> Floats:
+def _segments(at: Floats, cubics: interpolate.PPoly) -> Floats:
     return np.column_stack([at[:-1], np.diff(at), np.asarray(cubics.c, dtype=np.float64).T])
 
 

@@ -11,10 +11,10 @@ from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.log.captures import CaptureWindow
 from rig.log.file_names import RUN_FILE
-from rig.log.frame_columns import read_frame_columns
 from rig.log.reader import RUN_SCHEMA, read_run
+from rig.log.received_frames import read_frame_columns
 from rig.log.rotation import Rotation
-from rig.log.steps import BUS_FAULT, Step
+from rig.log.step_columns import BUS_FAULT, Step
 from rig.log.whole_file import WholeFile
 from rig.log.writer import MANY_WAITING, LogOptions, RunWriter
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import astuple
 
-from rig.log.steps import Step, StepRows
+from rig.log.step_columns import Step, StepRows
 
 COLUMNS = ["temperature_c", "tyre.force_n", "suspension.force_n"]
 

@@ -19,7 +19,7 @@ from rig.bridge.values import Mode
 from rig.bus.bus import BusError
 from rig.bus.link import Link
 from rig.log.reader import read_run
-from rig.log.steps import LOG_FAULT
+from rig.log.step_columns import LOG_FAULT
 from rig.log.whole_file import WholeFile
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan

@@ -10,7 +10,7 @@ from rig.bridge.supervisor import Supervision
 from rig.bridge.values import Mode, StepInput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.quantities import APPLIED_FORCE, HEIGHT
-from rig.log.steps import LogColumns
+from rig.log.step_columns import LogColumns
 from rig.plan.config import CONFIGS
 from rig.simulated_bench.schema import BenchConfig
 from rig.simulated_bench.trajectory import simulate

@@ -11,8 +11,8 @@ from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.changes import assign, change_line, parse_assignments, read_changes
+from rig.run.live_changes import Requests, ask
 from rig.run.replay import replay
-from rig.run.requests import Requests, ask
 from tests.view.serving import make_run
 
 GAIN = "observers.strut.proportional_n_per_m"

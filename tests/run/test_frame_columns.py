@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.log.candump import format_frame, parse_frame
-from rig.log.frame_columns import FrameColumns, read_frame_columns
+from rig.log.received_frames import FrameColumns, read_frame_columns
 
 EPOCH_NS = 1_700_000_000_123_456_789
 LENGTHS = [*range(9), 12, 16, 20, 24, 32, 48, 64]

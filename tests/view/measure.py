@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import yaml
 
-from rig.log.steps import END_OF_STREAM, step_schema
+from rig.log.step_columns import END_OF_STREAM, step_schema
 from tests.view.browser import browser, drawn, until
 from tests.view.serving import make_run
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from rig.log.file_names import part_name
 from rig.log.follower import BUCKET, FLAGS, RunFollower
-from rig.log.steps import END_OF_STREAM, Step, StepRows
+from rig.log.step_columns import END_OF_STREAM, Step, StepRows
 
 MS = 1_000_000
 NAMES = ("force_n", "sparse_m")

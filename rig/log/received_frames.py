@@ -1,7 +1,8 @@
 """The received frames of a log as columns: a log of hours is read at once and not line by line.
 
 Arrow splits the lines that `format_frame` writes, a block at a time. A line of any other form is
-read by `parse_frame`, which decides what is an error.
+read by `parse_frame`, which decides what is an error. (The columns of a tick are those of
+`rig.log.step_columns`.)
 """
 
 from collections.abc import Iterator, Sequence
