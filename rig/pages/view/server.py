@@ -116,6 +116,7 @@ class ViewServer(ThreadingHTTPServer):
         super().server_close()
         for diagnosis in getattr(self, "diagnoses", ()):
             diagnosis.cancel()
+            diagnosis.wait()
 
     def handle_error(
         self, request: socket.socket | tuple[bytes, socket.socket], client_address: object
