@@ -45,12 +45,14 @@ def stoppable() -> Generator[Callable[[], bool]]:
         nonlocal is_requested
         is_requested = True
 
-    with handled(request, signal.SIGINT, signal.SIGTERM):
+    with handle_signals(request, signal.SIGINT, signal.SIGTERM):
         yield lambda: is_requested
 
 
 @contextlib.contextmanager
-def handled(handler: Callable[[int, FrameType | None], None], *numbers: int) -> Generator[None]:
+def handle_signals(
+    handler: Callable[[int, FrameType | None], None], *numbers: int
+) -> Generator[None]:
     """Handle signals by a function, then again as before."""
     previous = {number: signal.signal(number, handler) for number in numbers}
     try:
@@ -121,7 +123,7 @@ def status_line(
         text += f"  lost {look.counts.lost}"
         if look.counts.refused:
             text += f"  refused {look.counts.refused}"
-        text += _excluded_sensors(look, channels, devices)
+        text += _describe_faults(look, channels, devices)
         if look.late_ns is not None:
             text += f"  missed {look.counts.overruns}  late ≤ {look.late_ns * 1e-6:.2f} ms"
         # Of several struts, the one with the largest force: there is one line.
@@ -142,7 +144,7 @@ def status_line(
             _write(b"\r\x1b[K")
 
 
-def _excluded_sensors(look: "Look", channels: Sequence[str], devices: Sequence[str]) -> str:
+def _describe_faults(look: "Look", channels: Sequence[str], devices: Sequence[str]) -> str:
     """Devices with a fault, with its reason, and sensors that are left out."""
     text = "".join(f"  {devices[index]}: {why}" for index, why in look.device_faults)
     if look.output.left_out:

@@ -16,7 +16,7 @@ from typing import TypedDict
 from rich.markup import escape
 
 from can_dbc.errors import InputError
-from rig.cli.progress import handled
+from rig.cli.progress import handle_signals
 from rig.cli.terminal import FAILED, OK, WRONG_INPUT, print_json, print_table
 from rig.files.folders import refuse_full
 
@@ -102,7 +102,7 @@ def _end_together(bridges: Mapping[str, "subprocess.Popen[str]"]) -> Generator[N
                 bridge.send_signal(signal.SIGINT)
 
     closed_terminal = [signal.SIGHUP] if sys.platform != "win32" else []
-    with handled(forward, signal.SIGINT, signal.SIGTERM, *closed_terminal):
+    with handle_signals(forward, signal.SIGINT, signal.SIGTERM, *closed_terminal):
         try:
             yield
         except BaseException:

@@ -94,7 +94,7 @@ def run_campaign(
         InputError: The store cannot be read or written.
     """
     store.sweep(out)
-    evaluated = store.read_evaluated(out)
+    evaluated = store.read_runs(out)
     keys = {key for key, _, _ in evaluated}
     known = {identity for _, identity, error in evaluated if not (again and error)}
     todo = [s for s in sources if identity_of(s, model.sha256) not in known]

@@ -116,7 +116,7 @@ def _write(store: Path, partition: str, rows: Sequence[RunRow]) -> None:
             _parquet.write_table(pa.Table.from_pylist(content, schema=schema), temporary)
 
 
-def read_evaluated(store: Path) -> list[tuple[str, str, str]]:
+def read_runs(store: Path) -> list[tuple[str, str, str]]:
     """Key, identity and error of every run of a store; none where there is no store yet.
 
     Raises:

@@ -74,7 +74,7 @@ def description_2(component: Component, tool: str, token: str, files: list[str])
     for tag, indices in (
         ("Outputs", _outputs(component)),
         ("Derivatives", list(states)),
-        ("InitialUnknowns", _calculated_variables(component)),
+        ("InitialUnknowns", _rates_and_outputs(component)),
     ):
         if indices:
             unknowns = SubElement(structure, tag)
@@ -103,7 +103,7 @@ def description_3(component: Component, tool: str, token: str) -> str:
     for tag, indices in (
         ("Output", _outputs(component)),
         ("ContinuousStateDerivative", list(states)),
-        ("InitialUnknown", _calculated_variables(component)),
+        ("InitialUnknown", _rates_and_outputs(component)),
         ("EventIndicator", [index for index, _ in component.of("indicator")]),
     ):
         for index in indices:
@@ -198,7 +198,7 @@ def _outputs(component: Component) -> list[int]:
     return [index for index, item in variables if item.kind == "output" or item.is_output]
 
 
-def _calculated_variables(component: Component) -> list[int]:
+def _rates_and_outputs(component: Component) -> list[int]:
     """Indices of the rates and the outputs."""
     return [index for index, _ in (*component.of("rate"), *component.of("output"))]
 

@@ -89,16 +89,16 @@ def _roles_by_name(description: Any, source: Path) -> FmuSpec:
     """Roles of the variables of an FMU of `rig export`, by their names."""
     causality = {item.name: item.causality for item in description.modelVariables}
 
-    def input_named(name: str) -> str | None:
+    def find_input(name: str) -> str | None:
         return name if causality.get(name) == "input" else None
 
     further = {
-        "temperature": input_named("temperature_c"),
-        "applied_force": input_named("applied_force_n"),
+        "temperature": find_input("temperature_c"),
+        "applied_force": find_input("applied_force_n"),
     }
     if (
-        input_named("height_m")
-        and input_named("velocity_m_per_s")
+        find_input("height_m")
+        and find_input("velocity_m_per_s")
         and causality.get("force_n") == "output"
     ):
         own = {"height": "height_m", "velocity": "velocity_m_per_s", "force": "force_n"}

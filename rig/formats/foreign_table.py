@@ -60,7 +60,7 @@ def import_table(source: Path, mapping: TableMapping, out: Path) -> ImportReport
         assumptions.append(
             f"height_m is missing in {missing} of {len(t_s)} rows; its cells are empty"
         )
-    assumptions += _assumed_signs(mapping)
+    assumptions += _assume_signs(mapping)
     assumptions += preflight(t_s, dict(zip(names[1:], values, strict=True)))
     duration_s = float(t_s[-1] - t_s[0])
     rate_hz = 1.0 / float(np.median(np.diff(t_s)))
@@ -100,7 +100,7 @@ def import_folder(
             yield path, error
 
 
-def _assumed_signs(mapping: TableMapping) -> list[str]:
+def _assume_signs(mapping: TableMapping) -> list[str]:
     signs = ["height is taken as positive when the bodies move apart"]
     if mapping.applied_force is not None:
         signs.append("applied force is taken as positive upwards, without the weight")

@@ -24,7 +24,7 @@ from can_dbc.errors import InputError
 from rig.files.delimited_text import MAX_ROWS
 from rig.formats.mapping import ColumnName, OutputColumn, TableMapping
 from rig.formats.mts import is_mts, read_mts, read_whole
-from rig.formats.text_table import Array, Columns, evenly_sampled, in_seconds
+from rig.formats.text_table import Array, Columns, in_seconds, sample_evenly
 
 _MAX_BYTES = 1_000_000_000
 """Largest file, and largest content of a worksheet: what memory holds."""
@@ -49,7 +49,7 @@ def read_named_columns(
     columns = [_find_column(source, table, output.key, output.column) for output in outputs]
     first = mapping.table.first_row
     if time.column is None:
-        t_s, time_words = evenly_sampled(time, len(columns[0]))
+        t_s, time_words = sample_evenly(time, len(columns[0]))
     else:
         t_s, time_words = in_seconds(time, _find_column(source, table, "time", time.column))
     for output, column in zip(outputs, columns, strict=True):

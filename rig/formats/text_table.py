@@ -62,7 +62,7 @@ def read_text_columns(
             f"{source}: {count} rows from row {table.first_row} on, expected {table.rows}"
         )
     if time.column is None:
-        t_s, words = evenly_sampled(time, count)
+        t_s, words = sample_evenly(time, count)
     elif time.date_format is not None:
         t_s = columns.pop()
         words = f"t_s from dates in column {time.column!r}, 0 at the first one"
@@ -71,7 +71,7 @@ def read_text_columns(
     return t_s, columns, [_layout_words(table, names, count), words]
 
 
-def evenly_sampled(time: TimeColumn, count: int) -> tuple[Array, str]:
+def sample_evenly(time: TimeColumn, count: int) -> tuple[Array, str]:
     """Times in s of rows at a sampling rate, shape (count,), and the assumption in words."""
     rate_hz = time.sampling_rate_hz or 1.0
     words = f"t_s from {rate_hz:.9g} rows a second, evenly, beginning at 0"

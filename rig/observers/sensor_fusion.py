@@ -169,13 +169,13 @@ def fuse_samples(
     while used and used[0][1].t_ns < oldest_ns:
         used.pop(0)
     from_ns = used[0][0].t_ns if used else error.t_ns
-    left_out = _find_left_out(health, sensors, t_ns)
+    left_out = _list_exclusions(health, sensors, t_ns)
     inputs = inputs_since(inputs, from_ns)
     after_tick = FusionMemory(tuple(used), inputs, health, measured_ns, own_ns, left_out)
     return replace(error, inputs=inputs_since(inputs, error.t_ns)), after_tick
 
 
-def _find_left_out(
+def _list_exclusions(
     health: Mapping[int, SensorHealth], sensors: Mapping[int, Channel], t_ns: int
 ) -> tuple[int, ...]:
     """Sensors that are not to be trusted, or silent."""

@@ -84,13 +84,15 @@ def _encoder_meaning(
     if index in _POSITIONS and kind in _LINEAR:
         step = number(objects, _STEPS, 1) or number(objects, _STEP_OF_DISPLAY)
         missing = "measuring step (6005h)"
-        return _stepped(f"POSITION{ending}", known is not False, step, _NM, "mm", missing)
+        return _meaning_in_steps(f"POSITION{ending}", known is not False, step, _NM, "mm", missing)
     if index in _POSITIONS:
         return _angle(objects, f"POSITION{ending}", is_signed=bool(known))
     if index == _SPEED:
         step = number(objects, _STEPS, 2) if kind in _LINEAR else None
         missing = "speed step (6005h.2)"
-        return _stepped(f"SPEED{ending}", True, step, _SPEED_STEP_MM_PER_S, "mm/s", missing)
+        return _meaning_in_steps(
+            f"SPEED{ending}", True, step, _SPEED_STEP_MM_PER_S, "mm/s", missing
+        )
     if index == _ACCELERATION:
         return Meaning(f"ACCELERATION{ending}", True, note="its unit is not known")
     if index in (_ALARMS, _WARNINGS):
@@ -99,7 +101,7 @@ def _encoder_meaning(
     return None
 
 
-def _stepped(
+def _meaning_in_steps(
     name: str, is_signed: bool, step: int | None, size: float, unit: str, missing: str
 ) -> Meaning:
     """Meaning of a value in steps of so many times a size."""

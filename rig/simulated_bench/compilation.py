@@ -22,7 +22,7 @@ _PACKAGE_STAMP = tuple(
 )
 
 
-def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
+def jit_compile(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Compile a function to machine code, typed as it was."""
     dispatcher = cast("Any", numba).njit(cache=True, error_model="numpy")(function)
     # numba renews what is on disk when the function's own file changes. What it calls is compiled

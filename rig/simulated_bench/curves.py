@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rig.simulated_bench.compilation import Floats, Integers, compiled
+from rig.simulated_bench.compilation import Floats, Integers, jit_compile
 
 
 class Curves(NamedTuple):
@@ -20,7 +20,7 @@ class Curves(NamedTuple):
     segments: Floats
 
 
-@compiled
+@jit_compile
 def curve_segment(curves: Curves, curve: int, at: float) -> int:
     """Segment of a curve at, or nearest to, an abscissa."""
     first = int(curves.first[curve])
@@ -28,7 +28,7 @@ def curve_segment(curves: Curves, curve: int, at: float) -> int:
     return first + max(int(np.searchsorted(starts, at, side="right")) - 1, 0)
 
 
-@compiled
+@jit_compile
 def curve_force(curves: Curves, strut: int, at: float) -> float:
     """Force of a curve in N at a height in m or a rate in m/s."""
     segments = curves.segments

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rig.simulated_bench.compilation import Floats, Integers, compiled
+from rig.simulated_bench.compilation import Floats, Integers, jit_compile
 from rig.simulated_bench.curves import Curves, curve_segment
 
 SINE_COLUMNS = 3
@@ -59,7 +59,7 @@ class BenchDrive(NamedTuple):
     prescribed: DrivenHeight
 
 
-@compiled
+@jit_compile
 def applied_force(drive: DrivenForce, t_s: float) -> float:
     """Applied force in N at a time, zero before time zero."""
     if t_s < 0.0:
@@ -74,14 +74,14 @@ def applied_force(drive: DrivenForce, t_s: float) -> float:
     return force_n
 
 
-@compiled
+@jit_compile
 def _sweep(sweep: Floats, t_s: float) -> float:
     if t_s > sweep[3]:
         return 0.0
     return float(sweep[0]) * math.sin(2.0 * math.pi * _sweep_turns(sweep, t_s)[0])
 
 
-@compiled
+@jit_compile
 def _sweep_turns(sweep: Floats, t_s: float) -> tuple[float, float]:
     """Turns since the start, and frequency in Hz."""
     _, start_hz, end_hz, duration_s, logarithmic = sweep
@@ -93,7 +93,7 @@ def _sweep_turns(sweep: Floats, t_s: float) -> tuple[float, float]:
     return (start_hz + 0.5 * rise) * t_s, start_hz + rise
 
 
-@compiled
+@jit_compile
 def _interpolate(drive: DrivenForce, first: int, last: int, t_s: float) -> float:
     t = drive.file_t_s
     force_n = drive.file_force_n
@@ -104,13 +104,13 @@ def _interpolate(drive: DrivenForce, first: int, last: int, t_s: float) -> float
     return force_n[low] + share * (force_n[low + 1] - force_n[low])
 
 
-@compiled
+@jit_compile
 def acting_force(drive: DrivenForce, t_s: float) -> float:
     """Force in N that reaches the driven body, after undeclared gain and delay."""
     return drive.gain * applied_force(drive, t_s - drive.delay_s)
 
 
-@compiled
+@jit_compile
 def prescribed_motion(prescribed: DrivenHeight, t_s: float) -> tuple[float, float]:
     """Prescribed height in m and its rate in m/s. Files and sweeps stay where they end."""
     height_m = prescribed.mean_height_m

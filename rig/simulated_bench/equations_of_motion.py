@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rig.simulated_bench.compilation import Floats, Integers, compiled
+from rig.simulated_bench.compilation import Floats, Integers, jit_compile
 from rig.simulated_bench.curves import Curves, curve_force
 from rig.simulated_bench.drive import BenchDrive, acting_force, applied_force, prescribed_motion
 from rig.simulated_bench.laws import (
@@ -92,7 +92,7 @@ class BenchMechanics(NamedTuple):
     thermal: Thermal
 
 
-@compiled
+@jit_compile
 def write_inputs(mechanics: BenchMechanics, drive: BenchDrive, t_s: float, inputs: Floats) -> None:
     """Write the inputs at a time, shape (INPUTS,)."""
     inputs[0] = acting_force(drive.force, t_s)
@@ -100,7 +100,7 @@ def write_inputs(mechanics: BenchMechanics, drive: BenchDrive, t_s: float, input
         inputs[1], inputs[2] = prescribed_motion(drive.prescribed, t_s)
 
 
-@compiled
+@jit_compile
 def prescribe(mechanics: BenchMechanics, inputs: Floats, y: Floats) -> None:
     """Set position and rate of the body above the strut whose motion is prescribed."""
     body = mechanics.prescribed
@@ -112,7 +112,7 @@ def prescribe(mechanics: BenchMechanics, inputs: Floats, y: Floats) -> None:
     y[n + body] = inputs[2] + (y[n + below] if below >= 0 else 0.0)
 
 
-@compiled
+@jit_compile
 def fade_factor(effects: Effects, strut: int, t_s: float, temperature_c: float) -> float:
     """Factor on the damper curve of a strut from all its fades."""
     factor = 1.0
@@ -122,14 +122,14 @@ def fade_factor(effects: Effects, strut: int, t_s: float, temperature_c: float) 
     return factor
 
 
-@compiled
+@jit_compile
 def strut_height(lower: Integers, strut: int, y: Floats) -> float:
     """Height of a strut in m."""
     below = int(lower[strut])
     return float(y[strut]) - (float(y[below]) if below >= 0 else 0.0)
 
 
-@compiled
+@jit_compile
 def strut_rate(lower: Integers, strut: int, y: Floats) -> float:
     """Rate of height of a strut in m/s."""
     n = lower.shape[0]
@@ -137,7 +137,7 @@ def strut_rate(lower: Integers, strut: int, y: Floats) -> float:
     return float(y[n + strut]) - (float(y[n + below]) if below >= 0 else 0.0)
 
 
-@compiled
+@jit_compile
 def effect_force(
     mechanics: BenchMechanics, effect: int, t_s: float, y: Floats, dy: Floats
 ) -> float:
@@ -164,7 +164,7 @@ def effect_force(
     return 0.0
 
 
-@compiled
+@jit_compile
 def strut_force(mechanics: BenchMechanics, strut: int, t_s: float, y: Floats, dy: Floats) -> float:
     """Total force of a strut in N; rates of temperature and internal states go into `dy`."""
     n = mechanics.mass_kg.shape[0]
@@ -182,7 +182,7 @@ def strut_force(mechanics: BenchMechanics, strut: int, t_s: float, y: Floats, dy
     return force_n
 
 
-@compiled
+@jit_compile
 def derivatives(
     mechanics: BenchMechanics, t_s: float, inputs: Floats, y: Floats, dy: Floats
 ) -> None:
@@ -215,7 +215,7 @@ def derivatives(
         dy[n + i] = dy[n + i] / mechanics.mass_kg[i] - mechanics.gravity_m_per_s2
 
 
-@compiled
+@jit_compile
 def hidden_mass_force(mechanics: BenchMechanics, effect: int, y: Floats, dy: Floats) -> float:
     """Force in N on the body that carries a hidden mass; its two states' rates go into `dy`.
 
@@ -232,7 +232,7 @@ def hidden_mass_force(mechanics: BenchMechanics, effect: int, y: Floats, dy: Flo
     return force_n
 
 
-@compiled
+@jit_compile
 def observe(
     mechanics: BenchMechanics, drive: BenchDrive, t_s: float, y: Floats, record: Floats
 ) -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rig.simulated_bench.compilation import Floats, compiled
+from rig.simulated_bench.compilation import Floats, jit_compile
 from rig.simulated_bench.drive import BenchDrive
 from rig.simulated_bench.equations_of_motion import (
     INPUTS,
@@ -31,7 +31,7 @@ class RecordGrid(NamedTuple):
     step_s: float
 
 
-@compiled
+@jit_compile
 def runge_kutta_step(
     mechanics: BenchMechanics, t_s: float, step_s: float, inputs: Floats, y: Floats, work: Floats
 ) -> None:
@@ -62,7 +62,7 @@ def runge_kutta_step(
     prescribe(mechanics, inputs[2], y)
 
 
-@compiled
+@jit_compile
 def advance(
     mechanics: BenchMechanics,
     drive: BenchDrive,

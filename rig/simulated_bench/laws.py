@@ -14,7 +14,7 @@ References:
 import math
 from enum import IntEnum, unique
 
-from rig.simulated_bench.compilation import Floats, compiled
+from rig.simulated_bench.compilation import Floats, jit_compile
 
 
 @unique
@@ -47,14 +47,14 @@ class LawCode(IntEnum):
     DELAY = 23
 
 
-@compiled
+@jit_compile
 def progressive_stiffness(deflection_m: float, force_n: float, length_m: float) -> float:
     """Force of a spring that stiffens exponentially on both sides of its free length."""
     ratio = deflection_m / length_m
     return -force_n * (math.sinh(ratio) - ratio)
 
 
-@compiled
+@jit_compile
 def gas_spring(
     deflection_m: float, charge_force_n: float, gas_length_m: float, polytropic_exponent: float
 ) -> float:
@@ -63,7 +63,7 @@ def gas_spring(
     return charge_force_n * (gas_length_m / length_m) ** polytropic_exponent
 
 
-@compiled
+@jit_compile
 def stop(
     depth_m: float,
     closing_m_per_s: float,
@@ -79,7 +79,7 @@ def stop(
     return max(force_n, 0.0)
 
 
-@compiled
+@jit_compile
 def backlash(
     height_m: float, centre_height_m: float, gap_m: float, stiffness_n_per_m: float
 ) -> float:
@@ -89,7 +89,7 @@ def backlash(
     return -stiffness_n_per_m * math.copysign(beyond_m, off_centre_m)
 
 
-@compiled
+@jit_compile
 def digressive_damping(
     velocity_m_per_s: float, damping_n_s_per_m: float, knee_velocity_m_per_s: float
 ) -> float:
@@ -101,7 +101,7 @@ def digressive_damping(
     )
 
 
-@compiled
+@jit_compile
 def bristle_rate(
     velocity_m_per_s: float,
     bristle_m: float,
@@ -115,7 +115,7 @@ def bristle_rate(
     return velocity_m_per_s - abs(velocity_m_per_s) * bristle_m / (presliding_m * level)
 
 
-@compiled
+@jit_compile
 def bouc_wen_rate(
     velocity_m_per_s: float, elastic_m: float, yield_m: float, exponent: float, shape: float
 ) -> float:
@@ -125,7 +125,7 @@ def bouc_wen_rate(
     return velocity_m_per_s * (1.0 - ratio * (shape * same_way + 1.0 - shape))
 
 
-@compiled
+@jit_compile
 def spring_force(law: int, p: Floats, deflection_m: float) -> float:
     """Force of a law of the deflection from the free length; `p` as of `EFFECT_KINDS`."""
     if law == LawCode.PRELOAD:
@@ -141,7 +141,7 @@ def spring_force(law: int, p: Floats, deflection_m: float) -> float:
     return gas_spring(deflection_m, p[0], p[1], p[2])
 
 
-@compiled
+@jit_compile
 def contact_force(law: int, p: Floats, height_m: float, velocity_m_per_s: float) -> float:
     """Force of a stop, or of a link with free play; `p` as of `EFFECT_KINDS`."""
     if law == LawCode.BACKLASH:
@@ -150,7 +150,7 @@ def contact_force(law: int, p: Floats, height_m: float, velocity_m_per_s: float)
     return outwards * stop(outwards * (p[0] - height_m), -outwards * velocity_m_per_s, p[1], p[2])
 
 
-@compiled
+@jit_compile
 def damping_force(law: int, p: Floats, deflection_m: float, velocity_m_per_s: float) -> float:
     """Force of a law that opposes the rate of height; `p` as of `EFFECT_KINDS`."""
     if law == LawCode.LINEAR_DAMPING:
@@ -164,7 +164,7 @@ def damping_force(law: int, p: Floats, deflection_m: float, velocity_m_per_s: fl
     return -p[0] * (deflection_m / p[1]) ** 2 * velocity_m_per_s
 
 
-@compiled
+@jit_compile
 def state_rate(law: int, p: Floats, velocity_m_per_s: float, state: float) -> float:
     """Rate of the internal state of a law; `p` as of `EFFECT_KINDS`.
 
@@ -178,7 +178,7 @@ def state_rate(law: int, p: Floats, velocity_m_per_s: float, state: float) -> fl
     return p[0] * velocity_m_per_s - state / p[1]
 
 
-@compiled
+@jit_compile
 def state_force(law: int, p: Floats, state: float, rate: float) -> float:
     """Force of a law with an internal state, from the state and its rate."""
     if law == LawCode.FRICTION:
@@ -188,7 +188,7 @@ def state_force(law: int, p: Floats, state: float, rate: float) -> float:
     return -state
 
 
-@compiled
+@jit_compile
 def fade(law: int, p: Floats, t_s: float, temperature_c: float) -> float:
     """Factor on the damper curve, over temperature or time; 1 for a law that fades nothing."""
     if law == LawCode.TEMPERATURE_FADE:

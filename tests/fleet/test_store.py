@@ -52,9 +52,7 @@ def test_a_run_that_failed_is_forgotten_when_it_succeeds(tmp_path):
     again = row(1)
     store.append(tmp_path, [RunRow(**{**vars(again), "key": "other"})])
     assert store.query(tmp_path, "SELECT key, error FROM runs")[1] == [("other", "")]
-    assert {identity for _, identity, error in store.read_evaluated(tmp_path) if not error} == {
-        "id1"
-    }
+    assert {identity for _, identity, error in store.read_runs(tmp_path) if not error} == {"id1"}
 
 
 def test_a_success_of_another_model_hides_no_failure(tmp_path):
@@ -129,4 +127,4 @@ def test_what_is_no_store_is_said(tmp_path):
     with pytest.raises(InputError):
         store.query(tmp_path, "SELECT * FROM runs")
     with pytest.raises(InputError):
-        store.read_evaluated(tmp_path)
+        store.read_runs(tmp_path)
