@@ -86,24 +86,14 @@ class ObserverState(Protocol):
 
 
 class SensorStep(NamedTuple):
-    """A step of the height sensor, for the check.
-
-    Attributes:
-        step_m: Its size.
-        weight_n: Weight of the model's bodies; None where it is not known.
-    """
+    """A step of the height sensor, for the check; the weight is that of the model's bodies."""
 
     step_m: float
     weight_n: float | None
 
 
 class Remark(NamedTuple):
-    """What a check of an observer found.
-
-    Attributes:
-        text: Text with figures.
-        is_warning: Whether the user is to be warned.
-    """
+    """What a check of an observer found; a warning is shown to the user as one."""
 
     text: str
     is_warning: bool
@@ -153,13 +143,10 @@ class Observer(Protocol[StateT]):
         innovation: Innovation | None,
         further: Sequence[Innovation] = (),
     ) -> StateT:
-        """State after a tick.
+        """State after a tick, from the state after the last one.
 
-        Args:
-            state: State after the last tick.
-            t_ns: Time of the tick.
-            innovation: Of a new measurement of the height; None where no frame came.
-            further: Of new samples of further sensors.
+        `innovation` is that of a new measurement of the height, None where no frame came; `further`
+        are those of new samples of further sensors.
         """
         ...
 
@@ -208,14 +195,7 @@ class Search(NamedTuple):
 
 
 class TuningTask(NamedTuple):
-    """The strut that an observer is tuned for.
-
-    Attributes:
-        mass_kg: Effective mass that the strut's force moves.
-        noise_std_m: Standard deviation of its height measurement.
-        interval_s: Time between two measurements.
-        force_limit_n: Limit of the virtual force.
-    """
+    """The strut that an observer is tuned for; `mass_kg` is what the strut's force moves."""
 
     mass_kg: float
     noise_std_m: float
