@@ -12,12 +12,8 @@ class Counts(NamedTuple):
 
     Attributes:
         lost: Frames missing in the counters' sequences.
-        refused: Frames not accepted.
         stale: Ticks in HOLD.
-        overruns: Ticks that were missed.
         saturated: Frames sent with a value at the limit of its range.
-        wrong_crc: Frames refused for their CRC.
-        wrong_length: Frames refused for their length.
         repeated: Frames refused because their counter had arrived already.
         out_of_sequence: Frames refused because their counter went backwards or jumped.
         masquerade: Frames refused because they carry another message's CRC.
@@ -60,13 +56,7 @@ Levels = tuple[float, float, float, float]
 
 
 class TimingFigures(NamedTuple):
-    """Timing figures of the run so far.
-
-    Attributes:
-        lateness_s: Lateness of a tick.
-        work_s: Duration of its work.
-        longest_gap_s: Longest time between two ticks.
-    """
+    """Timing figures of the run so far: of lateness, work, and the time between two ticks."""
 
     lateness_s: Levels = (0.0, 0.0, 0.0, 0.0)
     work_s: Levels = (0.0, 0.0, 0.0, 0.0)
@@ -80,8 +70,6 @@ class Conditions(NamedTuple):
     """Conditions of a tick, as the loop knows them.
 
     Attributes:
-        overruns: Ticks missed since the last one.
-        acknowledged: The user acknowledged the safe state.
         bus_fault: The bus could not be read or written.
         log_fault: The log could not be written.
         timing: Timing figures, for the bus; nothing else depends on them.
@@ -98,10 +86,7 @@ class Report(Struct, frozen=True, gc=False):
     """All that an outgoing message can publish.
 
     Attributes:
-        output: What the tick published.
-        counts: Counts since the start.
         reported: Counts at the last status that was sent.
-        conditions: Conditions of the tick.
         number: Frames of the message sent before.
     """
 
