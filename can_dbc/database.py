@@ -55,7 +55,6 @@ class Signal:
         minimum: Smallest physical value, in `unit`, or None if the DBC gives no range.
         maximum: Largest physical value, in `unit`, or None if the DBC gives no range.
         unit: Unit as written in the DBC, empty if none.
-        choices: Names of raw values.
         multiplexer: Name of the signal that selects this one, or None if it is always there.
         multiplexer_ids: Raw values of the multiplexer under which the signal is there.
     """
@@ -82,8 +81,6 @@ class Message:
     """One message of a database.
 
     Attributes:
-        path: The DBC file, for error messages.
-        arbitration_id: 11-bit id, or 29-bit if `is_extended`.
         is_j1939: Whether it is known by its J1939 parameter group.
         cycle_time_ns: Time between two frames, in ns, or None if the DBC gives none.
         sender: Node that sends it, or None if the DBC gives none.

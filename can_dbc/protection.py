@@ -61,7 +61,6 @@ class Protection:
     Attributes:
         length_bytes: Payload length; a frame of any other length is refused.
         max_delta_counter: Largest step of the counter that is read as lost frames.
-        cycle_time_ns: Time between two frames, in ns, or None where the DBC gives none.
         silence_ns: Silence after which the counter may have gone round, in ns (`NEVER_NS` where
             the DBC gives no cycle time).
         foreign: Identities of the database's other messages, for recognising their frames here.

@@ -50,12 +50,7 @@ class BridgeState(Struct, frozen=True, gc=False):
 
 
 class TickResult(Struct, frozen=True, gc=False):
-    """What a tick did.
-
-    Attributes:
-        frames: Frames to send, stamped with the tick's time.
-        device_faults: Indices of the devices that are at fault, and their faults.
-    """
+    """What a tick did; the frames are to be sent, and devices are given by their indices."""
 
     frames: list[Frame]
     step_input: StepInput
@@ -65,11 +60,7 @@ class TickResult(Struct, frozen=True, gc=False):
 
 
 class Bridge:
-    """The whole of a tick.
-
-    Args:
-        channels: Channels of the bench; their indices are their positions.
-    """
+    """The whole of a tick; the indices of the bench's channels are their positions."""
 
     def __init__(
         self,

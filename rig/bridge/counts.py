@@ -21,11 +21,8 @@ class Counts(NamedTuple):
         started: Sequences of a counter that began, the first one of each message among them.
         second_sender: Frames of another sender under an id of the bridge, and frames that
             persistently contradict the counter of the bench's.
-        limited: Ticks beyond a limit.
-        bus_faulty: Ticks with a fault of the bus.
         left_out: Ticks at which a further sensor was left out, one for each sensor.
         device_faulty: Ticks at which a device was at fault, one for each device.
-        from_faulty_device: Frames refused because their device was at fault.
         no_value: Frames refused because a signal holds no value: an error or "not available" of
             J1939, or a float that is not finite.
     """
@@ -67,13 +64,7 @@ NO_TIMING = TimingFigures()
 
 
 class Conditions(NamedTuple):
-    """Conditions of a tick, as the loop knows them.
-
-    Attributes:
-        bus_fault: The bus could not be read or written.
-        log_fault: The log could not be written.
-        timing: Timing figures, for the bus; nothing else depends on them.
-    """
+    """Conditions of a tick, as the loop knows them; the timing figures are for the bus alone."""
 
     overruns: int = 0
     acknowledged: bool = False
@@ -85,9 +76,7 @@ class Conditions(NamedTuple):
 class Report(Struct, frozen=True, gc=False):
     """All that an outgoing message can publish.
 
-    Attributes:
-        reported: Counts at the last status that was sent.
-        number: Frames of the message sent before.
+    `reported` are the counts at the last status that was sent, `number` the frames sent before.
     """
 
     output: StepOutput

@@ -68,8 +68,7 @@ class GateMemory(Struct, frozen=True, gc=False):
 class Reception:
     """What the frames of one tick change while they pass; written in place.
 
-    Attributes:
-        action: Severest action that limits on measurements require, 0 if none.
+    `action` is the severest one that limits on measurements require, 0 if none.
     """
 
     __slots__ = ("action", "memory", "sequences")
@@ -102,12 +101,7 @@ Gate = Callable[[Reception, Frame, Values], Values | None]
 
 
 class Gates:
-    """The gates of a bridge.
-
-    Args:
-        own: Identifiers of the messages that it sends itself, as of `Message.key`.
-        limits: Limits, of which those on measurements are used.
-    """
+    """The gates of a bridge; its `own` messages are identified as by `Message.key`."""
 
     def __init__(
         self,

@@ -59,8 +59,6 @@ class Incoming:
     """A message of the bench.
 
     Attributes:
-        read: Reads its frames.
-        deliveries: Values that go to channels.
         device: Index of the device that sends it; None if none is configured.
         struts: Struts whose reference heights it carries, a bit each.
         first_strut: The bit of the first of them; 0 if there is none.

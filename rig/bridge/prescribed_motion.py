@@ -60,14 +60,9 @@ class TrackedMotion(Struct, frozen=True, gc=False):
 
 
 class PrescribedMotionState(Struct, frozen=True, gc=False):
-    """State between two steps at a dyno.
+    """State between two steps at a dyno; None before the first measurement.
 
-    Attributes:
-        motion: The motion as it is known; None before the first measurement.
-        model: State of the model; None before the first measurement.
-        cell_n: Last force of the load cell; None before the first one.
-        cell_ns: Time at which it arrived.
-        is_moving: Whether the model has begun to move along the motion.
+    `cell_ns` is the time at which the last force of the load cell arrived.
     """
 
     t_ns: int

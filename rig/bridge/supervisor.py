@@ -96,7 +96,6 @@ class SupervisedState(Struct, frozen=True, gc=False):
     Attributes:
         last_valid: What was last published as valid; empty before.
         stopped_m: Heights at which the struts of a stopped model stand, in the safe state.
-        diverged: The last divergence of the model, if there ever was one.
     """
 
     t_ns: int
@@ -108,11 +107,9 @@ class SupervisedState(Struct, frozen=True, gc=False):
 
 
 class Reports(Struct, frozen=True, gc=False):
-    """What the gates and the devices report to the supervisor at a tick.
+    """What gates and devices report to the supervisor: the severest action, 0 if none.
 
-    Attributes:
-        action: Severest action that the limits on measurements require, 0 if none.
-        is_device_faulty: Whether a device that the estimate rests on is at fault.
+    A device counts as faulty if the estimate rests on it.
     """
 
     action: int = 0

@@ -24,7 +24,6 @@ class StepInput(Struct, frozen=True, gc=False):
     Attributes:
         samples: Samples that arrived since the last one, in the order of their arrival; at most one
             of each reference height.
-        acknowledged: The user acknowledged the safe state.
     """
 
     t_ns: int
@@ -54,12 +53,9 @@ class StrutOutput(Struct, frozen=True, gc=False):
 
 
 class StepOutput(Struct, frozen=True, gc=False):
-    """What a tick publishes.
+    """What a tick publishes: of each strut in the model's order, nothing before measurements.
 
-    Attributes:
-        mode: State of the bridge.
-        struts: One per strut, in the model's order; empty before the first measurements.
-        left_out: Channels of further sensors that are not used now.
+    `left_out` are the channels of further sensors that are not used now.
     """
 
     mode: Mode

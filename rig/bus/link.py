@@ -38,12 +38,8 @@ class LinkFigures:
     """Faults of a bus during a run.
 
     Attributes:
-        error_frames: Error frames received.
         warnings: Times the controller reached its warning limit.
         passive: Times it became error-passive.
-        bus_off: Times it went bus-off.
-        unsent: Frames that could not be sent.
-        clock_steps: Times the system's clock was set.
         unauthentic: Frames refused because no fresh value fits their authenticator.
         replayed: Frames refused because their freshness value is not newer than the last one.
         gaps: Times without an interface, at most the first 1000.

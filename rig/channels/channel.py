@@ -72,11 +72,7 @@ class Channel:
 
 
 class Sample(Struct, frozen=True, gc=False):
-    """A value that a channel delivered.
-
-    Attributes:
-        t_ns: Time at which it was true: the delay of the channel before its arrival.
-    """
+    """A value that a channel delivered; it was true at `t_ns`, the delay before its arrival."""
 
     channel: int
     value: float

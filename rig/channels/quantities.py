@@ -26,8 +26,6 @@ class Quantity:
 
     Attributes:
         key: Its key under `signals`; of a further sensor of a strut, what it `measures`.
-        column: Its column in the log and in a CSV of measured data, with the unit.
-        dimension: What a signal of it measures; its unit is converted to SI.
         noise: Noise of a sensor that measures it on a strut; None for a quantity of the bench.
     """
 

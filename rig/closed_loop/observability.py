@@ -40,11 +40,7 @@ _INDEPENDENT = 1e-6
 
 
 class Unknown(NamedTuple):
-    """An unknown force or offset.
-
-    Attributes:
-        is_offset: Whether it adds to the strut's measured height, and not to its force.
-    """
+    """An unknown force of a strut, or an offset that adds to its measured height."""
 
     name: str
     strut: int

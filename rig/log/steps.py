@@ -48,10 +48,7 @@ class LogColumns:
     """Columns of a run's log, and the numbers of a tick in their order.
 
     First stand the quantities of the bench, then the struts, then the further sensors.
-
-    Args:
-        struts: Names of the struts.
-        channels: Channels of the bench; their indices are their positions.
+    The indices of the bench's channels are their positions.
     """
 
     def __init__(self, struts: Sequence[str], channels: Sequence[Channel]) -> None:

@@ -85,12 +85,10 @@ class RunWriter:
     """Writer of a run's folder.
 
     Args:
-        folder: Folder to create; it must be empty or absent.
         header: What is known before the first tick, for `run.yaml`; its `epoch_ns` is the Unix time
             of the run's start.
         loop_priority: Real-time priority of a loop that waits for a clock (0 for none): a thread
             writes, just below it. None: no thread writes, and the caller waits for the disk.
-        options: What else is written.
 
     Raises:
         LogError: The folder cannot be created, or holds another run.

@@ -349,13 +349,7 @@ class ErrorFilter:
 
 
 class Pace(NamedTuple):
-    """What the variances depend on, in units of 1 / omega.
-
-    Attributes:
-        interval: Time between two measurements.
-        stiffness: Of the model's law over the mass.
-        damping: Of the model's law over the mass.
-    """
+    """Interval, stiffness and damping that the variances depend on, in units of 1 / omega."""
 
     interval: float
     stiffness: float = 0.0

@@ -34,12 +34,10 @@ class Start(Struct, frozen=True, gc=False):
     Attributes:
         t_ns: Time of the measurement that it starts with.
         mobility_per_kg: Acceleration of the strut's height per newton in the strut.
-        interval_ns: Time between two measurements.
         delay_ns: Time from a measurement to the arrival of its frame.
         stiffness_per_s2: Decrease of that acceleration per metre of height: of the model's own
             law, its stiffness over the effective mass.
         damping_per_s: The same per m/s.
-        sensors: Channels of the strut's further sensors.
     """
 
     t_ns: int
@@ -109,8 +107,6 @@ class Observer(Protocol[StateT]):
     `kind`, which `rig.observers.OBSERVERS` lists.
 
     Attributes:
-        requires_height: Whether the strut's height must be measured.
-        fuses_sensors: Whether it uses further sensors of the strut.
         knows_std: Whether it knows the standard deviation of its estimate.
     """
 

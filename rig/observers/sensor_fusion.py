@@ -58,13 +58,7 @@ thirtieth of what is unknown is added too early or too late, and never twice."""
 
 
 class SensorHealth(NamedTuple):
-    """Health of a further sensor.
-
-    Attributes:
-        beyond: Readings beyond the gate, the last ones in a row.
-        within: Readings within it, the last ones in a row.
-        is_out: Whether it is left out.
-    """
+    """Health of a further sensor: its last readings in a row beyond the gate, or within it."""
 
     t_ns: int
     beyond: int = 0
@@ -86,7 +80,6 @@ class FusionMemory(Struct, frozen=True, gc=False):
     Attributes:
         used: Innovations used lately, the oldest first, with the state before each.
         inputs: Accelerations by the virtual force and their times, as far back as `used`.
-        health: Of each further sensor, by its channel.
         measured_ns: Time of the last reading of a height that was used.
         own_ns: Time of the last reading of the strut's own height.
         left_out: Channels of sensors that are left out, or silent.

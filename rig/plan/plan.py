@@ -67,11 +67,8 @@ class Plan:
     """A run as it was configured, with every name resolved.
 
     Attributes:
-        source: File of the configuration, for messages.
         config: The configuration, with every strut and every published signal named.
-        struts: Struts in the model's order.
         channels: Channels of the bench: heights, quantities of the bench, further sensors.
-        devices: Devices that it watches.
         alarms: Messages with alarms of the devices, and the alarms.
         authentication: How frames are authenticated; None where they are not, and for the plan of
             a run, whose folder contains no key.

@@ -42,12 +42,7 @@ _PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "aut
 
 @dataclass(frozen=True)
 class Ended:
-    """How a run ended.
-
-    Attributes:
-        ticks: Number of ticks.
-        diverged: Strut and time of the model's last divergence, if there was one.
-    """
+    """How a run ended; of the model's last divergence strut and time."""
 
     folder: Path
     state: BridgeState

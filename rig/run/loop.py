@@ -46,13 +46,7 @@ SHOWN_EVERY_NS = 200_000_000
 
 
 class Look(NamedTuple):
-    """A look at a run.
-
-    Attributes:
-        ticks: How many there have been with it.
-        late_ns: Largest lateness so far; None where nothing waits for a clock.
-        device_faults: Indices of the devices that are at fault, and their faults.
-    """
+    """A look at a run after a number of ticks; without a clock there is no lateness."""
 
     t_ns: int
     ticks: int

@@ -35,12 +35,7 @@ _NO_CONDITIONS = Conditions()
 
 @dataclass(frozen=True)
 class Replay:
-    """A run computed again from its log.
-
-    Attributes:
-        different: Number of them that differ from the steps computed here in any bit.
-        first_different_ns: Time of the first that differs.
-    """
+    """A run computed again from its log, and how many of its steps differ in any bit."""
 
     steps: pa.Table
     logged: int
