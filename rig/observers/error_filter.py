@@ -103,7 +103,7 @@ class Steady(NamedTuple):
 
 
 class Constants(Struct, frozen=True, gc=False):
-    """What a filter asks for at every measurement and is the same all through a run.
+    """What a filter requires at every measurement and is the same all through a run.
 
     Attributes:
         gain: The steady gain in SI: what each of the mean changes by per metre that is new.
