@@ -30,13 +30,7 @@ def group_mask(arbitration_id: int) -> int:
 
 @dataclass(frozen=True)
 class Filter:
-    """Accepted identifiers: those with ``id & mask == arbitration_id & mask``.
-
-    Attributes:
-        arbitration_id: An identifier.
-        mask: Bits that must agree.
-        is_extended: Whether it has 29 bits.
-    """
+    """Accepted identifiers: those with ``id & mask == arbitration_id & mask``."""
 
     arbitration_id: int
     mask: int
@@ -44,12 +38,9 @@ class Filter:
 
 
 class Directory:
-    """Messages by the identifiers of their frames.
+    """Messages by the identifiers of their frames, as indices into `messages`.
 
     Where several messages share a group, they are identified by their whole identifiers.
-
-    Args:
-        messages: Messages, which are looked up by their index in this sequence.
     """
 
     def __init__(self, messages: Iterable[Message]) -> None:

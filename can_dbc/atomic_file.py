@@ -14,9 +14,6 @@ def replacing(path: Path) -> Generator[Path]:
     Where the block fails the file stays as it was, and nothing else is left. Only a program that
     is killed leaves the new name, which begins with a dot.
 
-    Args:
-        path: The file.
-
     Raises:
         OSError: The folder is missing, or the disk fails.
     """

@@ -10,15 +10,9 @@ _FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 
 
 def frame_time_s(message: Message, bitrate: int, data_bitrate: int | None) -> float:
-    """Longest time that one frame of a message takes, interframe space included.
+    """Longest time that one frame of a message takes, interframe space included, in s.
 
-    Args:
-        message: The message.
-        bitrate: Bit rate in bit/s.
-        data_bitrate: Bit rate of a CAN FD frame's payload in bit/s; None: no switch.
-
-    Returns:
-        Time in s.
+    Bit rates are in bit/s; that of a CAN FD frame's payload may differ, None for no switch.
     """
     if message.is_fd:
         return _fd_frame_time_s(message, bitrate, data_bitrate or bitrate)

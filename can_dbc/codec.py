@@ -32,27 +32,14 @@ or "not available" (SAE J1939-71, 5.1.3)."""
 
 
 class _Field(NamedTuple):
-    """Position and meaning of a signal's raw value.
-
-    Attributes:
-        name: Name of the signal.
-        is_big_endian: Whether `shift` counts in the payload read as a big-endian integer.
-        shift: Bits below the value in that integer.
-        mask: Ones for the bits of the value.
-        sign: The sign bit, 0 if unsigned.
-        float_format: `struct` format of an IEEE value, empty for integers.
-        scale: SI value of one raw step.
-        offset: SI value of raw 0.
-        minimum: Smallest SI value of the DBC's range, or None.
-        maximum: Largest SI value of the DBC's range, or None.
-    """
+    """Position and meaning of a signal's raw value; scale, offset and range are in SI."""
 
     name: str
-    is_big_endian: bool
+    is_big_endian: bool  # whether `shift` counts in the payload read as a big-endian integer
     shift: int
     mask: int
-    sign: int
-    float_format: str
+    sign: int  # the sign bit, 0 if unsigned
+    float_format: str  # empty for integers
     scale: float
     offset: float
     minimum: float | None
@@ -70,11 +57,6 @@ def compile_decoder(
     message: Message, signal_names: Sequence[str], dimensions: Sequence[Dimension]
 ) -> Decoder:
     """Build the decoder of some signals of a message.
-
-    Args:
-        message: Message of a database.
-        signal_names: Signals to decode, at least one.
-        dimensions: What each of them has to measure.
 
     Returns:
         A function from a payload to a tuple of SI values in the order of `signal_names`. It
@@ -104,11 +86,6 @@ def compile_encoder(
     A value beyond the DBC's range, or beyond what its bits can hold, is sent as the nearest
     value that is allowed. NaN is sent as the allowed value nearest to zero. Both are reported.
     Multiplexers of the signals are set as the signals need it; all other bits are zero.
-
-    Args:
-        message: Message of a database.
-        signal_names: Signals to encode, at least one.
-        dimensions: What each of them measures.
 
     Returns:
         A function from SI values in the order of `signal_names` to the payload and whether a
@@ -154,13 +131,7 @@ def decode_log(
     dimensions: Sequence[Dimension],
     data: NDArray[np.uint8],
 ) -> dict[str, NDArray[np.float64]]:
-    """Decode all frames of a log at once.
-
-    Args:
-        message: Message of a database.
-        signal_names: Signals to decode.
-        dimensions: What each of them has to measure.
-        data: Payloads, shape (n, `message.length_bytes`).
+    """Decode all frames of a log at once, payloads of shape (n, `message.length_bytes`).
 
     Returns:
         SI values by signal name, each of shape (n,), the same to the last bit as the decoder's;
@@ -286,9 +257,6 @@ def _all_conditions(message: Message, signal_names: Sequence[str]) -> tuple[_Con
     return tuple(conditions.values())
 
 
-# ------------------------------------------------------------------------------------ one frame
-
-
 def _integer_decoder(first: _Field, last: _Field, count: int, length: int) -> Decoder:
     """Decoder of one or two integers that are in every frame: the case of the loop."""
     order = "big" if first.is_big_endian else "little"
@@ -354,25 +322,15 @@ _Holder = Callable[[float], tuple[int, bool]]
 
 
 class _Slot(NamedTuple):
-    """How a signal is put into a payload.
-
-    Attributes:
-        scale: SI value of one raw step.
-        offset: SI value of raw 0.
-        below: A number of steps strictly between this and `above` is sent rounded.
-        above: See `below`.
-        mask: Ones for the bits of the value.
-        shift: Bits below the value in the joined payload.
-        hold: What is done with any other number of steps.
-    """
+    """How a signal is put into a payload."""
 
     scale: float
     offset: float
-    below: float
+    below: float  # a number of steps strictly between this and `above` is sent rounded
     above: float
     mask: int
-    shift: int
-    hold: _Holder
+    shift: int  # bits below the value in the joined payload
+    hold: _Holder  # what is done with any other number of steps
 
 
 def _slot(message: Message, field: _Field) -> _Slot:
@@ -494,9 +452,6 @@ def _base_payload(message: Message, signal_names: Sequence[str]) -> int:
         order = "big" if selector.is_big_endian else "little"
         joined |= int.from_bytes(placed.to_bytes(message.length_bytes, order), "little")
     return joined
-
-
-# --------------------------------------------------------------------------------- a whole log
 
 
 def _values_of_log(field: _Field, data: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -47,20 +47,14 @@ class Signal:
     """One signal of a message, as the DBC has it.
 
     Attributes:
-        name: Name in the DBC.
         start: Start bit in the DBC's numbering (of the lowest bit if little-endian, of the
             highest if big-endian).
-        length_bits: Number of bits.
         is_big_endian: Byte order (Motorola if true, Intel if not).
-        is_signed: Whether the raw integer is in two's complement.
-        is_float: Whether the raw value is an IEEE 754 number.
         scale: Physical value of one raw step, in `unit`.
         offset: Physical value of raw 0, in `unit`.
         minimum: Smallest physical value, in `unit`, or None if the DBC gives no range.
         maximum: Largest physical value, in `unit`, or None if the DBC gives no range.
         unit: Unit as written in the DBC, empty if none.
-        choices: Names of raw values.
-        is_multiplexer: Whether its raw value selects other signals.
         multiplexer: Name of the signal that selects this one, or None if it is always there.
         multiplexer_ids: Raw values of the multiplexer under which the signal is there.
     """
@@ -87,17 +81,9 @@ class Message:
     """One message of a database.
 
     Attributes:
-        path: The DBC file, for error messages.
-        name: Name in the DBC.
-        arbitration_id: 11-bit id, or 29-bit if `is_extended`.
-        is_extended: Whether the id has 29 bits.
-        is_fd: Whether the frame is CAN FD.
         is_j1939: Whether it is known by its J1939 parameter group.
-        length_bytes: Payload length.
         cycle_time_ns: Time between two frames, in ns, or None if the DBC gives none.
         sender: Node that sends it, or None if the DBC gives none.
-        signals: Signals by name.
-        protection: How its frames are protected, or None.
     """
 
     path: Path
@@ -134,13 +120,7 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Database:
-    """The messages of one DBC file.
-
-    Attributes:
-        path: The file.
-        sha256: SHA-256 of the file's bytes, in hex.
-        messages: Messages by name.
-    """
+    """The messages of one DBC file, by name; `sha256` is that of the file's bytes, in hex."""
 
     path: Path
     sha256: str
@@ -160,13 +140,9 @@ class Database:
 
 
 def load_database(path: Path) -> Database:
-    """Read a DBC file.
+    """Read a DBC file of at most 16 MiB, in UTF-8 or Windows-1252.
 
-    Args:
-        path: A DBC file of at most 16 MiB, in UTF-8 or Windows-1252.
-
-    Returns:
-        Its messages. Units are kept as written; a codec converts them.
+    Units are kept as written; a codec converts them.
 
     Raises:
         DatabaseError: The file cannot be read, is no DBC, has signals that overlap or do not fit,
@@ -392,11 +368,7 @@ def _protection(
 
 
 def _check_position(
-    where: str,
-    signals: Mapping[str, Signal],
-    attribute: str,
-    name: str,
-    bits: tuple[int, int],
+    where: str, signals: Mapping[str, Signal], attribute: str, name: str, bits: tuple[int, int]
 ) -> None:
     signal = signals.get(name)
     if signal is None:

@@ -8,10 +8,7 @@ class Frame(Struct, frozen=True, gc=False):
 
     Attributes:
         t_ns: Time of reception or transmission on the run's clock, in ns.
-        arbitration_id: 11-bit id, or 29-bit if `is_extended`.
         data: Payload, 0 to 8 bytes (0 to 64 with `is_fd`).
-        is_extended: Whether the id has 29 bits.
-        is_fd: Whether this is a CAN FD frame.
         bitrate_switch: Whether the payload of a CAN FD frame was sent at the data bit rate.
         is_error: Whether this is an error frame, which carries no payload of the bus.
     """

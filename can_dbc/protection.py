@@ -47,7 +47,6 @@ class Identity(Struct, frozen=True, gc=False):
     """What the CRC of a message covers besides its payload.
 
     Attributes:
-        profile: Layout and polynomial.
         data_ids: P02: 16 ids, the one of counter value i at index i. P01: the id, high byte first.
     """
 
@@ -60,13 +59,8 @@ class Protection:
     """How the frames of one message are protected.
 
     Attributes:
-        identity: Profile and data ids of the message.
         length_bytes: Payload length; a frame of any other length is refused.
-        crc_signal: Name of the signal that holds the CRC.
-        counter_signal: Name of the signal that holds the counter.
-        counter_modulus: Number of counter values.
         max_delta_counter: Largest step of the counter that is read as lost frames.
-        cycle_time_ns: Time between two frames, in ns, or None where the DBC gives none.
         silence_ns: Silence after which the counter may have gone round, in ns (`NEVER_NS` where
             the DBC gives no cycle time).
         foreign: Identities of the database's other messages, for recognising their frames here.
@@ -208,11 +202,7 @@ def compile_checker(protection: Protection) -> Checker:
 
 
 def check_crc_log(data: NDArray[np.uint8], protection: Protection) -> NDArray[np.bool_]:
-    """Check CRC and data id of all frames of a log at once.
-
-    Args:
-        data: Payloads, shape (n, length).
-        protection: Protection of the message.
+    """Check CRC and data id of all frames of a log at once, payloads of shape (n, length).
 
     Returns:
         Whether each frame passes, shape (n,); the same as `check_crc` frame by frame.

@@ -56,15 +56,10 @@ _SPELLINGS: dict[tuple[Dimension, str], str] = {
 
 
 def si_conversion(unit: str, dimension: Dimension) -> SiConversion:
-    """Find how values in a unit become SI values.
+    """Factor and offset from a unit, as the DBC writes it, to the unit that `dimension` names.
 
-    Args:
-        unit: Unit as the DBC writes it, such as `mm`, `in`, `kN`, `lbf`, `degF` or `m/s^2`;
-            `g` is standard gravity where an acceleration is expected.
-        dimension: What the signal has to measure.
-
-    Returns:
-        Factor and offset to the unit that `dimension` names.
+    Units are such as `mm`, `in`, `kN`, `lbf`, `degF` or `m/s^2`; `g` is standard gravity where an
+    acceleration is expected.
 
     Raises:
         DatabaseError: The unit is missing, unknown, or of another dimension. The message does

@@ -67,11 +67,7 @@ _NO_YAML = (yaml.YAMLError, ValueError, TypeError, LookupError, ArithmeticError,
 
 
 def read_text(path: Path, max_bytes: int = _MAX_BYTES) -> str:
-    """Text of a file.
-
-    Args:
-        path: The file.
-        max_bytes: Largest size that is read.
+    """Text of a file of at most `max_bytes`.
 
     Raises:
         FileError: The file is missing, unreadable, too large or not UTF-8.
@@ -90,11 +86,7 @@ def read_text(path: Path, max_bytes: int = _MAX_BYTES) -> str:
 
 
 def parse_mapping(text: str, source: str) -> dict[str, object]:
-    """The mapping a YAML text holds.
-
-    Args:
-        text: YAML.
-        source: What to call the text in an error, usually its path.
+    """The mapping that a YAML text contains; an error calls the text `source`.
 
     Raises:
         FileError: The text is no YAML, or no mapping.
@@ -119,13 +111,7 @@ def parse_mapping(text: str, source: str) -> dict[str, object]:
 
 
 def validate(model: type[_Model], data: object, source: str, context: object = None) -> _Model:
-    """`data` as a frozen `model`.
-
-    Args:
-        model: Class of the values.
-        data: Keys and values.
-        source: What to call them in an error, usually the path of their file.
-        context: Argument of the model's own checks.
+    """`data` as a frozen `model`, whose own checks get `context`; an error calls it `source`.
 
     Raises:
         FileError: With the first error's key, value and expectation, and how many more there are.
@@ -137,7 +123,7 @@ def validate(model: type[_Model], data: object, source: str, context: object = N
 
 
 def load_yaml(model: type[_Model], path: Path, context: object = None) -> _Model:
-    """The file at `path` as a frozen `model`; `context` as of `validated`.
+    """The file at `path` as a frozen `model`; `context` as of `validate`.
 
     Raises:
         FileError: One line that names file, key, value and what was expected.

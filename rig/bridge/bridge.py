@@ -23,27 +23,14 @@ _ALL_STANDARD = 0x7FF
 
 
 class Sending(Struct, frozen=True, gc=False):
-    """State of an outgoing message.
-
-    Attributes:
-        number: Frames sent so far.
-        due_ns: Time at which the next one is due.
-    """
+    """State of an outgoing message: frames sent so far, and when the next one is due."""
 
     number: int
     due_ns: int
 
 
 class BridgeState(Struct, frozen=True, gc=False):
-    """State of the bridge between two ticks.
-
-    Attributes:
-        supervised: State of estimator and supervisor.
-        sequences: Counter state of each incoming message.
-        memory: Memory of the gates.
-        sendings: State of each outgoing message.
-        reported: Counts at the last status that was sent.
-    """
+    """State of the bridge between two ticks; `reported`: counts at the last status sent."""
 
     supervised: SupervisedState
     sequences: tuple[SequenceState, ...]
@@ -63,15 +50,7 @@ class BridgeState(Struct, frozen=True, gc=False):
 
 
 class TickResult(Struct, frozen=True, gc=False):
-    """What a tick did.
-
-    Attributes:
-        frames: Frames to send, stamped with the tick's time.
-        step_input: What the last step of the tick was given.
-        output: What the tick published.
-        counts: Counts since the start.
-        device_faults: Indices of the devices that are at fault, and their faults.
-    """
+    """What a tick did; the frames are to be sent, and devices are given by their indices."""
 
     frames: list[Frame]
     step_input: StepInput
@@ -81,16 +60,7 @@ class TickResult(Struct, frozen=True, gc=False):
 
 
 class Bridge:
-    """The whole of a tick.
-
-    Args:
-        supervisor: Estimator and supervisor.
-        channels: Channels of the bench; their indices are their positions.
-        incoming: Messages of the bench.
-        outgoing: Messages of the bridge.
-        devices: Devices that are watched.
-        supervision: Settings of the supervisor, with all limits.
-    """
+    """The whole of a tick; the indices of the bench's channels are their positions."""
 
     def __init__(
         self,
@@ -150,17 +120,7 @@ class Bridge:
         frames: Sequence[Frame],
         conditions: Conditions = _NO_CONDITIONS,
     ) -> tuple[BridgeState, TickResult]:
-        """Compute one tick.
-
-        Args:
-            state: State after the last tick.
-            t_ns: Time of this one.
-            frames: Frames that have arrived since then; those of other ids are passed over.
-            conditions: Conditions of the tick.
-
-        Returns:
-            State after the tick, and what it did.
-        """
+        """State after a tick, and what it did; frames of other ids are passed over."""
         reception = Reception(state.sequences, state.memory)
         supervised, samples = self._receive(state.supervised, reception, t_ns, frames)
         step_input = StepInput(t_ns, tuple(samples), conditions.acknowledged)

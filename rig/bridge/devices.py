@@ -66,38 +66,28 @@ class DeviceSettings(BaseModel):
         return self
 
     def device(self, name: str, *, is_vital: bool) -> "Device":
-        """The device of these settings.
-
-        Args:
-            name: Name of the node in the DBC.
-            is_vital: Whether the estimate rests on it.
-        """
+        """The device of these settings, by its node's name; the estimate rests on a vital one."""
         node_id = self.node_id or 0
-        device = Device(
+        return Device(
             name,
             node_id,
             self.emergency_id or EMERGENCY_ID + node_id,
             round((self.heartbeat_s or 0.0) * 1e9),
             len(self.alarms),
             is_vital,
+            self.j1939_name,
+            _NO_ADDRESS if self.source_address is None else self.source_address,
         )
-        if self.j1939_name is None or self.source_address is None:
-            return device
-        return device._replace(j1939_name=self.j1939_name, address=self.source_address)
 
 
 class Device(NamedTuple):
     """A device as the bridge watches it.
 
     Attributes:
-        name: Name of the node in the DBC.
         node_id: CANopen node id; 0 of a J1939 device.
-        emergency_id: Arbitration id of its emergency frames.
         heartbeat_ns: Longest time between two heartbeats; 0 where they are not watched.
         alarms: How many signals of its frames are alarms.
-        is_vital: Whether the estimate rests on it.
         j1939_name: NAME of a J1939 device; None of a CANopen device.
-        address: Source address of a J1939 device at the start.
     """
 
     name: str
@@ -122,8 +112,6 @@ class DeviceHealth(Struct, frozen=True, gc=False):
         since_ns: Time of its last heartbeat, or of the start.
         state: State in the last heartbeat; operational before the first.
         error_code: Error code of the emergency that is not over, else 0.
-        alarms: Raw value of each of its alarms.
-        address: Source address that it claimed last.
     """
 
     since_ns: int
@@ -139,13 +127,7 @@ def initial_health(device: Device, t_ns: int) -> DeviceHealth:
 
 
 def update_by_frame(device: Device, health: DeviceHealth, frame: Frame) -> DeviceHealth:
-    """Health after an emergency or a heartbeat; one of another length is ignored.
-
-    Args:
-        device: The device.
-        health: Its health before.
-        frame: A frame with one of its ids.
-    """
+    """Health after an emergency or a heartbeat; one of another length is ignored."""
     data = frame.data
     if frame.arbitration_id == device.emergency_id:
         if len(data) != 8:
@@ -163,13 +145,7 @@ def update_by_frame(device: Device, health: DeviceHealth, frame: Frame) -> Devic
 
 
 def update_by_claim(device: Device, health: DeviceHealth, frame: Frame) -> DeviceHealth:
-    """Health after an address claim on a J1939 bus.
-
-    Args:
-        device: The device.
-        health: Its health before.
-        frame: An address claim.
-    """
+    """Health after an address claim on a J1939 bus."""
     if device.j1939_name is None or len(frame.data) != 8:
         return health
     address = frame.arbitration_id & 0xFF
@@ -196,13 +172,7 @@ def update_by_data(device: Device, health: DeviceHealth) -> DeviceHealth:
 
 
 def update_by_alarm(health: DeviceHealth, index: int, raw: int) -> DeviceHealth:
-    """Health after a frame with an alarm in it.
-
-    Args:
-        health: Health before.
-        index: Index of the alarm among the device's.
-        raw: Its raw value; 0 for none.
-    """
+    """Health after a frame with an alarm, by its index among the device's; raw 0 is none."""
     alarms = health.alarms
     if alarms[index] == raw:
         return health

@@ -55,12 +55,7 @@ class Estimator(Protocol[StateT]):
         ...
 
     def discard(self, before: StateT, after: StateT) -> StateT:
-        """State of a model that stopped before a step whose motion is not to be used.
-
-        Args:
-            before: State before the step.
-            after: State after it.
-        """
+        """State of a model that stopped before a step whose motion is not to be used."""
         ...
 
     def heights_m(self, state: StateT) -> Sequence[float]:
@@ -72,9 +67,7 @@ class Estimator(Protocol[StateT]):
     ) -> "Estimator[StateT]":
         """The same with other settings; a state of one is a state of the other.
 
-        Args:
-            observers: One per strut.
-            stale_after_ns: Age up to which a measurement can start the model.
+        A measurement can start the model up to the age `stale_after_ns`.
         """
         ...
 

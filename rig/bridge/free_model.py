@@ -25,8 +25,6 @@ class FreeModelState(Struct, frozen=True, gc=False):
     """State of a model that follows its bench.
 
     Attributes:
-        t_ns: Time of the last step.
-        temperature_c: Last damper temperature.
         first: Of each strut the measurements that arrived before the model started, the oldest
             first.
         observers: State of each strut's observer; empty while the model waits.
@@ -44,14 +42,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
 
 
 class _Received(Struct, frozen=True, gc=False):
-    """Samples of a step, by what they are used for.
-
-    Attributes:
-        heights: New height of each strut, None where none arrived.
-        readings: Samples of further sensors, in the order of their arrival.
-        applied_n: New applied force, None where none arrived.
-        temperature_c: New damper temperature, None where none arrived.
-    """
+    """Samples of a step, by what they are used for; None where none arrived."""
 
     heights: Sequence[Sample | None]
     readings: Sequence[Sample]
@@ -63,8 +54,6 @@ class FreeModelEstimator:
     """An estimator whose model moves under the applied force.
 
     Args:
-        plant: The model.
-        observers: One per strut, in the model's order.
         channels: Channels of the bench; their indices are their positions.
         stale_after_ns: Age up to which a measurement can start the model.
 
@@ -102,17 +91,14 @@ class FreeModelEstimator:
 
     @property
     def struts(self) -> int:
-        """Number of struts, each with an observer."""
         return len(self._observers)
 
     def with_settings(
         self, observers: Sequence[AnyObserver], stale_after_ns: int
     ) -> "FreeModelEstimator":
-        """The same model with other observers."""
         return FreeModelEstimator(self._plant, observers, self._channels, stale_after_ns)
 
     def init(self, t_ns: int) -> FreeModelState:
-        """State before the first step."""
         return FreeModelState(t_ns, AMBIENT_C, ((),) * self.struts)
 
     def restart(self, state: FreeModelState, t_ns: int) -> FreeModelState:
@@ -120,11 +106,9 @@ class FreeModelEstimator:
         return FreeModelState(t_ns, state.temperature_c, ((),) * self.struts)
 
     def discard(self, before: FreeModelState, after: FreeModelState) -> FreeModelState:
-        """State before a step whose motion is not to be used, at the time of that step."""
         return replace(before, t_ns=after.t_ns)
 
     def heights_m(self, state: FreeModelState) -> Sequence[float]:
-        """Height of each strut where the model stands; empty while it waits."""
         if state.model is None:
             return ()
         return [height_m for height_m, _ in state.model.state.struts]
@@ -132,15 +116,7 @@ class FreeModelEstimator:
     def step(
         self, state: FreeModelState, step_input: StepInput
     ) -> tuple[FreeModelState, Estimate | None]:
-        """Advance the model to a time and correct it with what was measured.
-
-        Args:
-            state: State after the last step.
-            step_input: What arrived since then.
-
-        Returns:
-            State after this step, and its estimate; None while the model waits for measurements.
-        """
+        """Advance the model to a time and correct it with what was measured."""
         received = self._sort(step_input.samples)
         if state.model is None:
             return self._try_to_start(state, step_input.t_ns, received)
@@ -330,10 +306,8 @@ class FreeModelEstimator:
 def start_of_motion(samples: Sequence[Sample], t_ns: int) -> tuple[float, float]:
     """Height (m) and velocity (m/s) at a time, from the measurements before it.
 
-    Args:
-        samples: One: the model starts at rest there. Three or more: a parabola through them. None:
-            NaN, the strut starts where the others put it.
-        t_ns: The time.
+    With one the model starts at rest there; with three or more, on a parabola through them; with
+    none the height is NaN, and the strut starts where the others put it.
     """
     if not samples:
         return math.nan, 0.0

@@ -51,26 +51,14 @@ _SUCCESSION_CYCLES = 3
 
 
 class Strays(NamedTuple):
-    """Frames of a message that contradicted its counter, in close succession.
-
-    Attributes:
-        frames: Their number.
-        t_ns: Time of the last one.
-    """
+    """Frames of a message that contradicted its counter, in close succession; time of the last."""
 
     frames: int = 0
     t_ns: int = 0
 
 
 class GateMemory(Struct, frozen=True, gc=False):
-    """What the gates remember between two ticks; most ticks leave it as it is.
-
-    Attributes:
-        strays: Frames of each incoming message that contradicted its counter.
-        heights: Memory of each strut's measured heights.
-        healths: Health of each device.
-        counts: Counts since the start.
-    """
+    """What the gates remember between two ticks; most ticks leave it as it is."""
 
     strays: tuple[Strays, ...]
     heights: tuple[Plausibility | None, ...]
@@ -81,12 +69,7 @@ class GateMemory(Struct, frozen=True, gc=False):
 class Reception:
     """What the frames of one tick change while they pass; written in place.
 
-    Args:
-        sequences: Counter state of each incoming message at the beginning of the tick.
-        memory: Memory of the gates at the beginning of the tick.
-
-    Attributes:
-        action: Severest action that limits on measurements require, 0 if none.
+    `action` is the severest one that limits on measurements require, 0 if none.
     """
 
     __slots__ = ("action", "memory", "sequences")
@@ -117,15 +100,7 @@ Gate = Callable[[Reception, Frame, Values], Values | None]
 
 
 class Gates:
-    """The gates of a bridge.
-
-    Args:
-        incoming: Messages that the bridge reads.
-        own: Identifiers of the messages that it sends itself, as of `Message.key`.
-        devices: Devices that it watches.
-        limits: Limits, of which those on measurements are used.
-        struts: Number of struts.
-    """
+    """The gates of a bridge; its `own` messages are identified as by `Message.key`."""
 
     def __init__(
         self,
@@ -160,11 +135,7 @@ class Gates:
     def receive(
         self, reception: Reception, frames: Sequence[Frame]
     ) -> list[tuple[Incoming, Values, int]]:
-        """Pass frames through all gates.
-
-        Returns:
-            Message, values and arrival time of each frame that no gate refused.
-        """
+        """Message, values and arrival time of each frame that no gate refused."""
         passed: list[tuple[Incoming, Values, int]] = []
         index_of, sequences = self._index_of, reception.sequences
         for frame in frames:

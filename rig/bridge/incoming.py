@@ -24,13 +24,7 @@ Reader = Callable[[SequenceState, Frame], Reading]
 
 
 class Delivery(NamedTuple):
-    """A value of a frame that goes to a channel.
-
-    Attributes:
-        value: Index of the value among the frame's.
-        channel: Index of the channel.
-        delay_ns: Time from the measurement to the arrival of its frame.
-    """
+    """A value of a frame that goes to a channel; `delay_ns` is the age at which it arrives."""
 
     value: int
     channel: int
@@ -38,13 +32,7 @@ class Delivery(NamedTuple):
 
 
 class Alarm(NamedTuple):
-    """A signal whose raw value is other than zero while its device is at fault.
-
-    Attributes:
-        signal: Name of the signal.
-        device: Index of the device.
-        alarm: Index of the alarm among the device's.
-    """
+    """A signal whose raw value is other than zero while its device is at fault; by indices."""
 
     signal: str
     device: int
@@ -52,13 +40,7 @@ class Alarm(NamedTuple):
 
 
 class AlarmDelivery(NamedTuple):
-    """A value of a frame that is an alarm.
-
-    Attributes:
-        value: Index of the value among the frame's.
-        device: Index of the device.
-        alarm: Index of the alarm among the device's.
-    """
+    """A value of a frame that is an alarm, one of a device's; by indices."""
 
     value: int
     device: int
@@ -66,12 +48,7 @@ class AlarmDelivery(NamedTuple):
 
 
 class HeightDelivery(NamedTuple):
-    """A value of a frame that is the reference height of a strut.
-
-    Attributes:
-        value: Index of the value among the frame's.
-        strut: Index of the strut.
-    """
+    """A value of a frame that is the reference height of a strut; by indices."""
 
     value: int
     strut: int
@@ -82,11 +59,6 @@ class Incoming:
     """A message of the bench.
 
     Attributes:
-        message: Its definition.
-        read: Reads its frames.
-        deliveries: Values that go to channels.
-        heights: Values that are reference heights.
-        alarms: Values that are alarms.
         device: Index of the device that sends it; None if none is configured.
         struts: Struts whose reference heights it carries, a bit each.
         first_strut: The bit of the first of them; 0 if there is none.
@@ -109,12 +81,6 @@ def compile_incoming(
     device: int | None = None,
 ) -> Incoming:
     """Compile an incoming message.
-
-    Args:
-        message: Message of the bench.
-        channels: Channels that it carries.
-        alarms: Alarms among its signals.
-        device: Index of the device that sends it.
 
     Raises:
         DatabaseError: A signal is missing, or its unit does not fit its quantity.

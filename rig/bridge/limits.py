@@ -90,13 +90,7 @@ class Limit(BaseModel):
 
 
 class Plausibility(NamedTuple):
-    """Memory of one strut's measurements.
-
-    Attributes:
-        height_m: Last measured height that was used.
-        t_ns: Its time.
-        since_ns: Since when the height is exactly that.
-    """
+    """Last measured height of a strut that was used, its time, and since when it is the same."""
 
     height_m: float
     t_ns: int
@@ -106,16 +100,9 @@ class Plausibility(NamedTuple):
 def judge_height(
     limits: Sequence[Limit], memory: Plausibility | None, height_m: float, t_ns: int
 ) -> tuple[Plausibility, int]:
-    """Hold the limits against a new measured height.
+    """Memory of a strut after a new height, and the severest action required, 0 if none.
 
-    Args:
-        limits: Limits on measurements.
-        memory: Memory of the strut; None before its first measurement.
-        height_m: The height.
-        t_ns: Time of its arrival.
-
-    Returns:
-        Memory after it, and the severest action required, 0 if none.
+    Before the first measurement there is no memory; `t_ns` is the time of arrival.
     """
     last = memory or Plausibility(height_m, t_ns, t_ns)
     age_s = (t_ns - last.t_ns) * 1e-9
@@ -137,12 +124,7 @@ def judge_height(
 
 
 def worst_action(limits: Sequence[Limit], strut: StrutOutput) -> int:
-    """The severest action that limits on estimates require of a strut, 0 if it is within them all.
-
-    Args:
-        limits: Limits on estimates.
-        strut: What a tick publishes of the strut.
-    """
+    """The severest action that limits on estimates require of a strut, 0 if it is within them."""
     values = {
         LimitedValue.HEIGHT_M: strut.height_m,
         LimitedValue.FORCE_N: strut.force_n,

@@ -18,7 +18,6 @@ class Outgoing:
     """A message of the bridge.
 
     Attributes:
-        message: Its definition.
         frame: What a tick reports, and the time in ns -> the frame, and whether one of its values
             saturated.
         period_ns: Time between two frames; 0: one at every tick.
@@ -32,13 +31,7 @@ class Outgoing:
 
 
 class PublishedSignal(NamedTuple):
-    """What one signal of an outgoing message carries.
-
-    Attributes:
-        signal: Name of the signal.
-        publication: What it carries.
-        strut: Index of the strut it is of, else 0.
-    """
+    """What one signal of an outgoing message carries; `strut` is 0 where it is of none."""
 
     signal: str
     publication: Publication
@@ -49,10 +42,6 @@ def compile_outgoing(message: Message, published: Sequence[PublishedSignal]) -> 
     """Compile an outgoing message. Signals that publish nothing are zero.
 
     Multiplexed signals are sent page by page, one page a frame.
-
-    Args:
-        message: Message of the bridge.
-        published: What its signals carry.
 
     Raises:
         DatabaseError: A signal is missing, or its unit does not fit what is published under it.

@@ -50,15 +50,7 @@ class PrescribedModel(Protocol[ModelT]):
 
 
 class TrackedMotion(Struct, frozen=True, gc=False):
-    """The motion as it is known.
-
-    Attributes:
-        height_m: Height at the last measurement.
-        velocity_m_per_s: Its rate.
-        acceleration_m_per_s2: Its second derivative.
-        innovation_m: Last measured less predicted height.
-        measured_ns: Time of the last measurement.
-    """
+    """The motion as it is known: derivatives of the height at the last measurement."""
 
     height_m: float
     velocity_m_per_s: float
@@ -68,16 +60,9 @@ class TrackedMotion(Struct, frozen=True, gc=False):
 
 
 class PrescribedMotionState(Struct, frozen=True, gc=False):
-    """State between two steps at a dyno.
+    """State between two steps at a dyno; None before the first measurement.
 
-    Attributes:
-        t_ns: Time of the last step.
-        temperature_c: Last damper temperature.
-        motion: The motion as it is known; None before the first measurement.
-        model: State of the model; None before the first measurement.
-        cell_n: Last force of the load cell; None before the first one.
-        cell_ns: Time at which it arrived.
-        is_moving: Whether the model has begun to move along the motion.
+    `cell_ns` is the time at which the last force of the load cell arrived.
     """
 
     t_ns: int
@@ -90,13 +75,7 @@ class PrescribedMotionState(Struct, frozen=True, gc=False):
 
 
 def update_motion(motion: TrackedMotion, sample: Sample, settling_s: float) -> TrackedMotion:
-    """The motion after a new measurement.
-
-    Args:
-        motion: The motion before it.
-        sample: The measured height.
-        settling_s: Time constant with which older measurements fade.
-    """
+    """The motion after a new measured height; older ones fade with a time constant."""
     age_s = (sample.t_ns - motion.measured_ns) * 1e-9
     if age_s <= 0.0:
         return motion
@@ -135,7 +114,6 @@ class PrescribedMotionEstimator:
     """An estimator whose motion is prescribed and whose force is measured.
 
     Args:
-        model: The strut.
         settling_s: Time constant with which older measurements of the motion fade.
         channels: Channels of the bench; their indices are their positions.
         stale_after_ns: Age up to which a measurement can start the model.
@@ -155,20 +133,17 @@ class PrescribedMotionEstimator:
 
     @property
     def struts(self) -> int:
-        """Number of struts."""
         return 1
 
     def with_settings(
         self, observers: Sequence[AnyObserver], stale_after_ns: int
     ) -> "PrescribedMotionEstimator":
-        """The same with another age; no observer is used."""
         del observers
         return PrescribedMotionEstimator(
             self._model, self._settling_s, self._channels, stale_after_ns
         )
 
     def init(self, t_ns: int) -> PrescribedMotionState:
-        """State before the first step."""
         return PrescribedMotionState(t_ns, AMBIENT_C)
 
     def restart(self, state: PrescribedMotionState, t_ns: int) -> PrescribedMotionState:
@@ -189,15 +164,7 @@ class PrescribedMotionEstimator:
     def step(
         self, state: PrescribedMotionState, step_input: StepInput
     ) -> tuple[PrescribedMotionState, Estimate | None]:
-        """Move the model to a time, and compare it with the load cell.
-
-        Args:
-            state: State after the last step.
-            step_input: What arrived since then.
-
-        Returns:
-            State after this step, and its estimate; None while measurements are awaited.
-        """
+        """Move the model to a time, and compare it with the load cell."""
         t_ns = step_input.t_ns
         state = self._receive(state, step_input)
         motion, cell_n = state.motion, state.cell_n

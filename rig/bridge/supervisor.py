@@ -94,12 +94,8 @@ class SupervisedState(Struct, frozen=True, gc=False):
     """State of an estimator and of its supervisor between two steps; a run can restart from any.
 
     Attributes:
-        t_ns: Time of the last step.
-        mode: State of the bridge.
-        estimator: State of the estimator.
         last_valid: What was last published as valid; empty before.
         stopped_m: Heights at which the struts of a stopped model stand, in the safe state.
-        diverged: The last divergence of the model, if there ever was one.
     """
 
     t_ns: int
@@ -111,11 +107,9 @@ class SupervisedState(Struct, frozen=True, gc=False):
 
 
 class Reports(Struct, frozen=True, gc=False):
-    """What the gates and the devices report to the supervisor at a tick.
+    """What gates and devices report to the supervisor: the severest action, 0 if none.
 
-    Attributes:
-        action: Severest action that the limits on measurements require, 0 if none.
-        is_device_faulty: Whether a device that the estimate rests on is at fault.
+    A device counts as faulty if the estimate rests on it.
     """
 
     action: int = 0
@@ -128,12 +122,7 @@ _EVENT_OF_ACTION = {Action.HOLD: Event.BEYOND_HOLD, Action.SAFE: Event.BEYOND_SA
 
 
 class Supervisor:
-    """Steps an estimator and decides what is published of it.
-
-    Args:
-        estimator: The estimator.
-        settings: Ages, safe output and limits.
-    """
+    """Steps an estimator and decides what is published of it."""
 
     def __init__(self, estimator: AnyEstimator, settings: Supervision) -> None:
         self.estimator = estimator
@@ -149,16 +138,7 @@ class Supervisor:
     def step(
         self, state: SupervisedState, step_input: StepInput, reports: Reports = NO_REPORTS
     ) -> tuple[SupervisedState, StepOutput, int]:
-        """Compute one step.
-
-        Args:
-            state: State after the last step.
-            step_input: What arrived since then.
-            reports: What gates and devices report.
-
-        Returns:
-            State after the step, what it publishes, and the severest action that a limit requires.
-        """
+        """State after a step, what it publishes, and the severest action that a limit requires."""
         t_ns, mode, before = step_input.t_ns, state.mode, state.estimator
         if mode is Mode.SAFE:
             if not step_input.acknowledged:

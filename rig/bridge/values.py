@@ -22,10 +22,8 @@ class StepInput(Struct, frozen=True, gc=False):
     """All that one step is given.
 
     Attributes:
-        t_ns: Time of the step.
         samples: Samples that arrived since the last one, in the order of their arrival; at most one
             of each reference height.
-        acknowledged: The user acknowledged the safe state.
     """
 
     t_ns: int
@@ -38,12 +36,7 @@ class StrutOutput(Struct, frozen=True, gc=False):
 
     Attributes:
         force_n: Estimated spring-damper force: the law's, and the residual force.
-        virtual_force_n: Virtual force.
         valid: Whether the estimate rests on a fresh measurement.
-        height_m: Model height.
-        velocity_m_per_s: Model velocity.
-        acceleration_m_per_s2: Model acceleration.
-        innovation_m: Innovation.
         force_std_n: Standard deviation of the estimated force; NaN where it is not known.
         law_force_n: Force of the model's law alone, part of the estimated force.
     """
@@ -60,12 +53,9 @@ class StrutOutput(Struct, frozen=True, gc=False):
 
 
 class StepOutput(Struct, frozen=True, gc=False):
-    """What a tick publishes.
+    """What a tick publishes: of each strut in the model's order, nothing before measurements.
 
-    Attributes:
-        mode: State of the bridge.
-        struts: One per strut, in the model's order; empty before the first measurements.
-        left_out: Channels of further sensors that are not used now.
+    `left_out` are the channels of further sensors that are not used now.
     """
 
     mode: Mode
@@ -74,12 +64,7 @@ class StepOutput(Struct, frozen=True, gc=False):
 
 
 class Divergence(Struct, frozen=True, gc=False):
-    """A model whose numbers no bench has.
-
-    Attributes:
-        strut: Index of the first strut that shows it.
-        t_ns: Time of the tick at which it showed.
-    """
+    """A model whose numbers no bench has: the first strut that shows it, and when it showed."""
 
     strut: int
     t_ns: int

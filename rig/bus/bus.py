@@ -69,7 +69,6 @@ class Bus:
     """An open bus.
 
     Args:
-        config: How to open it.
         filters: The only frames that are accepted, besides error frames; None accepts all.
         listen_only: Send nothing. Most interfaces ignore such a request silently, so it is
             enforced here: the method of sending is not even looked up.
@@ -98,8 +97,7 @@ class Bus:
     def receive(self, elapsed_ns: int = 1_000_000_000) -> list[Frame]:
         """The frames that have arrived, in order, without waiting; error frames among them.
 
-        Args:
-            elapsed_ns: Time since the last poll, for which the number of frames is bounded.
+        Their number is bounded by the time since the last poll.
 
         Raises:
             BusError: The interface is gone.
@@ -198,10 +196,7 @@ def open_bus(
 ) -> can.BusABC:
     """python-can's open bus, for callers that need more of it than `Bus` offers.
 
-    Args:
-        config: How to open it.
-        filters: The only frames that are accepted, where the interface filters; None: all.
-        listen_only: Whether the controller is to stay silent, where the interface supports that.
+    Filters and silence apply where the interface supports them.
 
     Raises:
         BusError: The interface cannot be opened.

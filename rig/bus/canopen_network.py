@@ -25,7 +25,7 @@ _LAST_NODE = 127
 _MOST_FRAMES = 200_000
 """Frames that are kept while listening; a second of a full bus at 1 Mbit/s has some 10 000."""
 
-OPERATIONAL, STOPPED, PRE_OPERATIONAL = 1, 2, 128
+OPERATIONAL, PRE_OPERATIONAL = 1, 128
 """Commands of network management."""
 
 
@@ -51,13 +51,8 @@ class RefusedError(InputError):
 class CanOpenNetwork:
     """A bus on which CANopen devices are read and set.
 
-    Args:
-        config: How to open the bus.
-        listen_only: Send nothing at all.
-
     Raises:
-        BusError: The interface cannot be opened.
-        BusError: The package is not installed.
+        BusError: The interface cannot be opened, or the package is not installed.
     """
 
     def __init__(self, config: BusConfig, *, listen_only: bool = False) -> None:
@@ -154,7 +149,6 @@ class CanOpenNetwork:
             raise BusError(f"the device does not take node id {node_id}: {error}") from error
 
     def _client(self, node_id: int) -> Any:
-        """Client that reads and writes the objects of a node."""
         client = self._clients.get(node_id)
         if client is None:
             request, answer = _SDO_REQUEST + node_id, _SDO_ANSWER + node_id
@@ -188,7 +182,6 @@ class _Listener(can.Listener):
         self._received = received
 
     def on_message_received(self, msg: can.Message) -> None:
-        """Keep a frame and pass it on."""
         if msg.is_error_frame or msg.is_remote_frame:
             return
         if len(self._received) < _MOST_FRAMES:
@@ -198,4 +191,4 @@ class _Listener(can.Listener):
             self._notify(msg.arbitration_id, msg.data, msg.timestamp)
 
     def stop(self) -> None:
-        """Release nothing: there is nothing to release."""
+        """There is nothing to release."""

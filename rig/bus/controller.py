@@ -27,15 +27,10 @@ _DETAILS = ((0x30, Controller.PASSIVE), (0x0C, Controller.WARNING), (0x40, Contr
 
 
 def state_after(state: Controller, frame: Frame) -> Controller:
-    """State of the controller after a frame.
+    """State of the controller after a frame of the bus, or an error frame.
 
-    Args:
-        state: State before it.
-        frame: An error frame, or one of the bus, which no controller receives while it is bus-off.
-
-    Returns:
-        The new state; an error frame that does not report it (a bit error, a lost arbitration)
-        leaves it unchanged.
+    No controller receives frames of the bus while it is bus-off. An error frame that does not
+    report the state (a bit error, a lost arbitration) leaves it unchanged.
     """
     if not frame.is_error:
         return Controller.ACTIVE if state is Controller.BUS_OFF else state

@@ -48,9 +48,6 @@ _READER_ERRORS: tuple[type[Exception], ...] = (
 def read_log(path: Path) -> Iterator[tuple[int, Frame]]:
     """Data frames of a bus log, in the order of the file, one at a time.
 
-    Args:
-        path: File with one of `LOG_SUFFIXES`.
-
     Yields:
         Unix time of each frame in ns, as exact as the file and python-can (a float in s, to
         0.24 us today), and the frame, stamped with the time since the first one.

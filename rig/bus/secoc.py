@@ -40,11 +40,8 @@ class AuthenticationError(InputError):
 class Authentication:
     """How frames are authenticated.
 
-    Attributes:
-        key: 16 bytes; no log and no error contains it.
-        freshness_bytes: Length of the freshness value's part in a frame.
-        mac_bytes: Length of the CMAC's part.
-        tolerance_ns: How far the clocks of two senders may be apart.
+    No log and no error contains the key, 16 bytes. The tolerance is how far the clocks of two
+    senders may be apart.
     """
 
     key: bytes = field(repr=False)
@@ -147,9 +144,7 @@ class _Received(NamedTuple):
 class Authenticator:
     """Secures the frames that one side of a bus sends, and accepts authentic and new ones alone.
 
-    Args:
-        how: Key and lengths.
-        epoch_ns: Unix time of the run's start, to which the frames' times are relative.
+    Times of frames are relative to `epoch_ns`, the Unix time of the run's start.
 
     Raises:
         AuthenticationError: The package that computes the CMAC is not installed.
@@ -185,11 +180,6 @@ class Authenticator:
             if payload is not None:
                 accepted.append(replace(frame, data=payload))
         return accepted
-
-    @property
-    def authentication_failures(self) -> int:
-        """Frames refused: unauthentic and replayed ones."""
-        return self.unauthentic + self.replayed
 
     def _payload_if_authentic(self, frame: Frame) -> bytes | None:
         """Payload of a frame without its trailer; None if it is refused."""

@@ -43,17 +43,12 @@ class Channel:
 
     Attributes:
         index: Position among the channels of the plan.
-        role: What a step does with its samples.
-        quantity: What is measured.
         name: Its name in messages to the user, and in the log what stands before the dot of its
             columns: a strut, or a strut and a sensor; of a quantity of the bench its key.
-        key: Its key in the configuration.
         strut: Index of the strut that it is of; -1 for a quantity of the bench.
-        interval_ns: Time between two samples.
         delay_ns: How much later a sample arrives than it is true.
         noise_std: Standard deviation of a sample in SI, quantisation included; of a further sensor.
         message: Message that carries it; None for a channel that is on no bus.
-        signal: Name of its signal in the message.
     """
 
     index: int
@@ -77,13 +72,7 @@ class Channel:
 
 
 class Sample(Struct, frozen=True, gc=False):
-    """A value that a channel delivered.
-
-    Attributes:
-        channel: Index of the channel.
-        value: The value in SI.
-        t_ns: Time at which it was true: the delay of the channel before its arrival.
-    """
+    """A value that a channel delivered; it was true at `t_ns`, the delay before its arrival."""
 
     channel: int
     value: float

@@ -13,13 +13,7 @@ from can_dbc.units import Dimension
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """How a configuration states the standard deviation of a sensor's readings.
-
-    Attributes:
-        key: Its key, with the unit.
-        low: Smallest value accepted, SI.
-        high: Largest value accepted, SI.
-    """
+    """How a configuration states the standard deviation of a sensor's readings; bounds are SI."""
 
     key: str
     low: float
@@ -32,9 +26,6 @@ class Quantity:
 
     Attributes:
         key: Its key under `signals`; of a further sensor of a strut, what it `measures`.
-        column: Its column in the log and in a CSV of measured data, with the unit.
-        dimension: What a signal of it measures; its unit is converted to SI.
-        words: The quantity as a phrase.
         noise: Noise of a sensor that measures it on a strut; None for a quantity of the bench.
     """
 

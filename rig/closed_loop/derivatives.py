@@ -9,14 +9,9 @@ Array = NDArray[np.float64]
 
 
 def central_differences(function: Callable[[Array], Array], widths: Sequence[float]) -> Array:
-    """Derivatives of a function about zero, one column per argument.
+    """Derivatives about zero of a function of shape (n,) -> (m,), by a step for each argument.
 
-    Args:
-        function: Takes arguments of shape (n,), gives values of shape (m,).
-        widths: Step of each argument.
-
-    Returns:
-        Shape (m, n).
+    The result has the shape (m, n).
     """
     columns: list[Array] = []
     for step, width in zip(np.diag(np.asarray(widths, np.float64)), widths, strict=True):

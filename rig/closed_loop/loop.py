@@ -30,13 +30,7 @@ _ACCELERATION_STEP_M_PER_S2 = 1e-2
 
 
 class SampleTiming(NamedTuple):
-    """How often a loop is closed, and on measurements how old.
-
-    Attributes:
-        period_ns: Time between two ticks.
-        measured_every: Ticks between two measurements.
-        delay: Age of a measurement when it is used, in measurement periods.
-    """
+    """How often a loop is closed, and how many measurement periods old a measurement is then."""
 
     period_ns: int
     measured_every: int = 1
@@ -88,27 +82,21 @@ class LinearLoop(NamedTuple):
 
     def lag_gain(self, frequency_hz: Array) -> Array:
         """Error of the published force over the residual force, at frequencies; shape (N,)."""
-        return np.abs(self._response(frequency_hz, 1))
-
-    def _response(self, frequency_hz: Array, column: int) -> NDArray[np.complex128]:
         eye = np.eye(len(self.a))
         response = np.empty(len(frequency_hz), np.complex128)
         for index, frequency in enumerate(frequency_hz):
             z = np.exp(2j * np.pi * frequency * self.interval_s)
             shifted: NDArray[np.complex128] = z * eye - self.a
-            before = np.linalg.solve(shifted, self.b[:, column])
-            response[index] = self.c @ before + self.d[column]
-        return response
+            before = np.linalg.solve(shifted, self.b[:, 1])
+            response[index] = self.c @ before + self.d[1]
+        return np.abs(response)
 
 
 class Loop:
     """The map from one measurement to the next, of numbers to numbers.
 
     Args:
-        plant: The model.
-        observers: One for each of its struts.
         heights_m: Strut heights at which the bench is assumed to rest.
-        timing: How often the loop is closed.
         responses: Responses that the observers take the model to have; by differences on it if
             absent.
     """
@@ -171,19 +159,22 @@ class Loop:
             loaded = self._plant.load(model, acting, 0.0, AMBIENT_C)
             model = self._plant.step(loaded, timing.period_ns * 1e-9, 0.0)
             now = [height_m for height_m, _ in model.struts]
-            if tick < timing.measured_every:
-                innovations: list[float | None] = [None] * count
-            else:
+            t_ns = tick * timing.period_ns
+            innovations: list[Innovation | None] = [None] * count
+            if tick == timing.measured_every:
+                measured_ns = t_ns - timing.delay * timing.interval_ns
                 compared = seen[-count:] if timing.delay else now
                 innovations = [
-                    bench_m - model_m + (noise_m if index == strut else 0.0)
+                    Innovation(
+                        bench_m - model_m + (noise_m if index == strut else 0.0), measured_ns
+                    )
                     for index, (bench_m, model_m) in enumerate(
                         zip(self._heights_m, compared, strict=True)
                     )
                 ]
                 seen = (now + seen)[: count * timing.delay]
             states = [
-                self._step_observer(observer, state, tick, innovation)
+                observer.step(state, t_ns, innovation)
                 for observer, state, innovation in zip(
                     self._observers, states, innovations, strict=True
                 )
@@ -225,14 +216,3 @@ class Loop:
                 innovation = Innovation(0.0, t_ns - delay_ns) if tick == 0 else None
                 state = observer.step(state, t_ns, innovation)
         return state
-
-    def _step_observer(
-        self, observer: Observer[StateT], state: StateT, tick: int, innovation_m: float | None
-    ) -> StateT:
-        """State of an observer at a tick after time zero."""
-        timing = self._timing
-        t_ns = tick * timing.period_ns
-        if innovation_m is None:
-            return observer.step(state, t_ns, None)
-        measured_ns = t_ns - timing.delay * timing.interval_ns
-        return observer.step(state, t_ns, Innovation(innovation_m, measured_ns))

@@ -40,13 +40,7 @@ _INDEPENDENT = 1e-6
 
 
 class Unknown(NamedTuple):
-    """An unknown force or offset.
-
-    Attributes:
-        name: What it is, as a phrase.
-        strut: Index of the strut that it is of.
-        is_offset: Whether it adds to the strut's measured height, and not to its force.
-    """
+    """An unknown force of a strut, or an offset that adds to its measured height."""
 
     name: str
     strut: int
@@ -106,13 +100,7 @@ def linear_model(plant: AnyPlant, heights_m: Sequence[float]) -> LinearModel:
 def observability(
     linear: LinearModel, measured: Sequence[int], unknowns: Sequence[Unknown]
 ) -> Observability:
-    """Which unknowns can be observed from the heights of some struts.
-
-    Args:
-        linear: The model about rest.
-        measured: Indices of the struts whose heights are measured.
-        unknowns: The unknowns.
-    """
+    """Which unknowns can be observed from the heights of the measured struts, by index."""
     model, by_force = linear.model, linear.by_force
     seen = linear.heights[list(measured)]
     columns = [_column(unknown, by_force, measured, len(seen)) for unknown in unknowns]

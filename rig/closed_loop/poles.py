@@ -35,28 +35,13 @@ def closed_loop_poles(
     heights_m: Sequence[float],
     timing: SampleTiming,
 ) -> list[Pole]:
-    """Poles of model and observers.
-
-    Args:
-        plant: The model.
-        observers: One for each of its struts.
-        heights_m: Strut heights at which the bench is assumed to rest.
-        timing: How often the loop is closed.
-
-    Returns:
-        Poles, the slowest to decay first.
-    """
+    """Poles of model and observers about rest at some heights, the slowest to decay first."""
     loop = Loop(plant, observers, heights_m, timing)
     return poles_of(loop.linear().a, timing.interval_ns * 1e-9)
 
 
 def poles_of(a: NDArray[np.float64], interval_s: float) -> list[Pole]:
-    """Poles of a discrete map, the slowest to decay first.
-
-    Args:
-        a: The map, shape (n, n).
-        interval_s: Time that it takes.
-    """
+    """Poles of a discrete map of shape (n, n) over an interval, the slowest to decay first."""
     poles = [_pole(complex(value), interval_s) for value in np.linalg.eigvals(a)]
     return sorted((pole for pole in poles if pole.magnitude > 1e-6), reverse=True)
 

@@ -21,10 +21,7 @@ _SECANT_N = 1.0
 class StrutResponse(NamedTuple):
     """Response of the acceleration of a strut's height to that strut alone.
 
-    Attributes:
-        mobility_per_kg: Per newton in the strut.
-        stiffness_per_s2: Per metre of height, with the opposite sign.
-        damping_per_s: Per metre per second, with the opposite sign.
+    It falls by stiffness and damping per metre of height and per metre per second.
     """
 
     mobility_per_kg: float

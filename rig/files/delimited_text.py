@@ -55,14 +55,7 @@ Row = tuple[int, list[str]]
 
 
 class Column(NamedTuple):
-    """A column of some rows.
-
-    Attributes:
-        file: What to call the file in an error.
-        name: What to call the column.
-        lines: Line of each cell.
-        texts: The cells.
-    """
+    """A column of some rows: what errors call file and column, and line and text of each cell."""
 
     file: str
     name: str
@@ -74,13 +67,7 @@ class Column(NamedTuple):
 def open_rows(
     path: Path, name: str, max_bytes: int, layout: Layout = CSV
 ) -> Generator[Iterator[Row]]:
-    """Every row that holds a cell.
-
-    Args:
-        path: The file.
-        name: What to call it in an error.
-        max_bytes: Largest size that is read.
-        layout: How the text is laid out.
+    """Every row that holds a cell; an error calls the file `name`.
 
     Raises:
         InputError: The file cannot be read, is too large, or is no such text.
@@ -96,10 +83,8 @@ def open_rows(
     except LookupError as error:
         raise InputError(f"{name}: encoding: {error}, expected e.g. utf-8") from error
     except (UnicodeError, csv.Error) as error:
-        encoding, reason = (
-            layout.encoding.removesuffix("-sig").upper(),
-            " ".join(str(error).split()),
-        )
+        encoding = layout.encoding.removesuffix("-sig").upper()
+        reason = " ".join(str(error).split())
         raise InputError(f"{name}: is no such text, expected {encoding}: {reason}") from error
 
 

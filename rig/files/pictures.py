@@ -10,11 +10,6 @@ from matplotlib.figure import Figure
 
 @contextlib.contextmanager
 def new_figure(size_in: tuple[float, float], style: Mapping[str, object]) -> Generator[Any]:
-    """An empty figure, in a style that applies until the end of the context.
-
-    Args:
-        size_in: Width and height, in inches.
-        style: Keys of matplotlib's configuration.
-    """
+    """An empty figure of a size in inches, in a style that applies until the end of the context."""
     with cast("Any", mpl).rc_context(style):
         yield Figure(figsize=size_in, layout="constrained")

@@ -49,12 +49,7 @@ def parse_frame(line: str, epoch_ns: int) -> tuple[Frame, str]:
 
 
 def line_error(where: str, line: str) -> LogError:
-    """The error of a line that is no frame.
-
-    Args:
-        where: File and number of the line.
-        line: The line.
-    """
+    """The error of a line that is no frame; `where` is its file and number."""
     return LogError(
         f"{where}: {line.strip()[:60]!r}: expected a line such as '(1.000000000) can0 100#0102 R'"
     )

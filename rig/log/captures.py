@@ -19,13 +19,7 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True)
 class CaptureWindow:
-    """Time captured around a trigger.
-
-    Attributes:
-        before_ns: Time before it.
-        after_ns: Time after it.
-        most: Most captures of one run; later triggers are ignored.
-    """
+    """Time captured before and after a trigger, and the most captures of one run."""
 
     before_ns: int
     after_ns: int
@@ -33,14 +27,7 @@ class CaptureWindow:
 
 
 class Capture(NamedTuple):
-    """A finished window.
-
-    Attributes:
-        number: 1 for the run's first.
-        why: Trigger, one word.
-        t_ns: Time of the trigger.
-        entries: All of its ticks.
-    """
+    """A finished window: its number from 1 on, its trigger in one word, and all of its ticks."""
 
     number: int
     why: str
@@ -53,11 +40,6 @@ class Captures:
 
     A trigger is a change to HOLD or SAFE, a fault of the bus or of the log that was not there the
     tick before, or one given with `trigger`. A trigger within a window does not lengthen it.
-
-    Args:
-        window: Time captured.
-        capture_name: Name of the capture that a change from one mode to another triggers, if any.
-        finished: Called with every finished window.
     """
 
     def __init__(
@@ -77,11 +59,7 @@ class Captures:
         self._flags = 0
 
     def trigger(self, why: str) -> None:
-        """Capture at the next tick; may be called from any thread.
-
-        Args:
-            why: One word, for the folder's name.
-        """
+        """Capture at the next tick, for one word of a reason; may be called from any thread."""
         self._requested = why
 
     def take(self, entry: Entry) -> None:

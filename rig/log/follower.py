@@ -40,10 +40,8 @@ class Stretch(NamedTuple):
     """A stretch of a run.
 
     Attributes:
-        t_s: Times, shape (N,).
         values: Columns in the order asked for, shape (columns, N); NaN where there is nothing.
             Where steps were thinned, two neighbours are a bucket's least and largest value.
-        steps: Number of steps in it.
     """
 
     t_s: Array
@@ -52,11 +50,7 @@ class Stretch(NamedTuple):
 
 
 class RunFollower:
-    """The steps of a run's folder, which may still be written.
-
-    Args:
-        folder: The folder.
-    """
+    """The steps of a run's folder, which may still be written."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -101,24 +95,13 @@ class RunFollower:
         return float(first) * 1e-9, float(self._newest[-1][-1, 0]) * 1e-9
 
     def update(self, most_steps: int) -> None:
-        """Take what has been written since the last time.
-
-        Args:
-            most_steps: About how many steps are taken; the rest is for the next call.
-        """
+        """Take about so many steps of what was written since; the rest is for the next call."""
         end = self.steps + most_steps
         while self.steps < end and (batches := self._read_batches()):
             self._add(_matrix(pa.Table.from_batches(batches)))
 
     def window(self, names: Sequence[str], begin_s: float, end_s: float, points: int) -> Stretch:
-        """A stretch of the run.
-
-        Args:
-            names: Columns; one that the run does not have is NaN.
-            begin_s: Time from which on.
-            end_s: Time up to which.
-            points: Most buckets into which it is thinned.
-        """
+        """A stretch of the run, thinned into at most so many buckets; unknown columns are NaN."""
         columns = [self.columns.index(name) if name in self.columns else -1 for name in names]
         begin_ns, end_ns = begin_s * 1e9 - 0.5, end_s * 1e9 + 0.5
         begin, end = self.between(begin_s, end_s)
@@ -145,12 +128,7 @@ class RunFollower:
         return self._bucket(begin_s * 1e9 - 0.5) * BUCKET, end
 
     def rows(self, begin: int, end: int) -> Array:
-        """Steps by their numbers, shape (N, columns), times in ns in the first column.
-
-        Args:
-            begin: Number of the first.
-            end: Number after the last.
-        """
+        """Steps `begin` to `end - 1`, shape (N, columns), times in ns in the first column."""
         begin, end = max(begin, 0), min(end, self.steps)
         if begin >= end:
             return np.zeros((0, max(len(self.columns), 1)))
@@ -159,7 +137,7 @@ class RunFollower:
             return self._newest_rows(begin - kept_from, end - kept_from)
         first = bisect.bisect_right(self._begins, begin) - 1
         last = bisect.bisect_left(self._begins, end)
-        batches = [self._read_again(*self._places[i]) for i in range(first, last)]
+        batches = [self._read_again(*place) for place in self._places[first:last]]
         offset = self._begins[first]
         return _matrix(pa.Table.from_batches(batches))[begin - offset : end - offset]
 
@@ -252,11 +230,9 @@ class _Growing:
 
     @property
     def rows(self) -> Array:
-        """All rows, shape (N, columns)."""
         return self._room[: self._count]
 
     def add(self, rows: Array) -> None:
-        """Add rows."""
         count = self._count + len(rows)
         if count > len(self._room):
             room = np.zeros((max(2 * len(self._room), count, 1024), rows.shape[1]))
@@ -269,9 +245,8 @@ class _Growing:
 def _matrix(table: pa.Table) -> Array:
     columns = [np.asarray(column.to_numpy(), np.float64) for column in table.columns]
     flags = table.column("flags").to_numpy()
-    return np.column_stack(
-        [*columns, *((flags & bit > 0).astype(np.float64) for bit in FLAGS.values())]
-    )
+    bits = [(flags & bit > 0).astype(np.float64) for bit in FLAGS.values()]
+    return np.column_stack([*columns, *bits])
 
 
 def _select_columns(rows: Array, columns: Sequence[int]) -> Array:

@@ -81,14 +81,7 @@ class RunHeader(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A run that is read back.
-
-    Attributes:
-        folder: The folder.
-        header: Content of `run.yaml`.
-        steps: `steps.arrow` as a table; what a kill cut off is missing.
-        epoch_ns: Unix time of the run's start.
-    """
+    """A run that is read back; of its steps what a kill cut off is missing."""
 
     folder: Path
     header: RunHeader

@@ -37,11 +37,7 @@ class FrameColumns(NamedTuple):
 
     Attributes:
         t_ns: Time on the run's clock, in ns, shape (n,).
-        arbitration_id: Ids, shape (n,).
-        is_extended: Whether ids have 29 bits, shape (n,).
-        is_error: Whether it is an error frame, shape (n,).
         length: Length of the payload in bytes, shape (n,).
-        is_fd: Whether it is a CAN FD frame, shape (n,).
         payload: Payloads, padded with zeros, shape (n, largest length).
     """
 
@@ -80,11 +76,9 @@ class FrameColumns(NamedTuple):
 
 
 def read_frame_columns(paths: Sequence[Path], epoch_ns: int) -> FrameColumns:
-    """Every received frame of a log; a last line that a kill cut off is left out.
+    """Every received frame of a log, from its files in their order.
 
-    Args:
-        paths: Files of the log in candump's format, in their order.
-        epoch_ns: Unix time of the run's start.
+    A last line that a kill cut off is left out.
 
     Raises:
         LogError: The file cannot be read, or a line of it is no frame.
@@ -117,12 +111,10 @@ def _whole_lines(path: Path) -> Iterator[tuple[bytes, int]]:
 
 
 def _empty(count: int, width: int) -> FrameColumns:
-    integers = np.zeros((3, count), dtype=np.int64)
-    flags = np.zeros((3, count), dtype=np.bool_)
     payload = np.zeros((count, width), dtype=np.uint8)
-    return FrameColumns(
-        integers[0], integers[1], flags[0], flags[1], integers[2], flags[2], payload
-    )
+    t_ns, ids, length = np.zeros((3, count), dtype=np.int64)
+    is_extended, is_error, is_fd = np.zeros((3, count), dtype=np.bool_)
+    return FrameColumns(t_ns, ids, is_extended, is_error, length, is_fd, payload)
 
 
 def _read_block(text: bytes, first_line: int, epoch_ns: int, path: Path) -> FrameColumns:
@@ -146,17 +138,7 @@ def _read_block(text: bytes, first_line: int, epoch_ns: int, path: Path) -> Fram
 def _read_usual(
     groups: Any, rows: NDArray[np.intp], epoch_ns: int, columns: FrameColumns
 ) -> NDArray[np.bool_]:
-    """Write the frames of lines that match `_LINE`.
-
-    Args:
-        groups: What the groups matched in each line, shape (n,).
-        rows: Row of each line in the columns, shape (n,).
-        epoch_ns: Unix time of the run's start.
-        columns: Receives the frames.
-
-    Returns:
-        Whether each line is a frame, shape (n,); the others are not written.
-    """
+    """Write the frames of lines that match `_LINE`; gives whether each is one, shape (n,)."""
     stamp, identifier, flags, data = (group.cast(pa.string()) for group in groups.flatten())
     stamp_ns = _numpy(_pc.replace_substring(stamp, ".", "").cast(pa.uint64()))
     digits, is_fd = _numpy(_pc.binary_length(data)), _numpy(_pc.binary_length(flags)) > 0

@@ -12,12 +12,7 @@ from rig.log.whole_file import WholeFile
 
 @dataclass(frozen=True)
 class Rotation:
-    """When a run is continued in further files; None for never.
-
-    Attributes:
-        size_bytes: Size of frames and steps together.
-        time_ns: Time of the run that they span.
-    """
+    """Size of frames and steps, and time, from which on other files follow; None for never."""
 
     size_bytes: int | None = None
     time_ns: int | None = None
@@ -25,12 +20,6 @@ class Rotation:
 
 class Part:
     """Frames and steps of one part of a run, being written.
-
-    Args:
-        folder: The run's folder.
-        number: Number of the part, 0 for the first.
-        schema: Arrow schema of the steps.
-        begin_ns: Time of the run at its begin.
 
     Raises:
         OSError: A file cannot be created.

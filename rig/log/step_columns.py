@@ -31,13 +31,9 @@ STRUT_COLUMNS = (*_MEASURED, *_PUBLISHED)
 class Step(Struct, frozen=True, gc=False):
     """The record of one tick.
 
-    Attributes:
-        t_ns: Time of the tick.
-        overruns: Ticks missed before it.
-        received: Frames received, so that a replay gives each tick the same ones.
-        mode: State of the bridge.
-        flags: Bit 0 acknowledged, bit 1 bus fault, bit 2 log fault.
-        numbers: Measured and published values, as the log's further columns are named.
+    received: Frames received, so that a replay gives each tick the same ones.
+    flags: Bit 0 acknowledged, bit 1 bus fault, bit 2 log fault.
+    numbers: Measured and published values, as the log's further columns are named.
     """
 
     t_ns: int
@@ -52,10 +48,7 @@ class LogColumns:
     """Columns of a run's log, and the numbers of a tick in their order.
 
     First stand the quantities of the bench, then the struts, then the further sensors.
-
-    Args:
-        struts: Names of the struts.
-        channels: Channels of the bench; their indices are their positions.
+    The indices of the bench's channels are their positions.
     """
 
     def __init__(self, struts: Sequence[str], channels: Sequence[Channel]) -> None:
@@ -99,11 +92,7 @@ class LogColumns:
 
 
 def step_schema(columns: Sequence[str] = ()) -> pa.Schema:
-    """Arrow schema of `steps.arrow`.
-
-    Args:
-        columns: Names of `Step.numbers`.
-    """
+    """Arrow schema of `steps.arrow`, with the names of `Step.numbers`."""
     fields = [
         ("t_ns", pa.int64()),
         ("overruns", pa.int32()),
@@ -119,9 +108,6 @@ class StepRows:
 
     Each is packed at once, in a third of a microsecond: to turn a batch of Python numbers into
     columns in one go would keep the interpreter from a fast loop for longer than a tick lasts.
-
-    Args:
-        columns: Names of the numbers of a step.
     """
 
     def __init__(self, columns: Sequence[str]) -> None:

@@ -7,9 +7,6 @@ from pathlib import Path
 class WholeFile:
     """A file to which pieces are appended, unbuffered. One that fails leaves no part of itself.
 
-    Args:
-        path: The file; it is created, or emptied.
-
     Raises:
         OSError: It cannot be created.
     """

@@ -85,14 +85,10 @@ class RunWriter:
     """Writer of a run's folder.
 
     Args:
-        folder: Folder to create; it must be empty or absent.
         header: What is known before the first tick, for `run.yaml`; its `epoch_ns` is the Unix time
             of the run's start.
-        columns: Names of the numbers of each step.
-        channel: Name of the bus in `frames.log`.
         loop_priority: Real-time priority of a loop that waits for a clock (0 for none): a thread
             writes, just below it. None: no thread writes, and the caller waits for the disk.
-        options: What else is written.
 
     Raises:
         LogError: The folder cannot be created, or holds another run.
@@ -175,20 +171,12 @@ class RunWriter:
         self._wake.set()
 
     def trigger(self, why: str) -> None:
-        """Capture a window around the next tick, if windows are captured at all.
-
-        Args:
-            why: One word, for the name of the window's folder.
-        """
+        """Capture a window around the next tick, if any are; one word names its folder."""
         if self._captures is not None:
             self._captures.trigger(why)
 
     def close(self, ending: Callable[[], dict[str, object]]) -> None:
-        """Write what is waiting, and how the run ended.
-
-        Args:
-            ending: Gives what is added to `run.yaml`, when all else is written.
-        """
+        """Write what is waiting, and then what `ending` adds to `run.yaml`."""
         self._closing.set()
         self._wake.set()
         if self._has_thread:

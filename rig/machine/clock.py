@@ -81,11 +81,7 @@ class VirtualClock:
 
 
 class WrappedClock:
-    """A clock that adds to the waits of another.
-
-    Args:
-        clock: The other clock.
-    """
+    """A clock that adds to the waits of another."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -111,9 +107,7 @@ class WrappedClock:
 class OccupiedClock(WrappedClock):
     """A clock whose waits begin with work, which so takes time that would be spent waiting.
 
-    Args:
-        clock: The clock.
-        occupation: Called before each wait, with the time that is awaited.
+    The work is given the time that is awaited.
     """
 
     def __init__(self, clock: Clock, occupation: Callable[[int], None]) -> None:

@@ -47,15 +47,9 @@ class Realtime(BaseModel):
 
 @dataclass(frozen=True)
 class Granted:
-    """Real-time conditions that the machine granted.
+    """Real-time conditions that the machine granted; without huge pages pages are small.
 
-    Attributes:
-        fifo: SCHED_FIFO.
-        locked_memory: Pages locked.
-        cpu: Core, or None if not pinned.
-        timer_slack: Timer slack of 1 ns.
-        small_pages: No huge pages: the kernel searches memory for them every ten seconds.
-        frozen_garbage: Garbage collection frozen.
+    The kernel would search memory for huge pages every ten seconds.
     """
 
     fifo: bool
@@ -72,14 +66,7 @@ class Granted:
 
 @contextlib.contextmanager
 def realtime(request: Realtime) -> Generator[Granted]:
-    """Context with real-time conditions, which are released at its end.
-
-    Args:
-        request: Requested conditions.
-
-    Yields:
-        Granted conditions.
-    """
+    """Context with real-time conditions, as granted, which are released at its end."""
     libc = ctypes.CDLL(ctypes.util.find_library("c"), use_errno=True)
     affinity = os.sched_getaffinity(0)
     switch_interval_s = sys.getswitchinterval()
@@ -117,10 +104,7 @@ def follow(priority: int) -> None:
     """Let the calling thread run just below the loop's real-time priority, where that is allowed.
 
     A thread that holds the interpreter and waits for the processor behind ordinary processes makes
-    the loop wait with it, whatever the loop's own priority is.
-
-    Args:
-        priority: The loop's priority; 0 if it has none, then nothing is done.
+    the loop wait with it, whatever the loop's own priority is. Without one nothing is done.
     """
     if priority > 1:
         _fifo(priority - 1)

@@ -78,7 +78,6 @@ _FADING_S = 1.0
 _SMALLEST_SCALE, _LARGEST_SCALE = 1e-4, 1e4
 """Bounds of a variance that follows the innovations, over the configured one."""
 
-
 _WIDEST_PER_INTERVAL, _NARROWEST_PER_INTERVAL = 2.0, 0.004
 """Bounds of a corner in rad/s times the time between two measurements: wider ones follow single
 samples, narrower ones nothing."""
@@ -104,15 +103,13 @@ class Steady(NamedTuple):
 
 
 class Constants(Struct, frozen=True, gc=False):
-    """What a filter asks for at every measurement and is the same all through a run.
+    """What a filter requires at every measurement and is the same all through a run.
 
     Attributes:
-        steady: What its variances come to.
         gain: The steady gain in SI: what each of the mean changes by per metre that is new.
         innovation_m2: Steady variance of what is new in a measurement.
         residual_std: Steady standard deviation of `ErrorFilter.residual` at a measurement.
         fading: Share of the newest innovation in the variances' scale.
-        omega: Corner in rad/s.
         next_ns: Time since the last measurement from which on one is missing.
         longest_ns: How long after the last measurement the error is predicted.
         forgotten_ns: Time after which the last measurement says nothing more.
@@ -142,8 +139,6 @@ class ErrorState(Struct, frozen=True, gc=False):
         scale: Variance of the sensor over the configured one, as the innovations show it.
         inputs: Accelerations by the virtual force, and from when on; the first one from `t_ns` or
             before.
-        start: What the filter was started with.
-        constants: What does not change from then on.
     """
 
     t_ns: int
@@ -221,12 +216,7 @@ class ErrorFilter:
         return replace(self.init(start), covariance=None)
 
     def update(self, state: ErrorState, innovation: Innovation) -> ErrorState:
-        """State at a new measurement; one that is not newer than the last changes nothing.
-
-        Args:
-            state: State at the last measurement.
-            innovation: Measured less model height, at the time of the measurement.
-        """
+        """State at a new measurement; one that is not newer than the last changes nothing."""
         if innovation.t_ns <= state.t_ns:
             return state
         constants, t_ns = state.constants, innovation.t_ns
@@ -272,12 +262,7 @@ class ErrorFilter:
         return mean_at(state, min(t_ns, state.t_ns + state.constants.longest_ns))
 
     def residual(self, state: ErrorState, mean: Mean) -> float:
-        """Acceleration by the force that the model lacks where it is now, in m/s².
-
-        Args:
-            state: The state.
-            mean: Of now, from `predicted`.
-        """
+        """Acceleration by the force that the model lacks now, in m/s², at the predicted mean."""
         x, v, a, *_ = mean
         return a - state.start.stiffness_per_s2 * x - state.start.damping_per_s * v
 
@@ -364,13 +349,7 @@ class ErrorFilter:
 
 
 class Pace(NamedTuple):
-    """What the variances depend on, in units of 1 / omega.
-
-    Attributes:
-        interval: Time between two measurements.
-        stiffness: Of the model's law over the mass.
-        damping: Of the model's law over the mass.
-    """
+    """Interval, stiffness and damping that the variances depend on, in units of 1 / omega."""
 
     interval: float
     stiffness: float = 0.0
@@ -380,11 +359,8 @@ class Pace(NamedTuple):
 def update_scale(constants: Constants, scale: float, squared: float) -> float:
     """The variances' scale after a measurement.
 
-    Args:
-        constants: Of the filter.
-        scale: The scale before.
-        squared: Square of what is new in the measurement over its variance, one on average where
-            the variances are right.
+    `squared` is the square of what is new in the measurement over its variance, one on average
+    where the variances are right.
     """
     scale += constants.fading * (squared - scale)
     return min(max(scale, _SMALLEST_SCALE), _LARGEST_SCALE)

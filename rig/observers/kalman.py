@@ -20,7 +20,7 @@ from math import sqrt
 from typing import ClassVar, Literal
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, structs
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
@@ -58,17 +58,7 @@ _UNTUNED_CORNER_PER_INTERVAL = 0.1
 
 
 class KalmanState(Struct, frozen=True, gc=False):
-    """State of a noise-aware observer.
-
-    Attributes:
-        error: Estimate of the model's error.
-        innovation_m: Last innovation.
-        virtual_force_n: Virtual force, constant until the next tick.
-        residual_force_n: Estimated residual force.
-        force_std_n: Its standard deviation.
-        measured_ns: Time of the last measurement of the height.
-        fusion: Memory of further sensors; None without any.
-    """
+    """State of a noise-aware observer; `fusion` is None without further sensors."""
 
     error: ErrorState
     innovation_m: float
@@ -108,11 +98,9 @@ class KalmanObserver:
         return 12
 
     def init(self, start: Start) -> KalmanState:
-        """State at the model's start."""
         return self._initial(self.filter.init(start), start)
 
     def steady_state(self, start: Start) -> KalmanState:
-        """State after a long time at rest."""
         return self._initial(self.filter.steady_state(start), start)
 
     def _initial(self, error: ErrorState, start: Start) -> KalmanState:
@@ -126,7 +114,6 @@ class KalmanObserver:
         innovation: Innovation | None,
         further: Sequence[Innovation] = (),
     ) -> KalmanState:
-        """State after a tick; arguments as of `Observer.step`."""
         error, fusion = state.error, state.fusion
         if error.start.sensors:
             memory = fusion or initial_memory(error.start)
@@ -134,18 +121,8 @@ class KalmanObserver:
         elif innovation is not None:
             error = self.filter.update(error, innovation)
         innovation_m = state.innovation_m if innovation is None else innovation.value
-        return self._drive(t_ns, error, innovation_m, fusion)
-
-    def _drive(
-        self,
-        t_ns: int,
-        error: ErrorState,
-        innovation_m: float,
-        fusion: FusionMemory | None = None,
-    ) -> KalmanState:
-        """State with the virtual force that a new estimate requires."""
-        follower, limit_n = self.filter, self.force_limit_n
-        start, mobility_per_kg = error.start, error.start.mobility_per_kg
+        start, follower, limit_n = error.start, self.filter, self.force_limit_n
+        mobility_per_kg = start.mobility_per_kg
         mean = follower.predict(error, t_ns)
         x, v, a, _, _ = mean
         corner = min(error.constants.omega, _MOST_PER_INTERVAL * 1e9 / start.interval_ns)
@@ -158,22 +135,13 @@ class KalmanObserver:
         return KalmanState(error, innovation_m, force_n, residual_n, std_n, measured_ns, fusion)
 
     def numbers(self, state: KalmanState) -> tuple[float, ...]:
-        """What the next state depends on: all of it is in the filter's inputs."""
+        # All of it is in the filter's inputs.
         return self.filter.numbers(state.error)
 
     def with_numbers(self, state: KalmanState, numbers: Sequence[float]) -> KalmanState:
-        """The state with other numbers, as `numbers` gives them."""
         error = self.filter.with_numbers(state.error, numbers)
         virtual_force_n = -error.inputs[-1][1] / error.start.mobility_per_kg
-        return KalmanState(
-            error,
-            state.innovation_m,
-            virtual_force_n,
-            state.residual_force_n,
-            state.force_std_n,
-            state.measured_ns,
-            state.fusion,
-        )
+        return structs.replace(state, error=error, virtual_force_n=virtual_force_n)
 
     def can_continue(self, other: AnyObserver) -> bool:
         """Whether the other one has the same filter, whose state it continues."""
@@ -187,7 +155,6 @@ class KalmanObserver:
         return Remark(text, is_warning=True)
 
     def remark_on_rate(self, rate_hz: float) -> Remark | None:
-        """Whether the filter smooths, at a rate of measurements."""
         return self.filter.remark_on_rate(rate_hz)
 
     @classmethod
@@ -198,7 +165,6 @@ class KalmanObserver:
 
     @classmethod
     def search(cls, task: TuningTask) -> Search:
-        """Search over the logarithm of the filter's corner in rad/s."""
         low, high = ErrorFilter.corners(task.interval_s)
 
         def observer(x: Vector) -> KalmanObserver:
@@ -209,14 +175,11 @@ class KalmanObserver:
         return Search(observer, [[value] for value in grid], 1, _GAIN_MARGIN)
 
     def bandwidth_hz(self, mobility_per_kg: float) -> float:
-        """Corner of the filter."""
         del mobility_per_kg
         return self.filter.bandwidth_hz
 
     def with_bandwidth(self, factor: float) -> "KalmanObserver":
-        """The observer with its filter's corner multiplied."""
         return replace(self, filter=self.filter.with_bandwidth(factor))
 
     def to_four_digits(self) -> "KalmanObserver":
-        """The observer with parameters of four digits."""
         return replace(self, filter=self.filter.to_four_digits())

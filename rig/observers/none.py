@@ -16,16 +16,7 @@ from rig.observers.protocol import AnyObserver, Innovation, Remark, SensorStep, 
 
 
 class NoState(Struct, frozen=True, gc=False):
-    """State of no observer.
-
-    Attributes:
-        measured_ns: Time of the last tick: no measurement is awaited.
-        innovation_m: NaN.
-        virtual_force_n: Zero.
-        residual_force_n: Zero.
-        force_std_n: NaN.
-        left_out: Empty.
-    """
+    """State of no observer; no measurement is awaited."""
 
     measured_ns: int
     innovation_m: float = nan
@@ -55,11 +46,9 @@ class NoObserver:
         return 0
 
     def init(self, start: Start) -> NoState:
-        """State at the model's start."""
         return NoState(start.t_ns)
 
     def steady_state(self, start: Start) -> NoState:
-        """State after a long time at rest."""
         return NoState(start.t_ns)
 
     def step(
@@ -69,30 +58,24 @@ class NoObserver:
         innovation: Innovation | None,
         further: Sequence[Innovation] = (),
     ) -> NoState:
-        """State after a tick."""
         del state, innovation, further
         return NoState(t_ns)
 
     def numbers(self, state: NoState) -> tuple[float, ...]:
-        """Empty: the next state depends on nothing."""
         del state
         return ()
 
     def with_numbers(self, state: NoState, numbers: Sequence[float]) -> NoState:
-        """The same state."""
         del numbers
         return state
 
     def can_continue(self, other: AnyObserver) -> bool:
-        """Whether the other one is no observer either."""
         return type(other) is NoObserver
 
     def remark_on_step(self, step: SensorStep) -> Remark:
-        """No remark: no height is used."""
         del step
         return Remark("", is_warning=False)
 
     def remark_on_rate(self, rate_hz: float) -> Remark | None:
-        """No remark: no measurement is used."""
         del rate_hz
         return None

@@ -17,7 +17,7 @@ from math import nan
 from typing import ClassVar, Literal
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, structs
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
@@ -56,16 +56,7 @@ PUBLISHED_PER_S2, PUBLISHED_PER_S3 = 1.0e4, 1.0e3
 
 
 class PiState(Struct, frozen=True, gc=False):
-    """State of a PI observer.
-
-    Attributes:
-        integral_m_s: Integral of the innovation.
-        innovation_m: Last innovation.
-        virtual_force_n: Virtual force, constant until the next measurement.
-        measured_ns: Time of the last measurement.
-        start: What the observer was started with.
-        error: State of the filter; None without one.
-    """
+    """State of a PI observer: the virtual force is the estimate; `error` is that of the filter."""
 
     integral_m_s: float
     innovation_m: float
@@ -76,17 +67,14 @@ class PiState(Struct, frozen=True, gc=False):
 
     @property
     def residual_force_n(self) -> float:
-        """The virtual force: it is the estimate."""
         return self.virtual_force_n
 
     @property
     def force_std_n(self) -> float:
-        """NaN: not known."""
         return nan
 
     @property
     def left_out(self) -> tuple[int, ...]:
-        """Empty: no further sensor is used."""
         return ()
 
 
@@ -125,12 +113,10 @@ class PiObserver:
         return 1
 
     def init(self, start: Start) -> PiState:
-        """State at the model's start."""
         error = None if self.filter is None else self.filter.init(start)
         return PiState(0.0, 0.0, 0.0, start.t_ns, start, error)
 
     def steady_state(self, start: Start) -> PiState:
-        """State after a long time at rest."""
         error = None if self.filter is None else self.filter.steady_state(start)
         return PiState(0.0, 0.0, 0.0, start.t_ns, start, error)
 
@@ -141,11 +127,7 @@ class PiObserver:
         innovation: Innovation | None,
         further: Sequence[Innovation] = (),
     ) -> PiState:
-        """State after a tick; arguments as of `Observer.step`.
-
-        Between measurements the virtual force is constant. At the limit the integral grows no
-        further.
-        """
+        """Between measurements the force is constant; at the limit the integral does not grow."""
         del further
         if innovation is None:
             return state
@@ -180,19 +162,16 @@ class PiObserver:
         return (*own, *self.filter.numbers(state.error))
 
     def with_numbers(self, state: PiState, numbers: Sequence[float]) -> PiState:
-        """The state with other numbers, as `numbers` gives them."""
         interval_s, moved = _scales(state.start)
         integral, force, *others = numbers
         error = state.error
         if self.filter is not None and error is not None:
             error = self.filter.with_numbers(error, others)
-        return PiState(
-            integral * interval_s,
-            state.innovation_m,
-            force / moved,
-            state.measured_ns,
-            state.start,
-            error,
+        return structs.replace(
+            state,
+            integral_m_s=integral * interval_s,
+            virtual_force_n=force / moved,
+            error=error,
         )
 
     def can_continue(self, other: AnyObserver) -> bool:
@@ -208,7 +187,6 @@ class PiObserver:
         return Remark(f"{text}: more than 1 % of the model's weight; see rig tune", is_warning=True)
 
     def remark_on_rate(self, rate_hz: float) -> Remark | None:
-        """Whether the filter smooths, at a rate of measurements."""
         return None if self.filter is None else self.filter.remark_on_rate(rate_hz)
 
     @classmethod
@@ -239,7 +217,6 @@ class PiObserver:
         return math.sqrt(self.proportional_n_per_m * mobility_per_kg) / (2.0 * math.pi)
 
     def with_bandwidth(self, factor: float) -> "PiObserver":
-        """The observer with its natural frequency and its filter's corner multiplied."""
         return replace(
             self,
             proportional_n_per_m=factor**2 * self.proportional_n_per_m,
@@ -249,7 +226,6 @@ class PiObserver:
         )
 
     def to_four_digits(self) -> "PiObserver":
-        """The observer with parameters of four digits."""
         return replace(
             self,
             proportional_n_per_m=float(f"{self.proportional_n_per_m:.4g}"),

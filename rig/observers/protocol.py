@@ -34,12 +34,10 @@ class Start(Struct, frozen=True, gc=False):
     Attributes:
         t_ns: Time of the measurement that it starts with.
         mobility_per_kg: Acceleration of the strut's height per newton in the strut.
-        interval_ns: Time between two measurements.
         delay_ns: Time from a measurement to the arrival of its frame.
         stiffness_per_s2: Decrease of that acceleration per metre of height: of the model's own
             law, its stiffness over the effective mass.
         damping_per_s: The same per m/s.
-        sensors: Channels of the strut's further sensors.
     """
 
     t_ns: int
@@ -86,24 +84,14 @@ class ObserverState(Protocol):
 
 
 class SensorStep(NamedTuple):
-    """A step of the height sensor, for the check.
-
-    Attributes:
-        step_m: Its size.
-        weight_n: Weight of the model's bodies; None where it is not known.
-    """
+    """A step of the height sensor, for the check; the weight is that of the model's bodies."""
 
     step_m: float
     weight_n: float | None
 
 
 class Remark(NamedTuple):
-    """What a check of an observer found.
-
-    Attributes:
-        text: Text with figures.
-        is_warning: Whether the user is to be warned.
-    """
+    """What a check of an observer found; a warning is shown to the user as one."""
 
     text: str
     is_warning: bool
@@ -119,8 +107,6 @@ class Observer(Protocol[StateT]):
     `kind`, which `rig.observers.OBSERVERS` lists.
 
     Attributes:
-        requires_height: Whether the strut's height must be measured.
-        fuses_sensors: Whether it uses further sensors of the strut.
         knows_std: Whether it knows the standard deviation of its estimate.
     """
 
@@ -153,13 +139,10 @@ class Observer(Protocol[StateT]):
         innovation: Innovation | None,
         further: Sequence[Innovation] = (),
     ) -> StateT:
-        """State after a tick.
+        """State after a tick, from the state after the last one.
 
-        Args:
-            state: State after the last tick.
-            t_ns: Time of the tick.
-            innovation: Of a new measurement of the height; None where no frame came.
-            further: Of new samples of further sensors.
+        `innovation` is that of a new measurement of the height, None where no frame came; `further`
+        are those of new samples of further sensors.
         """
         ...
 
@@ -208,14 +191,7 @@ class Search(NamedTuple):
 
 
 class TuningTask(NamedTuple):
-    """The strut that an observer is tuned for.
-
-    Attributes:
-        mass_kg: Effective mass that the strut's force moves.
-        noise_std_m: Standard deviation of its height measurement.
-        interval_s: Time between two measurements.
-        force_limit_n: Limit of the virtual force.
-    """
+    """The strut that an observer is tuned for; `mass_kg` is what the strut's force moves."""
 
     mass_kg: float
     noise_std_m: float

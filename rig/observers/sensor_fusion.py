@@ -58,14 +58,7 @@ thirtieth of what is unknown is added too early or too late, and never twice."""
 
 
 class SensorHealth(NamedTuple):
-    """Health of a further sensor.
-
-    Attributes:
-        t_ns: Time of its last reading.
-        beyond: Readings beyond the gate, the last ones in a row.
-        within: Readings within it, the last ones in a row.
-        is_out: Whether it is left out.
-    """
+    """Health of a further sensor: its last readings in a row beyond the gate, or within it."""
 
     t_ns: int
     beyond: int = 0
@@ -73,13 +66,7 @@ class SensorHealth(NamedTuple):
     is_out: bool = False
 
     def update(self, t_ns: int, *, is_within: bool, counts: bool) -> "SensorHealth":
-        """Health after another reading.
-
-        Args:
-            t_ns: Its time.
-            is_within: Whether it is within the gate.
-            counts: Whether it counts for a sensor that is out.
-        """
+        """Health after another reading; `counts`: it counts for a sensor that is out."""
         if self.is_out and not counts:
             return self._replace(t_ns=t_ns)
         beyond, within = (0, self.within + 1) if is_within else (self.beyond + 1, 0)
@@ -93,7 +80,6 @@ class FusionMemory(Struct, frozen=True, gc=False):
     Attributes:
         used: Innovations used lately, the oldest first, with the state before each.
         inputs: Accelerations by the virtual force and their times, as far back as `used`.
-        health: Of each further sensor, by its channel.
         measured_ns: Time of the last reading of a height that was used.
         own_ns: Time of the last reading of the strut's own height.
         left_out: Channels of sensors that are left out, or silent.
@@ -121,15 +107,10 @@ def fuse_samples(
     innovation: Innovation | None,
     further: Sequence[Innovation],
 ) -> tuple[ErrorState, FusionMemory]:
-    """Filter and memory after a tick.
+    """Filter and memory after a tick; `error` has all inputs up to now.
 
-    Args:
-        follower: The filter.
-        error: Its state, with all inputs up to now.
-        memory: Memory of the sensors.
-        t_ns: Time of the tick.
-        innovation: Of a new height of the strut; None where none arrived.
-        further: Of new samples of the further sensors.
+    `innovation` is that of a new height of the strut, None where none arrived; `further` are those
+    of new samples of the further sensors.
     """
     sensors = {channel.index: channel for channel in error.start.sensors}
     new = [*further]
@@ -165,7 +146,7 @@ def fuse_samples(
             used.append((replace(after, inputs=inputs), entry))
             after, _ = _update(follower, used[-1][0], entry, sensors.get(entry.channel))
         error = after
-    oldest_ns = t_ns - _longest_delay_ns(error.start)
+    oldest_ns = t_ns - max(channel.delay_ns for channel in (error.start, *error.start.sensors))
     while used and used[0][1].t_ns < oldest_ns:
         used.pop(0)
     from_ns = used[0][0].t_ns if used else error.t_ns
@@ -182,7 +163,8 @@ def _list_exclusions(
     return tuple(
         channel
         for channel, state in health.items()
-        if state.is_out or t_ns - state.t_ns > _silent_ns(sensors[channel])
+        if state.is_out
+        or t_ns - state.t_ns > sensors[channel].delay_ns + _SILENT * sensors[channel].interval_ns
     )
 
 
@@ -191,14 +173,6 @@ def _join_inputs(
 ) -> tuple[tuple[int, float], ...]:
     """All inputs: the latest, and those remembered from before them."""
     return (*(item for item in known if item[0] < latest[0][0]), *latest)
-
-
-def _silent_ns(sensor: Channel) -> int:
-    return sensor.delay_ns + _SILENT * sensor.interval_ns
-
-
-def _longest_delay_ns(start: Start) -> int:
-    return max([start.delay_ns, *(sensor.delay_ns for sensor in start.sensors)])
 
 
 def _update(

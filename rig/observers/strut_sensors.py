@@ -18,7 +18,6 @@ class Instant(NamedTuple):
     """The model at a time.
 
     Attributes:
-        t_ns: The time.
         struts: Height (m) and velocity (m/s) of each strut.
         forces_n: Force of each strut's law; empty where no sensor requires it.
     """
@@ -42,18 +41,6 @@ class StrutSensor:
     row: Callable[[Start], tuple[float, float, float]]
 
 
-def _read_velocity(instant: Instant, strut: int) -> float:
-    return instant.struts[strut][1]
-
-
-def _read_force(instant: Instant, strut: int) -> float:
-    return instant.forces_n[strut]
-
-
-def _read_height(instant: Instant, strut: int) -> float:
-    return instant.struts[strut][0]
-
-
 def _force_row(start: Start) -> tuple[float, float, float]:
     """The force that the law lacks, m (d/m - k x - c dx/dt)."""
     mass_kg = 1.0 / start.mobility_per_kg
@@ -62,9 +49,13 @@ def _force_row(start: Start) -> tuple[float, float, float]:
 
 STRUT_SENSORS: Mapping[Quantity, StrutSensor] = MappingProxyType(
     {
-        HEIGHT: StrutSensor(_read_height, lambda _start: (1.0, 0.0, 0.0)),
-        VELOCITY: StrutSensor(_read_velocity, lambda _start: (0.0, 1.0, 0.0)),
-        FORCE: StrutSensor(_read_force, _force_row),
+        HEIGHT: StrutSensor(
+            lambda instant, strut: instant.struts[strut][0], lambda _start: (1.0, 0.0, 0.0)
+        ),
+        VELOCITY: StrutSensor(
+            lambda instant, strut: instant.struts[strut][1], lambda _start: (0.0, 1.0, 0.0)
+        ),
+        FORCE: StrutSensor(lambda instant, strut: instant.forces_n[strut], _force_row),
     }
 )
 
@@ -73,11 +64,7 @@ def model_reading(t_ns: int, channel: Channel, instants: Sequence[Instant]) -> f
     """What a sensor of the model would have read at a time.
 
     A height is first order from the tick after that time, anything else linear between two ticks.
-
-    Args:
-        t_ns: The time.
-        channel: The sensor.
-        instants: The model at the ticks, the newest first.
+    `instants` has the newest tick first.
     """
     now, strut = instants[0], channel.strut
     if channel.quantity is HEIGHT:
@@ -104,12 +91,8 @@ def model_height_m(
 ) -> float:
     """Height of the model at the time of a measurement, to first order from the tick after it.
 
-    Args:
-        measured_ns: Time of the measurement.
-        strut: Index of the strut.
-        t_ns: Time of the newest tick.
-        struts: Height (m) and velocity (m/s) of each strut at it.
-        instants: The model at the ticks, the newest first; empty where no measurement is late.
+    The newest tick is at `t_ns`, with height (m) and velocity (m/s) of each strut; `instants` are
+    the ticks, the newest first, empty where no measurement is late.
     """
     for earlier in instants:
         if earlier.t_ns < measured_ns:

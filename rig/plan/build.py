@@ -23,11 +23,7 @@ ENGINES: Mapping[str, Callable[[ModelSpec], AnyPlant]] = MappingProxyType({"dart
 
 
 def build_bridge(plan: Plan, *, sending: bool = True) -> Bridge:
-    """Build the bridge of a plan.
-
-    Args:
-        plan: The plan.
-        sending: Whether it makes frames to send; what it computes is the same without.
+    """Build the bridge of a plan; without `sending` it makes no frames, and computes the same.
 
     Raises:
         InputError: The model cannot be built.

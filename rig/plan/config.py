@@ -52,13 +52,7 @@ class _Frozen(BaseModel):
 
 
 class OneOf:
-    """Reads one of several kinds of settings, selected by the value of one key.
-
-    Args:
-        key: The key.
-        choices: Value of the key -> its settings.
-        default: Value where the key is absent.
-    """
+    """Reads one of several kinds of settings, selected by the value of one key."""
 
     def __init__(self, key: str, choices: Mapping[str, type[object]], default: str | None) -> None:
         self._key, self.choices, self._default = key, choices, default
@@ -209,11 +203,7 @@ def _is_group(value: object) -> bool:
 
 
 def _mapping(choices: Sequence[Publication]) -> Callable[[object], object]:
-    """Reads a group of publications: signals by key, or a message that has all of them.
-
-    Args:
-        choices: What may be published.
-    """
+    """Reads a group of publications: signals by key, or a message that has all of them."""
 
     def read(data: object) -> object:
         match data:

@@ -14,12 +14,9 @@ from rig.plan.plan import Plan, resolve
 
 
 def load_plan(path: Path, *, model: str | None = None, duration_s: float | None = None) -> Plan:
-    """The plan of a configuration, with all files that it names.
+    """The plan of a configuration, with all files that it names, which are in its folder.
 
-    Args:
-        path: YAML file; the files that it names lie in its folder.
-        model: File or name of a model to use instead of the configuration's.
-        duration_s: A length to use instead of the configuration's.
+    A file or name of a model, and a length, may replace the configuration's.
 
     Raises:
         InputError: One line that names file, key, value and what was expected.

@@ -28,7 +28,7 @@ from rig.channels.channel import Channel, Role, SignalName
 from rig.channels.quantities import HEIGHT, LOAD_CELL_FORCE, Quantity
 from rig.observers.pi import PiObserver
 from rig.observers.protocol import AnyObserver
-from rig.plan.config import Mapped, RunConfig
+from rig.plan.config import HeightSignal, Mapped, RunConfig, SensorSignal
 
 _LARGEST_DELAY_DIFFERENCE_S = 0.02
 """Between the sensors of one strut: a filter that goes back by more at every reading takes half a
@@ -40,9 +40,7 @@ class PlannedStrut:
     """A strut of the model as the bridge runs it.
 
     Attributes:
-        name: Its name.
         free_length_m: Its free length, at which a bench is assumed to rest.
-        observer: Its observer.
         height: Channel of its measured height; None where none is measured.
         interval_ns: Time between two measurements: that of the height's message, or a tick.
         delay_ns: How much later a measurement arrives than it is true.
@@ -58,12 +56,7 @@ class PlannedStrut:
 
 @dataclass(frozen=True)
 class PlannedMessage:
-    """A message that the bridge sends.
-
-    Attributes:
-        message: Its definition.
-        signals: What its signals publish.
-    """
+    """A message that the bridge sends, and what its signals publish."""
 
     message: Message
     signals: tuple[PublishedSignal, ...]
@@ -74,14 +67,8 @@ class Plan:
     """A run as it was configured, with every name resolved.
 
     Attributes:
-        source: File of the configuration, for messages.
         config: The configuration, with every strut and every published signal named.
-        model: The model.
-        database: The DBC.
-        struts: Struts in the model's order.
         channels: Channels of the bench: heights, quantities of the bench, further sensors.
-        outgoing: Messages that the bridge sends.
-        devices: Devices that it watches.
         alarms: Messages with alarms of the devices, and the alarms.
         authentication: How frames are authenticated; None where they are not, and for the plan of
             a run, whose folder contains no key.
@@ -175,12 +162,6 @@ class Plan:
 
 def resolve(config: RunConfig, source: Path, model: ModelSpec, database: Database) -> Plan:
     """Resolve a configuration against its model and its DBC.
-
-    Args:
-        config: The configuration.
-        source: File it was read from, for messages.
-        model: The model.
-        database: The DBC.
 
     Raises:
         InputError: One line that names file, key, value and what was expected.
@@ -321,11 +302,7 @@ def _signals_of(message: str, publications: Iterable[Publication], database: Dat
 
 
 class _SignalReader:
-    """Looks the configured signals up in the DBC, each once.
-
-    Attributes:
-        read: Message of each signal that the bridge reads, by the signal's key.
-    """
+    """Looks the configured signals up in the DBC, each once; `read` has those it reads, by key."""
 
     def __init__(self, config: RunConfig, database: Database, source: Path) -> None:
         self._config, self._database, self._source = config, database, source
@@ -338,17 +315,12 @@ class _SignalReader:
         channels: list[Channel] = []
 
         def add(
-            role: Role,
-            quantity: Quantity,
-            name: str,
-            key: str,
-            strut: int,
-            entry: SignalName,
-            delay_ns: int = 0,
-            noise_std: float = 0.0,
+            role: Role, quantity: Quantity, name: str, key: str, strut: int, entry: SignalName
         ) -> None:
             message = self._message(entry, key)
             interval_ns = message.cycle_time_ns or self._config.period_ns
+            delay_ns = entry.delay_ns if isinstance(entry, HeightSignal) else 0
+            noise_std = entry.noise_std if isinstance(entry, SensorSignal) else 0.0
             channels.append(
                 Channel(
                     len(channels),
@@ -366,19 +338,15 @@ class _SignalReader:
             )
 
         for strut, entry in signals.height.items():
-            index = struts.index(strut)
-            key = f"signals.height.{strut}"
-            add(Role.HEIGHT, HEIGHT, strut, key, index, entry, entry.delay_ns)
+            index, key = struts.index(strut), f"signals.height.{strut}"
+            add(Role.HEIGHT, HEIGHT, strut, key, index, entry)
         for quantity, entry in signals.bench.items():
-            key = f"signals.{quantity.key}"
-            add(Role.BENCH, quantity, quantity.key, key, -1, entry)
+            add(Role.BENCH, quantity, quantity.key, f"signals.{quantity.key}", -1, entry)
         for strut, group in signals.further.items():
             for sensor, entry in group.items():
                 self._check_sensor(strut, sensor)
                 key, name = f"signals.further.{strut}.{sensor}", f"{strut}.{sensor}"
-                index, quantity = struts.index(strut), entry.quantity
-                delay_ns = entry.delay_ns
-                add(Role.SENSOR, quantity, name, key, index, entry, delay_ns, entry.noise_std)
+                add(Role.SENSOR, entry.quantity, name, key, struts.index(strut), entry)
         return tuple(channels)
 
     def outgoing(self) -> tuple[PlannedMessage, ...]:
@@ -429,11 +397,7 @@ class _SignalReader:
         return message
 
     def _signal(self, entry: SignalName, key: str) -> Message:
-        """Message of a signal.
-
-        Raises:
-            InputError: The DBC has no such message, or the message no such signal.
-        """
+        """Message of a signal."""
         try:
             message = self._database.message(entry.message)
             message.signal(entry.signal)

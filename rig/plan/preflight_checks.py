@@ -14,7 +14,7 @@ from rig.channels.quantities import LOAD_CELL_FORCE
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import Pole, closed_loop_poles
-from rig.observers.protocol import SensorStep
+from rig.observers.protocol import Remark, SensorStep
 from rig.plan.build import build_bridge, build_plant
 from rig.plan.plan import Plan
 
@@ -36,13 +36,7 @@ class Severity(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the check.
-
-    Attributes:
-        severity: Its severity.
-        what: Subject of the check.
-        text: Result, with figures.
-    """
+    """One line of the check: severity, subject, and result with figures."""
 
     severity: Severity
     what: str
@@ -54,13 +48,7 @@ class Finding:
 
 
 def check(plan: Plan) -> list[Finding]:
-    """Check a plan: signals and units, rate, bus load, stability.
-
-    Args:
-        plan: The plan.
-
-    Returns:
-        All findings, good ones too.
+    """Findings of a check of signals and units, rate, bus load and stability; good ones too.
 
     Raises:
         InputError: The model cannot be built, or a key cannot be read.
@@ -71,13 +59,10 @@ def check(plan: Plan) -> list[Finding]:
     sensors = {message.name: message for message in map(_message, plan.sensors)}
     further = dict(sorted(sensors.items()))
     read = {message.name: message for message in heights} | further
+    named = plan.database.path.name
     findings = [
-        Finding(
-            Severity.OK,
-            "signals",
-            f"all in {plan.database.path.name}, units converted to SI",
-        ),
-        *[_protection(message) for message in read.values()],
+        Finding(Severity.OK, "signals", f"all in {named}, units converted to SI"),
+        *map(_protection, read.values()),
         *[_rate(message, plan.period_ns) for message in heights],
         *_resolution(plan),
         *[
@@ -112,30 +97,23 @@ def _message(channel: Channel) -> Message:
 
 
 def _protection(message: Message) -> Finding:
-    if message.protection is None:
-        return Finding(
-            Severity.WARNING,
-            f"protection of {message.name}",
-            "none in the DBC: a corrupted, repeated or foreign frame passes as data",
-        )
-    profile = message.protection.identity.profile.value
-    return Finding(Severity.OK, f"protection of {message.name}", f"E2E profile {profile}")
+    what, protection = f"protection of {message.name}", message.protection
+    if protection is None:
+        text = "none in the DBC: a corrupted, repeated or foreign frame passes as data"
+        return Finding(Severity.WARNING, what, text)
+    return Finding(Severity.OK, what, f"E2E profile {protection.identity.profile.value}")
 
 
 def _rate(message: Message, period_ns: int) -> Finding:
     what = f"rate against {message.name}"
     cycle_ns = message.cycle_time_ns
     if cycle_ns is None:
-        return Finding(
-            Severity.WARNING, what, "the DBC gives no cycle time: poles assume a frame a tick"
-        )
+        text = "the DBC gives no cycle time: poles assume a frame a tick"
+        return Finding(Severity.WARNING, what, text)
     text = f"a frame every {cycle_ns * 1e-6:g} ms, a tick every {period_ns * 1e-6:g} ms"
     if cycle_ns < period_ns:
-        return Finding(
-            Severity.WARNING,
-            what,
-            f"{text}: each is used at its own time, at one core step a frame",
-        )
+        text += ": each is used at its own time, at one core step a frame"
+        return Finding(Severity.WARNING, what, text)
     if cycle_ns % period_ns:
         return Finding(Severity.WARNING, what, f"{text}: no whole number of ticks a frame")
     return Finding(Severity.OK, what, text)
@@ -148,12 +126,16 @@ def _resolution(plan: Plan) -> list[Finding]:
         step_m = si_step(_message(channel), channel.signal, channel.quantity.dimension)
         if step_m == 0.0 or plan.is_prescribed:
             continue
-        observer = plan.struts[channel.strut].observer
-        remark = observer.remark_on_step(SensorStep(step_m, _weight_n(plan)))
+        remark = plan.struts[channel.strut].observer.remark_on_step(
+            SensorStep(step_m, _weight_n(plan))
+        )
         text = ", ".join(filter(None, (f"steps of {step_m * 1e6:.3g} µm", remark.text)))
-        severity = Severity.WARNING if remark.is_warning else Severity.OK
-        findings.append(Finding(severity, f"resolution of {channel.name}", text))
+        findings.append(_of_remark(f"resolution of {channel.name}", remark, text))
     return findings
+
+
+def _of_remark(what: str, remark: Remark, text: str) -> Finding:
+    return Finding(Severity.WARNING if remark.is_warning else Severity.OK, what, text)
 
 
 def _weight_n(plan: Plan) -> float | None:
@@ -174,14 +156,14 @@ def _staleness(plan: Plan, heights: list[Message]) -> Finding:
     text = f"stale after {stale_ns * 1e-6:g} ms, slowest measurement every {slowest_ns * 1e-6:g} ms"
     if delay_ns:
         text += f", {delay_ns * 1e-6:g} ms old when it arrives"
-    if stale_ns < slowest_ns + delay_ns + plan.period_ns:
-        return Finding(
-            Severity.ERROR,
-            "supervision.stale_after_s",
-            f"{text}: expected more than one cycle, one tick and the delay, or the bridge holds "
-            "all the time",
+    is_short = stale_ns < slowest_ns + delay_ns + plan.period_ns
+    if is_short:
+        text += (
+            ": expected more than one cycle, one tick and the delay, or the bridge holds all the "
+            "time"
         )
-    return Finding(Severity.OK, "supervision.stale_after_s", text)
+    severity = Severity.ERROR if is_short else Severity.OK
+    return Finding(severity, "supervision.stale_after_s", text)
 
 
 def _authentication(plan: Plan) -> list[Finding]:
@@ -242,13 +224,11 @@ def _stability(plan: Plan, plant: AnyPlant) -> list[Finding]:
 
 def _bandwidths(plan: Plan) -> list[Finding]:
     """Whether filters smooth, or follow single measurements: their corner is near the rate."""
-    findings: list[Finding] = []
-    for strut in plan.struts:
-        remark = strut.observer.remark_on_rate(1e9 / strut.interval_ns)
-        if remark is not None:
-            severity = Severity.WARNING if remark.is_warning else Severity.OK
-            findings.append(Finding(severity, f"filter of {strut.name}", remark.text))
-    return findings
+    remarks = [
+        (strut.name, strut.observer.remark_on_rate(1e9 / strut.interval_ns))
+        for strut in plan.struts
+    ]
+    return [_of_remark(f"filter of {name}", it, it.text) for name, it in remarks if it is not None]
 
 
 def _observability(plan: Plan, plant: AnyPlant) -> list[Finding]:
@@ -262,13 +242,10 @@ def _observability(plan: Plan, plant: AnyPlant) -> list[Finding]:
     if not hidden and not result.together:
         hidden = ["all of these forces at once, which can be in balance: leave out one observer"]
     shown = ", ".join(names[i] for i in measured)
-    findings = [
-        Finding(
-            Severity.WARNING, "observability", f"not observable from heights: {'; '.join(hidden)}"
-        )
-        if hidden
-        else Finding(Severity.OK, "observability", f"the residual force of {shown} is observable")
-    ]
+    severity, text = Severity.OK, f"the residual force of {shown} is observable"
+    if hidden:
+        severity, text = Severity.WARNING, f"not observable from heights: {'; '.join(hidden)}"
+    findings = [Finding(severity, "observability", text)]
     confused: list[str] = []
     for i in measured:
         name = names[i]
@@ -305,9 +282,8 @@ def _worst(poles: list[Pole]) -> Finding:
     )
     # An integrator that is switched off leaves a pole at exactly 1, which harms nothing.
     if ringing.damping_ratio < 0.0 or slowest.magnitude > 1.0 + 1e-6:
-        return Finding(
-            Severity.ERROR, "poles", f"{text}: unstable, lower the gains or raise the rate"
-        )
+        text += ": unstable, lower the gains or raise the rate"
+        return Finding(Severity.ERROR, "poles", text)
     if ringing.damping_ratio < LITTLE_DAMPING:
         return Finding(Severity.WARNING, "poles", f"{text}: little damping")
     return Finding(Severity.OK, "poles", text)

@@ -40,9 +40,6 @@ def propose(database: Database) -> str:
     which messages are the bench's; up to four other candidates stand in a comment. It is a
     proposal: whoever knows the bench reads it before it runs.
 
-    Args:
-        database: The DBC.
-
     Raises:
         InputError: No signal measures a length.
     """

@@ -50,12 +50,7 @@ def parse_assignments(texts: Sequence[str]) -> dict[str, object]:
 
 
 def assign(plan: Plan, assignments: Assignments, source: str) -> Plan:
-    """The plan with other values.
-
-    Args:
-        plan: The plan.
-        assignments: The values.
-        source: What to call the change in an error.
+    """The plan with other values; an error calls the change `source`.
 
     Raises:
         InputError: A key cannot be changed or is unknown, or a value is wrong.

@@ -48,11 +48,9 @@ class LateTick(NamedTuple):
     """Consecutive missed ticks, and their cause.
 
     Attributes:
-        t_ns: When the first of them was due.
         missed: Their number.
         part: Where the time went: receive, compute, send, log, between (what the loop does before
             it waits) or wait.
-        cause: Cause of the loss.
         excess_ns: How much longer the part took than usual.
         end_ns: When the loop resumed.
     """
@@ -75,12 +73,7 @@ def by_cause(late: Sequence[LateTick]) -> list[tuple[Cause, int, int]]:
 
 
 def find_late_ticks(rows: Sequence[TraceRow], period_ns: int) -> list[LateTick]:
-    """Every gap in which ticks were missed.
-
-    Args:
-        rows: Rows of a trace, each late one behind the tick before it.
-        period_ns: Time between two ticks.
-    """
+    """Every gap in which ticks were missed; each late row follows that of the tick before it."""
     pairs = list(pairwise(rows))
     on_time = [
         _parts(before, row)

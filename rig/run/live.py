@@ -36,13 +36,9 @@ _SPINNING_SHARE = 5
 
 @contextlib.contextmanager
 def real_time(config: RunConfig) -> Generator[tuple[Granted, RealClock]]:
-    """Request what a fixed rate needs of the machine.
+    """Context with what a fixed rate needs of the machine: what was granted, and the clock to use.
 
-    Args:
-        config: What is requested.
-
-    Yields:
-        What was granted, and the clock to wait on; it spins only where SCHED_FIFO was granted.
+    The clock spins only where SCHED_FIFO was granted.
     """
     settings = config.realtime
     with realtime(settings) as granted:
@@ -60,14 +56,7 @@ def live(
     listen_only: bool = False,
     trace: Trace | None = None,
 ) -> Ended:
-    """Run on the configured bus in real time.
-
-    Args:
-        plan: The plan.
-        folder: Folder of the run; absent or empty.
-        control: How the run is ended and followed.
-        listen_only: Send nothing.
-        trace: Where the parts of ticks that are late are kept; None keeps nothing.
+    """Run on the configured bus in real time; parts of late ticks are kept in `trace`.
 
     Raises:
         InputError: The configuration is wrong, or the folder cannot be written.
@@ -86,16 +75,14 @@ def live(
 
 
 def _open_link(plan: Plan, bridge: Bridge, clock: Clock, *, listen_only: bool = False) -> Link:
-    def open_bus() -> Bus:
-        return Bus(
-            plan.config.bus,
-            bridge.filters,
-            listen_only=listen_only,
-            epoch_ns=clock.epoch_ns,
-        )
-
     authenticator = _authenticator(plan.authentication, clock)
-    return Link(open_bus, clock.epoch_now_ns, authenticator=authenticator)
+    return Link(
+        lambda: Bus(
+            plan.config.bus, bridge.filters, listen_only=listen_only, epoch_ns=clock.epoch_ns
+        ),
+        clock.epoch_now_ns,
+        authenticator=authenticator,
+    )
 
 
 def _authenticator(authentication: Authentication | None, clock: Clock) -> Authenticator | None:
@@ -113,13 +100,7 @@ def with_bench(
 ) -> Ended:
     """Run with a simulated bench at the other end of the configured bus.
 
-    Args:
-        plan: The plan.
-        bench_config: The bench.
-        folder: Folder of the run.
-        control: How the run is ended and followed.
-        lockstep: Simulated time, as fast as the machine allows; otherwise real time.
-        trace: Where the parts of ticks that are late are kept; None keeps nothing.
+    In lockstep time is simulated, as fast as the machine allows; otherwise it is real.
 
     Raises:
         InputError: The configuration is wrong, or the folder cannot be written.
@@ -161,18 +142,10 @@ def run_bench(
     authentication: Authentication | None = None,
     duration_s: float | None = None,
 ) -> int:
-    """Run a simulated bench on a bus in real time.
+    """Run a simulated bench on a bus in real time; gives the number of frames that it sent.
 
-    Args:
-        bench_config: The bench.
-        bus_config: The bus.
-        dbc: What its messages mean; the package's own if None.
-        control: How the bench is ended and followed; `stop` is asked at least every 0.1 s.
-        authentication: How its frames are secured; not at all if None.
-        duration_s: Length; until asked to stop if None.
-
-    Returns:
-        Number of frames sent.
+    Without a DBC the package's own is used; without a length the bench runs until `control`, asked
+    at least every 0.1 s, stops it.
 
     Raises:
         BusError: The bus cannot be opened.

@@ -44,16 +44,7 @@ class Answer(TypedDict, total=False):
 
 
 class Requests:
-    """The requests to a run.
-
-    Args:
-        folder: Folder of the run.
-        plan: Its plan.
-        bridge: Its bridge.
-        acknowledge: Acknowledges the safe state.
-        log: Takes the line of a change.
-        priority: Real-time priority of the loop, which the thread follows; 0 for none.
-    """
+    """The requests to a run; a change is logged, and the thread follows the loop's priority."""
 
     def __init__(
         self,
@@ -143,10 +134,8 @@ class Requests:
 def ask(folder: Path, content: Mapping[str, object], *, force: bool = False) -> Answer:
     """Send a request to a running run, and wait for its answer.
 
-    Args:
-        folder: Folder of the run.
-        content: ``{"set": assignments}`` or ``{"acknowledge": True}``.
-        force: Send it although the check of the changed configuration finds an error.
+    It contains ``{"set": assignments}`` or ``{"acknowledge": True}``; `force` sends it although the
+    check of the changed configuration finds an error.
 
     Raises:
         InputError: It is no run, it has ended, the check finds an error, or it refuses.

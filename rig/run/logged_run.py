@@ -42,18 +42,7 @@ _PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "aut
 
 @dataclass(frozen=True)
 class Ended:
-    """How a run ended.
-
-    Attributes:
-        folder: Its folder.
-        state: Last state of the bridge.
-        timing: Timing of its ticks.
-        granted: What the machine granted.
-        log_fault: Fault of the log, if there was one.
-        ticks: Number of ticks.
-        period_ns: Time between two of them.
-        diverged: Strut and time of the model's last divergence, if there was one.
-    """
+    """How a run ended; of the model's last divergence strut and time."""
 
     folder: Path
     state: BridgeState
@@ -86,9 +75,6 @@ class Endpoint:
     """What a run has instead of a bench: where frames come from and go to, and when.
 
     Attributes:
-        port: Where frames come from and go to.
-        clock: When ticks are due.
-        figures: Figures of the bus behind the port, for `run.yaml`.
         granted: What the machine granted; None for simulated time, which then waits for the disk.
         begin: Called when all is set up, before the first tick.
         while_waiting: Called before each wait with the time that is awaited.
@@ -113,15 +99,7 @@ def run_logged(
     *,
     trace: Trace | None = None,
 ) -> Ended:
-    """Run on a port and log it.
-
-    Args:
-        plan: The plan.
-        bridge: The bridge built from it.
-        endpoint: Port and clock.
-        folder: Folder of the run; absent or empty.
-        control: How the run is ended and followed.
-        trace: Where the parts of ticks that are late are kept; None keeps nothing.
+    """Run on a port and log it; parts of late ticks are kept in `trace`.
 
     Raises:
         InputError: The folder cannot be written.
@@ -140,15 +118,7 @@ def run_logged(
 
 
 class _LoggedRun:
-    """A run while it is going on.
-
-    Args:
-        plan: The plan.
-        bridge: The bridge built from it.
-        endpoint: Port and clock.
-        folder: Folder of the run, with its inputs in it.
-        control: How the run is ended and followed.
-    """
+    """A run while it is going on; its folder has the inputs in it."""
 
     def __init__(
         self, plan: Plan, bridge: Bridge, endpoint: Endpoint, folder: Path, control: RunControl
@@ -177,7 +147,6 @@ class _LoggedRun:
         self._ticks, self._shown_ns, self._status = 0, 0, "failed"
 
     def run(self, trace: Trace | None) -> None:
-        """Run until the end."""
         plan, endpoint, clock = self._plan, self._endpoint, self._endpoint.clock
         informed = InformedPort(endpoint.port, self._log, self._timing)
         source: Port = informed
@@ -197,11 +166,9 @@ class _LoggedRun:
         self._status = "safe" if self._state.mode is Mode.SAFE else "done"
 
     def close(self) -> None:
-        """Close the log with how the run ended."""
         self._log.close(self._ending)
 
     def outcome(self) -> Ended:
-        """How the run ended."""
         return Ended(
             self._folder,
             self._state,
@@ -218,22 +185,16 @@ class _LoggedRun:
     ) -> None:
         """Log a tick and show it."""
         self._log.add(received, sent, step)
-        self._reports.note(step.t_ns, result.device_faults)
+        t_ns = step.t_ns
+        self._reports.note(t_ns, result.device_faults)
         self._ticks += 1
-        self._control.progress(step.t_ns, result.output.mode)
-        if step.t_ns >= self._shown_ns:
-            self._shown_ns = step.t_ns + SHOWN_EVERY_NS
+        self._control.progress(t_ns, result.output.mode)
+        if t_ns >= self._shown_ns:
+            self._shown_ns = t_ns + SHOWN_EVERY_NS
             is_paced = self._endpoint.granted is not None
             late_ns = int(self._timing.extremes_ns[0]) if is_paced else None
             self._control.watch(
-                Look(
-                    step.t_ns,
-                    self._ticks,
-                    result.output,
-                    result.counts,
-                    late_ns,
-                    result.device_faults,
-                )
+                Look(t_ns, self._ticks, result.output, result.counts, late_ns, result.device_faults)
             )
 
     def _changes(self, around: contextlib.ExitStack) -> Changes:

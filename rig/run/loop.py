@@ -17,12 +17,7 @@ from rig.run.timing import BINS, Timing
 
 
 class Tick(Struct, frozen=True, gc=False):
-    """A tick that is due.
-
-    Attributes:
-        t_ns: Its time.
-        overruns: Ticks missed before it.
-    """
+    """A tick that is due, and how many were missed before it."""
 
     t_ns: int
     overruns: int
@@ -51,16 +46,7 @@ SHOWN_EVERY_NS = 200_000_000
 
 
 class Look(NamedTuple):
-    """A look at a run.
-
-    Attributes:
-        t_ns: Time of the tick.
-        ticks: How many there have been with it.
-        output: What it published.
-        counts: What has been counted since the start.
-        late_ns: Largest lateness so far; None where nothing waits for a clock.
-        device_faults: Indices of the devices that are at fault, and their faults.
-    """
+    """A look at a run after a number of ticks; without a clock there is no lateness."""
 
     t_ns: int
     ticks: int
@@ -110,13 +96,6 @@ def regular_ticks(
     """Ticks on a grid of absolute deadlines; missed ones are skipped and counted.
 
     The first one is the next after now: what had to be set up before it makes no tick late.
-
-    Args:
-        clock: The clock.
-        period_ns: Time between two ticks.
-        count: Number of ticks of the grid from the first one on; without end if None.
-        stop: Asked before each tick whether to end.
-        timing: Where lateness and work are written.
     """
     # A number is written through a view of the memory in half the time it takes in the array.
     lateness, work = timing.lateness.data, timing.work.data
@@ -155,19 +134,9 @@ def run(
     columns: LogColumns,
     changes: Changes = no_changes,
 ) -> BridgeState:
-    """Run the bridge over ticks.
+    """Run the bridge over ticks, from a state on; gives the state at the end.
 
-    Args:
-        bridge: The bridge.
-        state: Where it starts.
-        ticks: When.
-        port: Where frames come from and go to.
-        sink: Where the record of every tick goes.
-        columns: What the log keeps of a tick.
-        changes: Asked at every tick for another bridge from there on.
-
-    Returns:
-        The state at the end.
+    The record of every tick goes to `sink`; `changes` may give another bridge from a tick on.
     """
     for tick in ticks:
         bridge = changes(tick.t_ns) or bridge

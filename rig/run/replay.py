@@ -35,15 +35,7 @@ _NO_CONDITIONS = Conditions()
 
 @dataclass(frozen=True)
 class Replay:
-    """A run computed again from its log.
-
-    Attributes:
-        steps: Every step, as an Arrow table like that of the log.
-        logged: Number of steps in the log.
-        different: Number of them that differ from the steps computed here in any bit.
-        first_different_ns: Time of the first that differs.
-        refused_frames: Frames refused in the replay.
-    """
+    """A run computed again from its log, and how many of its steps differ in any bit."""
 
     steps: pa.Table
     logged: int
@@ -54,14 +46,7 @@ class Replay:
 
 @dataclass(frozen=True)
 class LoggedTicks:
-    """Ticks of a run, with what the loop knew at each; all of shape (ticks,).
-
-    Attributes:
-        t_ns: Time.
-        overruns: Ticks missed before it.
-        received: Frames received.
-        flags: Conditions, as in the log.
-    """
+    """Ticks of a run, with what the loop knew at each; all of shape (ticks,)."""
 
     t_ns: NDArray[np.int64]
     overruns: NDArray[np.int64]
@@ -74,10 +59,7 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
 
     Ticks whose steps a kill took are those of the rate, up to the last frame.
 
-    Args:
-        folder: Folder of the run.
-        plan: Another plan to replay with, such as one with a corrected model or other gains.
-        progress: Called with the time and mode of every tick.
+    `plan` may be another one, such as one with a corrected model or other gains.
 
     Raises:
         InputError: The run is damaged.
@@ -125,11 +107,7 @@ class _LogPort:
         self._current: tuple[Sequence[Frame], Conditions] = (), _NO_CONDITIONS
 
     def ticks(self, end_part: Callable[[], None]) -> Iterator[Tick]:
-        """The ticks, in parts whose frames are in memory at once.
-
-        Args:
-            end_part: Called after the last tick of each part.
-        """
+        """The ticks, in parts whose frames are in memory at once; each part has an end."""
         logged = self._ticks
         begins = np.concatenate([[0], np.cumsum(logged.received)])
         for first in range(0, len(logged.t_ns), _TICKS_AT_ONCE):

@@ -77,11 +77,7 @@ class _Busy(Protocol):
 
 
 class Trace:
-    """Keeps the rows of ticks that were late.
-
-    Args:
-        period_ns: Time between two ticks.
-    """
+    """Keeps the rows of ticks that were late."""
 
     def __init__(self, period_ns: int) -> None:
         self.rows: list[TraceRow] = []
@@ -102,12 +98,7 @@ class Trace:
         return _TracedClock(clock, self)
 
     def port(self, port: Port, log: _Busy) -> Port:
-        """The port, with marks.
-
-        Args:
-            port: The port.
-            log: The run's log.
-        """
+        """The port, with marks, and the run's log."""
         self._log = log
         return _TracedPort(port, self)
 
