@@ -53,9 +53,7 @@ class Argument(NamedTuple):
     """What an argument of a law stands for.
 
     Attributes:
-        name: Its name.
         origin: Values among which it is found; `rates` is where the law writes.
-        first: Index there.
         size: Number of values from there that form a row; None for a single one.
     """
 

@@ -42,10 +42,6 @@ def withdraw(content: bytes) -> None:
 def require_admission(content: bytes, path: Path) -> None:
     """Refuse a program that this user never admitted.
 
-    Args:
-        content: The program.
-        path: Its name in an error.
-
     Raises:
         ModelError: It was not admitted, or the user's settings cannot be read.
     """

@@ -17,13 +17,7 @@ _MOST_STEPS = 10_000
 
 
 class _StrutRow(NamedTuple, Generic[Value]):
-    """A strut in one configuration: ``height = offset + row @ q``.
-
-    Attributes:
-        strut: The strut.
-        offset_m: Its offset.
-        row: Its row of the Jacobian.
-    """
+    """A strut in one configuration: ``height = offset + row @ q``."""
 
     strut: Strut
     offset_m: float
@@ -34,7 +28,6 @@ class _Configuration(NamedTuple, Generic[Value]):
     """The struts and the applied force in one configuration.
 
     Attributes:
-        struts: The struts.
         applied: Generalised force per newton of applied force.
     """
 
@@ -43,13 +36,7 @@ class _Configuration(NamedTuple, Generic[Value]):
 
 
 class EquationsOfMotion(Generic[Value]):
-    """Equations of motion of a model, over time.
-
-    Args:
-        backend: Its coordinates and their dynamics.
-        struts: Its struts.
-        geometry: Their heights and Jacobians.
-    """
+    """Equations of motion of a model, over time."""
 
     def __init__(
         self, backend: Backend[Value], struts: Sequence[Strut], geometry: Geometry
@@ -81,7 +68,7 @@ class EquationsOfMotion(Generic[Value]):
         applied_force_n: float,
         temperature_c: float,
     ) -> Loaded:
-        """Let forces act on a state; arguments as of `DartPlant.load`."""
+        """Let forces act on a state."""
         backend, internal, t_s = self._backend, state.internal, state.t_s
         q, v = backend.value(state.positions), backend.value(state.velocities)
         struts, applied = self._constant or self._at(q)

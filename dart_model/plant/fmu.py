@@ -39,13 +39,7 @@ class MockUp:
     Its result depends on its arguments alone as long as the FMU has no state but its continuous
     states; one that declares others is refused.
 
-    Args:
-        spec: The file, and the meaning of its variables for a strut.
-        folder: Where the file lies.
-        gravity_m_per_s2: Standard gravity.
-
     Attributes:
-        name: Its name in messages.
         state_scales: Usual size of each internal state: a continuous state less its start.
 
     Raises:
@@ -276,10 +270,6 @@ def read_program(path: Path) -> bytes:
 
 def read_description(content: bytes, path: Path) -> Any:
     """Description of an FMU, as FMPy reads it; nothing of it is executed.
-
-    Args:
-        content: The FMU.
-        path: Its name in an error.
 
     Raises:
         ModelError: It is no FMU, or FMPy is not installed.

@@ -84,7 +84,6 @@ class Geometry:
     is the distance of its ends.
 
     Args:
-        spec: The model.
         skeleton: Its bodies and joints in DART; their positions and velocities are overwritten by
             every call.
 
@@ -236,13 +235,7 @@ def sample_positions(coordinates: int) -> list[Array]:
 
 
 def _guide(model: str, strut: StrutSpec, columns: Array) -> Array:
-    """Direction of a strut whose ends move along one straight line, shape (3,), else NaN.
-
-    Args:
-        model: Name of the model.
-        strut: The strut.
-        columns: Its gap's derivatives by the coordinates, in many configurations, shape (3, m).
-    """
+    """Direction (3,) of a strut on a straight line, else NaN; by its gap's derivatives (3, m)."""
     directions, singular, _ = np.linalg.svd(columns)
     if singular[0] < 1e-9:
         raise ModelError(

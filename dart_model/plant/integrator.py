@@ -52,9 +52,6 @@ class Course(Struct, frozen=True, gc=False):
     """Steps of equal length, and the input during them.
 
     Attributes:
-        t_s: Time at the beginning.
-        duration_s: Duration of all steps.
-        steps: Number of steps.
         inputs: Input at the beginning and at the end; it is linear in between.
     """
 
@@ -71,18 +68,7 @@ def advance(
     first: tuple[Value, Sequence[float]],
     course: Course,
 ) -> tuple[Value, Value, Internal]:
-    """State after a number of equal steps.
-
-    Args:
-        slope: The differential equation.
-        move: How rates move coordinates; ``q + h * v`` where coordinates add up.
-        start: Coordinates, their rates and internal states at the beginning.
-        first: The slope there.
-        course: Steps and input.
-
-    Returns:
-        Coordinates, rates and internal states at the end.
-    """
+    """Coordinates, rates and internal states after equal steps from a start with slope `first`."""
     (q, v, internal), (a1, rates1) = start, first
     t_s, steps = course.t_s, course.steps
     given, end = course.inputs
@@ -127,13 +113,7 @@ def propagate(internal: Internal, h: float, rates: Sequence[float]) -> Internal:
 
 
 class Linearised(NamedTuple):
-    """A bench about one configuration: ``mass @ q'' + damping @ q' + stiffness @ q = 0``.
-
-    Attributes:
-        mass: Shape (n, n).
-        damping: Shape (n, n).
-        stiffness: Shape (n, n).
-    """
+    """A bench about one configuration: ``mass @ q'' + damping @ q' + stiffness @ q = 0``, (n, n)."""
 
     mass: Array
     damping: Array

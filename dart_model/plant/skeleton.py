@@ -23,8 +23,6 @@ class Skeleton(NamedTuple):
     """Bodies and joints in DART.
 
     Attributes:
-        dart: DART's skeleton.
-        bodies: Its bodies by name.
         loaded: Body on which the applied force acts.
     """
 

@@ -26,9 +26,6 @@ class _Part(NamedTuple):
 
     Attributes:
         name: What it is called in messages.
-        force: Its force, N.
-        rates: Rates of its internal states.
-        parameters: Its parameters in their order.
         first: Index of its first internal state in the model's.
         end: Index after its last one.
     """
@@ -45,10 +42,8 @@ class Strut:
     """Force of a strut over height, velocity and internal states.
 
     Args:
-        spec: The strut.
         first_state: Index of its first internal state in the model's.
         gravity_m_per_s2: Standard gravity, for laws that carry a mass.
-        folder: Where an FMU is looked for.
     """
 
     def __init__(

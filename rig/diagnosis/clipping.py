@@ -30,7 +30,6 @@ class Plateaus(NamedTuple):
 
     Attributes:
         extreme: `lowest` or `highest`.
-        limit: The value there.
         firsts: First sample of each plateau, shape (P,).
         lengths: Samples of each plateau, shape (P,).
     """

@@ -111,13 +111,7 @@ def _error(evaluations: Sequence[RunEvaluation]) -> float:
 
 
 class _Search(NamedTuple):
-    """A search, before its conclusion.
-
-    Attributes:
-        first: Models about the linear model.
-        last: Models to choose from.
-        first_round: Single laws together with the linear model, where there was such a round.
-    """
+    """A search: models about the linear model, then models to choose from."""
 
     first: Pool
     last: Pool

@@ -21,10 +21,7 @@ class OwnParameter(NamedTuple):
     """A parameter of a model.
 
     Attributes:
-        strut: Its strut.
         effect: Its effect in the catalogue; empty for the linear part.
-        parameter: Its name, with the unit.
-        estimate: Its value with a 95 % interval.
     """
 
     strut: str
@@ -34,14 +31,7 @@ class OwnParameter(NamedTuple):
 
 
 def refit_parameters(spec: ModelSpec, runs: Sequence[Recording]) -> list[OwnParameter]:
-    """The parameters of a model with its given laws, fitted to recordings.
-
-    Args:
-        spec: The model.
-        runs: Recordings.
-
-    Returns:
-        The parameters of the linear part that are identifiable, and all of the effects.
+    """Identifiable linear parameters and all effects' parameters, fitted to recordings.
 
     Raises:
         RecordingError: A recording or the model cannot be used.

@@ -62,12 +62,7 @@ _TEN_POINTERS = types.UniTuple(_POINTER, SLOTS)
 
 
 class Laws(NamedTuple):
-    """Laws as machine code.
-
-    Attributes:
-        forces: Their forces, a typed list.
-        rates: Rates of their internal states, likewise.
-    """
+    """Laws as machine code."""
 
     forces: Forces
     rates: Rates
@@ -144,13 +139,7 @@ def compile_law(name: str) -> None:
 
 
 class Slot(NamedTuple):
-    """Where a placed effect reads its values.
-
-    Attributes:
-        strut: Index of its strut.
-        parameters: Its part of all parameters.
-        states: Its part of all internal states.
-    """
+    """Where a placed effect reads its values: its part of all parameters and internal states."""
 
     strut: int
     parameters: slice
@@ -161,8 +150,6 @@ class Placement(NamedTuple):
     """Where the laws of a simulation are, each of shape (effects,).
 
     Attributes:
-        struts: Index of the strut.
-        first_parameters: Index of the first parameter among all.
         first_states: Index of the first internal state among all; -1 if it has none.
     """
 
@@ -176,9 +163,6 @@ class Slots(NamedTuple):
 
     Attributes:
         laws: Their laws, filled up to `SLOTS`.
-        placement: Where they are, for the compiled loops.
-        each: The same, one by one.
-        states: Number of internal states of all.
     """
 
     laws: Laws
@@ -292,9 +276,7 @@ class Steps(NamedTuple):
     """How finely a simulation steps.
 
     Attributes:
-        substeps: Steps between nodes.
         bend: Share by which a smooth acceleration bends within one.
-        stroke_m: Stroke of the recordings.
     """
 
     substeps: int
@@ -314,11 +296,8 @@ class Model(NamedTuple):
     """A model as it is simulated.
 
     Attributes:
-        placement: Where the laws of its effects are.
-        parameters: Their parameters, one after another.
         struts: Constants of the struts, shape (struts, 5): free length, stiffness,
             damping, gravity and preload.
-        equations: Its equations of motion.
     """
 
     placement: Placement
@@ -332,14 +311,7 @@ class _Span(NamedTuple):
 
     Attributes:
         before: Index of the node before in the equations' tables.
-        after: Index of the node after.
-        gap_s: Time between the nodes.
-        first_s: Time of the node before.
-        step_s: Duration of the step.
-        step: Number of steps between that node and this one.
-        steps: Number of steps between the nodes.
         applied_n: Applied force at the beginning, the middle and the end of the step.
-        temperature_c: Temperature at the node before.
         warming_k: Change of the temperature from node to node.
     """
 
@@ -360,13 +332,7 @@ class _Work(NamedTuple):
 
     Attributes:
         x: Coordinates, their rates and internal states there, shape (2 n + states,).
-        slope: Derivative of `x`.
-        q: Reference coordinates there, shape (n,).
-        v: Their rates, shape (n,).
         general: Generalised force, shape (n,).
-        heights_m: Strut heights, shape (struts,).
-        velocities: Their rates, m/s, shape (struts,).
-        forces_n: Strut forces, shape (struts,).
     """
 
     x: Array
@@ -384,8 +350,6 @@ class _Step(NamedTuple):
 
     Attributes:
         x: Where the step has come to, shape (2 n + states,).
-        began: Where it began.
-        total: Weighted slopes.
         twist: Second difference of the accelerations, shape (n,).
     """
 
@@ -399,12 +363,7 @@ class _Calls(NamedTuple):
     """The laws of a simulation with pointers to what each reads and writes, `SLOTS` of each.
 
     Attributes:
-        forces: Forces.
-        rates: Rates of the internal states.
-        states: Pointers to the internal states.
         slopes: Pointers to where their rates are written.
-        parameters: Pointers to the parameters.
-        struts: Pointers to the constants of the strut.
     """
 
     forces: tuple[ForceOverArrays, ...]
@@ -419,13 +378,7 @@ class _Instant(NamedTuple):
     """A time between two nodes.
 
     Attributes:
-        before: Index of the node before in the equations' tables.
-        after: Index of the node after.
-        gap_s: Time between the nodes.
         share: Share of it that has passed.
-        t_s: The time.
-        applied_n: Applied force.
-        temperature_c: Temperature.
     """
 
     before: int
@@ -754,14 +707,10 @@ _simulate = compile_loop(
 
 
 def simulate(laws: Laws, model: Model, scenario: Scenario, steps: Steps, out: Trajectory) -> bool:
-    """Free-run simulation by the classical Runge-Kutta method; whether the motion stayed finite.
+    """Free-run simulation, written to `out`, by the classical Runge-Kutta method.
 
-    Args:
-        laws: Laws of the model's effects, `SLOTS` of them.
-        model: The model.
-        scenario: Start and inputs.
-        steps: How finely to step.
-        out: Where the motion is written.
+    Returns:
+        Whether the motion stayed finite.
     """
     parts = (tuple(model.placement), model.parameters, model.struts, tuple(model.equations))
     return _simulate(*laws, parts, tuple(scenario), steps[:], tuple(out))
@@ -781,8 +730,6 @@ class LawValues(NamedTuple):
     """What a law along a motion reads.
 
     Attributes:
-        parameters: Its parameters.
-        strut: Constants of its strut.
         start: Internal states at the beginning.
     """
 
@@ -837,14 +784,7 @@ _along = compile_loop(_along, types.void(_FORCES, _RATES, _VALUES, _MOTION, _I8,
 
 
 def force_along(name: str, values: LawValues, motion: StrutMotion, substeps: int) -> Array:
-    """Force (N,) of the law of an effect along a known motion.
-
-    Args:
-        name: Name of the effect.
-        values: What the law reads.
-        motion: The motion.
-        substeps: Steps of the internal states between two samples.
-    """
+    """Force (N,) of an effect along a motion; internal states take `substeps` steps a sample."""
     out = np.empty(len(motion.t_s))
     _along(*_laws((name,)), tuple(values), tuple(motion), substeps, out)
     return out

@@ -47,7 +47,6 @@ class Noise(NamedTuple):
     """Noise and smoothness of a signal.
 
     Attributes:
-        variance: Variance of the sensor's noise.
         ratio: Intensity of the random walk over that variance.
     """
 
@@ -203,12 +202,7 @@ _smooth_c = compile_loop(_smooth, types.void(_V, _F8, _M, _T3))
 
 
 def estimate_noise(t_s: Array, y: Array) -> Noise:
-    """Sensor noise and random walk of a signal, by maximum likelihood.
-
-    Args:
-        t_s: Times, shape (N,).
-        y: Signal, NaN where missing, shape (N,).
-    """
+    """Sensor noise and random walk of a signal (N,), NaN where missing, by maximum likelihood."""
     n = len(t_s)
     if n > _LONGEST_FOR_LIKELIHOOD:
         # A third from each part of the recording determines the noise as well as the whole.
@@ -249,13 +243,7 @@ def estimate_noise(t_s: Array, y: Array) -> Noise:
 
 
 def smooth(t_s: Array, y: Array, noise: Noise) -> Smoothed:
-    """Smooth a signal over its whole length.
-
-    Args:
-        t_s: Times, shape (N,).
-        y: Signal, NaN where missing, shape (N,).
-        noise: From `estimate_noise`.
-    """
+    """Smooth a signal (N,), NaN where missing, over its whole length."""
     n = len(t_s)
     means, covariances, out = np.empty((n, _ORDER)), np.empty((n, _ORDER, _ORDER)), np.empty(3)
     t = np.ascontiguousarray(t_s)

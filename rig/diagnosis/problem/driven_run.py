@@ -40,13 +40,9 @@ class DrivenRun(NamedTuple):
     """A recording as it is simulated.
 
     Attributes:
-        grid: Its nodes.
         applied_n: Applied force at the nodes, shape (N,).
         fine_n: Applied force at half sub-steps, shape (2 * substeps * (N - 1) + 1,).
-        substeps: Steps of the integrator between nodes.
         angle: Angle by which the fastest motion turns within such a step.
-        mechanism: Constant, or along this recording's motion.
-        cells: Load cells, where there are any: to evaluate on.
     """
 
     grid: RecordingGrid
@@ -92,12 +88,7 @@ def driven_run(
 ) -> DrivenRun:
     """A recording ready to be simulated; the applied force as a cubic spline between its samples.
 
-    Args:
-        grid: Its nodes.
-        applied: Times and values of the applied force.
-        mechanism: The mechanism.
-        fastest: Largest eigenvalue of the model by size, in rad/s.
-        cells: Load cells, where there are any.
+    `applied` are times and values of that, `fastest` is the model's largest eigenvalue in rad/s.
     """
     usual = grid.step_s
     substeps = max(1, int(np.ceil(usual / min(_LONGEST_STEP_S, _STEP_ANGLE / fastest) - 1e-9)))

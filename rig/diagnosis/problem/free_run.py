@@ -18,14 +18,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from dart_model.effects import Bench
 from dart_model.spec import ModelSpec
-from rig.diagnosis.numerics.compiled import (
-    Equations,
-    Model,
-    Scenario,
-    Steps,
-    Trajectory,
-    simulate,
-)
+from rig.diagnosis.numerics.compiled import Equations, Model, Scenario, Steps, Trajectory, simulate
 from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise
 from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem import linear_part, on_dart, track
@@ -88,8 +81,6 @@ class _Reference(NamedTuple):
     """A simulated recording that the regression along the motion is about.
 
     Attributes:
-        run: The recording.
-        motion: Its free run.
         residual: Measured less simulated heights, smoothed, one entry a strut.
     """
 
@@ -113,7 +104,6 @@ class FreeRunProblem(Problem):
     """A model held against recordings of a force-driven bench.
 
     Attributes:
-        runs: The recordings.
         noise_m: Standard deviation of each height's noise, shape (struts,).
     """
 
@@ -450,11 +440,7 @@ class FreeRunProblem(Problem):
         )
 
     def _cell_errors(
-        self,
-        k: int,
-        models: ComparedModels,
-        motions: tuple[Trajectory, Trajectory],
-        rows: Flags,
+        self, k: int, models: ComparedModels, motions: tuple[Trajectory, Trajectory], rows: Flags
     ) -> BeforeAfter | None:
         """Errors against the load cell where it is evaluated, the models in free run."""
         run = self.runs[k]

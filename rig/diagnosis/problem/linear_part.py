@@ -52,14 +52,7 @@ EFFECTS = {
 def linear_parameters(
     spec: ModelSpec, bench: Bench, motions: Sequence[Motion], mechanism: LinearisedMechanism
 ) -> tuple[LinearParameter, ...]:
-    """Linear parameters of a model that a bench can show, with their priors.
-
-    Args:
-        spec: The nominal model.
-        bench: Kind of bench.
-        motions: What each strut did.
-        mechanism: For the masses, and for whether the applied force acts along a strut.
-    """
+    """Linear parameters of a model that a bench can show, with their priors."""
     parameters: list[LinearParameter] = []
     for i, (strut, motion) in enumerate(zip(spec.struts, motions, strict=True)):
         stiffness, damping = strut.stiffness_n_per_m, strut.damping_n_s_per_m
@@ -138,10 +131,7 @@ def with_linear_changes(
 
 
 def spec_with_linear_changes(
-    spec: ModelSpec,
-    linear: Sequence[LinearParameter],
-    changes: Array,
-    motions: Sequence[Motion],
+    spec: ModelSpec, linear: Sequence[LinearParameter], changes: Array, motions: Sequence[Motion]
 ) -> ModelSpec:
     """The model with its linear part changed: in the field of the file where there is one."""
     for parameter, change in zip(linear, changes, strict=True):

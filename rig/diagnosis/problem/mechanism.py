@@ -63,14 +63,7 @@ class LinearisedMechanism(NamedTuple):
         return self if len(self.q) == 1 else LinearisedMechanism(*(part[nodes] for part in self))
 
     def strut_forces_of_motion(self, z: Array, w: Array, a: Array, applied_n: Array) -> Array:
-        """Strut forces that a motion takes, shape (N, struts).
-
-        Args:
-            z: Heights, shape (N, struts).
-            w: Their rates.
-            a: Their accelerations.
-            applied_n: Applied force, shape (N,).
-        """
+        """Strut forces that heights, their rates and accelerations take, each (N, struts)."""
         every = np.arange(len(z)) if len(self.q) > 1 else np.zeros(len(z), dtype=np.int64)
         jacobian, mass = self.jacobian[every], self.mass[every]
         q = (
@@ -97,7 +90,6 @@ class MechanismPlants(NamedTuple):
 
     Attributes:
         plain: The model without effects other than inertia.
-        heavier: One for each strut.
     """
 
     plain: DartPlant
@@ -139,13 +131,7 @@ def mechanism_along(plants: MechanismPlants, motion: Track) -> LinearisedMechani
 def _with_mockups(
     mechanism: LinearisedMechanism, plant: DartPlant, motion: Track
 ) -> LinearisedMechanism:
-    """The mechanism with the forces of FMUs, along a motion and linear about it.
-
-    Args:
-        mechanism: Without them, constant or along the motion.
-        plant: The model.
-        motion: The measured motion, with the applied force; N nodes.
-    """
+    """The mechanism with the forces of FMUs, along a motion and linear about it."""
     if not any(plant.mockups):
         return mechanism
     nodes = len(motion.t_s)
@@ -177,12 +163,7 @@ def constant_mechanism(plants: MechanismPlants) -> LinearisedMechanism:
 def tabulate_mechanism(
     plants: MechanismPlants, heights_m: Array, velocities_m_per_s: Array
 ) -> LinearisedMechanism:
-    """The mechanism along a motion.
-
-    Args:
-        plants: DART.
-        heights_m: Heights at the nodes, without gaps, shape (N, struts).
-        velocities_m_per_s: Their rates, shape (N, struts).
+    """The mechanism along heights without gaps and their rates, shape (N, struts).
 
     Raises:
         InputError: The joints cannot reach the heights.

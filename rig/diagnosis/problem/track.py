@@ -70,15 +70,9 @@ def pieces(nodes: int, samples: int, most: int, largest_stride: int) -> list[sli
 def law_force(
     track: Track, strut: int, name: str, values: Array, constants: Array, state: Array = _NO_STATE
 ) -> Array:
-    """Force (N,) of a law along a motion.
+    """Force (N,) of a law along a motion, from an internal state (zero if absent) on.
 
-    Args:
-        track: The motion.
-        strut: Index of the strut.
-        name: Name of the effect.
-        values: Its parameters.
-        constants: Free length, stiffness, damping and gravity of all struts, shape (struts, 4...).
-        state: Internal state at the beginning; at zero if absent.
+    `constants` are free length, stiffness, damping and gravity of all struts, shape (struts, 4...).
     """
     start = state if len(state) else np.zeros(effect(name).state_size)
     motion = StrutMotion(
@@ -90,11 +84,7 @@ def law_force(
 
 
 def linear_forces(tracks: Sequence[Track], strut: int) -> Array:
-    """An orthonormal basis of a strut's linear forces along motions one after another.
-
-    Returns:
-        Of a constant force, a spring's and a damper's, shape (N, 3).
-    """
+    """An orthonormal basis (N, 3) of constant, spring and damper force along motions in a row."""
     heights_m = np.concatenate([track.heights_m[strut] for track in tracks])
     velocities = np.concatenate([track.velocities_m_per_s[strut] for track in tracks])
     columns = np.column_stack([np.ones_like(heights_m), heights_m, velocities])
@@ -111,12 +101,7 @@ def segment_forces(
 ) -> list[Array]:
     """Force (N,) of a law along each segment; internal states come from the whole recordings.
 
-    Args:
-        segments: The segments.
-        strut_effect: Index of the strut, and name of the effect.
-        values: Its parameters.
-        constants: Strut constants.
-        reference: Along the reference's motion, not the measured one.
+    It is taken along the reference's motion or along the measured one.
     """
     strut, name = strut_effect
     forces: list[Array] = []

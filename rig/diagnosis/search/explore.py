@@ -31,12 +31,7 @@ _EXPLORED = 0.85
 
 
 class FirstRound(NamedTuple):
-    """Single laws together with the linear part, along the motion.
-
-    Attributes:
-        nothing: No law at all.
-        screenings: The laws, best first.
-    """
+    """Single laws with the linear part along the motion, best first, and no law at all."""
 
     nothing: Screening
     screenings: tuple[Screening, ...]
