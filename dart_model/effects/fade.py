@@ -1,11 +1,11 @@
 """A damper that loses its damping as it warms up, or with time or work."""
 
 import math
+from functools import partial
 
 from dart_model.effects.law import Effect, Motion, Parameter, Start, State
 from dart_model.effects.ranges import grid, moving, within
 
-_FAMILY = "fade"
 _REFERENCE = "Dixon, The Shock Absorber Handbook (2007), 7.12, temperature effects"
 _FINAL = Parameter("final_fraction", "", 0.0, 3.0, "share of the damping that stays")
 _COLD = Parameter("reference_c", "°C", -273.15, 2000.0, "temperature with full damping")
@@ -126,9 +126,10 @@ def _energies(motion: Motion) -> tuple[float, float]:
     return 0.01 * _work_j(motion), 10.0 * _work_j(motion)
 
 
-TEMPERATURE_FADE = Effect(
+_fade = partial(Effect, family="fade", reference=_REFERENCE, simpler=("linear_damping",), scaled=())
+
+TEMPERATURE_FADE = _fade(
     name="temperature_fade",
-    family=_FAMILY,
     words="fade of the damper with temperature",
     parameters=(
         Parameter("fraction_per_k", "1/K", -0.2, 0.2, "share of the damping lost per kelvin"),
@@ -136,34 +137,29 @@ TEMPERATURE_FADE = Effect(
     ),
     force=_temperature,
     excitation="a measured temperature that changes by several kelvin",
-    reference=_REFERENCE,
-    scaled=(),
     starts=_temperature_starts,
     bounds=within(reference_c=_standard),
     simpler=("linear_damping", "linear_temperature_fade"),
     shown=("fraction_per_k",),
 )
 
-LINEAR_TEMPERATURE_FADE = Effect(
+LINEAR_TEMPERATURE_FADE = _fade(
     name="linear_temperature_fade",
-    family=_FAMILY,
     words="fade of the damper with temperature (linear)",
     parameters=(
         Parameter("fraction_per_k", "1/K", -0.2, 0.2, "share of the damping lost per kelvin"),
         _COLD,
     ),
     force=_linear_temperature,
+    scaled=(0,),
     excitation="a measured temperature that changes by several kelvin",
-    reference=_REFERENCE,
     starts=_linear_temperature_starts,
     bounds=within(reference_c=_standard),
-    simpler=("linear_damping",),
     shown=("fraction_per_k",),
 )
 
-TIME_FADE = Effect(
+TIME_FADE = _fade(
     name="time_fade",
-    family=_FAMILY,
     words="fade of the damper with time",
     parameters=(
         _FINAL,
@@ -171,17 +167,13 @@ TIME_FADE = Effect(
     ),
     force=_time,
     excitation="a long run with the same motion at its beginning and end",
-    reference=_REFERENCE,
-    scaled=(),
     starts=_time_starts,
     bounds=within(time_constant_s=lambda m: (0.01 * m.duration_s, 10.0 * m.duration_s)),
-    simpler=("linear_damping",),
     shown=("final_fraction",),
 )
 
-ENERGY_FADE = Effect(
+ENERGY_FADE = _fade(
     name="energy_fade",
-    family=_FAMILY,
     words="fade of the damper with dissipated energy",
     parameters=(
         _FINAL,
@@ -189,12 +181,9 @@ ENERGY_FADE = Effect(
     ),
     force=_energy,
     excitation="a long run with the same motion at its beginning and end",
-    reference=_REFERENCE,
     rate=_energy_rate,
-    scaled=(),
     states=(State("work_j", 1.0),),
     starts=_energy_starts,
     bounds=within(energy_j=_energies),
-    simpler=("linear_damping",),
     shown=("final_fraction",),
 )

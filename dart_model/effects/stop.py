@@ -1,5 +1,7 @@
 """End stops, which push but never pull."""
 
+from functools import partial
+
 from dart_model.effects.law import Effect, Motion, Parameter, Start
 from dart_model.effects.ranges import (
     Starts,
@@ -12,7 +14,6 @@ from dart_model.effects.ranges import (
     within,
 )
 
-_FAMILY = "stop"
 _CONTACT = Parameter("contact_height_m", "m", -1e4, 1e4, "height at which the stop is touched")
 _BUMP = "heights below the bump stop's contact, several times"
 _REBOUND = "heights above the rebound stop's contact, several times"
@@ -229,9 +230,10 @@ _POWER = (
     Parameter("dissipation_s_per_m", "s/m", 0.0, 1e12, "dissipation by closing speed"),
 )
 
-BUMP_STOP = Effect(
+_stop = partial(Effect, family="stop", scaled=(1,))
+
+BUMP_STOP = _stop(
     name="bump_stop",
-    family=_FAMILY,
     words="a bump stop",
     parameters=_LINEAR,
     force=_bump,
@@ -243,9 +245,8 @@ BUMP_STOP = Effect(
     shown=("contact_height_m", "stiffness_n_per_m"),
 )
 
-REBOUND_STOP = Effect(
+REBOUND_STOP = _stop(
     name="rebound_stop",
-    family=_FAMILY,
     words="a rebound stop",
     parameters=_LINEAR,
     force=_rebound,
@@ -257,67 +258,58 @@ REBOUND_STOP = Effect(
     shown=("contact_height_m", "stiffness_n_per_m"),
 )
 
-HERTZ_BUMP_STOP = Effect(
+HERTZ_BUMP_STOP = _stop(
     name="hertz_bump_stop",
-    family=_FAMILY,
     words="a bump stop (Hertzian contact)",
     parameters=_HERTZ,
     force=_hertz_bump,
     excitation=_BUMP,
     reference=_HUNT_CROSSLEY,
-    scaled=(1,),
     starts=_hertz_starts(0.04, 0.1, 0.16, 0.24, 0.36),
     bounds=within(contact_height_m=_TOUCHED_BELOW, dissipation_s_per_m=dissipation),
     shown=("contact_height_m",),
 )
 
-HERTZ_REBOUND_STOP = Effect(
+HERTZ_REBOUND_STOP = _stop(
     name="hertz_rebound_stop",
-    family=_FAMILY,
     words="a rebound stop (Hertzian contact)",
     parameters=_HERTZ,
     force=_hertz_rebound,
     excitation=_REBOUND,
     reference=_HUNT_CROSSLEY,
-    scaled=(1,),
     starts=_hertz_starts(0.96, 0.9, 0.84, 0.76, 0.64),
     bounds=within(contact_height_m=_TOUCHED_ABOVE, dissipation_s_per_m=dissipation),
     shown=("contact_height_m",),
 )
 
-POWER_BUMP_STOP = Effect(
+POWER_BUMP_STOP = _stop(
     name="power_bump_stop",
-    family=_FAMILY,
     words="a bump stop (power law, as rubber)",
     parameters=_POWER,
     force=_power_bump,
     excitation=_BUMP,
     reference=_HUNT_CROSSLEY,
-    scaled=(1,),
     starts=_power_starts(0.05, 0.15, 0.3),
     bounds=within(contact_height_m=_TOUCHED_BELOW, dissipation_s_per_m=dissipation),
     simpler=("bump_stop", "hertz_bump_stop"),
     shown=("contact_height_m", "force_at_10_mm_n"),
 )
 
-POWER_REBOUND_STOP = Effect(
+POWER_REBOUND_STOP = _stop(
     name="power_rebound_stop",
-    family=_FAMILY,
     words="a rebound stop (power law, as rubber)",
     parameters=_POWER,
     force=_power_rebound,
     excitation=_REBOUND,
     reference=_HUNT_CROSSLEY,
-    scaled=(1,),
     starts=_power_starts(0.95, 0.85, 0.7),
     bounds=within(contact_height_m=_TOUCHED_ABOVE, dissipation_s_per_m=dissipation),
     simpler=("rebound_stop", "hertz_rebound_stop"),
     shown=("contact_height_m", "force_at_10_mm_n"),
 )
 
-END_STOPS = Effect(
+END_STOPS = _stop(
     name="end_stops",
-    family=_FAMILY,
     words="a bump stop and a rebound stop",
     parameters=(_LOW, _HIGH, *_LINEAR[1:]),
     force=_ends,
@@ -330,9 +322,8 @@ END_STOPS = Effect(
     shown=("low_contact_height_m", "high_contact_height_m", "stiffness_n_per_m"),
 )
 
-HERTZ_END_STOPS = Effect(
+HERTZ_END_STOPS = _stop(
     name="hertz_end_stops",
-    family=_FAMILY,
     words="a bump stop and a rebound stop (Hertzian contact)",
     parameters=(_LOW, _HIGH, *_HERTZ[1:]),
     force=_hertz_ends,

@@ -113,7 +113,7 @@ def propagate(internal: Internal, h: float, rates: Sequence[float]) -> Internal:
 
 
 class Linearised(NamedTuple):
-    """A bench about one configuration: ``mass @ q'' + damping @ q' + stiffness @ q = 0``, (n, n)."""
+    """A bench in one configuration: ``mass @ q'' + damping @ q' + stiffness @ q = 0``, (n, n)."""
 
     mass: Array
     damping: Array
