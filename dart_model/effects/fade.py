@@ -8,6 +8,7 @@ from dart_model.effects.ranges import grid, moving, within
 
 _REFERENCE = "Dixon, The Shock Absorber Handbook (2007), 7.12, temperature effects"
 _FINAL = Parameter("final_fraction", "", 0.0, 3.0, "share of the damping that stays")
+_LOSS = Parameter("fraction_per_k", "1/K", -0.2, 0.2, "share of the damping lost per kelvin")
 _COLD = Parameter("reference_c", "°C", -273.15, 2000.0, "temperature with full damping")
 AMBIENT_C = 20.0
 """Damper temperature where none is measured: that of a bench hall, and the reference of ISO 1."""
@@ -131,10 +132,7 @@ _fade = partial(Effect, family="fade", reference=_REFERENCE, simpler=("linear_da
 TEMPERATURE_FADE = _fade(
     name="temperature_fade",
     words="fade of the damper with temperature",
-    parameters=(
-        Parameter("fraction_per_k", "1/K", -0.2, 0.2, "share of the damping lost per kelvin"),
-        _COLD,
-    ),
+    parameters=(_LOSS, _COLD),
     force=_temperature,
     excitation="a measured temperature that changes by several kelvin",
     starts=_temperature_starts,
@@ -146,10 +144,7 @@ TEMPERATURE_FADE = _fade(
 LINEAR_TEMPERATURE_FADE = _fade(
     name="linear_temperature_fade",
     words="fade of the damper with temperature (linear)",
-    parameters=(
-        Parameter("fraction_per_k", "1/K", -0.2, 0.2, "share of the damping lost per kelvin"),
-        _COLD,
-    ),
+    parameters=(_LOSS, _COLD),
     force=_linear_temperature,
     scaled=(0,),
     excitation="a measured temperature that changes by several kelvin",

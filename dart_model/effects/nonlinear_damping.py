@@ -21,6 +21,9 @@ _SPEEDS = "velocities that differ by a factor of three or more, in both directio
 _PLACES = "the same velocities at different heights"
 _DAMPING = Parameter("damping_n_s_per_m", "N·s/m", -1e12, 1e12, "damping")
 _KNEE = Parameter("knee_velocity_m_per_s", "m/s", 1e-12, 1e6, "velocity of the knee")
+_LOST_DAMPING = Parameter(
+    "lost_damping_n_s_per_m", "N·s/m", -1e12, 1e12, "slope lost beyond the knee"
+)
 
 
 def _quadratic(velocity_m_per_s: float, damping_n_s2_per_m2: float) -> float:
@@ -264,10 +267,7 @@ ARCTAN_DAMPING = _damper(
 BLOW_OFF_DAMPING = _damper(
     name="blow_off_damping",
     words="a non-linear damper (blow-off valve)",
-    parameters=(
-        Parameter("lost_damping_n_s_per_m", "N·s/m", -1e12, 1e12, "slope lost beyond the knee"),
-        _KNEE,
-    ),
+    parameters=(_LOST_DAMPING, _KNEE),
     force=_blow_off,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
     starts=_knees(0.2, 0.5, 1.0, 1.8),
@@ -279,10 +279,7 @@ BLOW_OFF_DAMPING = _damper(
 SMOOTH_BLOW_OFF_DAMPING = _damper(
     name="smooth_blow_off_damping",
     words="a non-linear damper (blow-off valve, rounded knee)",
-    parameters=(
-        Parameter("lost_damping_n_s_per_m", "N·s/m", -1e12, 1e12, "slope lost beyond the knee"),
-        _KNEE,
-    ),
+    parameters=(_LOST_DAMPING, _KNEE),
     force=_smooth_blow_off,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
     starts=_knees(0.2, 0.6, 1.5),

@@ -8,6 +8,10 @@ from dart_model.effects.ranges import always, grid, height, moving, of_stroke, w
 
 _WIDE = "deflections from the free length that differ by a factor of three or more"
 _LARGEST_EXPONENT = 40.0
+_GAS = (
+    Parameter("gas_length_m", "m", 1e-12, 1e4, "gas volume over piston area at free length"),
+    Parameter("polytropic_exponent", "", 1.0, 3.0, "1 isothermal, 1.4 adiabatic air"),
+)
 
 
 def _quadratic(height_m: float, free_length_m: float, stiffness_n_per_m2: float) -> float:
@@ -180,8 +184,7 @@ GAS_SPRING = _spring(
     words="a gas spring (polytropic)",
     parameters=(
         Parameter("charge_force_n", "N", -1e12, 1e12, "force at the free length"),
-        Parameter("gas_length_m", "m", 1e-12, 1e4, "gas volume over piston area at free length"),
-        Parameter("polytropic_exponent", "", 1.0, 3.0, "1 isothermal, 1.4 adiabatic air"),
+        *_GAS,
     ),
     force=_gas,
     reference="Dixon, The Shock Absorber Handbook (2007), 6.4",
@@ -196,8 +199,7 @@ BALANCED_GAS_SPRING = _spring(
     words="a gas spring (polytropic, balanced at the free length)",
     parameters=(
         Parameter("charge_force_n", "N", -1e12, 1e12, "charge, balanced at the free length"),
-        Parameter("gas_length_m", "m", 1e-12, 1e4, "gas volume over piston area at free length"),
-        Parameter("polytropic_exponent", "", 1.0, 3.0, "1 isothermal, 1.4 adiabatic air"),
+        *_GAS,
     ),
     force=_balanced_gas,
     reference="Dixon, The Shock Absorber Handbook (2007), 6.4",

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Generic, NamedTuple
+from typing import Generic
 
 import numpy as np
 
@@ -16,23 +16,9 @@ _MOST_STEPS = 10_000
 """Steps of one call; one that is so late that it would need more takes longer ones."""
 
 
-class _StrutRow(NamedTuple, Generic[Value]):
-    """A strut in one configuration: ``height = offset + row @ q``."""
-
-    strut: Strut
-    offset_m: float
-    row: Value
-
-
-class _Configuration(NamedTuple, Generic[Value]):
-    """The struts and the applied force in one configuration.
-
-    Attributes:
-        applied: Generalised force per newton of applied force.
-    """
-
-    struts: tuple[_StrutRow[Value], ...]
-    applied: Value
+_Configuration = tuple[tuple[tuple[Strut, float, Value], ...], Value]
+"""Struts in one configuration, ``height = offset + row @ q`` (strut, offset in m, row of the
+Jacobian), and the generalised force per newton of applied force."""
 
 
 class EquationsOfMotion(Generic[Value]):
@@ -155,13 +141,11 @@ class EquationsOfMotion(Generic[Value]):
 
     def _configuration(self, jacobians: Jacobians) -> _Configuration[Value]:
         value = self._backend.value
-        rows = tuple(
-            _StrutRow(strut, offset_m, value(row))
-            for strut, offset_m, row in zip(
-                self._struts, jacobians.offsets_m.tolist(), jacobians.struts.tolist(), strict=True
-            )
+        columns = self._struts, jacobians.offsets_m.tolist(), jacobians.struts.tolist()
+        rows = (
+            (strut, offset_m, value(row)) for strut, offset_m, row in zip(*columns, strict=True)
         )
-        return _Configuration(rows, value(jacobians.applied.tolist()))
+        return tuple(rows), value(jacobians.applied.tolist())
 
 
 def count_steps(dt_s: float, longest_s: float) -> int:

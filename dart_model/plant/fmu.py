@@ -115,8 +115,7 @@ class _Unit:
         self._has_events = bool(description.numberOfEventIndicators)
         parameters = {variables[n].valueReference: v for n, v in spec.parameters.items()}
         self._calls = _start(content, path, description, parameters)
-        self._start = self._calls.states(self._count)
-        nominals = self._calls.nominals(self._count)
+        self._start, nominals = self._calls.states_and_nominals(self._count)
         self.nominals = tuple(nominals[k] for k in self.internal)
 
     def at(
@@ -227,19 +226,13 @@ class _Calls:
                 return changed
         raise _Refused("comes to no end of events")
 
-    def states(self, count: int) -> list[float]:
-        """The continuous states."""
-        x = _doubles(count)
+    def states_and_nominals(self, count: int) -> tuple[list[float], list[float]]:
+        """The continuous states, and their usual size."""
+        states, nominals = _doubles(count), _doubles(count)
         if count:
-            self._it.getContinuousStates(x, count)
-        return list(x[:count])
-
-    def nominals(self, count: int) -> list[float]:
-        """Their usual size."""
-        x = _doubles(count)
-        if count:
-            self._it.getNominalsOfContinuousStates(x, count)
-        return list(x[:count])
+            self._it.getContinuousStates(states, count)
+            self._it.getNominalsOfContinuousStates(nominals, count)
+        return list(states[:count]), list(nominals[:count])
 
 
 def _doubles(count: int) -> _Doubles:

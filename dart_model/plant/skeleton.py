@@ -151,18 +151,6 @@ def _read_urdf(uri: str) -> DartSkeleton | None:
     return loader.parseSkeleton(uri)
 
 
-def _read_sdf(uri: str) -> DartSkeleton | None:
-    return _dart.utils.SdfParser.readSkeleton(uri)
-
-
-def _read_skel(uri: str) -> DartSkeleton | None:
-    return _first_skeleton(_dart.utils.SkelParser.readWorld(uri))
-
-
-def _read_mjcf(uri: str) -> DartSkeleton | None:
-    return _first_skeleton(_dart.utils.MjcfParser.readWorld(uri))
-
-
 def _first_skeleton(world: Any) -> DartSkeleton | None:
     return world.getSkeleton(0) if world is not None and world.getNumSkeletons() > 0 else None
 
@@ -172,9 +160,9 @@ _MJCF = (".xml", ".mjcf")
 
 _PARSERS: dict[str, Callable[[str], DartSkeleton | None]] = {
     ".urdf": _read_urdf,
-    ".sdf": _read_sdf,
-    ".skel": _read_skel,
-    **dict.fromkeys(_MJCF, _read_mjcf),
+    ".sdf": _dart.utils.SdfParser.readSkeleton,
+    ".skel": lambda uri: _first_skeleton(_dart.utils.SkelParser.readWorld(uri)),
+    **dict.fromkeys(_MJCF, lambda uri: _first_skeleton(_dart.utils.MjcfParser.readWorld(uri))),
 }
 """DART's parser for each suffix."""
 

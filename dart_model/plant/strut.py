@@ -109,16 +109,9 @@ class Strut:
             if own:
                 rates = [0.0] * len(own)
                 part_rates(
-                    t_s,
-                    height_m,
-                    velocity_m_per_s,
-                    applied_force_n,
-                    temperature_c,
-                    own,
-                    values,
-                    strut,
-                    rates,
-                )
+                    t_s, height_m, velocity_m_per_s, applied_force_n, temperature_c, own, values,
+                    strut, rates,
+                )  # fmt: skip
                 internal_rates[first:end] = rates
         return force
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -110,14 +109,6 @@ def _error(evaluations: Sequence[RunEvaluation]) -> float:
     return quadratic_mean([run.target.after for run in evaluations])
 
 
-class _Search(NamedTuple):
-    """A search: models about the linear model, then models to choose from."""
-
-    first: Pool
-    last: Pool
-    first_round: FirstRound | None
-
-
 def _search(
     problem: Problem, criteria: SelectionCriteria, progress: Progress
 ) -> tuple[SearchResult, Problem]:
@@ -131,21 +122,23 @@ def _search(
     problem = _with_residual_noise(problem, fits[1])
     part = part_of(problem, _SEARCHED_NODES)
     if part is problem:
-        search = _explore_twice(part, fits, criteria, within(progress, 0.05, 0.85))
+        first, last, single = _explore_twice(part, fits, criteria, within(progress, 0.05, 0.85))
     else:
-        search = _explore_twice(part, first_fits(part), criteria, within(progress, 0.05, 0.6))
-        last = _fit_to_all(problem, fits, search.last, within(progress, 0.6, 0.85))
-        search = search._replace(last=last)
-    problem = search.last.problem
-    result = select_model(search.last, search.first, search.first_round, progress)
-    return result._replace(chosen=_refit_with_finer_steps(problem, result.chosen)), problem
+        first, last, single = _explore_twice(
+            part, first_fits(part), criteria, within(progress, 0.05, 0.6)
+        )
+        last = _fit_to_all(problem, fits, last, within(progress, 0.6, 0.85))
+    result = select_model(last, first, single, progress)
+    chosen = _refit_with_finer_steps(last.problem, result.chosen)
+    return result._replace(chosen=chosen), last.problem
 
 
 def _explore_twice(
     problem: Problem, fits: tuple[Fit, Fit], criteria: SelectionCriteria, progress: Progress
-) -> _Search:
+) -> tuple[Pool, Pool, FirstRound | None]:
     """Search, and search again about the best model: its free run is nearer to the measurement.
 
+    These are the models about the linear one, those about the best, and the first round.
     The noise, too, is only known once a model is near: the residual of a poor one is smooth.
     """
     given, linear = fits
@@ -155,7 +148,7 @@ def _explore_twice(
     seeds = [model.fit for model in (first.linear, *first.best_and_subsets())]
     second = Pool(problem, given, seeds, criteria)
     explore(second, within(progress, 0.55, 1.0))
-    return _Search(first, second, first_round)
+    return first, second, first_round
 
 
 def _fit_to_all(

@@ -13,8 +13,8 @@ from rig.diagnosis.outcome import Estimate
 from rig.diagnosis.problem.build import build
 from rig.diagnosis.recording import Recording
 from rig.diagnosis.search.criteria import CRITERIA
-from rig.diagnosis.search.fit import effect_variables
-from rig.diagnosis.write_up import estimates_of, estimates_of_fit, linear_corrections
+from rig.diagnosis.search.fit import effect_variables, fit_covariance
+from rig.diagnosis.write_up import FitEstimates, estimates_of, linear_corrections
 
 
 class OwnParameter(NamedTuple):
@@ -38,7 +38,7 @@ def refit_parameters(spec: ModelSpec, runs: Sequence[Recording]) -> list[OwnPara
     """
     problem = build(spec, runs, CRITERIA.blocks, None)
     _, fit = first_fits(problem)
-    estimates = estimates_of_fit(fit)
+    estimates = FitEstimates(fit, fit_covariance(fit))
     parameters = [
         OwnParameter(item.strut, "", item.parameter, item.total)
         for item in linear_corrections(problem, estimates)

@@ -83,11 +83,6 @@ class FitEstimates(NamedTuple):
         )
 
 
-def estimates_of_fit(result: Fit) -> FitEstimates:
-    """A fit with its covariance."""
-    return FitEstimates(result, fit_covariance(result))
-
-
 def compose_result(
     problem: Problem,
     search: SearchResult,
@@ -102,7 +97,7 @@ def compose_result(
     recordings = range(problem.recordings)
     before = [problem.residual_forces(k, search.given.model) for k in recordings]
     after = [problem.residual_forces(k, chosen.model) for k in recordings]
-    estimates = estimates_of_fit(chosen)
+    estimates = FitEstimates(chosen, fit_covariance(chosen))
     ambiguous = verdict == "ambiguous"
     floors = [run.floor for run in evaluations]
     diagnosis = Diagnosis(

@@ -32,7 +32,6 @@ from dart_model.effects.law import Writable
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
-Cube = NDArray[np.float64]
 Forces = MutableSequence[ForceOverArrays]
 Rates = MutableSequence[RatesOverArrays]
 _Arrays = tuple[Array, ...]
@@ -245,11 +244,11 @@ class Equations(NamedTuple):
         v: Their rates, shape (K, n).
     """
 
-    mass_inverse: Cube
+    mass_inverse: Array
     bias: Array
-    bias_q: Cube
-    bias_v: Cube
-    jacobian: Cube
+    bias_q: Array
+    bias_v: Array
+    jacobian: Array
     heights_m: Array
     applied: Array
     q: Array
@@ -716,28 +715,6 @@ def simulate(laws: Laws, model: Model, scenario: Scenario, steps: Steps, out: Tr
     return _simulate(*laws, parts, tuple(scenario), steps[:], tuple(out))
 
 
-class StrutMotion(NamedTuple):
-    """A known motion of a strut, each of shape (N,)."""
-
-    t_s: Array
-    heights_m: Array
-    velocities_m_per_s: Array
-    applied_n: Array
-    temperature_c: Array
-
-
-class LawValues(NamedTuple):
-    """What a law along a motion reads.
-
-    Attributes:
-        start: Internal states at the beginning.
-    """
-
-    parameters: Array
-    strut: Array
-    start: Array
-
-
 def _along(
     forces: Forces, rates: Rates, values: _Arrays, motion: _Arrays, substeps: int, out: Array
 ) -> None:
@@ -783,10 +760,17 @@ _MOTION = types.UniTuple(_VECTOR, 5)
 _along = compile_loop(_along, types.void(_FORCES, _RATES, _VALUES, _MOTION, _I8, _VECTOR))
 
 
-def force_along(name: str, values: LawValues, motion: StrutMotion, substeps: int) -> Array:
-    """Force (N,) of an effect along a motion; internal states take `substeps` steps a sample."""
-    out = np.empty(len(motion.t_s))
-    _along(*_laws((name,)), tuple(values), tuple(motion), substeps, out)
+def force_along(name: str, values: _Arrays, motion: _Arrays, substeps: int) -> Array:
+    """Force (N,) of the law of an effect along a known motion.
+
+    Args:
+        name: Name of the effect.
+        values: Its parameters, constants of its strut, internal states at the beginning.
+        motion: Times, heights, their rates, applied force and temperature, each of shape (N,).
+        substeps: Steps of the internal states between two samples.
+    """
+    out = np.empty(len(motion[0]))
+    _along(*_laws((name,)), values, motion, substeps, out)
     return out
 
 

@@ -75,9 +75,7 @@ def _transition(h: float, a: Array, q: Array) -> None:
 
 
 _F8 = types.float64
-_V = types.Array(types.float64, 1, "C")
-_M = types.Array(types.float64, 2, "C")
-_T3 = types.Array(types.float64, 3, "C")
+_V, _M, _T3 = (types.Array(types.float64, axes, "C") for axes in (1, 2, 3))
 _transition_c = compile_loop(_transition, types.void(_F8, _M, _M))
 
 

@@ -11,7 +11,7 @@ from dart_model.effects import Motion, effect
 from dart_model.spec import ModelSpec
 from rig.diagnosis.problem import linear_part, track
 from rig.diagnosis.problem.free_run import FreeRunProblem
-from rig.diagnosis.problem.grid import HeldOutBlocks, smooth_recording, strut_motions
+from rig.diagnosis.problem.grid import smooth_recording, strut_motions
 from rig.diagnosis.problem.mechanism import mechanism_along, open_plants
 from rig.diagnosis.problem.prescribed_motion import PrescribedProblem
 from rig.diagnosis.problem.problem import Problem, ProblemBasis, ResidualForces
@@ -61,7 +61,7 @@ def build_problems(
         return Problems(learnt, learnt, by_blocks=True)
     for recording in held_out:
         check_fits(recording, spec)
-    smooth = [smooth_recording(recording, None) for recording in held_out]
+    smooth = [smooth_recording(recording) for recording in held_out]
     evaluated = type(learnt).of_recordings(learnt.basis, smooth)
     return Problems(learnt, evaluated, by_blocks=False)
 
@@ -79,7 +79,7 @@ def build(
         check_fits(recording, spec)
     length = sum(recording.duration_s for recording in recordings)
     block_s = max(length / blocks, _LEAST_BLOCK_S)
-    held_out = None if held_out_every is None else HeldOutBlocks(block_s, held_out_every)
+    held_out = None if held_out_every is None else (block_s, held_out_every)
     smooth = [smooth_recording(recording, held_out) for recording in recordings]
     plants = open_plants(spec)
     motions = strut_motions(spec, smooth)

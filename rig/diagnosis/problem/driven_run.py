@@ -24,18 +24,6 @@ _TOP = 0.8
 actuator end below, so that only noise is left above."""
 
 
-class LoadCells(NamedTuple):
-    """Load cells of a force-driven bench, on the recording's own times.
-
-    Attributes:
-        t_s: Times, shape (samples,).
-        forces_n: Force of each strut, shape (samples, struts), NaN for a strut without a cell.
-    """
-
-    t_s: Array
-    forces_n: Array
-
-
 class DrivenRun(NamedTuple):
     """A recording as it is simulated.
 
@@ -43,6 +31,8 @@ class DrivenRun(NamedTuple):
         applied_n: Applied force at the nodes, shape (N,).
         fine_n: Applied force at half sub-steps, shape (2 * substeps * (N - 1) + 1,).
         angle: Angle by which the fastest motion turns within such a step.
+        cells: Load cells, to evaluate on: their own times, shape (samples,), and the force of each
+            strut, shape (samples, struts), NaN for a strut without a cell; None where none is.
     """
 
     grid: RecordingGrid
@@ -51,7 +41,7 @@ class DrivenRun(NamedTuple):
     substeps: int
     angle: float
     mechanism: LinearisedMechanism
-    cells: LoadCells | None
+    cells: tuple[Array, Array] | None
 
     def cut(self, nodes: slice) -> "DrivenRun":
         """The recording at some of the nodes."""
@@ -84,7 +74,7 @@ def driven_run(
     applied: tuple[Array, Array],
     mechanism: LinearisedMechanism,
     fastest: float,
-    cells: LoadCells | None,
+    cells: tuple[Array, Array] | None,
 ) -> DrivenRun:
     """A recording ready to be simulated; the applied force as a cubic spline between its samples.
 

@@ -153,15 +153,10 @@ class SmoothRecording(NamedTuple):
     noises: list[Noise]
 
 
-class HeldOutBlocks(NamedTuple):
-    """Blocks that are held out of fits where no run is: one in `every`."""
-
-    length_s: float
-    every: int
-
-
-def smooth_recording(recording: Recording, blocks: HeldOutBlocks | None) -> SmoothRecording:
-    """A recording on nodes and smoothed, some blocks held out of fits if asked for."""
+def smooth_recording(
+    recording: Recording, blocks: tuple[float, int] | None = None
+) -> SmoothRecording:
+    """A recording on nodes and smoothed; of blocks of a length (s) one in so many is held out."""
     grid, sample_nodes = _place_on_nodes(recording)
     if blocks is not None:
         grid = grid.with_held_out_blocks(*blocks)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.effects import Bench, Motion
+from dart_model.effects import Bench, Motion, effect
 from dart_model.spec import WORLD, EffectSpec, InlineSkeleton, ModelSpec
 from rig.diagnosis.problem.mechanism import LinearisedMechanism
 from rig.diagnosis.problem.problem import Kind, LinearParameter, mid_stroke_m
@@ -180,9 +180,8 @@ def _with_sum(spec: ModelSpec, strut: str, name: str, change: float) -> ModelSpe
             ((key, value),) = item.parameters.items()
             effects[i] = EffectSpec(name=name, parameters={key: round_for_file(value + change)})
             return spec.with_effects(strut, effects)
-    key = {"preload": "force_n", "linear_damping": "damping_n_s_per_m", "input_gain": "gain"}
-    key["added_mass"] = "mass_kg"
-    new = EffectSpec(name=name, parameters={key[name]: round_for_file(change)})
+    key = effect(name).parameters[0].name
+    new = EffectSpec(name=name, parameters={key: round_for_file(change)})
     return spec.with_effects(strut, (*effects, new))
 
 

@@ -66,18 +66,13 @@ class LinearisedMechanism(NamedTuple):
         """Strut forces that heights, their rates and accelerations take, each (N, struts)."""
         every = np.arange(len(z)) if len(self.q) > 1 else np.zeros(len(z), dtype=np.int64)
         jacobian, mass = self.jacobian[every], self.mass[every]
-        q = (
-            self.q[every]
-            + np.linalg.solve(jacobian, (z - self.heights_m[every])[..., np.newaxis])[..., 0]
-        )
-        v = np.linalg.solve(jacobian, w[..., np.newaxis])[..., 0]
-        acceleration = np.linalg.solve(jacobian, a[..., np.newaxis])[..., 0]
+        q = self.q[every] + _solve_coordinates(jacobian, z - self.heights_m[every])
+        v, acceleration = _solve_coordinates(jacobian, w), _solve_coordinates(jacobian, a)
         bias = self.bias[every] + self.applied[every] * applied_n[:, np.newaxis]
         bias = bias + np.einsum("kij,kj->ki", self.bias_q[every], q - self.q[every])
         bias = bias + np.einsum("kij,kj->ki", self.bias_v[every], v - self.v[every])
         generalised = np.einsum("kij,kj->ki", mass, acceleration) - bias
-        transposed = np.swapaxes(jacobian, 1, 2)
-        return np.linalg.solve(transposed, generalised[..., np.newaxis])[..., 0]
+        return _solve_coordinates(np.swapaxes(jacobian, 1, 2), generalised)
 
     def strut_inertia(self) -> Array:
         """Strut forces per acceleration of a strut at the first node, by size, (struts, struts)."""

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import Motion, effect
 from dart_model.spec import ModelSpec
-from rig.diagnosis.numerics.compiled import LawValues, StrutMotion, force_along
+from rig.diagnosis.numerics.compiled import force_along
 from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.problem import (
     CandidateModel,
@@ -32,12 +32,6 @@ errs by less than a thousandth."""
 _NEGLIGIBLE = 1e-9
 """Share of the strut's force below which an existing effect does not act on the recordings."""
 _NO_STATE = np.zeros(0)
-
-
-def _substeps(t_s: Array) -> int:
-    """Steps of an internal state between the samples of a track."""
-    step = float(t_s[-1] - t_s[0]) / (len(t_s) - 1)
-    return int(np.clip(np.ceil(step / _LONGEST_STATE_STEP_S), 1, _MOST_STATE_STEPS))
 
 
 def largest_stride(motions: Sequence[Motion]) -> int:
@@ -75,12 +69,13 @@ def law_force(
     `constants` are free length, stiffness, damping and gravity of all struts, shape (struts, 4...).
     """
     start = state if len(state) else np.zeros(effect(name).state_size)
-    motion = StrutMotion(
-        track.t_s, track.heights_m[strut], track.velocities_m_per_s[strut],
-        track.applied_n, track.temperature_c,
-    )  # fmt: skip
-    own = LawValues(np.ascontiguousarray(values), constants[strut], start)
-    return force_along(name, own, motion, _substeps(track.t_s))
+    own = np.ascontiguousarray(values), constants[strut], start
+    t_s, heights_m, velocities, *inputs = track
+    motion = t_s, heights_m[strut], velocities[strut], *inputs
+    # Internal states take shorter steps than the samples.
+    step = float(t_s[-1] - t_s[0]) / (len(t_s) - 1)
+    substeps = int(np.clip(np.ceil(step / _LONGEST_STATE_STEP_S), 1, _MOST_STATE_STEPS))
+    return force_along(name, own, motion, substeps)
 
 
 def linear_forces(tracks: Sequence[Track], strut: int) -> Array:
@@ -146,16 +141,11 @@ def effect_forces(
     candidate, parts = model
     constants = strut_constants(problem, parts.linear)
     slots = slots_of(problem, candidate).each
-    return [
-        (
-            strut,
-            law_force(
-                track, strut, name, parts.effects[slot.parameters], constants,
-                states[slot.states],
-            ),
-        )
-        for (strut, name), slot in zip(strut_effects(problem, candidate), slots, strict=True)
-    ]  # fmt: skip
+    forces: list[tuple[int, Array]] = []
+    for (strut, name), slot in zip(strut_effects(problem, candidate), slots, strict=True):
+        values, own_states = parts.effects[slot.parameters], states[slot.states]
+        forces.append((strut, law_force(track, strut, name, values, constants, own_states)))
+    return forces
 
 
 def forces_along(

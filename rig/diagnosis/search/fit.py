@@ -354,16 +354,12 @@ class FitCovariance(NamedTuple):
         return self.factor * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def fit_covariance(result: Fit) -> FitCovariance:
     """Covariance of a fit whose residual may be autocorrelated (White's sandwich).
 
     The covariance under white noise is a lower limit.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        return _sandwich(result)
-
-
-def _sandwich(result: Fit) -> FitCovariance:
     jacobian, residual = result.solution.jacobian, result.solution.residual
     prior = result.solution.prior
     size: Array = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + prior, _TINY))
