@@ -24,37 +24,13 @@ from dart_model.effects import (
     unmodelled_mode,
 )
 from dart_model.effects.fade import AMBIENT_C
-from dart_model.effects.law import (
-    Bench,
-    Bounds,
-    Effect,
-    Floats,
-    Force,
-    Motion,
-    Parameter,
-    Rate,
-    Start,
-    Writable,
-)
+from dart_model.effects.law import Bench, Effect, Motion, Parameter
 from dart_model.errors import ModelError
 
 __all__ = [
-    "AMBIENT_C",
-    "CATALOGUE",
-    "FAMILY_WORDS",
-    "Bench",
-    "Bounds",
-    "Effect",
-    "Floats",
-    "Force",
-    "Motion",
-    "Parameter",
-    "Rate",
-    "Start",
-    "UnknownEffectError",
-    "Writable",
-    "effect",
-]
+    "AMBIENT_C", "CATALOGUE", "FAMILY_WORDS", "Bench", "Effect", "Motion", "Parameter",
+    "UnknownEffectError", "effect",
+]  # fmt: skip
 
 _FAMILIES = (
     none, preload, stiffness, damping, inertia, input_gain, nonlinear_stiffness, stop, backlash,

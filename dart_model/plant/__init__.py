@@ -32,22 +32,13 @@ from dart_model.plant.integrator import (
     exact_step_s,
     stable_step_s,
 )
-from dart_model.plant.prescribed_strut import PrescribedState, PrescribedStrut
+from dart_model.plant.prescribed_strut import PrescribedStrut
 from dart_model.plant.skeleton import build
 from dart_model.plant.state import Loaded, Mechanics, PlantState
 from dart_model.plant.strut import struts_of
 from dart_model.spec import ModelSpec
 
-__all__ = [
-    "LONGEST_STEP_S",
-    "DartPlant",
-    "Jacobians",
-    "Loaded",
-    "Mechanics",
-    "PlantState",
-    "PrescribedState",
-    "PrescribedStrut",
-]
+__all__ = ["LONGEST_STEP_S", "DartPlant", "PlantState", "PrescribedStrut"]
 
 _RESTING_STEPS, _RESTING_STEP, _RESTED, _LONGEST_MOVE, _SPRINGLESS = 50, 1e-6, 1e-9, 0.1, 1e-9
 """Newton's method for a bench at rest: steps, difference and end (m or rad), longest move, and the
