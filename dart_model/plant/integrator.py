@@ -49,11 +49,7 @@ enough that the method is stable, as it is up to 2.5."""
 
 
 class Course(Struct, frozen=True, gc=False):
-    """Steps of equal length, and the input during them.
-
-    Attributes:
-        inputs: Input at the beginning and at the end; it is linear in between.
-    """
+    """Steps of equal length, with an input that is linear from the beginning to the end."""
 
     t_s: float
     duration_s: float

@@ -20,11 +20,7 @@ _INSTANT_S = 1e-9
 
 
 class Skeleton(NamedTuple):
-    """Bodies and joints in DART.
-
-    Attributes:
-        loaded: Body on which the applied force acts.
-    """
+    """Bodies and joints in DART; the applied force acts on `loaded`."""
 
     dart: DartSkeleton
     bodies: dict[str, DartBody]

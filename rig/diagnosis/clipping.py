@@ -49,11 +49,7 @@ def _find_plateaus(values: Array) -> list[Plateaus]:
 
 
 def find_sudden_plateaus(values: Array) -> list[Plateaus]:
-    """Plateaus that a channel enters with a jump, which deserve a warning.
-
-    Args:
-        values: Finite values, shape (N,).
-    """
+    """Plateaus that a channel (N,), all finite, enters with a jump, which deserve a warning."""
     steps = np.abs(np.diff(values))
     if not np.any(steps):
         return []
@@ -69,11 +65,7 @@ def find_sudden_plateaus(values: Array) -> list[Plateaus]:
 
 
 def find_long_plateaus(values: Array) -> Plateaus | None:
-    """Plateaus at an end of the range that make a channel useless; None if there are none.
-
-    Args:
-        values: Finite values, shape (N,).
-    """
+    """Plateaus at an end of the range that make a channel (N,), all finite, useless, or None."""
     levels = np.diff(np.unique(values))
     if len(levels) == 0 or float(np.ptp(values)) <= _COARSE * float(levels.min()):
         return None

@@ -243,11 +243,7 @@ class DiagnosisSource:
 
 @dataclass(frozen=True)
 class Result:
-    """The result of a diagnosis.
-
-    Attributes:
-        fitted: Residual force along the recordings that were learnt from, for the report.
-    """
+    """The result of a diagnosis; `fitted` are residual forces along the recordings learnt from."""
 
     diagnosis: Diagnosis
     corrected: ModelSpec

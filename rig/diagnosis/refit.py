@@ -18,11 +18,7 @@ from rig.diagnosis.write_up import FitEstimates, estimates_of, linear_correction
 
 
 class OwnParameter(NamedTuple):
-    """A parameter of a model.
-
-    Attributes:
-        effect: Its effect in the catalogue; empty for the linear part.
-    """
+    """A parameter of a model; `effect` is empty for the linear part."""
 
     strut: str
     effect: str

@@ -146,11 +146,7 @@ class Slot(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """Where the laws of a simulation are, each of shape (effects,).
-
-    Attributes:
-        first_states: Index of the first internal state among all; -1 if it has none.
-    """
+    """Indices (effects,) of strut, first parameter and first internal state (-1 if it has none)."""
 
     struts: Integers
     first_parameters: Integers
@@ -158,11 +154,7 @@ class Placement(NamedTuple):
 
 
 class Slots(NamedTuple):
-    """Effects in the struts of a model.
-
-    Attributes:
-        laws: Their laws, filled up to `SLOTS`.
-    """
+    """Effects in the struts of a model; its laws are filled up to `SLOTS`."""
 
     laws: Laws
     placement: Placement
@@ -272,11 +264,7 @@ class Scenario(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """How finely a simulation steps.
-
-    Attributes:
-        bend: Share by which a smooth acceleration bends within one.
-    """
+    """How finely a simulation steps; `bend`: share by which a smooth acceleration bends in one."""
 
     substeps: int
     bend: float
@@ -327,12 +315,7 @@ class _Span(NamedTuple):
 
 
 class _Work(NamedTuple):
-    """What one evaluation of the slope leaves behind.
-
-    Attributes:
-        x: Coordinates, their rates and internal states there, shape (2 n + states,).
-        general: Generalised force, shape (n,).
-    """
+    """What an evaluation of the slope at `x` (2 n + states,) leaves behind, `general` in (n,)."""
 
     x: Array
     slope: Array
@@ -345,12 +328,7 @@ class _Work(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """Sums of a step by Runge and Kutta's method.
-
-    Attributes:
-        x: Where the step has come to, shape (2 n + states,).
-        twist: Second difference of the accelerations, shape (n,).
-    """
+    """Sums of a Runge-Kutta step at `x`; `twist`: second difference of the accelerations (n,)."""
 
     x: Array
     began: Array
@@ -359,11 +337,7 @@ class _Step(NamedTuple):
 
 
 class _Calls(NamedTuple):
-    """The laws of a simulation with pointers to what each reads and writes, `SLOTS` of each.
-
-    Attributes:
-        slopes: Pointers to where their rates are written.
-    """
+    """The laws of a simulation with pointers to what each reads and writes, `SLOTS` of each."""
 
     forces: tuple[ForceOverArrays, ...]
     rates: tuple[RatesOverArrays, ...]
@@ -374,11 +348,7 @@ class _Calls(NamedTuple):
 
 
 class _Instant(NamedTuple):
-    """A time between two nodes.
-
-    Attributes:
-        share: Share of it that has passed.
-    """
+    """A time between two nodes, `share` of the gap after the first."""
 
     before: int
     after: int

@@ -32,23 +32,14 @@ _LONGEST_FOR_LIKELIHOOD = 12_000
 
 
 class Smoothed(NamedTuple):
-    """A smoothed signal.
-
-    Attributes:
-        states: Signal, first, second and third derivative at each time, shape (N, 4).
-        deviations: Their standard deviations, shape (N, 4).
-    """
+    """Signal, first, second and third derivative, with their standard deviations, each (N, 4)."""
 
     states: Array
     deviations: Array
 
 
 class Noise(NamedTuple):
-    """Noise and smoothness of a signal.
-
-    Attributes:
-        ratio: Intensity of the random walk over that variance.
-    """
+    """Noise of a signal, and the intensity of its random walk over that variance."""
 
     variance: float
     ratio: float

@@ -26,11 +26,7 @@ _MOSTLY = 0.5
 
 
 class Problems(NamedTuple):
-    """The problems of a diagnosis.
-
-    Attributes:
-        held_out: That of the held-out runs; with blocks held out, the learnt one.
-    """
+    """The problems of a diagnosis; with blocks held out, `held_out` is the learnt one."""
 
     learnt: Problem
     held_out: Problem

@@ -78,11 +78,7 @@ _IMPLAUSIBLE = 5.0
 
 @dataclass(frozen=True, eq=False)
 class FreeRunProblem(Problem):
-    """A model held against recordings of a force-driven bench.
-
-    Attributes:
-        noise_m: Standard deviation of each height's noise, shape (struts,).
-    """
+    """A model and recordings of a force-driven bench; `noise_m`: each height's deviation, (struts,)."""
 
     bench: ClassVar[Bench] = "force_given"
     assumption: ClassVar[str] = (

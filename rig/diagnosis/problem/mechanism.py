@@ -81,11 +81,7 @@ class LinearisedMechanism(NamedTuple):
 
 
 class MechanismPlants(NamedTuple):
-    """DART with the model, and with a kg more on the body of each strut.
-
-    Attributes:
-        plain: The model without effects other than inertia.
-    """
+    """DART with the model (inertia its only effects), and with a kg more on each strut's body."""
 
     plain: DartPlant
     heavier: tuple[DartPlant, ...]

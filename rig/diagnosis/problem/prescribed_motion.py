@@ -131,11 +131,7 @@ def cell_residual_std(spec: ModelSpec, runs: Sequence[DynoRun]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class PrescribedProblem(Problem):
-    """A model held against recordings of a displacement-controlled bench.
-
-    Attributes:
-        noise_n: Standard deviation of each load cell's residual, shape (struts,).
-    """
+    """A model and recordings of a dyno; `noise_n`: deviation of each cell's residual, (struts,)."""
 
     bench: ClassVar[Bench] = "motion_given"
     assumption: ClassVar[str] = "The motion is smoothed over the whole recording."

@@ -67,11 +67,7 @@ class ExistingParameters(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """Effects under test.
-
-    Attributes:
-        kept: Which of the nominal model's effects stay, by index.
-    """
+    """Effects under test: those of the nominal model that stay, by index, and new ones."""
 
     kept: tuple[int, ...]
     new: tuple[StrutEffect, ...]
@@ -173,17 +169,13 @@ class RunEvaluation(NamedTuple):
 
 
 class ProblemBasis(NamedTuple):
-    """What the problems of one diagnosis share, in the order of the fields of `Problem`.
-
-    Attributes:
-        block_s: Length of the blocks of cross-validation.
-    """
+    """What the problems of one diagnosis share: the first fields of `Problem`, in their order."""
 
     spec: ModelSpec
     linear: tuple[LinearParameter, ...]
     existing: tuple[ExistingParameters, ...]
     motions: tuple[Motion, ...]
-    block_s: float
+    block_s: float  # Length of the blocks of cross-validation.
     plants: MechanismPlants
 
 

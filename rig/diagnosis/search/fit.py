@@ -338,12 +338,7 @@ UNBOUND = 30.0
 
 
 class FitCovariance(NamedTuple):
-    """Uncertainty of a fit.
-
-    Attributes:
-        covariance: Of the search variables, shape (k, k).
-        factor: Half a 95 % confidence interval in standard deviations (Student).
-    """
+    """Covariance (k, k) of search variables; half a 95 % interval in deviations (Student's)."""
 
     covariance: Array
     factor: float

@@ -51,11 +51,7 @@ FINAL = Effort(15, 1e-6, 2)
 
 
 class ValidatedModel(NamedTuple):
-    """A fitted model and its cross-validation.
-
-    Attributes:
-        block_costs: Out-of-sample sum of squares of each block.
-    """
+    """A fitted model, and its out-of-sample sum of squares of each block."""
 
     fit: Fit
     block_costs: Array
