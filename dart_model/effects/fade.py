@@ -4,7 +4,7 @@ import math
 from functools import partial
 
 from dart_model.effects.law import Effect, Motion, Parameter, Start, State
-from dart_model.effects.ranges import grid, moving, within
+from dart_model.effects.ranges import Starts, grid, moving, within
 
 _REFERENCE = "Dixon, The Shock Absorber Handbook (2007), 7.12, temperature effects"
 _FINAL = Parameter("final_fraction", "", 0.0, 3.0, "share of the damping that stays")
@@ -79,23 +79,12 @@ def _energy_rate(
     return damping_n_s_per_m * left * velocity_m_per_s * velocity_m_per_s
 
 
-def _shows_temperature(motion: Motion) -> bool:
-    cold, hot = motion.temperatures_c
-    return hot - cold >= 1.0
+def _temperature_starts(*fractions_per_k: float) -> Starts:
+    def starts(motion: Motion) -> list[Start]:
+        cold, hot = motion.temperatures_c
+        return grid(fractions_per_k, [AMBIENT_C]) if hot - cold >= 1.0 else []
 
-
-@moving
-def _temperature_starts(motion: Motion) -> list[Start]:
-    if not _shows_temperature(motion):
-        return []
-    return grid([0.003, 0.015, -0.005], [AMBIENT_C])
-
-
-@moving
-def _linear_temperature_starts(motion: Motion) -> list[Start]:
-    if not _shows_temperature(motion):
-        return []
-    return grid([0.01], [AMBIENT_C])
+    return moving(starts)
 
 
 def _standard(_: Motion) -> tuple[float, float]:
@@ -123,10 +112,6 @@ def _energy_starts(motion: Motion) -> list[Start]:
     return grid([0.9, 0.5], [share * work_j for share in (0.1, 0.3, 1.0)])
 
 
-def _energies(motion: Motion) -> tuple[float, float]:
-    return 0.01 * _work_j(motion), 10.0 * _work_j(motion)
-
-
 _fade = partial(Effect, family="fade", reference=_REFERENCE, simpler=("linear_damping",), scaled=())
 
 TEMPERATURE_FADE = _fade(
@@ -135,7 +120,7 @@ TEMPERATURE_FADE = _fade(
     parameters=(_LOSS, _COLD),
     force=_temperature,
     excitation="a measured temperature that changes by several kelvin",
-    starts=_temperature_starts,
+    starts=_temperature_starts(0.003, 0.015, -0.005),
     bounds=within(reference_c=_standard),
     simpler=("linear_damping", "linear_temperature_fade"),
     shown=("fraction_per_k",),
@@ -148,7 +133,7 @@ LINEAR_TEMPERATURE_FADE = _fade(
     force=_linear_temperature,
     scaled=(0,),
     excitation="a measured temperature that changes by several kelvin",
-    starts=_linear_temperature_starts,
+    starts=_temperature_starts(0.01),
     bounds=within(reference_c=_standard),
     shown=("fraction_per_k",),
 )
@@ -179,6 +164,6 @@ ENERGY_FADE = _fade(
     rate=_energy_rate,
     states=(State("work_j", 1.0),),
     starts=_energy_starts,
-    bounds=within(energy_j=_energies),
+    bounds=within(energy_j=lambda m: (0.01 * _work_j(m), 10.0 * _work_j(m))),
     shown=("final_fraction",),
 )

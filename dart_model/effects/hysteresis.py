@@ -170,10 +170,6 @@ def _bends(motion: Motion) -> tuple[float, float]:
     return 0.012 * motion.least_stroke_m, 3.0 * motion.stroke_m
 
 
-def _relaxation_times(motion: Motion) -> tuple[float, float]:
-    return motion.step_s, motion.duration_s
-
-
 _hysteresis = partial(Effect, family="hysteresis", excitation=_LOOPS, fits_state=True)
 
 BOUC_WEN = _hysteresis(
@@ -281,7 +277,7 @@ MAXWELL = _hysteresis(
     rate=_maxwell_rate,
     states=(State("spring_deflection_m", 0.01),),
     starts=_maxwell_starts,
-    bounds=within(relaxation_time_s=_relaxation_times),
+    bounds=within(relaxation_time_s=lambda m: (m.step_s, m.duration_s)),
     simpler=("linear_damping", "linear_stiffness"),
     shown=("stiffness_n_per_m",),
 )

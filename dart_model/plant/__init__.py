@@ -43,10 +43,8 @@ __all__ = ["LONGEST_STEP_S", "DartPlant", "PlantState", "PrescribedStrut"]
 _RESTING_STEPS, _RESTING_STEP, _RESTED, _LONGEST_MOVE, _SPRINGLESS = 50, 1e-6, 1e-9, 0.1, 1e-9
 """Newton's method for a bench at rest: steps, difference and end (m or rad), longest move, and the
 share of the largest stiffness below which a direction counts as free."""
-
 _FARTHEST = 1.0
 """Distance of a rest (m or rad) beyond which nothing holds the bench: no strut is as long."""
-
 _DIFFERENCE = 1e-6
 """Step of the coordinates (m or rad, and per second) in central differences of the bias force: a
 third of the digits of a double, where rounding and truncation are about equal."""

@@ -28,7 +28,6 @@ _Doubles = ctypes.Array[ctypes.c_double]
 
 _MOST_ITERATIONS = 20
 """Most event iterations at one time."""
-
 _MESSAGES = 3
 """Most recent messages of an FMU that an error contains."""
 

@@ -14,13 +14,10 @@ Array = NDArray[np.float64]
 
 _NEWTON_STEPS = 50
 """Newton's method doubles its digits at each step, once it is near: more steps change nothing."""
-
 _REACHED_M, _OUT_OF_REACH_M = 1e-13, 1e-9
 """Error of a height at which Newton's method ends, and above which it has failed."""
-
 _DISAGREEMENT_M = 5e-4
 """Disagreement of the sensors of more struts than coordinates that noise explains."""
-
 _SHORTEST_M = 1e-12
 """Length of a strut below which its direction is not defined."""
 

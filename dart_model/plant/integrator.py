@@ -39,10 +39,8 @@ _FREQUENCY_STEP = 0.1
 """Largest product of step and natural angular frequency. An undamped mode loses (0.1)³ π / 12, that
 is 0.03 %, of its amplitude in a period, and one with a damping ratio of 0.02 is never off by more
 than 0.1 % of where it began."""
-
 _POLE_STEP = 0.5
 """Largest product of step and magnitude of a pole, for modes too strongly damped to swing."""
-
 _STABLE_STEP = 1.0
 """The same with the steepest slopes of effects, which act within short ranges: there it is
 enough that the method is stable, as it is up to 2.5."""

@@ -11,7 +11,6 @@ from dart_model.spec import ModelSpec
 
 _LONGEST_STEP_S = 0.5e-3
 """Half the longest step of a bench, since the midpoint rule is of one order less."""
-
 _MOST_STEPS = 1000
 """Steps of one call: over half a second without a measured height they get longer."""
 

@@ -9,17 +9,13 @@ Array = NDArray[np.float64]
 
 _LONGEST_PLATEAU = 0.002
 """Share of the samples that a channel that is not clipped may stay at its extreme value."""
-
 _STANDS = 4
 """Samples in a row at an extreme value that are no coincidence."""
-
 _FULL_SPEED = 0.3
 """Share of its usual speed with which a clipped channel enters a plateau; a channel that comes to
 rest slows down before."""
-
 _COARSE = 50.0
 """Steps of its resolution that a channel spans at least, for a plateau to mean anything."""
-
 _JUMP = 4.0
 """Steps of its resolution by which a clipped channel enters a plateau: the flat top of a channel in
 steps is one step above its sides."""

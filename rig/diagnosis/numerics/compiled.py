@@ -363,7 +363,6 @@ _PIECES = 8
 """Parts into which a step is cut where a force jumps."""
 _MOST_PIECES = 32
 """The same where it jumps within one of these, as friction does that is all but a sign."""
-
 _LARGEST_ERROR = 5e-8
 """Change of height within a step by a jump of force, as a share of the stroke, from which on the
 step is cut: a tenth of the resolution of usual height sensors over their range."""

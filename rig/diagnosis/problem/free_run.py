@@ -78,7 +78,7 @@ _IMPLAUSIBLE = 5.0
 
 @dataclass(frozen=True, eq=False)
 class FreeRunProblem(Problem):
-    """A model and recordings of a force-driven bench; `noise_m`: each height's deviation, (struts,)."""
+    """A model and recordings of a driven bench; `noise_m`: deviation of each height, (struts,)."""
 
     bench: ClassVar[Bench] = "force_given"
     assumption: ClassVar[str] = (

@@ -17,7 +17,6 @@ _TRIED_S = 4.0
 """Length of the part of a recording on which the number of DART's steps is determined."""
 _MOST_STEPS = 32
 """Steps of DART between two nodes from which on no more are tried."""
-
 _MOST_STEPS_IN_ALL = 1_500_000
 """Steps of DART that take some ten seconds."""
 
