@@ -13,10 +13,7 @@ from dart_model.errors import ModelError
 
 
 def admit(content: bytes) -> bool:
-    """Admit a program for this user.
-
-    Returns:
-        Whether it was not admitted before.
+    """Admit a program for this user; whether it was not admitted before.
 
     Raises:
         ModelError: The user's settings cannot be read or written.

@@ -50,15 +50,9 @@ class Strut:
         self, spec: StrutSpec, first_state: int, gravity_m_per_s2: float, folder: Path
     ) -> None:
         self.name = spec.name
-        self._free_length = spec.free_length_m
-        self._stiffness = spec.stiffness_n_per_m
-        self._damping = spec.damping_n_s_per_m
-        self._constants = (
-            spec.free_length_m,
-            spec.stiffness_n_per_m,
-            spec.damping_n_s_per_m,
-            gravity_m_per_s2,
-        )
+        linear = spec.free_length_m, spec.stiffness_n_per_m, spec.damping_n_s_per_m
+        self._free_length, self._stiffness, self._damping = linear
+        self._constants = (*linear, gravity_m_per_s2)
         parts: list[_Part] = []
         first = first_state
         for item in spec.effects:

@@ -22,13 +22,7 @@ steps is one step above its sides."""
 
 
 class Plateaus(NamedTuple):
-    """Where a channel stays at one end of its range.
-
-    Attributes:
-        extreme: `lowest` or `highest`.
-        firsts: First sample of each plateau, shape (P,).
-        lengths: Samples of each plateau, shape (P,).
-    """
+    """Where a channel stays at its `lowest` or `highest` value: first samples and lengths, (P,)."""
 
     extreme: str
     limit: float

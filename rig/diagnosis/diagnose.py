@@ -77,7 +77,8 @@ def _diagnose_problems(
 ) -> Result:
     search, problem = _search(problems.learnt, criteria, progress)
     progress("evaluating on held-out data", 0.95)
-    problems = problems.with_learnt(problem)
+    held_out = replace(problems.held_out, motions=problem.motions)
+    problems = problems._replace(learnt=problem, held_out=held_out)
     linear = search.linear.fit
     evaluations = evaluate_held_out(problems, linear, search.chosen.fit)
     if search.chosen.size and are_laws_superfluous(problem, linear, evaluations, criteria):

@@ -125,13 +125,9 @@ def _filter(
 ) -> None:
     """Kalman filter; all covariances are in units of the noise variance, concentrated out.
 
-    Args:
-        t: Times, shape (N,).
-        y: Signal, NaN where missing, shape (N,).
-        ratio: Intensity of the random walk over the noise variance.
-        means: Receives the filtered means, shape (N, 4); empty where only sums are needed.
-        covariances: Receives the filtered covariances, shape (N, 4, 4), or empty.
-        sums: Receives squares and logarithms of innovations, and their number, shape (3,).
+    Of times and a signal (N,), NaN where missing, it writes the filtered means (N, 4) and
+    covariances (N, 4, 4), both empty where only sums are needed, and the sums (3,): squares and
+    logarithms of innovations, and their number.
     """
     m = np.zeros(4)
     p = np.zeros((4, 4))

@@ -32,10 +32,6 @@ class Problems(NamedTuple):
     held_out: Problem
     by_blocks: bool
 
-    def with_learnt(self, learnt: Problem) -> "Problems":
-        """The problems with the noise and motions that a search determined."""
-        return self._replace(learnt=learnt, held_out=replace(self.held_out, motions=learnt.motions))
-
 
 def build_problems(
     spec: ModelSpec,

@@ -377,7 +377,8 @@ class FreeRunProblem(Problem):
         for model, motion in ((models.nominal, before), (models.corrected, after)):
             error_m = rms(measured - motion.heights_m)
             tolerance_m = max(_AGREEMENT * float(noise.min()), _ACCURACY * error_m)
-            on_dart_m.append(self.heights_on_dart(k, model, motion.heights_m, tolerance_m))
+            start, expected_m = model.parts.starts[k], motion.heights_m
+            on_dart_m.append(on_dart.dart_heights(self, run, model, start, expected_m, tolerance_m))
         forces = [self.residual_forces(k, model) for model in models]
         residual_n = [
             np.nan if f is None else rms(np.where(rows, f.force_n, np.nan)) for f in forces
@@ -405,14 +406,6 @@ class FreeRunProblem(Problem):
             figures, heights, rms(measured - linear.heights_m), residual_n[1],
             NoiseFloor(floor_m, deviation), drift_m, series,
         )  # fmt: skip
-
-    def heights_on_dart(
-        self, k: int, model: CandidateModel, expected_m: Array, tolerance_m: float
-    ) -> Array:
-        """Heights of a model's free run in DART, see `on_dart.dart_heights`."""
-        return on_dart.dart_heights(
-            self, self.runs[k], model, model.parts.starts[k], expected_m, tolerance_m
-        )
 
     def _cell_errors(
         self, k: int, models: ComparedModels, motions: tuple[Trajectory, Trajectory], rows: Flags

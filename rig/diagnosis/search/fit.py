@@ -288,11 +288,7 @@ def leave_block_out_costs(
 ) -> Array:
     """Sum of squares of each block's residual in a fit to the other blocks, shape (blocks,).
 
-    Args:
-        residual: At the solution, shape (m,).
-        jacobian: Its derivative, shape (m, k).
-        blocks: Block of each row, shape (m,).
-        prior: Precision of the variables' priors, shape (k, k).
+    Residual (m,) and Jacobian (m, k) are those at the solution, the priors' precision is (k, k).
     """
     count = int(blocks.max()) + 1
     size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + np.diag(prior), _TINY))

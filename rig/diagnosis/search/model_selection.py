@@ -278,8 +278,7 @@ def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] |
     that changed so, within their intervals, are then nominal. With several struts a mass carries
     others, and there is no such degeneracy.
 
-    Returns:
-        Where to begin, and which linear parameters are free, shapes (L,).
+    The result is where to begin, and which linear parameters are free, shapes (L,).
     """
     linear = problem.linear
     if len(problem.motions) > 1 or not any(p.kind == "gain" for p in linear):
