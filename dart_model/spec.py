@@ -326,12 +326,7 @@ class ModelSpec(_Frozen):
 
 
 def parse_model(text: str, source: str, folder: Path = Path()) -> ModelSpec:
-    """Model from YAML text.
-
-    Args:
-        text: YAML as documented in the README.
-        source: Name of the text in an error.
-        folder: Where a skeleton file is looked for.
+    """Model from YAML text as documented in the README; its files are looked for in `folder`.
 
     Raises:
         ModelError: One line that names file, key, value and what was expected.
@@ -341,11 +336,7 @@ def parse_model(text: str, source: str, folder: Path = Path()) -> ModelSpec:
 
 
 def model_file(name: str, folder: Path) -> Path:
-    """The file of a model: one in a folder, or the shipped one of that name.
-
-    Args:
-        name: File, absolute or from the folder on, or the name of a shipped model.
-        folder: The folder.
+    """The file of a model: absolute or from a folder on, or the shipped one of that name.
 
     Raises:
         ModelError: There is neither.
@@ -367,12 +358,9 @@ def load_model(path: Path) -> ModelSpec:
 
 
 def load_named_model(name: str, folder: Path, named_by: Path | None = None) -> ModelSpec:
-    """Model from its file, or a shipped one by its name.
+    """Model from its file, absolute or from a folder on, or a shipped one by its name.
 
-    Args:
-        name: File, absolute or from the folder on, or the name of a shipped model.
-        folder: The folder.
-        named_by: File that names the model, for messages; None for the user.
+    Messages name `named_by`, the file that names the model; None for the user.
 
     Raises:
         ModelError: One line that names file, key, value and what was expected.

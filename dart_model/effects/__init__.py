@@ -24,100 +24,29 @@ from dart_model.effects import (
     unmodelled_mode,
 )
 from dart_model.effects.fade import AMBIENT_C
-from dart_model.effects.law import (
-    Bench,
-    Bounds,
-    Effect,
-    Floats,
-    Force,
-    Motion,
-    Parameter,
-    Rate,
-    Start,
-    Writable,
-)
+from dart_model.effects.law import Bench, Effect, Motion, Parameter
 from dart_model.errors import ModelError
 
 __all__ = [
-    "AMBIENT_C",
-    "CATALOGUE",
-    "FAMILY_WORDS",
-    "Bench",
-    "Bounds",
-    "Effect",
-    "Floats",
-    "Force",
-    "Motion",
-    "Parameter",
-    "Rate",
-    "Start",
-    "UnknownEffectError",
-    "Writable",
-    "effect",
-]
+    "AMBIENT_C", "CATALOGUE", "FAMILY_WORDS", "Bench", "Effect", "Motion", "Parameter",
+    "UnknownEffectError", "effect",
+]  # fmt: skip
 
-_ALL = (
-    none.NONE,
-    preload.PRELOAD,
-    stiffness.LINEAR_STIFFNESS,
-    damping.LINEAR_DAMPING,
-    inertia.ADDED_MASS,
-    inertia.INERTER,
-    input_gain.INPUT_GAIN,
-    nonlinear_stiffness.QUADRATIC_STIFFNESS,
-    nonlinear_stiffness.CUBIC_STIFFNESS,
-    nonlinear_stiffness.CENTRED_CUBIC_STIFFNESS,
-    nonlinear_stiffness.POWER_STIFFNESS,
-    nonlinear_stiffness.PROGRESSIVE_STIFFNESS,
-    nonlinear_stiffness.EXPONENTIAL_STIFFNESS,
-    nonlinear_stiffness.GAS_SPRING,
-    nonlinear_stiffness.BALANCED_GAS_SPRING,
-    stop.BUMP_STOP,
-    stop.REBOUND_STOP,
-    stop.HERTZ_BUMP_STOP,
-    stop.HERTZ_REBOUND_STOP,
-    stop.POWER_BUMP_STOP,
-    stop.POWER_REBOUND_STOP,
-    stop.END_STOPS,
-    stop.HERTZ_END_STOPS,
-    backlash.BACKLASH,
-    backlash.FREE_PLAY,
-    friction.COULOMB_FRICTION,
-    friction.STRIBECK_FRICTION,
-    friction.PRESLIDING_FRICTION,
-    friction.ELASTOPLASTIC_FRICTION,
-    friction.LUGRE_FRICTION,
-    nonlinear_damping.QUADRATIC_DAMPING,
-    nonlinear_damping.POWER_DAMPING,
-    nonlinear_damping.ASYMMETRIC_DAMPING,
-    nonlinear_damping.DIRECTIONAL_DAMPING,
-    nonlinear_damping.DIGRESSIVE_DAMPING,
-    nonlinear_damping.SATURATING_DAMPING,
-    nonlinear_damping.ARCTAN_DAMPING,
-    nonlinear_damping.BLOW_OFF_DAMPING,
-    nonlinear_damping.SMOOTH_BLOW_OFF_DAMPING,
-    nonlinear_damping.STROKE_DAMPING,
-    nonlinear_damping.POSITION_DEPENDENT_DAMPING,
-    nonlinear_damping.ZONE_DAMPING,
-    nonlinear_damping.END_ZONE_DAMPING,
-    hysteresis.BOUC_WEN,
-    hysteresis.DAHL,
-    hysteresis.GENERAL_BOUC_WEN,
-    hysteresis.FRICTION_BEHIND_PLAY,
-    hysteresis.IWAN,
-    hysteresis.MAXWELL,
-    fade.TEMPERATURE_FADE,
-    fade.LINEAR_TEMPERATURE_FADE,
-    fade.TIME_FADE,
-    fade.ENERGY_FADE,
-    delay.DELAY,
-    periodic_force.PERIODIC_FORCE,
-    unmodelled_mode.HIDDEN_MASS,
-    restoring_surface.RESTORING_SURFACE,
+_FAMILIES = (
+    none, preload, stiffness, damping, inertia, input_gain, nonlinear_stiffness, stop, backlash,
+    friction, nonlinear_damping, hysteresis, fade, delay, periodic_force, unmodelled_mode,
+    restoring_surface,
+)  # fmt: skip
+
+CATALOGUE: Mapping[str, Effect] = MappingProxyType(
+    {
+        item.name: item
+        for family in _FAMILIES
+        for item in vars(family).values()
+        if isinstance(item, Effect)
+    }
 )
-
-CATALOGUE: Mapping[str, Effect] = MappingProxyType({item.name: item for item in _ALL})
-"""Every effect by its name in a model file."""
+"""Every effect by its name in a model file, in the order of the families' files."""
 
 FAMILY_WORDS: Mapping[str, str] = MappingProxyType(
     {

@@ -24,20 +24,8 @@ STRUT = ("free_length_m", "stiffness_n_per_m", "damping_n_s_per_m", "gravity_m_p
 Origin = Literal["motion", "states", "strut", "parameters", "rates"]
 _ORDER: tuple[Origin, ...] = ("motion", "states", "strut", "parameters", "rates")
 
-ForceOverArrays = Callable[
-    [
-        float,  # t_s
-        float,  # height_m
-        float,  # velocity_m_per_s
-        float,  # applied_force_n
-        float,  # temperature_c
-        Floats,  # internal states
-        Floats,  # parameters
-        Floats,  # strut
-    ],
-    float,
-]
-"""Force in N over the values of `MOTION`, those of the effect, and those of `STRUT`."""
+ForceOverArrays = Callable[[float, float, float, float, float, Floats, Floats, Floats], float]
+"""Force in N over the values of `MOTION`, internal states, parameters, and those of `STRUT`."""
 
 RatesOverArrays = Callable[
     [float, float, float, float, float, Floats, Floats, Floats, Writable], None
@@ -53,9 +41,7 @@ class Argument(NamedTuple):
     """What an argument of a law stands for.
 
     Attributes:
-        name: Its name.
         origin: Values among which it is found; `rates` is where the law writes.
-        first: Index there.
         size: Number of values from there that form a row; None for a single one.
     """
 

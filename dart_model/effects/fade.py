@@ -1,13 +1,14 @@
 """A damper that loses its damping as it warms up, or with time or work."""
 
 import math
+from functools import partial
 
 from dart_model.effects.law import Effect, Motion, Parameter, Start, State
-from dart_model.effects.ranges import grid, moving, within
+from dart_model.effects.ranges import Starts, grid, moving, within
 
-_FAMILY = "fade"
 _REFERENCE = "Dixon, The Shock Absorber Handbook (2007), 7.12, temperature effects"
 _FINAL = Parameter("final_fraction", "", 0.0, 3.0, "share of the damping that stays")
+_LOSS = Parameter("fraction_per_k", "1/K", -0.2, 0.2, "share of the damping lost per kelvin")
 _COLD = Parameter("reference_c", "°C", -273.15, 2000.0, "temperature with full damping")
 AMBIENT_C = 20.0
 """Damper temperature where none is measured: that of a bench hall, and the reference of ISO 1."""
@@ -78,23 +79,12 @@ def _energy_rate(
     return damping_n_s_per_m * left * velocity_m_per_s * velocity_m_per_s
 
 
-def _shows_temperature(motion: Motion) -> bool:
-    cold, hot = motion.temperatures_c
-    return hot - cold >= 1.0
+def _temperature_starts(*fractions_per_k: float) -> Starts:
+    def starts(motion: Motion) -> list[Start]:
+        cold, hot = motion.temperatures_c
+        return grid(fractions_per_k, [AMBIENT_C]) if hot - cold >= 1.0 else []
 
-
-@moving
-def _temperature_starts(motion: Motion) -> list[Start]:
-    if not _shows_temperature(motion):
-        return []
-    return grid([0.003, 0.015, -0.005], [AMBIENT_C])
-
-
-@moving
-def _linear_temperature_starts(motion: Motion) -> list[Start]:
-    if not _shows_temperature(motion):
-        return []
-    return grid([0.01], [AMBIENT_C])
+    return moving(starts)
 
 
 def _standard(_: Motion) -> tuple[float, float]:
@@ -122,48 +112,34 @@ def _energy_starts(motion: Motion) -> list[Start]:
     return grid([0.9, 0.5], [share * work_j for share in (0.1, 0.3, 1.0)])
 
 
-def _energies(motion: Motion) -> tuple[float, float]:
-    return 0.01 * _work_j(motion), 10.0 * _work_j(motion)
+_fade = partial(Effect, family="fade", reference=_REFERENCE, simpler=("linear_damping",), scaled=())
 
-
-TEMPERATURE_FADE = Effect(
+TEMPERATURE_FADE = _fade(
     name="temperature_fade",
-    family=_FAMILY,
     words="fade of the damper with temperature",
-    parameters=(
-        Parameter("fraction_per_k", "1/K", -0.2, 0.2, "share of the damping lost per kelvin"),
-        _COLD,
-    ),
+    parameters=(_LOSS, _COLD),
     force=_temperature,
     excitation="a measured temperature that changes by several kelvin",
-    reference=_REFERENCE,
-    scaled=(),
-    starts=_temperature_starts,
+    starts=_temperature_starts(0.003, 0.015, -0.005),
     bounds=within(reference_c=_standard),
     simpler=("linear_damping", "linear_temperature_fade"),
     shown=("fraction_per_k",),
 )
 
-LINEAR_TEMPERATURE_FADE = Effect(
+LINEAR_TEMPERATURE_FADE = _fade(
     name="linear_temperature_fade",
-    family=_FAMILY,
     words="fade of the damper with temperature (linear)",
-    parameters=(
-        Parameter("fraction_per_k", "1/K", -0.2, 0.2, "share of the damping lost per kelvin"),
-        _COLD,
-    ),
+    parameters=(_LOSS, _COLD),
     force=_linear_temperature,
+    scaled=(0,),
     excitation="a measured temperature that changes by several kelvin",
-    reference=_REFERENCE,
-    starts=_linear_temperature_starts,
+    starts=_temperature_starts(0.01),
     bounds=within(reference_c=_standard),
-    simpler=("linear_damping",),
     shown=("fraction_per_k",),
 )
 
-TIME_FADE = Effect(
+TIME_FADE = _fade(
     name="time_fade",
-    family=_FAMILY,
     words="fade of the damper with time",
     parameters=(
         _FINAL,
@@ -171,17 +147,13 @@ TIME_FADE = Effect(
     ),
     force=_time,
     excitation="a long run with the same motion at its beginning and end",
-    reference=_REFERENCE,
-    scaled=(),
     starts=_time_starts,
     bounds=within(time_constant_s=lambda m: (0.01 * m.duration_s, 10.0 * m.duration_s)),
-    simpler=("linear_damping",),
     shown=("final_fraction",),
 )
 
-ENERGY_FADE = Effect(
+ENERGY_FADE = _fade(
     name="energy_fade",
-    family=_FAMILY,
     words="fade of the damper with dissipated energy",
     parameters=(
         _FINAL,
@@ -189,12 +161,9 @@ ENERGY_FADE = Effect(
     ),
     force=_energy,
     excitation="a long run with the same motion at its beginning and end",
-    reference=_REFERENCE,
     rate=_energy_rate,
-    scaled=(),
     states=(State("work_j", 1.0),),
     starts=_energy_starts,
-    bounds=within(energy_j=_energies),
-    simpler=("linear_damping",),
+    bounds=within(energy_j=lambda m: (0.01 * _work_j(m), 10.0 * _work_j(m))),
     shown=("final_fraction",),
 )

@@ -5,11 +5,11 @@ that bends by a fraction of a millimetre before it slides, which holds.
 """
 
 import math
+from functools import partial
 
 from dart_model.effects.law import Effect, Motion, Parameter, Start, State
 from dart_model.effects.ranges import crossing_time_s, grid, moving, of_speed, of_stroke, within
 
-_FAMILY = "friction"
 _SLIDING = "motion that changes direction, and slow passages"
 _COULOMB = Parameter("coulomb_force_n", "N", 0.0, 1e12, "sliding friction")
 _STATIC = Parameter("static_to_coulomb", "", 1.0, 5.0, "break-away over sliding friction")
@@ -131,70 +131,63 @@ _ROUNDINGS = of_speed(5e-4, 0.12)
 _DEFLECTIONS = of_stroke(1e-5, 0.012)
 
 
-COULOMB_FRICTION = Effect(
-    name="coulomb_friction",
-    family=_FAMILY,
-    words="dry friction (Coulomb)",
-    parameters=(_COULOMB, _ROUNDING),
-    force=_coulomb,
+_friction = partial(
+    Effect,
+    family="friction",
     excitation=_SLIDING,
-    reference="Armstrong-Hélouvry, Dupont, Canudas de Wit, Automatica 30 (1994)",
-    starts=_coulomb_starts,
-    bounds=within(rounding_velocity_m_per_s=_ROUNDINGS),
-    shown=("coulomb_force_n",),
-)
-
-STRIBECK_FRICTION = Effect(
-    name="stribeck_friction",
-    family=_FAMILY,
-    words="dry friction with break-away (Stribeck)",
-    parameters=(_COULOMB, _STATIC, _STRIBECK, _ROUNDING),
-    force=_stribeck,
-    excitation=_SLIDING,
-    reference="Armstrong-Hélouvry, Dupont, Canudas de Wit, Automatica 30 (1994)",
-    starts=_stribeck_starts,
-    bounds=within(stribeck_velocity_m_per_s=_FALLS, rounding_velocity_m_per_s=_ROUNDINGS),
     simpler=("coulomb_friction",),
     shown=("coulomb_force_n",),
 )
 
-PRESLIDING_FRICTION = Effect(
+COULOMB_FRICTION = _friction(
+    name="coulomb_friction",
+    words="dry friction (Coulomb)",
+    parameters=(_COULOMB, _ROUNDING),
+    force=_coulomb,
+    reference="Armstrong-Hélouvry, Dupont, Canudas de Wit, Automatica 30 (1994)",
+    starts=_coulomb_starts,
+    bounds=within(rounding_velocity_m_per_s=_ROUNDINGS),
+    simpler=(),
+)
+
+STRIBECK_FRICTION = _friction(
+    name="stribeck_friction",
+    words="dry friction with break-away (Stribeck)",
+    parameters=(_COULOMB, _STATIC, _STRIBECK, _ROUNDING),
+    force=_stribeck,
+    reference="Armstrong-Hélouvry, Dupont, Canudas de Wit, Automatica 30 (1994)",
+    starts=_stribeck_starts,
+    bounds=within(stribeck_velocity_m_per_s=_FALLS, rounding_velocity_m_per_s=_ROUNDINGS),
+)
+
+PRESLIDING_FRICTION = _friction(
     name="presliding_friction",
-    family=_FAMILY,
     words="dry friction with presliding (Dahl's bristle)",
     parameters=(_COULOMB, _PRESLIDING),
     force=_bristle,
-    excitation=_SLIDING,
     reference="Dahl, Solid friction damping of mechanical vibrations, AIAA J. 14 (1976)",
     rate=_presliding_rate,
     states=(_DEFLECTION,),
     fits_state=True,
     starts=_bristle_starts,
     bounds=within(presliding_m=_DEFLECTIONS),
-    simpler=("coulomb_friction",),
-    shown=("coulomb_force_n",),
 )
 
-ELASTOPLASTIC_FRICTION = Effect(
+ELASTOPLASTIC_FRICTION = _friction(
     name="elastoplastic_friction",
-    family=_FAMILY,
     words="dry friction that holds at rest (elastoplastic bristle)",
     parameters=(_COULOMB, _PRESLIDING),
     force=_bristle,
-    excitation=_SLIDING,
     reference="Dupont, Hayward, Armstrong, Altpeter, IEEE TAC 47 (2002)",
     rate=_elastoplastic_rate,
     states=(_DEFLECTION,),
     fits_state=True,
     starts=_bristle_starts,
     bounds=within(presliding_m=_DEFLECTIONS),
-    simpler=("coulomb_friction",),
-    shown=("coulomb_force_n",),
 )
 
-LUGRE_FRICTION = Effect(
+LUGRE_FRICTION = _friction(
     name="lugre_friction",
-    family=_FAMILY,
     words="dry friction with break-away and presliding (LuGre)",
     parameters=(
         _COULOMB,
@@ -204,7 +197,6 @@ LUGRE_FRICTION = Effect(
         Parameter("bristle_damping_n_s_per_m", "N·s/m", 0.0, 1e12, "damping of the bristle"),
     ),
     force=_lugre,
-    excitation=_SLIDING,
     reference="Canudas de Wit, Olsson, Åström, Lischinsky, IEEE TAC 40 (1995)",
     rate=_lugre_rate,
     scaled=(0, 4),
@@ -213,5 +205,4 @@ LUGRE_FRICTION = Effect(
     starts=_lugre_starts,
     bounds=within(stribeck_velocity_m_per_s=_FALLS, presliding_m=_DEFLECTIONS),
     simpler=("presliding_friction", "stribeck_friction"),
-    shown=("coulomb_force_n",),
 )

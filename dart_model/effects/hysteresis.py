@@ -1,11 +1,11 @@
 """Forces with an internal state: they depend on where the strut has been."""
 
 import math
+from functools import partial
 
 from dart_model.effects.law import Effect, Floats, Motion, Parameter, Start, State, Writable
 from dart_model.effects.ranges import geometric, grid, moving, of_least_stroke, of_stroke, within
 
-_FAMILY = "hysteresis"
 _LOOPS = "loops of different amplitude and frequency"
 # A loop that turned the other way would make energy out of nothing.
 _LIMIT = Parameter("yield_force_n", "N", 0.0, 1e12, "force at which the loop is fully bent")
@@ -170,13 +170,10 @@ def _bends(motion: Motion) -> tuple[float, float]:
     return 0.012 * motion.least_stroke_m, 3.0 * motion.stroke_m
 
 
-def _relaxation_times(motion: Motion) -> tuple[float, float]:
-    return motion.step_s, motion.duration_s
+_hysteresis = partial(Effect, family="hysteresis", excitation=_LOOPS, fits_state=True)
 
-
-BOUC_WEN = Effect(
+BOUC_WEN = _hysteresis(
     name="bouc_wen",
-    family=_FAMILY,
     words="hysteresis (Bouc-Wen)",
     parameters=(
         _LIMIT,
@@ -185,37 +182,31 @@ BOUC_WEN = Effect(
         Parameter("shape", "", 0.0, 1.0, "0.5: unloading is elastic"),
     ),
     force=_yielding,
-    excitation=_LOOPS,
     reference="Ikhouane and Rodellar, Systems with Hysteresis (2007)",
     rate=_bouc_wen_rate,
     states=(State("force_ratio", 1.0),),  # force over `yield_force_n`
-    fits_state=True,
     starts=_bouc_wen_starts,
     bounds=within(yield_displacement_m=_bends),
     simpler=("dahl", "presliding_friction", "coulomb_friction", "linear_stiffness"),
     shown=("yield_force_n",),
 )
 
-DAHL = Effect(
+DAHL = _hysteresis(
     name="dahl",
-    family=_FAMILY,
     words="hysteresis (Dahl)",
     parameters=(_LIMIT, _BEND, Parameter("exponent", "", 0.3, 4.0, "sharpness of the bend")),
     force=_yielding,
-    excitation=_LOOPS,
     reference="Dahl, Solid friction damping of mechanical vibrations, AIAA J. 14 (1976)",
     rate=_dahl_rate,
     states=(State("force_ratio", 1.0),),  # force over `yield_force_n`
-    fits_state=True,
     starts=_dahl_starts,
     bounds=within(yield_displacement_m=_bends),
     simpler=("presliding_friction", "linear_stiffness"),
     shown=("yield_force_n",),
 )
 
-GENERAL_BOUC_WEN = Effect(
+GENERAL_BOUC_WEN = _hysteresis(
     name="general_bouc_wen",
-    family=_FAMILY,
     words="hysteresis (Bouc-Wen, general: it may harden)",
     parameters=(
         Parameter("stiffness_n_per_m", "N/m", 1e-12, 1e12, "stiffness at the start of a loop"),
@@ -230,20 +221,17 @@ GENERAL_BOUC_WEN = Effect(
         ),
     ),
     force=_spring,
-    excitation=_LOOPS,
     reference="Wen, J. Eng. Mech. 102 (1976); Erlicher and Point, C. R. Mecanique 332 (2004)",
     rate=_general_bouc_wen_rate,
     states=(State("spring_deflection_m", 1e-3),),
-    fits_state=True,
     starts=_general_bouc_wen_starts,
     bounds=within(bend_m=_bends),
     simpler=("bouc_wen",),
     shown=("stiffness_n_per_m", "bend_m"),
 )
 
-FRICTION_BEHIND_PLAY = Effect(
+FRICTION_BEHIND_PLAY = _hysteresis(
     name="friction_behind_play",
-    family=_FAMILY,
     words="friction behind play (pinching)",
     parameters=(
         Parameter("coulomb_force_n", "N", 0.0, 1e12, "sliding friction"),
@@ -252,36 +240,32 @@ FRICTION_BEHIND_PLAY = Effect(
         Parameter("exponent", "", 0.3, 4.0, "sharpness of the bend"),
     ),
     force=_behind_play,
-    excitation=_LOOPS,
     reference="Baber and Noori, J. Eng. Mech. 111 (1985), pinching; Nordin and Gutman (2002)",
     rate=_behind_play_rate,
     states=(State("deflection_m", 1e-3),),
-    fits_state=True,
     starts=_behind_play_starts,
     bounds=within(gap_m=of_least_stroke(1e-3, 0.8), travel_m=of_stroke(1e-3, 1.0)),
     simpler=("dahl", "elastoplastic_friction", "bouc_wen"),
     shown=("coulomb_force_n", "gap_m"),
 )
 
-IWAN = Effect(
+IWAN = _hysteresis(
     name="iwan",
-    family=_FAMILY,
     words="hysteresis (Iwan)",
     parameters=(_LIMIT, _BEND),
     force=_iwan,
-    excitation=_LOOPS,
     reference="Iwan, A distributed-element model for hysteresis, J. Appl. Mech. 33 (1966)",
     rate=_iwan_rate,
     states=tuple(State(f"element_{i + 1}", 1.0, group="elements") for i in range(ELEMENTS)),
+    fits_state=False,
     starts=_iwan_starts,
     bounds=within(yield_displacement_m=_bends),
     simpler=("elastoplastic_friction", "linear_stiffness"),
     shown=("yield_force_n",),
 )
 
-MAXWELL = Effect(
+MAXWELL = _hysteresis(
     name="maxwell",
-    family=_FAMILY,
     words="hysteresis (a Maxwell branch)",
     parameters=(
         Parameter("stiffness_n_per_m", "N/m", 0.0, 1e12, "spring in series with a damper"),
@@ -292,9 +276,8 @@ MAXWELL = Effect(
     reference="Flügge, Viscoelasticity (1975), 1.2",
     rate=_maxwell_rate,
     states=(State("spring_deflection_m", 0.01),),
-    fits_state=True,
     starts=_maxwell_starts,
-    bounds=within(relaxation_time_s=_relaxation_times),
+    bounds=within(relaxation_time_s=lambda m: (m.step_s, m.duration_s)),
     simpler=("linear_damping", "linear_stiffness"),
     shown=("stiffness_n_per_m",),
 )

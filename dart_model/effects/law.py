@@ -30,16 +30,11 @@ class Motion(NamedTuple):
     """What a strut did on the recordings: that from which starts and bounds of a law follow.
 
     Attributes:
-        low_m: Lowest height.
-        high_m: Highest height.
         speed_m_per_s: Root mean square of the velocity.
         top_speed_m_per_s: Largest velocity.
         least_stroke_m: Stroke of the recording with the smallest one.
         duration_s: Length of the longest recording.
         step_s: Usual time between samples.
-        free_length_m: Free length of the strut.
-        stiffness_n_per_m: Its stiffness.
-        damping_n_s_per_m: Its damping.
         mass_kg: Mass that the strut moves.
         force_n: Root mean square of the force that the linear part leaves over.
         temperatures_c: Lowest and highest temperature; equal where none was measured.
@@ -98,7 +93,6 @@ class Parameter:
         unit: Unit as printed in reports; empty if dimensionless.
         low: Smallest value that makes physical sense; a model file below it is refused.
         high: Largest value that makes physical sense; a model file above it is refused.
-        meaning: One line for the report.
         group: Argument by which the law takes this parameter together with its neighbours of the
             same group, as a row; empty if it is a separate argument.
     """
@@ -116,7 +110,6 @@ class State(NamedTuple):
 
     Attributes:
         name: Argument of the law, with its unit.
-        scale: Its usual size.
         group: Argument by which the law takes this state together with its neighbours of the same
             group, as a row; empty if it is a separate argument.
     """
@@ -135,13 +128,11 @@ class Effect:
     recording, and an FMU can hold it as C.
 
     Attributes:
-        name: Key in the model file.
         family: Family as in the diagnosis, e.g. ``friction``.
         words: The effect as a phrase with its article, the law in brackets.
         parameters: Parameters in the order in which arrays of values hold them.
         force: The law.
         excitation: What a recording must contain for the effect to be seen.
-        reference: Literature.
         rate: Derivative of the internal state, or None for a law without one.
         states: Internal states in the order of `rate`.
         fits_state: Whether the state at the beginning of a recording is fitted: states that fade

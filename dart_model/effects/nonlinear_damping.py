@@ -1,6 +1,7 @@
 """Dampers whose force is not proportional to velocity."""
 
 import math
+from functools import partial
 
 from dart_model.effects.law import Effect, Motion, Parameter, Start
 from dart_model.effects.ranges import (
@@ -14,13 +15,15 @@ from dart_model.effects.ranges import (
     within,
 )
 
-_FAMILY = "nonlinear_damping"
 _FRICTION = "coulomb_friction"
 """What a damper with a knee is where the motion is hardly ever as slow as that."""
 _SPEEDS = "velocities that differ by a factor of three or more, in both directions"
 _PLACES = "the same velocities at different heights"
 _DAMPING = Parameter("damping_n_s_per_m", "N·s/m", -1e12, 1e12, "damping")
 _KNEE = Parameter("knee_velocity_m_per_s", "m/s", 1e-12, 1e6, "velocity of the knee")
+_LOST_DAMPING = Parameter(
+    "lost_damping_n_s_per_m", "N·s/m", -1e12, 1e12, "slope lost beyond the knee"
+)
 
 
 def _quadratic(velocity_m_per_s: float, damping_n_s2_per_m2: float) -> float:
@@ -157,57 +160,52 @@ def _zone_heights(motion: Motion) -> tuple[float, float]:
     return motion.low_m - margin, max(motion.high_m, motion.free_length_m) + margin
 
 
-QUADRATIC_DAMPING = Effect(
+_damper = partial(
+    Effect, family="nonlinear_damping", excitation=_SPEEDS, simpler=("linear_damping",)
+)
+
+QUADRATIC_DAMPING = _damper(
     name="quadratic_damping",
-    family=_FAMILY,
     words="a non-linear damper (quadratic, orifice flow)",
     parameters=(
         Parameter("damping_n_s2_per_m2", "N·s²/m²", -1e18, 1e18, "force per squared velocity"),
     ),
     force=_quadratic,
-    excitation=_SPEEDS,
     reference="Dixon, The Shock Absorber Handbook (2007), 6.9, orifice flow",
     starts=always((1.0,)),
-    simpler=("linear_damping",),
     shown=("damping_n_s2_per_m2",),
 )
 
-POWER_DAMPING = Effect(
+POWER_DAMPING = _damper(
     name="power_damping",
-    family=_FAMILY,
     words="a non-linear damper (power law)",
     parameters=(
         Parameter("force_at_1_m_per_s_n", "N", -1e18, 1e18, "force at 1 m/s"),
         Parameter("exponent", "", 0.3, 4.0, "exponent of the velocity"),
     ),
     force=_power,
-    excitation=_SPEEDS,
     reference="Symans and Constantinou, Eng. Struct. 20 (1998), fractional velocity damper",
     starts=always((1.0, 0.5), (1.0, 1.5), (1.0, 2.5)),
     simpler=("linear_damping", "quadratic_damping"),
     shown=("force_at_1_m_per_s_n",),
 )
 
-ASYMMETRIC_DAMPING = Effect(
+ASYMMETRIC_DAMPING = _damper(
     name="asymmetric_damping",
-    family=_FAMILY,
     words="a non-linear damper (rebound and compression differ)",
     parameters=(
         Parameter("compression_n_s_per_m", "N·s/m", -1e12, 1e12, "damping while heights fall"),
         Parameter("rebound_n_s_per_m", "N·s/m", -1e12, 1e12, "damping while heights rise"),
     ),
     force=_asymmetric,
-    excitation=_SPEEDS,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.2",
     scaled=(0, 1),
     starts=always((1.0, 0.0), (0.0, 1.0), (1.0, -1.0)),
-    simpler=("linear_damping",),
     shown=("compression_n_s_per_m", "rebound_n_s_per_m"),
 )
 
-DIRECTIONAL_DAMPING = Effect(
+DIRECTIONAL_DAMPING = _damper(
     name="directional_damping",
-    family=_FAMILY,
     words="a non-linear damper (rebound and compression, each by a power law)",
     parameters=(
         Parameter("compression_at_1_m_per_s_n", "N", -1e18, 1e18, "force as heights fall by 1 m/s"),
@@ -216,7 +214,6 @@ DIRECTIONAL_DAMPING = Effect(
         Parameter("rebound_exponent", "", 0.3, 4.0, "exponent of the velocity there"),
     ),
     force=_directional,
-    excitation=_SPEEDS,
     reference="Dixon, The Shock Absorber Handbook (2007), 6.9 and 7.2, valves of each direction",
     scaled=(0, 2),
     starts=always(
@@ -231,13 +228,11 @@ DIRECTIONAL_DAMPING = Effect(
     shown=("compression_at_1_m_per_s_n", "rebound_at_1_m_per_s_n"),
 )
 
-DIGRESSIVE_DAMPING = Effect(
+DIGRESSIVE_DAMPING = _damper(
     name="digressive_damping",
-    family=_FAMILY,
     words="a non-linear damper (digressive)",
     parameters=(_DAMPING, _KNEE),
     force=_digressive,
-    excitation=_SPEEDS,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
     starts=_knees(0.2, 0.6, 1.5),
     bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
@@ -245,13 +240,11 @@ DIGRESSIVE_DAMPING = Effect(
     shown=("damping_n_s_per_m",),
 )
 
-SATURATING_DAMPING = Effect(
+SATURATING_DAMPING = _damper(
     name="saturating_damping",
-    family=_FAMILY,
     words="a non-linear damper (saturating)",
     parameters=(_DAMPING, _KNEE, Parameter("sharpness", "", 0.5, 12.0, "sharpness of the knee")),
     force=_saturating,
-    excitation=_SPEEDS,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
     starts=_saturating_starts,
     bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
@@ -259,13 +252,11 @@ SATURATING_DAMPING = Effect(
     shown=("damping_n_s_per_m",),
 )
 
-ARCTAN_DAMPING = Effect(
+ARCTAN_DAMPING = _damper(
     name="arctan_damping",
-    family=_FAMILY,
     words="a non-linear damper (arctangent)",
     parameters=(_DAMPING, _KNEE),
     force=_arctan,
-    excitation=_SPEEDS,
     reference="Duym, Vehicle Syst. Dyn. 33 (2000), simulation tools for shock absorbers",
     starts=_knees(0.2, 0.6, 1.5),
     bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
@@ -273,16 +264,11 @@ ARCTAN_DAMPING = Effect(
     shown=("damping_n_s_per_m",),
 )
 
-BLOW_OFF_DAMPING = Effect(
+BLOW_OFF_DAMPING = _damper(
     name="blow_off_damping",
-    family=_FAMILY,
     words="a non-linear damper (blow-off valve)",
-    parameters=(
-        Parameter("lost_damping_n_s_per_m", "N·s/m", -1e12, 1e12, "slope lost beyond the knee"),
-        _KNEE,
-    ),
+    parameters=(_LOST_DAMPING, _KNEE),
     force=_blow_off,
-    excitation=_SPEEDS,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
     starts=_knees(0.2, 0.5, 1.0, 1.8),
     bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
@@ -290,16 +276,11 @@ BLOW_OFF_DAMPING = Effect(
     shown=("lost_damping_n_s_per_m",),
 )
 
-SMOOTH_BLOW_OFF_DAMPING = Effect(
+SMOOTH_BLOW_OFF_DAMPING = _damper(
     name="smooth_blow_off_damping",
-    family=_FAMILY,
     words="a non-linear damper (blow-off valve, rounded knee)",
-    parameters=(
-        Parameter("lost_damping_n_s_per_m", "N·s/m", -1e12, 1e12, "slope lost beyond the knee"),
-        _KNEE,
-    ),
+    parameters=(_LOST_DAMPING, _KNEE),
     force=_smooth_blow_off,
-    excitation=_SPEEDS,
     reference="Dixon, The Shock Absorber Handbook (2007), 7.3, blow-off valve",
     starts=_knees(0.2, 0.6, 1.5),
     bounds=within(knee_velocity_m_per_s=of_speed(0.08, 6.0)),
@@ -307,22 +288,19 @@ SMOOTH_BLOW_OFF_DAMPING = Effect(
     shown=("lost_damping_n_s_per_m",),
 )
 
-STROKE_DAMPING = Effect(
+STROKE_DAMPING = _damper(
     name="stroke_damping",
-    family=_FAMILY,
     words="a non-linear damper (linear in the stroke)",
     parameters=(Parameter("damping_n_s_per_m2", "N·s/m²", -1e18, 1e18, "damping per deflection"),),
     force=_over_stroke,
     excitation=_PLACES,
     reference="Dixon, The Shock Absorber Handbook (2007), 8.3, position-dependent damping",
     starts=always((1.0,)),
-    simpler=("linear_damping",),
     shown=("damping_n_s_per_m2",),
 )
 
-POSITION_DEPENDENT_DAMPING = Effect(
+POSITION_DEPENDENT_DAMPING = _damper(
     name="position_dependent_damping",
-    family=_FAMILY,
     words="a non-linear damper (quadratic in the stroke)",
     parameters=(
         Parameter("damping_n_s_per_m3", "N·s/m³", -1e18, 1e18, "damping per squared deflection"),
@@ -331,14 +309,12 @@ POSITION_DEPENDENT_DAMPING = Effect(
     excitation=_PLACES,
     reference="van der Pol, Phil. Mag. 2 (1926); Dixon (2007), 8.3",
     starts=always((1.0,)),
-    simpler=("linear_damping",),
     shown=("damping_n_s_per_m3",),
     about_free_length=True,
 )
 
-ZONE_DAMPING = Effect(
+ZONE_DAMPING = _damper(
     name="zone_damping",
-    family=_FAMILY,
     words="a non-linear damper (a zone of its stroke)",
     parameters=(
         _DAMPING,
@@ -350,13 +326,11 @@ ZONE_DAMPING = Effect(
     reference="Dixon, The Shock Absorber Handbook (2007), 8.3, position-dependent damping",
     starts=_zone_starts,
     bounds=within(centre_height_m=height(-1.0, 2.0), width_m=of_stroke(0.03, 1.5)),
-    simpler=("linear_damping",),
     shown=("damping_n_s_per_m",),
 )
 
-END_ZONE_DAMPING = Effect(
+END_ZONE_DAMPING = _damper(
     name="end_zone_damping",
-    family=_FAMILY,
     words="a non-linear damper (hydraulic end stop)",
     parameters=(
         Parameter("damping_n_s_per_m2", "N·s/m²", -1e18, 1e18, "damping per depth in the zone"),
@@ -367,6 +341,5 @@ END_ZONE_DAMPING = Effect(
     reference="Dixon, The Shock Absorber Handbook (2007), 8.3, hydraulic bump stop",
     starts=_end_zone_starts,
     bounds=within(zone_height_m=_zone_heights),
-    simpler=("linear_damping",),
     shown=("damping_n_s_per_m2",),
 )

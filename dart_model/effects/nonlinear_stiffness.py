@@ -1,13 +1,17 @@
 """Springs whose force is not proportional to their deflection."""
 
 import math
+from functools import partial
 
 from dart_model.effects.law import Effect, Motion, Parameter, Start
 from dart_model.effects.ranges import always, grid, height, moving, of_stroke, within
 
-_FAMILY = "nonlinear_stiffness"
 _WIDE = "deflections from the free length that differ by a factor of three or more"
 _LARGEST_EXPONENT = 40.0
+_GAS = (
+    Parameter("gas_length_m", "m", 1e-12, 1e4, "gas volume over piston area at free length"),
+    Parameter("polytropic_exponent", "", 1.0, 3.0, "1 isothermal, 1.4 adiabatic air"),
+)
 
 
 def _quadratic(height_m: float, free_length_m: float, stiffness_n_per_m2: float) -> float:
@@ -85,30 +89,28 @@ def _gas_lengths(motion: Motion) -> tuple[float, float]:
     return 1.02 * _deepest_m(motion), 50.0 * _deepest_m(motion)
 
 
-QUADRATIC_STIFFNESS = Effect(
+_spring = partial(Effect, family="nonlinear_stiffness", excitation=_WIDE)
+
+QUADRATIC_STIFFNESS = _spring(
     name="quadratic_stiffness",
-    family=_FAMILY,
     words="a non-linear spring (quadratic)",
     parameters=(
         Parameter("stiffness_n_per_m2", "N/m²", -1e18, 1e18, "force per squared deflection"),
     ),
     force=_quadratic,
-    excitation=_WIDE,
     reference="Nayfeh and Mook, Nonlinear Oscillations (1979), 2.1",
     starts=always((1.0,)),
     simpler=("linear_stiffness",),
     shown=("stiffness_n_per_m2",),
 )
 
-CUBIC_STIFFNESS = Effect(
+CUBIC_STIFFNESS = _spring(
     name="cubic_stiffness",
-    family=_FAMILY,
     words="a non-linear spring (cubic, about the free length)",
     parameters=(
         Parameter("stiffness_n_per_m3", "N/m³", -1e24, 1e24, "force per cubed deflection"),
     ),
     force=_cubic,
-    excitation=_WIDE,
     reference="Duffing, Erzwungene Schwingungen bei veränderlicher Eigenfrequenz (1918)",
     starts=always((1.0,)),
     simpler=("linear_stiffness",),
@@ -116,16 +118,14 @@ CUBIC_STIFFNESS = Effect(
     about_free_length=True,
 )
 
-CENTRED_CUBIC_STIFFNESS = Effect(
+CENTRED_CUBIC_STIFFNESS = _spring(
     name="centred_cubic_stiffness",
-    family=_FAMILY,
     words="a non-linear spring (cubic, about a centre of its own)",
     parameters=(
         Parameter("stiffness_n_per_m3", "N/m³", -1e24, 1e24, "force per cubed deflection"),
         Parameter("centre_height_m", "m", -1e4, 1e4, "height without force"),
     ),
     force=_centred_cubic,
-    excitation=_WIDE,
     reference="Nayfeh and Mook, Nonlinear Oscillations (1979), 2.1",
     starts=moving(lambda m: grid([1.0], m.heights_m(0.1, 0.3, 0.5, 0.7, 0.9))),
     bounds=within(centre_height_m=height(-1.0, 2.0)),
@@ -133,16 +133,14 @@ CENTRED_CUBIC_STIFFNESS = Effect(
     shown=("stiffness_n_per_m3",),
 )
 
-POWER_STIFFNESS = Effect(
+POWER_STIFFNESS = _spring(
     name="power_stiffness",
-    family=_FAMILY,
     words="a non-linear spring (power law)",
     parameters=(
         Parameter("force_at_100_mm_n", "N", -1e36, 1e36, "force at a deflection of 100 mm"),
         Parameter("exponent", "", 1.2, 8.0, "exponent of the deflection"),
     ),
     force=_power,
-    excitation=_WIDE,
     reference="Kovacic and Brennan, The Duffing Equation (2011), 1.3",
     starts=always((1.0, 1.5), (1.0, 2.5), (1.0, 3.5), (1.0, 5.0)),
     simpler=("linear_stiffness", "cubic_stiffness"),
@@ -150,16 +148,14 @@ POWER_STIFFNESS = Effect(
     about_free_length=True,
 )
 
-PROGRESSIVE_STIFFNESS = Effect(
+PROGRESSIVE_STIFFNESS = _spring(
     name="progressive_stiffness",
-    family=_FAMILY,
     words="a non-linear spring (progressive)",
     parameters=(
         Parameter("force_n", "N", -1e12, 1e12, "force scale"),
         Parameter("length_m", "m", 1e-12, 1e4, "deflection at which the spring stiffens"),
     ),
     force=_progressive,
-    excitation=_WIDE,
     reference="Kovacic and Brennan, The Duffing Equation (2011), 1.3",
     starts=_lengths,
     bounds=within(length_m=of_stroke(0.04, 4.0)),
@@ -168,16 +164,14 @@ PROGRESSIVE_STIFFNESS = Effect(
     about_free_length=True,
 )
 
-EXPONENTIAL_STIFFNESS = Effect(
+EXPONENTIAL_STIFFNESS = _spring(
     name="exponential_stiffness",
-    family=_FAMILY,
     words="a non-linear spring (exponential, as rubber)",
     parameters=(
         Parameter("force_n", "N", -1e12, 1e12, "force scale"),
         Parameter("length_m", "m", 1e-12, 1e4, "compression by which the force grows e-fold"),
     ),
     force=_exponential,
-    excitation=_WIDE,
     reference="Gent, Engineering with Rubber (2012), 3.2",
     starts=_lengths,
     bounds=within(length_m=of_stroke(0.04, 4.0)),
@@ -185,17 +179,14 @@ EXPONENTIAL_STIFFNESS = Effect(
     shown=("force_n",),
 )
 
-GAS_SPRING = Effect(
+GAS_SPRING = _spring(
     name="gas_spring",
-    family=_FAMILY,
     words="a gas spring (polytropic)",
     parameters=(
         Parameter("charge_force_n", "N", -1e12, 1e12, "force at the free length"),
-        Parameter("gas_length_m", "m", 1e-12, 1e4, "gas volume over piston area at free length"),
-        Parameter("polytropic_exponent", "", 1.0, 3.0, "1 isothermal, 1.4 adiabatic air"),
+        *_GAS,
     ),
     force=_gas,
-    excitation=_WIDE,
     reference="Dixon, The Shock Absorber Handbook (2007), 6.4",
     starts=_gas_starts,
     bounds=within(gas_length_m=_gas_lengths),
@@ -203,17 +194,14 @@ GAS_SPRING = Effect(
     shown=("charge_force_n",),
 )
 
-BALANCED_GAS_SPRING = Effect(
+BALANCED_GAS_SPRING = _spring(
     name="balanced_gas_spring",
-    family=_FAMILY,
     words="a gas spring (polytropic, balanced at the free length)",
     parameters=(
         Parameter("charge_force_n", "N", -1e12, 1e12, "charge, balanced at the free length"),
-        Parameter("gas_length_m", "m", 1e-12, 1e4, "gas volume over piston area at free length"),
-        Parameter("polytropic_exponent", "", 1.0, 3.0, "1 isothermal, 1.4 adiabatic air"),
+        *_GAS,
     ),
     force=_balanced_gas,
-    excitation=_WIDE,
     reference="Dixon, The Shock Absorber Handbook (2007), 6.4",
     starts=_gas_starts,
     bounds=within(gas_length_m=_gas_lengths),

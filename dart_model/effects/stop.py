@@ -1,5 +1,8 @@
 """End stops, which push but never pull."""
 
+from collections.abc import Callable, Sequence
+from functools import partial
+
 from dart_model.effects.law import Effect, Motion, Parameter, Start
 from dart_model.effects.ranges import (
     Starts,
@@ -12,7 +15,6 @@ from dart_model.effects.ranges import (
     within,
 )
 
-_FAMILY = "stop"
 _CONTACT = Parameter("contact_height_m", "m", -1e4, 1e4, "height at which the stop is touched")
 _BUMP = "heights below the bump stop's contact, several times"
 _REBOUND = "heights above the rebound stop's contact, several times"
@@ -162,26 +164,17 @@ def _hertz_ends(
     return force
 
 
-def _stop_starts(*shares: float) -> Starts:
+def _contacts(
+    shares: Sequence[float],
+    usual: Callable[[Motion], float],
+    factors: Sequence[float],
+    *exponents: Sequence[float],
+) -> Starts:
+    """Contacts at shares of the stroke, with factors of a usual damping or dissipation."""
+
     def starts(motion: Motion) -> list[Start]:
-        dampings = [share * crossing_time_s(motion) for share in (0.01, 0.1)]
-        return grid(motion.heights_m(*shares), [1.0], dampings)
-
-    return moving(starts)
-
-
-def _hertz_starts(*shares: float) -> Starts:
-    def starts(motion: Motion) -> list[Start]:
-        dissipations = [share * slowness_s_per_m(motion) for share in (0.01, 0.1)]
-        return grid(motion.heights_m(*shares), [1.0], dissipations)
-
-    return moving(starts)
-
-
-def _power_starts(*shares: float) -> Starts:
-    def starts(motion: Motion) -> list[Start]:
-        dissipations = [0.03 * slowness_s_per_m(motion)]
-        return grid(motion.heights_m(*shares), [1.0], [1.0, 2.0], dissipations)
+        dissipations = [factor * usual(motion) for factor in factors]
+        return grid(motion.heights_m(*shares), [1.0], *exponents, dissipations)
 
     return moving(starts)
 
@@ -229,95 +222,86 @@ _POWER = (
     Parameter("dissipation_s_per_m", "s/m", 0.0, 1e12, "dissipation by closing speed"),
 )
 
-BUMP_STOP = Effect(
+_stop = partial(Effect, family="stop", scaled=(1,))
+
+BUMP_STOP = _stop(
     name="bump_stop",
-    family=_FAMILY,
     words="a bump stop",
     parameters=_LINEAR,
     force=_bump,
     excitation=_BUMP,
     reference=_KELVIN_VOIGT,
     scaled=(1, 2),
-    starts=_stop_starts(0.03, 0.07, 0.12, 0.18, 0.26, 0.36),
+    starts=_contacts((0.03, 0.07, 0.12, 0.18, 0.26, 0.36), crossing_time_s, (0.01, 0.1)),
     bounds=within(contact_height_m=_TOUCHED_BELOW),
     shown=("contact_height_m", "stiffness_n_per_m"),
 )
 
-REBOUND_STOP = Effect(
+REBOUND_STOP = _stop(
     name="rebound_stop",
-    family=_FAMILY,
     words="a rebound stop",
     parameters=_LINEAR,
     force=_rebound,
     excitation=_REBOUND,
     reference=_KELVIN_VOIGT,
     scaled=(1, 2),
-    starts=_stop_starts(0.97, 0.93, 0.88, 0.82, 0.74, 0.64),
+    starts=_contacts((0.97, 0.93, 0.88, 0.82, 0.74, 0.64), crossing_time_s, (0.01, 0.1)),
     bounds=within(contact_height_m=_TOUCHED_ABOVE),
     shown=("contact_height_m", "stiffness_n_per_m"),
 )
 
-HERTZ_BUMP_STOP = Effect(
+HERTZ_BUMP_STOP = _stop(
     name="hertz_bump_stop",
-    family=_FAMILY,
     words="a bump stop (Hertzian contact)",
     parameters=_HERTZ,
     force=_hertz_bump,
     excitation=_BUMP,
     reference=_HUNT_CROSSLEY,
-    scaled=(1,),
-    starts=_hertz_starts(0.04, 0.1, 0.16, 0.24, 0.36),
+    starts=_contacts((0.04, 0.1, 0.16, 0.24, 0.36), slowness_s_per_m, (0.01, 0.1)),
     bounds=within(contact_height_m=_TOUCHED_BELOW, dissipation_s_per_m=dissipation),
     shown=("contact_height_m",),
 )
 
-HERTZ_REBOUND_STOP = Effect(
+HERTZ_REBOUND_STOP = _stop(
     name="hertz_rebound_stop",
-    family=_FAMILY,
     words="a rebound stop (Hertzian contact)",
     parameters=_HERTZ,
     force=_hertz_rebound,
     excitation=_REBOUND,
     reference=_HUNT_CROSSLEY,
-    scaled=(1,),
-    starts=_hertz_starts(0.96, 0.9, 0.84, 0.76, 0.64),
+    starts=_contacts((0.96, 0.9, 0.84, 0.76, 0.64), slowness_s_per_m, (0.01, 0.1)),
     bounds=within(contact_height_m=_TOUCHED_ABOVE, dissipation_s_per_m=dissipation),
     shown=("contact_height_m",),
 )
 
-POWER_BUMP_STOP = Effect(
+POWER_BUMP_STOP = _stop(
     name="power_bump_stop",
-    family=_FAMILY,
     words="a bump stop (power law, as rubber)",
     parameters=_POWER,
     force=_power_bump,
     excitation=_BUMP,
     reference=_HUNT_CROSSLEY,
-    scaled=(1,),
-    starts=_power_starts(0.05, 0.15, 0.3),
+    starts=_contacts((0.05, 0.15, 0.3), slowness_s_per_m, (0.03,), (1.0, 2.0)),
     bounds=within(contact_height_m=_TOUCHED_BELOW, dissipation_s_per_m=dissipation),
     simpler=("bump_stop", "hertz_bump_stop"),
     shown=("contact_height_m", "force_at_10_mm_n"),
 )
 
-POWER_REBOUND_STOP = Effect(
+POWER_REBOUND_STOP = _stop(
     name="power_rebound_stop",
-    family=_FAMILY,
     words="a rebound stop (power law, as rubber)",
     parameters=_POWER,
     force=_power_rebound,
     excitation=_REBOUND,
     reference=_HUNT_CROSSLEY,
-    scaled=(1,),
-    starts=_power_starts(0.95, 0.85, 0.7),
+    starts=_contacts((0.95, 0.85, 0.7), slowness_s_per_m, (0.03,), (1.0, 2.0)),
     bounds=within(contact_height_m=_TOUCHED_ABOVE, dissipation_s_per_m=dissipation),
     simpler=("rebound_stop", "hertz_rebound_stop"),
     shown=("contact_height_m", "force_at_10_mm_n"),
 )
 
-END_STOPS = Effect(
+END_STOPS = _stop(
     name="end_stops",
-    family=_FAMILY,
     words="a bump stop and a rebound stop",
     parameters=(_LOW, _HIGH, *_LINEAR[1:]),
     force=_ends,
@@ -330,9 +314,8 @@ END_STOPS = Effect(
     shown=("low_contact_height_m", "high_contact_height_m", "stiffness_n_per_m"),
 )
 
-HERTZ_END_STOPS = Effect(
+HERTZ_END_STOPS = _stop(
     name="hertz_end_stops",
-    family=_FAMILY,
     words="a bump stop and a rebound stop (Hertzian contact)",
     parameters=(_LOW, _HIGH, *_HERTZ[1:]),
     force=_hertz_ends,

@@ -47,19 +47,9 @@ def _hidden_mass_starts(motion: Motion) -> list[Start]:
     return grid([mass_kg], frequencies, [0.01, 0.06])
 
 
-def _masses(motion: Motion) -> tuple[float, float]:
-    return 1e-4 * motion.mass_kg, 3.0 * motion.mass_kg
-
-
-def _frequencies(motion: Motion) -> tuple[float, float]:
-    return 1.0 / motion.duration_s, 0.25 / motion.step_s
-
-
-def _damping_ratios(_: Motion) -> tuple[float, float]:
-    # The least logarithmic decrement of EN 1991-1-4:2005, table F.2 (welded steel) is 0.012; with
-    # less, a free vibration lasts as long as a run and passes for a tone of whatever cause.
-    return 0.012 / (2.0 * math.pi), 2.0
-
+_LEAST_DAMPING_RATIO = 0.012 / (2.0 * math.pi)
+"""By the least logarithmic decrement of EN 1991-1-4:2005, table F.2 (welded steel), 0.012; with
+less, a free vibration lasts as long as a run and passes for a tone of whatever cause."""
 
 HIDDEN_MASS = Effect(
     name="hidden_mass",
@@ -77,7 +67,11 @@ HIDDEN_MASS = Effect(
     states=(State("deflection_m", 0.01), State("mass_velocity_m_per_s", 0.01)),
     fits_state=True,
     starts=_hidden_mass_starts,
-    bounds=within(mass_kg=_masses, frequency_hz=_frequencies, damping_ratio=_damping_ratios),
+    bounds=within(
+        mass_kg=lambda m: (1e-4 * m.mass_kg, 3.0 * m.mass_kg),
+        frequency_hz=lambda m: (1.0 / m.duration_s, 0.25 / m.step_s),
+        damping_ratio=lambda _: (_LEAST_DAMPING_RATIO, 2.0),
+    ),
     simpler=("added_mass",),
     benches=("force_given",),
     shown=("mass_kg", "frequency_hz"),

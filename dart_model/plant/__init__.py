@@ -32,30 +32,19 @@ from dart_model.plant.integrator import (
     exact_step_s,
     stable_step_s,
 )
-from dart_model.plant.prescribed_strut import PrescribedState, PrescribedStrut
+from dart_model.plant.prescribed_strut import PrescribedStrut
 from dart_model.plant.skeleton import build
 from dart_model.plant.state import Loaded, Mechanics, PlantState
 from dart_model.plant.strut import struts_of
 from dart_model.spec import ModelSpec
 
-__all__ = [
-    "LONGEST_STEP_S",
-    "DartPlant",
-    "Jacobians",
-    "Loaded",
-    "Mechanics",
-    "PlantState",
-    "PrescribedState",
-    "PrescribedStrut",
-]
+__all__ = ["LONGEST_STEP_S", "DartPlant", "PlantState", "PrescribedStrut"]
 
 _RESTING_STEPS, _RESTING_STEP, _RESTED, _LONGEST_MOVE, _SPRINGLESS = 50, 1e-6, 1e-9, 0.1, 1e-9
 """Newton's method for a bench at rest: steps, difference and end (m or rad), longest move, and the
 share of the largest stiffness below which a direction counts as free."""
-
 _FARTHEST = 1.0
 """Distance of a rest (m or rad) beyond which nothing holds the bench: no strut is as long."""
-
 _DIFFERENCE = 1e-6
 """Step of the coordinates (m or rad, and per second) in central differences of the bias force: a
 third of the digits of a double, where rounding and truncation are about equal."""
@@ -67,9 +56,6 @@ class DartPlant:
     The skeleton inside holds no state: every call first writes all of the state that its result
     depends on, so that results depend on the arguments alone. One plant must not be used from two
     threads at once.
-
-    Args:
-        spec: The model.
 
     Raises:
         ModelError: A skeleton file is wrong, a body that a strut names is not in it, no joint moves
@@ -143,10 +129,6 @@ class DartPlant:
         """Coordinates with the given heights, at rest in the directions that these leave free.
 
         Where there is no such rest within a metre, these directions stay as they are.
-
-        Args:
-            q: Coordinates with those heights, shape (n,).
-            heights_m: One height a strut, shape (struts,); NaN where none is given.
         """
         start = q
         for _ in range(_RESTING_STEPS):
@@ -203,14 +185,7 @@ class DartPlant:
         applied_force_n: float,
         temperature_c: float,
     ) -> Loaded:
-        """Let forces act on a state.
-
-        Args:
-            state: The state.
-            virtual_forces_n: Virtual force in each strut.
-            applied_force_n: Applied force.
-            temperature_c: Damper temperature.
-        """
+        """Let forces act on a state."""
         return self._equations.load(state, virtual_forces_n, applied_force_n, temperature_c)
 
     def step(self, loaded: Loaded, dt_s: float, applied_force_end_n: float) -> PlantState:
@@ -220,9 +195,6 @@ class DartPlant:
             loaded: State at the beginning and the forces on it; virtual forces are held.
             dt_s: Duration; divided into steps of at most `step_s`, and into 10 000 at most.
             applied_force_end_n: Applied force at the end; it is linear in between.
-
-        Returns:
-            State at the end.
         """
         return self._equations.step(loaded, dt_s, applied_force_end_n, self.step_s)
 
@@ -242,12 +214,7 @@ class DartPlant:
         return Mechanics(here.heights_m(q), here.struts, here.applied, mass, bias)
 
     def bias_slopes(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Derivatives of the bias force by coordinates and by their rates, each of shape (n, n).
-
-        Args:
-            q: Coordinates, shape (n,).
-            v: Their rates, shape (n,).
-        """
+        """Derivatives (n, n) of the bias force by coordinates (n,) and by their rates (n,)."""
         steps = _DIFFERENCE * np.eye(len(q))
         by_q = [self.mechanics(q + h, v).bias - self.mechanics(q - h, v).bias for h in steps]
         by_v = [self.mechanics(q, v + h).bias - self.mechanics(q, v - h).bias for h in steps]
@@ -289,7 +256,5 @@ def _linearise(
     stiffness, damping = (np.diag(column) for column in zip(*struts, strict=True))
     jacobian = here.struts
     return Linearised(
-        here.mass,
-        jacobian.T @ damping @ jacobian - by_v,
-        jacobian.T @ stiffness @ jacobian - by_q,
+        here.mass, jacobian.T @ damping @ jacobian - by_v, jacobian.T @ stiffness @ jacobian - by_q
     )

@@ -13,10 +13,7 @@ from dart_model.errors import ModelError
 
 
 def admit(content: bytes) -> bool:
-    """Admit a program for this user.
-
-    Returns:
-        Whether it was not admitted before.
+    """Admit a program for this user; whether it was not admitted before.
 
     Raises:
         ModelError: The user's settings cannot be read or written.
@@ -41,10 +38,6 @@ def withdraw(content: bytes) -> None:
 
 def require_admission(content: bytes, path: Path) -> None:
     """Refuse a program that this user never admitted.
-
-    Args:
-        content: The program.
-        path: Its name in an error.
 
     Raises:
         ModelError: It was not admitted, or the user's settings cannot be read.

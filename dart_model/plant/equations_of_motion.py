@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Generic, NamedTuple
+from typing import Generic
 
 import numpy as np
 
@@ -16,40 +16,13 @@ _MOST_STEPS = 10_000
 """Steps of one call; one that is so late that it would need more takes longer ones."""
 
 
-class _StrutRow(NamedTuple, Generic[Value]):
-    """A strut in one configuration: ``height = offset + row @ q``.
-
-    Attributes:
-        strut: The strut.
-        offset_m: Its offset.
-        row: Its row of the Jacobian.
-    """
-
-    strut: Strut
-    offset_m: float
-    row: Value
-
-
-class _Configuration(NamedTuple, Generic[Value]):
-    """The struts and the applied force in one configuration.
-
-    Attributes:
-        struts: The struts.
-        applied: Generalised force per newton of applied force.
-    """
-
-    struts: tuple[_StrutRow[Value], ...]
-    applied: Value
+_Configuration = tuple[tuple[tuple[Strut, float, Value], ...], Value]
+"""Struts in one configuration, ``height = offset + row @ q`` (strut, offset in m, row of the
+Jacobian), and the generalised force per newton of applied force."""
 
 
 class EquationsOfMotion(Generic[Value]):
-    """Equations of motion of a model, over time.
-
-    Args:
-        backend: Its coordinates and their dynamics.
-        struts: Its struts.
-        geometry: Their heights and Jacobians.
-    """
+    """Equations of motion of a model, over time."""
 
     def __init__(
         self, backend: Backend[Value], struts: Sequence[Strut], geometry: Geometry
@@ -81,7 +54,7 @@ class EquationsOfMotion(Generic[Value]):
         applied_force_n: float,
         temperature_c: float,
     ) -> Loaded:
-        """Let forces act on a state; arguments as of `DartPlant.load`."""
+        """Let forces act on a state."""
         backend, internal, t_s = self._backend, state.internal, state.t_s
         q, v = backend.value(state.positions), backend.value(state.velocities)
         struts, applied = self._constant or self._at(q)
@@ -168,13 +141,11 @@ class EquationsOfMotion(Generic[Value]):
 
     def _configuration(self, jacobians: Jacobians) -> _Configuration[Value]:
         value = self._backend.value
-        rows = tuple(
-            _StrutRow(strut, offset_m, value(row))
-            for strut, offset_m, row in zip(
-                self._struts, jacobians.offsets_m.tolist(), jacobians.struts.tolist(), strict=True
-            )
+        columns = self._struts, jacobians.offsets_m.tolist(), jacobians.struts.tolist()
+        rows = (
+            (strut, offset_m, value(row)) for strut, offset_m, row in zip(*columns, strict=True)
         )
-        return _Configuration(rows, value(jacobians.applied.tolist()))
+        return tuple(rows), value(jacobians.applied.tolist())
 
 
 def count_steps(dt_s: float, longest_s: float) -> int:

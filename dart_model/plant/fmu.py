@@ -28,7 +28,6 @@ _Doubles = ctypes.Array[ctypes.c_double]
 
 _MOST_ITERATIONS = 20
 """Most event iterations at one time."""
-
 _MESSAGES = 3
 """Most recent messages of an FMU that an error contains."""
 
@@ -39,13 +38,7 @@ class MockUp:
     Its result depends on its arguments alone as long as the FMU has no state but its continuous
     states; one that declares others is refused.
 
-    Args:
-        spec: The file, and the meaning of its variables for a strut.
-        folder: Where the file lies.
-        gravity_m_per_s2: Standard gravity.
-
     Attributes:
-        name: Its name in messages.
         state_scales: Usual size of each internal state: a continuous state less its start.
 
     Raises:
@@ -121,8 +114,7 @@ class _Unit:
         self._has_events = bool(description.numberOfEventIndicators)
         parameters = {variables[n].valueReference: v for n, v in spec.parameters.items()}
         self._calls = _start(content, path, description, parameters)
-        self._start = self._calls.states(self._count)
-        nominals = self._calls.nominals(self._count)
+        self._start, nominals = self._calls.states_and_nominals(self._count)
         self.nominals = tuple(nominals[k] for k in self.internal)
 
     def at(
@@ -233,19 +225,13 @@ class _Calls:
                 return changed
         raise _Refused("comes to no end of events")
 
-    def states(self, count: int) -> list[float]:
-        """The continuous states."""
-        x = _doubles(count)
+    def states_and_nominals(self, count: int) -> tuple[list[float], list[float]]:
+        """The continuous states, and their usual size."""
+        states, nominals = _doubles(count), _doubles(count)
         if count:
-            self._it.getContinuousStates(x, count)
-        return list(x[:count])
-
-    def nominals(self, count: int) -> list[float]:
-        """Their usual size."""
-        x = _doubles(count)
-        if count:
-            self._it.getNominalsOfContinuousStates(x, count)
-        return list(x[:count])
+            self._it.getContinuousStates(states, count)
+            self._it.getNominalsOfContinuousStates(nominals, count)
+        return list(states[:count]), list(nominals[:count])
 
 
 def _doubles(count: int) -> _Doubles:
@@ -276,10 +262,6 @@ def read_program(path: Path) -> bytes:
 
 def read_description(content: bytes, path: Path) -> Any:
     """Description of an FMU, as FMPy reads it; nothing of it is executed.
-
-    Args:
-        content: The FMU.
-        path: Its name in an error.
 
     Raises:
         ModelError: It is no FMU, or FMPy is not installed.

@@ -14,13 +14,10 @@ Array = NDArray[np.float64]
 
 _NEWTON_STEPS = 50
 """Newton's method doubles its digits at each step, once it is near: more steps change nothing."""
-
 _REACHED_M, _OUT_OF_REACH_M = 1e-13, 1e-9
 """Error of a height at which Newton's method ends, and above which it has failed."""
-
 _DISAGREEMENT_M = 5e-4
 """Disagreement of the sensors of more struts than coordinates that noise explains."""
-
 _SHORTEST_M = 1e-12
 """Length of a strut below which its direction is not defined."""
 
@@ -84,7 +81,6 @@ class Geometry:
     is the distance of its ends.
 
     Args:
-        spec: The model.
         skeleton: Its bodies and joints in DART; their positions and velocities are overwritten by
             every call.
 
@@ -236,13 +232,7 @@ def sample_positions(coordinates: int) -> list[Array]:
 
 
 def _guide(model: str, strut: StrutSpec, columns: Array) -> Array:
-    """Direction of a strut whose ends move along one straight line, shape (3,), else NaN.
-
-    Args:
-        model: Name of the model.
-        strut: The strut.
-        columns: Its gap's derivatives by the coordinates, in many configurations, shape (3, m).
-    """
+    """Direction (3,) of a strut on a straight line, else NaN; by its gap's derivatives (3, m)."""
     directions, singular, _ = np.linalg.svd(columns)
     if singular[0] < 1e-9:
         raise ModelError(

@@ -39,24 +39,15 @@ _FREQUENCY_STEP = 0.1
 """Largest product of step and natural angular frequency. An undamped mode loses (0.1)³ π / 12, that
 is 0.03 %, of its amplitude in a period, and one with a damping ratio of 0.02 is never off by more
 than 0.1 % of where it began."""
-
 _POLE_STEP = 0.5
 """Largest product of step and magnitude of a pole, for modes too strongly damped to swing."""
-
 _STABLE_STEP = 1.0
 """The same with the steepest slopes of effects, which act within short ranges: there it is
 enough that the method is stable, as it is up to 2.5."""
 
 
 class Course(Struct, frozen=True, gc=False):
-    """Steps of equal length, and the input during them.
-
-    Attributes:
-        t_s: Time at the beginning.
-        duration_s: Duration of all steps.
-        steps: Number of steps.
-        inputs: Input at the beginning and at the end; it is linear in between.
-    """
+    """Steps of equal length, with an input that is linear from the beginning to the end."""
 
     t_s: float
     duration_s: float
@@ -71,18 +62,7 @@ def advance(
     first: tuple[Value, Sequence[float]],
     course: Course,
 ) -> tuple[Value, Value, Internal]:
-    """State after a number of equal steps.
-
-    Args:
-        slope: The differential equation.
-        move: How rates move coordinates; ``q + h * v`` where coordinates add up.
-        start: Coordinates, their rates and internal states at the beginning.
-        first: The slope there.
-        course: Steps and input.
-
-    Returns:
-        Coordinates, rates and internal states at the end.
-    """
+    """Coordinates, rates and internal states after equal steps from a start with slope `first`."""
     (q, v, internal), (a1, rates1) = start, first
     t_s, steps = course.t_s, course.steps
     given, end = course.inputs
@@ -127,13 +107,7 @@ def propagate(internal: Internal, h: float, rates: Sequence[float]) -> Internal:
 
 
 class Linearised(NamedTuple):
-    """A bench about one configuration: ``mass @ q'' + damping @ q' + stiffness @ q = 0``.
-
-    Attributes:
-        mass: Shape (n, n).
-        damping: Shape (n, n).
-        stiffness: Shape (n, n).
-    """
+    """A bench in one configuration: ``mass @ q'' + damping @ q' + stiffness @ q = 0``, (n, n)."""
 
     mass: Array
     damping: Array

@@ -11,7 +11,6 @@ from dart_model.spec import ModelSpec
 
 _LONGEST_STEP_S = 0.5e-3
 """Half the longest step of a bench, since the midpoint rule is of one order less."""
-
 _MOST_STEPS = 1000
 """Steps of one call: over half a second without a measured height they get longer."""
 
@@ -20,12 +19,7 @@ Motion = Callable[[float], tuple[float, float]]
 
 
 class PrescribedState(NamedTuple):
-    """State of a strut whose motion is given.
-
-    Attributes:
-        t_s: Time.
-        internal: Internal states of its effects.
-    """
+    """State of a strut whose motion is given."""
 
     t_s: float
     internal: tuple[float, ...]
@@ -33,9 +27,6 @@ class PrescribedState(NamedTuple):
 
 class PrescribedStrut:
     """The only strut of a model, moved as a dyno moves it.
-
-    Args:
-        spec: The model.
 
     Raises:
         ModelError: It has more than one strut.
@@ -56,14 +47,7 @@ class PrescribedStrut:
     def step(
         self, state: PrescribedState, t_s: float, motion: Motion, temperature_c: float
     ) -> PrescribedState:
-        """State at a later time, by the midpoint rule.
-
-        Args:
-            state: State before.
-            t_s: The later time.
-            motion: The motion in between.
-            temperature_c: Damper temperature.
-        """
+        """State at a later time, by the midpoint rule."""
         internal, duration_s = state.internal, t_s - state.t_s
         if not internal or duration_s <= 0.0:
             return PrescribedState(t_s, internal)
@@ -78,11 +62,7 @@ class PrescribedStrut:
         return PrescribedState(t_s, internal)
 
     def force_n(
-        self,
-        state: PrescribedState,
-        height_m: float,
-        velocity_m_per_s: float,
-        temperature_c: float,
+        self, state: PrescribedState, height_m: float, velocity_m_per_s: float, temperature_c: float
     ) -> float:
         """Force of spring, damper and effects: what a load cell would show."""
         unused = [0.0] * self._strut.states

@@ -20,13 +20,7 @@ _INSTANT_S = 1e-9
 
 
 class Skeleton(NamedTuple):
-    """Bodies and joints in DART.
-
-    Attributes:
-        dart: DART's skeleton.
-        bodies: Its bodies by name.
-        loaded: Body on which the applied force acts.
-    """
+    """Bodies and joints in DART; the applied force acts on `loaded`."""
 
     dart: DartSkeleton
     bodies: dict[str, DartBody]
@@ -153,18 +147,6 @@ def _read_urdf(uri: str) -> DartSkeleton | None:
     return loader.parseSkeleton(uri)
 
 
-def _read_sdf(uri: str) -> DartSkeleton | None:
-    return _dart.utils.SdfParser.readSkeleton(uri)
-
-
-def _read_skel(uri: str) -> DartSkeleton | None:
-    return _first_skeleton(_dart.utils.SkelParser.readWorld(uri))
-
-
-def _read_mjcf(uri: str) -> DartSkeleton | None:
-    return _first_skeleton(_dart.utils.MjcfParser.readWorld(uri))
-
-
 def _first_skeleton(world: Any) -> DartSkeleton | None:
     return world.getSkeleton(0) if world is not None and world.getNumSkeletons() > 0 else None
 
@@ -174,9 +156,9 @@ _MJCF = (".xml", ".mjcf")
 
 _PARSERS: dict[str, Callable[[str], DartSkeleton | None]] = {
     ".urdf": _read_urdf,
-    ".sdf": _read_sdf,
-    ".skel": _read_skel,
-    **dict.fromkeys(_MJCF, _read_mjcf),
+    ".sdf": _dart.utils.SdfParser.readSkeleton,
+    ".skel": lambda uri: _first_skeleton(_dart.utils.SkelParser.readWorld(uri)),
+    **dict.fromkeys(_MJCF, lambda uri: _first_skeleton(_dart.utils.MjcfParser.readWorld(uri))),
 }
 """DART's parser for each suffix."""
 

@@ -17,7 +17,6 @@ class PlantState(Struct, frozen=True, gc=False):
         positions: Joint coordinates, in m or rad, as DART orders them.
         velocities: Joint velocities, in m/s or rad/s.
         internal: Internal states of all effects, strut after strut.
-        t_s: Time, for effects that depend on it.
         struts: Height (m) and velocity (m/s; positive is rebound) of every strut at
             these coordinates.
     """
@@ -33,16 +32,12 @@ class Loaded(Struct, frozen=True, gc=False):
     """A state under the forces that act from it on.
 
     Attributes:
-        state: The state.
         virtual_forces_n: Virtual force in each strut, held until the next state.
-        applied_force_n: Applied force at the state.
-        temperature_c: Damper temperature.
         forces_n: Spring-damper force of each strut with its effects, without the virtual force.
         accelerations_m_per_s2: Second derivative of each strut's height under all forces.
         position: Coordinates, for the integrator: a float where there is one, else an array.
         velocity: Their rates, likewise.
         acceleration: Their second derivative, likewise.
-        internal_rates: Derivative of the internal states.
     """
 
     state: PlantState

@@ -26,9 +26,6 @@ class _Part(NamedTuple):
 
     Attributes:
         name: What it is called in messages.
-        force: Its force, N.
-        rates: Rates of its internal states.
-        parameters: Its parameters in their order.
         first: Index of its first internal state in the model's.
         end: Index after its last one.
     """
@@ -45,25 +42,17 @@ class Strut:
     """Force of a strut over height, velocity and internal states.
 
     Args:
-        spec: The strut.
         first_state: Index of its first internal state in the model's.
         gravity_m_per_s2: Standard gravity, for laws that carry a mass.
-        folder: Where an FMU is looked for.
     """
 
     def __init__(
         self, spec: StrutSpec, first_state: int, gravity_m_per_s2: float, folder: Path
     ) -> None:
         self.name = spec.name
-        self._free_length = spec.free_length_m
-        self._stiffness = spec.stiffness_n_per_m
-        self._damping = spec.damping_n_s_per_m
-        self._constants = (
-            spec.free_length_m,
-            spec.stiffness_n_per_m,
-            spec.damping_n_s_per_m,
-            gravity_m_per_s2,
-        )
+        linear = spec.free_length_m, spec.stiffness_n_per_m, spec.damping_n_s_per_m
+        self._free_length, self._stiffness, self._damping = linear
+        self._constants = (*linear, gravity_m_per_s2)
         parts: list[_Part] = []
         first = first_state
         for item in spec.effects:
@@ -114,16 +103,9 @@ class Strut:
             if own:
                 rates = [0.0] * len(own)
                 part_rates(
-                    t_s,
-                    height_m,
-                    velocity_m_per_s,
-                    applied_force_n,
-                    temperature_c,
-                    own,
-                    values,
-                    strut,
-                    rates,
-                )
+                    t_s, height_m, velocity_m_per_s, applied_force_n, temperature_c, own, values,
+                    strut, rates,
+                )  # fmt: skip
                 internal_rates[first:end] = rates
         return force
 

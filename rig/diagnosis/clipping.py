@@ -9,31 +9,20 @@ Array = NDArray[np.float64]
 
 _LONGEST_PLATEAU = 0.002
 """Share of the samples that a channel that is not clipped may stay at its extreme value."""
-
 _STANDS = 4
 """Samples in a row at an extreme value that are no coincidence."""
-
 _FULL_SPEED = 0.3
 """Share of its usual speed with which a clipped channel enters a plateau; a channel that comes to
 rest slows down before."""
-
 _COARSE = 50.0
 """Steps of its resolution that a channel spans at least, for a plateau to mean anything."""
-
 _JUMP = 4.0
 """Steps of its resolution by which a clipped channel enters a plateau: the flat top of a channel in
 steps is one step above its sides."""
 
 
 class Plateaus(NamedTuple):
-    """Where a channel stays at one end of its range.
-
-    Attributes:
-        extreme: `lowest` or `highest`.
-        limit: The value there.
-        firsts: First sample of each plateau, shape (P,).
-        lengths: Samples of each plateau, shape (P,).
-    """
+    """Where a channel stays at its `lowest` or `highest` value: first samples and lengths, (P,)."""
 
     extreme: str
     limit: float
@@ -50,11 +39,7 @@ def _find_plateaus(values: Array) -> list[Plateaus]:
 
 
 def find_sudden_plateaus(values: Array) -> list[Plateaus]:
-    """Plateaus that a channel enters with a jump, which deserve a warning.
-
-    Args:
-        values: Finite values, shape (N,).
-    """
+    """Plateaus that a channel (N,), all finite, enters with a jump, which deserve a warning."""
     steps = np.abs(np.diff(values))
     if not np.any(steps):
         return []
@@ -70,11 +55,7 @@ def find_sudden_plateaus(values: Array) -> list[Plateaus]:
 
 
 def find_long_plateaus(values: Array) -> Plateaus | None:
-    """Plateaus at an end of the range that make a channel useless; None if there are none.
-
-    Args:
-        values: Finite values, shape (N,).
-    """
+    """Plateaus at an end of the range that make a channel (N,), all finite, useless, or None."""
     levels = np.diff(np.unique(values))
     if len(levels) == 0 or float(np.ptp(values)) <= _COARSE * float(levels.min()):
         return None

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -78,7 +77,8 @@ def _diagnose_problems(
 ) -> Result:
     search, problem = _search(problems.learnt, criteria, progress)
     progress("evaluating on held-out data", 0.95)
-    problems = problems.with_learnt(problem)
+    held_out = replace(problems.held_out, motions=problem.motions)
+    problems = problems._replace(learnt=problem, held_out=held_out)
     linear = search.linear.fit
     evaluations = evaluate_held_out(problems, linear, search.chosen.fit)
     if search.chosen.size and are_laws_superfluous(problem, linear, evaluations, criteria):
@@ -110,20 +110,6 @@ def _error(evaluations: Sequence[RunEvaluation]) -> float:
     return quadratic_mean([run.target.after for run in evaluations])
 
 
-class _Search(NamedTuple):
-    """A search, before its conclusion.
-
-    Attributes:
-        first: Models about the linear model.
-        last: Models to choose from.
-        first_round: Single laws together with the linear model, where there was such a round.
-    """
-
-    first: Pool
-    last: Pool
-    first_round: FirstRound | None
-
-
 def _search(
     problem: Problem, criteria: SelectionCriteria, progress: Progress
 ) -> tuple[SearchResult, Problem]:
@@ -137,21 +123,23 @@ def _search(
     problem = _with_residual_noise(problem, fits[1])
     part = part_of(problem, _SEARCHED_NODES)
     if part is problem:
-        search = _explore_twice(part, fits, criteria, within(progress, 0.05, 0.85))
+        first, last, single = _explore_twice(part, fits, criteria, within(progress, 0.05, 0.85))
     else:
-        search = _explore_twice(part, first_fits(part), criteria, within(progress, 0.05, 0.6))
-        last = _fit_to_all(problem, fits, search.last, within(progress, 0.6, 0.85))
-        search = search._replace(last=last)
-    problem = search.last.problem
-    result = select_model(search.last, search.first, search.first_round, progress)
-    return result._replace(chosen=_refit_with_finer_steps(problem, result.chosen)), problem
+        first, last, single = _explore_twice(
+            part, first_fits(part), criteria, within(progress, 0.05, 0.6)
+        )
+        last = _fit_to_all(problem, fits, last, within(progress, 0.6, 0.85))
+    result = select_model(last, first, single, progress)
+    chosen = _refit_with_finer_steps(last.problem, result.chosen)
+    return result._replace(chosen=chosen), last.problem
 
 
 def _explore_twice(
     problem: Problem, fits: tuple[Fit, Fit], criteria: SelectionCriteria, progress: Progress
-) -> _Search:
+) -> tuple[Pool, Pool, FirstRound | None]:
     """Search, and search again about the best model: its free run is nearer to the measurement.
 
+    These are the models about the linear one, those about the best, and the first round.
     The noise, too, is only known once a model is near: the residual of a poor one is smooth.
     """
     given, linear = fits
@@ -161,7 +149,7 @@ def _explore_twice(
     seeds = [model.fit for model in (first.linear, *first.best_and_subsets())]
     second = Pool(problem, given, seeds, criteria)
     explore(second, within(progress, 0.55, 1.0))
-    return _Search(first, second, first_round)
+    return first, second, first_round
 
 
 def _fit_to_all(

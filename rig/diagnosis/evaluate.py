@@ -22,11 +22,6 @@ from rig.diagnosis.search.fit import Fit, fit
 def evaluate_held_out(problems: Problems, linear: Fit, corrected: Fit) -> tuple[RunEvaluation, ...]:
     """Figures of every held-out recording.
 
-    Args:
-        problems: What models were fitted to, and what is held out.
-        linear: The best linear model.
-        corrected: The corrected model.
-
     Raises:
         RecordingError: A model runs away on a recording.
     """

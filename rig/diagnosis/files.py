@@ -23,20 +23,9 @@ from rig.log.file_names import RUN_FILE
 
 
 def diagnose_runs(
-    runs: Sequence[Path],
-    model: ModelSpec,
-    held_out: Sequence[Path],
-    out: Path,
-    progress: Progress,
+    runs: Sequence[Path], model: ModelSpec, held_out: Sequence[Path], out: Path, progress: Progress
 ) -> Result:
-    """Diagnose runs, and write the diagnosis and the corrected model.
-
-    Args:
-        runs: Folders of runs, or CSV files.
-        model: The nominal model.
-        held_out: Runs to evaluate on.
-        out: Folder to write into.
-        progress: Called with what is being done, and the share that is done.
+    """Diagnose runs (folders or CSV files); write diagnosis and corrected model into `out`.
 
     Raises:
         InputError: A run cannot be read or is given twice, or `out` cannot be written or holds a

@@ -56,7 +56,6 @@ class Recording:
     """One run of a bench, as measured.
 
     Attributes:
-        name: File or folder, for reports.
         t_s: Times, increasing, shape (N,).
         heights_m: Heights of the struts, shape (N, struts); NaN where a sample is missing.
         applied_force_n: Applied force, shape (N,), or None where the bench has none.
@@ -81,11 +80,7 @@ class Recording:
 
 
 def read_recording(path: Path, struts: Sequence[str] | None = None) -> Recording:
-    """Recording from a run's folder or from a CSV file.
-
-    Args:
-        path: The folder or file.
-        struts: Names of the model's struts, for the columns of a CSV file that name them.
+    """Recording from a run's folder or from a CSV file, whose columns may name `struts`.
 
     Raises:
         InputError: There is no such run.
@@ -114,10 +109,7 @@ def _sha256(files: Iterable[Path]) -> str:
 def read_csv(path: Path, struts: Sequence[str] | None = None) -> Recording:
     """Recording from a CSV file with units in its header.
 
-    Args:
-        path: The file.
-        struts: Names of the model's struts, in its order. Columns without a strut's name belong to
-            the only one.
+    `struts` are the model's, in its order; columns without a strut's name belong to the only one.
 
     Raises:
         RecordingError: The file is no such table, or holds no run that can be diagnosed.
@@ -215,9 +207,6 @@ def read_run(folder: Path) -> Recording:
 
     Frames with a wrong CRC or length are ignored; single missing heights are NaN, the other
     channels are linear between their samples.
-
-    Args:
-        folder: Folder of the run.
 
     Raises:
         InputError: The run is damaged, or holds no height.

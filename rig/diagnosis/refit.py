@@ -13,19 +13,12 @@ from rig.diagnosis.outcome import Estimate
 from rig.diagnosis.problem.build import build
 from rig.diagnosis.recording import Recording
 from rig.diagnosis.search.criteria import CRITERIA
-from rig.diagnosis.search.fit import effect_variables
-from rig.diagnosis.write_up import estimates_of, estimates_of_fit, linear_corrections
+from rig.diagnosis.search.fit import effect_variables, fit_covariance
+from rig.diagnosis.write_up import FitEstimates, estimates_of, linear_corrections
 
 
 class OwnParameter(NamedTuple):
-    """A parameter of a model.
-
-    Attributes:
-        strut: Its strut.
-        effect: Its effect in the catalogue; empty for the linear part.
-        parameter: Its name, with the unit.
-        estimate: Its value with a 95 % interval.
-    """
+    """A parameter of a model; `effect` is empty for the linear part."""
 
     strut: str
     effect: str
@@ -34,21 +27,14 @@ class OwnParameter(NamedTuple):
 
 
 def refit_parameters(spec: ModelSpec, runs: Sequence[Recording]) -> list[OwnParameter]:
-    """The parameters of a model with its given laws, fitted to recordings.
-
-    Args:
-        spec: The model.
-        runs: Recordings.
-
-    Returns:
-        The parameters of the linear part that are identifiable, and all of the effects.
+    """Identifiable linear parameters and all effects' parameters, fitted to recordings.
 
     Raises:
         RecordingError: A recording or the model cannot be used.
     """
     problem = build(spec, runs, CRITERIA.blocks, None)
     _, fit = first_fits(problem)
-    estimates = estimates_of_fit(fit)
+    estimates = FitEstimates(fit, fit_covariance(fit))
     parameters = [
         OwnParameter(item.strut, "", item.parameter, item.total)
         for item in linear_corrections(problem, estimates)

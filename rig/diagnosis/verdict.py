@@ -12,10 +12,7 @@ from rig.diagnosis.search.model_selection import SearchResult
 
 
 def are_laws_superfluous(
-    problem: Problem,
-    linear: Fit,
-    evaluations: Sequence[RunEvaluation],
-    criteria: SelectionCriteria,
+    problem: Problem, linear: Fit, evaluations: Sequence[RunEvaluation], criteria: SelectionCriteria
 ) -> bool:
     """Whether all data are at the floor without any law, and laws gain nothing on held-out data.
 

@@ -59,12 +59,7 @@ _HOLD = 0.3
 
 
 class FitEstimates(NamedTuple):
-    """A fit with its covariance, from which estimates with confidence intervals follow.
-
-    Attributes:
-        fit: The fit.
-        covariance: The covariance of its variables.
-    """
+    """A fit with its covariance, from which estimates with confidence intervals follow."""
 
     fit: Fit
     covariance: FitCovariance
@@ -88,11 +83,6 @@ class FitEstimates(NamedTuple):
         )
 
 
-def estimates_of_fit(result: Fit) -> FitEstimates:
-    """A fit with its covariance."""
-    return FitEstimates(result, fit_covariance(result))
-
-
 def compose_result(
     problem: Problem,
     search: SearchResult,
@@ -102,21 +92,12 @@ def compose_result(
     *,
     by_blocks: bool,
 ) -> Result:
-    """The outcome of a search.
-
-    Args:
-        problem: Model and recordings.
-        search: The result of the search.
-        verdict: What held-out data show.
-        evaluations: Held-out recordings, before and after.
-        criteria: What decides.
-        by_blocks: Whether blocks were held out, not runs.
-    """
+    """The outcome of a search."""
     chosen = search.chosen.fit
     recordings = range(problem.recordings)
     before = [problem.residual_forces(k, search.given.model) for k in recordings]
     after = [problem.residual_forces(k, chosen.model) for k in recordings]
-    estimates = estimates_of_fit(chosen)
+    estimates = FitEstimates(chosen, fit_covariance(chosen))
     ambiguous = verdict == "ambiguous"
     floors = [run.floor for run in evaluations]
     diagnosis = Diagnosis(
@@ -187,13 +168,7 @@ def _existing_preload(problem: Problem, parameter: LinearParameter) -> float:
 def _effects(
     problem: Problem, estimates: FitEstimates, after: Sequence[ResidualForces | None]
 ) -> tuple[FoundEffect, ...]:
-    """The chosen laws, strongest first.
-
-    Args:
-        problem: Model and recordings.
-        estimates: The chosen model.
-        after: Its residual force along each recording.
-    """
+    """The chosen laws, strongest first."""
     model, residuals = estimates.fit.model, [(k, f) for k, f in enumerate(after) if f is not None]
     first = len(model.candidate.kept)
     forces = forces_along(problem, model, [(k, f.track) for k, f in residuals])
@@ -214,15 +189,7 @@ def _describe_effect(
     force: Array,
     parameters: dict[str, Estimate],
 ) -> FoundEffect:
-    """An effect with the share of the residual force that it explains.
-
-    Args:
-        problem: Model and recordings.
-        strut_effect: The effect in its strut.
-        residual: Residual force with it, shape (N,); NaN where it is not known.
-        force: Its force, shape (N,).
-        parameters: Estimates of its parameters.
-    """
+    """An effect with the share of the residual force that it explains."""
     strut, name = strut_effect
     known = np.isfinite(residual)
     without = float(np.mean((residual + force)[known] ** 2))
@@ -249,7 +216,7 @@ def estimates_of(
 def _linear_effects(
     problem: Problem, estimates: FitEstimates, after: Sequence[ResidualForces | None]
 ) -> tuple[FoundEffect, ...]:
-    """Linear corrections as effects, where there are no others; arguments as for `_effects`."""
+    """Linear corrections as effects, where there are no others."""
     result = estimates.fit
     effects: list[FoundEffect] = []
     indices = np.flatnonzero(result.free)

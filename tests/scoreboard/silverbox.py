@@ -23,6 +23,7 @@ from rig.diagnosis.files import diagnose_runs
 from rig.diagnosis.numerics.least_squares import Effort
 from rig.diagnosis.outcome import CORRECTED_FILE
 from rig.diagnosis.problem.build import build
+from rig.diagnosis.problem.on_dart import dart_heights
 from rig.diagnosis.problem.problem import first_starts, nominal, nominal_model
 from rig.diagnosis.progress import Progress, within
 from rig.diagnosis.recording import Recording, RecordingError, read_recording
@@ -153,5 +154,6 @@ def open_loop_rmse_m(spec: ModelSpec, record: Recording, skipped: int) -> float:
     if there is None:
         return float("nan")
     tolerance = _AGREEMENT * float(np.nanstd(run.grid.heights_m - there.heights_m))
-    heights_m = problem.heights_on_dart(0, found.model, there.heights_m, tolerance)
+    start = found.parts.starts[0]
+    heights_m = dart_heights(problem, run, found.model, start, there.heights_m, tolerance)
     return float(np.sqrt(np.nanmean((run.grid.heights_m - heights_m)[skipped:] ** 2)))

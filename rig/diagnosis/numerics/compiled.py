@@ -32,7 +32,6 @@ from dart_model.effects.law import Writable
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
-Cube = NDArray[np.float64]
 Forces = MutableSequence[ForceOverArrays]
 Rates = MutableSequence[RatesOverArrays]
 _Arrays = tuple[Array, ...]
@@ -62,12 +61,7 @@ _TEN_POINTERS = types.UniTuple(_POINTER, SLOTS)
 
 
 class Laws(NamedTuple):
-    """Laws as machine code.
-
-    Attributes:
-        forces: Their forces, a typed list.
-        rates: Rates of their internal states, likewise.
-    """
+    """Laws as machine code."""
 
     forces: Forces
     rates: Rates
@@ -144,13 +138,7 @@ def compile_law(name: str) -> None:
 
 
 class Slot(NamedTuple):
-    """Where a placed effect reads its values.
-
-    Attributes:
-        strut: Index of its strut.
-        parameters: Its part of all parameters.
-        states: Its part of all internal states.
-    """
+    """Where a placed effect reads its values: its part of all parameters and internal states."""
 
     strut: int
     parameters: slice
@@ -158,13 +146,7 @@ class Slot(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """Where the laws of a simulation are, each of shape (effects,).
-
-    Attributes:
-        struts: Index of the strut.
-        first_parameters: Index of the first parameter among all.
-        first_states: Index of the first internal state among all; -1 if it has none.
-    """
+    """Indices (effects,) of strut, first parameter and first internal state (-1 if it has none)."""
 
     struts: Integers
     first_parameters: Integers
@@ -172,14 +154,7 @@ class Placement(NamedTuple):
 
 
 class Slots(NamedTuple):
-    """Effects in the struts of a model.
-
-    Attributes:
-        laws: Their laws, filled up to `SLOTS`.
-        placement: Where they are, for the compiled loops.
-        each: The same, one by one.
-        states: Number of internal states of all.
-    """
+    """Effects in the struts of a model; its laws are filled up to `SLOTS`."""
 
     laws: Laws
     placement: Placement
@@ -261,11 +236,11 @@ class Equations(NamedTuple):
         v: Their rates, shape (K, n).
     """
 
-    mass_inverse: Cube
+    mass_inverse: Array
     bias: Array
-    bias_q: Cube
-    bias_v: Cube
-    jacobian: Cube
+    bias_q: Array
+    bias_v: Array
+    jacobian: Array
     heights_m: Array
     applied: Array
     q: Array
@@ -289,13 +264,7 @@ class Scenario(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """How finely a simulation steps.
-
-    Attributes:
-        substeps: Steps between nodes.
-        bend: Share by which a smooth acceleration bends within one.
-        stroke_m: Stroke of the recordings.
-    """
+    """How finely a simulation steps; `bend`: share by which a smooth acceleration bends in one."""
 
     substeps: int
     bend: float
@@ -314,11 +283,8 @@ class Model(NamedTuple):
     """A model as it is simulated.
 
     Attributes:
-        placement: Where the laws of its effects are.
-        parameters: Their parameters, one after another.
         struts: Constants of the struts, shape (struts, 5): free length, stiffness,
             damping, gravity and preload.
-        equations: Its equations of motion.
     """
 
     placement: Placement
@@ -332,14 +298,7 @@ class _Span(NamedTuple):
 
     Attributes:
         before: Index of the node before in the equations' tables.
-        after: Index of the node after.
-        gap_s: Time between the nodes.
-        first_s: Time of the node before.
-        step_s: Duration of the step.
-        step: Number of steps between that node and this one.
-        steps: Number of steps between the nodes.
         applied_n: Applied force at the beginning, the middle and the end of the step.
-        temperature_c: Temperature at the node before.
         warming_k: Change of the temperature from node to node.
     """
 
@@ -356,18 +315,7 @@ class _Span(NamedTuple):
 
 
 class _Work(NamedTuple):
-    """What one evaluation of the slope leaves behind.
-
-    Attributes:
-        x: Coordinates, their rates and internal states there, shape (2 n + states,).
-        slope: Derivative of `x`.
-        q: Reference coordinates there, shape (n,).
-        v: Their rates, shape (n,).
-        general: Generalised force, shape (n,).
-        heights_m: Strut heights, shape (struts,).
-        velocities: Their rates, m/s, shape (struts,).
-        forces_n: Strut forces, shape (struts,).
-    """
+    """What an evaluation of the slope at `x` (2 n + states,) leaves behind, `general` in (n,)."""
 
     x: Array
     slope: Array
@@ -380,14 +328,7 @@ class _Work(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """Sums of a step by Runge and Kutta's method.
-
-    Attributes:
-        x: Where the step has come to, shape (2 n + states,).
-        began: Where it began.
-        total: Weighted slopes.
-        twist: Second difference of the accelerations, shape (n,).
-    """
+    """Sums of a Runge-Kutta step at `x`; `twist`: second difference of the accelerations (n,)."""
 
     x: Array
     began: Array
@@ -396,16 +337,7 @@ class _Step(NamedTuple):
 
 
 class _Calls(NamedTuple):
-    """The laws of a simulation with pointers to what each reads and writes, `SLOTS` of each.
-
-    Attributes:
-        forces: Forces.
-        rates: Rates of the internal states.
-        states: Pointers to the internal states.
-        slopes: Pointers to where their rates are written.
-        parameters: Pointers to the parameters.
-        struts: Pointers to the constants of the strut.
-    """
+    """The laws of a simulation with pointers to what each reads and writes, `SLOTS` of each."""
 
     forces: tuple[ForceOverArrays, ...]
     rates: tuple[RatesOverArrays, ...]
@@ -416,17 +348,7 @@ class _Calls(NamedTuple):
 
 
 class _Instant(NamedTuple):
-    """A time between two nodes.
-
-    Attributes:
-        before: Index of the node before in the equations' tables.
-        after: Index of the node after.
-        gap_s: Time between the nodes.
-        share: Share of it that has passed.
-        t_s: The time.
-        applied_n: Applied force.
-        temperature_c: Temperature.
-    """
+    """A time between two nodes, `share` of the gap after the first."""
 
     before: int
     after: int
@@ -441,7 +363,6 @@ _PIECES = 8
 """Parts into which a step is cut where a force jumps."""
 _MOST_PIECES = 32
 """The same where it jumps within one of these, as friction does that is all but a sign."""
-
 _LARGEST_ERROR = 5e-8
 """Change of height within a step by a jump of force, as a share of the stroke, from which on the
 step is cut: a tenth of the resolution of usual height sensors over their range."""
@@ -754,41 +675,13 @@ _simulate = compile_loop(
 
 
 def simulate(laws: Laws, model: Model, scenario: Scenario, steps: Steps, out: Trajectory) -> bool:
-    """Free-run simulation by the classical Runge-Kutta method; whether the motion stayed finite.
+    """Free-run simulation, written to `out`, by the classical Runge-Kutta method.
 
-    Args:
-        laws: Laws of the model's effects, `SLOTS` of them.
-        model: The model.
-        scenario: Start and inputs.
-        steps: How finely to step.
-        out: Where the motion is written.
+    Returns:
+        Whether the motion stayed finite.
     """
     parts = (tuple(model.placement), model.parameters, model.struts, tuple(model.equations))
     return _simulate(*laws, parts, tuple(scenario), steps[:], tuple(out))
-
-
-class StrutMotion(NamedTuple):
-    """A known motion of a strut, each of shape (N,)."""
-
-    t_s: Array
-    heights_m: Array
-    velocities_m_per_s: Array
-    applied_n: Array
-    temperature_c: Array
-
-
-class LawValues(NamedTuple):
-    """What a law along a motion reads.
-
-    Attributes:
-        parameters: Its parameters.
-        strut: Constants of its strut.
-        start: Internal states at the beginning.
-    """
-
-    parameters: Array
-    strut: Array
-    start: Array
 
 
 def _along(
@@ -836,17 +729,17 @@ _MOTION = types.UniTuple(_VECTOR, 5)
 _along = compile_loop(_along, types.void(_FORCES, _RATES, _VALUES, _MOTION, _I8, _VECTOR))
 
 
-def force_along(name: str, values: LawValues, motion: StrutMotion, substeps: int) -> Array:
+def force_along(name: str, values: _Arrays, motion: _Arrays, substeps: int) -> Array:
     """Force (N,) of the law of an effect along a known motion.
 
     Args:
         name: Name of the effect.
-        values: What the law reads.
-        motion: The motion.
+        values: Its parameters, constants of its strut, internal states at the beginning.
+        motion: Times, heights, their rates, applied force and temperature, each of shape (N,).
         substeps: Steps of the internal states between two samples.
     """
-    out = np.empty(len(motion.t_s))
-    _along(*_laws((name,)), tuple(values), tuple(motion), substeps, out)
+    out = np.empty(len(motion[0]))
+    _along(*_laws((name,)), values, motion, substeps, out)
     return out
 
 

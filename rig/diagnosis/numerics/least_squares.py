@@ -34,13 +34,11 @@ _LARGEST_LOGARITHMIC_STEP = 1.5
 
 
 class Space(NamedTuple):
-    """Bounds and scales of the parameters that are searched.
+    """Bounds and scales of the parameters that are searched, each of shape (k,).
 
     Attributes:
-        low: Lowest values, shape (k,).
-        high: Highest values, shape (k,).
-        scale: Unit of each parameter that is not searched by its logarithm, shape (k,).
-        logarithmic: Which are searched by their logarithm, shape (k,).
+        scale: Unit of each parameter that is not searched by its logarithm.
+        logarithmic: Which are searched by their logarithm.
     """
 
     low: Array
@@ -98,7 +96,6 @@ class Solution(NamedTuple):
         values: Parameters, shape (k,).
         residual: Residual there, shape (m,).
         jacobian: Derivative of the residual by the search variables, shape (m, k).
-        cost: Sum of squares.
         level: Variance of the residual, see `Prior.level`.
         prior: Precision of the prior in units of that variance, shape (k,).
     """
@@ -115,8 +112,6 @@ class Rows(NamedTuple):
     """The rows of the residual that depend on a parameter.
 
     Attributes:
-        first: First row.
-        last: Past the last row.
         residual_of: Those rows alone as a function of parameters; None where the model runs away.
     """
 
@@ -147,7 +142,6 @@ class Differences(NamedTuple):
     Attributes:
         residual_of: Residual as a function of parameters, or None where there is none.
         rows: Parameters, by index, on which some rows only depend; they then cost less.
-        threads: Differences that are taken at a time.
     """
 
     residual_of: ResidualOf
@@ -192,18 +186,7 @@ class Differences(NamedTuple):
 def solve(
     differences: Differences, start: Array, space: Space, effort: Effort, prior: Prior | None = None
 ) -> Solution | None:
-    """Least squares from a start.
-
-    Args:
-        differences: The residual and how its derivatives are taken.
-        start: First parameters, shape (k,).
-        space: Bounds and scales.
-        effort: How far to go.
-        prior: Prior of the search variables; none if absent.
-
-    Returns:
-        The solution, or None if there is no residual at the start.
-    """
+    """Least squares from first parameters (k,); None if there is no residual there."""
     x = space.inner(start)
     r = differences.residual_of(space.outer(x))
     if r is None or not np.all(np.isfinite(r)):
@@ -263,13 +246,7 @@ def _lower_cost(
 ) -> tuple[_Point, float] | None:
     """A step with as little damping as lowers the cost, and the damping to begin the next with.
 
-    Args:
-        residual_of: Residual of parameters.
-        point: Where the step begins.
-        space: Bounds and scales.
-        tangent: The Jacobian, and whether it was taken here; with an older one a single damping is
-            tried.
-        damping: First damping.
+    With a Jacobian (of `tangent`) that was not taken here, a single damping is tried.
     """
     jacobian, fresh = tangent
     with np.errstate(over="ignore", invalid="ignore"):  # No step is taken from what overflows.

@@ -32,24 +32,14 @@ _LONGEST_FOR_LIKELIHOOD = 12_000
 
 
 class Smoothed(NamedTuple):
-    """A smoothed signal.
-
-    Attributes:
-        states: Signal, first, second and third derivative at each time, shape (N, 4).
-        deviations: Their standard deviations, shape (N, 4).
-    """
+    """Signal, first, second and third derivative, with their standard deviations, each (N, 4)."""
 
     states: Array
     deviations: Array
 
 
 class Noise(NamedTuple):
-    """Noise and smoothness of a signal.
-
-    Attributes:
-        variance: Variance of the sensor's noise.
-        ratio: Intensity of the random walk over that variance.
-    """
+    """Noise of a signal, and the intensity of its random walk over that variance."""
 
     variance: float
     ratio: float
@@ -76,9 +66,7 @@ def _transition(h: float, a: Array, q: Array) -> None:
 
 
 _F8 = types.float64
-_V = types.Array(types.float64, 1, "C")
-_M = types.Array(types.float64, 2, "C")
-_T3 = types.Array(types.float64, 3, "C")
+_V, _M, _T3 = (types.Array(types.float64, axes, "C") for axes in (1, 2, 3))
 _transition_c = compile_loop(_transition, types.void(_F8, _M, _M))
 
 
@@ -137,13 +125,9 @@ def _filter(
 ) -> None:
     """Kalman filter; all covariances are in units of the noise variance, concentrated out.
 
-    Args:
-        t: Times, shape (N,).
-        y: Signal, NaN where missing, shape (N,).
-        ratio: Intensity of the random walk over the noise variance.
-        means: Receives the filtered means, shape (N, 4); empty where only sums are needed.
-        covariances: Receives the filtered covariances, shape (N, 4, 4), or empty.
-        sums: Receives squares and logarithms of innovations, and their number, shape (3,).
+    Of times and a signal (N,), NaN where missing, it writes the filtered means (N, 4) and
+    covariances (N, 4, 4), both empty where only sums are needed, and the sums (3,): squares and
+    logarithms of innovations, and their number.
     """
     m = np.zeros(4)
     p = np.zeros((4, 4))
@@ -203,12 +187,7 @@ _smooth_c = compile_loop(_smooth, types.void(_V, _F8, _M, _T3))
 
 
 def estimate_noise(t_s: Array, y: Array) -> Noise:
-    """Sensor noise and random walk of a signal, by maximum likelihood.
-
-    Args:
-        t_s: Times, shape (N,).
-        y: Signal, NaN where missing, shape (N,).
-    """
+    """Sensor noise and random walk of a signal (N,), NaN where missing, by maximum likelihood."""
     n = len(t_s)
     if n > _LONGEST_FOR_LIKELIHOOD:
         # A third from each part of the recording determines the noise as well as the whole.
@@ -249,13 +228,7 @@ def estimate_noise(t_s: Array, y: Array) -> Noise:
 
 
 def smooth(t_s: Array, y: Array, noise: Noise) -> Smoothed:
-    """Smooth a signal over its whole length.
-
-    Args:
-        t_s: Times, shape (N,).
-        y: Signal, NaN where missing, shape (N,).
-        noise: From `estimate_noise`.
-    """
+    """Smooth a signal (N,), NaN where missing, over its whole length."""
     n = len(t_s)
     means, covariances, out = np.empty((n, _ORDER)), np.empty((n, _ORDER, _ORDER)), np.empty(3)
     t = np.ascontiguousarray(t_s)

@@ -11,18 +11,10 @@ from dart_model.effects import Motion, effect
 from dart_model.spec import ModelSpec
 from rig.diagnosis.problem import linear_part, track
 from rig.diagnosis.problem.free_run import FreeRunProblem
-from rig.diagnosis.problem.grid import (
-    HeldOutBlocks,
-    smooth_recording,
-    strut_motions,
-)
+from rig.diagnosis.problem.grid import smooth_recording, strut_motions
 from rig.diagnosis.problem.mechanism import mechanism_along, open_plants
 from rig.diagnosis.problem.prescribed_motion import PrescribedProblem
-from rig.diagnosis.problem.problem import (
-    Problem,
-    ProblemBasis,
-    ResidualForces,
-)
+from rig.diagnosis.problem.problem import Problem, ProblemBasis, ResidualForces
 from rig.diagnosis.recording import Recording, RecordingError, check_fits
 
 Array = NDArray[np.float64]
@@ -34,21 +26,11 @@ _MOSTLY = 0.5
 
 
 class Problems(NamedTuple):
-    """The problems of a diagnosis.
-
-    Attributes:
-        learnt: That of the recordings that are learnt from.
-        held_out: That of the held-out runs; with blocks held out, the learnt one.
-        by_blocks: Whether blocks are held out, not runs.
-    """
+    """The problems of a diagnosis; with blocks held out, `held_out` is the learnt one."""
 
     learnt: Problem
     held_out: Problem
     by_blocks: bool
-
-    def with_learnt(self, learnt: Problem) -> "Problems":
-        """The problems with the noise and motions that a search determined."""
-        return self._replace(learnt=learnt, held_out=replace(self.held_out, motions=learnt.motions))
 
 
 def build_problems(
@@ -58,14 +40,9 @@ def build_problems(
     blocks: int,
     held_out_every: int,
 ) -> Problems:
-    """The problems of recordings.
+    """The problems of recordings, with a number of cross-validation blocks over all `runs`.
 
-    Args:
-        spec: The nominal model.
-        runs: Recordings to learn from, all of one kind.
-        held_out: Recordings to evaluate on; without them, blocks of `runs` are held out.
-        blocks: Blocks of cross-validation over all of `runs`.
-        held_out_every: Without held-out runs, one block in so many is held out.
+    Without held-out runs, one block in `held_out_every` is held out.
 
     Raises:
         RecordingError: A recording or the model cannot be used; one line says why.
@@ -76,7 +53,7 @@ def build_problems(
         return Problems(learnt, learnt, by_blocks=True)
     for recording in held_out:
         check_fits(recording, spec)
-    smooth = [smooth_recording(recording, None) for recording in held_out]
+    smooth = [smooth_recording(recording) for recording in held_out]
     evaluated = type(learnt).of_recordings(learnt.basis, smooth)
     return Problems(learnt, evaluated, by_blocks=False)
 
@@ -84,13 +61,7 @@ def build_problems(
 def build(
     spec: ModelSpec, recordings: Sequence[Recording], blocks: int, held_out_every: int | None
 ) -> Problem:
-    """The problem of recordings that are learnt from.
-
-    Args:
-        spec: The nominal model.
-        recordings: Runs, of one kind.
-        blocks: Blocks of cross-validation over all of them.
-        held_out_every: One block in so many is held out of fits; none if absent.
+    """The problem of recordings that are learnt from; arguments as of `build_problems`.
 
     Raises:
         RecordingError: A recording or the model cannot be used; one line says why.
@@ -100,7 +71,7 @@ def build(
         check_fits(recording, spec)
     length = sum(recording.duration_s for recording in recordings)
     block_s = max(length / blocks, _LEAST_BLOCK_S)
-    held_out = None if held_out_every is None else HeldOutBlocks(block_s, held_out_every)
+    held_out = None if held_out_every is None else (block_s, held_out_every)
     smooth = [smooth_recording(recording, held_out) for recording in recordings]
     plants = open_plants(spec)
     motions = strut_motions(spec, smooth)
@@ -131,12 +102,7 @@ def problem_kind(recordings: Sequence[Recording]) -> type[Problem]:
 
 
 def part_of(problem: Problem, most: int) -> Problem:
-    """The problem of pieces spread over long recordings; itself with up to twice as many nodes.
-
-    Args:
-        problem: The problem.
-        most: Nodes of all recordings that are taken, about.
-    """
+    """The problem of pieces of about `most` nodes in all; itself with up to twice as many."""
     flags = [problem.fit_nodes(k) for k in range(problem.recordings)]
     nodes = sum(map(len, flags))
     if nodes < 2 * most:

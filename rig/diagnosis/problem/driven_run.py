@@ -24,29 +24,15 @@ _TOP = 0.8
 actuator end below, so that only noise is left above."""
 
 
-class LoadCells(NamedTuple):
-    """Load cells of a force-driven bench, on the recording's own times.
-
-    Attributes:
-        t_s: Times, shape (samples,).
-        forces_n: Force of each strut, shape (samples, struts), NaN for a strut without a cell.
-    """
-
-    t_s: Array
-    forces_n: Array
-
-
 class DrivenRun(NamedTuple):
     """A recording as it is simulated.
 
     Attributes:
-        grid: Its nodes.
         applied_n: Applied force at the nodes, shape (N,).
         fine_n: Applied force at half sub-steps, shape (2 * substeps * (N - 1) + 1,).
-        substeps: Steps of the integrator between nodes.
         angle: Angle by which the fastest motion turns within such a step.
-        mechanism: Constant, or along this recording's motion.
-        cells: Load cells, where there are any: to evaluate on.
+        cells: Load cells, to evaluate on: their own times, shape (samples,), and the force of each
+            strut, shape (samples, struts), NaN for a strut without a cell; None where none is.
     """
 
     grid: RecordingGrid
@@ -55,7 +41,7 @@ class DrivenRun(NamedTuple):
     substeps: int
     angle: float
     mechanism: LinearisedMechanism
-    cells: LoadCells | None
+    cells: tuple[Array, Array] | None
 
     def cut(self, nodes: slice) -> "DrivenRun":
         """The recording at some of the nodes."""
@@ -88,16 +74,11 @@ def driven_run(
     applied: tuple[Array, Array],
     mechanism: LinearisedMechanism,
     fastest: float,
-    cells: LoadCells | None,
+    cells: tuple[Array, Array] | None,
 ) -> DrivenRun:
     """A recording ready to be simulated; the applied force as a cubic spline between its samples.
 
-    Args:
-        grid: Its nodes.
-        applied: Times and values of the applied force.
-        mechanism: The mechanism.
-        fastest: Largest eigenvalue of the model by size, in rad/s.
-        cells: Load cells, where there are any.
+    `applied` are times and values of that, `fastest` is the model's largest eigenvalue in rad/s.
     """
     usual = grid.step_s
     substeps = max(1, int(np.ceil(usual / min(_LONGEST_STEP_S, _STEP_ANGLE / fastest) - 1e-9)))

@@ -10,7 +10,7 @@ error (Young 2011, 8.2). The measured motion itself comes from a smoother.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,20 +18,12 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from dart_model.effects import Bench
 from dart_model.spec import ModelSpec
-from rig.diagnosis.numerics.compiled import (
-    Equations,
-    Model,
-    Scenario,
-    Steps,
-    Trajectory,
-    simulate,
-)
+from rig.diagnosis.numerics.compiled import Equations, Model, Scenario, Steps, Trajectory, simulate
 from rig.diagnosis.numerics.smoother import Smoothed, estimate_noise
 from rig.diagnosis.outcome import BeforeAfter, HeldOutSeries, NoiseFloor, RunFigures
 from rig.diagnosis.problem import linear_part, on_dart, track
 from rig.diagnosis.problem.driven_run import (
     DrivenRun,
-    LoadCells,
     driven_run,
     first_motion,
     input_noise_n,
@@ -84,38 +76,9 @@ _IMPLAUSIBLE = 5.0
 """Times the largest deflection that the load could cause from which on columns are mixed up."""
 
 
-class _Reference(NamedTuple):
-    """A simulated recording that the regression along the motion is about.
-
-    Attributes:
-        run: The recording.
-        motion: Its free run.
-        residual: Measured less simulated heights, smoothed, one entry a strut.
-    """
-
-    run: DrivenRun
-    motion: Trajectory
-    residual: Sequence[Smoothed]
-
-    def whole(self) -> tuple[Track, Track]:
-        """Measured and reference motion of the whole recording, at its nodes."""
-        reference = track_of(self.motion, self.run)
-        measured = reference._replace(
-            heights_m=reference.heights_m + np.array([s.states[:, 0] for s in self.residual]),
-            velocities_m_per_s=reference.velocities_m_per_s
-            + np.array([s.states[:, 1] for s in self.residual]),
-        )
-        return measured, reference
-
-
 @dataclass(frozen=True, eq=False)
 class FreeRunProblem(Problem):
-    """A model held against recordings of a force-driven bench.
-
-    Attributes:
-        runs: The recordings.
-        noise_m: Standard deviation of each height's noise, shape (struts,).
-    """
+    """A model and recordings of a driven bench; `noise_m`: deviation of each height, (struts,)."""
 
     bench: ClassVar[Bench] = "force_given"
     assumption: ClassVar[str] = (
@@ -315,28 +278,30 @@ class FreeRunProblem(Problem):
             if motion is None:
                 raise FloatingPointError(run.grid.name)
             residual, _ = run.grid.residual_states(motion.heights_m)
-            reference = _Reference(run, motion, residual)
             pieces = track.pieces(len(run.grid.t_s), samples, most_samples, largest_stride)
-            lead = reference.whole() if len(pieces) > 1 else None
-            for cut in pieces:
-                if not np.any(run.grid.fitted[cut]):
-                    continue  # All of it is held out.
-                segments.append(self._segment(reference, lead, cut, model.parts.linear))
+            lead = _whole_motions(run, motion, residual) if len(pieces) > 1 else None
+            segments += [
+                self._segment(run, motion, residual, lead, cut, model.parts.linear)
+                for cut in pieces
+                if np.any(run.grid.fitted[cut])
+            ]
         return tuple(segments)
 
-    def _dynamics(self, run: DrivenRun, linear: Array, cut: slice) -> LinearDynamics:
+    def _segment(
+        self,
+        run: DrivenRun,
+        simulated: Trajectory,
+        residual: Sequence[Smoothed],
+        lead: tuple[Track, Track] | None,
+        cut: slice,
+        linear: Array,
+    ) -> Segment:
         m = linear_part.with_linear_changes(run.mechanism, self.linear, linear)
         if m is None:
             raise FloatingPointError(run.grid.name)
-        step_s = run.grid.step_s
-        constants = strut_constants(self, linear)
-        return LinearDynamics(m, constants, (cut.stop - cut.start) * step_s, step_s * cut.step)
-
-    def _segment(
-        self, about: _Reference, lead: tuple[Track, Track] | None, cut: slice, linear: Array
-    ) -> Segment:
-        run, simulated, residual = about
-        grid, dynamics = run.grid, self._dynamics(run, linear, cut)
+        grid, step_s, constants = run.grid, run.grid.step_s, strut_constants(self, linear)
+        length_s = (cut.stop - cut.start) * step_s
+        dynamics = LinearDynamics(m, constants, length_s, step_s * cut.step)
         states = [np.column_stack([s.states[cut, i] for s in residual]) for i in range(3)]
         motion = [a[cut] + b for a, b in zip(simulated, states, strict=True)]
         # The grid of the filter: finer where the motion is fast, never coarser than the samples.
@@ -412,7 +377,8 @@ class FreeRunProblem(Problem):
         for model, motion in ((models.nominal, before), (models.corrected, after)):
             error_m = rms(measured - motion.heights_m)
             tolerance_m = max(_AGREEMENT * float(noise.min()), _ACCURACY * error_m)
-            on_dart_m.append(self.heights_on_dart(k, model, motion.heights_m, tolerance_m))
+            start, expected_m = model.parts.starts[k], motion.heights_m
+            on_dart_m.append(on_dart.dart_heights(self, run, model, start, expected_m, tolerance_m))
         forces = [self.residual_forces(k, model) for model in models]
         residual_n = [
             np.nan if f is None else rms(np.where(rows, f.force_n, np.nan)) for f in forces
@@ -441,28 +407,16 @@ class FreeRunProblem(Problem):
             NoiseFloor(floor_m, deviation), drift_m, series,
         )  # fmt: skip
 
-    def heights_on_dart(
-        self, k: int, model: CandidateModel, expected_m: Array, tolerance_m: float
-    ) -> Array:
-        """Heights of a model's free run in DART, see `on_dart.dart_heights`."""
-        return on_dart.dart_heights(
-            self, self.runs[k], model, model.parts.starts[k], expected_m, tolerance_m
-        )
-
     def _cell_errors(
-        self,
-        k: int,
-        models: ComparedModels,
-        motions: tuple[Trajectory, Trajectory],
-        rows: Flags,
+        self, k: int, models: ComparedModels, motions: tuple[Trajectory, Trajectory], rows: Flags
     ) -> BeforeAfter | None:
         """Errors against the load cell where it is evaluated, the models in free run."""
         run = self.runs[k]
         if run.cells is None or any(self.plants.plain.mockups):
             return None  # The mechanism of an FMU contains its force.
-        t_s = run.cells.t_s
+        t_s, cells_n = run.cells
         evaluated = np.interp(t_s, run.grid.t_s, rows) > 0.5
-        cells = np.where(evaluated[:, np.newaxis], run.cells.forces_n, np.nan)
+        cells = np.where(evaluated[:, np.newaxis], cells_n, np.nan)
         errors: list[float] = []
         for model, motion in zip((models.nominal, models.corrected), motions, strict=True):
             forces = track.strut_forces(self, model, track_of(motion, run), self.states(k, model))
@@ -485,7 +439,7 @@ def _driven(basis: ProblemBasis, smooth: SmoothRecording) -> DrivenRun:
         applied,
         mechanism,
         _fastest(basis.spec, mechanism),
-        None if cells is None else LoadCells(recording.t_s, cells),
+        None if cells is None else (recording.t_s, cells),
     )
 
 
@@ -515,6 +469,18 @@ def _check_columns(spec: ModelSpec, recording: Recording, mechanism: LinearisedM
                 f"load of at most {load:.3g} N bends the model's strut by {bend:.3g} m: expected "
                 "heights near its free length: are the columns swapped, or the units wrong?"
             )
+
+
+def _whole_motions(
+    run: DrivenRun, simulated: Trajectory, residual: Sequence[Smoothed]
+) -> tuple[Track, Track]:
+    """Measured and reference motion of a whole recording, at its nodes."""
+    reference = track_of(simulated, run)
+    z, w = (np.array([s.states[:, i] for s in residual]) for i in (0, 1))
+    measured = reference._replace(
+        heights_m=reference.heights_m + z, velocities_m_per_s=reference.velocities_m_per_s + w
+    )
+    return measured, reference
 
 
 def _spline_through(nodes_s: Array, values: Array, t_s: Array) -> Array:

@@ -35,12 +35,8 @@ _QUIET = 0.3
 class Track(NamedTuple):
     """A motion on a grid, along which laws are evaluated.
 
-    Attributes:
-        t_s: Times, shape (N,).
-        heights_m: Heights, shape (struts, N).
-        velocities_m_per_s: Their rates, shape (struts, N).
-        applied_n: Applied force, shape (N,); zero where there is none.
-        temperature_c: Temperature, shape (N,).
+    Times, applied force (zero where there is none) and temperature are of shape (N,), heights and
+    their rates of shape (struts, N).
     """
 
     t_s: Array
@@ -71,13 +67,11 @@ class RecordingGrid(NamedTuple):
     """A recording on nodes.
 
     Attributes:
-        name: Name of the recording.
         t_s: Times of the nodes: measured times and, in gaps, times between, shape (N,).
         heights_m: Measured heights, NaN elsewhere and where outliers were, shape (N, struts).
         fitted: Nodes whose measurements take part in fits, shape (N,).
         held_out: Nodes that are held out of fits, to evaluate on, shape (N,).
         temperature_c: Temperature at the nodes, shape (N,).
-        has_temperature: Whether it was measured.
         outliers: Number of heights that were removed as outliers.
     """
 
@@ -147,12 +141,8 @@ class SmoothRecording(NamedTuple):
     """A recording on nodes, with its motion smoothed without any model.
 
     Attributes:
-        recording: As measured.
-        grid: Its nodes.
         sample_nodes: Node of each sample, shape (samples,).
-        motion: The smoothed motion.
         deviations: The smoothed difference from the mean height, one entry a strut.
-        noises: Noise of each height sensor.
     """
 
     recording: Recording
@@ -163,20 +153,10 @@ class SmoothRecording(NamedTuple):
     noises: list[Noise]
 
 
-class HeldOutBlocks(NamedTuple):
-    """Blocks that are held out of fits where no run is.
-
-    Attributes:
-        length_s: Length of a block.
-        every: One block in so many is held out.
-    """
-
-    length_s: float
-    every: int
-
-
-def smooth_recording(recording: Recording, blocks: HeldOutBlocks | None) -> SmoothRecording:
-    """A recording on nodes and smoothed, some blocks held out of fits if asked for."""
+def smooth_recording(
+    recording: Recording, blocks: tuple[float, int] | None = None
+) -> SmoothRecording:
+    """A recording on nodes and smoothed; of blocks of a length (s) one in so many is held out."""
     grid, sample_nodes = _place_on_nodes(recording)
     if blocks is not None:
         grid = grid.with_held_out_blocks(*blocks)

@@ -23,13 +23,7 @@ _SETTLES_WITHIN = 0.15
 
 
 class FilterMechanism:
-    """The mechanism on the grid of the filter.
-
-    Args:
-        mechanism: At the nodes.
-        nodes_s: Times of the nodes.
-        t_s: Times of the filter.
-    """
+    """The mechanism, given at nodes, on the grid `t_s` of the filter."""
 
     def __init__(self, mechanism: LinearisedMechanism, nodes_s: Array, t_s: Array) -> None:
         at = np.zeros(len(t_s), dtype=np.int64)
@@ -45,14 +39,7 @@ class FilterMechanism:
         accelerations_m_per_s2: Array,
         motions: Sequence[Motion],
     ) -> Array:
-        """Generalised force (N, n) of a unit change of a linear parameter along a motion.
-
-        Args:
-            parameter: The parameter.
-            track: The motion.
-            accelerations_m_per_s2: Its accelerations, shape (N, struts).
-            motions: What each strut did.
-        """
+        """Generalised force (N, n) of a unit change of a parameter; accelerations (N, struts)."""
         strut = parameter.strut
         if parameter.kind == "mass":
             q = np.linalg.solve(self.jacobian, accelerations_m_per_s2[..., np.newaxis])[..., 0]
@@ -69,7 +56,6 @@ class LinearDynamics:
     """The linear dynamics of a model about its mean configuration, discretised.
 
     Args:
-        m: The mechanism with the model's masses and gain.
         constants: Strut constants, shape (struts, 5).
         duration_s: Length of the part of a recording that is filtered.
         coarse_s: Time between the samples of the regression.

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dart_model.effects import Bench, Motion
+from dart_model.effects import Bench, Motion, effect
 from dart_model.spec import WORLD, EffectSpec, InlineSkeleton, ModelSpec
 from rig.diagnosis.problem.mechanism import LinearisedMechanism
 from rig.diagnosis.problem.problem import Kind, LinearParameter, mid_stroke_m
@@ -52,14 +52,7 @@ EFFECTS = {
 def linear_parameters(
     spec: ModelSpec, bench: Bench, motions: Sequence[Motion], mechanism: LinearisedMechanism
 ) -> tuple[LinearParameter, ...]:
-    """Linear parameters of a model that a bench can show, with their priors.
-
-    Args:
-        spec: The nominal model.
-        bench: Kind of bench.
-        motions: What each strut did.
-        mechanism: For the masses, and for whether the applied force acts along a strut.
-    """
+    """Linear parameters of a model that a bench can show, with their priors."""
     parameters: list[LinearParameter] = []
     for i, (strut, motion) in enumerate(zip(spec.struts, motions, strict=True)):
         stiffness, damping = strut.stiffness_n_per_m, strut.damping_n_s_per_m
@@ -138,10 +131,7 @@ def with_linear_changes(
 
 
 def spec_with_linear_changes(
-    spec: ModelSpec,
-    linear: Sequence[LinearParameter],
-    changes: Array,
-    motions: Sequence[Motion],
+    spec: ModelSpec, linear: Sequence[LinearParameter], changes: Array, motions: Sequence[Motion]
 ) -> ModelSpec:
     """The model with its linear part changed: in the field of the file where there is one."""
     for parameter, change in zip(linear, changes, strict=True):
@@ -190,9 +180,8 @@ def _with_sum(spec: ModelSpec, strut: str, name: str, change: float) -> ModelSpe
             ((key, value),) = item.parameters.items()
             effects[i] = EffectSpec(name=name, parameters={key: round_for_file(value + change)})
             return spec.with_effects(strut, effects)
-    key = {"preload": "force_n", "linear_damping": "damping_n_s_per_m", "input_gain": "gain"}
-    key["added_mass"] = "mass_kg"
-    new = EffectSpec(name=name, parameters={key[name]: round_for_file(change)})
+    key = effect(name).parameters[0].name
+    new = EffectSpec(name=name, parameters={key: round_for_file(change)})
     return spec.with_effects(strut, (*effects, new))
 
 

@@ -63,28 +63,16 @@ class LinearisedMechanism(NamedTuple):
         return self if len(self.q) == 1 else LinearisedMechanism(*(part[nodes] for part in self))
 
     def strut_forces_of_motion(self, z: Array, w: Array, a: Array, applied_n: Array) -> Array:
-        """Strut forces that a motion takes, shape (N, struts).
-
-        Args:
-            z: Heights, shape (N, struts).
-            w: Their rates.
-            a: Their accelerations.
-            applied_n: Applied force, shape (N,).
-        """
+        """Strut forces that heights, their rates and accelerations take, each (N, struts)."""
         every = np.arange(len(z)) if len(self.q) > 1 else np.zeros(len(z), dtype=np.int64)
         jacobian, mass = self.jacobian[every], self.mass[every]
-        q = (
-            self.q[every]
-            + np.linalg.solve(jacobian, (z - self.heights_m[every])[..., np.newaxis])[..., 0]
-        )
-        v = np.linalg.solve(jacobian, w[..., np.newaxis])[..., 0]
-        acceleration = np.linalg.solve(jacobian, a[..., np.newaxis])[..., 0]
+        q = self.q[every] + _solve_coordinates(jacobian, z - self.heights_m[every])
+        v, acceleration = _solve_coordinates(jacobian, w), _solve_coordinates(jacobian, a)
         bias = self.bias[every] + self.applied[every] * applied_n[:, np.newaxis]
         bias = bias + np.einsum("kij,kj->ki", self.bias_q[every], q - self.q[every])
         bias = bias + np.einsum("kij,kj->ki", self.bias_v[every], v - self.v[every])
         generalised = np.einsum("kij,kj->ki", mass, acceleration) - bias
-        transposed = np.swapaxes(jacobian, 1, 2)
-        return np.linalg.solve(transposed, generalised[..., np.newaxis])[..., 0]
+        return _solve_coordinates(np.swapaxes(jacobian, 1, 2), generalised)
 
     def strut_inertia(self) -> Array:
         """Strut forces per acceleration of a strut at the first node, by size, (struts, struts)."""
@@ -93,12 +81,7 @@ class LinearisedMechanism(NamedTuple):
 
 
 class MechanismPlants(NamedTuple):
-    """DART with the model, and with a kg more on the body of each strut.
-
-    Attributes:
-        plain: The model without effects other than inertia.
-        heavier: One for each strut.
-    """
+    """DART with the model (inertia its only effects), and with a kg more on each strut's body."""
 
     plain: DartPlant
     heavier: tuple[DartPlant, ...]
@@ -139,13 +122,7 @@ def mechanism_along(plants: MechanismPlants, motion: Track) -> LinearisedMechani
 def _with_mockups(
     mechanism: LinearisedMechanism, plant: DartPlant, motion: Track
 ) -> LinearisedMechanism:
-    """The mechanism with the forces of FMUs, along a motion and linear about it.
-
-    Args:
-        mechanism: Without them, constant or along the motion.
-        plant: The model.
-        motion: The measured motion, with the applied force; N nodes.
-    """
+    """The mechanism with the forces of FMUs, along a motion and linear about it."""
     if not any(plant.mockups):
         return mechanism
     nodes = len(motion.t_s)
@@ -177,12 +154,7 @@ def constant_mechanism(plants: MechanismPlants) -> LinearisedMechanism:
 def tabulate_mechanism(
     plants: MechanismPlants, heights_m: Array, velocities_m_per_s: Array
 ) -> LinearisedMechanism:
-    """The mechanism along a motion.
-
-    Args:
-        plants: DART.
-        heights_m: Heights at the nodes, without gaps, shape (N, struts).
-        velocities_m_per_s: Their rates, shape (N, struts).
+    """The mechanism along heights without gaps and their rates, shape (N, struts).
 
     Raises:
         InputError: The joints cannot reach the heights.

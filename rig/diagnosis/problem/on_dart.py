@@ -17,7 +17,6 @@ _TRIED_S = 4.0
 """Length of the part of a recording on which the number of DART's steps is determined."""
 _MOST_STEPS = 32
 """Steps of DART between two nodes from which on no more are tried."""
-
 _MOST_STEPS_IN_ALL = 1_500_000
 """Steps of DART that take some ten seconds."""
 
@@ -65,13 +64,8 @@ def dart_heights(
 ) -> Array:
     """Heights of a model in free run in DART, shape (N, struts).
 
-    Args:
-        problem: Nominal model and recordings.
-        run: The recording.
-        model: The model.
-        start: Its initial vector.
-        expected_m: Heights of the same model as the diagnosis simulates it, shape (N, struts).
-        tolerance_m: Root mean square by which the two may differ; DART's steps follow from it.
+    Its steps are refined until its heights differ from `expected_m`, those of the same model as the
+    diagnosis simulates it, by less than `tolerance_m` RMS.
     """
     plant = DartPlant(corrected_model(problem, model))
     nodes = len(run.grid.t_s)
@@ -104,21 +98,9 @@ def _plant_states(
 
 
 def _simulate_heights(
-    plant: DartPlant,
-    run: DrivenRun,
-    begin: tuple[tuple[float, ...], Array],
-    count: int,
-    steps: int,
+    plant: DartPlant, run: DrivenRun, begin: tuple[tuple[float, ...], Array], count: int, steps: int
 ) -> Array:
-    """Heights at the first `count` nodes with so many steps between nodes, shape (count, struts).
-
-    Args:
-        plant: DART with the model.
-        run: The recording.
-        begin: Internal states in DART's order, and the initial vector.
-        count: Number of nodes.
-        steps: Steps between two nodes.
-    """
+    """Heights (count, struts) at the first nodes; `begin`: internal states, initial vector."""
     states, start = begin
     grid = run.grid
     n = plant.coordinates

@@ -63,8 +63,6 @@ class DynoRun(NamedTuple):
     """A recording of a prescribed motion and the forces that it took.
 
     Attributes:
-        grid: Nodes of the recording.
-        along: The smoothed motion at the nodes.
         cells_n: Load cells at the nodes, shape (struts, N); NaN where a strut has none.
         certain: Nodes at which the motion is well known, shape (N,).
         height_noise_m: Standard deviation of each height's noise, shape (struts,).
@@ -133,12 +131,7 @@ def cell_residual_std(spec: ModelSpec, runs: Sequence[DynoRun]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class PrescribedProblem(Problem):
-    """A model held against recordings of a displacement-controlled bench.
-
-    Attributes:
-        runs: The recordings.
-        noise_n: Standard deviation of each load cell's residual, shape (struts,).
-    """
+    """A model and recordings of a dyno; `noise_n`: deviation of each cell's residual, (struts,)."""
 
     bench: ClassVar[Bench] = "motion_given"
     assumption: ClassVar[str] = "The motion is smoothed over the whole recording."
@@ -332,12 +325,7 @@ class PrescribedProblem(Problem):
 
 
 def _check_channels(run: DynoRun, model_n: Array) -> None:
-    """Refuse channels of a dyno that cannot be what their names say.
-
-    Args:
-        run: The recording.
-        model_n: Forces of the nominal model along its motion, shape (struts, N).
-    """
+    """Refuse channels of a dyno that cannot be what their names say; model forces (struts, N)."""
     name = run.grid.name
     check_swing(run.grid)
     if not np.any(np.isfinite(run.cells_n)):

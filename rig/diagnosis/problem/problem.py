@@ -39,10 +39,8 @@ class LinearParameter(NamedTuple):
     """A parameter of the linear part, searched as its change against the nominal model.
 
     Attributes:
-        strut: Index of the strut.
         kind: What it is. Stiffness and preload are taken about mid-stroke; the free length is that
             from which laws are taken, its share in the linear spring's force counts as preload.
-        nominal: As the model file has it.
         deviation: Standard deviation of the prior on its change.
         least: Lowest change; mass stays positive, no spring or damper turns negative.
     """
@@ -58,9 +56,6 @@ class ExistingParameters(NamedTuple):
     """An effect of the nominal model, with its parameters.
 
     Attributes:
-        strut: Index of the strut.
-        name: Name of the effect.
-        values: Its parameters.
         free: Whether it is refitted along: linear ones, a table, and what does not act on these
             recordings are not.
     """
@@ -72,12 +67,7 @@ class ExistingParameters(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """Effects under test.
-
-    Attributes:
-        kept: Which of the nominal model's effects stay, by index.
-        new: Effects that the nominal model lacks.
-    """
+    """Effects under test: those of the nominal model that stay, by index, and new ones."""
 
     kept: tuple[int, ...]
     new: tuple[StrutEffect, ...]
@@ -107,25 +97,14 @@ class Parts(NamedTuple):
 
 
 class CandidateModel(NamedTuple):
-    """A candidate with its values: a model that can be simulated.
-
-    Attributes:
-        candidate: Its effects.
-        parts: Their parameters, the linear changes and the initial vectors.
-    """
+    """A candidate with its values: a model that can be simulated."""
 
     candidate: Candidate
     parts: Parts
 
 
 class ComparedModels(NamedTuple):
-    """The models that are compared on held-out data.
-
-    Attributes:
-        nominal: The model as given.
-        linear: The best linear one.
-        corrected: The corrected one.
-    """
+    """The models that are compared on held-out data."""
 
     nominal: CandidateModel
     linear: CandidateModel
@@ -161,8 +140,6 @@ class ResidualForces(NamedTuple):
     """The force that would make the residual of a recording vanish.
 
     Attributes:
-        name: Name of the recording.
-        track: The smoothed motion.
         force_n: The force in each strut, shape (struts, N); NaN where it is not known.
         deviation_n: Its standard deviation, shape (struts, N).
     """
@@ -177,13 +154,9 @@ class RunEvaluation(NamedTuple):
     """Figures of one held-out recording.
 
     Attributes:
-        figures: As they are reported.
         target: Error that decides (of height or load cell), of nominal and corrected model.
         linear: The same of the best linear model.
-        linear_force_n: Residual force of the best linear model.
-        floor: RMS that a right model can reach.
         drift_m: Share of the floor that noise of the applied force causes; zero on a dyno.
-        series: For the report.
     """
 
     figures: RunFigures
@@ -196,22 +169,13 @@ class RunEvaluation(NamedTuple):
 
 
 class ProblemBasis(NamedTuple):
-    """What the problems of one diagnosis share, in the order of the fields of `Problem`.
-
-    Attributes:
-        spec: The nominal model.
-        linear: Parameters of the linear part.
-        existing: Effects of the nominal model.
-        motions: What each strut did on the recordings that are learnt from.
-        block_s: Length of the blocks of cross-validation.
-        plants: DART with the nominal model.
-    """
+    """What the problems of one diagnosis share: the first fields of `Problem`, in their order."""
 
     spec: ModelSpec
     linear: tuple[LinearParameter, ...]
     existing: tuple[ExistingParameters, ...]
     motions: tuple[Motion, ...]
-    block_s: float
+    block_s: float  # Length of the blocks of cross-validation.
     plants: MechanismPlants
 
 
@@ -220,7 +184,6 @@ class Problem(ABC):
     """A model held against recordings; fields as in `ProblemBasis`.
 
     Attributes:
-        bench: Kind of bench.
         assumption: Note of a diagnosis: what the bench's residual takes for granted.
     """
 

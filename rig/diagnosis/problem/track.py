@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import Motion, effect
 from dart_model.spec import ModelSpec
-from rig.diagnosis.numerics.compiled import LawValues, StrutMotion, force_along
+from rig.diagnosis.numerics.compiled import force_along
 from rig.diagnosis.problem.grid import Track
 from rig.diagnosis.problem.problem import (
     CandidateModel,
@@ -32,12 +32,6 @@ errs by less than a thousandth."""
 _NEGLIGIBLE = 1e-9
 """Share of the strut's force below which an existing effect does not act on the recordings."""
 _NO_STATE = np.zeros(0)
-
-
-def _substeps(t_s: Array) -> int:
-    """Steps of an internal state between the samples of a track."""
-    step = float(t_s[-1] - t_s[0]) / (len(t_s) - 1)
-    return int(np.clip(np.ceil(step / _LONGEST_STATE_STEP_S), 1, _MOST_STATE_STEPS))
 
 
 def largest_stride(motions: Sequence[Motion]) -> int:
@@ -70,31 +64,22 @@ def pieces(nodes: int, samples: int, most: int, largest_stride: int) -> list[sli
 def law_force(
     track: Track, strut: int, name: str, values: Array, constants: Array, state: Array = _NO_STATE
 ) -> Array:
-    """Force (N,) of a law along a motion.
+    """Force (N,) of a law along a motion, from an internal state (zero if absent) on.
 
-    Args:
-        track: The motion.
-        strut: Index of the strut.
-        name: Name of the effect.
-        values: Its parameters.
-        constants: Free length, stiffness, damping and gravity of all struts, shape (struts, 4...).
-        state: Internal state at the beginning; at zero if absent.
+    `constants` are free length, stiffness, damping and gravity of all struts, shape (struts, 4...).
     """
     start = state if len(state) else np.zeros(effect(name).state_size)
-    motion = StrutMotion(
-        track.t_s, track.heights_m[strut], track.velocities_m_per_s[strut],
-        track.applied_n, track.temperature_c,
-    )  # fmt: skip
-    own = LawValues(np.ascontiguousarray(values), constants[strut], start)
-    return force_along(name, own, motion, _substeps(track.t_s))
+    own = np.ascontiguousarray(values), constants[strut], start
+    t_s, heights_m, velocities, *inputs = track
+    motion = t_s, heights_m[strut], velocities[strut], *inputs
+    # Internal states take shorter steps than the samples.
+    step = float(t_s[-1] - t_s[0]) / (len(t_s) - 1)
+    substeps = int(np.clip(np.ceil(step / _LONGEST_STATE_STEP_S), 1, _MOST_STATE_STEPS))
+    return force_along(name, own, motion, substeps)
 
 
 def linear_forces(tracks: Sequence[Track], strut: int) -> Array:
-    """An orthonormal basis of a strut's linear forces along motions one after another.
-
-    Returns:
-        Of a constant force, a spring's and a damper's, shape (N, 3).
-    """
+    """An orthonormal basis (N, 3) of constant, spring and damper force along motions in a row."""
     heights_m = np.concatenate([track.heights_m[strut] for track in tracks])
     velocities = np.concatenate([track.velocities_m_per_s[strut] for track in tracks])
     columns = np.column_stack([np.ones_like(heights_m), heights_m, velocities])
@@ -111,12 +96,7 @@ def segment_forces(
 ) -> list[Array]:
     """Force (N,) of a law along each segment; internal states come from the whole recordings.
 
-    Args:
-        segments: The segments.
-        strut_effect: Index of the strut, and name of the effect.
-        values: Its parameters.
-        constants: Strut constants.
-        reference: Along the reference's motion, not the measured one.
+    It is taken along the reference's motion or along the measured one.
     """
     strut, name = strut_effect
     forces: list[Array] = []
@@ -161,16 +141,11 @@ def effect_forces(
     candidate, parts = model
     constants = strut_constants(problem, parts.linear)
     slots = slots_of(problem, candidate).each
-    return [
-        (
-            strut,
-            law_force(
-                track, strut, name, parts.effects[slot.parameters], constants,
-                states[slot.states],
-            ),
-        )
-        for (strut, name), slot in zip(strut_effects(problem, candidate), slots, strict=True)
-    ]  # fmt: skip
+    forces: list[tuple[int, Array]] = []
+    for (strut, name), slot in zip(strut_effects(problem, candidate), slots, strict=True):
+        values, own_states = parts.effects[slot.parameters], states[slot.states]
+        forces.append((strut, law_force(track, strut, name, values, constants, own_states)))
+    return forces
 
 
 def forces_along(

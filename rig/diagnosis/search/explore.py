@@ -31,12 +31,7 @@ _EXPLORED = 0.85
 
 
 class FirstRound(NamedTuple):
-    """Single laws together with the linear part, along the motion.
-
-    Attributes:
-        nothing: No law at all.
-        screenings: The laws, best first.
-    """
+    """Single laws with the linear part along the motion, best first, and no law at all."""
 
     nothing: Screening
     screenings: tuple[Screening, ...]
@@ -45,8 +40,7 @@ class FirstRound(NamedTuple):
 def explore(pool: Pool, progress: Progress) -> FirstRound | None:
     """Fit models that may be chosen, starting from the linear model or the best of several seeds.
 
-    Returns:
-        The first round about the linear model, where there was one.
+    The result is the first round about the linear model, where there was one.
     """
     first = None
     if len(pool.fits) > 1:
@@ -77,7 +71,9 @@ def _search_along_motion(pool: Pool, progress: Progress) -> FirstRound | None:
             beam = _diverse(levels[-1], criteria.beam)
             rounds = _screen_rounds(pool, stage, beam, within(progress, begin, 0.5 * (begin + end)))
         level = _refine_best_of_each(rounds)
-        if not level or not _gains(pool, stage, min(beam, key=_cost), level[0]):
+        if not level or not _gains(
+            pool, stage, min(beam, key=lambda screening: screening.validation_cost), level[0]
+        ):
             break
         chosen = _choose_for_fitting(pool, level) + _remove_laws(pool, levels, level[:2])
         levels.append(level)
@@ -217,9 +213,9 @@ def _fit_all(
 
 
 def _choose_for_fitting(pool: Pool, level: Sequence[Screening]) -> list[Screening]:
-    least = pool.criteria.hopeless * min(map(_cost, level), default=0.0)
+    least = pool.criteria.hopeless * min((s.validation_cost for s in level), default=0.0)
     diverse = _diverse(level, pool.criteria.fitted_a_size)
-    return [screening for screening in diverse if _cost(screening) <= least]
+    return [screening for screening in diverse if screening.validation_cost <= least]
 
 
 def _diverse(level: Sequence[LawCombination], count: int) -> list[LawCombination]:
@@ -234,7 +230,3 @@ def _diverse(level: Sequence[LawCombination], count: int) -> list[LawCombination
             chosen.append(screening)
             counts[families] = counts.get(families, 0) + 1
     return chosen
-
-
-def _cost(screening: Screening) -> float:
-    return screening.validation_cost

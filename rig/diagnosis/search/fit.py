@@ -65,11 +65,7 @@ class Fit(NamedTuple):
     """A fitted model.
 
     Attributes:
-        model: The model.
         free: Which linear parameters were fitted, shape (L,).
-        fits_effects: Whether effects' parameters were fitted.
-        solution: The solution of the least-squares problem.
-        space: Bounds and scales of its variables.
         blocks: Block of each row of data, over all recordings, shape (m,).
         recording: Recording of each row of data, shape (m,).
     """
@@ -155,14 +151,7 @@ def _existing_space(name: str, values: Array, free: bool) -> Space:
 
 
 class _Layout:
-    """How the search variables of a fit are ordered in a model's parts.
-
-    Args:
-        problem: Model and recordings.
-        model: Where the fit begins.
-        free: Which linear parameters are fitted, shape (L,).
-        effects: Whether effects' parameters are fitted.
-    """
+    """How the search variables of a fit are ordered in a model's parts."""
 
     def __init__(self, problem: Problem, model: CandidateModel, free: Flags, effects: bool) -> None:
         candidate, first = model
@@ -261,7 +250,7 @@ def fit(
     effects: bool = True,
     most_level: float = np.inf,
 ) -> Fit | None:
-    """Fit a model.
+    """Fit a model; None if it runs away where it begins.
 
     Args:
         problem: Model and recordings.
@@ -271,9 +260,6 @@ def fit(
         effects: Whether effects' parameters are fitted.
         most_level: Variance of the residual up to which priors gain weight with it. A prior that is
             weighted by the residual where a fit begins would hold it there.
-
-    Returns:
-        The fit, or None if the model runs away where it begins.
     """
     layout = _Layout(problem, first, free, effects)
     blocks = [problem.blocks(k) for k in range(problem.recordings)]
@@ -302,11 +288,7 @@ def leave_block_out_costs(
 ) -> Array:
     """Sum of squares of each block's residual in a fit to the other blocks, shape (blocks,).
 
-    Args:
-        residual: At the solution, shape (m,).
-        jacobian: Its derivative, shape (m, k).
-        blocks: Block of each row, shape (m,).
-        prior: Precision of the variables' priors, shape (k, k).
+    Residual (m,) and Jacobian (m, k) are those at the solution, the priors' precision is (k, k).
     """
     count = int(blocks.max()) + 1
     size = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + np.diag(prior), _TINY))
@@ -352,12 +334,7 @@ UNBOUND = 30.0
 
 
 class FitCovariance(NamedTuple):
-    """Uncertainty of a fit.
-
-    Attributes:
-        covariance: Of the search variables, shape (k, k).
-        factor: Half a 95 % confidence interval in standard deviations (Student).
-    """
+    """Covariance (k, k) of search variables; half a 95 % interval in deviations (Student's)."""
 
     covariance: Array
     factor: float
@@ -368,16 +345,12 @@ class FitCovariance(NamedTuple):
         return self.factor * np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def fit_covariance(result: Fit) -> FitCovariance:
     """Covariance of a fit whose residual may be autocorrelated (White's sandwich).
 
     The covariance under white noise is a lower limit.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        return _sandwich(result)
-
-
-def _sandwich(result: Fit) -> FitCovariance:
     jacobian, residual = result.solution.jacobian, result.solution.residual
     prior = result.solution.prior
     size: Array = np.sqrt(np.maximum(np.sum(jacobian**2, axis=0) + prior, _TINY))
@@ -459,11 +432,7 @@ def model_for(
 ) -> CandidateModel:
     """A fitted model with the effects of another candidate, further laws starting at rest.
 
-    Args:
-        problem: Model and recordings.
-        result: The fitted model.
-        candidate: The other candidate.
-        further: Parameters of its laws that the fitted model lacks.
+    `further` are parameters of laws that the fitted model lacks.
     """
     old, new = slots_of(problem, result.candidate), slots_of(problem, candidate)
     known = dict(zip((*result.candidate.kept, *result.candidate.new), old.each, strict=True))

@@ -9,13 +9,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects import effect
 from rig.diagnosis.outcome import RejectedEffect
-from rig.diagnosis.problem.problem import (
-    Candidate,
-    CandidateModel,
-    Problem,
-    StrutEffect,
-    nominal,
-)
+from rig.diagnosis.problem.problem import Candidate, CandidateModel, Problem, StrutEffect, nominal
 from rig.diagnosis.progress import Progress
 from rig.diagnosis.search.explore import FirstRound
 from rig.diagnosis.search.fit import Fit, fit, fit_covariance, law_values, model_for
@@ -37,12 +31,9 @@ class SearchResult(NamedTuple):
 
     Attributes:
         given: The nominal model, only initial states fitted.
-        linear: The best linear model.
         lawless: The same with significant corrections alone.
-        chosen: The model that was chosen.
         rivals: Models with other families that the data cannot distinguish from it.
         superfluous: Existing effects, by index, without which the data are as well described.
-        rejected: Laws that were not chosen, best first.
         gain_alike: Whether a gain of the applied force replaces mass, stiffness and damping, or two
             of them, that changed in one proportion.
     """
@@ -60,14 +51,7 @@ class SearchResult(NamedTuple):
 def select_model(
     pool: Pool, first: Pool, first_round: FirstRound | None, progress: Progress
 ) -> SearchResult:
-    """The result of a search.
-
-    Args:
-        pool: Models to choose from.
-        first: Models about the linear model, for the rejected laws.
-        first_round: Single laws about the linear model, where they were screened.
-        progress: Called with what is being done and the share that is done.
-    """
+    """The result of a search; `first` are the models about the linear one, for rejected laws."""
     progress("removing superfluous laws", 0.85)
     most_laws = pool.criteria.most_laws
     while True:
@@ -229,8 +213,7 @@ def _superfluous_effects(pool: Pool, chosen: ValidatedModel) -> tuple[int, ...]:
 def _with_few_corrections(pool: Pool, chosen: ValidatedModel) -> tuple[ValidatedModel, bool]:
     """The chosen model, converged, with significant linear corrections alone.
 
-    Returns:
-        The model, and whether a gain of the applied force replaces other corrections.
+    Also whether a gain of the applied force replaces other corrections.
     """
     problem = pool.problem
     converged = fit(problem, chosen.fit.model, chosen.fit.free, FINAL)
@@ -295,8 +278,7 @@ def _corrections_as_gain(problem: Problem, result: Fit) -> tuple[Array, Flags] |
     that changed so, within their intervals, are then nominal. With several struts a mass carries
     others, and there is no such degeneracy.
 
-    Returns:
-        Where to begin, and which linear parameters are free, shapes (L,).
+    The result is where to begin, and which linear parameters are free, shapes (L,).
     """
     linear = problem.linear
     if len(problem.motions) > 1 or not any(p.kind == "gain" for p in linear):

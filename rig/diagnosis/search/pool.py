@@ -51,12 +51,7 @@ FINAL = Effort(15, 1e-6, 2)
 
 
 class ValidatedModel(NamedTuple):
-    """A fitted model and its cross-validation.
-
-    Attributes:
-        fit: The model.
-        block_costs: Out-of-sample sum of squares of each block.
-    """
+    """A fitted model, and its out-of-sample sum of squares of each block."""
 
     fit: Fit
     block_costs: Array
@@ -86,10 +81,8 @@ class Pool:
     """Fitted models by candidate; of two fits of one candidate the better is kept.
 
     Args:
-        problem: Model and recordings.
         given: The nominal model, initial states fitted.
         seeds: First models, the best linear one first.
-        criteria: What decides.
     """
 
     def __init__(
@@ -154,14 +147,7 @@ class Pool:
     def attempt_screening(
         self, stage: Stage, reference: ValidatedModel, screening: Screening, effort: Effort = ROUGH
     ) -> None:
-        """Fit a screening's laws in simulation, from their parameters along the motion.
-
-        Args:
-            stage: The regression that the screening belongs to.
-            reference: The model that the regression is about.
-            screening: The laws.
-            effort: How far to go.
-        """
+        """Fit a screening's laws in simulation, from their parameters along the motion."""
         base, known = nominal(self.problem), reference.fit
         existing = existing_values(self.problem, base)
         if known.candidate.kept == base.kept:

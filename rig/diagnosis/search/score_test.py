@@ -65,10 +65,6 @@ class _Base(NamedTuple):
     """A fitted model, with what the test of every change of it needs.
 
     Attributes:
-        problem: Model and recordings.
-        fit: The fitted model.
-        tracks: The motion of recordings.
-        constants: The struts' constants as fitted.
         basis: Orthonormal basis of the responses to the fitted variables, shape (m, k).
         residual: The residual without its projection on the basis, shape (m,).
     """
@@ -85,8 +81,6 @@ class _ReplacedLaw(NamedTuple):
     """A law of a model that others may replace.
 
     Attributes:
-        law: The law.
-        values: Its parameters.
         linear: Orthonormal basis of the strut's linear forces along the motion, shape (N, 3).
         force_n: The law's force along the motion without its projection on that, shape (N,).
     """
@@ -100,14 +94,7 @@ class _ReplacedLaw(NamedTuple):
 def find_changes(
     problem: Problem, result: Fit, motions: Sequence[tuple[int, Track]], most_laws: int
 ) -> tuple[ModelChange, ...]:
-    """Changes of a fitted model by one law, each at its best start, best first.
-
-    Args:
-        problem: Model and recordings.
-        result: The model.
-        motions: The motion of recordings, by their index.
-        most_laws: Most laws of a model.
-    """
+    """Changes of a fitted model by one law, each at its best start, best first."""
     constants = strut_constants(problem, result.parts.linear)
     tracks = tuple(track for _, track in motions)
     base = _Base(problem, result, tracks, constants, *_project_out_fit(result))

@@ -72,12 +72,9 @@ class Stage(NamedTuple):
     """The regression along the motion, which all combinations of laws share.
 
     Attributes:
-        problem: Model and recordings.
-        segments: Recordings and parts of them.
         constants: Strut constants of the reference, shape (struts, 5).
         nuisance: Responses to the linear part (its counted parameters first), to existing effects'
             parameters and to initial states, shape (m, c).
-        counted: Index of each counted linear parameter.
         goal: Whitened residual without the reference's laws, shape (m,).
         basis: Orthonormal columns that span `nuisance`, shape (m, c').
         target: `goal` without its projection on `basis`, shape (m,).
@@ -105,10 +102,8 @@ class Screening(NamedTuple):
     """A combination of laws along the motion, refined or (without values) at its best start.
 
     Attributes:
-        laws: The laws, each in its strut.
         values: Parameters of each; for a law that depends on the strut's free length, followed by
             the change of that against the reference.
-        cost: Sum of squares of the residual.
         block_costs: Out-of-sample sum of squares of each block; `cost` where nothing was refined.
     """
 
@@ -146,10 +141,7 @@ def whole_stage_of(problem: Problem, reference: CandidateModel) -> Stage:
 
 
 def _stage(
-    problem: Problem,
-    reference: CandidateModel,
-    segments: tuple[Segment, ...],
-    coarse: Stage | None,
+    problem: Problem, reference: CandidateModel, segments: tuple[Segment, ...], coarse: Stage | None
 ) -> Stage:
     candidate, parts = reference
     constants = strut_constants(problem, parts.linear)
@@ -316,9 +308,6 @@ class _Round(NamedTuple):
     """One law more for a combination: what the comparison of all starts shares.
 
     Attributes:
-        stage: The regression.
-        coarse: The regression on which starts are compared.
-        base: The combination.
         residual: Its residual on the coarse regression, tangents projected out, shape (m,).
         basis: Orthonormal basis of those tangents, shape (m, k).
     """
@@ -355,19 +344,9 @@ def _begin_round(stage: Stage, base: Screening) -> _Round:
 
 
 def rank_laws(
-    stage: Stage,
-    base: Screening,
-    screened: int,
-    only: Sequence[StrutEffect] | None = None,
+    stage: Stage, base: Screening, screened: int, only: Sequence[StrutEffect] | None = None
 ) -> list[Screening]:
-    """A combination of laws with each further law, best first.
-
-    Args:
-        stage: The regression.
-        base: The combination.
-        screened: How many laws are refined.
-        only: Laws that are compared; all if absent.
-    """
+    """A combination with each further law (of `only`), best first; `screened` are refined."""
     laws = candidate_laws(stage.problem) if only is None else only
     laws = [at for at in laws if is_compatible(at, base.laws)]
     for _, name in laws:

@@ -10,13 +10,7 @@ from numpy.typing import NDArray
 
 from dart_model.effects.restoring_surface import FIRST_FORCE, HEIGHTS, VELOCITIES
 from rig.diagnosis.numerics.least_squares import Effort
-from rig.diagnosis.problem.problem import (
-    CandidateModel,
-    Parts,
-    Problem,
-    existing_values,
-    nominal,
-)
+from rig.diagnosis.problem.problem import CandidateModel, Parts, Problem, existing_values, nominal
 from rig.diagnosis.search.fit import Fit, fit, leave_block_out_costs
 from rig.diagnosis.search.screen import Stage, response, stage_of
 
@@ -30,12 +24,7 @@ _SMOOTHING = np.geomspace(1e-4, 1e4, 9)
 def fit_surface(problem: Problem, linear: Fit) -> Fit | None:
     """The best linear model with a table in the strut where that explains most.
 
-    Args:
-        problem: Model and recordings.
-        linear: The best linear model.
-
-    Returns:
-        The fit; None where the model runs away with it.
+    None where it runs away.
     """
     stage = stage_of(problem, linear.model)
     tables = [_table(stage, strut) for strut in range(len(problem.motions))]

@@ -35,14 +35,7 @@ def smooth_tracks(problem: Problem, result: Fit) -> list[tuple[int, Track]]:
 def find_defect(
     problem: Problem, result: Fit, motions: Sequence[tuple[int, Track]], criteria: SelectionCriteria
 ) -> str | None:
-    """The reason for which a model is not used; None where there is none.
-
-    Args:
-        problem: Model and recordings.
-        result: The fitted model.
-        motions: The motion of recordings, by their index.
-        criteria: What decides.
-    """
+    """The reason for which a model is not used; None where there is none."""
     forces = forces_along(problem, result.model, motions)
     along = [track for _, track in motions]
     return (
@@ -89,12 +82,7 @@ def _find_unbounded_law(problem: Problem, result: Fit, criteria: SelectionCriter
 
 
 def find_unidentifiable_law(problem: Problem, result: Fit) -> str | None:
-    """Reason against a law all of whose sizes have intervals that contain zero; None without one.
-
-    Args:
-        problem: Model and recordings.
-        result: The model, fitted until converged.
-    """
+    """Reason against a law of a converged fit, all of whose sizes have intervals with zero."""
     half, variables = fit_covariance(result).half, effect_variables(problem, result)
     space = result.space
     sizes = np.where(
