@@ -87,7 +87,7 @@ class Bus:
         epoch_ns: int = 0,
     ) -> None:
         self._filters = None if filters is None else frozenset(filters)
-        self._list_arguments: dict[tuple[int, bool], bool] = {}
+        self._accepted: dict[tuple[int, bool], bool] = {}
         self.epoch_ns = epoch_ns
         """Unix time that stamps are relative to; to be updated when the system's clock was set."""
         self._bus = open_bus(config, self._filters, listen_only=listen_only)
@@ -119,15 +119,15 @@ class Bus:
         if self._filters is None:
             return True
         key = (message.arbitration_id, message.is_extended_id)
-        known = self._list_arguments.get(key)
+        known = self._accepted.get(key)
         if known is None:
-            known = self._list_arguments[key] = any(
+            known = self._accepted[key] = any(
                 item.is_extended == message.is_extended_id
                 and message.arbitration_id & item.mask == item.arbitration_id & item.mask
                 for item in self._filters
             )
-            if len(self._list_arguments) > _MOST_KNOWN:
-                self._list_arguments.clear()
+            if len(self._accepted) > _MOST_KNOWN:
+                self._accepted.clear()
         return known
 
     def _frame(self, message: can.Message) -> Frame:

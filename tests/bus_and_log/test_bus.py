@@ -118,4 +118,4 @@ def test_a_flood_of_foreign_identifiers_fills_no_memory(opened, peer):
         if number % 60 == 0:
             bus.receive()
     bus.receive()
-    assert len(bus._list_arguments) <= 10_001
+    assert len(bus._accepted) <= 10_001
