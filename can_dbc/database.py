@@ -207,7 +207,9 @@ def _refuse_excess(path: Path, text: str) -> None:
     limit = _LENGTH_MAX_BYTES
     for match in _MESSAGE_LENGTH.finditer(text):
         if len(match[1]) > 6 or int(match[1]) > limit:
-            raise DatabaseError(f"{path}: message of {match[1][:20]} bytes, expected at most 64")
+            raise DatabaseError(
+                f"{path}: message of {match[1][:20]} bytes, expected at most {limit}"
+            )
     for match in _SIGNAL_POSITION.finditer(text):
         if any(len(part) > 6 or int(part) > 8 * limit for part in match.groups()):
             raise DatabaseError(f"{path}: signal at {match[0][1:40]} does not fit in any message")

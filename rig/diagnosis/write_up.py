@@ -23,7 +23,7 @@ from rig.diagnosis.outcome import (
     White,
 )
 from rig.diagnosis.problem.linear_part import EFFECTS, PARAMETERS
-from rig.diagnosis.problem.on_dart import corrected_model
+from rig.diagnosis.problem.on_dart import spec_with_corrections
 from rig.diagnosis.problem.problem import (
     LinearParameter,
     Problem,
@@ -124,7 +124,7 @@ def compose_result(
     series = (_collect_series(problem, before[k], after[k]) for k in recordings)
     return Result(
         diagnosis,
-        corrected_model(problem, chosen.model),
+        spec_with_corrections(problem, chosen.model),
         tuple(item for items in series for item in items),
         tuple(item for run in evaluations for item in run.series),
     )

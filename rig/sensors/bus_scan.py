@@ -65,7 +65,7 @@ class _DeviceObjects:
     def __init__(self, network: CanOpenNetwork, node_id: int) -> None:
         self._network = network
         self._node_id = node_id
-        self._list_arguments: dict[tuple[int, int], bytes | None] = {}
+        self._objects: dict[tuple[int, int], bytes | None] = {}
         self.unanswered: list[str] = []
         """Objects for which the device gave no answer."""
 
@@ -76,15 +76,15 @@ class _DeviceObjects:
             BusError: The device answers no request.
         """
         key = index, subindex
-        if key not in self._list_arguments:
+        if key not in self._objects:
             try:
-                self._list_arguments[key] = self._network.read(self._node_id, index, subindex)
+                self._objects[key] = self._network.read(self._node_id, index, subindex)
             except BusError:
-                self._list_arguments[key] = None
+                self._objects[key] = None
                 self.unanswered.append(f"{index:04X}h.{subindex}")
                 if index == _DEVICE_TYPE or len(self.unanswered) > _MOST_UNANSWERED:
                     raise
-        return self._list_arguments[key]
+        return self._objects[key]
 
     def is_signed(self, index: int, subindex: int) -> bool | None:
         """None: a device does not report it."""

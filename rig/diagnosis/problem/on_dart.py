@@ -21,7 +21,7 @@ _MOST_STEPS_IN_ALL = 1_500_000
 """Steps of DART that take some ten seconds."""
 
 
-def corrected_model(problem: Problem, model: CandidateModel) -> ModelSpec:
+def spec_with_corrections(problem: Problem, model: CandidateModel) -> ModelSpec:
     """The nominal model with a fit's linear corrections and effects."""
     candidate, parts = model
     spec = problem.spec
@@ -67,7 +67,7 @@ def dart_heights(
     Its steps are refined until its heights differ from `expected_m`, those of the same model as the
     diagnosis simulates it, by less than `tolerance_m` RMS.
     """
-    plant = DartPlant(corrected_model(problem, model))
+    plant = DartPlant(spec_with_corrections(problem, model))
     nodes = len(run.grid.t_s)
     count = min(nodes, max(50, int(_TRIED_S / run.grid.step_s)))
     states = _plant_states(problem, model, start[2 * plant.coordinates :], plant)
