@@ -10,10 +10,10 @@ from can_dbc.frame import Frame
 from can_dbc.protection import SequenceState
 from rig.bridge.counts import Conditions, Counts, Report, count_tick
 from rig.bridge.devices import CLAIM, CLAIM_MASK, Device, faults
-from rig.bridge.gates import GateMemory, Gates, Reception
-from rig.bridge.incoming import Incoming
-from rig.bridge.outgoing import Outgoing
-from rig.bridge.supervisor import NO_REPORTS, Reports, SupervisedState, Supervision, Supervisor
+from rig.bridge.frame_checks import CheckMemory, FrameChecks, Reception
+from rig.bridge.incoming_messages import Incoming
+from rig.bridge.mode_supervisor import NO_REPORTS, Reports, SupervisedState, Supervision, Supervisor
+from rig.bridge.outgoing_messages import Outgoing
 from rig.bridge.values import Mode, StepInput, StepOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.observers.protocol import AnyObserver
@@ -34,7 +34,7 @@ class BridgeState(Struct, frozen=True, gc=False):
 
     supervised: SupervisedState
     sequences: tuple[SequenceState, ...]
-    memory: GateMemory
+    memory: CheckMemory
     sendings: tuple[Sending, ...]
     reported: Counts
 
@@ -77,7 +77,7 @@ class Bridge:
         self._devices = tuple(devices)
         own = frozenset(item.message.key for item in outgoing)
         struts = supervisor.estimator.struts
-        self._gates = Gates(incoming, own, devices, supervision.limits, struts)
+        self._checks = FrameChecks(incoming, own, devices, supervision.limits, struts)
         self._is_height = [channel.role is Role.HEIGHT for channel in channels]
         self._is_reading = [channel.role is Role.SENSOR for channel in channels]
         self.filters = _filters(incoming, outgoing, devices)
@@ -86,12 +86,12 @@ class Bridge:
     @property
     def incoming(self) -> tuple[Incoming, ...]:
         """Messages of the bench."""
-        return self._gates.incoming
+        return self._checks.incoming
 
     @property
     def directory(self) -> Directory:
         """Index of the incoming message that a frame is of."""
-        return self._gates.directory
+        return self._checks.directory
 
     def with_settings(self, observers: Sequence[AnyObserver], supervision: Supervision) -> "Bridge":
         """The same with other observers and limits; it continues from a state of this one."""
@@ -109,7 +109,7 @@ class Bridge:
     def init(self, t_ns: int) -> BridgeState:
         """State before the first tick."""
         sendings = (Sending(0, t_ns),) * len(self._outgoing)
-        sequences, memory = self._gates.init(t_ns)
+        sequences, memory = self._checks.init(t_ns)
         supervised = self._supervisor.init(t_ns)
         return BridgeState(supervised, sequences, memory, sendings, memory.counts)
 
@@ -147,14 +147,14 @@ class Bridge:
         t_ns: int,
         frames: Sequence[Frame],
     ) -> tuple[SupervisedState, list[Sample]]:
-        """Pass every frame through the gates; returns the samples of the tick's last step.
+        """Pass every frame through the checks; returns the samples of the tick's last step.
 
         A late tick finds several measurements of one strut. Each is used in a step at its own time,
         or the model would run away under a force that was constant over the whole gap.
         """
         samples: list[Sample] = []
         measured = 0
-        for incoming, values, frame_ns in self._gates.receive(reception, frames):
+        for incoming, values, frame_ns in self._checks.receive(reception, frames):
             if measured & incoming.first_strut:
                 supervised, samples = self._catch_up(supervised, samples)
                 measured = 0

@@ -1,6 +1,6 @@
 """What is counted of frames and ticks, and what an outgoing message can report.
 
-A frame is counted by the gate that refuses it (`rig.bridge.gates`), under the value of its
+A frame is counted by the check that refuses it (`rig.bridge.frame_checks`), under the value of its
 `FrameStatus`; a tick at its end.
 """
 

@@ -4,7 +4,7 @@
     prescribed_motion   a strut whose motion is prescribed and whose force is measured
 
 An estimator knows no modes: when its estimate is published, and as what, is decided by
-`rig.bridge.supervisor`.
+`rig.bridge.mode_supervisor`.
 """
 
 from collections.abc import Sequence

@@ -11,10 +11,10 @@ from dart_model.spec import ModelSpec
 from rig.bridge.bridge import Bridge
 from rig.bridge.estimator import AnyEstimator
 from rig.bridge.free_model import FreeModelEstimator
-from rig.bridge.incoming import Alarm, Incoming, compile_incoming
-from rig.bridge.outgoing import compile_outgoing
+from rig.bridge.incoming_messages import Alarm, Incoming, compile_incoming
+from rig.bridge.mode_supervisor import Supervisor
+from rig.bridge.outgoing_messages import compile_outgoing
 from rig.bridge.prescribed_motion import PrescribedMotionEstimator
-from rig.bridge.supervisor import Supervisor
 from rig.channels.channel import Channel
 from rig.plan.plan import Plan
 

@@ -18,8 +18,8 @@ from pydantic_core.core_schema import tagged_union_schema
 
 from can_dbc.yaml_file import Finite, Positive
 from rig.bridge.devices import DeviceSettings
+from rig.bridge.mode_supervisor import Supervision
 from rig.bridge.publications import STATUS, STRUT, TIMING, Publication
-from rig.bridge.supervisor import Supervision
 from rig.bus.bus import BusConfig
 from rig.bus.secoc import AuthenticationSettings
 from rig.channels.channel import SignalName

@@ -12,8 +12,8 @@ from can_dbc.database import Database, Message
 from can_dbc.errors import DatabaseError, InputError
 from dart_model.spec import ModelSpec
 from rig.bridge.devices import Device
-from rig.bridge.incoming import Alarm
-from rig.bridge.outgoing import PublishedSignal
+from rig.bridge.incoming_messages import Alarm
+from rig.bridge.outgoing_messages import PublishedSignal
 from rig.bridge.publications import (
     ESTIMATE,
     KINEMATICS,

@@ -22,7 +22,7 @@ from can_dbc.frame import Frame
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model
 from rig.bridge.bridge import Bridge, BridgeState
-from rig.bridge.supervisor import SupervisedState, Supervision, Supervisor
+from rig.bridge.mode_supervisor import SupervisedState, Supervision, Supervisor
 from rig.bridge.values import StepInput
 from rig.bus.bus import Bus, BusConfig
 from rig.channels.channel import Sample

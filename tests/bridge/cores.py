@@ -6,7 +6,7 @@ from dart_model.plant import DartPlant
 from dart_model.protocol import AnyPlant
 from dart_model.spec import MODELS, load_model
 from rig.bridge.free_model import FreeModelEstimator
-from rig.bridge.supervisor import SupervisedState, Supervision, Supervisor
+from rig.bridge.mode_supervisor import SupervisedState, Supervision, Supervisor
 from rig.bridge.values import StepInput, StepOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.quantities import (

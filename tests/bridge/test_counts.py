@@ -9,10 +9,10 @@ from rig.bridge import (
     bridge,
     counts,
     estimator,
+    frame_checks,
     free_model,
-    gates,
+    mode_supervisor,
     prescribed_motion,
-    supervisor,
     values,
 )
 from rig.bridge.counts import Conditions
@@ -69,7 +69,16 @@ def test_a_count_beyond_its_signal_stays_at_the_largest_value():
 
 
 def test_a_state_of_the_core_cannot_be_changed():
-    modules = [bridge, estimator, free_model, gates, prescribed_motion, counts, supervisor, values]
+    modules = [
+        bridge,
+        estimator,
+        frame_checks,
+        free_model,
+        prescribed_motion,
+        counts,
+        mode_supervisor,
+        values,
+    ]
     structs = {
         value
         for module in modules

@@ -3,7 +3,7 @@
 from can_dbc.database import load_database
 from can_dbc.frame import Frame
 from can_dbc.protection import FrameStatus, SequenceState
-from rig.bridge.incoming import HeightDelivery, compile_incoming
+from rig.bridge.incoming_messages import HeightDelivery, compile_incoming
 from rig.channels.channel import Channel, Role
 from rig.channels.quantities import HEIGHT
 

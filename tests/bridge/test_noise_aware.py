@@ -9,7 +9,7 @@ import pytest
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model
 from rig.bridge.free_model import start_of_motion
-from rig.bridge.supervisor import Supervision
+from rig.bridge.mode_supervisor import Supervision
 from rig.bridge.values import StepInput
 from rig.channels.channel import Sample
 from rig.channels.quantities import APPLIED_FORCE

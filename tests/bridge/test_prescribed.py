@@ -7,13 +7,13 @@ import pytest
 from can_dbc.errors import InputError
 from dart_model.plant import PrescribedStrut
 from dart_model.spec import MODELS, EffectSpec, load_model, parse_model
+from rig.bridge.mode_supervisor import Supervision, Supervisor
 from rig.bridge.prescribed_motion import (
     PrescribedMotionEstimator,
     TrackedMotion,
     predict_motion,
     update_motion,
 )
-from rig.bridge.supervisor import Supervision, Supervisor
 from rig.bridge.values import Mode, StepInput
 from rig.channels.channel import Sample
 from rig.channels.quantities import LOAD_CELL_FORCE, TEMPERATURE

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from rig.bridge.supervisor import Supervision
+from rig.bridge.mode_supervisor import Supervision
 from rig.bridge.values import Mode, StepInput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.quantities import APPLIED_FORCE, FORCE, HEIGHT, VELOCITY

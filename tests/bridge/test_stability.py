@@ -7,7 +7,7 @@ import pytest
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model, parse_model
-from rig.bridge.supervisor import Supervision
+from rig.bridge.mode_supervisor import Supervision
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.poles import Pole, closed_loop_poles
 from rig.observers.pi import PiObserver

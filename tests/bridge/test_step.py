@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model
 from rig.bridge.free_model import FreeModelEstimator
-from rig.bridge.supervisor import Supervisor
+from rig.bridge.mode_supervisor import Supervisor
 from rig.bridge.values import Mode, StepInput, StepOutput, StrutOutput
 from tests.bridge.cores import (
     GAINS,

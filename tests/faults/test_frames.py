@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from can_dbc.codec import compile_decoder
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
-from rig.bridge.gates import SECOND_SENDER_FRAMES
+from rig.bridge.frame_checks import SECOND_SENDER_FRAMES
 from rig.bridge.values import Mode
 from tests.faults.trial import (
     BEGIN_NS,

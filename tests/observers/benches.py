@@ -6,7 +6,7 @@ import yaml
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, parse_model
-from rig.bridge.supervisor import Supervision
+from rig.bridge.mode_supervisor import Supervision
 from rig.bridge.values import Mode, StepInput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.quantities import APPLIED_FORCE, HEIGHT

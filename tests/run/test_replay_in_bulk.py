@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.bridge.supervisor import Supervision
+from rig.bridge.mode_supervisor import Supervision
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.plan.plan import Plan

@@ -1,4 +1,7 @@
-"""Incoming messages, compiled from the DBC and the channels that they carry."""
+"""Incoming messages, compiled from the DBC and the channels that they carry.
+
+The order of the checks that their frames pass is that of `rig.bridge.frame_checks`.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -107,7 +107,7 @@ class SupervisedState(Struct, frozen=True, gc=False):
 
 
 class Reports(Struct, frozen=True, gc=False):
-    """What gates and devices report to the supervisor: the severest action, 0 if none.
+    """What frame checks and devices report to the supervisor: the severest action, 0 if none.
 
     A device counts as faulty if the estimate rests on it.
     """

@@ -1,7 +1,7 @@
-"""The gates that a frame passes before its values are used, in their order.
+"""The checks that a frame passes before its values are used, in their order.
 
-1. addressed: it is a frame of a message that the bridge reads (`Gates.receive`). What is not may be
-   a heartbeat, an emergency or an address claim of a device, or a second sender.
+1. addressed: it is a frame of a message that the bridge reads (`FrameChecks.receive`). What is not
+   may be a heartbeat, an emergency or an address claim of a device, or a second sender.
 2. protected: its length, CRC and counter are right (`can_dbc.protection`), and its signals hold
    values (`Incoming.read`).
 3. sent by its device: its sender is the configured device (`_sent_by_device`).
@@ -10,7 +10,8 @@
 
 Whether a frame is authentic is decided before, on the bus (`rig.bus.secoc`). No measurement of a
 refused frame is used; alarms in it count. It is counted where it was refused (`rig.bridge.counts`);
-that of another sender than the device is none of the message's frames, and is not.
+that of another sender than the device is none of the message's frames, and is not. Whether the
+newest measurement has become too old is decided later (`rig.bridge.mode_supervisor`).
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +37,7 @@ from rig.bridge.devices import (
     update_by_data,
     update_by_frame,
 )
-from rig.bridge.incoming import Incoming, Values
+from rig.bridge.incoming_messages import Incoming, Values
 from rig.bridge.limits import Action, Limit, Plausibility, judge_height
 
 # Looking up a member of an enum costs as much as the CRC of a frame.
@@ -57,8 +58,8 @@ class Strays(NamedTuple):
     t_ns: int = 0
 
 
-class GateMemory(Struct, frozen=True, gc=False):
-    """What the gates remember between two ticks; most ticks leave it as it is."""
+class CheckMemory(Struct, frozen=True, gc=False):
+    """What the checks remember between two ticks; most ticks leave it as it is."""
 
     strays: tuple[Strays, ...]
     heights: tuple[Plausibility | None, ...]
@@ -74,7 +75,7 @@ class Reception:
 
     __slots__ = ("action", "memory", "sequences")
 
-    def __init__(self, sequences: Sequence[SequenceState], memory: GateMemory) -> None:
+    def __init__(self, sequences: Sequence[SequenceState], memory: CheckMemory) -> None:
         self.sequences = list(sequences)
         self.memory = memory
         self.action = 0
@@ -95,12 +96,12 @@ class Reception:
             self.memory = replace(self.memory, healths=healths)
 
 
-Gate = Callable[[Reception, Frame, Values], Values | None]
+FrameCheck = Callable[[Reception, Frame, Values], Values | None]
 """Passes a frame's values on, or refuses the frame: None."""
 
 
-class Gates:
-    """The gates of a bridge; its `own` messages are identified as by `Message.key`."""
+class FrameChecks:
+    """The checks of a bridge; its `own` messages are identified as by `Message.key`."""
 
     def __init__(
         self,
@@ -118,13 +119,13 @@ class Gates:
         self._device_of_id = {key: index for index, item in enumerate(devices) for key in item.ids}
         self._limits = tuple(limit for limit in limits if limit.value.is_measured)
         self._struts = struts
-        self._gates = [self._gates_of(item) for item in incoming]
+        self._checks = [self._checks_of(item) for item in incoming]
         self._index_of = self.directory.index_of
 
-    def init(self, t_ns: int) -> tuple[tuple[SequenceState, ...], GateMemory]:
+    def init(self, t_ns: int) -> tuple[tuple[SequenceState, ...], CheckMemory]:
         """Counter states and memory before the first tick."""
         messages = len(self.incoming)
-        memory = GateMemory(
+        memory = CheckMemory(
             (Strays(),) * messages,
             (None,) * self._struts,
             tuple(initial_health(device, t_ns) for device in self._devices),
@@ -135,7 +136,7 @@ class Gates:
     def receive(
         self, reception: Reception, frames: Sequence[Frame]
     ) -> list[tuple[Incoming, Values, int]]:
-        """Message, values and arrival time of each frame that no gate refused."""
+        """Message, values and arrival time of each frame that no check refused."""
         passed: list[tuple[Incoming, Values, int]] = []
         index_of, sequences = self._index_of, reception.sequences
         for frame in frames:
@@ -147,8 +148,8 @@ class Gates:
             sequences[index], status, values = incoming.read(sequences[index], frame)
             if status is not _OK:
                 self._record_status(reception, index, frame.t_ns, status)
-            if values is not None and (gates := self._gates[index]):
-                values = _pass(gates, reception, frame, values)
+            if values is not None and (checks := self._checks[index]):
+                values = _pass(checks, reception, frame, values)
             if values is not None:
                 passed.append((incoming, values, frame.t_ns))
         return passed
@@ -199,42 +200,42 @@ class Gates:
         if stray.frames >= SECOND_SENDER_FRAMES:
             reception.count(second_sender=1)
 
-    def _gates_of(self, incoming: Incoming) -> tuple[Gate, ...]:
-        """The gates that a message needs after its protection, in their order."""
-        gates: list[Gate] = []
+    def _checks_of(self, incoming: Incoming) -> tuple[FrameCheck, ...]:
+        """The checks that a message needs after its protection, in their order."""
+        checks: list[FrameCheck] = []
         if incoming.device is not None:
             index, device = incoming.device, self._devices[incoming.device]
-            gates += [_sent_by_device(index, device), _healthy_sender(incoming, index, device)]
+            checks += [_sent_by_device(index, device), _healthy_sender(incoming, index, device)]
         if self._limits and incoming.heights:
-            gates.append(_plausible(incoming, self._limits))
-        return tuple(gates)
+            checks.append(_plausible(incoming, self._limits))
+        return tuple(checks)
 
 
 def _pass(
-    gates: Sequence[Gate], reception: Reception, frame: Frame, values: Values
+    checks: Sequence[FrameCheck], reception: Reception, frame: Frame, values: Values
 ) -> Values | None:
-    """Values of a frame behind some gates; None if one of them refused the frame."""
-    for gate in gates:
-        passed = gate(reception, frame, values)
+    """Values of a frame behind some checks; None if one of them refused the frame."""
+    for check in checks:
+        passed = check(reception, frame, values)
         if passed is None:
             return None
         values = passed
     return values
 
 
-def _sent_by_device(index: int, device: Device) -> Gate:
-    """A gate for frames of the device alone: another one may send the same group."""
+def _sent_by_device(index: int, device: Device) -> FrameCheck:
+    """A check for frames of the device alone: another one may send the same group."""
 
-    def gate(reception: Reception, frame: Frame, values: Values) -> Values | None:
+    def check(reception: Reception, frame: Frame, values: Values) -> Values | None:
         return values if is_from(device, reception.memory.healths[index], frame) else None
 
-    return gate
+    return check
 
 
-def _healthy_sender(incoming: Incoming, index: int, device: Device) -> Gate:
-    """A gate for frames of a healthy device; alarms in the frame itself count."""
+def _healthy_sender(incoming: Incoming, index: int, device: Device) -> FrameCheck:
+    """A check for frames of a healthy device; alarms in the frame itself count."""
 
-    def gate(reception: Reception, frame: Frame, values: Values) -> Values | None:
+    def check(reception: Reception, frame: Frame, values: Values) -> Values | None:
         reception.set_health(index, update_by_data(device, reception.memory.healths[index]))
         for alarm in incoming.alarms:
             health = reception.memory.healths[alarm.device]
@@ -245,13 +246,13 @@ def _healthy_sender(incoming: Incoming, index: int, device: Device) -> Gate:
         reception.count_refusal("from_faulty_device")
         return None
 
-    return gate
+    return check
 
 
-def _plausible(incoming: Incoming, limits: Sequence[Limit]) -> Gate:
-    """A gate for heights within the limits: a frame is used whole or not at all."""
+def _plausible(incoming: Incoming, limits: Sequence[Limit]) -> FrameCheck:
+    """A check for heights within the limits: a frame is used whole or not at all."""
 
-    def gate(reception: Reception, frame: Frame, values: Values) -> Values | None:
+    def check(reception: Reception, frame: Frame, values: Values) -> Values | None:
         heights, action = list(reception.memory.heights), 0
         for target in incoming.heights:
             memory = heights[target.strut]
@@ -266,4 +267,4 @@ def _plausible(incoming: Incoming, limits: Sequence[Limit]) -> Gate:
         reception.count_refusal("implausible")
         return None
 
-    return gate
+    return check
