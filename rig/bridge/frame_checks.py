@@ -11,7 +11,7 @@
 Whether a frame is authentic is decided before, on the bus (`rig.bus.secoc`). No measurement of a
 refused frame is used; alarms in it count. It is counted where it was refused (`rig.bridge.counts`);
 that of another sender than the device is none of the message's frames, and is not. Whether the
-newest measurement has become too old is decided later (`rig.bridge.mode_supervisor`).
+newest measurement has become too old is decided later (`rig.bridge.measurement_age`).
 """
 
 from collections.abc import Callable, Sequence
@@ -38,7 +38,7 @@ from rig.bridge.devices import (
     update_by_frame,
 )
 from rig.bridge.incoming_messages import Incoming, Values
-from rig.bridge.limits import Action, Limit, Plausibility, judge_height
+from rig.bridge.supervision_limits import Action, Limit, Plausibility, judge_height
 
 # Looking up a member of an enum costs as much as the CRC of a frame.
 _OK = FrameStatus.OK

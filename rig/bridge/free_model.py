@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant, LoadedModel, ModelState
 from rig.bridge.estimator import Estimate, find_divergence, is_sensible
+from rig.bridge.measurement_age import is_too_old
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.quantities import APPLIED_FORCE, TEMPERATURE
@@ -195,7 +196,7 @@ class FreeModelEstimator:
             ):
                 return False
         newest_ns = min(samples[-1].t_ns for samples in first if samples)
-        return t_ns - newest_ns <= self._stale_after_ns
+        return not is_too_old(newest_ns, t_ns, self._stale_after_ns)
 
     def _observe(
         self, state: FreeModelState, loaded: LoadedModel[ModelState], t_ns: int, received: _Received

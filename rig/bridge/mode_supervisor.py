@@ -14,7 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.yaml_file import Positive
 from rig.bridge.estimator import AnyEstimator, Estimate
-from rig.bridge.limits import Action, Limit, worst_action
+from rig.bridge.measurement_age import is_too_old
+from rig.bridge.supervision_limits import Action, Limit, worst_action
 from rig.bridge.values import Divergence, Mode, StepInput, StepOutput, StrutOutput
 
 
@@ -150,9 +151,9 @@ class Supervisor:
         if estimate is None:
             state = SupervisedState(t_ns, mode, after, state.last_valid, (), state.diverged)
             return state, StepOutput(mode, ()), reports.action
-        age_ns = t_ns - estimate.measured_ns
-        if mode is not Mode.RUNNING or age_ns > self._stale_after_ns:
-            mode = next_mode(mode, self.age_event(age_ns))
+        measured_ns = estimate.measured_ns
+        if mode is not Mode.RUNNING or is_too_old(measured_ns, t_ns, self._stale_after_ns):
+            mode = next_mode(mode, self._age_event(measured_ns, t_ns))
         if estimate.diverged >= 0:
             mode = next_mode(mode, Event.DIVERGED)
             state = replace(state, diverged=Divergence(estimate.diverged, t_ns))
@@ -182,11 +183,12 @@ class Supervisor:
             mode = next_mode(mode, Event.DEVICE_FAULT)
         return mode, action
 
-    def age_event(self, age_ns: int) -> Event:
+    def _age_event(self, measured_ns: int, t_ns: int) -> Event:
         """What the age of the oldest measurement means."""
-        if age_ns <= self._stale_after_ns:
+        if not is_too_old(measured_ns, t_ns, self._stale_after_ns):
             return Event.FRESH
-        return Event.STALE if age_ns <= self._safe_after_ns else Event.TIMEOUT
+        is_timeout = is_too_old(measured_ns, t_ns, self._safe_after_ns)
+        return Event.TIMEOUT if is_timeout else Event.STALE
 
     def _hold(
         self, state: SupervisedState, t_ns: int, estimator: object, estimate: Estimate

@@ -17,6 +17,7 @@ from msgspec import Struct
 
 from dart_model.effects import AMBIENT_C
 from rig.bridge.estimator import Estimate, is_sensible
+from rig.bridge.measurement_age import is_too_old
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.quantities import LOAD_CELL_FORCE, TEMPERATURE
@@ -171,7 +172,7 @@ class PrescribedMotionEstimator:
         if motion is None or cell_n is None:
             return state, None
         measured_ns = min(motion.measured_ns, state.cell_ns)
-        if not state.is_moving and t_ns - measured_ns > self._stale_after_ns:
+        if not state.is_moving and is_too_old(measured_ns, t_ns, self._stale_after_ns):
             return state, None
         temperature_c = state.temperature_c
         model = self._model.step(

@@ -31,8 +31,8 @@ def set_command(
     ] = False,
 ) -> None:
     """Change gains or limits of a run in progress, or acknowledge its safe state."""
+    from rig.run.change_requests import ask
     from rig.run.changes import parse_assignments
-    from rig.run.live_changes import ask
 
     if acknowledge == bool(assignments):
         raise InputError("rig set: expected KEY=VALUE, or --acknowledge")

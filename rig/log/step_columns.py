@@ -1,6 +1,7 @@
 """`steps.arrow`: the columns that the log keeps of a tick, the record of one, and a batch of them.
 
-What it holds of a channel or a strut is declared here; the frames of a tick are in `frames.log`.
+What it holds of a channel is declared here, what it holds of a strut are the attributes of
+`rig.bridge.values.StrutOutput`; the frames of a tick are in `frames.log`.
 """
 
 import struct

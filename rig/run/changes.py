@@ -2,7 +2,7 @@
 
 A change is checked as the configuration is. It becomes another bridge, prepared outside the loop,
 which continues from the state of the one before; the log holds the tick from which on, so that a
-replay changes there too. During a run `rig.run.live_changes` hands the bridge to the loop
+replay changes there too. During a run `rig.run.change_requests` hands the bridge to the loop
 (`rig.run.loop.run`), which asks for it at every tick.
 """
 

@@ -9,8 +9,8 @@ from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from can_dbc.yaml_file import load_yaml
 from rig.bridge.counts import Conditions
-from rig.bridge.limits import Action, Limit, LimitedValue, judge_height
 from rig.bridge.mode_supervisor import TRANSITIONS, Event, next_mode
+from rig.bridge.supervision_limits import Action, Limit, LimitedValue, judge_height
 from rig.bridge.values import Mode
 from rig.plan.config import CONFIGS, RunConfig
 from tests.faults.trial import BEGIN_NS, MS, Trial, after, measurements_only

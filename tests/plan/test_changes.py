@@ -10,8 +10,8 @@ from rig.log.file_names import CHANGES_FILE
 from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
+from rig.run.change_requests import Requests, ask
 from rig.run.changes import assign, change_line, parse_assignments, read_changes
-from rig.run.live_changes import Requests, ask
 from rig.run.replay import replay
 from tests.view.serving import make_run
 

@@ -27,7 +27,7 @@ from rig.pages.view import visible_stretch
 from rig.pages.view.diagnosis_job import DiagnosisJob
 from rig.pages.view.live_page import live_page
 from rig.pages.view.run_status import WatchedRun
-from rig.run.live_changes import ask
+from rig.run.change_requests import ask
 from rig.run.timing import read_histograms
 
 HOST = "127.0.0.1"

@@ -1,0 +1,11 @@
+"""Whether a measurement is too old to rest an estimate on.
+
+The bridge marks its estimate invalid by it and then enters the safe state
+(`rig.bridge.mode_supervisor`), and starts no model from measurements that are too old. The two ages
+are `supervision.stale_after_s` and `supervision.safe_after_s` of a configuration.
+"""
+
+
+def is_too_old(measured_ns: int, t_ns: int, limit_ns: int) -> bool:
+    """Whether a measurement is older than a limit at a time."""
+    return t_ns - measured_ns > limit_ns
