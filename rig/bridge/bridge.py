@@ -23,14 +23,27 @@ _ALL_STANDARD = 0x7FF
 
 
 class Sending(Struct, frozen=True, gc=False):
-    """State of an outgoing message: frames sent so far, and when the next one is due."""
+    """State of an outgoing message.
+
+    Attributes:
+        number: Frames sent so far.
+        due_ns: Time at which the next one is due.
+    """
 
     number: int
     due_ns: int
 
 
 class BridgeState(Struct, frozen=True, gc=False):
-    """State of the bridge between two ticks; `reported`: counts at the last status sent."""
+    """State of the bridge between two ticks.
+
+    Attributes:
+        supervised: State of estimator and supervisor.
+        sequences: Counter state of each incoming message.
+        memory: Memory of the frame checks.
+        sendings: State of each outgoing message.
+        reported: Counts at the last status that was sent.
+    """
 
     supervised: SupervisedState
     sequences: tuple[SequenceState, ...]
@@ -50,7 +63,15 @@ class BridgeState(Struct, frozen=True, gc=False):
 
 
 class TickResult(Struct, frozen=True, gc=False):
-    """What a tick did; the frames are to be sent, and devices are given by their indices."""
+    """What a tick did.
+
+    Attributes:
+        frames: Frames to send, stamped with the tick's time.
+        step_input: What the last step of the tick was given.
+        output: What the tick published.
+        counts: Counts since the start.
+        device_faults: Indices of the devices that are at fault, and their faults.
+    """
 
     frames: list[Frame]
     step_input: StepInput

@@ -16,8 +16,12 @@ class Counts(NamedTuple):
 
     Attributes:
         lost: Frames missing in the counters' sequences.
+        refused: Frames not accepted.
         stale: Ticks in HOLD.
+        overruns: Ticks that were missed.
         saturated: Frames sent with a value at the limit of its range.
+        wrong_crc: Frames refused for their CRC.
+        wrong_length: Frames refused for their length.
         repeated: Frames refused because their counter had arrived already.
         out_of_sequence: Frames refused because their counter went backwards or jumped.
         masquerade: Frames refused because they carry another message's CRC.
@@ -25,8 +29,11 @@ class Counts(NamedTuple):
         started: Sequences of a counter that began, the first one of each message among them.
         second_sender: Frames of another sender under an id of the bridge, and frames that
             persistently contradict the counter of the bench's.
+        limited: Ticks beyond a limit.
+        bus_faulty: Ticks with a fault of the bus.
         left_out: Ticks at which a further sensor was left out, one for each sensor.
         device_faulty: Ticks at which a device was at fault, one for each device.
+        from_faulty_device: Frames refused because their device was at fault.
         no_value: Frames refused because a signal holds no value: an error or "not available" of
             J1939, or a float that is not finite.
     """
@@ -66,7 +73,13 @@ Levels = tuple[float, float, float, float]
 
 
 class TimingFigures(NamedTuple):
-    """Timing figures of the run so far: of lateness, work, and the time between two ticks."""
+    """Timing figures of the run so far.
+
+    Attributes:
+        lateness_s: Lateness of a tick.
+        work_s: Duration of its work.
+        longest_gap_s: Longest time between two ticks.
+    """
 
     lateness_s: Levels = (0.0, 0.0, 0.0, 0.0)
     work_s: Levels = (0.0, 0.0, 0.0, 0.0)
@@ -77,7 +90,15 @@ NO_TIMING = TimingFigures()
 
 
 class Conditions(NamedTuple):
-    """Conditions of a tick, as the loop knows them; the timing figures are for the bus alone."""
+    """Conditions of a tick, as the loop knows them.
+
+    Attributes:
+        overruns: Ticks missed since the last one.
+        acknowledged: The user acknowledged the safe state.
+        bus_fault: The bus could not be read or written.
+        log_fault: The log could not be written.
+        timing: Timing figures, for the bus; nothing else depends on them.
+    """
 
     overruns: int = 0
     acknowledged: bool = False
@@ -107,7 +128,12 @@ def count_tick(
 class Report(Struct, frozen=True, gc=False):
     """All that an outgoing message can publish.
 
-    `reported` are the counts at the last status that was sent, `number` the frames sent before.
+    Attributes:
+        output: What the tick published.
+        counts: Counts since the start.
+        reported: Counts at the last status that was sent.
+        conditions: Conditions of the tick.
+        number: Frames of the message sent before.
     """
 
     output: StepOutput

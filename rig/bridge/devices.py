@@ -84,10 +84,14 @@ class Device(NamedTuple):
     """A device as the bridge watches it.
 
     Attributes:
+        name: Name of the node in the DBC.
         node_id: CANopen node id; 0 of a J1939 device.
+        emergency_id: Arbitration id of its emergency frames.
         heartbeat_ns: Longest time between two heartbeats; 0 where they are not watched.
         alarms: How many signals of its frames are alarms.
+        is_vital: Whether the estimate rests on it.
         j1939_name: NAME of a J1939 device; None of a CANopen device.
+        address: Source address of a J1939 device at the start.
     """
 
     name: str
@@ -112,6 +116,8 @@ class DeviceHealth(Struct, frozen=True, gc=False):
         since_ns: Time of its last heartbeat, or of the start.
         state: State in the last heartbeat; operational before the first.
         error_code: Error code of the emergency that is not over, else 0.
+        alarms: Raw value of each of its alarms.
+        address: Source address that it claimed last.
     """
 
     since_ns: int

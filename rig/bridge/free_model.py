@@ -26,6 +26,8 @@ class FreeModelState(Struct, frozen=True, gc=False):
     """State of a model that follows its bench.
 
     Attributes:
+        t_ns: Time of the last step.
+        temperature_c: Last damper temperature.
         first: Of each strut the measurements that arrived before the model started, the oldest
             first.
         observers: State of each strut's observer; empty while the model waits.

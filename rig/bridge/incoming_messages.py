@@ -27,7 +27,13 @@ Reader = Callable[[SequenceState, Frame], Reading]
 
 
 class Delivery(NamedTuple):
-    """A value of a frame that goes to a channel; `delay_ns` is the age at which it arrives."""
+    """A value of a frame that goes to a channel.
+
+    Attributes:
+        value: Index of the value among the frame's.
+        channel: Index of the channel.
+        delay_ns: Time from the measurement to the arrival of its frame.
+    """
 
     value: int
     channel: int
@@ -35,7 +41,13 @@ class Delivery(NamedTuple):
 
 
 class Alarm(NamedTuple):
-    """A signal whose raw value is other than zero while its device is at fault; by indices."""
+    """A signal whose raw value is other than zero while its device is at fault.
+
+    Attributes:
+        signal: Name of the signal.
+        device: Index of the device.
+        alarm: Index of the alarm among the device's.
+    """
 
     signal: str
     device: int
@@ -43,7 +55,13 @@ class Alarm(NamedTuple):
 
 
 class AlarmDelivery(NamedTuple):
-    """A value of a frame that is an alarm, one of a device's; by indices."""
+    """A value of a frame that is an alarm.
+
+    Attributes:
+        value: Index of the value among the frame's.
+        device: Index of the device.
+        alarm: Index of the alarm among the device's.
+    """
 
     value: int
     device: int
@@ -51,7 +69,12 @@ class AlarmDelivery(NamedTuple):
 
 
 class HeightDelivery(NamedTuple):
-    """A value of a frame that is the reference height of a strut; by indices."""
+    """A value of a frame that is the reference height of a strut.
+
+    Attributes:
+        value: Index of the value among the frame's.
+        strut: Index of the strut.
+    """
 
     value: int
     strut: int
@@ -62,6 +85,11 @@ class Incoming:
     """A message of the bench.
 
     Attributes:
+        message: Its definition.
+        read: Reads its frames.
+        deliveries: Values that go to channels.
+        heights: Values that are reference heights.
+        alarms: Values that are alarms.
         device: Index of the device that sends it; None if none is configured.
         struts: Struts whose reference heights it carries, a bit each.
         first_strut: The bit of the first of them; 0 if there is none.

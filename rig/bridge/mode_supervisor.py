@@ -95,8 +95,12 @@ class SupervisedState(Struct, frozen=True, gc=False):
     """State of an estimator and of its supervisor between two steps; a run can restart from any.
 
     Attributes:
+        t_ns: Time of the last step.
+        mode: State of the bridge.
+        estimator: State of the estimator.
         last_valid: What was last published as valid; empty before.
         stopped_m: Heights at which the struts of a stopped model stand, in the safe state.
+        diverged: The last divergence of the model, if there ever was one.
     """
 
     t_ns: int
@@ -108,9 +112,11 @@ class SupervisedState(Struct, frozen=True, gc=False):
 
 
 class Reports(Struct, frozen=True, gc=False):
-    """What frame checks and devices report to the supervisor: the severest action, 0 if none.
+    """What the frame checks and the devices report to the supervisor at a tick.
 
-    A device counts as faulty if the estimate rests on it.
+    Attributes:
+        action: Severest action that the limits on measurements require, 0 if none.
+        is_device_faulty: Whether a device that the estimate rests on is at fault.
     """
 
     action: int = 0

@@ -18,6 +18,7 @@ class Outgoing:
     """A message of the bridge.
 
     Attributes:
+        message: Its definition.
         frame: What a tick reports, and the time in ns -> the frame, and whether one of its values
             saturated.
         period_ns: Time between two frames; 0: one at every tick.

@@ -22,8 +22,10 @@ class StepInput(Struct, frozen=True, gc=False):
     """All that one step is given.
 
     Attributes:
+        t_ns: Time of the step.
         samples: Samples that arrived since the last one, in the order of their arrival; at most one
             of each reference height.
+        acknowledged: The user acknowledged the safe state.
     """
 
     t_ns: int
@@ -36,7 +38,12 @@ class StrutOutput(Struct, frozen=True, gc=False):
 
     Attributes:
         force_n: Estimated spring-damper force: the law's, and the residual force.
+        virtual_force_n: Virtual force.
         valid: Whether the estimate rests on a fresh measurement.
+        height_m: Model height.
+        velocity_m_per_s: Model velocity.
+        acceleration_m_per_s2: Model acceleration.
+        innovation_m: Innovation.
         force_std_n: Standard deviation of the estimated force; NaN where it is not known.
         law_force_n: Force of the model's law alone, part of the estimated force.
     """

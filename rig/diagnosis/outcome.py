@@ -34,6 +34,7 @@ class LinearCorrection:
     """What the data correct in the linear part of the nominal model.
 
     Attributes:
+        strut: Strut that it belongs to.
         parameter: ``mass_kg`` (of the strut's upper body and what it carries),
             ``stiffness_n_per_m``, ``damping_n_s_per_m``, ``preload_n``, ``free_length_m`` or
             ``input_gain``.
@@ -54,9 +55,13 @@ class FoundEffect:
     """An effect that the nominal model lacks.
 
     Attributes:
+        family: Family.
+        name: Effect in the catalogue.
+        strut: Strut that it acts in.
         explained_fraction: Share of the residual force's mean square that it explains, all other
             corrections being in the model.
         force_rms_n: Root mean square of its force along the recordings.
+        parameters: Estimates by name.
     """
 
     family: str
@@ -72,6 +77,8 @@ class ExistingEffect:
     """An effect that the nominal model has and that the data change.
 
     Attributes:
+        name: Effect in the catalogue.
+        strut: Strut that it acts in.
         change: ``refitted``: other parameters; ``superfluous``: the data are as well described
             without it.
         nominal: Its parameters in the model file.
@@ -90,6 +97,10 @@ class RejectedEffect:
     """A candidate that was not chosen.
 
     Attributes:
+        family: Family.
+        name: Effect in the catalogue.
+        strut: Strut on which it was tested.
+        why: One line.
         left: Residual along the motion with it and the corrected linear part, as a share of the
             residual without it (1: it explains nothing); None where it was not tested.
     """
@@ -114,6 +125,7 @@ class RunFigures:
     """Figures of one held-out run.
 
     Attributes:
+        run: Its name.
         height_rmse_m: Open loop in DART; NaN where the motion is prescribed.
         residual_force_rmse_n: Force that the model lacks along the smoothed motion.
         strut_force_rmse_n: Against the load cell, where there is one.
@@ -127,9 +139,13 @@ class RunFigures:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Figures over all held-out runs, as in `RunFigures`.
+    """Figures over all held-out runs.
 
     Attributes:
+        height_rmse_m: Open loop, with the applied force as the only input.
+        residual_force_rmse_n: Force that the model lacks along the motion.
+        strut_force_rmse_n: Against the load cell, where there is one.
+        runs: Each run.
         source: ``runs``, or ``blocks`` where no run was held out and blocks of the recordings were.
     """
 
@@ -161,12 +177,19 @@ class Diagnosis:
     """The diagnosis of a nominal model. Fields as in ``diagnosis.json``.
 
     Attributes:
+        verdict: What held-out data show.
+        linear: Linear corrections.
         effects: Missing effects, strongest first; where there are linear corrections alone, these.
         existing: Effects of the nominal model that the data change.
         rejected: Candidates that were not chosen, best first.
         ambiguous_with: Families that these recordings cannot distinguish from the effects.
+        suggested_excitation: A recording that would distinguish them.
+        held_out: Figures on data that took no part in the search.
+        noise_floor: RMS that a right model can reach there.
+        residual_white: Whether the residual is white.
         notes: Whole sentences: what the data cannot distinguish, what was removed.
         runs: Names of the recordings that were learnt from.
+        model: Name of the nominal model.
     """
 
     verdict: Verdict
@@ -186,9 +209,14 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class FittedSeries:
-    """Residual force of one strut along the smoothed motion of a fitted recording, shape (N,).
+    """Residual force of one strut along one recording that was fitted; arrays of shape (N,).
 
     Attributes:
+        run: Name of the recording.
+        strut: Name of the strut.
+        t_s: Times in s, increasing.
+        height_m: Smoothed height.
+        velocity_m_per_s: Smoothed velocity.
         residual_before_n: Force that the nominal model lacks.
         residual_after_n: Force that the corrected model lacks.
         residual_std_n: Standard deviation of either, from the smoother.
@@ -209,11 +237,15 @@ class HeldOutSeries:
     """One strut along one held-out run: heights, or forces where the motion is prescribed.
 
     Attributes:
+        run: Name of the run.
+        strut: Name of the strut.
         unit: ``m`` or ``N``, of the next three.
         t_s: Times in s, increasing, shape (N,).
         measured: Height or load-cell force; NaN where it is missing or not evaluated.
         before: The nominal model, open loop (or driven along the motion).
+        after: The corrected model.
         height_m: Measured height, smoothed where the motion is prescribed.
+        velocity_m_per_s: Smoothed velocity.
     """
 
     run: str
@@ -233,6 +265,7 @@ class DiagnosisSource:
 
     Attributes:
         role: ``fitted``, ``held out`` or ``nominal model``.
+        name: Its path, or the name of the model.
         sha256: Of the CSV file, of a run's steps, or of the model's text, in hex.
     """
 
