@@ -83,7 +83,7 @@ class Fault(NamedTuple):
 
 
 class NamedFault(NamedTuple):
-    """A fault with its size, a 95 % interval, and by how much it lowers chi-squared."""
+    """A fault with its size, a 95 % interval, and the decrease of chi-squared that it explains."""
 
     name: str
     quantity: str

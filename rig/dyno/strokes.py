@@ -49,6 +49,8 @@ _FEWEST_STROKES = 3
 """Of a block: a single stroke has no repetition, and one by which a machine gets there is none."""
 
 _SHORTEST_HOLD_S = 0.5
+"""Shortest hold."""
+
 _STILL_SHARE = 1e-3
 """Of the record's stroke: a height that moves less within the shortest hold is at rest; of 50 mm
 that is 0.1 mm/s, a fifth of the slowest step that machines run."""
@@ -64,6 +66,8 @@ _FEWEST_AT_REST = 20
 """Samples of a hold: two for each of the batches whose means give its uncertainty."""
 
 _MOST_HARMONICS = 6
+"""Most harmonics of a block's motion; Akaike's criterion chooses how many."""
+
 _SERIES_SHARE = 0.01
 """Residual of a series over the amplitude above which the motion is smoothed instead."""
 

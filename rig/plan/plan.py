@@ -138,8 +138,7 @@ class Plan:
         Raises:
             InputError: The configuration does not fit them.
         """
-        plan = resolve(config, self.source, self.model, self.database)
-        return replace(plan, authentication=self.authentication)
+        return self._resolve_again(config, self.model)
 
     def with_model(self, model: ModelSpec) -> "Plan":
         """The plan with another model of the same struts, such as a corrected one.
@@ -147,8 +146,7 @@ class Plan:
         Raises:
             InputError: The configuration does not fit it.
         """
-        plan = resolve(self.config, self.source, model, self.database)
-        return replace(plan, authentication=self.authentication)
+        return self._resolve_again(self.config, model)
 
     def with_observers(self, observers: Mapping[str, AnyObserver]) -> "Plan":
         """The plan with other observers, by strut name.
@@ -158,6 +156,10 @@ class Plan:
         """
         every = {**self.config.observers, **observers}
         return self.with_config(self.config.model_copy(update={"observers": every}))
+
+    def _resolve_again(self, config: RunConfig, model: ModelSpec) -> "Plan":
+        plan = resolve(config, self.source, model, self.database)
+        return replace(plan, authentication=self.authentication)
 
 
 def resolve(config: RunConfig, source: Path, model: ModelSpec, database: Database) -> Plan:

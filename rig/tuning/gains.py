@@ -36,6 +36,7 @@ _LARGEST_COST = 1e12
 """Cost of an observer that is unstable or cannot be made."""
 
 _LARGEST_MARGIN = 20.0
+"""Gain margin at which the search for it ends: the largest that a user may require."""
 
 
 class Aim(NamedTuple):

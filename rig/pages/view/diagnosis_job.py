@@ -92,7 +92,7 @@ class DiagnosisJob:
 
     def _is_running(self) -> bool:
         # The reader alone waits for the process: of two threads that wait for one child, the
-        # system gives the exit code to one, and the other is told that there is no child.
+        # system gives the exit code to one, and reports to the other that there is no child.
         return self._reader is not None and self._reader.is_alive()
 
     def _read(self, process: SpawnProcess, receiver: Connection) -> None:
