@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from dart_model.spec import ModelSpec
-    from rig.diagnosis.recording import Recording
     from rig.formats.run_arrays import Run
     from rig.pages.diagnosis_outcome import DiagnosisOutcome
+    from rig.recordings.recording import Recording
 
 __all__ = ["diagnose", "load_model", "open_run", "read_csv"]
 
@@ -56,9 +56,9 @@ def read_csv(path: Path | str, struts: Sequence[str] | None = None) -> "Recordin
     Raises:
         InputError: The file is no such table, or none of its columns can be diagnosed.
     """
-    from rig.diagnosis import recording
+    from rig.recordings import checks, csv_file
 
-    return recording.read_csv(Path(path), struts)
+    return checks.check_recording(csv_file.read_csv(Path(path), struts))
 
 
 def diagnose(
@@ -83,8 +83,9 @@ def diagnose(
     """
     from dart_model.spec import ModelSpec
     from rig.diagnosis import diagnose as diagnosis
-    from rig.diagnosis.recording import Recording, read_recording
     from rig.pages.diagnosis_outcome import DiagnosisOutcome
+    from rig.recordings.read import read_recording
+    from rig.recordings.recording import Recording
 
     spec = model if isinstance(model, ModelSpec) else load_model(model)
     struts = [strut.name for strut in spec.struts]

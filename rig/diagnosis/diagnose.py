@@ -22,7 +22,6 @@ from rig.diagnosis.problem.problem import (
     quadratic_mean,
 )
 from rig.diagnosis.progress import Progress, within
-from rig.diagnosis.recording import Recording, RecordingError
 from rig.diagnosis.search.criteria import CRITERIA, SelectionCriteria
 from rig.diagnosis.search.explore import FirstRound, explore
 from rig.diagnosis.search.fit import Fit, fit
@@ -31,6 +30,7 @@ from rig.diagnosis.search.pool import Pool, ValidatedModel
 from rig.diagnosis.search.surface import fit_surface
 from rig.diagnosis.verdict import are_laws_superfluous, find_verdict
 from rig.diagnosis.write_up import compose_result
+from rig.recordings.recording import Recording, RecordingError
 
 _SEARCHED_NODES = 32_000
 """Nodes of all recordings that are searched, half a minute at 1 kHz; with more than twice as many,

@@ -15,8 +15,8 @@ from rig.diagnosis.problem.problem import (
     first_starts,
     nominal_model,
 )
-from rig.diagnosis.recording import RecordingError
 from rig.diagnosis.search.fit import Fit, fit
+from rig.recordings.recording import RecordingError
 
 
 def evaluate_held_out(problems: Problems, linear: Fit, corrected: Fit) -> tuple[RunEvaluation, ...]:

@@ -18,8 +18,9 @@ from rig.diagnosis.outcome import (
     write_results,
 )
 from rig.diagnosis.progress import Progress
-from rig.diagnosis.recording import Recording, read_recording
 from rig.log.file_names import RUN_FILE
+from rig.recordings.read import read_recording
+from rig.recordings.recording import Recording
 
 
 def diagnose_runs(

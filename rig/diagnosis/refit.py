@@ -11,10 +11,10 @@ from dart_model.spec import ModelSpec
 from rig.diagnosis.diagnose import first_fits
 from rig.diagnosis.outcome import Estimate
 from rig.diagnosis.problem.build import build
-from rig.diagnosis.recording import Recording
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.diagnosis.search.fit import effect_variables, fit_covariance
 from rig.diagnosis.write_up import FitEstimates, estimates_of, linear_corrections
+from rig.recordings.recording import Recording
 
 
 class OwnParameter(NamedTuple):

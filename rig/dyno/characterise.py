@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from can_dbc.errors import InputError
-from rig.diagnosis.recording import Recording, read_recording
 from rig.dyno.damper import Damper, mark_warm_up, summarise_damper
 from rig.dyno.figures import AtRest, DynoStep, ForceRecord, compute_rest, compute_step
 from rig.dyno.quality import quality
 from rig.dyno.strokes import Array, find_blocks, find_holds, find_strokes
 from rig.log.reader import read_run
+from rig.recordings.read import read_recording
+from rig.recordings.recording import Recording
 
 _LARGEST_N = 1e8
 """Ten times what the largest damper machines of civil engineering reach."""

@@ -5,9 +5,9 @@ from itertools import combinations
 
 import numpy as np
 
-from rig.diagnosis.clipping import find_sudden_plateaus
 from rig.dyno.figures import AtRest, DynoStep, ForceRecord
 from rig.dyno.strokes import Array
+from rig.recordings.clipping import find_sudden_plateaus
 
 _GAP = 2.5
 """Times the usual time between samples: one is missing at least, however the clock jitters."""

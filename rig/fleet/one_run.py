@@ -23,11 +23,12 @@ from dart_model.effects import effect
 from dart_model.spec import ModelSpec, parse_model
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.outcome import Estimate, FoundEffect
-from rig.diagnosis.recording import Recording, read_recording
 from rig.diagnosis.refit import refit_parameters
 from rig.dyno.characterise import characterise
 from rig.fleet.sources import RunSource, printable
 from rig.log.file_names import RUN_FILE
+from rig.recordings.read import read_recording
+from rig.recordings.recording import Recording
 
 _PIECE = 1 << 20
 

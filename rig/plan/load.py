@@ -46,7 +46,7 @@ def plan_of_run(folder: Path) -> Plan:
         InputError: A file of the run is missing or damaged.
         DatabaseError: Its DBC is.
     """
-    source = folder / RUN_FILE
-    config = validate(RunConfig, read_header(folder).get("config"), f"{source}: config")
+    header, source = read_header(folder), folder / RUN_FILE
+    config = validate(RunConfig, header.get("config"), f"{source}: config")
     model, database = load_model(folder / MODEL_FILE), load_database(folder / DBC_FILE)
     return resolve(config, source, model, database)

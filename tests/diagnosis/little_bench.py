@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from dart_model.spec import parse_model
-from rig.diagnosis.recording import Recording
+from rig.recordings.recording import Recording
 from tests.diagnosis.integrator import integrated, measured
 
 MASS, STIFFNESS, DAMPING, FREE, GRAVITY = 12.0, 2500.0, 70.0, 0.4, 9.81

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from dart_model.spec import parse_model
-from rig.diagnosis.recording import Recording
+from rig.recordings.recording import Recording
 from tests.diagnosis.integrator import measured
 
 STIFFNESS, DAMPING, FREE, GRAVITY = 8000.0, 900.0, 0.32, 9.81

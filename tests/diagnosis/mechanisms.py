@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from dart_model.spec import load_model
-from rig.diagnosis.recording import Recording
+from rig.recordings.recording import Recording
 from tests.diagnosis.integrator import integrated, measured
 
 GRAVITY = 9.81

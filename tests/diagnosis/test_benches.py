@@ -7,7 +7,7 @@ import pytest
 
 from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, EffectSpec, load_model
-from rig.diagnosis.recording import read_csv
+from rig.recordings.read import read_recording
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis import little_dyno as dyno
 from tests.diagnosis.mechanisms import (
@@ -176,7 +176,9 @@ def test_the_quarter_car_with_friction():
 
 def test_the_quarter_cars_file(tmp_path):
     car = QuarterCar()
-    record = read_csv(car.csv(tmp_path / "car.csv", duration_s=SHORT_S), ("tyre", "suspension"))
+    record = read_recording(
+        car.csv(tmp_path / "car.csv", duration_s=SHORT_S), ("tyre", "suspension")
+    )
     t_s, heights_m = car.heights(SHORT_S)
     np.testing.assert_array_equal(record.t_s, t_s)
     np.testing.assert_allclose(record.heights_m, heights_m, rtol=0.0, atol=7e-5)

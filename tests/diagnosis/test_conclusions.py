@@ -6,7 +6,7 @@ import pytest
 
 from dart_model.spec import load_model
 from rig.diagnosis.diagnose import diagnose
-from rig.diagnosis.recording import read_csv
+from rig.recordings.read import read_recording
 from tests.diagnosis import little_dyno as dyno
 from tests.diagnosis.answers import correction
 from tests.truth.cases import make_case
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.long
 
 def diagnosed(seed, kind, folder):
     write_case(make_case(seed, kind), folder)
-    runs = [read_csv(folder / f"{name}.csv") for name in ("train", "test")]
+    runs = [read_recording(folder / f"{name}.csv") for name in ("train", "test")]
     return diagnose(load_model(folder / "model.yaml"), runs[:1], runs[1:]).diagnosis
 
 

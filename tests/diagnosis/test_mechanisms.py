@@ -6,7 +6,7 @@ from dart_model.spec import MODELS, load_model
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.problem.linear_part import moving_mass_kg
 from rig.diagnosis.problem.mechanism import constant_mechanism, open_plants
-from rig.diagnosis.recording import read_csv
+from rig.recordings.read import read_recording
 from tests.diagnosis.answers import is_at_the_floor, missing
 from tests.diagnosis.mechanisms import (
     ArmWithStop,
@@ -55,7 +55,7 @@ def quarter_car(car, folder):
     files = car.csv(folder / "train.csv"), car.csv(folder / "test.csv", 2, car.later_n)
     model = load_model(MODELS / "quarter_car.yaml")
     struts = [strut.name for strut in model.struts]
-    train, test = (read_csv(file, struts) for file in files)
+    train, test = (read_recording(file, struts) for file in files)
     return diagnose(model, [train], [test]).diagnosis
 
 

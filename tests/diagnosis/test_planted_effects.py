@@ -7,7 +7,7 @@ import pytest
 
 from dart_model.effects import CATALOGUE
 from rig.diagnosis.diagnose import diagnose
-from rig.diagnosis.recording import Recording
+from rig.recordings.recording import Recording
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis.answers import LINEAR_FAMILIES, correction, holds, is_at_the_floor, named
 from tests.diagnosis.little_bench import DAMPING, FREE, MASS, STIFFNESS, Nothing

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from rig.diagnosis.diagnose import diagnose
-from rig.diagnosis.recording import RecordingError
+from rig.recordings.recording import RecordingError
 from tests.diagnosis import little_dyno as dyno
 from tests.diagnosis.answers import (
     LINEAR_FAMILIES,

@@ -8,14 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from can_dbc.errors import InputError
 from dart_model.spec import MODELS, load_model
 from rig.diagnosis.diagnose import diagnose
 from rig.diagnosis.problem.build import build
-from rig.diagnosis.recording import Recording, RecordingError, read_csv
 from rig.diagnosis.search.criteria import CRITERIA
 from rig.formats.foreign_table import import_table
 from rig.formats.mapping import load_mapping
 from rig.plan.config import CONFIGS
+from rig.recordings.read import read_recording
+from rig.recordings.recording import Recording, RecordingError
 from tests.diagnosis import little_bench as bench
 from tests.diagnosis import little_dyno as dyno
 from tests.diagnosis.answers import is_at_the_floor
@@ -119,9 +121,9 @@ def written(path: Path, table: dict[str, np.ndarray]) -> Path:
 
 def test_a_strut_needs_no_name_where_there_is_one(tmp_path: Path) -> None:
     table = single()
-    plain = read_csv(written(tmp_path / "plain.csv", table))
+    plain = read_recording(written(tmp_path / "plain.csv", table))
     table = {name.replace("height_m", "height_m:strut"): each for name, each in table.items()}
-    by_name = read_csv(written(tmp_path / "named.csv", table), ["strut"])
+    by_name = read_recording(written(tmp_path / "named.csv", table), ["strut"])
     assert plain.name == "plain.csv"
     for found in (plain, by_name):
         assert found.heights_m.shape == (400, 1)
@@ -140,7 +142,7 @@ def test_columns_may_stand_in_any_order(
     path = written(
         tmp_path_factory.mktemp("order") / "two.csv", {name: table[name] for name in order}
     )
-    found = read_csv(path, STRUTS)
+    found = read_recording(path, STRUTS)
     np.testing.assert_array_equal(found.t_s, table["t_s"])
     for index, strut in enumerate(STRUTS):
         np.testing.assert_array_equal(found.heights_m[:, index], table[f"height_m:{strut}"])
@@ -153,7 +155,7 @@ def test_columns_may_stand_in_any_order(
 
 def test_the_order_of_struts_is_the_models(tmp_path: Path) -> None:
     path = written(tmp_path / "two.csv", columns())
-    one, other = read_csv(path, STRUTS), read_csv(path, STRUTS[::-1])
+    one, other = read_recording(path, STRUTS), read_recording(path, STRUTS[::-1])
     np.testing.assert_array_equal(one.heights_m, other.heights_m[:, ::-1])
 
 
@@ -218,7 +220,7 @@ TABLES = {
 
 def refused_file(path: Path, struts=None) -> str:
     with pytest.raises(RecordingError) as caught:
-        read_csv(path, struts)
+        read_recording(path, struts)
     said = str(caught.value)
     assert "\n" not in said
     assert said.startswith(f"{path.name}: ")
@@ -234,7 +236,7 @@ def test_a_table_that_would_mislead_is_refused(case: str, tmp_path: Path) -> Non
 TEXT = "t_s,height_m,applied_force_n\n"
 BYTES = {
     "nothing": (b"", "empty"),
-    "a header alone": (TEXT.encode(), "no samples"),
+    "a header alone": (TEXT.encode(), "0 samples"),
     "a column twice": (TEXT.replace("applied_force_n", "height_m").encode(), "twice"),
     "a row too short": (f"{TEXT}0.0,0.3,1.0\n0.1,0.3\n".encode(), "line 3: 2 values, expected 3"),
     "a word": (f"{TEXT}0.0,0.3,1.0\n0.1,low,1.0\n".encode(), "line 3: height_m = 'low'"),
@@ -251,7 +253,8 @@ def test_a_file_that_is_no_table_is_refused(case: str, tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    assert "cannot be read" in refused_file(tmp_path / "run.csv")
+    with pytest.raises(InputError, match=r"run\.csv: no such run"):
+        read_recording(tmp_path / "run.csv")
 
 
 def table_of(record: Recording) -> dict[str, np.ndarray]:
@@ -273,7 +276,7 @@ def test_a_clipped_height_is_refused(tmp_path: Path) -> None:
 
 def test_a_strut_that_rests_at_an_end_of_its_stroke_is_not_clipped(tmp_path: Path) -> None:
     record = dyno.run(Nothing(), motion=dyno.resting, height_noise_m=0.0, resolution_m=2e-6)
-    found = read_csv(written(tmp_path / "run.csv", table_of(record)))
+    found = read_recording(written(tmp_path / "run.csv", table_of(record)))
     np.testing.assert_array_equal(found.heights_m, record.heights_m)
 
 

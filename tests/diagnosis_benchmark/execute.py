@@ -12,7 +12,8 @@ from pathlib import Path
 from dart_model.spec import load_model
 from rig.diagnosis.diagnose import diagnose as rig_diagnose
 from rig.diagnosis.outcome import to_json
-from rig.diagnosis.recording import RecordingError, read_csv
+from rig.recordings.read import read_recording
+from rig.recordings.recording import RecordingError
 from tests.diagnosis_benchmark.comparable import Interval
 from tests.diagnosis_benchmark.judge import Result, judge
 from tests.diagnosis_benchmark.plan import Slot, fill
@@ -29,7 +30,9 @@ def diagnose(folder: Path) -> dict:
     model = load_model(folder / "model.yaml")
     try:
         found = rig_diagnose(
-            model, [read_csv(folder / "train.csv")], held_out=[read_csv(folder / "test.csv")]
+            model,
+            [read_recording(folder / "train.csv")],
+            held_out=[read_recording(folder / "test.csv")],
         )
     except RecordingError as error:
         return failed(str(error))

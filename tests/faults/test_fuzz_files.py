@@ -13,11 +13,12 @@ import yaml
 import rig.log.reader
 import rig.plan.load
 from can_dbc.errors import DatabaseError, InputError
-from rig.diagnosis.recording import RecordingError, read_csv
 from rig.formats.mapping import load_mapping
 from rig.log.file_names import DBC_FILE, FRAMES_FILE, MODEL_FILE, RUN_FILE, STEPS_FILE
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
+from rig.recordings.read import read_recording
+from rig.recordings.recording import RecordingError
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
 from rig.simulated_bench.schema import BenchConfigError
@@ -148,7 +149,7 @@ def other(kind):
         case "mapping":
             return (CONFIGS / "dyno_mapping.yaml").read_bytes(), "mapping.yaml", load_mapping
         case _:
-            return csv_text().encode(), "run.csv", read_csv
+            return csv_text().encode(), "run.csv", read_recording
 
 
 def fuzz(original, path, read, count, seed):

@@ -10,10 +10,10 @@ from can_dbc.errors import InputError
 from dart_model.spec import load_model
 from rig.demo.cases import DemoOptions, run_case
 from rig.diagnosis.files import diagnose_runs
-from rig.diagnosis.recording import read_recording
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.plan.preflight_checks import check
+from rig.recordings.read import read_recording
 from rig.run.live import with_bench
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config

@@ -13,10 +13,11 @@ import numpy as np
 
 from rig.diagnosis.files import diagnose_runs
 from rig.diagnosis.progress import Progress, within
-from rig.diagnosis.recording import RecordingError, read_recording
 from rig.formats.mapping import load_mapping
 from rig.pages.report import write_report
 from rig.plan.config import CONFIGS
+from rig.recordings.read import read_recording
+from rig.recordings.recording import RecordingError
 from tests.scoreboard.parts import Part, imported
 from tests.scoreboard.starts import dyno_start
 from tests.scoreboard.table import CORRECTED, Row, findings

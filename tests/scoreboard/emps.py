@@ -11,8 +11,8 @@ from pathlib import Path
 
 from rig.diagnosis.files import diagnose_runs
 from rig.diagnosis.progress import Progress, within
-from rig.diagnosis.recording import RecordingError
 from rig.pages.report import write_report
+from rig.recordings.recording import RecordingError
 from tests.scoreboard.starts import one_body
 from tests.scoreboard.table import CORRECTED, START, Row, findings
 

@@ -26,11 +26,12 @@ from rig.diagnosis.problem.build import build
 from rig.diagnosis.problem.on_dart import dart_heights
 from rig.diagnosis.problem.problem import first_starts, nominal, nominal_model
 from rig.diagnosis.progress import Progress, within
-from rig.diagnosis.recording import Recording, RecordingError, read_recording
 from rig.diagnosis.search.fit import fit
 from rig.formats.mapping import load_mapping
 from rig.pages.report import write_report
 from rig.plan.config import CONFIGS
+from rig.recordings.read import read_recording
+from rig.recordings.recording import Recording, RecordingError
 from tests.scoreboard.parts import Part, imported
 from tests.scoreboard.starts import driven_start
 from tests.scoreboard.table import CORRECTED, START, Row, findings

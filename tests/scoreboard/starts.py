@@ -9,7 +9,7 @@ from scipy import signal
 
 from can_dbc.errors import InputError
 from dart_model.spec import WORLD, BodySpec, InlineSkeleton, JointSpec, ModelSpec, StrutSpec
-from rig.diagnosis.recording import Recording
+from rig.recordings.recording import Recording
 
 Array = NDArray[np.float64]
 

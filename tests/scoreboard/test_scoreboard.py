@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from can_dbc.errors import InputError
-from rig.diagnosis.recording import Recording
 from rig.formats.foreign_table import import_table
 from rig.formats.mapping import load_mapping
 from rig.plan.config import CONFIGS
+from rig.recordings.recording import Recording
 from tests.diagnosis import little_dyno as dyno
 from tests.scoreboard import silverbox
 from tests.scoreboard.run import run_scoreboard

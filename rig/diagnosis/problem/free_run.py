@@ -60,7 +60,7 @@ from rig.diagnosis.problem.problem import (
     strut_constants,
     strut_effects,
 )
-from rig.diagnosis.recording import Recording, RecordingError
+from rig.recordings.recording import Recording, RecordingError
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dart_model.effects import AMBIENT_C, Motion
 from dart_model.spec import ModelSpec
 from rig.diagnosis.numerics.smoother import Noise, Smoothed, estimate_noise, smooth
-from rig.diagnosis.recording import Recording, RecordingError
+from rig.recordings.recording import Recording, RecordingError
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -14,7 +14,7 @@ from dart_model.plant import DartPlant
 from dart_model.spec import EffectSpec, ModelSpec
 from rig.diagnosis.problem.fmu_force import forces_along
 from rig.diagnosis.problem.grid import Track
-from rig.diagnosis.recording import RecordingError
+from rig.recordings.recording import RecordingError
 
 Array = NDArray[np.float64]
 

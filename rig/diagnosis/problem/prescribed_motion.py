@@ -42,7 +42,7 @@ from rig.diagnosis.problem.problem import (
     state_scales,
     strut_effects,
 )
-from rig.diagnosis.recording import RecordingError
+from rig.recordings.recording import RecordingError
 
 Array = NDArray[np.float64]
 

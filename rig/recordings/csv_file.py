@@ -1,0 +1,105 @@
+"""Recordings in CSV files, with units in their headers."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from can_dbc.errors import InputError
+from rig.files.delimited_text import read_csv_columns
+from rig.recordings.recording import Array, Recording, RecordingError
+
+COLUMNS = ("t_s", "height_m", "applied_force_n", "strut_force_n", "temperature_c")
+"""Columns of a CSV file. Heights and strut forces may name their strut: ``height_m:tyre``."""
+
+_OF_A_STRUT = ("height_m", "strut_force_n")
+_LARGEST_BYTES = 2_000_000_000
+
+
+def read_csv(path: Path, struts: Sequence[str] | None = None) -> Recording:
+    """Recording from a CSV file with units in its header.
+
+    `struts` are the model's, in its order; columns without a strut's name belong to the only one.
+
+    Raises:
+        RecordingError: The file is no such table.
+    """
+    name = path.name
+    try:
+        values, _ = read_csv_columns(
+            path, name, _LARGEST_BYTES, lambda header: _check_header(name, header)
+        )
+    except InputError as error:
+        raise RecordingError(str(error)) from error
+    columns, samples = list(values), len(values["t_s"])
+    names = _struts_of(name, columns, struts)
+    heights = [_column_of(name, values, "height_m", strut, names) for strut in names]
+    if any(height is None for height in heights):
+        missing = names[[height is None for height in heights].index(True)]
+        raise RecordingError(f"{name}: header: expected a column height_m:{missing}")
+    cells = [_column_of(name, values, "strut_force_n", strut, names) for strut in names]
+    return Recording(
+        name,
+        values["t_s"],
+        np.column_stack([height for height in heights if height is not None]),
+        values.get("applied_force_n"),
+        _stack_columns(cells, samples),
+        values.get("temperature_c"),
+    )
+
+
+def _stack_columns(cells: Sequence[Array | None], samples: int) -> Array | None:
+    if all(cell is None for cell in cells):
+        return None
+    return np.column_stack([np.full(samples, np.nan) if cell is None else cell for cell in cells])
+
+
+def _column_of(
+    name: str, values: Mapping[str, Array], kind: str, strut: str, names: Sequence[str]
+) -> Array | None:
+    """The column of a strut; without a name it belongs to the only strut."""
+    named, plain = values.get(f"{kind}:{strut}"), values.get(kind)
+    if plain is not None and len(names) > 1:
+        raise RecordingError(
+            f"{name}: header: column {kind} of {len(names)} struts ({', '.join(names)}), "
+            f"expected {kind}:{strut}"
+        )
+    return plain if named is None else named
+
+
+def _struts_of(name: str, columns: Sequence[str], struts: Sequence[str] | None) -> list[str]:
+    named = [column.partition(":")[2] for column in columns if ":" in column]
+    if struts is None:
+        return list(dict.fromkeys(named)) or [""]
+    for strut in named:
+        if strut not in struts:
+            raise RecordingError(
+                f"{name}: header: strut {strut[:40]!r}: expected one of {', '.join(struts)}"
+            )
+    return list(struts)
+
+
+def _check_header(name: str, columns: list[str]) -> list[str]:
+    """The columns of a file's header, all of them, if they are those of a recording."""
+    if not columns:
+        raise RecordingError(f"{name}: is empty, expected a header {','.join(COLUMNS[:3])}")
+    kinds: list[str] = []
+    for column in columns:
+        kind, colon, strut = column.partition(":")
+        if kind not in COLUMNS or (colon and (kind not in _OF_A_STRUT or not strut)):
+            raise RecordingError(
+                f"{name}: header: column {column[:40]!r}: expected one of {', '.join(COLUMNS)}, "
+                "a height or strut force with its strut as in height_m:tyre"
+            )
+        if columns.count(column) > 1:
+            raise RecordingError(f"{name}: header: column {column} occurs twice, expected once")
+        kinds.append(kind)
+    for column in COLUMNS[:2]:
+        if column not in kinds:
+            raise RecordingError(f"{name}: header: column {column} is missing, expected it")
+    if "applied_force_n" not in kinds and "strut_force_n" not in kinds:
+        raise RecordingError(
+            f"{name}: header: expected applied_force_n or strut_force_n, in addition to t_s and "
+            "height_m"
+        )
+    return columns

@@ -1,0 +1,39 @@
+"""Reads recordings from wherever a run was measured: a CSV file or a run's folder."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+
+from can_dbc.errors import InputError
+from rig.log.file_names import STEPS_FILE, parts
+from rig.recordings.checks import check_recording
+from rig.recordings.csv_file import read_csv
+from rig.recordings.recording import Recording
+from rig.recordings.run_folder import read_run
+
+
+def read_recording(path: Path, struts: Sequence[str] | None = None) -> Recording:
+    """Recording from a run's folder or from a CSV file, whose columns may name `struts`.
+
+    Raises:
+        InputError: There is no such run.
+        RecordingError: It holds nothing that can be diagnosed.
+    """
+    if path.is_dir():
+        recording, files = read_run(path), parts(path, STEPS_FILE)
+    elif path.is_file():
+        recording, files = read_csv(path, struts), [path]
+    else:
+        raise InputError(f"{path}: no such run, expected a run's folder or a CSV file")
+    return replace(check_recording(recording), sha256=_sha256(files))
+
+
+def _sha256(files: Iterable[Path]) -> str:
+    """SHA-256 of files, one after another, in hex."""
+    digest = sha256()
+    for path in files:
+        with path.open("rb") as file:
+            while piece := file.read(1 << 20):
+                digest.update(piece)
+    return digest.hexdigest()

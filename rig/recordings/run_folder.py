@@ -1,0 +1,133 @@
+"""Recordings in the folders of runs: what the bench sent, on the time of the first height."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from can_dbc.addressing import Directory
+from can_dbc.codec import decode_log
+from can_dbc.database import Message
+from can_dbc.errors import InputError
+from can_dbc.protection import check_crc_log
+from rig.channels.channel import Channel
+from rig.channels.quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE
+from rig.log.reader import RunFolder
+from rig.log.reader import read_run as read_run_folder
+from rig.plan.load import plan_of_run
+from rig.recordings.recording import Array, Recording, RecordingError
+
+
+def read_run(folder: Path) -> Recording:
+    """What the bench sent in a run, on the time of the first strut's height.
+
+    Frames with a wrong CRC or length are ignored; single missing heights are NaN, the other
+    channels are linear between their samples.
+
+    Raises:
+        InputError: The run is damaged, or holds no height.
+        RecordingError: It holds heights alone.
+    """
+    plan = plan_of_run(folder)
+    applied, cell, temperature = map(
+        plan.bench_channel, (APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE)
+    )
+    payloads = _payloads(read_run_folder(folder), plan.channels)
+    heights = [_samples(payloads, channel) for channel in plan.heights]
+    for channel, (t_s, _) in zip(plan.heights, heights, strict=True):
+        if len(t_s) < 2:
+            raise InputError(
+                f"{folder}: no {_message(channel).name} with the height of strut {channel.name}"
+            )
+    t_s = heights[0][0]
+    half_s = 0.5 * float(np.median(np.diff(t_s)))
+    applied_n, cell_n = (_resample(payloads, channel, t_s) for channel in (applied, cell))
+    if cell_n is None and applied_n is None:
+        raise RecordingError(
+            f"{folder}: has heights alone, expected signals.applied_force or "
+            "signals.load_cell_force in its configuration, and frames of it"
+        )
+    # The bus carries one load cell; with several struts its strut is not known.
+    return Recording(
+        folder.name,
+        t_s,
+        np.column_stack([_nearest(t_s, *height, half_s) for height in heights]),
+        applied_n,
+        None if cell_n is None or len(heights) > 1 else cell_n[:, np.newaxis],
+        _resample(payloads, temperature, t_s),
+    )
+
+
+_Payloads = dict[str, tuple[NDArray[np.int64], NDArray[np.uint8]]]
+
+
+def _message(channel: Channel) -> Message:
+    if channel.message is None:
+        raise ValueError(f"{channel.key}: expected a channel on a bus")
+    return channel.message
+
+
+def _payloads(run: RunFolder, channels: Iterable[Channel]) -> _Payloads:
+    """Times and payloads of every received message, wrong lengths left out."""
+    messages = sorted(
+        {item.name: item for item in map(_message, channels)}.values(),
+        key=lambda item: item.name,
+    )
+    directory = Directory(messages)
+    times: list[list[int]] = [[] for _ in messages]
+    data: list[list[bytes]] = [[] for _ in messages]
+    for frame, direction in run.frames():
+        index = directory.index_of(frame.arbitration_id, frame.is_extended)
+        if index is None or direction != "R" or frame.is_error:
+            continue
+        if len(frame.data) == messages[index].length_bytes:
+            times[index].append(frame.t_ns)
+            data[index].append(frame.data)
+    return {
+        message.name: (
+            np.array(times[index], dtype=np.int64),
+            np.frombuffer(b"".join(data[index]), dtype=np.uint8).reshape(-1, message.length_bytes),
+        )
+        for index, message in enumerate(messages)
+    }
+
+
+def _samples(payloads: _Payloads, channel: Channel) -> tuple[Array, Array]:
+    """Sample times in s and values of one channel."""
+    message = _message(channel)
+    t_ns, data = payloads[message.name]
+    good = np.ones(len(data), dtype=bool)
+    if message.protection is not None:
+        good = check_crc_log(data, message.protection)
+    signal = channel.signal
+    values = decode_log(message, [signal], [channel.quantity.dimension], data)[signal]
+    good &= np.isfinite(values)
+    t_s, first = np.unique(_sample_times_s(t_ns[good], message), return_index=True)
+    return t_s, values[good][first]
+
+
+def _sample_times_s(t_ns: NDArray[np.int64], message: Message) -> Array:
+    """Times of sampling in s: on the grid of the cycle time where the arrivals fit one."""
+    cycle_ns = message.cycle_time_ns
+    if cycle_ns is None or len(t_ns) == 0:
+        return np.asarray(t_ns * 1e-9, dtype=np.float64)
+    index = np.rint((t_ns - t_ns[0]) / cycle_ns)
+    jitter_ns = t_ns - t_ns[0] - index * cycle_ns
+    if float(np.max(np.abs(jitter_ns - np.median(jitter_ns)))) > 0.4 * cycle_ns:
+        return np.asarray(t_ns * 1e-9, dtype=np.float64)
+    return (t_ns[0] + np.median(jitter_ns) + index * cycle_ns) * 1e-9
+
+
+def _resample(payloads: _Payloads, channel: Channel | None, t_s: Array) -> Array | None:
+    """Values of a channel at other times, linear between its samples; None where it has none."""
+    if channel is None:
+        return None
+    own_t_s, values = _samples(payloads, channel)
+    return np.interp(t_s, own_t_s, values) if len(own_t_s) else None
+
+
+def _nearest(t_s: Array, own_t_s: Array, values: Array, half_s: float) -> Array:
+    """Values at the times of another message; NaN where none is near."""
+    at = np.clip(np.searchsorted(own_t_s, t_s - half_s), 0, len(own_t_s) - 1)
+    return np.where(np.abs(own_t_s[at] - t_s) <= half_s, values[at], np.nan)
