@@ -56,9 +56,9 @@ def read_csv(path: Path | str, struts: Sequence[str] | None = None) -> "Recordin
     Raises:
         InputError: The file is no such table, or none of its columns can be diagnosed.
     """
-    from rig.recordings import checks, csv_file
+    from rig.recordings import csv_file, recording_checks
 
-    return checks.check_recording(csv_file.read_csv(Path(path), struts))
+    return recording_checks.check_recording(csv_file.read_csv(Path(path), struts))
 
 
 def diagnose(

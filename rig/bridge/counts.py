@@ -20,7 +20,7 @@ class Counts(NamedTuple):
         stale: Ticks in HOLD.
         overruns: Ticks that were missed.
         saturated: Frames sent with a value at the limit of its range.
-        wrong_crc: Frames refused for their CRC.
+        wrong_crc: Frames refused for their CRC (`FrameStatus.WRONG_CRC` in `can_dbc.protection`).
         wrong_length: Frames refused for their length.
         repeated: Frames refused because their counter had arrived already.
         out_of_sequence: Frames refused because their counter went backwards or jumped.

@@ -13,7 +13,7 @@ from rig.bridge.estimator import Estimate, find_divergence, is_sensible
 from rig.bridge.measurement_age import is_too_old
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
-from rig.channels.quantities import APPLIED_FORCE, TEMPERATURE
+from rig.channels.measured_quantities import APPLIED_FORCE, TEMPERATURE
 from rig.closed_loop.strut_response import strut_responses
 from rig.observers.protocol import AnyObserver, Innovation, ObserverState, Start
 from rig.observers.strut_sensors import Instant, model_height_m, model_reading

@@ -1,7 +1,8 @@
 """The state machine that owns the mode: the only place where it changes.
 
 What may change it is an event: the age of the measurements, a model that diverged, a limit, a
-device, the user. What is published follows from the mode.
+device, the user. A tick may show several; they are applied one after the other: age, divergence,
+limits, devices. What is published follows from the mode.
 """
 
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ from rig.bridge.values import Divergence, Mode, StepInput, StepOutput, StrutOutp
 
 
 class Event(IntEnum):
-    """What a tick shows, the severest first."""
+    """What a tick shows."""
 
     BEYOND_SAFE = auto()
     DIVERGED = auto()

@@ -10,7 +10,7 @@ from can_dbc.database import Message
 from can_dbc.frame import Frame
 from can_dbc.protection import compile_protector
 from rig.bridge.counts import Report
-from rig.bridge.publications import STATUS, Publication
+from rig.bridge.published_quantities import STATUS, Publication
 
 
 @dataclass(frozen=True)

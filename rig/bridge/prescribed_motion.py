@@ -20,7 +20,7 @@ from rig.bridge.estimator import Estimate, is_sensible
 from rig.bridge.measurement_age import is_too_old
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
-from rig.channels.quantities import LOAD_CELL_FORCE, TEMPERATURE
+from rig.channels.measured_quantities import LOAD_CELL_FORCE, TEMPERATURE
 from rig.observers.protocol import AnyObserver
 
 ModelT = TypeVar("ModelT")

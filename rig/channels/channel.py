@@ -8,7 +8,7 @@ from msgspec import Struct
 from pydantic import BaseModel, ConfigDict, Field
 
 from can_dbc.database import Message
-from rig.channels.quantities import Quantity
+from rig.channels.measured_quantities import Quantity
 
 
 class SignalName(BaseModel):

@@ -32,7 +32,7 @@ def set_command(
 ) -> None:
     """Change gains or limits of a run in progress, or acknowledge its safe state."""
     from rig.run.change_requests import ask
-    from rig.run.changes import parse_assignments
+    from rig.run.changed_settings import parse_assignments
 
     if acknowledge == bool(assignments):
         raise InputError("rig set: expected KEY=VALUE, or --acknowledge")

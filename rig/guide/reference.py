@@ -22,8 +22,8 @@ from dart_model.effects import CATALOGUE, FAMILY_WORDS, Effect, Motion
 from dart_model.effects.calling import force_over_arrays, rates_over_arrays
 from dart_model.effects.law import Force, Rate
 from dart_model.spec import ModelSpec
-from rig.bridge.publications import STATUS, STRUT, TIMING
-from rig.channels.quantities import BENCH_QUANTITIES, HEIGHT
+from rig.bridge.published_quantities import STATUS, STRUT, TIMING
+from rig.channels.measured_quantities import BENCH_QUANTITIES, HEIGHT
 from rig.observers import OBSERVERS
 from rig.pages.html import render
 from rig.plan.config import OneOf, RunConfig

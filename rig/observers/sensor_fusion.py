@@ -27,7 +27,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from rig.channels.channel import Channel
-from rig.channels.quantities import HEIGHT
+from rig.channels.measured_quantities import HEIGHT
 from rig.observers.error_filter import (
     Array,
     ErrorFilter,

@@ -1,7 +1,7 @@
 """What a sensor of a strut measures: on the model, and of the model's error.
 
-A further kind of sensor is a quantity in `rig.channels.quantities.STRUT_QUANTITIES` and an entry
-here.
+A further kind of sensor is a quantity in `rig.channels.measured_quantities.STRUT_QUANTITIES` and an
+entry here.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from rig.channels.channel import Channel
-from rig.channels.quantities import FORCE, HEIGHT, VELOCITY, Quantity
+from rig.channels.measured_quantities import FORCE, HEIGHT, VELOCITY, Quantity
 from rig.observers.protocol import Start
 
 

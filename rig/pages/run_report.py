@@ -11,7 +11,7 @@ from rig.log.reader import Ending, RunHeader, read_header
 from rig.pages.html import render_report, write_page
 from rig.pages.plotted_quantities import TICK_CURVES, TICK_TIME, TIME, TIME_PLOTS, Origin
 from rig.pages.report.figures import LineStyle, Panel, Plot, plot
-from rig.run.changes import read_changes
+from rig.run.changed_settings import read_changes
 from rig.run.timing import read_histograms
 
 _POINTS = 1500

@@ -19,11 +19,11 @@ from pydantic_core.core_schema import tagged_union_schema
 from can_dbc.yaml_file import Finite, Positive
 from rig.bridge.devices import DeviceSettings
 from rig.bridge.mode_supervisor import Supervision
-from rig.bridge.publications import STATUS, STRUT, TIMING, Publication
+from rig.bridge.published_quantities import STATUS, STRUT, TIMING, Publication
 from rig.bus.bus import BusConfig
 from rig.bus.secoc import AuthenticationSettings
 from rig.channels.channel import SignalName
-from rig.channels.quantities import (
+from rig.channels.measured_quantities import (
     APPLIED_FORCE,
     BENCH_QUANTITIES,
     HEIGHT,
@@ -269,13 +269,14 @@ class RunConfig(_Frozen):
         observers: One for each strut of the model, by strut name; PI where none is named.
             `kind` says which, `pi` if absent; its other keys are its own. A dyno uses none.
         publish: What is published of each strut, by strut name: signals by the keys of
-            `rig.bridge.publications.STRUT`. By default, where the DBC has them, RIG_ESTIMATE and
-            RIG_KINEMATICS for the first strut, and the same with _2, _3, ... for the next ones.
-        status: What is published of the bridge, by the keys of `rig.bridge.publications.STATUS`; or
-            a message that has a signal of each name. By default RIG_STATUS, where the DBC has it.
-        timing: How well the rate is kept, by the keys of `rig.bridge.publications.TIMING`, or a
-            message;
-            nothing by default.
+            `rig.bridge.published_quantities.STRUT`. By default, where the DBC has them,
+            RIG_ESTIMATE and RIG_KINEMATICS for the first strut, and the same with _2, _3, ... for
+            the next ones.
+        status: What is published of the bridge, by the keys of
+            `rig.bridge.published_quantities.STATUS`; or a message that has a signal of each name.
+            By default RIG_STATUS, where the DBC has it.
+        timing: How well the rate is kept, by the keys of
+            `rig.bridge.published_quantities.TIMING`, or a message; nothing by default.
         supervision: Ages and safe state.
         realtime: What is asked of the machine.
         log: Rotation, and windows that are kept apart.

@@ -14,7 +14,7 @@ from dart_model.spec import ModelSpec
 from rig.bridge.devices import Device
 from rig.bridge.incoming_messages import Alarm
 from rig.bridge.outgoing_messages import PublishedSignal
-from rig.bridge.publications import (
+from rig.bridge.published_quantities import (
     ESTIMATE,
     KINEMATICS,
     STATUS,
@@ -25,7 +25,7 @@ from rig.bridge.publications import (
 )
 from rig.bus.secoc import FD_LENGTHS, Authentication, AuthenticationSettings
 from rig.channels.channel import Channel, Role, SignalName
-from rig.channels.quantities import HEIGHT, LOAD_CELL_FORCE, Quantity
+from rig.channels.measured_quantities import HEIGHT, LOAD_CELL_FORCE, Quantity
 from rig.observers.pi import PiObserver
 from rig.observers.protocol import AnyObserver
 from rig.plan.config import HeightSignal, Mapped, RunConfig, SensorSignal

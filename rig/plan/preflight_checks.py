@@ -10,7 +10,7 @@ from can_dbc.database import Message
 from dart_model.protocol import AnyPlant
 from dart_model.spec import InlineSkeleton
 from rig.channels.channel import Channel
-from rig.channels.quantities import LOAD_CELL_FORCE
+from rig.channels.measured_quantities import LOAD_CELL_FORCE
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import Pole, closed_loop_poles

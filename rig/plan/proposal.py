@@ -6,7 +6,13 @@ from typing import NamedTuple
 from can_dbc.database import Database, Message, Signal
 from can_dbc.errors import DatabaseError, InputError
 from can_dbc.units import Dimension, si_conversion
-from rig.channels.quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, TEMPERATURE, Quantity
+from rig.channels.measured_quantities import (
+    APPLIED_FORCE,
+    HEIGHT,
+    LOAD_CELL_FORCE,
+    TEMPERATURE,
+    Quantity,
+)
 
 _WORDS: dict[Quantity, tuple[str, ...]] = {
     HEIGHT: ("height", "hoehe", "stroke", "travel", "weg", "displ", "pos", "length", "lvdt"),

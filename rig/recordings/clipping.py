@@ -1,4 +1,8 @@
-"""Channels that are clipped: plateaus at an end of their range, which they enter at speed."""
+"""Channels that are clipped: plateaus at an end of their range, which they enter at speed.
+
+A recording with long plateaus is refused (`rig.recordings.recording_checks`); sudden ones are a
+warning beside dyno figures (`rig.dyno.quality`).
+"""
 
 from typing import NamedTuple
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from can_dbc.errors import InputError
 from rig.log.file_names import STEPS_FILE, parts
-from rig.recordings.checks import check_recording
 from rig.recordings.csv_file import read_csv
 from rig.recordings.recording import Recording
+from rig.recordings.recording_checks import check_recording
 from rig.recordings.run_folder import read_run
 
 

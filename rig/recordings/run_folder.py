@@ -12,7 +12,7 @@ from can_dbc.database import Message
 from can_dbc.errors import InputError
 from can_dbc.protection import check_crc_log
 from rig.channels.channel import Channel
-from rig.channels.quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE
+from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE
 from rig.log.reader import RunFolder
 from rig.log.reader import read_run as read_run_folder
 from rig.plan.load import plan_of_run

@@ -23,7 +23,13 @@ from rig.machine.realtime import follow
 from rig.plan.load import plan_of_run
 from rig.plan.plan import Plan
 from rig.plan.preflight_checks import errors
-from rig.run.changes import Assignments, assign, bridge_with_settings, change_line, read_changes
+from rig.run.changed_settings import (
+    Assignments,
+    assign,
+    bridge_with_settings,
+    change_line,
+    read_changes,
+)
 
 _FOLDER = "requests"
 _LOOK_S = 0.1

@@ -28,7 +28,7 @@ from rig.machine.clock import Clock, OccupiedClock
 from rig.machine.realtime import Granted
 from rig.plan.plan import Plan
 from rig.run.change_requests import Requests
-from rig.run.changes import Changes, no_changes
+from rig.run.changed_settings import Changes, no_changes
 from rig.run.loop import SHOWN_EVERY_NS, Look, Port, RunControl, Sink, regular_ticks, run
 from rig.run.ports import InformedPort
 from rig.run.timing import Timing

@@ -12,7 +12,7 @@ from rig.bridge.counts import Conditions, Counts
 from rig.bridge.values import Mode, StepOutput
 from rig.log.step_columns import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, LogColumns, Step
 from rig.machine.clock import Clock
-from rig.run.changes import Changes, no_changes
+from rig.run.changed_settings import Changes, no_changes
 from rig.run.timing import BINS, Timing
 
 

@@ -21,7 +21,7 @@ from rig.log.step_columns import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, LogColumns,
 from rig.plan.build import build_bridge
 from rig.plan.load import plan_of_run
 from rig.plan.plan import Plan
-from rig.run.changes import changes_for_replay, no_changes
+from rig.run.changed_settings import changes_for_replay, no_changes
 from rig.run.loop import Progress, Tick, no_progress, run
 
 _TICKS_AT_ONCE = 4096

@@ -9,7 +9,7 @@ from rig.bridge.free_model import FreeModelEstimator
 from rig.bridge.mode_supervisor import SupervisedState, Supervision, Supervisor
 from rig.bridge.values import StepInput, StepOutput
 from rig.channels.channel import Channel, Role, Sample
-from rig.channels.quantities import (
+from rig.channels.measured_quantities import (
     APPLIED_FORCE,
     BENCH_QUANTITIES,
     HEIGHT,

@@ -10,7 +10,7 @@ from dart_model.spec import MODELS, load_model
 from rig.bridge.mode_supervisor import Supervision
 from rig.bridge.values import StepInput
 from rig.channels.channel import Sample
-from rig.channels.quantities import APPLIED_FORCE
+from rig.channels.measured_quantities import APPLIED_FORCE
 from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
 from rig.observers.none import NoObserver

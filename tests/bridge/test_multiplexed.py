@@ -5,7 +5,7 @@ from can_dbc.frame import Frame
 from can_dbc.protection import FrameStatus, SequenceState
 from rig.bridge.incoming_messages import HeightDelivery, compile_incoming
 from rig.channels.channel import Channel, Role
-from rig.channels.quantities import HEIGHT
+from rig.channels.measured_quantities import HEIGHT
 
 DBC = """VERSION ""
 NS_ :

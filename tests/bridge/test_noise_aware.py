@@ -12,7 +12,7 @@ from rig.bridge.free_model import start_of_motion
 from rig.bridge.mode_supervisor import Supervision
 from rig.bridge.values import StepInput
 from rig.channels.channel import Sample
-from rig.channels.quantities import APPLIED_FORCE
+from rig.channels.measured_quantities import APPLIED_FORCE
 from rig.closed_loop.loop import Loop, SampleTiming
 from rig.closed_loop.poles import closed_loop_poles
 from rig.closed_loop.strut_response import strut_responses

@@ -16,7 +16,7 @@ from rig.bridge.prescribed_motion import (
 )
 from rig.bridge.values import Mode, StepInput
 from rig.channels.channel import Sample
-from rig.channels.quantities import LOAD_CELL_FORCE, TEMPERATURE
+from rig.channels.measured_quantities import LOAD_CELL_FORCE, TEMPERATURE
 from tests.bridge.cores import bench_sample, channels
 
 MODEL = """

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from rig.bridge.mode_supervisor import Supervision
 from rig.bridge.values import Mode, StepInput
 from rig.channels.channel import Channel, Role, Sample
-from rig.channels.quantities import APPLIED_FORCE, FORCE, HEIGHT, VELOCITY
+from rig.channels.measured_quantities import APPLIED_FORCE, FORCE, HEIGHT, VELOCITY
 from rig.observers.error_filter import ErrorFilter
 from rig.observers.kalman import KalmanObserver
 from rig.observers.protocol import Innovation, Start

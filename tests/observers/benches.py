@@ -9,7 +9,7 @@ from dart_model.spec import MODELS, parse_model
 from rig.bridge.mode_supervisor import Supervision
 from rig.bridge.values import Mode, StepInput
 from rig.channels.channel import Channel, Role, Sample
-from rig.channels.quantities import APPLIED_FORCE, HEIGHT
+from rig.channels.measured_quantities import APPLIED_FORCE, HEIGHT
 from rig.log.step_columns import LogColumns
 from rig.plan.config import CONFIGS
 from rig.simulated_bench.schema import BenchConfig

@@ -13,7 +13,7 @@ from can_dbc.errors import InputError
 from rig.formats.run_arrays import open_run
 from rig.pages import browser_print
 from rig.pages.run_report import write_run_report
-from rig.run.changes import change_line
+from rig.run.changed_settings import change_line
 from tests.view.serving import make_run
 
 

@@ -11,7 +11,7 @@ from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.change_requests import Requests, ask
-from rig.run.changes import assign, change_line, parse_assignments, read_changes
+from rig.run.changed_settings import assign, change_line, parse_assignments, read_changes
 from rig.run.replay import replay
 from tests.view.serving import make_run
 

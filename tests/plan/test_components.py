@@ -168,7 +168,7 @@ QUANTITY = '''
 import json, re, sys
 from pathlib import Path
 
-import rig.channels.quantities as quantities
+import rig.channels.measured_quantities as quantities
 from can_dbc.units import Dimension
 GAS = quantities.Quantity("humidity", "humidity", Dimension.NUMBER, "relative humidity")
 quantities.BENCH_QUANTITIES = (*quantities.BENCH_QUANTITIES, GAS)

@@ -13,10 +13,10 @@ from dart_model.spec import MODELS, load_model
 from rig.bridge.counts import Conditions, Counts, Report
 from rig.bridge.free_model import FreeModelEstimator
 from rig.bridge.prescribed_motion import PrescribedMotionEstimator
-from rig.bridge.publications import STATUS, STRUT, TIMING
+from rig.bridge.published_quantities import STATUS, STRUT, TIMING
 from rig.bridge.values import Mode, StepInput, StepOutput, StrutOutput
 from rig.channels.channel import Sample
-from rig.channels.quantities import BENCH_QUANTITIES, LOAD_CELL_FORCE, STRUT_QUANTITIES
+from rig.channels.measured_quantities import BENCH_QUANTITIES, LOAD_CELL_FORCE, STRUT_QUANTITIES
 from rig.observers import OBSERVERS
 from rig.observers.protocol import Innovation, SensorStep, Start, TuningTask
 from rig.observers.strut_sensors import STRUT_SENSORS, Instant

@@ -15,7 +15,7 @@ import yaml
 
 from rig.pages.report import page as page_of
 from rig.pages.run_report import write_run_report
-from rig.run.changes import read_changes
+from rig.run.changed_settings import read_changes
 from rig.run.replay import replay
 from tests.pages.test_report import report
 from tests.view.browser import browser, drawn, frames, in_sight, needs_chromium, page, until

@@ -13,7 +13,7 @@ from rig.formats.run_arrays import open_run
 from rig.log.file_names import CHANGES_FILE
 from rig.pages.view import foxglove
 from rig.pages.view.foxglove import FoxgloveView, Playback
-from rig.run.changes import change_line
+from rig.run.changed_settings import change_line
 from tests.view.browser import browser, needs_chromium, until
 from tests.view.serving import COUNT, make_run
 

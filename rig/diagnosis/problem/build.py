@@ -15,8 +15,8 @@ from rig.diagnosis.problem.grid import smooth_recording, strut_motions
 from rig.diagnosis.problem.mechanism import mechanism_along, open_plants
 from rig.diagnosis.problem.prescribed_motion import PrescribedProblem
 from rig.diagnosis.problem.problem import Problem, ProblemBasis, ResidualForces
-from rig.recordings.checks import check_fits
 from rig.recordings.recording import Recording, RecordingError
+from rig.recordings.recording_checks import check_fits
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
 from rig.pages.view.run_status import WatchedRun
-from rig.run.changes import read_changes
+from rig.run.changed_settings import read_changes
 
 if TYPE_CHECKING:
     from foxglove import Channel, Parameter

@@ -11,7 +11,7 @@ from scipy import signal
 from dart_model.effects import AMBIENT_C
 from dart_model.plant.strut import Strut, struts_of
 from dart_model.spec import ModelSpec
-from rig.channels.quantities import TEMPERATURE
+from rig.channels.measured_quantities import TEMPERATURE
 from rig.log.candump import LATEST_S, parse_frame
 from rig.log.file_names import FRAMES_FILE, parts
 from rig.log.follower import RunFollower

@@ -1,4 +1,8 @@
-"""Every quantity that the bridge can publish, each declared here and nowhere else."""
+"""Every quantity that the bridge can publish, each declared here and nowhere else.
+
+Unit, scale and range of a published signal are those of the DBC: a value in SI is converted to
+them. What a bench sends stands in `rig.channels.measured_quantities`.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
