@@ -267,7 +267,10 @@ def read_description(content: bytes, path: Path) -> Any:
         ModelError: It is no FMU, or FMPy is not installed.
     """
     if importlib.util.find_spec("fmpy") is None:
-        raise ModelError("the package fmpy is not installed, expected `pip install 'rig[fmu]'`")
+        raise ModelError(
+            "the package fmpy is not installed, expected `pip install -e '.[fmu]'` in the clone of "
+            "rig"
+        )
     import fmpy
 
     try:

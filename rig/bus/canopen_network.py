@@ -40,7 +40,8 @@ def package() -> ModuleType:
         return importlib.import_module("canopen")
     except ImportError:
         raise BusError(
-            "the package canopen is not installed, expected `pip install 'rig[sensors]'`"
+            "the package canopen is not installed, expected `pip install -e '.[sensors]'` in the "
+            "clone of rig"
         ) from None
 
 

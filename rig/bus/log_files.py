@@ -96,7 +96,8 @@ def _reader_errors(path: Path) -> tuple[type[Exception], ...]:
         module = importlib.import_module("asammdf.blocks.utils")
     except ImportError as error:
         raise BusLogError(
-            f"{path}: requires the package asammdf: pip install 'rig[mf4]'"
+            f"{path}: the package asammdf is not installed, expected `pip install -e '.[mf4]'` "
+            "in the clone of rig"
         ) from error
     return (*_READER_ERRORS, cast("type[Exception]", module.MdfException))
 

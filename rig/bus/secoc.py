@@ -122,7 +122,8 @@ def cmac(key: bytes) -> Callable[[bytes], bytes]:
         ciphers = importlib.import_module("cryptography.hazmat.primitives.ciphers")
     except ImportError as error:
         raise AuthenticationError(
-            "authentication: requires the package cryptography: pip install 'rig[secoc]'"
+            "authentication: the package cryptography is not installed, expected "
+            "`pip install -e '.[secoc]'` in the clone of rig"
         ) from error
     keyed = module.CMAC(ciphers.algorithms.AES(key))
 

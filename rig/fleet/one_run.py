@@ -11,7 +11,6 @@ import time
 from collections.abc import Generator
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,6 +26,7 @@ from rig.diagnosis.refit import refit_parameters
 from rig.dyno.characterise import characterise
 from rig.fleet.sources import RunSource, printable
 from rig.log.file_names import RUN_FILE
+from rig.machine.installed_versions import installed_version
 from rig.recordings.read import read_recording
 from rig.recordings.recording import Recording
 
@@ -145,7 +145,7 @@ def row_without_result(source: RunSource, model: FleetModel, error: str) -> RunR
 @lru_cache(maxsize=1)
 def rig_version() -> str:
     """The version whose rows these are."""
-    return version("rig")
+    return installed_version("rig")
 
 
 @lru_cache(maxsize=4)

@@ -161,7 +161,10 @@ def connect(store: Path) -> Any:
     if not any((store / "runs").rglob("*.parquet")):
         raise InputError(f"{store}: no runs in it, expected what `rig fleet SOURCE` wrote")
     if _duckdb is None:
-        raise InputError("duckdb is not installed, expected `pip install 'rig[fleet]'`")
+        raise InputError(
+            "the package duckdb is not installed, expected `pip install -e '.[fleet]'` in the "
+            "clone of rig"
+        )
     connection = _duckdb.connect()
     runs, values = (_quote(store / name / "**" / "*.parquet") for name in ("runs", "values"))
     try:

@@ -5,13 +5,13 @@ import html
 import io
 import zipfile
 from collections.abc import Callable, Iterable
-from importlib.metadata import version as installed
 from uuid import UUID
 
 from rig.fmu.binaries import TARGETS, Target, compile_for
 from rig.fmu.component import Component
 from rig.fmu.description import build_description, description_2, description_3
 from rig.fmu.source import select_c_files, sources
+from rig.machine.installed_versions import installed_version
 
 _FILE_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of every file in the archive, so that the same model gives the same bytes."""
@@ -32,7 +32,7 @@ def archive(
     Raises:
         InputError: There is no compiler, or it refuses.
     """
-    tool = f"rig {installed('rig')}"
+    tool = f"rig {installed_version('rig')}"
     token = _token(component, version, tool)
     code = sources(component, version, token)
     c_files = select_c_files(code)

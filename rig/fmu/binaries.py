@@ -70,7 +70,8 @@ def compile_for(
     """
     if importlib.util.find_spec("ziglang") is None:
         raise InputError(
-            "the package ziglang, a C compiler, is not installed, expected `pip install 'rig[fmu]'`"
+            "the package ziglang, a C compiler, is not installed, expected "
+            "`pip install -e '.[fmu]'` in the clone of rig"
         )
     libraries: dict[Target, bytes] = {}
     with tempfile.TemporaryDirectory() as name:

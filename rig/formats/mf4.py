@@ -53,7 +53,8 @@ def _asammdf() -> ModuleType:
         return importlib.import_module("asammdf")
     except ImportError as error:
         raise InputError(
-            "format mf4: the package asammdf is missing, expected `pip install rig[mf4]`"
+            "format mf4: the package asammdf is not installed, expected "
+            "`pip install -e '.[mf4]'` in the clone of rig"
         ) from error
 
 

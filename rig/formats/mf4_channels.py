@@ -26,7 +26,8 @@ def read_mf4_channels(
         damaged = cast("type[Exception]", asammdf.blocks.utils.MdfException)
     except ImportError as error:
         raise InputError(
-            f"{source}: requires the package asammdf: pip install 'rig[mf4]'"
+            f"{source}: the package asammdf is not installed, expected `pip install -e '.[mf4]'` "
+            "in the clone of rig"
         ) from error
     try:
         with source.open("rb") as raw, asammdf.MDF(raw) as file:

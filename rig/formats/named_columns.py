@@ -79,7 +79,8 @@ def _read_file(source: Path) -> Mapping[str, Array]:
         return READERS[source.suffix.lower()](content)
     except ImportError as error:
         raise InputError(
-            f"{source}: requires the package {error.name}: pip install 'rig[tables]'"
+            f"{source}: the package {error.name} is not installed, expected "
+            "`pip install -e '.[tables]'` in the clone of rig"
         ) from error
     except Exception as error:
         # Foreign readers raise anything on a file that is cut or malicious.

@@ -9,7 +9,6 @@ import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import cast
 
@@ -25,6 +24,7 @@ from rig.log.reader import RUN_SCHEMA, ConfigEntry, RunHeader
 from rig.log.step_columns import LogColumns, Step
 from rig.log.writer import LogOptions, RunWriter
 from rig.machine.clock import Clock, OccupiedClock
+from rig.machine.installed_versions import installed_version
 from rig.machine.realtime import Granted
 from rig.plan.plan import Plan
 from rig.run.change_requests import Requests
@@ -248,7 +248,7 @@ def _header(
         "config_source": str(plan.source),
         "files_sha256": files,
         "versions": {
-            **{name: version(name) for name in _PACKAGES},
+            **{name: installed_version(name) for name in _PACKAGES},
             "python": platform.python_version(),
             "system": platform.platform(),
         },

@@ -85,4 +85,4 @@ def test_without_the_compiler_one_line_says_what_to_install(rig, tmp_path, monke
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     code, said = rig("export", REFERENCE, "--fmu", "--out", tmp_path / "it.fmu")
     assert code == 2
-    assert "rig[fmu]" in said
+    assert "pip install -e '.[fmu]'" in said

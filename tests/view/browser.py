@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 playwright = pytest.importorskip(
-    "playwright.sync_api", reason="no playwright: pip install '.[browser]'"
+    "playwright.sync_api", reason="no playwright: pip install -e '.[browser]'"
 )
 
 CHROMIUM = next(

@@ -17,7 +17,7 @@ from rig.run.changed_settings import change_line
 from tests.view.browser import browser, needs_chromium, until
 from tests.view.serving import COUNT, make_run
 
-pytest.importorskip("foxglove", reason="no foxglove-sdk: pip install '.[foxglove]'")
+pytest.importorskip("foxglove", reason="no foxglove-sdk: pip install -e '.[foxglove]'")
 
 CLIENT = """
 address => {
@@ -226,7 +226,7 @@ def test_without_the_sdk_it_says_what_to_install(original, monkeypatch):
         raise ImportError
 
     monkeypatch.setattr(foxglove.importlib, "import_module", missing)
-    with pytest.raises(InputError, match=r"pip install 'rig\[foxglove\]'"):
+    with pytest.raises(InputError, match=r"pip install -e '\.\[foxglove\]'"):
         FoxgloveView([original], 0)
 
 

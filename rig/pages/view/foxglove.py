@@ -327,7 +327,8 @@ def _sdk() -> ModuleType:
         importlib.import_module("foxglove.websocket")
     except ImportError as error:
         raise InputError(
-            "--foxglove requires the package foxglove-sdk: pip install 'rig[foxglove]'"
+            "--foxglove: the package foxglove-sdk is not installed, expected "
+            "`pip install -e '.[foxglove]'` in the clone of rig"
         ) from error
     foxglove.set_log_level("ERROR")
     return foxglove
