@@ -19,6 +19,7 @@ from can_dbc.errors import InputError
 from rig.cli.progress import handle_signals
 from rig.cli.terminal import FAILED, OK, WRONG_INPUT, print_json, print_table
 from rig.files.folders import refuse_full
+from rig.machine.child_processes import PYTHON
 
 _PR_SET_PDEATHSIG = 1
 """Of linux/prctl.h: which signal a process is sent when its parent dies; see prctl(2)."""
@@ -68,7 +69,7 @@ def run_side_by_side(
 
 
 def _start(config: Path, folder: Path, options: Sequence[str]) -> "subprocess.Popen[str]":
-    command = [sys.executable, "-m", "rig", "run", str(config), "--out", str(folder), *options]
+    command = [*PYTHON, "-m", "rig", "run", str(config), "--out", str(folder), *options]
     # A separate session: the terminal's Ctrl-C comes here, and is passed on once.
     return subprocess.Popen(  # noqa: S603  # a list, no shell
         command,

@@ -1,7 +1,6 @@
 """Where the runs of a fleet are computed: processes of this machine, or a cluster of Dask."""
 
 import importlib
-import multiprocessing
 import os
 import signal
 import sys
@@ -12,6 +11,7 @@ from functools import partial
 from typing import NamedTuple
 
 from can_dbc.errors import InputError
+from rig.machine.child_processes import spawn_context
 
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _AHEAD = 4
@@ -34,7 +34,7 @@ def processes(jobs: int | None) -> Engine:
     make = partial(
         ProcessPoolExecutor,
         count,
-        mp_context=multiprocessing.get_context("spawn"),
+        mp_context=spawn_context(),
         # Ctrl-C is the parent's: it ends in order, and with it its workers.
         initializer=signal.signal,
         initargs=(signal.SIGINT, signal.SIG_IGN),

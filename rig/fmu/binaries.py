@@ -2,7 +2,6 @@
 
 import importlib.util
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import NamedTuple
 
 from can_dbc.errors import InputError
 from rig.fmu.source import select_c_files
+from rig.machine.child_processes import PYTHON
 
 
 class Target(NamedTuple):
@@ -88,7 +88,7 @@ def compile_for(
 
 
 def _compile(folder: Path, files: list[str], target: Target, out: Path) -> None:
-    compiler = [sys.executable, "-m", "ziglang", "cc", "-target", target.triple]
+    compiler = [*PYTHON, "-m", "ziglang", "cc", "-target", target.triple]
     linked = ["-s", "-lm"] if target.suffix == ".so" else ["-s"]
     shared = ["-shared", "-fPIC"] if target.suffix != ".dll" else ["-shared"]
     command = [*compiler, *_FLAGS, *shared, "-o", str(out), *files, *linked]

@@ -99,3 +99,13 @@ def test_one_name_twice_and_a_folder_that_is_full_are_refused(two, tmp_path):
     assert process.returncode == 2
     assert "is not empty" in said
     assert not (tmp_path / "full" / "left").exists()
+
+
+def test_no_bridge_imports_a_module_of_the_working_directory(foreign_modules):
+    for name in ("left", "right"):
+        (foreign_modules.folder / f"{name}.yaml").write_text("rate_hz: none")
+    command = [sys.executable, "-P", "-m", "rig", "run", "left.yaml", "right.yaml", "--out", "runs"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert foreign_modules.imported == []
+    assert done.returncode == 2
+    assert "left: rig: " in done.stderr  # it is rig that refuses

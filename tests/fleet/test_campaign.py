@@ -14,6 +14,7 @@ from can_dbc.errors import InputError
 from rig.fleet import campaign as campaigns
 from rig.fleet import store
 from rig.fleet.campaign import load_fleet_model, run_campaign
+from rig.fleet.executors import processes
 from rig.fleet.one_run import RunRow, evaluate_run
 from rig.fleet.overview import read_overview
 from rig.fleet.sources import RunSource, find_sources, select_shard
@@ -277,3 +278,9 @@ def test_what_is_ready_is_written_though_nothing_follows(fleet, tmp_path, monkey
 
     run_campaign(sources, given(fleet), tmp_path, lambda: Slow(2), 8, progress=look)
     assert seen[0] >= len(sources) - 1
+
+
+def test_no_worker_imports_a_module_of_the_working_directory(foreign_modules):
+    with processes(1).make() as executor:
+        assert executor.submit(len, "rig").result(timeout=60) == 3
+    assert foreign_modules.imported == []

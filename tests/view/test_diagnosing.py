@@ -86,6 +86,14 @@ def test_what_fails_says_why(tmp_path):
     assert "expected at least" in found["why"]
 
 
+def test_it_imports_no_module_of_the_working_directory(foreign_modules, tmp_path):
+    with serving(make_run(tmp_path / "short", 30), token="secret") as server:
+        post(server, "/diagnose?run=0")
+        found = ended(server)
+    assert foreign_modules.imported == []
+    assert "expected at least" in found["why"]  # it is the diagnosis that refuses
+
+
 def test_nobody_starts_one_without_the_token(run):
     with serving(run, token="secret") as server:
         for path in ("/diagnose?run=0", "/cancel?run=0"):

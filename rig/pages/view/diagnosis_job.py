@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import multiprocessing
 import re
 import threading
 from collections.abc import Mapping, Sequence
@@ -12,9 +11,9 @@ from pathlib import Path
 
 from rig.diagnosis.outcome import DIAGNOSIS_FILE, REPORT_FILE
 from rig.files.folders import free_folder
+from rig.machine.child_processes import spawn_context
 from rig.pages.view.diagnosis_worker import DiagnosisFailure, DiagnosisProgress, run_diagnosis
 
-_SPAWN = multiprocessing.get_context("spawn")
 _STARTING = DiagnosisProgress("starting", 0.0)
 
 
@@ -37,9 +36,10 @@ class DiagnosisJob:
             self._progress, self._reason, self._is_cancelled = _STARTING, "", False
             out = free_folder(self._first_folder())
             others = [path.absolute() for path in held_out]
-            receiver, sender = _SPAWN.Pipe(duplex=False)
+            context = spawn_context()
+            receiver, sender = context.Pipe(duplex=False)
             with sender:  # the worker keeps its copy alone, so that its end closes the pipe
-                self._process = _SPAWN.Process(
+                self._process = context.Process(
                     target=run_diagnosis,
                     args=(self._run, model, others, out, sender),
                     daemon=True,
