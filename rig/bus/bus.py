@@ -3,11 +3,13 @@
 import contextlib
 import errno
 import socket
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field
+from types import MappingProxyType
 from typing import Annotated, Any, cast
 
 import can
+from can.typechecking import BitTimingDict, BitTimingFdDict
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
@@ -32,6 +34,15 @@ _LISTEN_ONLY_OPTIONS: dict[str, dict[str, object]] = {
     "kvaser": {"driver_mode": False},
 }
 """What keeps a controller from acknowledging frames too. SocketCAN leaves this to `ip link`."""
+
+_STATES = MappingProxyType({state.name: state for state in can.BusState})
+_TIMINGS: Mapping[Callable[..., object], frozenset[str]] = MappingProxyType(
+    {
+        can.BitTimingFd: frozenset(BitTimingFdDict.__annotations__),
+        can.BitTiming: frozenset(BitTimingDict.__annotations__),
+    }
+)
+"""Options that together are a bit timing."""
 
 
 class BusError(InputError):
@@ -191,6 +202,26 @@ def _sending_error(error: Exception) -> BusError:
     return (BusFullError if full else BusError)(f"sending failed: {text}")
 
 
+def _interface_options(options: Mapping[str, object]) -> dict[str, object]:
+    """Options of an interface, with the objects that a file can only describe.
+
+    python-can makes them too, but only together with the settings of the user and the environment.
+    """
+    found = dict(options)
+    state = found.get("state")
+    if isinstance(state, str):
+        if state not in _STATES:
+            raise BusError(f"bus.options.state {state!r}: expected one of {', '.join(_STATES)}")
+        found["state"] = _STATES[state]
+    for timing, keys in _TIMINGS.items():
+        if "timing" not in found and keys <= found.keys():
+            try:
+                found["timing"] = timing(**{key: found[key] for key in keys}, strict=False)
+            except (ValueError, TypeError) as error:
+                raise BusError(f"bus.options: expected a bit timing: {error}") from error
+    return found
+
+
 def open_bus(
     config: BusConfig, filters: frozenset[Filter] | None = None, *, listen_only: bool = False
 ) -> can.BusABC:
@@ -201,7 +232,7 @@ def open_bus(
     Raises:
         BusError: The interface cannot be opened.
     """
-    options: dict[str, object] = dict(config.options)
+    options = _interface_options(config.options)
     if listen_only:
         options |= _LISTEN_ONLY_OPTIONS.get(config.interface, {})
     if config.interface == "virtual":
@@ -221,7 +252,9 @@ def open_bus(
     try:
         bus: can.BusABC = cast("Any", can.Bus)(
             interface=config.interface,
-            channel=config.channel,
+            # Some interfaces know their channels by numbers alone, and none by digits in a text.
+            channel=int(config.channel) if config.channel.isdecimal() else config.channel,
+            ignore_config=True,  # settings of a user or an environment are in no log of a run
             bitrate=config.bitrate,
             can_filters=kernel_filters,
             **options,

@@ -1,6 +1,9 @@
 """A bus through python-can's `virtual` interface."""
 
+import json
+
 import can
+import can.util
 import pytest
 
 from can_dbc.addressing import Filter
@@ -119,3 +122,74 @@ def test_a_flood_of_foreign_identifiers_fills_no_memory(opened, peer):
             bus.receive()
     bus.receive()
     assert len(bus._accepted) <= 10_001
+
+
+OF_THE_USER = {"receive_own_messages": "True", "data_bitrate": "8000000"}
+"""Settings of python-can that a user's own files may hold, for other programs."""
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {"CAN_CONFIG": json.dumps(OF_THE_USER)},
+        {"CAN_CONFIG": "no JSON"},
+        {"CAN_INTERFACE": "nosuch", "CAN_CHANNEL": "other", "CAN_BITRATE": "5"},
+    ],
+)
+def test_the_environment_of_python_can_changes_no_bus(opened, monkeypatch, environment):
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    hears_only_the_other_one(opened(), opened())
+
+
+def test_the_files_of_python_can_change_no_bus(opened, monkeypatch, tmp_path):
+    path = tmp_path / "can.ini"
+    path.write_text("\n".join(["[default]", *map(" = ".join, OF_THE_USER.items())]))
+    monkeypatch.setattr(can.util, "CONFIG_FILES", [str(path)])
+    hears_only_the_other_one(opened(), opened())
+
+
+def hears_only_the_other_one(bus, other):
+    bus.send(Frame(1, 0x100, b"\1"))
+    other.send(Frame(2, 0x101, b"\2"))
+    assert bus.receive() == [Frame(2, 0x101, b"\2")]
+
+
+TIMING = {"f_clock": 8_000_000, "brp": 1, "tseg1": 11, "tseg2": 4, "sjw": 2, "nof_samples": 1}
+
+
+@pytest.mark.parametrize(
+    ("channel", "options", "expected"),
+    [
+        ("can0", {"serial": "0123"}, {"channel": "can0", "serial": "0123"}),
+        ("1", {}, {"channel": 1}),
+        ("can0", {"state": "PASSIVE"}, {"state": can.BusState.PASSIVE}),
+        ("can0", TIMING, {"timing": can.BitTiming(**TIMING)}),
+    ],
+)
+def test_an_interface_is_given_what_a_file_can_only_describe(
+    monkeypatch, channel, options, expected
+):
+    given = {}
+
+    class Recorded(can.interfaces.virtual.VirtualBus):
+        def __init__(self, channel, **others):
+            given.update(others, channel=channel)
+            super().__init__(channel)
+
+    monkeypatch.setattr(can.interfaces.virtual, "VirtualBus", Recorded)
+    Bus(BusConfig("virtual", channel, 500_000, options=options)).close()
+    assert {key: given[key] for key in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        ({"state": "LOUD"}, r"^bus\.options\.state 'LOUD': expected one of ACTIVE, .*$"),
+        (TIMING | {"brp": 0}, r"^bus\.options: expected a bit timing: .*$"),
+        (TIMING | {"brp": "few"}, r"^bus\.options: expected a bit timing: .*$"),
+    ],
+)
+def test_options_that_are_none_are_one_line(options, line):
+    with pytest.raises(BusError, match=line):
+        Bus(BusConfig("virtual", "x", 500_000, options=options))
