@@ -173,7 +173,7 @@ def query_command(
     as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Ask a store, in SQL (DuckDB).
+    """Ask a store, in SQL (DuckDB): one SELECT statement, which opens no other file.
 
     `runs` has a row a run, `effects` a row a parameter of the model (kind `model`) or of an effect
     that it lacks (`found`), `values` also the figures of `rig characterise` (`figure`).

@@ -4,7 +4,6 @@ import datetime
 import math
 import re
 from collections.abc import Mapping
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median_high
@@ -185,7 +184,7 @@ def read_overview(store: Path) -> Overview:
     Raises:
         InputError: There is none, or it cannot be read.
     """
-    with closing(connect(store)) as connection:
+    with connect(store) as connection:
         model, sha256, version = connection.execute(
             "SELECT model, model_sha256, version FROM runs ORDER BY written DESC LIMIT 1"
         ).fetchall()[0]

@@ -10,17 +10,16 @@ written twice all the same is counted once by the views.
 
 import contextlib
 import datetime
-import glob
 import hashlib
 import importlib
 import time
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any, cast
 from urllib.parse import quote
 
 import pyarrow as pa
-from pyarrow import dataset, parquet
+from pyarrow import dataset, fs, parquet
 
 from can_dbc.atomic_file import replacing
 from can_dbc.errors import InputError
@@ -53,15 +52,13 @@ _VALUE = pa.schema(
         ("part", _TEXT),
     ]
 )
+_PARTITION = pa.schema([("bench", _TEXT), ("date", _TEXT)])
 _VIEWS = """
-CREATE VIEW every_run AS
-    SELECT * FROM read_parquet({runs}, hive_partitioning = true, hive_types_autocast = false);
 CREATE VIEW runs AS SELECT * EXCLUDE (identity) FROM (
     SELECT * FROM every_run QUALIFY row_number() OVER (
         PARTITION BY source, model_sha256, version ORDER BY written DESC, part) = 1
 ) QUALIFY row_number() OVER (PARTITION BY key ORDER BY written, part) = 1;
-CREATE VIEW "values" AS SELECT v.* FROM
-    read_parquet({values}, hive_partitioning = true, hive_types_autocast = false) AS v
+CREATE VIEW "values" AS SELECT v.* FROM every_value AS v
     SEMI JOIN every_run ON v.key = every_run.key AND v.part = every_run.part
     SEMI JOIN runs ON v.key = runs.key
     QUALIFY dense_rank() OVER (PARTITION BY v.key ORDER BY v.part) = 1;
@@ -152,11 +149,14 @@ def _age_s(path: Path, now: float) -> float:
         return 0.0
 
 
-def connect(store: Path) -> Any:
-    """A DuckDB connection with the views `runs`, `values` and `effects`.
+@contextlib.contextmanager
+def connect(store: Path) -> Generator[Any]:
+    """A DuckDB connection with the views `runs`, `values` and `effects`, until the block ends.
+
+    It can open no file, not even to read: what is in the store is handed to it.
 
     Raises:
-        InputError: There is no store, or DuckDB is not installed.
+        InputError: There is no store, DuckDB is not installed, or it refuses what it is asked for.
     """
     if not any((store / "runs").rglob("*.parquet")):
         raise InputError(f"{store}: no runs in it, expected what `rig fleet SOURCE` wrote")
@@ -165,32 +165,44 @@ def connect(store: Path) -> Any:
             "the package duckdb is not installed, expected `pip install -e '.[fleet]'` in the "
             "clone of rig"
         )
-    connection = _duckdb.connect()
-    runs, values = (_quote(store / name / "**" / "*.parquet") for name in ("runs", "values"))
+    # A SELECT can write as well (`WITH a AS (COPY ... TO ...)`), and a folder that DuckDB may read
+    # (`allowed_directories`) is one that it may write.
+    connection = _duckdb.connect(config={"enable_external_access": False})
     try:
-        connection.execute(_VIEWS.format(runs=runs, values=values))
-    except _duckdb.Error as error:
+        connection.register("every_run", _open_parts(store / "runs", _RUN))
+        connection.register("every_value", _open_parts(store / "values", _VALUE))
+        connection.execute(_VIEWS)
+        connection.execute("SET lock_configuration = true")
+        yield connection
+    except (_duckdb.Error, pa.ArrowException, OSError) as error:
         raise InputError(f"{store}: {str(error).splitlines()[0]}") from error
-    return connection
+    finally:
+        connection.close()
 
 
-def _quote(path: Path) -> str:
-    text = glob.escape(str(path.parents[1])) + f"/{path.parent.name}/{path.name}"
-    return "'" + text.replace("'", "''") + "'"
+def _open_parts(folder: Path, schema: pa.Schema) -> dataset.Dataset:
+    """All parts in a folder of a store; bench and date are in their paths alone."""
+    # Below a root of their own: a folder above the store may be called `bench=...` too.
+    root = fs.SubTreeFileSystem(folder.absolute().as_posix(), fs.LocalFileSystem())
+    parts = [path.relative_to(folder).as_posix() for path in folder.rglob("*.parquet")]
+    return dataset.dataset(
+        parts,
+        schema=pa.schema([*schema, *_PARTITION]),
+        format="parquet",
+        filesystem=root,
+        partitioning=dataset.partitioning(_PARTITION, flavor="hive"),
+    )
 
 
 def query(store: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
-    """Names of columns, and rows, of a query over a store.
+    """Names of columns, and rows, of a query over a store, which it cannot change.
 
     Raises:
-        InputError: There is no store, or DuckDB refuses the query.
+        InputError: There is no store, or `sql` is not one SELECT that DuckDB accepts.
     """
-    with contextlib.closing(connect(store)) as connection:
-        try:
-            answer = connection.execute(sql)
-            if answer is None or answer.description is None:
-                raise InputError(f"{store}: {sql!r}: expected a query")
-            names = [item[0] for item in answer.description]
-            return names, answer.fetchall() if names else []
-        except _duckdb.Error as error:
-            raise InputError(f"{store}: {str(error).splitlines()[0]}") from error
+    with connect(store) as connection:
+        statements = connection.extract_statements(sql)
+        if [item.type for item in statements] != [_duckdb.StatementType.SELECT]:
+            raise InputError(f"{store}: {sql!r:.200}: expected one SELECT statement")
+        answer = connection.execute(statements[0])
+        return [item[0] for item in answer.description], answer.fetchall()

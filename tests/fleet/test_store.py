@@ -2,6 +2,7 @@
 
 import math
 import os
+import sys
 
 import duckdb
 import pandas as pd
@@ -9,8 +10,10 @@ import pyarrow.dataset as pad
 import pytest
 
 from can_dbc.errors import InputError
+from rig.cli.main import main
 from rig.fleet import store
 from rig.fleet.one_run import RunRow, RunValue
+from rig.fleet.overview import read_overview
 
 
 def row(number, *, bench="b", date="2026-01-05", error="", values=1):
@@ -128,3 +131,86 @@ def test_what_is_no_store_is_said(tmp_path):
         store.query(tmp_path, "SELECT * FROM runs")
     with pytest.raises(InputError):
         store.read_runs(tmp_path)
+
+
+PART = "store/runs/bench=b/date=2026-01-05/own.parquet"
+ONE_SELECT = "expected one SELECT statement"
+NO_FILES = "file system operations are disabled"
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("sql", "reason"),
+    [
+        ("COPY runs TO 'out.csv'", ONE_SELECT),
+        (f"COPY (SELECT 1) TO '{PART}'", ONE_SELECT),
+        ("WITH a AS (COPY (SELECT 1) TO 'out.csv') SELECT * FROM a", NO_FILES),
+        (f"WITH a AS (COPY (SELECT 1) TO '{PART}') SELECT * FROM a", NO_FILES),
+        ("EXPORT DATABASE 'out'", ONE_SELECT),
+        ("ATTACH 'out.db'", ONE_SELECT),
+        ("INSTALL httpfs", ONE_SELECT),
+        ("LOAD httpfs", ONE_SELECT),
+        ("CREATE TABLE a AS SELECT 1", ONE_SELECT),
+        ("SET enable_external_access = true", ONE_SELECT),
+        ("PRAGMA version", ONE_SELECT),
+        ("CALL enable_logging(storage := 'file', storage_path := 'out')", ONE_SELECT),
+        ("FROM enable_logging(storage := 'file', storage_path := 'out')", "locked"),
+        ("SELECT 1; SELECT 2", ONE_SELECT),
+        (f"SELECT 1; COPY (SELECT 1) TO '{PART}'", ONE_SELECT),
+        ("", ONE_SELECT),
+        ("SELECT * FROM read_csv('/etc/passwd')", NO_FILES),
+        ("SELECT * FROM read_text('/etc/passwd')", NO_FILES),
+        ("SELECT * FROM '/etc/passwd.csv'", "passwd"),
+        ("SELECT * FROM glob('/etc/*')", NO_FILES),
+        ("SELECT * FROM sql", "sql does not exist"),  # a variable of rig itself
+    ],
+)
+def test_a_query_reads_the_store_and_nothing_else(tmp_path, monkeypatch, capsys, sql, reason):
+    store.append(tmp_path / "store", [row(1)])
+    before = contents(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["rig", "fleet", "query", "store", sql])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = capsys.readouterr()
+    assert ended.value.code == 2
+    assert said.out == ""
+    assert said.err.startswith("rig: store: ")
+    assert reason in said.err
+    assert len(said.err.splitlines()) == 1
+    assert contents(tmp_path) == before
+    assert {path.name for path in tmp_path.iterdir()} == {"store"}
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "SELECT key, bench, date FROM runs",
+        "-- the runs\nSELECT key, bench, date FROM runs;",
+        "WITH own AS (SELECT * FROM runs) SELECT key, bench, date FROM own",
+        "FROM (SELECT key, bench, date FROM runs)",
+    ],
+)
+def test_a_query_is_any_one_select(tmp_path, sql):
+    store.append(tmp_path, [row(1)])
+    assert store.query(tmp_path, sql) == (["key", "bench", "date"], [("key1", "b", "2026-01-05")])
+
+
+def test_a_store_below_a_folder_that_is_called_like_a_partition(tmp_path):
+    folder = tmp_path / "bench=other" / "store"
+    store.append(folder, [row(1)])
+    assert store.query(folder, "SELECT bench FROM effects")[1] == [("b",)]
+
+
+def test_a_damaged_part_is_one_line_in_a_report_too(tmp_path):
+    store.append(tmp_path, [row(1)])
+    store.append(tmp_path, [row(2, bench="c")])
+    for path in (tmp_path / "runs" / "bench=c").rglob("*.parquet"):
+        path.write_bytes(b"nothing of the kind")
+    for read in (read_overview, lambda folder: store.query(folder, "SELECT * FROM runs")):
+        with pytest.raises(InputError) as caught:
+            read(tmp_path)
+        assert "\n" not in str(caught.value)
