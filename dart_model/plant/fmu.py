@@ -12,9 +12,11 @@ import ctypes
 import importlib.util
 import io
 import math
+import re
 import shutil
 import tempfile
 import weakref
+import zipfile
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -28,6 +30,8 @@ _Doubles = ctypes.Array[ctypes.c_double]
 
 _MOST_ITERATIONS = 20
 """Most event iterations at one time."""
+_INTERFACES = ("modelExchange", "coSimulation", "scheduledExecution")
+_C_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _MESSAGES = 3
 """Most recent messages of an FMU that an error contains."""
 
@@ -264,7 +268,7 @@ def read_description(content: bytes, path: Path) -> Any:
     """Description of an FMU, as FMPy reads it; nothing of it is executed.
 
     Raises:
-        ModelError: It is no FMU, or FMPy is not installed.
+        ModelError: It is no FMU, names files outside its own folder, or FMPy is not installed.
     """
     if importlib.util.find_spec("fmpy") is None:
         raise ModelError(
@@ -278,9 +282,30 @@ def read_description(content: bytes, path: Path) -> Any:
     except Exception as error:  # of any library that a hostile archive may upset
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ModelError(f"{path}: is no FMU of FMI 2.0 or 3.0 ({reason[:200]})") from error
+    _refuse_outside(content, path, description)
     if any(item.variable.derivative is None for item in description.derivatives):
         raise ModelError(f"{path}: a derivative without a state, expected the state that it is of")
     return description
+
+
+def _refuse_outside(content: bytes, path: Path, description: Any) -> None:
+    """Refuse an FMU that names a place outside its own folder.
+
+    A library would be loaded from there, while what was admitted is the content of the archive.
+    """
+    offered = [getattr(description, interface) for interface in _INTERFACES]
+    for identifier in [item.modelIdentifier or "" for item in offered if item is not None]:
+        if not _C_IDENTIFIER.fullmatch(identifier):
+            raise ModelError(
+                f"{path}: modelDescription.xml: modelIdentifier {identifier!r:.200}: expected a C "
+                "identifier, as FMI does: letters, digits and _"
+            )
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        for name in archive.namelist():
+            if name.startswith("/") or "\\" in name or ":" in name or ".." in name.split("/"):
+                raise ModelError(
+                    f"{path}: {name!r:.200}: expected files in the folder of the FMU alone"
+                )
 
 
 def _refuse_unfit(

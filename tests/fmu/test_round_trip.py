@@ -1,7 +1,9 @@
 """A model that is an FMU: bench, diagnosis, FMU, and the same bench again."""
 
+import dataclasses
 import tempfile
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -201,6 +203,14 @@ def changed(path, out, changes):
     return out
 
 
+@pytest.fixture(scope="module")
+def fmu(tmp_path_factory):
+    """A strut called `it`, of FMI 2.0."""
+    spec = with_effects("none")
+    component = dataclasses.replace(strut_component(spec, spec.struts[0]), identifier="it")
+    return written(tmp_path_factory.mktemp("fmu"), component, "2.0", spec)
+
+
 def test_a_model_file_alone_makes_no_program_run(tmp_path, monkeypatch):
     """Another user, or another machine: the FMU has to be imported there, by hand."""
     spec = with_effects("none")
@@ -237,6 +247,59 @@ def test_what_cannot_be_a_model_is_said(tmp_path, version, changes, line):
     with pytest.raises(InputError, match=line):
         import_fmu(changed(path, tmp_path / "it.fmu", changes), None, 10.0, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+@pytest.mark.parametrize("is_absolute", [False, True])
+def test_no_library_from_outside_the_archive_is_loaded(tmp_path, monkeypatch, version, is_absolute):
+    """A library that does what is wanted, at a place of which a foreign file can know."""
+    spec = with_effects("none")
+    component = bench_component(spec)
+    path = written(tmp_path, component, version, spec)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # where the FMU is extracted
+    with zipfile.ZipFile(path) as archive:
+        (name,) = [name for name in archive.namelist() if name.startswith("binaries/")]
+        library = tmp_path / f"outside{Path(name).suffix}"
+        library.write_bytes(archive.read(name))
+    outside = str(library.with_suffix("")) if is_absolute else "../../../outside"
+    changes = {f'modelIdentifier="{component.identifier}"': f'modelIdentifier="{outside}"'}
+    foreign = changed(path, tmp_path / "it.fmu", changes)
+    with pytest.raises(InputError, match=f"modelIdentifier '{outside}': expected a C identifier"):
+        import_fmu(foreign, None, None, tmp_path / "out")
+    with pytest.raises(InputError, match="not imported on this machine"):
+        require_admission(foreign.read_bytes(), foreign)
+
+
+@pytest.mark.parametrize("interface", ["ModelExchange", "CoSimulation"])
+@pytest.mark.parametrize(
+    "identifier", ["../it", "a/b", "a\\b", "/it", "C:it", "..", "", " it", "it ", "1t", "ït", "i-t"]
+)
+def test_an_identifier_is_one_of_c_in_every_interface(fmu, tmp_path, interface, identifier):
+    old, new = (f'<{interface} modelIdentifier="{name}"' for name in ("it", identifier))
+    foreign = changed(fmu, tmp_path / "it.fmu", {old: new})
+    with pytest.raises(InputError, match="expected a C identifier") as caught:
+        import_fmu(foreign, None, 10.0, tmp_path / "out")
+    assert "\n" not in str(caught.value)
+
+
+def test_an_identifier_with_a_zero_byte_is_no_description(fmu, tmp_path):
+    old, new = (f'modelIdentifier="{name}"' for name in ("it", "it\0"))
+    with pytest.raises(InputError, match="is no FMU"):
+        import_fmu(changed(fmu, tmp_path / "it.fmu", {old: new}), None, 10.0, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    "name", ["../outside", "binaries/../../outside", "/outside", "a\\..\\outside", "C:outside"]
+)
+def test_no_member_of_the_archive_is_written_outside(fmu, tmp_path, monkeypatch, name):
+    foreign = tmp_path / "foreign.fmu"
+    foreign.write_bytes(fmu.read_bytes())
+    with zipfile.ZipFile(foreign, "a") as archive:
+        archive.writestr(name, "")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(InputError, match="outside': expected files in the folder of the FMU"):
+        import_fmu(foreign, None, 10.0, tmp_path / "out")
+    assert {path.name for path in tmp_path.iterdir()} == {"foreign.fmu"}
 
 
 @pytest.mark.parametrize("content", [b"", b"PK", b"no archive at all", bytes(range(256)) * 9])
