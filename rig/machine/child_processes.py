@@ -1,7 +1,8 @@
 """Processes of Python that rig starts.
 
-Whoever wrote the files of the working directory, of which a configuration may be one, has no say in
-them: Python would otherwise take modules from there (a `yaml.py`, a `pickle.py`) before its own.
+They import nothing from the working directory, whose files may come with a configuration from
+elsewhere: Python would otherwise take modules from there (a `yaml.py`, a `pickle.py`) before its
+own.
 """
 
 import multiprocessing
