@@ -133,7 +133,8 @@ def _joint(body: BodySpec, skeleton: object) -> tuple[Callable[..., Any], object
 
 
 def _read_skeleton(spec: FileSkeleton, folder: Path) -> DartSkeleton:
-    path = (folder / spec.file).resolve()
+    # Not behind a link: what the file includes is beside it, also where it was copied to.
+    path = (folder / spec.file).absolute()
     if not path.is_file():
         raise ModelError(f"{path}: skeleton.file: no such file, expected URDF, SDF, SKEL or MJCF")
     suffix = path.suffix.lower()

@@ -156,21 +156,28 @@ def read_header(folder: Path) -> RunHeader:
 def find_changed_files(folder: Path) -> list[str]:
     """Names of a run's files that differ from those it ran with, by their hashes in `run.yaml`.
 
+    A run of before 0.3 has no hashes of the files that its model names.
+
     Raises:
-        LogError: A file cannot be read.
+        LogError: A file cannot be read, or is none of the run's folder.
     """
     recorded = read_run(folder).header.get("files_sha256")
     if not isinstance(recorded, dict):
         return []
     changed: list[str] = []
-    for name, expected in cast("dict[object, object]", recorded).items():
-        path = folder / Path(str(name)).name
+    for key, expected in cast("dict[object, object]", recorded).items():
+        name = str(key)
+        path = folder / name
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise LogError(
+                f"{folder / RUN_FILE}: files_sha256: {name[:100]!r}: expected a file in the folder"
+            )
         try:
             sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         except OSError as error:
             raise LogError(f"{path}: cannot be read: {error.strerror}") from error
         if sha256 != expected:
-            changed.append(path.name)
+            changed.append(name)
     return changed
 
 

@@ -15,7 +15,7 @@ from typing import cast
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from dart_model.spec import copy_files, dump_model
+from dart_model.spec import copy_files, dump_model, files_of
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
 from rig.bridge.values import Mode
 from rig.bus.link import LinkFigures
@@ -239,7 +239,7 @@ def _header(
 ) -> RunHeader:
     files = {
         name: hashlib.sha256((folder / name).read_bytes()).hexdigest()
-        for name in (MODEL_FILE, DBC_FILE)
+        for name in (MODEL_FILE, DBC_FILE, *files_of(plan.model))
     }
     header: RunHeader = {
         "schema": RUN_SCHEMA,
