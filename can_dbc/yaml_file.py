@@ -14,6 +14,10 @@ from can_dbc.errors import FileError
 _MAX_BYTES = 4 * 1024 * 1024
 """Largest file; a model with a thousand struts has a tenth of it."""
 
+_TEXT, _INT, _FLOAT = (f"tag:yaml.org,2002:{name}" for name in ("str", "int", "float"))
+_INTEGER = re.compile(r"[-+]?(?:0[bx])?[0-9a-fA-F]{1,40}")
+"""Integers up to twice as long as any of 64 bits; Python writes none of more than 4300 digits."""
+
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
@@ -40,6 +44,31 @@ class _PlainLoader(yaml.SafeLoader):
             )
         return super().compose_node(parent, index)
 
+    def resolve(
+        self, kind: type[yaml.Node], value: str | None, implicit: tuple[bool, bool] | bool
+    ) -> str:
+        tag = str(cast("Any", super()).resolve(kind, value, implicit))
+        # To YAML 1.1, 1:30 is 90: base 60, in a time that grows with the square of its length.
+        return _TEXT if tag in (_INT, _FLOAT) and ":" in (value or "") else tag
+
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+        text = str(self.construct_scalar(node))
+        if not _INTEGER.fullmatch(text.replace("_", "")):
+            raise yaml.MarkedYAMLError(
+                problem=f"{text[:40]!r}: expected an integer of at most 40 digits",
+                problem_mark=node.start_mark,
+            )
+        return int(super().construct_yaml_int(node))
+
+    def construct_yaml_float(self, node: yaml.ScalarNode) -> float:
+        text = str(self.construct_scalar(node))
+        if ":" in text:
+            raise yaml.MarkedYAMLError(
+                problem=f"{text[:40]!r}: expected a number without colons",
+                problem_mark=node.start_mark,
+            )
+        return float(super().construct_yaml_float(node))
+
     def construct_mapping(
         self, node: yaml.MappingNode, deep: bool = False
     ) -> dict[Hashable, object]:
@@ -55,6 +84,8 @@ class _PlainLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+_PlainLoader.add_constructor(_INT, _PlainLoader.construct_yaml_int)
+_PlainLoader.add_constructor(_FLOAT, _PlainLoader.construct_yaml_float)
 # YAML 1.1 reads 1e5, without a point, as text.
 cast("Any", _PlainLoader).add_implicit_resolver(
     "tag:yaml.org,2002:float",

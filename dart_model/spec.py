@@ -25,6 +25,7 @@ from pydantic_core import PydanticCustomError
 from can_dbc.yaml_file import Finite, NotNegative, Positive, parse_mapping, read_text, validate
 from dart_model.effects import CATALOGUE, effect
 from dart_model.errors import ModelError
+from dart_model.skeleton_file import included_files
 
 MODELS = Path(__file__).parent / "models"
 """Folder of the models that come with the package."""
@@ -379,17 +380,27 @@ def dump_model(spec: ModelSpec) -> str:
 
 
 def files_of(spec: ModelSpec) -> list[str]:
-    """Files that a model names, from its folder on: skeleton and FMUs."""
-    files = [strut.fmu.file for strut in spec.struts if strut.fmu is not None]
+    """Files that a model needs, from its folder on: skeleton, what that includes, and FMUs.
+
+    Raises:
+        FileError: A skeleton file cannot be read.
+        ModelError: What it includes is wrong.
+    """
+    files: list[str] = []
     if isinstance(spec.skeleton, FileSkeleton):
-        files.insert(0, spec.skeleton.file)
+        name = spec.skeleton.file
+        included = included_files(spec.folder / name)
+        files += [name, *(str(Path(name).parent / other) for other in included)]
+    files += [strut.fmu.file for strut in spec.struts if strut.fmu is not None]
     return list(dict.fromkeys(files))
 
 
 def copy_files(spec: ModelSpec, folder: Path) -> None:
-    """Copy the files that a model names to where `dump_model`'s text will look for them.
+    """Copy the files that a model needs to where `dump_model`'s text will look for them.
 
     Raises:
+        FileError: A skeleton file cannot be read.
+        ModelError: What it includes is wrong.
         OSError: The folder cannot be written.
     """
     for name in files_of(spec):

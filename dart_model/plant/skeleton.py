@@ -10,6 +10,7 @@ import numpy as np
 from dart_model.effects import effect
 from dart_model.errors import ModelError
 from dart_model.plant.dart_types import DartBody, DartSkeleton
+from dart_model.skeleton_file import MJCF_SUFFIXES, refuse_endless
 from dart_model.spec import WORLD, BodySpec, FileSkeleton, InlineSkeleton, ModelSpec
 
 # dartpy ships no types: it is untyped in this module, and nowhere else.
@@ -56,6 +57,7 @@ def build(spec: ModelSpec) -> Skeleton:
     dart.setGravity([0.0, 0.0, -spec.gravity_m_per_s2])
     dart.setTimeStep(_INSTANT_S)
     _add_masses(spec, bodies)
+    _refuse_singular_mass(spec, dart)
     return Skeleton(dart, bodies, bodies[_loaded_body_name(spec, bodies)])
 
 
@@ -73,6 +75,17 @@ def _add_masses(spec: ModelSpec, bodies: dict[str, DartBody]) -> None:
                     f"a mass of {mass} kg, expected more than zero"
                 )
             bodies[end].setMass(mass)
+
+
+def _refuse_singular_mass(spec: ModelSpec, dart: DartSkeleton) -> None:
+    """Refuse a skeleton that moves without inertia: DART reads a mass that is no number as 0."""
+    try:
+        np.linalg.cholesky(dart.getMassMatrix())
+    except np.linalg.LinAlgError:
+        raise ModelError(
+            f"model {spec.name}: skeleton: a joint moves no mass, expected axes that are not zero "
+            "and bodies with mass and moments of inertia"
+        ) from None
 
 
 def _loaded_body_name(spec: ModelSpec, bodies: dict[str, DartBody]) -> str:
@@ -120,20 +133,25 @@ def _joint(body: BodySpec, skeleton: object) -> tuple[Callable[..., Any], object
 
 
 def _read_skeleton(spec: FileSkeleton, folder: Path) -> DartSkeleton:
-    path = (folder / spec.file).resolve()
+    # Not behind a link: what the file includes is beside it, also where it was copied to.
+    path = (folder / spec.file).absolute()
     if not path.is_file():
         raise ModelError(f"{path}: skeleton.file: no such file, expected URDF, SDF, SKEL or MJCF")
     suffix = path.suffix.lower()
     if suffix not in _PARSERS:
         raise ModelError(f"{path}: suffix {suffix!r}: expected {', '.join(_PARSERS)}")
+    refuse_endless(path)
     try:
         skeleton = _PARSERS[suffix](str(path))
-    except RuntimeError as error:
+    except _OF_THE_PARSERS as error:
         reason = " ".join(str(error).split())[:200]
-        raise ModelError(f"{path}: DART cannot read it: {reason}") from error
+        raise ModelError(
+            f"{path}: DART cannot read it ({reason}), expected a valid {suffix} file, whose values "
+            "are numbers where they should be"
+        ) from error
     if skeleton is None:
         raise ModelError(f"{path}: DART reads no skeleton from it, expected a valid {suffix} file")
-    if suffix in _MJCF:
+    if suffix in MJCF_SUFFIXES:
         _refuse_bodies_without_shape(skeleton, path)
     return skeleton
 
@@ -151,16 +169,18 @@ def _first_skeleton(world: Any) -> DartSkeleton | None:
     return world.getSkeleton(0) if world is not None and world.getNumSkeletons() > 0 else None
 
 
-_MJCF = (".xml", ".mjcf")
-
-
 _PARSERS: dict[str, Callable[[str], DartSkeleton | None]] = {
     ".urdf": _read_urdf,
     ".sdf": _dart.utils.SdfParser.readSkeleton,
     ".skel": lambda uri: _first_skeleton(_dart.utils.SkelParser.readWorld(uri)),
-    **dict.fromkeys(_MJCF, lambda uri: _first_skeleton(_dart.utils.MjcfParser.readWorld(uri))),
+    **dict.fromkeys(
+        MJCF_SUFFIXES, lambda uri: _first_skeleton(_dart.utils.MjcfParser.readWorld(uri))
+    ),
 }
 """DART's parser for each suffix."""
+
+_OF_THE_PARSERS = (RuntimeError, ValueError, LookupError, ArithmeticError, MemoryError)
+"""What exceptions of C++ become: of a word that is no number, and of a number out of range."""
 
 
 def _refuse_bodies_without_shape(skeleton: DartSkeleton, path: Path) -> None:

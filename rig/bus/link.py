@@ -41,7 +41,8 @@ class LinkFigures:
         warnings: Times the controller reached its warning limit.
         passive: Times it became error-passive.
         unauthentic: Frames refused because no fresh value fits their authenticator.
-        replayed: Frames refused because their freshness value is not newer than the last one.
+        replayed: Frames refused because their freshness value is not newer than the last one, or
+            too far from the own clock.
         gaps: Times without an interface, at most the first 1000.
     """
 

@@ -3,7 +3,9 @@
 Behind the payload stand the low bits of a freshness value and the high bits of a CMAC (AES-128)
 over data id, payload and whole freshness value. The freshness value is the sender's Unix time in
 units of 0.1 ms, and more than the last one in any case: it needs no memory across restarts, and a
-repeated frame is refused. A refused frame reaches no decoder.
+repeated frame is refused. So is one that is too old by the receiver's own clock, however slowly it
+became so: whoever holds frames back by more and more makes the sender's clock look slow. A refused
+frame reaches no decoder.
 
 References: AUTOSAR, "Specification of Secure Onboard Communication" (profile 1, 24Bit-CMAC-8Bit-FV,
 is the default); RFC 4493, "The AES-CMAC Algorithm".
@@ -29,6 +31,9 @@ FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 _FRESHNESS_UNIT_NS = 100_000
 _FRESHNESS_BYTES = 8
 _KEY_BYTES = 16
+_MOST_CANDIDATES = 64
+"""Freshness values that are tried about one clock: each costs a CMAC, and is a chance to forge."""
+
 _LARGEST_KEY_FILE = 1000
 
 
@@ -41,13 +46,14 @@ class Authentication:
     """How frames are authenticated.
 
     No log and no error contains the key, 16 bytes. The tolerance is how far the clocks of two
-    senders may be apart.
+    senders may be apart at first, and `max_age_ns` how far a frame's may ever be from one's own.
     """
 
     key: bytes = field(repr=False)
     freshness_bytes: int
     mac_bytes: int
     tolerance_ns: int
+    max_age_ns: int = 1_000_000_000
 
     @property
     def trailer_bytes(self) -> int:
@@ -64,6 +70,8 @@ class AuthenticationSettings(BaseModel):
         mac_bits: Bits of the CMAC in a frame.
         clock_tolerance_s: How far bench's and bridge's clocks may be apart. A frame that was
             recorded longer ago is refused also by a bridge that has just been started.
+        max_age_s: How old a frame may be by the bridge's own clock, or ahead of it, during the
+            whole run; never less than the tolerance. Clocks that drift apart need it.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -72,20 +80,30 @@ class AuthenticationSettings(BaseModel):
     freshness_bits: Literal[8, 16, 24, 32] = 8
     mac_bits: Literal[24, 32, 40, 48, 56, 64, 96, 128] = 24
     clock_tolerance_s: Annotated[float, Field(ge=0.001, le=10.0, allow_inf_nan=False)] = 0.1
+    max_age_s: Annotated[float, Field(ge=0.001, le=60.0, allow_inf_nan=False)] = 1.0
 
-    def load(self, folder: Path) -> Authentication:
-        """Authentication with the key of a file in the configuration's folder.
+    def load(self, source: Path) -> Authentication:
+        """Authentication with the key of a file in the folder of the configuration `source`.
 
         Raises:
             FileError: The file cannot be read.
-            AuthenticationError: It contains no key.
+            AuthenticationError: It contains no key, or a frame could have too many freshness
+                values.
         """
         tolerance_ns = round(self.clock_tolerance_s * 1e9)
+        most_ns = (_MOST_CANDIDATES << self.freshness_bits) * _FRESHNESS_UNIT_NS // 2
+        if tolerance_ns > most_ns:
+            raise AuthenticationError(
+                f"{source}: authentication.clock_tolerance_s: {self.clock_tolerance_s:g}: expected "
+                f"at most {most_ns * 1e-9:.2g} with {self.freshness_bits} bits of freshness, or "
+                "more freshness_bits"
+            )
         return Authentication(
-            read_key(folder / self.key_file),
+            read_key(source.parent / self.key_file),
             self.freshness_bits // 8,
             self.mac_bits // 8,
             tolerance_ns,
+            max(round(self.max_age_s * 1e9), tolerance_ns),
         )
 
     @property
@@ -155,7 +173,8 @@ class Authenticator:
         self.unauthentic = 0
         """Frames refused because no fresh value fits their CMAC."""
         self.replayed = 0
-        """Frames refused because their freshness value is not newer than the last one."""
+        """Frames refused because their freshness value is not newer than the last one, or too far
+        from the own clock."""
         self._how = how
         self._epoch_ns = epoch_ns
         self._cmac = cmac(how.key)
@@ -191,7 +210,7 @@ class Authenticator:
         last = self._received.get(frame.arbitration_id)
         for freshness in self._possible(last, frame.t_ns, low) if end >= 0 else ():
             if hmac.compare_digest(self._mac(frame, payload, freshness), received):
-                if last is not None and freshness <= last.freshness:
+                if self._is_old(freshness, last, frame.t_ns):
                     self.replayed += 1
                     return None
                 self._received[frame.arbitration_id] = _Received(freshness, frame.t_ns)
@@ -199,17 +218,34 @@ class Authenticator:
         self.unauthentic += 1
         return None
 
+    def _is_old(self, freshness: int, last: _Received | None, t_ns: int) -> bool:
+        """Whether an authentic frame is no news, or by the own clock none of its time."""
+        distance_ns = abs(freshness - self._time(t_ns)) * _FRESHNESS_UNIT_NS
+        is_repeated = last is not None and freshness <= last.freshness
+        return is_repeated or distance_ns > self._how.max_age_ns
+
     def _possible(self, last: _Received | None, t_ns: int, low: bytes) -> Iterator[int]:
         """Whole freshness values that a frame may have, the likeliest first.
 
-        They lie about the own clock before the first frame, then about the sender's clock, which
-        runs on from the last frame.
+        They lie about the sender's clock, which runs on from the last frame, and about the own one:
+        alone before the first frame, and for a sender whose clock was set.
         """
-        modulus = 1 << 8 * self._how.freshness_bytes
-        if last is None:
-            expected = self._time(t_ns)
+        own = self._time(t_ns)
+        if last is not None:
+            sender = last.freshness + (t_ns - last.t_ns) // _FRESHNESS_UNIT_NS
+            yield from self._about(sender, low)
+            tolerance = self._how.tolerance_ns // _FRESHNESS_UNIT_NS
+            yield from (
+                freshness
+                for freshness in self._about(own, low)
+                if abs(freshness - sender) > tolerance
+            )
         else:
-            expected = last.freshness + (t_ns - last.t_ns) // _FRESHNESS_UNIT_NS
+            yield from self._about(own, low)
+
+    def _about(self, expected: int, low: bytes) -> Iterator[int]:
+        """Freshness values with these low bits about a time, the nearest first."""
+        modulus = 1 << 8 * self._how.freshness_bytes
         tolerance = self._how.tolerance_ns // _FRESHNESS_UNIT_NS
         ahead = (int.from_bytes(low, "big") - expected + modulus // 2) % modulus - modulus // 2
         nearest = expected + ahead

@@ -10,7 +10,8 @@
     trace.arrow     parts of its late ticks, if they were traced
     captures/       windows around its faults, each a run folder
 
-Where a run was rotated, `frames.0001.log` and `steps.0001.arrow` follow, and so on.
+Where a run was rotated, `frames.0001.log` and `steps.0001.arrow` follow, and so on; after 9999
+comes 10000.
 """
 
 from pathlib import Path
@@ -24,7 +25,13 @@ CAPTURES_FOLDER = "captures"
 def parts(folder: Path, name: str) -> list[Path]:
     """A file of a run and what it was continued in, in their order."""
     stem, _, ending = name.partition(".")
-    return [folder / name, *sorted(folder.glob(f"{stem}.[0-9][0-9][0-9][0-9].{ending}"))]
+    numbered = {
+        int(number): path
+        for path in folder.glob(f"{stem}.*.{ending}")
+        if (number := path.name[len(stem) + 1 : -len(ending) - 1]).isdecimal()
+        and path.name == part_name(name, int(number))
+    }
+    return [folder / name, *(numbered[number] for number in sorted(numbered))]
 
 
 def part_name(name: str, number: int) -> str:

@@ -22,6 +22,9 @@ from rig.log.step_columns import step_schema
 _TAIL_BYTES = 4096
 """More than the longest line of `frames.log`."""
 
+_MOST_MAPPED = 10_000
+"""Parts of a run's steps that are mapped into memory: Linux lets a process map 65 530 files."""
+
 RUN_SCHEMA = 2
 """Version of the folder's layout, in `run.yaml`."""
 
@@ -153,21 +156,28 @@ def read_header(folder: Path) -> RunHeader:
 def find_changed_files(folder: Path) -> list[str]:
     """Names of a run's files that differ from those it ran with, by their hashes in `run.yaml`.
 
+    A run of before 0.3 has no hashes of the files that its model names.
+
     Raises:
-        LogError: A file cannot be read.
+        LogError: A file cannot be read, or is none of the run's folder.
     """
     recorded = read_run(folder).header.get("files_sha256")
     if not isinstance(recorded, dict):
         return []
     changed: list[str] = []
-    for name, expected in cast("dict[object, object]", recorded).items():
-        path = folder / Path(str(name)).name
+    for key, expected in cast("dict[object, object]", recorded).items():
+        name = str(key)
+        path = folder / name
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise LogError(
+                f"{folder / RUN_FILE}: files_sha256: {name[:100]!r}: expected a file in the folder"
+            )
         try:
             sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         except OSError as error:
             raise LogError(f"{path}: cannot be read: {error.strerror}") from error
         if sha256 != expected:
-            changed.append(path.name)
+            changed.append(name)
     return changed
 
 
@@ -191,7 +201,9 @@ def last_frame_ns(folder: Path, epoch_ns: int) -> int:
 
 
 def _read_steps(paths: list[Path]) -> pa.Table:
-    tables = [_read_part(path) for path in paths]
+    tables = [
+        _read_part(path, is_mapped=number < _MOST_MAPPED) for number, path in enumerate(paths)
+    ]
     first = tables[0]
     for path, table in zip(paths, tables, strict=True):
         if table.num_rows and table.schema != first.schema:
@@ -199,10 +211,10 @@ def _read_steps(paths: list[Path]) -> pa.Table:
     return pa.concat_tables([first, *[table for table in tables[1:] if table.num_rows]])
 
 
-def _read_part(path: Path) -> pa.Table:
+def _read_part(path: Path, *, is_mapped: bool) -> pa.Table:
     batches: list[pa.RecordBatch] = []
     try:
-        with pa.memory_map(str(path)) as source:
+        with pa.memory_map(str(path)) if is_mapped else pa.OSFile(str(path), "r") as source:
             if source.size() < _schema_bytes(bytes(source.read(8))):
                 return step_schema().empty_table()
             source.seek(0)

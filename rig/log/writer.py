@@ -22,7 +22,7 @@ from can_dbc.frame import Frame
 from rig.log.candump import format_frame
 from rig.log.captures import Capture, Captures, CaptureWindow, Entry
 from rig.log.errors import LogError
-from rig.log.file_names import CAPTURES_FOLDER, DBC_FILE, MODEL_FILE, RUN_FILE
+from rig.log.file_names import CAPTURES_FOLDER, RUN_FILE
 from rig.log.reader import RunHeader
 from rig.log.rotation import Part, Rotation
 from rig.log.step_columns import Step, StepRows
@@ -325,9 +325,9 @@ class RunWriter:
                 rows.clear()
                 self._give_way()
             part.close()
-            for name in (MODEL_FILE, DBC_FILE):
-                if (self.folder / name).exists():
-                    shutil.copyfile(self.folder / name, folder / name)
+            for name in self._header.get("files_sha256", {}):
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(self.folder / name, folder / name)
             _write_yaml(folder / RUN_FILE, header)
         except OSError as error:
             self._set_fault(f"capture {folder.name}: {error.strerror}")

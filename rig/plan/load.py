@@ -36,7 +36,7 @@ def load_plan(path: Path, *, model: str | None = None, duration_s: float | None 
     settings = config.authentication
     if settings is None:
         return plan
-    return replace(plan, authentication=settings.load(path.parent))
+    return replace(plan, authentication=settings.load(path))
 
 
 def plan_of_run(folder: Path) -> Plan:

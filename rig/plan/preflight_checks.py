@@ -172,7 +172,8 @@ def _authentication(plan: Plan) -> list[Finding]:
         return []
     text = (
         f"AES-128 CMAC, {settings.mac_bits} bits, freshness {settings.freshness_bits} bits, "
-        f"clocks within {settings.clock_tolerance_s:g} s"
+        f"clocks within {settings.clock_tolerance_s:g} s, no frame older than "
+        f"{max(settings.max_age_s, settings.clock_tolerance_s):g} s"
     )
     path = plan.source.parent / settings.key_file
     is_loaded = plan.authentication is not None

@@ -14,11 +14,11 @@ from typing import cast
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from dart_model.spec import copy_files, dump_model
+from dart_model.spec import copy_files, dump_model, files_of
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
 from rig.bridge.values import Mode
 from rig.bus.link import LinkFigures
-from rig.files.folders import refuse_full
+from rig.files.folders import claim
 from rig.log.file_names import CHANGES_FILE, DBC_FILE, HISTOGRAMS_FILE, MODEL_FILE
 from rig.log.reader import RUN_SCHEMA, ConfigEntry, RunHeader
 from rig.log.step_columns import LogColumns, Step
@@ -102,11 +102,12 @@ def run_logged(
     """Run on a port and log it; parts of late ticks are kept in `trace`.
 
     Raises:
-        InputError: The folder cannot be written.
+        InputError: The folder is not empty, another run is beginning in it, or it cannot be
+            written.
     """
-    refuse_full(folder)
-    _copy_inputs(plan, folder)
-    running = _LoggedRun(plan, bridge, endpoint, folder, control)
+    with claim(folder):
+        _copy_inputs(plan, folder)
+        running = _LoggedRun(plan, bridge, endpoint, folder, control)
     try:
         endpoint.begin()
         running.run(trace)
@@ -239,7 +240,7 @@ def _header(
 ) -> RunHeader:
     files = {
         name: hashlib.sha256((folder / name).read_bytes()).hexdigest()
-        for name in (MODEL_FILE, DBC_FILE)
+        for name in (MODEL_FILE, DBC_FILE, *files_of(plan.model))
     }
     header: RunHeader = {
         "schema": RUN_SCHEMA,
@@ -261,7 +262,6 @@ def _header(
 
 def _copy_inputs(plan: Plan, folder: Path) -> None:
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         (folder / MODEL_FILE).write_text(dump_model(plan.model), "utf-8")
         shutil.copyfile(plan.database.path, folder / DBC_FILE)
         copy_files(plan.model, folder)

@@ -34,7 +34,7 @@ from rig.sensors.canopen_device import (
     SYNC_PERIOD,
     TRANSMISSION,
 )
-from rig.sensors.canopen_profiles import ENCODER
+from rig.sensors.canopen_profiles import ENCODER, MEASURING_DEVICE
 
 _BY_EVENT, _AT_EVERY_SYNC = 255, 1
 _PRODUCES_SYNC = 1 << 30
@@ -124,16 +124,38 @@ class CanOpenSettings(NamedTuple):
 
 
 def configure_device(writer: DeviceWriter, settings: CanOpenSettings) -> None:
-    """Set cycle and heartbeat of a device, and switch it to operational.
+    """Set cycle and heartbeat of a sensor, and switch it to operational.
 
     Raises:
-        InputError: The device cannot do it.
+        InputError: The device is no sensor, or cannot do it.
         BusError: It does not answer.
     """
     network, node_id = writer.network, writer.node_id
-    if writer.read(0x1000) is None:
-        raise InputError(f"node {node_id}: has no device type (1000h), expected a CANopen device")
+    _refuse_other_than_sensor(network, node_id)
     network.command(node_id, PRE_OPERATIONAL)
+    try:
+        _set_objects(writer, settings)
+    except InputError as error:
+        raise InputError(f"{error}; the device may still be pre-operational") from error
+    network.command(node_id, OPERATIONAL)
+
+
+def _refuse_other_than_sensor(network: CanOpenNetwork, node_id: int) -> None:
+    """Refuse a device that may move something, such as a drive, before anything is written."""
+    device_type = network.read(node_id, 0x1000)
+    if not device_type:
+        raise InputError(f"node {node_id}: has no device type (1000h), expected a CANopen device")
+    profile = int.from_bytes(device_type, "little") & 0xFFFF
+    if profile not in (ENCODER, MEASURING_DEVICE):
+        raise InputError(
+            f"node {node_id}: device profile {profile} (1000h), expected {ENCODER} (encoder) or "
+            f"{MEASURING_DEVICE} (measuring device): another device is set by its maker's tool"
+        )
+
+
+def _set_objects(writer: DeviceWriter, settings: CanOpenSettings) -> None:
+    """Set cycle and heartbeat of a device that is pre-operational."""
+    node_id = writer.node_id
     if settings.heartbeat_ms is not None:
         writer.set_value(HEARTBEAT, 0, settings.heartbeat_ms)
     if settings.cycle_ms is not None:
@@ -144,17 +166,19 @@ def configure_device(writer: DeviceWriter, settings: CanOpenSettings) -> None:
             _set_cycle(writer, pdo, settings.cycle_ms, sync=settings.sync)
         if settings.sync:
             _produce_sync(writer, settings.cycle_ms)
-    network.command(node_id, OPERATIONAL)
 
 
 def restore(network: CanOpenNetwork, changes: Sequence[ObjectChange]) -> None:
     """Undo changes, the last one first, and switch every device to pre-operational.
 
     Raises:
-        InputError: A device refuses it.
+        InputError: A device is no sensor (another may have got its node id), or refuses it.
         BusError: It does not answer.
     """
-    for node_id in dict.fromkeys(item.node_id for item in changes):
+    node_ids = dict.fromkeys(item.node_id for item in changes)
+    for node_id in node_ids:
+        _refuse_other_than_sensor(network, node_id)
+    for node_id in node_ids:
         network.command(node_id, PRE_OPERATIONAL)
     for item in reversed(changes):
         node_id, index = item.node_id, item.index

@@ -47,8 +47,9 @@ def configure_with_undo(
     try:
         configure_device(writer, settings)
     except InputError as error:
-        changes = f"; {undo} holds the changes so far" if writer.changes else ""
-        raise InputError(f"{error}; the device may still be pre-operational{changes}") from error
+        if not writer.changes:
+            raise
+        raise InputError(f"{error}; {undo} holds the changes so far") from error
     finally:
         if writer.changes:
             write_undo(undo, writer.changes)

@@ -3,14 +3,16 @@
 import math
 import resource
 import threading
+from pathlib import Path
 
+import pyarrow as pa
 import pytest
 import yaml
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.log.captures import CaptureWindow
-from rig.log.file_names import RUN_FILE
+from rig.log.file_names import FRAMES_FILE, RUN_FILE, STEPS_FILE, part_name, parts
 from rig.log.reader import RUN_SCHEMA, read_run
 from rig.log.received_frames import read_frame_columns
 from rig.log.rotation import Rotation
@@ -191,6 +193,34 @@ def test_a_rotated_run_reads_like_one_that_is_not(tmp_path, rotation):
     log.close(ending)
     assert len(read_run(tmp_path / "run").frame_files) > 4
     assert_holds(tmp_path / "run", 0, 3000)
+
+
+def test_parts_are_read_by_number_also_where_numbers_grow_by_a_digit(tmp_path):
+    log = open_log(tmp_path / "run", rotation=Rotation(1, 1))
+    for index in range(3000):
+        log.add(*tick(index))
+    log.close(ending)
+    for name in (FRAMES_FILE, STEPS_FILE):
+        for number in range(len(parts(tmp_path / "run", name)) - 1, 0, -1):
+            path = tmp_path / "run" / part_name(name, number)
+            path.rename(path.with_name(part_name(name, 9_995 + number)))
+    (tmp_path / "run" / "frames.copy.log").write_text("no part\n")
+    names = [path.name for path in read_run(tmp_path / "run").frame_files]
+    assert names[4:6] == ["frames.9999.log", "frames.10000.log"]
+    assert_holds(tmp_path / "run", 0, 3000)
+
+
+def test_no_more_parts_are_mapped_than_a_process_can_map(tmp_path, monkeypatch):
+    log = open_log(tmp_path / "run", rotation=Rotation(1, 1))
+    for index in range(3000):
+        log.add(*tick(index))
+    log.close(ending)
+    mapped = []
+    memory_map = pa.memory_map
+    monkeypatch.setattr(pa, "memory_map", lambda path: mapped.append(path) or memory_map(path))
+    monkeypatch.setattr("rig.log.reader._MOST_MAPPED", 4, raising=False)
+    assert_holds(tmp_path / "run", 0, 3000)
+    assert [Path(path).name for path in mapped] == [part_name(STEPS_FILE, k) for k in range(4)]
 
 
 def test_parts_end_with_the_same_tick(tmp_path):

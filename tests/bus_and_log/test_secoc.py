@@ -141,6 +141,53 @@ def test_clocks_may_be_apart_by_the_tolerance(offset_ms, accepted):
     assert len(heard.authenticate([send(k * MS, bytes(8)) for k in range(5)])) == accepted
 
 
+def test_frames_that_are_held_back_by_more_and_more_are_refused_when_they_are_too_old():
+    send, heard = sender(), receiver()
+    # A gateway stretches time by half: after 40 s a frame is 20 s old, and none came abruptly.
+    sent_ns = [10 * MS * k for k in range(4000)]
+    late = [replace(send(t_ns, bytes(8)), t_ns=t_ns * 3 // 2) for t_ns in sent_ns]
+    accepted = heard.authenticate(late)
+    ages_ns = [frame.t_ns - frame.t_ns * 2 // 3 for frame in accepted]
+    assert 0.95 * S < max(ages_ns) <= PROFILE_1.max_age_ns == S
+    assert heard.replayed > 0
+    assert heard.replayed + heard.unauthentic == 4000 - len(accepted)
+    # Without the gateway the next frame is believed at once.
+    assert payloads(heard, [send(60 * S, b"directly")]) == [b"directly"]
+
+
+@pytest.mark.parametrize("drift", [1e-4, -1e-4])
+def test_clocks_that_drift_apart_are_followed_up_to_a_bound(drift):
+    how = dataclasses.replace(PROFILE_1, max_age_ns=500 * MS)
+    send, heard = sender(), Authenticator(how, EPOCH_NS)
+    # 10 s apart, with clocks that differ by 1 ms more each time.
+    frames = [
+        replace(send(round(k * 10 * S * (1 + drift)), bytes(8)), t_ns=k * 10 * S)
+        for k in range(1000)
+    ]
+    assert len(heard.authenticate(frames)) == 501
+    assert heard.replayed > 0
+
+
+def test_a_clock_that_was_slow_and_is_set_is_believed_at_once():
+    send, heard = sender(), receiver()
+    slow = [replace(send(k * 990 * MS, bytes(8)), t_ns=k * S) for k in range(51)]
+    assert len(heard.authenticate(slow)) == 51
+    assert payloads(heard, [send(51 * S, b"set")]) == [b"set"]
+
+
+@pytest.mark.parametrize(("bits", "tolerance_ms"), [(8, 100), (8, 819), (16, 10_000)])
+def test_a_forged_frame_costs_a_bounded_number_of_tries(bits, tolerance_ms):
+    how = Authentication(KEY, bits // 8, 3, tolerance_ms * MS, 60 * S)
+    heard, slow = Authenticator(how, EPOCH_NS), Authenticator(how, EPOCH_NS - tolerance_ms * MS)
+    # The clocks are apart, so that all about the one is tried and all about the other.
+    assert payloads(heard, [slow.secure(Frame(0, 0x100, b"first"))]) == [b"first"]
+    tried = []
+    right = heard._cmac
+    heard._cmac = lambda message: tried.append(message) or right(message)
+    assert heard.authenticate([Frame(S, 0x100, bytes(12), is_fd=True)]) == []
+    assert len(tried) == len(set(tried)) <= 2 * (64 + 1)
+
+
 def test_more_frames_than_the_clock_has_steps_are_each_newer_than_the_last():
     send, heard = sender(), receiver()
     assert len(heard.authenticate([send(0, bytes(8)) for _ in range(100)])) == 100
@@ -256,11 +303,29 @@ def test_the_plan_of_a_run_is_checked_without_its_key(configured):
         ({"bus": {"interface": "virtual", "channel": "x"}}, "expected bus.data_bitrate"),
         ({"authentication": {"key_file": "bench.key", "mac_bits": 32}}, "13 bytes long"),
         ({"authentication": {"key_file": "bench.key", "mac_bits": 16}}, "authentication.mac_bits"),
+        (
+            {"authentication": {"key_file": "bench.key", "clock_tolerance_s": 5}},
+            r"secured\.yaml: authentication\.clock_tolerance_s: 5: expected at most 0\.82",
+        ),
     ],
 )
 def test_a_configuration_that_cannot_work_is_refused(configured, keys, said):
     with pytest.raises(InputError, match=said):
         load_plan(configured(**keys))
+
+
+@pytest.mark.parametrize(
+    ("keys", "max_age_ns"),
+    [
+        ({}, S),
+        ({"max_age_s": 0.3}, 300 * MS),
+        ({"clock_tolerance_s": 0.5, "max_age_s": 0.3}, 500 * MS),
+        ({"clock_tolerance_s": 5, "freshness_bits": 16, "mac_bits": 48}, 5 * S),
+    ],
+)
+def test_the_largest_age_is_a_setting(configured, keys, max_age_ns):
+    plan = load_plan(configured(authentication={"key_file": "bench.key", **keys}))
+    assert plan.authentication.max_age_ns == max_age_ns
 
 
 @pytest.mark.parametrize("text", ["", "00" * 15, "00" * 17, "zz" * 16, KEY.hex()[:-1]])

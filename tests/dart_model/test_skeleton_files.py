@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from can_dbc.errors import InputError
+from dart_model.errors import ModelError
 from dart_model.plant import DartPlant
 from dart_model.spec import ModelSpec, load_model
 
@@ -184,3 +185,92 @@ def test_a_skeleton_without_a_joint_that_moves_is_refused(tmp_path):
     (tmp_path / "bench.urdf").write_text(URDF.replace('type="prismatic"', 'type="fixed"'), "utf-8")
     with pytest.raises(InputError, match="no joint that moves"):
         DartPlant(model(tmp_path, "{file: bench.urdf}"))
+
+
+def included(*names: str) -> str:
+    """The MJCF file, with further files included."""
+    elements = "".join(f'<include file="{name}"/>' for name in names)
+    return MJCF.replace("<worldbody>", f"{elements}<worldbody>")
+
+
+def only_includes(*names: str) -> str:
+    return f"<mujoco>{''.join(f'<include file={name!r}/>' for name in names)}</mujoco>"
+
+
+def ring(text: str, body: str) -> str:
+    """A file in which `body` and a further one carry each other."""
+    axis = "<axis><xyz>0 0 1</xyz></axis>"
+    other = (
+        f'<{body} name="other"/><joint name="back" type="prismatic">'
+        f"<parent>body</parent><child>other</child>{axis}</joint>"
+    )
+    return text.replace("<parent>world", "<parent><!-- -->other").replace(
+        "</joint>", f"</joint>{other}"
+    )
+
+
+SUFFIXES = (".xml", ".mjcf", ".sdf", ".skel")
+
+ENDLESS = {
+    "itself": {"bench.xml": included("bench.xml")},
+    "nothing": {"bench.xml": included("")},
+    "another name of itself": {"bench.xml": included("bench.xml?x")},
+    "each other": {"bench.xml": included("a.xml"), "a.xml": only_includes("bench.xml")},
+    "twice": {"bench.xml": included("a.xml", "a.xml"), "a.xml": only_includes()},
+    "in a ring": {
+        "bench.mjcf": included("parts/a.xml"),
+        "parts/a.xml": only_includes("parts/b.xml"),
+        "parts/b.xml": only_includes("parts/a.xml"),
+    },
+    "above": {"bench.xml": included("../bench.xml")},
+    "by a document type": {
+        "bench.xml": '<!DOCTYPE mujoco [<!ATTLIST include file CDATA "x.xml">]>' + included()
+    },
+    "SDF, one body": {"bench.sdf": SDF.replace("<parent>world", "<parent>body")},
+    "SDF, two bodies": {"bench.sdf": ring(SDF, "link")},
+    "SDF, a name in pieces": {"bench.sdf": SDF.replace("<parent>world", "<parent>body<!-- -->x")},
+    "SKEL, one body": {"bench.skel": SKEL.replace("<parent>world", "<parent>body")},
+    "SKEL, two bodies": {"bench.skel": ring(SKEL, "body")},
+}
+
+
+@pytest.mark.parametrize("files", ENDLESS.values(), ids=ENDLESS)
+def test_what_dart_would_read_without_end_is_refused_before(files, tmp_path, monkeypatch):
+    parsers = dict.fromkeys(SUFFIXES, lambda _: pytest.fail("DART was given the file"))
+    monkeypatch.setattr("dart_model.plant.skeleton._PARSERS", parsers)
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text, "utf-8")
+    with pytest.raises(ModelError) as caught:
+        DartPlant(model(tmp_path, f"{{file: {next(iter(files))}}}"))
+    assert str(tmp_path) in str(caught.value)
+    assert ", expected" in str(caught.value) or ": expected" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_include_each_other_once_are_read(tmp_path):
+    body = MJCF[MJCF.index("<worldbody>") : MJCF.index("</mujoco>")]
+    (tmp_path / "bench.xml").write_text(only_includes("parts/a.xml"), "utf-8")
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "a.xml").write_text(only_includes("parts/b.xml"), "utf-8")
+    (tmp_path / "parts" / "b.xml").write_text(f"<mujoco>{body}</mujoco>", "utf-8")
+    plant = DartPlant(model(tmp_path, "{file: bench.xml}"))
+    assert plant.init([0.42]).struts[0][0] == pytest.approx(0.42)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("bench.sdf", "<mass>10", "<mass>ten"),
+        ("bench.sdf", "<mass>10", "<mass>1e999"),
+        ("bench.skel", "<mass>10", "<mass>ten"),
+        ("bench.xml", 'size="0.1"', 'size="small"'),
+        ("bench.xml", 'mass="10"', 'mass="ten"'),
+        ("bench.urdf", 'mass value="10"', 'mass value="ten"'),
+    ],
+)
+def test_a_value_that_is_no_number_is_one_line(name, old, new, tmp_path):
+    (tmp_path / name).write_text(FILES[name].replace(old, new), "utf-8")
+    with pytest.raises(ModelError, match="expected") as caught:
+        DartPlant(model(tmp_path, f"{{file: {name}}}"))
+    assert "\n" not in str(caught.value)

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from can_dbc.codec import compile_decoder
 from can_dbc.database import load_database
+from can_dbc.errors import InputError
 from can_dbc.units import Dimension, si_conversion
 from rig.bus.bus import BusConfig
 from rig.bus.canopen_network import CanOpenNetwork
@@ -20,10 +21,16 @@ from rig.plan.load import load_plan
 from rig.plan.preflight_checks import check
 from rig.sensors.bus_scan import scan
 from rig.sensors.canopen_device import describe_device
-from rig.sensors.canopen_set_up import CanOpenSettings, DeviceWriter, configure_device, restore
+from rig.sensors.canopen_set_up import (
+    CanOpenSettings,
+    DeviceWriter,
+    ObjectChange,
+    configure_device,
+    restore,
+)
 from rig.sensors.height_zero import HeightZero
 from rig.sensors.proposed_config import dbc_text
-from rig.sensors.undo_file import read_undo, write_undo
+from rig.sensors.undo_file import configure_with_undo, read_undo, write_undo
 from tests.sensors.peer import KILONEWTON, amplifier, encoder, with_timer
 
 NO_REMOTE_REQUEST = 1 << 30
@@ -299,6 +306,53 @@ def test_a_node_that_is_not_there_is_not_set(channel, tmp_path):
     result = CliRunner().invoke(app, [*arguments, "--before", str(before)])
     assert "no answer" in str(result.exception)
     assert not before.exists()
+
+
+DRIVE, GENERIC = 0x00020192, 0
+
+
+@pytest.mark.parametrize(("device_type", "profile"), [(DRIVE, 402), (GENERIC, 0)])
+def test_what_is_no_sensor_is_refused_before_anything_is_sent_to_it(
+    bus, channel, tmp_path, monkeypatch, device_type, profile
+):
+    node = encoder(bus(), 5)
+    node.object_dictionary.write(0x1000, 0, device_type)
+    sent = []
+    for name in ("write", "command"):
+        monkeypatch.setattr(CanOpenNetwork, name, lambda *given: sent.append(given))
+    undo = tmp_path / "before.yaml"
+    write_undo(undo, [ObjectChange(node_id=5, index=0x1017, subindex=0, before="6400")])
+    arguments = ["sensor", "set", "--interface", "virtual", "--channel", channel]
+    for given in (
+        ("5", "--cycle-ms", "2", "--heartbeat-ms", "50", "--before", str(tmp_path / "new.yaml")),
+        ("--restore", str(undo)),
+    ):
+        result = CliRunner().invoke(app, [*arguments, *given])
+        assert isinstance(result.exception, InputError)
+        assert str(result.exception).startswith(f"node 5: device profile {profile} (1000h), ")
+        assert "pre-operational" not in str(result.exception)
+        assert "\n" not in str(result.exception)
+    assert sent == []
+    assert [path.name for path in tmp_path.iterdir()] == ["before.yaml"]
+
+
+def test_an_amplifier_is_set_and_put_back(bus, network, tmp_path):
+    node = amplifier(bus(), 6)
+    undo = tmp_path / "before.yaml"
+    configure_with_undo(network, 6, CanOpenSettings(heartbeat_ms=100), undo)
+    assert node.object_dictionary.read(0x1017, 0) == 100
+    restore(network, read_undo(undo))
+    assert node.object_dictionary.read(0x1017, 0) == 0
+
+
+def test_a_device_that_refuses_on_the_way_may_be_pre_operational(bus, network, tmp_path):
+    encoder(bus(), 5).object_dictionary[0x6200].access = "ro"
+    refused = pytest.raises(InputError, match=r"the device may still be pre-operational; .* holds")
+    with refused:
+        configure_with_undo(
+            network, 5, CanOpenSettings(cycle_ms=3, heartbeat_ms=100), tmp_path / "before.yaml"
+        )
+    assert [item.index for item in read_undo(tmp_path / "before.yaml")] == [0x1017, 0x6200]
 
 
 def test_an_undo_that_cannot_be_written_is_said_before_anything_is_changed(bus, channel):

@@ -1,11 +1,13 @@
 """What the page's server answers, and to whom."""
 
+import contextlib
 import copy
 import http.client
 import json
 import re
 import shutil
 import socket
+import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +18,7 @@ from can_dbc.errors import InputError
 from dart_model.spec import MODELS, load_model
 from rig.formats.run_arrays import open_run
 from rig.pages.view import visible_stretch as closely
-from rig.pages.view.server import HOST, ViewServer
+from rig.pages.view.server import _MOST_CONNECTIONS, HOST, ViewServer
 from tests.view.serving import COUNT, described, get, grown_old, make_run, serving, stretch
 
 STRUT = "strut"
@@ -277,6 +279,101 @@ def test_a_stalled_browser_delays_no_other(server):
             assert stretch(server, run=0, begin=0, end=1, points=50, columns="mode")[0]["count"]
     finally:
         stalled.close()
+
+
+def connect(server, begun=b""):
+    connection = socket.create_connection(server.server_address, timeout=20)
+    connection.sendall(begun)
+    return connection
+
+
+def received(connection):
+    """All that a connection still gets before the server closes it."""
+    answer = b""
+    with contextlib.suppress(ConnectionError):
+        while piece := connection.recv(4096):
+            answer += piece
+    return answer
+
+
+def test_no_more_connections_are_served_than_pages_need(run):
+    before = threading.active_count()
+    with serving(run) as server, contextlib.ExitStack() as open_ones:
+        begun = [
+            open_ones.enter_context(connect(server, b"GET /runs HTTP/1.1\r\n")) for _ in range(100)
+        ]
+        for refused in begun[_MOST_CONNECTIONS:]:
+            assert received(refused).startswith(b"HTTP/1.1 503 ")
+        # One serves, and one for each connection.
+        assert threading.active_count() - before <= _MOST_CONNECTIONS + 1
+        # Those that were let in are answered as soon as they have asked.
+        rest = f"Host: {HOST}:{server.server_address[1]}\r\nConnection: close\r\n\r\n".encode()
+        for taken in begun[:_MOST_CONNECTIONS]:
+            taken.sendall(rest)
+            assert received(taken).startswith(b"HTTP/1.1 200 ")
+        # A thread gives its place back after its connection was closed.
+        while (status := get(server, "/runs")[0]) == 503:
+            pass
+        assert status == 200
+
+
+def dripped(server, begun, drip):
+    """What a connection gets whose request comes byte by byte and to no end."""
+    with connect(server, begun) as slow:
+        slow.settimeout(0.02)
+        for _ in range(1000):
+            try:
+                slow.sendall(drip)
+                return slow.recv(4096)
+            except TimeoutError:
+                continue
+            except ConnectionError:
+                return b""
+    return pytest.fail("the connection was never closed")
+
+
+def test_a_request_that_takes_too_long_is_given_up(run, monkeypatch):
+    monkeypatch.setattr("rig.pages.view.server._REQUEST_S", 0.2, raising=False)
+    with serving(run, token="secret") as server:
+        port = server.server_address[1]
+        head = f"POST /set?run=0 HTTP/1.1\r\nHost: {HOST}:{port}\r\nX-Rig-Token: secret\r\n"
+        assert dripped(server, b"GET /", b"x") == b""
+        assert dripped(server, f"{head}X: ".encode(), b"x") == b""
+        body = f"{head}Content-Length: 9000\r\n\r\n".encode()
+        assert dripped(server, body, b" ").startswith(b"HTTP/1.1 400 ")
+
+
+def test_a_connection_answers_one_request_after_another_until_it_is_left_idle(run, monkeypatch):
+    monkeypatch.setattr("rig.pages.view.server._REQUEST_S", 0.5, raising=False)
+    with serving(run) as server:
+        asking = http.client.HTTPConnection(*server.server_address, timeout=20)
+        for _ in range(5):
+            asking.request("GET", "/runs")
+            assert len(json.loads(asking.getresponse().read())) == 1
+        assert asking.sock.recv(1) == b""
+        asking.close()
+
+
+@pytest.mark.parametrize("length", ["9" * 5000, "-1", "", "1e3", "10001", "\xb2", "+5"])
+def test_a_wrong_length_of_a_request_is_refused(run, capfd, length):
+    with serving(run, token="secret") as server:
+        text = (
+            f"POST /set?run=0 HTTP/1.1\r\nHost: {HOST}:{server.server_address[1]}\r\n"
+            f"X-Rig-Token: secret\r\nContent-Length: {length}\r\n\r\n"
+        )
+        with connect(server, text.encode("latin-1")) as asking:
+            answer = received(asking)
+    assert answer.startswith(b"HTTP/1.1 400 ")
+    assert answer.endswith(b"Content-Length: expected a number up to 10000")
+    assert capfd.readouterr().err == ""
+
+
+def test_a_request_for_no_address_is_one_for_nothing(server, capfd):
+    with connect(server) as asking:
+        host = f"{HOST}:{server.server_address[1]}"
+        asking.sendall(f"GET http://[ HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+        assert received(asking).startswith(b"HTTP/1.1 404 ")
+    assert capfd.readouterr().err == ""
 
 
 def test_a_load_cell_is_drawn_only_where_it_can_be_one_struts():

@@ -1,20 +1,24 @@
-"""Server of the live page: on loopback only, one thread a request.
+"""Server of the live page: on loopback only, one thread a connection, and not many of them.
 
 A page requests a stretch when it has drawn the last one, so that a stalled page slows no other, and
 a page that lost its connection repeats its request. The server keeps no state of a page.
 """
 
+import contextlib
+import io
 import json
+import re
 import secrets
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, cast
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import SplitResult, parse_qs, urlsplit
 
 import numpy as np
 
@@ -37,6 +41,17 @@ _MOST_POINTS, _MOST_COLUMNS = 4000, 64
 
 _MOST_REQUEST_BYTES = 10_000
 """Limit of one change: hundreds of keys."""
+
+_MOST_CONNECTIONS = 32
+"""Connections that are served at once: a browser opens six."""
+
+_MOST_WAITING = 128
+"""Connections that the system keeps until they are looked at; the next one has to try again."""
+
+_REQUEST_S, _ANSWER_S = 30.0, 30.0
+"""Longest time from an answer to the end of the next request, and for a page to take an answer."""
+
+_LENGTH = re.compile(r"[0-9]{1,9}")
 
 _HTTP_PORT = 80
 """Port that a browser leaves out of the host's name."""
@@ -87,6 +102,7 @@ class ViewServer(ThreadingHTTPServer):
     """
 
     daemon_threads = True
+    request_queue_size = _MOST_WAITING
 
     def __init__(
         self,
@@ -99,6 +115,7 @@ class ViewServer(ThreadingHTTPServer):
         self.runs = tuple(WatchedRun(folder) for folder in folders)
         self.diagnoses = tuple(DiagnosisJob(folder) for folder in folders)
         self.models = models
+        self._places = threading.BoundedSemaphore(_MOST_CONNECTIONS)
         try:
             super().__init__((HOST, port), _Handler)
         except OSError as error:
@@ -110,6 +127,29 @@ class ViewServer(ThreadingHTTPServer):
     def address(self) -> str:
         """Address of the page."""
         return f"http://{HOST}:{self.server_address[1]}/"
+
+    def process_request(
+        self, request: socket.socket | tuple[bytes, socket.socket], client_address: Any
+    ) -> None:
+        """Serve a connection in a thread of its own, if there is a place for one more."""
+        if not self._places.acquire(blocking=False):
+            _answer_busy(cast("socket.socket", request))
+            self.shutdown_request(request)
+            return
+        try:
+            super().process_request(request, client_address)
+        except BaseException:
+            self._places.release()
+            raise
+
+    def process_request_thread(
+        self, request: socket.socket | tuple[bytes, socket.socket], client_address: Any
+    ) -> None:
+        """Serve a connection until it ends."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._places.release()
 
     def server_close(self) -> None:
         """End the server and its diagnoses."""
@@ -132,10 +172,52 @@ class ViewServer(ThreadingHTTPServer):
         return thread
 
 
+def _answer_busy(connection: socket.socket) -> None:
+    """Answer a connection for which there is no place, whatever it requests."""
+    connection.setblocking(False)
+    with contextlib.suppress(OSError):
+        connection.sendall(
+            b"HTTP/1.1 503 Service Unavailable\r\nRetry-After: 1\r\nConnection: close\r\n"
+            b"Content-Length: 0\r\n\r\n"
+        )
+
+
+class _Requests(io.RawIOBase):
+    """The bytes of a connection; a request has a limited time, however its bytes are spread."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._end_s = 0.0
+
+    def begin(self) -> None:
+        """Begin to wait for the next request."""
+        self._end_s = time.monotonic() + _REQUEST_S
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any, /) -> int:
+        left_s = self._end_s - time.monotonic()
+        if left_s <= 0.0:
+            raise TimeoutError
+        self._connection.settimeout(left_s)
+        return self._connection.recv_into(buffer)
+
+
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "rig", ""
     disable_nagle_algorithm = True
+
+    def setup(self) -> None:
+        super().setup()
+        self.rfile.close()
+        self._requests = _Requests(self.connection)
+        self.rfile = io.BufferedReader(self._requests)
+
+    def handle_one_request(self) -> None:
+        self._requests.begin()
+        super().handle_one_request()
 
     @property
     def _view(self) -> ViewServer:
@@ -146,9 +228,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer a request."""
-        url = urlsplit(self.path)
         if not self._check_host():
             return
+        url = self._url()
         if url.path == "/":
             self._send(HTTPStatus.OK, live_page().encode(), _HTML)
             return
@@ -179,14 +261,15 @@ class _Handler(BaseHTTPRequestHandler):
         if token is None or not secrets.compare_digest(token.encode(), sent.encode()):
             self._send(HTTPStatus.FORBIDDEN, b"read only", "text/plain")
             return
-        url = urlsplit(self.path)
+        url = self._url()
         action = _ACTIONS.get(url.path)
         if action is None:
             self._send(HTTPStatus.NOT_FOUND, b"no such action", "text/plain")
             return
         length = self.headers.get("Content-Length", "")
-        if not (length.isascii() and length.isdecimal()) or int(length) > _MOST_REQUEST_BYTES:
-            self._send(HTTPStatus.BAD_REQUEST, b"too long", "text/plain")
+        if not _LENGTH.fullmatch(length) or int(length) > _MOST_REQUEST_BYTES:
+            why = f"Content-Length: expected a number up to {_MOST_REQUEST_BYTES}"
+            self._send(HTTPStatus.BAD_REQUEST, why.encode(), "text/plain")
             return
         try:
             body = json.loads(self.rfile.read(int(length)))
@@ -197,6 +280,13 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.BAD_REQUEST, str(error).encode(), "text/plain; charset=utf-8")
             return
         self._send(HTTPStatus.OK, *_json(content))
+
+    def _url(self) -> SplitResult:
+        """What is requested; nothing that there is, where it is no address."""
+        try:
+            return urlsplit(self.path)
+        except ValueError:
+            return urlsplit("")
 
     def _check_host(self) -> bool:
         """Whether the request is for this server and comes from its page; if not, refuse it."""
@@ -213,6 +303,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _send(
         self, status: HTTPStatus, content: bytes, kind: str, policy: dict[str, str] = _POLICY
     ) -> None:
+        self.connection.settimeout(_ANSWER_S)
         self.send_response(status)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))
