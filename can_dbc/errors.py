@@ -10,6 +10,11 @@ class InputError(ValueError):
     """
 
 
+def missing_package(package: str, remedy: str) -> str:
+    """What an error says of a package that is not installed; `remedy` is the command to type."""
+    return f"the package {package} is not installed, expected `{remedy}` in the clone of rig"
+
+
 class DatabaseError(InputError):
     """A DBC file, or a signal requested of it, is wrong."""
 

@@ -1,8 +1,8 @@
 """What DART's parsers would read without end in a skeleton file, and the files that it includes.
 
 DART inserts what an MJCF file includes as often as it stands there, and follows the joints of an
-SDF or SKEL file from body to parent until it comes to a root. Both are looked at here before: the
-XML is read with the strictness that leaves DART's own reader nothing else to see in it.
+SDF or SKEL file from body to parent until it comes to a root. Both are checked here before: the
+XML is read so strictly that DART's own reader finds nothing else in it.
 """
 
 import re
@@ -41,7 +41,7 @@ class _Element:
         return next((child.text.strip() for child in self.children if child.name == name), "")
 
 
-def included_files(path: Path) -> list[str]:
+def list_includes(path: Path) -> list[str]:
     """Files that a skeleton file includes, also through others, from its own folder on.
 
     Raises:
@@ -54,8 +54,8 @@ def included_files(path: Path) -> list[str]:
     waiting = [path]
     while waiting:
         file = waiting.pop()
-        for name in _included_by(file):
-            # DART looks for it beside the first file, whichever includes it.
+        for name in _find_includes(file):
+            # DART looks for it in the folder of the first file, whichever includes it.
             if name in found or name == path.name:
                 raise ModelError(
                     f"{file}: include file {name!r}: is included already, or includes itself: "
@@ -73,13 +73,13 @@ def refuse_endless(path: Path) -> None:
         FileError: It cannot be read.
         ModelError: It includes itself, or a body carries itself; or it is no XML.
     """
-    included_files(path)
+    list_includes(path)
     if path.suffix.lower() in _SUFFIXES_WITH_RINGS:
         for element in _walk(_read_xml(path)):
             _refuse_ring(element, path)
 
 
-def _included_by(path: Path) -> Iterator[str]:
+def _find_includes(path: Path) -> Iterator[str]:
     """Files that an MJCF file includes where DART looks for it: directly below its root."""
     for element in _read_xml(path).children:
         if element.name != "include":

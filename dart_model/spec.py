@@ -25,7 +25,7 @@ from pydantic_core import PydanticCustomError
 from can_dbc.yaml_file import Finite, NotNegative, Positive, parse_mapping, read_text, validate
 from dart_model.effects import CATALOGUE, effect
 from dart_model.errors import ModelError
-from dart_model.skeleton_file import included_files
+from dart_model.skeleton_file import list_includes
 
 MODELS = Path(__file__).parent / "models"
 """Folder of the models that come with the package."""
@@ -389,7 +389,7 @@ def files_of(spec: ModelSpec) -> list[str]:
     files: list[str] = []
     if isinstance(spec.skeleton, FileSkeleton):
         name = spec.skeleton.file
-        included = included_files(spec.folder / name)
+        included = list_includes(spec.folder / name)
         files += [name, *(str(Path(name).parent / other) for other in included)]
     files += [strut.fmu.file for strut in spec.struts if strut.fmu is not None]
     return list(dict.fromkeys(files))

@@ -22,6 +22,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+from can_dbc.errors import missing_package
 from dart_model.errors import ModelError
 from dart_model.plant.admitted_programs import require_admission
 from dart_model.spec import FmuSpec
@@ -271,10 +272,7 @@ def read_description(content: bytes, path: Path) -> Any:
         ModelError: It is no FMU, names files outside its own folder, or FMPy is not installed.
     """
     if importlib.util.find_spec("fmpy") is None:
-        raise ModelError(
-            "the package fmpy is not installed, expected `pip install -e '.[fmu]'` in the clone of "
-            "rig"
-        )
+        raise ModelError(missing_package("fmpy", "pip install -e '.[fmu]'"))
     import fmpy
 
     try:
@@ -289,7 +287,7 @@ def read_description(content: bytes, path: Path) -> Any:
 
 
 def _refuse_outside(content: bytes, path: Path, description: Any) -> None:
-    """Refuse an FMU that names a place outside its own folder.
+    """Refuse an FMU that names files outside its own folder.
 
     A library would be loaded from there, while what was admitted is the content of the archive.
     """

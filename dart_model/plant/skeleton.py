@@ -133,7 +133,7 @@ def _joint(body: BodySpec, skeleton: object) -> tuple[Callable[..., Any], object
 
 
 def _read_skeleton(spec: FileSkeleton, folder: Path) -> DartSkeleton:
-    # Not behind a link: what the file includes is beside it, also where it was copied to.
+    # No link is followed: what the file includes is in its folder, also where it was copied to.
     path = (folder / spec.file).absolute()
     if not path.is_file():
         raise ModelError(f"{path}: skeleton.file: no such file, expected URDF, SDF, SKEL or MJCF")

@@ -14,7 +14,7 @@ from typing import Any, cast
 
 import can
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, missing_package
 from can_dbc.frame import Frame
 from rig.bus.bus import BusConfig, BusError, open_bus
 
@@ -39,10 +39,7 @@ def package() -> ModuleType:
     try:
         return importlib.import_module("canopen")
     except ImportError:
-        raise BusError(
-            "the package canopen is not installed, expected `pip install -e '.[sensors]'` in the "
-            "clone of rig"
-        ) from None
+        raise BusError(missing_package("canopen", "pip install -e '.[sensors]'")) from None
 
 
 class RefusedError(InputError):

@@ -11,7 +11,7 @@ from typing import IO, cast
 import can
 from can.io.blf import BLFParseError
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, missing_package
 from can_dbc.frame import Frame
 
 _TEXT = MappingProxyType(
@@ -96,8 +96,7 @@ def _reader_errors(path: Path) -> tuple[type[Exception], ...]:
         module = importlib.import_module("asammdf.blocks.utils")
     except ImportError as error:
         raise BusLogError(
-            f"{path}: the package asammdf is not installed, expected `pip install -e '.[mf4]'` "
-            "in the clone of rig"
+            f"{path}: " + missing_package("asammdf", "pip install -e '.[mf4]'")
         ) from error
     return (*_READER_ERRORS, cast("type[Exception]", module.MdfException))
 

@@ -21,7 +21,7 @@ from typing import Annotated, Literal, NamedTuple, cast
 from msgspec.structs import replace
 from pydantic import BaseModel, ConfigDict, Field
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, missing_package
 from can_dbc.frame import Frame
 from can_dbc.yaml_file import read_text
 
@@ -140,8 +140,7 @@ def cmac(key: bytes) -> Callable[[bytes], bytes]:
         ciphers = importlib.import_module("cryptography.hazmat.primitives.ciphers")
     except ImportError as error:
         raise AuthenticationError(
-            "authentication: the package cryptography is not installed, expected "
-            "`pip install -e '.[secoc]'` in the clone of rig"
+            "authentication: " + missing_package("cryptography", "pip install -e '.[secoc]'")
         ) from error
     keyed = module.CMAC(ciphers.algorithms.AES(key))
 

@@ -30,7 +30,7 @@ from rig.cli import (
 )
 from rig.cli import set as set_
 from rig.cli.terminal import OK, WRONG_INPUT
-from rig.machine.installed_versions import installed_version
+from rig.machine.installed_versions import version_of
 
 __all__ = ["app", "main"]
 
@@ -67,7 +67,7 @@ app.command("report", epilog=report.EXAMPLES)(report.report)
 def _show_version(is_requested: bool) -> None:
     if is_requested:
         for name in ("rig", "dartpy", "python-can", "numpy"):
-            typer.echo(f"{name} {installed_version(name)}")
+            typer.echo(f"{name} {version_of(name)}")
         typer.echo(f"Python {platform.python_version()}")
         raise typer.Exit
 

@@ -26,7 +26,7 @@ from rig.diagnosis.refit import refit_parameters
 from rig.dyno.characterise import characterise
 from rig.fleet.sources import RunSource, printable
 from rig.log.file_names import RUN_FILE
-from rig.machine.installed_versions import installed_version
+from rig.machine.installed_versions import version_of
 from rig.recordings.read import read_recording
 from rig.recordings.recording import Recording
 
@@ -145,7 +145,7 @@ def row_without_result(source: RunSource, model: FleetModel, error: str) -> RunR
 @lru_cache(maxsize=1)
 def rig_version() -> str:
     """The version whose rows these are."""
-    return installed_version("rig")
+    return version_of("rig")
 
 
 @lru_cache(maxsize=4)

@@ -22,7 +22,7 @@ import pyarrow as pa
 from pyarrow import dataset, fs, parquet
 
 from can_dbc.atomic_file import replacing
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, missing_package
 from rig.fleet.one_run import RunRow
 
 _parquet = cast("Any", parquet)  # its stubs are incomplete
@@ -161,10 +161,7 @@ def connect(store: Path) -> Generator[Any]:
     if not any((store / "runs").rglob("*.parquet")):
         raise InputError(f"{store}: no runs in it, expected what `rig fleet SOURCE` wrote")
     if _duckdb is None:
-        raise InputError(
-            "the package duckdb is not installed, expected `pip install -e '.[fleet]'` in the "
-            "clone of rig"
-        )
+        raise InputError(missing_package("duckdb", "pip install -e '.[fleet]'"))
     # A SELECT can write as well (`WITH a AS (COPY ... TO ...)`), and a folder that DuckDB may read
     # (`allowed_directories`) is one that it may write.
     connection = _duckdb.connect(config={"enable_external_access": False})

@@ -11,7 +11,7 @@ from rig.fmu.binaries import TARGETS, Target, compile_for
 from rig.fmu.component import Component
 from rig.fmu.description import build_description, description_2, description_3
 from rig.fmu.source import select_c_files, sources
-from rig.machine.installed_versions import installed_version
+from rig.machine.installed_versions import version_of
 
 _FILE_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of every file in the archive, so that the same model gives the same bytes."""
@@ -32,7 +32,7 @@ def archive(
     Raises:
         InputError: There is no compiler, or it refuses.
     """
-    tool = f"rig {installed_version('rig')}"
+    tool = f"rig {version_of('rig')}"
     token = _token(component, version, tool)
     code = sources(component, version, token)
     c_files = select_c_files(code)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, missing_package
 from rig.fmu.source import select_c_files
 from rig.machine.child_processes import PYTHON
 
@@ -69,10 +69,7 @@ def compile_for(
         InputError: The package `ziglang` is not installed, or its compiler refuses.
     """
     if importlib.util.find_spec("ziglang") is None:
-        raise InputError(
-            "the package ziglang, a C compiler, is not installed, expected "
-            "`pip install -e '.[fmu]'` in the clone of rig"
-        )
+        raise InputError(missing_package("ziglang, a C compiler,", "pip install -e '.[fmu]'"))
     libraries: dict[Target, bytes] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, missing_package
 from can_dbc.frame import Frame
 from rig.formats.run_content import RunContent, read_content
 from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
@@ -53,8 +53,7 @@ def _asammdf() -> ModuleType:
         return importlib.import_module("asammdf")
     except ImportError as error:
         raise InputError(
-            "format mf4: the package asammdf is not installed, expected "
-            "`pip install -e '.[mf4]'` in the clone of rig"
+            "format mf4: " + missing_package("asammdf", "pip install -e '.[mf4]'")
         ) from error
 
 

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, missing_package
 from rig.formats.mapping import OutputColumn, TableMapping
 from rig.formats.text_table import Array, Columns
 
@@ -26,8 +26,7 @@ def read_mf4_channels(
         damaged = cast("type[Exception]", asammdf.blocks.utils.MdfException)
     except ImportError as error:
         raise InputError(
-            f"{source}: the package asammdf is not installed, expected `pip install -e '.[mf4]'` "
-            "in the clone of rig"
+            f"{source}: " + missing_package("asammdf", "pip install -e '.[mf4]'")
         ) from error
     try:
         with source.open("rb") as raw, asammdf.MDF(raw) as file:

@@ -20,7 +20,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, missing_package
 from rig.files.delimited_text import MAX_ROWS
 from rig.formats.mapping import ColumnName, OutputColumn, TableMapping
 from rig.formats.mts import is_mts, read_mts, read_whole
@@ -79,8 +79,7 @@ def _read_file(source: Path) -> Mapping[str, Array]:
         return READERS[source.suffix.lower()](content)
     except ImportError as error:
         raise InputError(
-            f"{source}: the package {error.name} is not installed, expected "
-            "`pip install -e '.[tables]'` in the clone of rig"
+            f"{source}: " + missing_package(str(error.name), "pip install -e '.[tables]'")
         ) from error
     except Exception as error:
         # Foreign readers raise anything on a file that is cut or malicious.

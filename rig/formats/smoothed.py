@@ -32,7 +32,7 @@ from rig.bridge.values import Mode
 from rig.diagnosis.numerics.smoother import estimate_noise, smooth
 from rig.log.reader import RunFolder, read_run
 from rig.plan.build import build_plant
-from rig.plan.load import plan_of_run
+from rig.plan.load import plan_of_header
 from rig.plan.plan import Plan
 from rig.tuning.expectation import FEWEST, free_error, stretches
 
@@ -65,7 +65,8 @@ def read_with_smoothed_forces(folder: Path, progress: Progress) -> RunFolder:
     Raises:
         InputError: The run is damaged, or its forces cannot be smoothed.
     """
-    run, plan = read_run(folder), plan_of_run(folder)
+    run = read_run(folder)
+    plan = plan_of_header(folder, run.header)
     steps = run.steps
     for name, (force_n, std_n) in smooth_forces(run, plan, progress).items():
         for key, values in (("smoothed_force_n", force_n), ("smoothed_force_std_n", std_n)):

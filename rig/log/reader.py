@@ -4,7 +4,6 @@ A replay computes the steps that a kill cut off again from the frames.
 """
 
 import contextlib
-import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import pyarrow as pa
 
 from can_dbc.frame import Frame
 from can_dbc.yaml_file import parse_mapping, read_text
+from rig.files.hashes import hash_files
 from rig.log.candump import LATEST_S, line_error, parse_frame
 from rig.log.errors import LogError
 from rig.log.file_names import FRAMES_FILE, RUN_FILE, STEPS_FILE, parts
@@ -173,7 +173,7 @@ def find_changed_files(folder: Path) -> list[str]:
                 f"{folder / RUN_FILE}: files_sha256: {name[:100]!r}: expected a file in the folder"
             )
         try:
-            sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+            sha256 = hash_files([path])
         except OSError as error:
             raise LogError(f"{path}: cannot be read: {error.strerror}") from error
         if sha256 != expected:

@@ -6,6 +6,6 @@ DISTRIBUTION = "shock-rig"
 """Name under which pip knows rig: `rig` itself is another project's on the public index."""
 
 
-def installed_version(package: str) -> str:
+def version_of(package: str) -> str:
     """Version of an installed package; rig is known as `rig`, not as its distribution."""
     return version(DISTRIBUTION if package == "rig" else package)

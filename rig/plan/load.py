@@ -8,7 +8,7 @@ from can_dbc.errors import InputError
 from can_dbc.yaml_file import load_yaml, validate
 from dart_model.spec import load_model, load_named_model
 from rig.log.file_names import DBC_FILE, MODEL_FILE, RUN_FILE
-from rig.log.reader import read_header
+from rig.log.reader import RunHeader, read_header
 from rig.plan.config import RunConfig
 from rig.plan.plan import Plan, resolve
 
@@ -46,7 +46,17 @@ def plan_of_run(folder: Path) -> Plan:
         InputError: A file of the run is missing or damaged.
         DatabaseError: Its DBC is.
     """
-    header, source = read_header(folder), folder / RUN_FILE
+    return plan_of_header(folder, read_header(folder))
+
+
+def plan_of_header(folder: Path, header: RunHeader) -> Plan:
+    """The plan of a run whose header has been read, as of `plan_of_run`.
+
+    Raises:
+        InputError: Another file of the run is missing or damaged.
+        DatabaseError: Its DBC is.
+    """
+    source = folder / RUN_FILE
     config = validate(RunConfig, header.get("config"), f"{source}: config")
     model, database = load_model(folder / MODEL_FILE), load_database(folder / DBC_FILE)
     return resolve(config, source, model, database)

@@ -14,6 +14,7 @@ COLUMNS = ("t_s", "height_m", "applied_force_n", "strut_force_n", "temperature_c
 
 _OF_A_STRUT = ("height_m", "strut_force_n")
 _LARGEST_BYTES = 2_000_000_000
+"""Ten minutes, the longest recording, at 50 kHz in five columns of twelve characters."""
 
 
 def read_csv(path: Path, struts: Sequence[str] | None = None) -> Recording:

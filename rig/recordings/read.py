@@ -1,11 +1,11 @@
 """Reads recordings from wherever a run was measured: a CSV file or a run's folder."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from hashlib import sha256
 from pathlib import Path
 
 from can_dbc.errors import InputError
+from rig.files.hashes import hash_files
 from rig.log.file_names import STEPS_FILE, parts
 from rig.recordings.csv_file import read_csv
 from rig.recordings.recording import Recording
@@ -26,14 +26,4 @@ def read_recording(path: Path, struts: Sequence[str] | None = None) -> Recording
         recording, files = read_csv(path, struts), [path]
     else:
         raise InputError(f"{path}: no such run, expected a run's folder or a CSV file")
-    return replace(check_recording(recording), sha256=_sha256(files))
-
-
-def _sha256(files: Iterable[Path]) -> str:
-    """SHA-256 of files, one after another, in hex."""
-    digest = sha256()
-    for path in files:
-        with path.open("rb") as file:
-            while piece := file.read(1 << 20):
-                digest.update(piece)
-    return digest.hexdigest()
+    return replace(check_recording(recording), sha256=hash_files(files))

@@ -9,8 +9,10 @@ from rig.recordings.clipping import find_long_plateaus
 from rig.recordings.recording import Array, Recording, RecordingError
 
 _LEAST_SAMPLES = 200
+"""The shortest recording, half a second, at 400 Hz."""
 _LEAST_DURATION_S = 0.5
 _LARGEST_HEIGHT_M = 100.0
+"""No strut is as long: a height beyond it is in mm, or another column."""
 _LONGEST_DURATION_S = 600.0
 """A longer recording adds nothing about a strut, and takes minutes."""
 _MOST_MISSING = 0.3

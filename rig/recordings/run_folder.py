@@ -15,7 +15,7 @@ from rig.channels.channel import Channel
 from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE
 from rig.log.reader import RunFolder
 from rig.log.reader import read_run as read_run_folder
-from rig.plan.load import plan_of_run
+from rig.plan.load import plan_of_header
 from rig.recordings.recording import Array, Recording, RecordingError
 
 
@@ -29,11 +29,12 @@ def read_run(folder: Path) -> Recording:
         InputError: The run is damaged, or holds no height.
         RecordingError: It holds heights alone.
     """
-    plan = plan_of_run(folder)
+    run = read_run_folder(folder)
+    plan = plan_of_header(folder, run.header)
     applied, cell, temperature = map(
         plan.bench_channel, (APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE)
     )
-    payloads = _payloads(read_run_folder(folder), plan.channels)
+    payloads = _payloads(run, plan.channels)
     heights = [_samples(payloads, channel) for channel in plan.heights]
     for channel, (t_s, _) in zip(plan.heights, heights, strict=True):
         if len(t_s) < 2:

@@ -1,7 +1,6 @@
 """A run of the bridge on any port, logged to its folder."""
 
 import contextlib
-import hashlib
 import platform
 import shutil
 import signal
@@ -19,12 +18,13 @@ from rig.bridge.bridge import Bridge, BridgeState, TickResult
 from rig.bridge.values import Mode
 from rig.bus.link import LinkFigures
 from rig.files.folders import claim
+from rig.files.hashes import hash_files
 from rig.log.file_names import CHANGES_FILE, DBC_FILE, HISTOGRAMS_FILE, MODEL_FILE
 from rig.log.reader import RUN_SCHEMA, ConfigEntry, RunHeader
 from rig.log.step_columns import LogColumns, Step
 from rig.log.writer import LogOptions, RunWriter
 from rig.machine.clock import Clock, OccupiedClock
-from rig.machine.installed_versions import installed_version
+from rig.machine.installed_versions import version_of
 from rig.machine.realtime import Granted
 from rig.plan.plan import Plan
 from rig.run.change_requests import Requests
@@ -239,8 +239,7 @@ def _header(
     plan: Plan, epoch_ns: int, granted: Granted | None, folder: Path, control: RunControl
 ) -> RunHeader:
     files = {
-        name: hashlib.sha256((folder / name).read_bytes()).hexdigest()
-        for name in (MODEL_FILE, DBC_FILE, *files_of(plan.model))
+        name: hash_files([folder / name]) for name in (MODEL_FILE, DBC_FILE, *files_of(plan.model))
     }
     header: RunHeader = {
         "schema": RUN_SCHEMA,
@@ -249,7 +248,7 @@ def _header(
         "config_source": str(plan.source),
         "files_sha256": files,
         "versions": {
-            **{name: installed_version(name) for name in _PACKAGES},
+            **{name: version_of(name) for name in _PACKAGES},
             "python": platform.python_version(),
             "system": platform.platform(),
         },

@@ -19,7 +19,7 @@ from rig.log.reader import RunFolder, last_frame_ns, read_run
 from rig.log.received_frames import FrameColumns, read_frame_columns
 from rig.log.step_columns import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, LogColumns, Step, StepRows
 from rig.plan.build import build_bridge
-from rig.plan.load import plan_of_run
+from rig.plan.load import plan_of_header
 from rig.plan.plan import Plan
 from rig.run.changed_settings import changes_for_replay, no_changes
 from rig.run.loop import Progress, Tick, no_progress, run
@@ -64,7 +64,8 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
     Raises:
         InputError: The run is damaged.
     """
-    run_folder, own = read_run(folder), plan_of_run(folder)
+    run_folder = read_run(folder)
+    own = plan_of_header(folder, run_folder.header)
     plan = plan or own
     bridge = build_bridge(plan, sending=False)
     frames = read_frame_columns(run_folder.frame_files, run_folder.epoch_ns)

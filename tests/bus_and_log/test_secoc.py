@@ -142,55 +142,55 @@ def test_clocks_may_be_apart_by_the_tolerance(offset_ms, accepted):
 
 
 def test_frames_that_are_held_back_by_more_and_more_are_refused_when_they_are_too_old():
-    send, heard = sender(), receiver()
+    send, receiving = sender(), receiver()
     # A gateway stretches time by half: after 40 s a frame is 20 s old, and none came abruptly.
     sent_ns = [10 * MS * k for k in range(4000)]
     late = [replace(send(t_ns, bytes(8)), t_ns=t_ns * 3 // 2) for t_ns in sent_ns]
-    accepted = heard.authenticate(late)
+    accepted = receiving.authenticate(late)
     ages_ns = [frame.t_ns - frame.t_ns * 2 // 3 for frame in accepted]
     assert 0.95 * S < max(ages_ns) <= PROFILE_1.max_age_ns == S
-    assert heard.replayed > 0
-    assert heard.replayed + heard.unauthentic == 4000 - len(accepted)
+    assert receiving.replayed > 0
+    assert receiving.replayed + receiving.unauthentic == 4000 - len(accepted)
     # Without the gateway the next frame is believed at once.
-    assert payloads(heard, [send(60 * S, b"directly")]) == [b"directly"]
+    assert payloads(receiving, [send(60 * S, b"directly")]) == [b"directly"]
 
 
 @pytest.mark.parametrize("drift", [1e-4, -1e-4])
 def test_clocks_that_drift_apart_are_followed_up_to_a_bound(drift):
     how = dataclasses.replace(PROFILE_1, max_age_ns=500 * MS)
-    send, heard = sender(), Authenticator(how, EPOCH_NS)
+    send, receiving = sender(), Authenticator(how, EPOCH_NS)
     # 10 s apart, with clocks that differ by 1 ms more each time.
     frames = [
         replace(send(round(k * 10 * S * (1 + drift)), bytes(8)), t_ns=k * 10 * S)
         for k in range(1000)
     ]
-    assert len(heard.authenticate(frames)) == 501
-    assert heard.replayed > 0
+    assert len(receiving.authenticate(frames)) == 501
+    assert receiving.replayed > 0
 
 
 def test_a_clock_that_was_slow_and_is_set_is_believed_at_once():
-    send, heard = sender(), receiver()
+    send, receiving = sender(), receiver()
     slow = [replace(send(k * 990 * MS, bytes(8)), t_ns=k * S) for k in range(51)]
-    assert len(heard.authenticate(slow)) == 51
-    assert payloads(heard, [send(51 * S, b"set")]) == [b"set"]
+    assert len(receiving.authenticate(slow)) == 51
+    assert payloads(receiving, [send(51 * S, b"set")]) == [b"set"]
 
 
 @pytest.mark.parametrize(("bits", "tolerance_ms"), [(8, 100), (8, 819), (16, 10_000)])
 def test_a_forged_frame_costs_a_bounded_number_of_tries(bits, tolerance_ms):
     how = Authentication(KEY, bits // 8, 3, tolerance_ms * MS, 60 * S)
-    heard, slow = Authenticator(how, EPOCH_NS), Authenticator(how, EPOCH_NS - tolerance_ms * MS)
+    receiving, slow = Authenticator(how, EPOCH_NS), Authenticator(how, EPOCH_NS - tolerance_ms * MS)
     # The clocks are apart, so that all about the one is tried and all about the other.
-    assert payloads(heard, [slow.secure(Frame(0, 0x100, b"first"))]) == [b"first"]
+    assert payloads(receiving, [slow.secure(Frame(0, 0x100, b"first"))]) == [b"first"]
     tried = []
-    right = heard._cmac
-    heard._cmac = lambda message: tried.append(message) or right(message)
-    assert heard.authenticate([Frame(S, 0x100, bytes(12), is_fd=True)]) == []
+    right = receiving._cmac
+    receiving._cmac = lambda message: tried.append(message) or right(message)
+    assert receiving.authenticate([Frame(S, 0x100, bytes(12), is_fd=True)]) == []
     assert len(tried) == len(set(tried)) <= 2 * (64 + 1)
 
 
 def test_more_frames_than_the_clock_has_steps_are_each_newer_than_the_last():
-    send, heard = sender(), receiver()
-    assert len(heard.authenticate([send(0, bytes(8)) for _ in range(100)])) == 100
+    send, receiving = sender(), receiver()
+    assert len(receiving.authenticate([send(0, bytes(8)) for _ in range(100)])) == 100
 
 
 class Wire:

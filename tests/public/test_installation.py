@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from rig.machine.installed_versions import DISTRIBUTION, installed_version
+from rig.machine.installed_versions import DISTRIBUTION, version_of
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from tests.run.listed import ListPort, bench_frames, live
@@ -60,7 +60,7 @@ def test_every_hint_names_an_extra_that_there_is():
 
 @pytest.mark.parametrize("package", ["rig", "numpy"])
 def test_a_version_is_found_by_the_name_of_the_package(package):
-    assert re.match(r"\d+\.\d+", installed_version(package))
+    assert re.match(r"\d+\.\d+", version_of(package))
 
 
 def test_a_run_has_the_version_under_the_name_rig(tmp_path):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from dart_model.effects import FAMILY_WORDS, effect
 from rig.diagnosis.outcome import Diagnosis, Result
-from rig.machine.installed_versions import installed_version
+from rig.machine.installed_versions import version_of
 from rig.pages.html import render_report, write_page
 from rig.pages.report import tables
 from rig.pages.report.figures import (
@@ -91,7 +91,7 @@ def page(result: Result) -> str:
         percent=percent,
         sources=result.sources,
         split=_SPLITS[diagnosis.held_out.source],
-        versions=[f"{name} {installed_version(name)}" for name in _PACKAGES],
+        versions=[f"{name} {version_of(name)}" for name in _PACKAGES],
     )
 
 

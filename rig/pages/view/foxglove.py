@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from can_dbc.errors import InputError
+from can_dbc.errors import InputError, missing_package
 from rig.pages.view.run_status import WatchedRun
 from rig.run.changed_settings import read_changes
 
@@ -327,8 +327,7 @@ def _sdk() -> ModuleType:
         importlib.import_module("foxglove.websocket")
     except ImportError as error:
         raise InputError(
-            "--foxglove: the package foxglove-sdk is not installed, expected "
-            "`pip install -e '.[foxglove]'` in the clone of rig"
+            "--foxglove: " + missing_package("foxglove-sdk", "pip install -e '.[foxglove]'")
         ) from error
     foxglove.set_log_level("ERROR")
     return foxglove

@@ -115,7 +115,7 @@ class ViewServer(ThreadingHTTPServer):
         self.runs = tuple(WatchedRun(folder) for folder in folders)
         self.diagnoses = tuple(DiagnosisJob(folder) for folder in folders)
         self.models = models
-        self._places = threading.BoundedSemaphore(_MOST_CONNECTIONS)
+        self._connections = threading.BoundedSemaphore(_MOST_CONNECTIONS)
         try:
             super().__init__((HOST, port), _Handler)
         except OSError as error:
@@ -131,15 +131,15 @@ class ViewServer(ThreadingHTTPServer):
     def process_request(
         self, request: socket.socket | tuple[bytes, socket.socket], client_address: Any
     ) -> None:
-        """Serve a connection in a thread of its own, if there is a place for one more."""
-        if not self._places.acquire(blocking=False):
+        """Serve a connection in a thread of its own, if one more may be served."""
+        if not self._connections.acquire(blocking=False):
             _answer_busy(cast("socket.socket", request))
             self.shutdown_request(request)
             return
         try:
             super().process_request(request, client_address)
         except BaseException:
-            self._places.release()
+            self._connections.release()
             raise
 
     def process_request_thread(
@@ -149,7 +149,7 @@ class ViewServer(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._places.release()
+            self._connections.release()
 
     def server_close(self) -> None:
         """End the server and its diagnoses."""
@@ -173,7 +173,7 @@ class ViewServer(ThreadingHTTPServer):
 
 
 def _answer_busy(connection: socket.socket) -> None:
-    """Answer a connection for which there is no place, whatever it requests."""
+    """Answer a connection that is one too many, whatever it requests."""
     connection.setblocking(False)
     with contextlib.suppress(OSError):
         connection.sendall(
