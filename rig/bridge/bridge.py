@@ -14,7 +14,7 @@ from rig.bridge.frame_checks import CheckMemory, FrameChecks, Reception
 from rig.bridge.incoming_messages import Incoming
 from rig.bridge.mode_supervisor import NO_REPORTS, Reports, SupervisedState, Supervision, Supervisor
 from rig.bridge.outgoing_messages import Outgoing
-from rig.bridge.values import Mode, StepInput, StepOutput
+from rig.bridge.values import Mode, StepInput, StepOutput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.observers.protocol import AnyObserver
 
@@ -99,10 +99,16 @@ class Bridge:
         own = frozenset(item.message.key for item in outgoing)
         struts = supervisor.estimator.struts
         self._checks = FrameChecks(incoming, own, devices, supervision.limits, struts)
+        self._nothing = (StrutOutput(0.0, 0.0, False, 0.0, 0.0, 0.0, 0.0),) * struts
         self._is_height = [channel.role is Role.HEIGHT for channel in channels]
         self._is_reading = [channel.role is Role.SENSOR for channel in channels]
         self.filters = _filters(incoming, outgoing, devices)
         """What admits the frames that the bridge subscribes to, its own among them."""
+
+    @property
+    def observers(self) -> Sequence[AnyObserver]:
+        """Observers of the struts."""
+        return self._supervisor.estimator.observers
 
     @property
     def incoming(self) -> tuple[Incoming, ...]:
@@ -134,6 +140,24 @@ class Bridge:
         supervised = self._supervisor.init(t_ns)
         return BridgeState(supervised, sequences, memory, sendings, memory.counts)
 
+    def take_over(self, state: BridgeState, before: "Bridge", t_ns: int) -> BridgeState:
+        """State of a bridge that ran before; with other observers it has to settle again."""
+        if self.observers == before.observers:
+            return state
+        supervised = state.supervised
+        estimator = self._supervisor.estimator.unsettle(supervised.estimator, t_ns)
+        return replace(state, supervised=replace(supervised, estimator=estimator))
+
+    def end(
+        self, state: BridgeState, t_ns: int, conditions: Conditions = _NO_CONDITIONS
+    ) -> tuple[BridgeState, list[Frame]]:
+        """State and frames at the end of a run: every message once, with the safe output."""
+        due = tuple(Sending(item.number, t_ns) for item in state.sendings)
+        state = replace(state, sendings=due)
+        output = self._supervisor.end(state.supervised)
+        sent = self._send(state, t_ns, output, state.counts, conditions)
+        return replace(state, sendings=sent[0]), sent[1]
+
     def tick(
         self,
         state: BridgeState,
@@ -149,9 +173,10 @@ class Bridge:
         wrong: tuple[tuple[int, str], ...] = ()
         if self._devices:
             wrong = faults(self._devices, memory.healths, t_ns)
-        if wrong or reception.action:
-            is_faulty = any(self._devices[index].is_vital for index, _ in wrong)
-            reports = Reports(reception.action, is_faulty)
+        gap_ns = t_ns - state.supervised.t_ns if conditions.overruns else 0
+        if wrong or reception.action or gap_ns:
+            vital = [index for index, _ in wrong if self._devices[index].is_vital]
+            reports = Reports(reception.action, reception.excess, gap_ns, *vital[:1])
         supervised, output, action = self._supervisor.step(supervised, step_input, reports)
         counts = count_tick(memory.counts, output, action, conditions, len(wrong))
         sent = self._send(state, t_ns, output, counts, conditions)
@@ -215,9 +240,10 @@ class Bridge:
         """State of the outgoing messages, frames to send, counts, and counts as reported."""
         frames: list[Frame] = []
         sendings, reported = state.sendings, state.reported
-        # Nothing is sent before the first valid measurement.
-        if not (sendings and output.struts):
+        if not sendings:
             return sendings, frames, counts, reported
+        if not output.struts:
+            output = StepOutput(output.mode, self._nothing)
         after = list(sendings)
         for index, item in enumerate(self._outgoing):
             sending = sendings[index]

@@ -107,11 +107,15 @@ class Conditions(NamedTuple):
     timing: TimingFigures = NO_TIMING
 
 
+# Looking up a member of an enum costs as much as the CRC of a frame.
+_HOLD = Mode.HOLD
+
+
 def count_tick(
     counts: Counts, output: StepOutput, action: int, conditions: Conditions, faulty_devices: int
 ) -> Counts:
     """Counts after a tick; most ticks are as they should be."""
-    is_held = output.mode is Mode.HOLD
+    is_held = output.mode is _HOLD
     is_unusual = conditions.overruns or conditions.bus_fault or output.left_out or faulty_devices
     if not (action or is_held or is_unusual):
         return counts

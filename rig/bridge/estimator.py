@@ -24,12 +24,14 @@ class Estimate(Struct, frozen=True, gc=False):
     Attributes:
         struts: One per strut, in the model's order, as published while the bridge is running.
         measured_ns: Time of the oldest of the newest measurements that it rests on.
+        is_settled: Whether it has forgotten how it began, and what was missing since.
         diverged: Index of the first strut whose numbers no bench has; -1 if there is none.
         left_out: Channels of further sensors that are not used now.
     """
 
     struts: tuple[StrutOutput, ...]
     measured_ns: int
+    is_settled: bool
     diverged: int = -1
     left_out: tuple[int, ...] = ()
 
@@ -42,8 +44,17 @@ class Estimator(Protocol[StateT]):
         """Number of struts."""
         ...
 
+    @property
+    def observers(self) -> Sequence[AnyObserver]:
+        """Observers of the struts; empty where the motion is prescribed."""
+        ...
+
     def init(self, t_ns: int) -> StateT:
         """State before the first step: it waits for measurements."""
+        ...
+
+    def unsettle(self, state: StateT, t_ns: int) -> StateT:
+        """State whose estimate has to settle again, from a time on."""
         ...
 
     def restart(self, state: StateT, t_ns: int) -> StateT:
@@ -52,6 +63,13 @@ class Estimator(Protocol[StateT]):
 
     def step(self, state: StateT, step_input: StepInput) -> tuple[StateT, Estimate | None]:
         """State after a step, and its estimate; None while it waits for measurements."""
+        ...
+
+    def collect(self, state: StateT, step_input: StepInput) -> tuple[StateT, bool]:
+        """State of an estimator that must not start, with new measurements, and whether it could.
+
+        The state is one that waits for measurements.
+        """
         ...
 
     def discard(self, before: StateT, after: StateT) -> StateT:

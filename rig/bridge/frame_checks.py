@@ -38,7 +38,14 @@ from rig.bridge.devices import (
     update_by_frame,
 )
 from rig.bridge.incoming_messages import Incoming, Values
-from rig.bridge.supervision_limits import Action, Limit, Plausibility, judge_height
+from rig.bridge.supervision_limits import (
+    Action,
+    Excess,
+    Limit,
+    Plausibility,
+    explain_height,
+    judge_height,
+)
 
 # Looking up a member of an enum costs as much as the CRC of a frame.
 _OK = FrameStatus.OK
@@ -70,15 +77,17 @@ class CheckMemory(Struct, frozen=True, gc=False):
 class Reception:
     """What the frames of one tick change while they pass; written in place.
 
-    `action` is the severest one that limits on measurements require, 0 if none.
+    `action` is the severest one that limits on measurements require, 0 if none; `excess` is the
+    first measurement that requires it.
     """
 
-    __slots__ = ("action", "memory", "sequences")
+    __slots__ = ("action", "excess", "memory", "sequences")
 
     def __init__(self, sequences: Sequence[SequenceState], memory: CheckMemory) -> None:
         self.sequences = list(sequences)
         self.memory = memory
         self.action = 0
+        self.excess: Excess | None = None
 
     def count(self, **increments: int) -> None:
         """Add to counts, by the names of `Counts`."""
@@ -251,16 +260,21 @@ def _healthy_sender(incoming: Incoming, index: int, device: Device) -> FrameChec
 
 def _plausible(incoming: Incoming, limits: Sequence[Limit]) -> FrameCheck:
     """A check for heights within the limits: a frame is used whole or not at all."""
+    shortest_ns = max(1, (incoming.message.cycle_time_ns or 0) // 2)
 
     def check(reception: Reception, frame: Frame, values: Values) -> Values | None:
         heights, action = list(reception.memory.heights), 0
         for target in incoming.heights:
+            height_m = values[target.value]
             memory = heights[target.strut]
-            heights[target.strut], required = judge_height(
-                limits, memory, values[target.value], frame.t_ns
-            )
+            if memory is None:
+                memory = Plausibility(height_m, frame.t_ns, frame.t_ns, shortest_ns)
+            heights[target.strut], required = judge_height(limits, memory, height_m, frame.t_ns)
+            if required > reception.action:
+                height = target.strut, height_m
+                reception.excess = explain_height(limits, memory, height, frame.t_ns, required)
+                reception.action = required
             action = max(action, required)
-        reception.action = max(reception.action, action)
         if action < Action.REFUSE:
             reception.memory = replace(reception.memory, heights=tuple(heights))
             return values

@@ -1,7 +1,9 @@
 """A model under the applied force that observers make follow its bench."""
 
+import itertools
 import math
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from msgspec import Struct
@@ -22,6 +24,14 @@ _APPLIED, _TEMPERATURE, _READING, _UNUSED = -1, -2, -3, -4
 """Routes of samples other than heights; a load cell of the bench is logged and not used here."""
 
 
+_MOST_CYCLES = 3
+"""Cycles after which a missing applied force is old, if that is longer than a height's age."""
+
+
+_AT_ONCE = 4
+"""Intervals that may not be over in less than half of their time."""
+
+
 class FreeModelState(Struct, frozen=True, gc=False):
     """State of a model that follows its bench.
 
@@ -30,10 +40,16 @@ class FreeModelState(Struct, frozen=True, gc=False):
         temperature_c: Last damper temperature.
         first: Of each strut the measurements that arrived before the model started, the oldest
             first.
-        observers: State of each strut's observer; empty while the model waits.
+        observers: State of each strut's observer; while the model waits that before it stopped,
+            empty before its first start.
         model: The model under its forces; None while it waits for measurements.
         past: The model at the ticks before the last, the newest first, as far back as a measurement
             may be old; empty where none is late.
+        disturbed_ns: Of each strut the time of the last disturbance of its estimate: the start, a
+            change of settings, or what its observer takes for one.
+        applied: Last applied force; None before the first.
+        is_settled: Whether every strut's estimate has settled.
+        longest_gaps_ns: Of each strut the longest time without a measurement.
     """
 
     t_ns: int
@@ -42,6 +58,10 @@ class FreeModelState(Struct, frozen=True, gc=False):
     observers: tuple[ObserverState, ...] = ()
     model: LoadedModel[ModelState] | None = None
     past: tuple[Instant, ...] = ()
+    disturbed_ns: tuple[int, ...] = ()
+    applied: Sample | None = None
+    is_settled: bool = False
+    longest_gaps_ns: tuple[int, ...] = ()
 
 
 class _Received(Struct, frozen=True, gc=False):
@@ -49,8 +69,12 @@ class _Received(Struct, frozen=True, gc=False):
 
     heights: Sequence[Sample | None]
     readings: Sequence[Sample]
-    applied_n: float | None
+    applied: Sample | None
     temperature_c: float | None
+
+
+SettlingTimes = Callable[[Sequence[AnyObserver]], Sequence[int | None]]
+"""Observers -> settling time of each strut's estimate in ns; None if it never settles."""
 
 
 class FreeModelEstimator:
@@ -59,6 +83,7 @@ class FreeModelEstimator:
     Args:
         channels: Channels of the bench; their indices are their positions.
         stale_after_ns: Age up to which a measurement can start the model.
+        settling_times: Settling times of the closed loop with some observers.
 
     Raises:
         ValueError: There is not one observer per strut.
@@ -70,15 +95,18 @@ class FreeModelEstimator:
         observers: Sequence[AnyObserver],
         channels: Sequence[Channel],
         stale_after_ns: int,
+        settling_times: SettlingTimes,
     ) -> None:
         if len(observers) != plant.struts:
             raise ValueError(
                 f"{len(observers)} observers for {plant.struts} struts, expected one each"
             )
         self._plant = plant
-        self._observers = tuple(observers)
+        self.observers = tuple(observers)
         self._channels = tuple(channels)
         self._stale_after_ns = stale_after_ns
+        self._settling_times = settling_times
+        self._settling_ns = tuple(settling_times(observers))
         self._routes = [_route(channel) for channel in channels]
         self._heights = {
             channel.strut: channel for channel in channels if channel.role is Role.HEIGHT
@@ -91,22 +119,39 @@ class FreeModelEstimator:
         latest = max([item.delay_ns for item in (*self._heights.values(), *sensors)], default=0)
         # A reading lies between two ticks: both are kept for it.
         self._oldest_ns = latest + 1 if sensors else latest
+        self._untimed = frozenset(
+            strut for strut, channel in self._heights.items() if not _has_cycle(channel)
+        )
+        applied = [channel for channel in channels if channel.quantity is APPLIED_FORCE]
+        self._has_applied = bool(applied)
+        self._applied_grace_ns = _grace_ns(applied, stale_after_ns)
 
     @property
     def struts(self) -> int:
-        return len(self._observers)
+        return len(self.observers)
 
     def with_settings(
         self, observers: Sequence[AnyObserver], stale_after_ns: int
     ) -> "FreeModelEstimator":
-        return FreeModelEstimator(self._plant, observers, self._channels, stale_after_ns)
+        return FreeModelEstimator(
+            self._plant, observers, self._channels, stale_after_ns, self._settling_times
+        )
 
     def init(self, t_ns: int) -> FreeModelState:
         return FreeModelState(t_ns, AMBIENT_C, ((),) * self.struts)
 
+    def unsettle(self, state: FreeModelState, t_ns: int) -> FreeModelState:
+        return replace(state, disturbed_ns=(t_ns,) * self.struts, is_settled=False)
+
     def restart(self, state: FreeModelState, t_ns: int) -> FreeModelState:
         """State that waits for measurements again; the temperature is kept."""
-        return FreeModelState(t_ns, state.temperature_c, ((),) * self.struts)
+        return FreeModelState(
+            t_ns,
+            state.temperature_c,
+            ((),) * self.struts,
+            observers=state.observers,
+            applied=state.applied,
+        )
 
     def discard(self, before: FreeModelState, after: FreeModelState) -> FreeModelState:
         return replace(before, t_ns=after.t_ns)
@@ -121,93 +166,127 @@ class FreeModelEstimator:
     ) -> tuple[FreeModelState, Estimate | None]:
         """Advance the model to a time and correct it with what was measured."""
         received = self._sort(step_input.samples)
-        if state.model is None:
-            return self._try_to_start(state, step_input.t_ns, received)
-        return self._observe(state, state.model, step_input.t_ns, received)
+        if state.model is not None:
+            return self._observe(state, state.model, step_input.t_ns, received)
+        return self._start_if_possible(state, step_input.t_ns, received)
 
     def _sort(self, samples: Sequence[Sample]) -> _Received:
         """Samples by what they are used for; of a quantity of the bench the newest."""
-        heights: list[Sample | None] = [None] * len(self._observers)
+        heights: list[Sample | None] = [None] * len(self.observers)
         readings: list[Sample] = []
-        applied_n = temperature_c = None
+        applied = temperature_c = None
         routes = self._routes
         for sample in samples:
             route = routes[sample.channel]
             if route >= 0:
                 heights[route] = sample
             elif route == _APPLIED:
-                applied_n = sample.value
+                applied = sample
             elif route == _TEMPERATURE:
                 temperature_c = sample.value
             elif route == _READING:
                 readings.append(sample)
-        return _Received(heights, readings, applied_n, temperature_c)
+        return _Received(heights, readings, applied, temperature_c)
 
-    def _try_to_start(
+    def collect(self, state: FreeModelState, step_input: StepInput) -> tuple[FreeModelState, bool]:
+        """State with the newest measurements of those that a start requires."""
+        return self._collect(state, step_input.t_ns, self._sort(step_input.samples))
+
+    def _collect(
         self, state: FreeModelState, t_ns: int, received: _Received
-    ) -> tuple[FreeModelState, Estimate | None]:
-        """Start the model at the measured heights, once every strut has enough of them."""
-        required = [observer.measurements_to_start for observer in self._observers]
+    ) -> tuple[FreeModelState, bool]:
+        required = [observer.measurements_to_start for observer in self.observers]
         first = tuple(
             (*old, new)[-count:] if new is not None and count else old
             for new, old, count in zip(received.heights, state.first, required, strict=True)
         )
         temperature_c = _latest(received.temperature_c, state.temperature_c)
-        state = FreeModelState(t_ns, temperature_c, first)
-        if not self._can_start(first, required, t_ns):
-            return state, None
+        applied = received.applied or state.applied
+        state = FreeModelState(t_ns, temperature_c, first, state.observers, applied=applied)
+        return state, self._can_start(state, required)
+
+    def _start_if_possible(
+        self, state: FreeModelState, t_ns: int, received: _Received
+    ) -> tuple[FreeModelState, Estimate | None]:
+        state, can_start = self._collect(state, t_ns, received)
+        return self._start(state) if can_start else (state, None)
+
+    def _start(self, state: FreeModelState) -> tuple[FreeModelState, Estimate]:
+        """Start the model at the measured heights and at their velocities."""
+        t_ns, first, applied = state.t_ns, state.first, state.applied
         starts = [start_of_motion(samples, t_ns) for samples in first]
         heights, velocities = [[item[i] for item in starts] for i in (0, 1)]
         model = self._plant.init(heights, velocities, t_s=t_ns * 1e-9)
-        applied_n = _latest(received.applied_n, 0.0)
-        loaded = self._plant.load(model, (0.0,) * len(first), applied_n, temperature_c)
+        applied_n = 0.0 if applied is None else applied.value
+        loaded = self._plant.load(model, (0.0,) * len(first), applied_n, state.temperature_c)
         responses = strut_responses(self._plant, heights)
         observers: list[ObserverState] = []
-        for strut, observer in enumerate(self._observers):
+        longest_gaps_ns: list[int] = []
+        for strut, observer in enumerate(self.observers):
             measured_ns = first[strut][-1].t_ns if first[strut] else t_ns
             mobility_per_kg, stiffness_per_s2, damping_per_s = responses[strut]
+            interval_ns, delay_ns = self._sample_timing(strut)
+            if strut in self._untimed:
+                interval_ns = max(interval_ns, _gaps_ns(first[strut])[len(first[strut]) // 2 - 1])
+            longest_gaps_ns.append(observer.longest_gap_ns(interval_ns) + delay_ns)
             start = Start(
                 measured_ns,
                 mobility_per_kg,
-                *self._sample_timing(strut),
+                interval_ns,
+                delay_ns,
                 stiffness_per_s2,
                 damping_per_s,
                 self._sensors[strut],
             )
-            observers.append(observer.init(start))
-        newest_ns = min(samples[-1].t_ns for samples in first if samples)
-        return self._estimate(t_ns, tuple(observers), loaded, newest_ns, ())
+            before = state.observers
+            observers.append(
+                observer.restart(before[strut], start) if before else observer.init(start)
+            )
+        started = replace(
+            state,
+            observers=tuple(observers),
+            model=loaded,
+            longest_gaps_ns=tuple(longest_gaps_ns),
+        )
+        started = self.unsettle(started, t_ns)
+        return self._estimate(started, loaded, self._newest_ns(state))
 
     def _sample_timing(self, strut: int) -> tuple[int, int]:
         """Interval and delay of a strut's heights in ns; zero where none is measured."""
         channel = self._heights.get(strut)
         return (0, 0) if channel is None else (channel.interval_ns, channel.delay_ns)
 
-    def _can_start(
-        self, first: Sequence[tuple[Sample, ...]], required: Sequence[int], t_ns: int
-    ) -> bool:
+    def _can_start(self, state: FreeModelState, required: Sequence[int]) -> bool:
         """Whether every strut has enough measurements, fresh and without a gap.
 
         A velocity is computed from several: they must belong together.
         """
-        for strut, samples in enumerate(first):
+        if self._has_applied and state.applied is None:
+            return False
+        for strut, samples in enumerate(state.first):
             if len(samples) != required[strut]:
                 return False
-            if samples and samples[-1].t_ns - samples[0].t_ns > (
-                2 * len(samples) * self._sample_timing(strut)[0]
-            ):
+            if not _belong_together(samples, self._sample_timing(strut)[0]):
                 return False
-        newest_ns = min(samples[-1].t_ns for samples in first if samples)
-        return not is_too_old(newest_ns, t_ns, self._stale_after_ns)
+        return not is_too_old(self._newest_ns(state), state.t_ns, self._stale_after_ns)
+
+    def _newest_ns(self, state: FreeModelState) -> int:
+        """Time of the oldest of the newest measurements before the model starts."""
+        newest_ns = min(samples[-1].t_ns for samples in state.first if samples)
+        if state.applied is None:
+            return newest_ns
+        return min(newest_ns, state.applied.t_ns + self._applied_grace_ns)
 
     def _observe(
         self, state: FreeModelState, loaded: LoadedModel[ModelState], t_ns: int, received: _Received
-    ) -> tuple[FreeModelState, Estimate]:
-        """Advance the model to the tick and correct it with what was measured."""
+    ) -> tuple[FreeModelState, Estimate | None]:
+        """Advance the model to the tick and correct it with what was measured.
+
+        After too long a gap the model starts again from the measurements behind it instead.
+        """
         heights, readings = received.heights, received.readings
-        applied_n, temperature_c = received.applied_n, received.temperature_c
-        if applied_n is None:
-            applied_n = loaded.applied_force_n
+        applied, temperature_c = received.applied or state.applied, received.temperature_c
+        applied_n = loaded.applied_force_n if applied is None else applied.value
         if temperature_c is None:
             temperature_c = loaded.temperature_c
         model = self._plant.step(loaded, (t_ns - state.t_ns) * 1e-9, applied_n)
@@ -223,14 +302,16 @@ class FreeModelEstimator:
         observers: list[ObserverState] = []
         virtual_n: list[float] = []
         oldest_ns = t_ns
-        for strut, observer in enumerate(self._observers):
+        for strut, observer in enumerate(self.observers):
             measured = heights[strut]
             innovation = None
+            before = state.observers[strut]
             if measured is not None:
                 measured_ns = measured.t_ns
+                if measured_ns - before.measured_ns > state.longest_gaps_ns[strut]:
+                    return self._start_if_possible(self.restart(state, t_ns), t_ns, received)
                 model_m = model_height_m(measured_ns, strut, t_ns, model.struts, instants)
                 innovation = Innovation(measured.value - model_m, measured_ns)
-            before = state.observers[strut]
             if further:
                 observed = observer.step(before, t_ns, innovation, further[strut])
             else:
@@ -239,8 +320,22 @@ class FreeModelEstimator:
             virtual_n.append(observed.virtual_force_n)
             oldest_ns = min(oldest_ns, observed.measured_ns)
         loaded = self._plant.load(model, virtual_n, applied_n, temperature_c)
-        past = instants[1:] if instants else state.past
-        return self._estimate(t_ns, tuple(observers), loaded, oldest_ns, past)
+        after = FreeModelState(
+            t_ns,
+            loaded.temperature_c,
+            (),
+            tuple(observers),
+            loaded,
+            instants[1:] if instants else state.past,
+            state.disturbed_ns,
+            applied,
+            state.is_settled,
+            state.longest_gaps_ns,
+        )
+        if applied is not None:
+            until_ns = applied.t_ns + self._applied_grace_ns
+            oldest_ns = min(oldest_ns, until_ns)
+        return self._estimate(after, loaded, oldest_ns)
 
     def _recent_instants(
         self, state: FreeModelState, before: LoadedModel[ModelState], now: Instant
@@ -269,18 +364,16 @@ class FreeModelEstimator:
         return innovations
 
     def _estimate(
-        self,
-        t_ns: int,
-        observers: tuple[ObserverState, ...],
-        loaded: LoadedModel[ModelState],
-        measured_ns: int,
-        past: tuple[Instant, ...],
+        self, state: FreeModelState, loaded: LoadedModel[ModelState], measured_ns: int
     ) -> tuple[FreeModelState, Estimate]:
-        """State and estimate at the end of a step."""
+        """State and estimate at the end of a step, after which the model is `loaded`."""
         struts: list[StrutOutput] = []
         left_out: tuple[int, ...] = ()
         size = loaded.applied_force_n
-        for strut, observer in enumerate(observers):
+        is_calm, t_ns, longest_gaps_ns = state.is_settled, state.t_ns, state.longest_gaps_ns
+        for strut, observer in enumerate(state.observers):
+            if observer.is_disturbed or t_ns - observer.measured_ns > longest_gaps_ns[strut]:
+                is_calm = False
             height_m, velocity_m_per_s = loaded.state.struts[strut]
             law_force_n = loaded.forces_n[strut]
             force_n = law_force_n + observer.residual_force_n
@@ -302,8 +395,47 @@ class FreeModelEstimator:
         # A model that has diverged is of no use, and would not come back by itself. DART hides it:
         # what is not finite has an acceleration of zero there.
         diverged = -1 if is_sensible(size) else find_divergence(struts)
-        state = FreeModelState(t_ns, loaded.temperature_c, (), observers, loaded, past)
-        return state, Estimate(tuple(struts), measured_ns, diverged, left_out)
+        if not is_calm:
+            state = self._settle(state)
+        estimate = Estimate(tuple(struts), measured_ns, state.is_settled, diverged, left_out)
+        return state, estimate
+
+    def _settle(self, state: FreeModelState) -> FreeModelState:
+        """State with the times of the last disturbances, and whether every strut has settled."""
+        is_settled, t_ns, disturbed_ns = True, state.t_ns, list(state.disturbed_ns)
+        for strut, settling_ns in enumerate(self._settling_ns):
+            observer = state.observers[strut]
+            is_old = t_ns - observer.measured_ns > state.longest_gaps_ns[strut]
+            if is_old or observer.is_disturbed:
+                disturbed_ns[strut] = t_ns
+                is_settled = False
+            elif settling_ns is None or t_ns - disturbed_ns[strut] < settling_ns:
+                is_settled = False
+        return replace(state, disturbed_ns=tuple(disturbed_ns), is_settled=is_settled)
+
+
+def _belong_together(samples: Sequence[Sample], interval_ns: int) -> bool:
+    """Whether measurements follow each other as they should.
+
+    None is missing, and none has waited with others in a queue, so that their times are one. How
+    long it takes is no matter: the DBC may not know the cycle time.
+    """
+    if len(samples) < 2:
+        return True
+    gaps_ns = _gaps_ns(samples)
+    if gaps_ns[-1] > 3 * max(interval_ns, gaps_ns[len(gaps_ns) // 2]):
+        return False
+    # One that is late and one that is early are nothing unusual, some that came at once are.
+    step = min(_AT_ONCE, len(gaps_ns))
+    spans_ns = [
+        later.t_ns - item.t_ns for item, later in zip(samples, samples[step:], strict=False)
+    ]
+    return 2 * min(spans_ns) >= step * interval_ns
+
+
+def _gaps_ns(samples: Sequence[Sample]) -> list[int]:
+    """Times between measurements, the shortest first."""
+    return sorted(after.t_ns - before.t_ns for before, after in itertools.pairwise(samples))
 
 
 def start_of_motion(samples: Sequence[Sample], t_ns: int) -> tuple[float, float]:
@@ -332,6 +464,21 @@ def _route(channel: Channel) -> int:
     if channel.role is Role.SENSOR:
         return _READING
     return {APPLIED_FORCE: _APPLIED, TEMPERATURE: _TEMPERATURE}.get(channel.quantity, _UNUSED)
+
+
+def _has_cycle(channel: Channel) -> bool:
+    """Whether it is known how often a channel is measured."""
+    return channel.message is None or channel.message.cycle_time_ns is not None
+
+
+def _grace_ns(channels: Sequence[Channel], stale_after_ns: int) -> int:
+    """How much older than a height a channel's newest sample may be: its own cycle is longer.
+
+    Of a channel whose cycle the DBC does not give, no age can be judged.
+    """
+    if not all(map(_has_cycle, channels)):
+        return sys.maxsize
+    return max([_MOST_CYCLES * item.interval_ns - stale_after_ns for item in channels] + [0])
 
 
 def _latest(new: float | None, old: float) -> float:

@@ -5,44 +5,59 @@ device, the user. A tick may show several; they are applied one after the other:
 limits, devices. What is published follows from the mode.
 """
 
-from collections.abc import Sequence
-from enum import IntEnum, auto
+from collections.abc import Iterable, Iterator, Sequence
+from enum import Enum
+from math import nan
 from typing import Annotated, Literal
 
 from msgspec import Struct
 from msgspec.structs import replace
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from can_dbc.yaml_file import Positive
+from can_dbc.yaml_file import NotNegative, Positive
 from rig.bridge.estimator import AnyEstimator, Estimate
 from rig.bridge.measurement_age import is_too_old
-from rig.bridge.supervision_limits import Action, Limit, worst_action
+from rig.bridge.supervision_limits import Action, Excess, Limit, find_excess, worst_action
 from rig.bridge.values import Divergence, Mode, StepInput, StepOutput, StrutOutput
 
 
-class Event(IntEnum):
-    """What a tick shows."""
+class Event(Enum):
+    """What a tick shows, in the order in which it is applied."""
 
-    BEYOND_SAFE = auto()
-    DIVERGED = auto()
-    TIMEOUT = auto()
-    BEYOND_HOLD = auto()
-    DEVICE_FAULT = auto()
-    STALE = auto()
-    ACKNOWLEDGED = auto()
-    FRESH = auto()
+    TICKS_MISSING = "ticks_missing"
+    ACKNOWLEDGED = "acknowledged"
+    FRESH = "fresh"
+    STALE = "stale"
+    TIMEOUT = "timeout"
+    DIVERGED = "diverged"
+    SETTLED = "settled"
+    UNSETTLED = "unsettled"
+    BEYOND_HOLD = "beyond_hold"
+    BEYOND_SAFE = "beyond_safe"
+    DEVICE_FAULT = "device_fault"
 
 
 TRANSITIONS: dict[tuple[Mode, Event], Mode] = {
-    (Mode.WAITING, Event.FRESH): Mode.RUNNING,
+    (Mode.WAITING, Event.FRESH): Mode.SETTLING,
+    (Mode.SETTLING, Event.SETTLED): Mode.RUNNING,
+    (Mode.SETTLING, Event.STALE): Mode.HOLD,
+    (Mode.SETTLING, Event.TIMEOUT): Mode.SAFE,
+    (Mode.SETTLING, Event.TICKS_MISSING): Mode.SAFE,
+    (Mode.SETTLING, Event.DIVERGED): Mode.SAFE,
+    (Mode.SETTLING, Event.BEYOND_HOLD): Mode.HOLD,
+    (Mode.SETTLING, Event.BEYOND_SAFE): Mode.SAFE,
+    (Mode.SETTLING, Event.DEVICE_FAULT): Mode.HOLD,
+    (Mode.RUNNING, Event.UNSETTLED): Mode.SETTLING,
     (Mode.RUNNING, Event.STALE): Mode.HOLD,
     (Mode.RUNNING, Event.TIMEOUT): Mode.SAFE,
+    (Mode.RUNNING, Event.TICKS_MISSING): Mode.SAFE,
     (Mode.RUNNING, Event.DIVERGED): Mode.SAFE,
     (Mode.RUNNING, Event.BEYOND_HOLD): Mode.HOLD,
     (Mode.RUNNING, Event.BEYOND_SAFE): Mode.SAFE,
     (Mode.RUNNING, Event.DEVICE_FAULT): Mode.HOLD,
-    (Mode.HOLD, Event.FRESH): Mode.RUNNING,
+    (Mode.HOLD, Event.FRESH): Mode.SETTLING,
     (Mode.HOLD, Event.TIMEOUT): Mode.SAFE,
+    (Mode.HOLD, Event.TICKS_MISSING): Mode.SAFE,
     (Mode.HOLD, Event.DIVERGED): Mode.SAFE,
     (Mode.HOLD, Event.BEYOND_SAFE): Mode.SAFE,
     (Mode.SAFE, Event.ACKNOWLEDGED): Mode.WAITING,
@@ -61,6 +76,10 @@ class Supervision(BaseModel):
     Attributes:
         stale_after_s: Age of a height from which the estimate is marked invalid.
         safe_after_s: Age from which the safe state is entered.
+        settling_s: Time after a start, a change of gains or a saturated virtual force until an
+            estimate is valid. By default that in which a step of the residual force decays to a
+            hundredth in the closed loop; none for an observer that knows its variance, which
+            settles with it.
         safe_output: Force that the safe state publishes: `zero`, or the `last` valid one.
         limits: What is done beyond which values, row by row.
     """
@@ -69,6 +88,7 @@ class Supervision(BaseModel):
 
     stale_after_s: Positive = 0.01
     safe_after_s: Positive = 0.5
+    settling_s: NotNegative | None = None
     safe_output: Literal["zero", "last"] = "zero"
     limits: Annotated[tuple[Limit, ...], Field(max_length=100)] = ()
 
@@ -92,6 +112,26 @@ class Supervision(BaseModel):
         return round(self.safe_after_s * 1e9)
 
 
+class Cause(Struct, frozen=True, gc=False):
+    """Why the mode changed.
+
+    Attributes:
+        event: What the tick showed.
+        strut: Index of the strut that shows it; -1 if it is none.
+        quantity: What was too large, with its unit; empty where nothing was.
+        value: Its value.
+        limit: The limit that it is beyond.
+        device: Index of the device that is at fault; -1 if none is.
+    """
+
+    event: Event
+    strut: int = -1
+    quantity: str = ""
+    value: float = nan
+    limit: float = nan
+    device: int = -1
+
+
 class SupervisedState(Struct, frozen=True, gc=False):
     """State of an estimator and of its supervisor between two steps; a run can restart from any.
 
@@ -102,6 +142,9 @@ class SupervisedState(Struct, frozen=True, gc=False):
         last_valid: What was last published as valid; empty before.
         stopped_m: Heights at which the struts of a stopped model stand, in the safe state.
         diverged: The last divergence of the model, if there ever was one.
+        measured_ns: Time of the measurements that the last estimate rests on.
+        cause: Why the mode is what it is.
+        first_cause: Why the estimate was last lost; None while the bridge is running.
     """
 
     t_ns: int
@@ -110,23 +153,38 @@ class SupervisedState(Struct, frozen=True, gc=False):
     last_valid: tuple[StrutOutput, ...] = ()
     stopped_m: Sequence[float] = ()
     diverged: Divergence | None = None
+    measured_ns: int = 0
+    cause: Cause | None = None
+    first_cause: Cause | None = None
 
 
 class Reports(Struct, frozen=True, gc=False):
-    """What the frame checks and the devices report to the supervisor at a tick.
+    """What the frame checks, the devices and the loop report to the supervisor at a tick.
 
     Attributes:
         action: Severest action that the limits on measurements require, 0 if none.
-        is_device_faulty: Whether a device that the estimate rests on is at fault.
+        excess: The measurement beyond them; None if there is none.
+        gap_ns: Time without a tick before this one, if any was missed.
+        faulty_device: Index of a device at fault that the estimate rests on; -1 if there is none.
     """
 
     action: int = 0
-    is_device_faulty: bool = False
+    excess: Excess | None = None
+    gap_ns: int = 0
+    faulty_device: int = -1
 
 
 NO_REPORTS = Reports()
 _EVENT_OF_ACTION = {Action.HOLD: Event.BEYOND_HOLD, Action.SAFE: Event.BEYOND_SAFE}
 """Action -> event; the others change no mode."""
+
+_UNSUPPORTED = (Event.TIMEOUT, Event.DIVERGED)
+"""Events that make a step's own motion worthless: the model stops where it was before."""
+
+_LOST = (Mode.HOLD, Mode.SAFE)
+
+# Looking up a member of an enum costs as much as the CRC of a frame.
+_RUNNING, _SAFE = Mode.RUNNING, Mode.SAFE
 
 
 class Supervisor:
@@ -147,73 +205,149 @@ class Supervisor:
         self, state: SupervisedState, step_input: StepInput, reports: Reports = NO_REPORTS
     ) -> tuple[SupervisedState, StepOutput, int]:
         """State after a step, what it publishes, and the severest action that a limit requires."""
-        t_ns, mode, before = step_input.t_ns, state.mode, state.estimator
-        if mode is Mode.SAFE:
-            if not step_input.acknowledged:
-                state = replace(state, t_ns=t_ns)
-                return state, self._safe_output(state), reports.action
-            mode = next_mode(mode, Event.ACKNOWLEDGED)
-            before = self.estimator.restart(before, state.t_ns)
+        mode = state.mode
+        if mode is _SAFE:
+            return *self._stand(state, step_input, reports), reports.action
+        t_ns, before = step_input.t_ns, state.estimator
         after, estimate = self.estimator.step(before, step_input)
         if estimate is None:
-            state = SupervisedState(t_ns, mode, after, state.last_valid, (), state.diverged)
-            return state, StepOutput(mode, ()), reports.action
-        measured_ns = estimate.measured_ns
-        if mode is not Mode.RUNNING or is_too_old(measured_ns, t_ns, self._stale_after_ns):
-            mode = next_mode(mode, self._age_event(measured_ns, t_ns))
-        if estimate.diverged >= 0:
-            mode = next_mode(mode, Event.DIVERGED)
-            state = replace(state, diverged=Divergence(estimate.diverged, t_ns))
+            return *self._wait(state, t_ns, after, reports), reports.action
         action = reports.action
-        if mode is Mode.SAFE:
-            # The model stops where it was before a motion that no measurement supports.
-            return *self._stop(state, t_ns, self.estimator.discard(before, after)), action
-        if self._limits or reports is not NO_REPORTS:
-            mode, action = self._mode_by_reports(mode, estimate, reports)
-        if mode is Mode.RUNNING:
-            struts = estimate.struts
-            state = SupervisedState(t_ns, mode, after, struts, (), state.diverged)
+        if self._limits:
+            action = max(action, *[worst_action(self._limits, item) for item in estimate.struts])
+        is_calm = (
+            mode is _RUNNING
+            and estimate.is_settled
+            and estimate.diverged < 0
+            and not action
+            and reports is NO_REPORTS
+            and not is_too_old(estimate.measured_ns, t_ns, self._stale_after_ns)
+        )
+        if is_calm:
+            struts, measured_ns = estimate.struts, estimate.measured_ns
+            state = SupervisedState(
+                t_ns, mode, after, struts, (), state.diverged, measured_ns, state.cause
+            )
             return state, StepOutput(mode, struts, estimate.left_out), action
-        if mode is Mode.SAFE:
-            return *self._stop(state, t_ns, after), action
-        return *self._hold(state, t_ns, after, estimate), action
+        if estimate.diverged >= 0:
+            state = replace(state, diverged=Divergence(estimate.diverged, t_ns))
+        causes = self._causes(t_ns, estimate, action, reports)
+        return *self._change(state, t_ns, after, estimate, causes), action
 
-    def _mode_by_reports(
-        self, mode: Mode, estimate: Estimate, reports: Reports
-    ) -> tuple[Mode, int]:
-        """Mode after limits and devices, and the severest action that a limit requires."""
-        actions = [worst_action(self._limits, strut) for strut in estimate.struts]
-        action = max([reports.action, *actions])
-        if action in _EVENT_OF_ACTION:
-            mode = next_mode(mode, _EVENT_OF_ACTION[Action(action)])
-        if reports.is_device_faulty:
-            mode = next_mode(mode, Event.DEVICE_FAULT)
-        return mode, action
+    def end(self, state: SupervisedState) -> StepOutput:
+        """What is published when the run ends: the safe output, whatever the mode was."""
+        stopped_m = state.stopped_m or self._standing_m(state, state.estimator)
+        return self._safe_output(replace(state, mode=Mode.SAFE, stopped_m=stopped_m))
 
-    def _age_event(self, measured_ns: int, t_ns: int) -> Event:
-        """What the age of the oldest measurement means."""
-        if not is_too_old(measured_ns, t_ns, self._stale_after_ns):
-            return Event.FRESH
-        is_timeout = is_too_old(measured_ns, t_ns, self._safe_after_ns)
-        return Event.TIMEOUT if is_timeout else Event.STALE
-
-    def _hold(
-        self, state: SupervisedState, t_ns: int, estimator: object, estimate: Estimate
+    def _change(
+        self,
+        state: SupervisedState,
+        t_ns: int,
+        after: object,
+        estimate: Estimate,
+        causes: Iterable[Cause],
     ) -> tuple[SupervisedState, StepOutput]:
-        """State and output while the model moves and its estimate is not valid."""
-        struts = tuple([replace(strut, valid=False) for strut in estimate.struts])
-        after = SupervisedState(t_ns, Mode.HOLD, estimator, state.last_valid, (), state.diverged)
-        return after, StepOutput(Mode.HOLD, struts, estimate.left_out)
+        """State and output after what a tick shows, one event after the other."""
+        before, struts = state.estimator, estimate.struts
+        state, cause = _apply(state, causes)
+        if state.mode is Mode.SAFE:
+            is_unsupported = cause is not None and cause.event in _UNSUPPORTED
+            stopped = self.estimator.discard(before, after) if is_unsupported else after
+            return self._stop(state, t_ns, stopped)
+        is_running = state.mode is Mode.RUNNING
+        struts = struts if is_running else _as_invalid(struts)
+        state = replace(
+            state,
+            t_ns=t_ns,
+            estimator=after,
+            last_valid=struts if is_running else state.last_valid,
+            measured_ns=estimate.measured_ns,
+        )
+        return state, StepOutput(state.mode, struts, estimate.left_out)
+
+    def _causes(
+        self, t_ns: int, estimate: Estimate, action: int, reports: Reports
+    ) -> Iterator[Cause]:
+        """What a tick with an estimate shows, in order."""
+        yield from self._missing_ticks(reports)
+        yield self._age(estimate.measured_ns, t_ns)
+        if estimate.diverged >= 0:
+            yield Cause(Event.DIVERGED, estimate.diverged)
+        yield Cause(Event.SETTLED if estimate.is_settled else Event.UNSETTLED)
+        if action >= Action.HOLD:
+            excess = reports.excess
+            if action > reports.action:
+                excess = find_excess(self._limits, estimate.struts, action)
+            yield _beyond(action, excess)
+        if reports.faulty_device >= 0:
+            yield Cause(Event.DEVICE_FAULT, device=reports.faulty_device)
+
+    def _missing_ticks(self, reports: Reports) -> Iterator[Cause]:
+        """A gap between two ticks that left the bench alone for too long."""
+        gap_s, limit_s = reports.gap_ns * 1e-9, self._safe_after_ns * 1e-9
+        if reports.gap_ns > self._safe_after_ns:
+            yield Cause(Event.TICKS_MISSING, -1, "gap_s", gap_s, limit_s)
+
+    def _age(self, measured_ns: int, t_ns: int) -> Cause:
+        """What the age of the oldest measurement means."""
+        age_s = (t_ns - measured_ns) * 1e-9
+        if is_too_old(measured_ns, t_ns, self._safe_after_ns):
+            return Cause(Event.TIMEOUT, -1, "age_s", age_s, self._settings.safe_after_s)
+        if is_too_old(measured_ns, t_ns, self._stale_after_ns):
+            return Cause(Event.STALE, -1, "age_s", age_s, self._settings.stale_after_s)
+        return Cause(Event.FRESH)
+
+    def _wait(
+        self, state: SupervisedState, t_ns: int, estimator: object, reports: Reports
+    ) -> tuple[SupervisedState, StepOutput]:
+        """State and output without a model: before its start, and while it starts again."""
+        if state.mode is not Mode.WAITING:
+            # Fresh measurements are not enough yet, old ones are a reason to stop.
+            age = self._age(state.measured_ns, t_ns)
+            if age.event is Event.FRESH:
+                age = Cause(Event.STALE, -1, "age_s", age.value)
+            causes = [*self._missing_ticks(reports), age]
+            if reports.action >= Action.HOLD:
+                causes.append(_beyond(reports.action, reports.excess))
+            state, _ = _apply(state, causes)
+            if state.mode is Mode.SAFE:
+                return self._stop(state, t_ns, estimator)
+        after = replace(state, t_ns=t_ns, estimator=estimator)
+        struts = () if state.mode is Mode.WAITING else _as_invalid(state.last_valid)
+        return after, StepOutput(state.mode, struts)
+
+    def _stand(
+        self, state: SupervisedState, step_input: StepInput, reports: Reports
+    ) -> tuple[SupervisedState, StepOutput]:
+        """State and output of the safe state, which an acknowledgement leaves.
+
+        It does so only when what has led there is over: the model could start from fresh
+        measurements, and neither a limit on them nor a device is in the way.
+        """
+        estimator, can_start = self.estimator.collect(state.estimator, step_input)
+        state = replace(state, t_ns=step_input.t_ns, estimator=estimator)
+        is_over = can_start and reports.action < Action.HOLD and reports.faulty_device < 0
+        if not (step_input.acknowledged and is_over):
+            return state, self._safe_output(state)
+        state, _ = _apply(replace(state, stopped_m=()), (Cause(Event.ACKNOWLEDGED),))
+        return state, StepOutput(state.mode, ())
 
     def _stop(
         self, state: SupervisedState, t_ns: int, estimator: object
     ) -> tuple[SupervisedState, StepOutput]:
-        """State and output at the entry of the safe state."""
-        heights_m = self.estimator.heights_m(estimator)
-        state = SupervisedState(
-            t_ns, Mode.SAFE, estimator, state.last_valid, heights_m, state.diverged
+        """State and output at the entry of the safe state; measurements are collected again."""
+        state = replace(
+            state,
+            t_ns=t_ns,
+            estimator=self.estimator.restart(estimator, t_ns),
+            stopped_m=self._standing_m(state, estimator),
         )
         return state, self._safe_output(state)
+
+    def _standing_m(self, state: SupervisedState, estimator: object) -> Sequence[float]:
+        """Heights at which the model stands, or last stood if it was to start again."""
+        heights_m = self.estimator.heights_m(estimator)
+        return heights_m or [strut.height_m for strut in state.last_valid]
 
     def _safe_output(self, state: SupervisedState) -> StepOutput:
         """The defined output of the safe state: the model stands still."""
@@ -225,3 +359,38 @@ class Supervisor:
             for force_n, height_m in zip(forces, state.stopped_m, strict=True)
         )
         return StepOutput(state.mode, struts)
+
+
+def _apply(state: SupervisedState, causes: Iterable[Cause]) -> tuple[SupervisedState, Cause | None]:
+    """State after what a tick shows, and what changed its mode last; None if nothing did.
+
+    A cause that lasts leads to the mode that there was: that mode keeps its cause. Nothing leaves
+    the safe state within the tick that enters it.
+    """
+    mode, last = state.mode, None
+    for cause in causes:
+        after = next_mode(mode, cause.event)
+        if after is not mode:
+            mode, last = after, cause
+            if mode is Mode.SAFE:
+                break
+    if last is None or mode is state.mode:
+        return state, last
+    first = state.first_cause
+    if mode is Mode.RUNNING:
+        first = None
+    elif mode in _LOST:
+        first = first or last
+    return replace(state, mode=mode, cause=last, first_cause=first), last
+
+
+def _beyond(action: int, excess: Excess | None) -> Cause:
+    """The cause that a limit's action is; of HOLD or SAFE."""
+    event = _EVENT_OF_ACTION[Action(action)]
+    if excess is None:
+        return Cause(event)
+    return Cause(event, excess.strut, excess.value.value, excess.number, excess.bound)
+
+
+def _as_invalid(struts: Sequence[StrutOutput]) -> tuple[StrutOutput, ...]:
+    return tuple([replace(strut, valid=False) for strut in struts])

@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from dart_model.effects import AMBIENT_C
 from rig.bridge.estimator import Estimate, is_sensible
@@ -24,6 +25,12 @@ from rig.channels.measured_quantities import LOAD_CELL_FORCE, TEMPERATURE
 from rig.observers.protocol import AnyObserver
 
 ModelT = TypeVar("ModelT")
+
+_SETTLED = 9.0
+"""Time constants after which the filter has forgotten that it began at rest: to a hundredth."""
+
+_LONGEST_GAP = 10
+"""Measurements that may be missing in a row; the motion is followed from the next one on."""
 
 
 class PrescribedModel(Protocol[ModelT]):
@@ -63,7 +70,8 @@ class TrackedMotion(Struct, frozen=True, gc=False):
 class PrescribedMotionState(Struct, frozen=True, gc=False):
     """State between two steps at a dyno; None before the first measurement.
 
-    `cell_ns` is the time at which the last force of the load cell arrived.
+    `cell_ns` is the time at which the last force of the load cell arrived, `disturbed_ns` that
+    since which the motion is followed without a gap.
     """
 
     t_ns: int
@@ -73,6 +81,7 @@ class PrescribedMotionState(Struct, frozen=True, gc=False):
     cell_n: float | None = None
     cell_ns: int = 0
     is_moving: bool = False
+    disturbed_ns: int = 0
 
 
 def update_motion(motion: TrackedMotion, sample: Sample, settling_s: float) -> TrackedMotion:
@@ -136,6 +145,10 @@ class PrescribedMotionEstimator:
     def struts(self) -> int:
         return 1
 
+    @property
+    def observers(self) -> Sequence[AnyObserver]:
+        return ()
+
     def with_settings(
         self, observers: Sequence[AnyObserver], stale_after_ns: int
     ) -> "PrescribedMotionEstimator":
@@ -146,6 +159,9 @@ class PrescribedMotionEstimator:
 
     def init(self, t_ns: int) -> PrescribedMotionState:
         return PrescribedMotionState(t_ns, AMBIENT_C)
+
+    def unsettle(self, state: PrescribedMotionState, t_ns: int) -> PrescribedMotionState:
+        return replace(state, disturbed_ns=t_ns)
 
     def restart(self, state: PrescribedMotionState, t_ns: int) -> PrescribedMotionState:
         """State that waits for measurements again; the temperature is kept."""
@@ -167,13 +183,11 @@ class PrescribedMotionEstimator:
     ) -> tuple[PrescribedMotionState, Estimate | None]:
         """Move the model to a time, and compare it with the load cell."""
         t_ns = step_input.t_ns
-        state = self._receive(state, step_input)
+        state, can_start = self.collect(state, step_input)
         motion, cell_n = state.motion, state.cell_n
-        if motion is None or cell_n is None:
+        if motion is None or cell_n is None or not (state.is_moving or can_start):
             return state, None
         measured_ns = min(motion.measured_ns, state.cell_ns)
-        if not state.is_moving and is_too_old(measured_ns, t_ns, self._stale_after_ns):
-            return state, None
         temperature_c = state.temperature_c
         model = self._model.step(
             state.model, t_ns * 1e-9, partial(_motion_at, motion), temperature_c
@@ -183,29 +197,46 @@ class PrescribedMotionEstimator:
         innovation_m, virtual_n = motion.innovation_m, cell_n - model_n
         strut = StrutOutput(cell_n, virtual_n, True, height_m, velocity, acceleration, innovation_m)
         diverged = -1 if is_sensible(cell_n + model_n + height_m + velocity) else 0
-        after = PrescribedMotionState(
-            t_ns, temperature_c, motion, model, cell_n, state.cell_ns, is_moving=True
-        )
-        return after, Estimate((strut,), measured_ns, diverged)
+        after = replace(state, model=model, is_moving=True)
+        is_settled = (t_ns - state.disturbed_ns) * 1e-9 >= _SETTLED * self._settling_s
+        return after, Estimate((strut,), measured_ns, is_settled, diverged)
 
-    def _receive(
+    def collect(
         self, state: PrescribedMotionState, step_input: StepInput
-    ) -> PrescribedMotionState:
+    ) -> tuple[PrescribedMotionState, bool]:
         """State with the samples of a step; the model begins at the first measured height."""
         motion, model, temperature_c = state.motion, state.model, state.temperature_c
-        cell_n, cell_ns = state.cell_n, state.cell_ns
+        cell_n, cell_ns, disturbed_ns = state.cell_n, state.cell_ns, state.disturbed_ns
         for sample in step_input.samples:
             channel = self._channels[sample.channel]
             if channel.role is Role.HEIGHT:
-                if motion is None:
+                longest_ns = _LONGEST_GAP * channel.interval_ns
+                if motion is None or sample.t_ns - motion.measured_ns > longest_ns:
+                    if motion is None:
+                        model = self._model.init(state.t_ns * 1e-9)
                     motion = TrackedMotion(sample.value, 0.0, 0.0, 0.0, sample.t_ns)
-                    model = self._model.init(state.t_ns * 1e-9)
+                    disturbed_ns = sample.t_ns
                 else:
                     motion = update_motion(motion, sample, self._settling_s)
             elif channel.quantity is LOAD_CELL_FORCE:
                 cell_n, cell_ns = sample.value, step_input.t_ns
             elif channel.quantity is TEMPERATURE:
                 temperature_c = sample.value
-        return PrescribedMotionState(
-            step_input.t_ns, temperature_c, motion, model, cell_n, cell_ns, state.is_moving
+        can_start = (
+            motion is not None
+            and cell_n is not None
+            and not is_too_old(
+                min(motion.measured_ns, cell_ns), step_input.t_ns, self._stale_after_ns
+            )
         )
+        collected = PrescribedMotionState(
+            step_input.t_ns,
+            temperature_c,
+            motion,
+            model,
+            cell_n,
+            cell_ns,
+            state.is_moving,
+            disturbed_ns,
+        )
+        return collected, can_start

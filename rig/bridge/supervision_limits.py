@@ -1,7 +1,8 @@
 """Limits on measurements and estimates, and what is done beyond them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import Enum, IntEnum
+from math import nan
 from typing import Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, model_validator
@@ -88,13 +89,62 @@ class Limit(BaseModel):
             return 0
         return Action[self.action.upper()]
 
+    def bound_beyond(self, value: float) -> float:
+        """The bound that a value is beyond; one that is no number is beyond either."""
+        is_low = self.low is not None and value < self.low
+        bound = self.low if is_low or self.high is None else self.high
+        return nan if bound is None else bound
+
+
+class Excess(NamedTuple):
+    """A value beyond a limit: its strut, what it is, and the bound that it is beyond."""
+
+    strut: int
+    value: LimitedValue
+    number: float
+    bound: float
+
 
 class Plausibility(NamedTuple):
-    """Last measured height of a strut that was used, its time, and since when it is the same."""
+    """Last measured height of a strut that was used, its time, and since when it is the same.
+
+    Attributes:
+        shortest_ns: Time between two measurements at least: half a cycle.
+    """
 
     height_m: float
     t_ns: int
     since_ns: int
+    shortest_ns: int = 1
+
+
+def _measured(last: Plausibility, height_m: float, t_ns: int) -> Mapping[LimitedValue, float]:
+    """What limits on measurements are set on, of a new height."""
+    change_m = height_m - last.height_m
+    # Heights with one time stamp, as of a queue that is read late, are not simultaneous.
+    elapsed_ns = max(t_ns - last.t_ns, last.shortest_ns)
+    return {
+        LimitedValue.MEASURED_HEIGHT_M: height_m,
+        LimitedValue.MEASURED_RATE_M_PER_S: change_m / (elapsed_ns * 1e-9),
+        LimitedValue.UNCHANGED_S: 0.0 if change_m else (t_ns - last.since_ns) * 1e-9,
+    }
+
+
+def explain_height(
+    limits: Sequence[Limit],
+    last: Plausibility,
+    height: tuple[int, float],
+    t_ns: int,
+    action: int,
+) -> Excess | None:
+    """Why a new height (index of its strut, and m) requires an action; None if it does not."""
+    strut, height_m = height
+    values = _measured(last, height_m, t_ns)
+    for limit in limits:
+        number = values[limit.value]
+        if limit.action_at(number) == action:
+            return Excess(strut, limit.value, number, limit.bound_beyond(number))
+    return None
 
 
 def judge_height(
@@ -105,30 +155,38 @@ def judge_height(
     Before the first measurement there is no memory; `t_ns` is the time of arrival.
     """
     last = memory or Plausibility(height_m, t_ns, t_ns)
-    age_s = (t_ns - last.t_ns) * 1e-9
-    values = {
-        LimitedValue.MEASURED_HEIGHT_M: height_m,
-        LimitedValue.MEASURED_RATE_M_PER_S: (
-            (height_m - last.height_m) / age_s if age_s > 0.0 else 0.0
-        ),
-        LimitedValue.UNCHANGED_S: (
-            (t_ns - last.since_ns) * 1e-9 if height_m == last.height_m else 0.0
-        ),
-    }
+    values = _measured(last, height_m, t_ns)
     action = max([limit.action_at(values[limit.value]) for limit in limits], default=0)
     if action >= Action.REFUSE:
         # What was used last stays the reference, but only for as long as the rate allows for.
         return last, action
     since_ns = last.since_ns if height_m == last.height_m else t_ns
-    return Plausibility(height_m, t_ns, since_ns), action
+    return last._replace(height_m=height_m, t_ns=t_ns, since_ns=since_ns), action
+
+
+def find_excess(
+    limits: Sequence[Limit], struts: Sequence[StrutOutput], action: int
+) -> Excess | None:
+    """The first estimate that requires an action, and its limit."""
+    for index, strut in enumerate(struts):
+        values = _estimates(strut)
+        for limit in limits:
+            number = values[limit.value]
+            if limit.action_at(number) == action:
+                return Excess(index, limit.value, number, limit.bound_beyond(number))
+    return None
 
 
 def worst_action(limits: Sequence[Limit], strut: StrutOutput) -> int:
     """The severest action that limits on estimates require of a strut, 0 if it is within them."""
-    values = {
+    values = _estimates(strut)
+    return max([limit.action_at(values[limit.value]) for limit in limits], default=0)
+
+
+def _estimates(strut: StrutOutput) -> Mapping[LimitedValue, float]:
+    return {
         LimitedValue.HEIGHT_M: strut.height_m,
         LimitedValue.FORCE_N: strut.force_n,
         LimitedValue.VIRTUAL_FORCE_N: strut.virtual_force_n,
         LimitedValue.INNOVATION_M: strut.innovation_m,
     }
-    return max([limit.action_at(values[limit.value]) for limit in limits], default=0)

@@ -9,13 +9,19 @@ from rig.channels.channel import Sample
 
 
 class Mode(IntEnum):
-    """State of the bridge, with the numbers it has on the bus."""
+    """State of the bridge, with the numbers it has on the bus.
+
+    WAITING has no model yet, SETTLING one whose estimate is not to be believed yet. RUNNING alone
+    publishes valid estimates. HOLD goes without fresh measurements, or is beyond a limit; SAFE has
+    stopped the model until the user acknowledges.
+    """
 
     INIT = 0
     WAITING = 1
     RUNNING = 2
     HOLD = 3
     SAFE = 4
+    SETTLING = 5
 
 
 class StepInput(Struct, frozen=True, gc=False):
@@ -39,7 +45,7 @@ class StrutOutput(Struct, frozen=True, gc=False):
     Attributes:
         force_n: Estimated spring-damper force: the law's, and the residual force.
         virtual_force_n: Virtual force.
-        valid: Whether the estimate rests on a fresh measurement.
+        valid: Whether the estimate rests on fresh measurements and has settled.
         height_m: Model height.
         velocity_m_per_s: Model velocity.
         acceleration_m_per_s2: Model acceleration.

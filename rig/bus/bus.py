@@ -122,8 +122,8 @@ class Bus:
                     break
                 if message.is_error_frame or self._accepts(message):
                     frames.append(self._frame(message))
-        except (can.CanError, OSError, ValueError) as error:
-            raise BusError(f"receiving failed: {error}") from error
+        except Exception as error:  # drivers raise whatever they like
+            raise BusError(f"receiving failed: {_describe(error)}") from error
         return frames
 
     def _accepts(self, message: can.Message) -> bool:
@@ -176,16 +176,13 @@ class Bus:
         )
         try:
             self._send(message)
-        except (can.CanError, OSError, ValueError) as error:
+        except Exception as error:  # drivers raise whatever they like
             raise _sending_error(error) from error
 
     def close(self) -> None:
         """Close the interface; an interface that is gone already is closed."""
-        with contextlib.suppress(can.CanError, OSError):
+        with contextlib.suppress(Exception):
             self._bus.shutdown()
-
-
-_OPENING_ERRORS = (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError)
 
 
 def _widen(connection: socket.socket) -> None:
@@ -195,9 +192,14 @@ def _widen(connection: socket.socket) -> None:
         connection.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _QUEUE_BYTES)
 
 
+def _describe(error: Exception) -> str:
+    """What an error of a driver says, in one line."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
 def _sending_error(error: Exception) -> BusError:
     code = getattr(error, "error_code", None) or getattr(error, "errno", None)
-    text = " ".join(str(error).split())
+    text = _describe(error)
     full = code == errno.ENOBUFS or "buffer full" in text.lower()
     return (BusFullError if full else BusError)(f"sending failed: {text}")
 
@@ -261,10 +263,9 @@ def open_bus(
         )
         if config.interface == "socketcan":
             _widen(cast("Any", bus).socket)
-    except _OPENING_ERRORS as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+    except Exception as error:
         raise BusError(
             f"bus.interface {config.interface!r}, bus.channel {config.channel!r}: "
-            f"cannot be opened: {reason}"
+            f"cannot be opened: {_describe(error)}"
         ) from error
     return bus

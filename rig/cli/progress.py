@@ -38,14 +38,18 @@ def _write(text: bytes) -> None:
 
 @contextlib.contextmanager
 def stoppable() -> Generator[Callable[[], bool]]:
-    """Whether Ctrl-C or SIGTERM came, which then end a loop in order instead of aborting it."""
+    """Whether Ctrl-C, SIGTERM or a closed terminal's SIGHUP came: they end a loop in order.
+
+    A SIGHUP that is ignored, as under nohup, stays so.
+    """
     is_requested = False
 
     def request(_number: int, _frame: FrameType | None) -> None:
         nonlocal is_requested
         is_requested = True
 
-    with handle_signals(request, signal.SIGINT, signal.SIGTERM):
+    hang_up = [] if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else [signal.SIGHUP]
+    with handle_signals(request, signal.SIGINT, signal.SIGTERM, *hang_up):
         yield lambda: is_requested
 
 

@@ -136,3 +136,10 @@ def _refuse_bad_ends(plan: "Plan", ended: "Ended") -> None:
     if ended.state.mode is Mode.SAFE:
         stderr.print("The run ended in its safe state.", style="red")
         raise typer.Exit(FAILED)
+    if ended.dropped_steps:
+        stderr.print(
+            f"The log lacks {ended.dropped_steps} ticks ({ended.log_fault}): expected a disk with "
+            "room, and fast enough.",
+            style="red",
+        )
+        raise typer.Exit(FAILED)

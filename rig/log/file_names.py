@@ -6,6 +6,7 @@
     model.yaml      the model
     bus.dbc         the DBC
     changes.jsonl   changes of the configuration during the run
+    events.jsonl    changes of the mode, with their causes
     timing.json     histograms of its ticks
     trace.arrow     parts of its late ticks, if they were traced
     captures/       windows around its faults, each a run folder
@@ -19,7 +20,7 @@ from pathlib import Path
 RUN_FILE, FRAMES_FILE, STEPS_FILE = "run.yaml", "frames.log", "steps.arrow"
 MODEL_FILE, DBC_FILE = "model.yaml", "bus.dbc"
 CHANGES_FILE, HISTOGRAMS_FILE, TRACE_FILE = "changes.jsonl", "timing.json", "trace.arrow"
-CAPTURES_FOLDER = "captures"
+CAPTURES_FOLDER, EVENTS_FILE = "captures", "events.jsonl"
 
 
 def parts(folder: Path, name: str) -> list[Path]:

@@ -25,8 +25,11 @@ _TAIL_BYTES = 4096
 _MOST_MAPPED = 10_000
 """Parts of a run's steps that are mapped into memory: Linux lets a process map 65 530 files."""
 
-RUN_SCHEMA = 2
-"""Version of the folder's layout, in `run.yaml`."""
+RUN_SCHEMA = 3
+"""Version of the folder's layout and of the modes in it, in `run.yaml`."""
+
+_READ_SCHEMAS = (2, RUN_SCHEMA)
+"""A run of schema 2 has the same files, and no SETTLING: it is read, and cannot be replayed."""
 
 
 class BusEntry(TypedDict, total=False):
@@ -65,6 +68,7 @@ class Ending(TypedDict, total=False):
     timing: dict[str, dict[str, float]]
     log_fault: str | None
     dropped_steps: int
+    time_in_mode_s: dict[str, float]
 
 
 class RunHeader(TypedDict, total=False):
@@ -143,7 +147,7 @@ def read_header(folder: Path) -> RunHeader:
     path = folder / RUN_FILE
     header = parse_mapping(read_text(path, 64 * 1024 * 1024), str(path))
     schema = header.get("schema")
-    if schema != RUN_SCHEMA:
+    if schema not in _READ_SCHEMAS:
         raise LogError(
             f"{path}: schema: {str(schema)[:40]}: expected {RUN_SCHEMA}, a run of this version"
         )
@@ -182,7 +186,9 @@ def find_changed_files(folder: Path) -> list[str]:
 
 
 def last_frame_ns(folder: Path, epoch_ns: int) -> int:
-    """Time of the last whole line of a run's `frames.log`, -1 if there is none.
+    """Time of the last frame that a run received, -1 if the end of its log holds none.
+
+    Frames that it sent after its last tick are those of its end.
 
     Raises:
         LogError: The file cannot be read.
@@ -196,7 +202,9 @@ def last_frame_ns(folder: Path, epoch_ns: int) -> int:
             raise LogError(f"{path}: cannot be read: {error.strerror}") from error
         for line in reversed(lines):
             with contextlib.suppress(ValueError, IndexError):
-                return parse_frame(line.decode("ascii", "replace"), epoch_ns)[0].t_ns
+                frame, direction = parse_frame(line.decode("ascii", "replace"), epoch_ns)
+                if direction == "R":
+                    return frame.t_ns
     return -1
 
 

@@ -175,8 +175,11 @@ class RunWriter:
         if self._captures is not None:
             self._captures.trigger(why)
 
-    def close(self, ending: Callable[[], dict[str, object]]) -> None:
-        """Write what is waiting, and then what `ending` adds to `run.yaml`."""
+    def close(self, ending: Callable[[], dict[str, object]], last: Sequence[Frame] = ()) -> None:
+        """Write what is waiting, and then what `ending` adds to `run.yaml`.
+
+        `last` are frames that were sent after the last tick.
+        """
         self._closing.set()
         self._wake.set()
         if self._has_thread:
@@ -184,7 +187,7 @@ class RunWriter:
         if self._thread.is_alive():
             self._set_fault("the disk is too slow")
         else:
-            self._finish()
+            self._finish(last)
         self.dropped += len(self._waiting) + self._rows.count
         with contextlib.suppress(OSError):
             (self.folder / _RESERVE_FILE).unlink()
@@ -193,18 +196,21 @@ class RunWriter:
         except OSError as error:
             self._set_fault(str(error.strerror))
 
-    def _finish(self) -> None:
+    def _finish(self, last: Sequence[Frame]) -> None:
         self._write_waiting()
+        self._lines += "".join(self._line(frame, "T") for frame in last).encode("ascii")
         self._write_side_file()
         if self._captures is not None:
             self._captures.finish()
         try:
             try:
+                self._write_lines()
                 self._flush()
             finally:
-                self._part.close()
-                for file in self._noted.values():
-                    file.close()
+                with contextlib.ExitStack() as files:  # all of them, whichever fails
+                    for file in self._noted.values():
+                        files.callback(file.close)
+                    files.callback(self._part.close)
         except OSError as error:
             self._set_fault(str(error.strerror))
 

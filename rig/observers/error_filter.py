@@ -49,6 +49,13 @@ four the reference case's force error is 2.7 or 1.05 % of the peak at its best b
 _SETTLED = 1e-6
 """Relative distance of the variances from their limit below which the gains are constant."""
 
+_STEADY_VARIANCE = 1.5**2
+"""Variance of the residual force, over that with every measurement there, up to which the filter is
+steady: single missing ones do no harm."""
+
+_SETTLING = 8.0
+"""Time in units of 1 / omega in which a steady filter forgets what it was before."""
+
 _MOST_DOUBLINGS = 60
 """Of the recursion for the limit: more updates than any run has."""
 
@@ -206,6 +213,29 @@ class ErrorFilter:
         """Corner in rad/s."""
         return 2.0 * math.pi * self.bandwidth_hz
 
+    @property
+    def forgotten_ns(self) -> int:
+        """Time without a measurement after which the last one says nothing more."""
+        return round(_FORGOTTEN / self.omega * 1e9)
+
+    @property
+    def settling_ns(self) -> int:
+        """Time from steady variances to a steady estimate."""
+        return round(_SETTLING / self.omega * 1e9)
+
+    def is_steady(self, state: ErrorState, t_ns: int) -> bool:
+        """Whether the residual force is about as uncertain at a time as it ever is."""
+        covariance, constants, pace = state.covariance, state.constants, self.pace(state.start)
+        if covariance is not None:
+            variance = _ahead(covariance, pace, 0)
+            if variance > _STEADY_VARIANCE * constants.steady.residual:
+                return False
+        if t_ns - state.t_ns < constants.next_ns:
+            return True
+        number = round((t_ns - state.t_ns) / state.start.interval_ns)
+        usual = _steady_ahead(pace, 1)
+        return number < 2 or _steady_ahead(pace, number) <= _STEADY_VARIANCE * usual
+
     def init(self, start: Start) -> ErrorState:
         """State at the model's start, at the first measured height."""
         inputs, constants = ((start.t_ns, 0.0),), self._constants(start)
@@ -327,7 +357,7 @@ class ErrorFilter:
             omega,
             (3 * interval_ns + 1) // 2,
             start.delay_ns + 2 * interval_ns + round(1e9 / omega),
-            round(_FORGOTTEN / omega * 1e9),
+            self.forgotten_ns,
             max(abs(start.damping_per_s), math.sqrt(abs(start.stiffness_per_s2))),
         )
 

@@ -36,7 +36,12 @@ from rig.observers.protocol import (
     TuningTask,
     Vector,
 )
-from rig.observers.sensor_fusion import FusionMemory, fuse_samples, initial_memory
+from rig.observers.sensor_fusion import (
+    FusionMemory,
+    fuse_samples,
+    initial_memory,
+    restart_memory,
+)
 
 _DAMPING = 0.8
 """Damping ratio of the feedback: settles fast, hardly overshoots."""
@@ -67,6 +72,7 @@ class KalmanState(Struct, frozen=True, gc=False):
     force_std_n: float
     measured_ns: int
     fusion: FusionMemory | None = None
+    is_disturbed: bool = False
 
     @property
     def left_out(self) -> tuple[int, ...]:
@@ -100,6 +106,13 @@ class KalmanObserver:
     def init(self, start: Start) -> KalmanState:
         return self._initial(self.filter.init(start), start)
 
+    def restart(self, state: KalmanState, start: Start) -> KalmanState:
+        """The state of a start, with the health of the further sensors."""
+        begun = self.init(start)
+        if state.fusion is None:
+            return begun
+        return structs.replace(begun, fusion=restart_memory(state.fusion, start))
+
     def steady_state(self, start: Start) -> KalmanState:
         return self._initial(self.filter.steady_state(start), start)
 
@@ -132,7 +145,20 @@ class KalmanObserver:
         residual_n = follower.residual(error, mean) / mobility_per_kg
         error = follower.with_input(error, t_ns, -force_n * mobility_per_kg)
         measured_ns = error.t_ns if fusion is None else fusion.measured_ns
-        return KalmanState(error, innovation_m, force_n, residual_n, std_n, measured_ns, fusion)
+        is_disturbed = abs(force_n) >= limit_n or not follower.is_steady(error, t_ns)
+        return KalmanState(
+            error, innovation_m, force_n, residual_n, std_n, measured_ns, fusion, is_disturbed
+        )
+
+    def longest_gap_ns(self, interval_ns: int) -> int:
+        """The time after which the filter knows nothing more: until then its variances say what."""
+        del interval_ns
+        return self.filter.forgotten_ns
+
+    def settling_ns(self, decay_ns: int) -> int:
+        """Its variances know the start and every gap: what they cannot know decays soon after."""
+        del decay_ns
+        return self.filter.settling_ns
 
     def numbers(self, state: KalmanState) -> tuple[float, ...]:
         # All of it is in the filter's inputs.

@@ -4,6 +4,7 @@ An example is a tyre under an observed suspension: its law takes part in the mot
 corrected.
 """
 
+import sys
 from collections.abc import Sequence
 from math import nan
 from typing import ClassVar, Literal
@@ -24,6 +25,7 @@ class NoState(Struct, frozen=True, gc=False):
     residual_force_n: float = 0.0
     force_std_n: float = nan
     left_out: tuple[int, ...] = ()
+    is_disturbed: bool = False
 
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
@@ -48,6 +50,10 @@ class NoObserver:
     def init(self, start: Start) -> NoState:
         return NoState(start.t_ns)
 
+    def restart(self, state: NoState, start: Start) -> NoState:
+        del state
+        return self.init(start)
+
     def steady_state(self, start: Start) -> NoState:
         return NoState(start.t_ns)
 
@@ -60,6 +66,14 @@ class NoObserver:
     ) -> NoState:
         del state, innovation, further
         return NoState(t_ns)
+
+    def longest_gap_ns(self, interval_ns: int) -> int:
+        del interval_ns
+        return sys.maxsize
+
+    def settling_ns(self, decay_ns: int) -> int:
+        del decay_ns
+        return 0
 
     def numbers(self, state: NoState) -> tuple[float, ...]:
         del state

@@ -38,6 +38,10 @@ _COARSE_OF_WEIGHT = 0.01
 """Force of one step of the height sensor over the model's weight from which it is warned of: the
 published method errs by 1.1 % of the strut's peak force in all."""
 
+_LONGEST_GAP = 5
+"""Time in measurement intervals for which the virtual force may stay as it is: for longer it is far
+from the true one."""
+
 _GAIN_MARGIN = 2.0
 """Usual for a PI loop."""
 
@@ -64,6 +68,7 @@ class PiState(Struct, frozen=True, gc=False):
     measured_ns: int
     start: Start
     error: ErrorState | None = None
+    is_disturbed: bool = False
 
     @property
     def residual_force_n(self) -> float:
@@ -109,12 +114,16 @@ class PiObserver:
 
     @property
     def measurements_to_start(self) -> int:
-        """The model starts at rest, at the first measured height."""
-        return 1
+        """Enough for height and velocity: a parabola through twelve of them."""
+        return 12
 
     def init(self, start: Start) -> PiState:
         error = None if self.filter is None else self.filter.init(start)
         return PiState(0.0, 0.0, 0.0, start.t_ns, start, error)
+
+    def restart(self, state: PiState, start: Start) -> PiState:
+        del state
+        return self.init(start)
 
     def steady_state(self, start: Start) -> PiState:
         error = None if self.filter is None else self.filter.steady_state(start)
@@ -150,8 +159,24 @@ class PiObserver:
         if self.filter is not None and error is not None:
             acceleration = -force_n * error.start.mobility_per_kg
             error = self.filter.with_input(error, t_ns, acceleration)
-        measured_ns = innovation.t_ns
-        return PiState(integral_m_s, innovation.value, force_n, measured_ns, state.start, error)
+        is_disturbed = not -limit_n < force_n < limit_n
+        if self.filter is not None and error is not None:
+            is_disturbed = is_disturbed or not self.filter.is_steady(error, t_ns)
+        return PiState(
+            integral_m_s,
+            innovation.value,
+            force_n,
+            innovation.t_ns,
+            state.start,
+            error,
+            is_disturbed,
+        )
+
+    def longest_gap_ns(self, interval_ns: int) -> int:
+        return _LONGEST_GAP * interval_ns
+
+    def settling_ns(self, decay_ns: int) -> int:
+        return decay_ns
 
     def numbers(self, state: PiState) -> tuple[float, ...]:
         """Integral, virtual force and filter, all in m: what the next state depends on."""

@@ -82,6 +82,15 @@ class ObserverState(Protocol):
         """Channels of further sensors that are not used now."""
         ...
 
+    @property
+    def is_disturbed(self) -> bool:
+        """Whether the estimate is not what it would be had nothing ever been missing.
+
+        Its variances show the start or a gap, or the virtual force is at its limit, so that the
+        model cannot follow.
+        """
+        ...
+
 
 class SensorStep(NamedTuple):
     """A step of the height sensor, for the check; the weight is that of the model's bodies."""
@@ -128,6 +137,10 @@ class Observer(Protocol[StateT]):
         """State at the model's start, without virtual force."""
         ...
 
+    def restart(self, state: StateT, start: Start) -> StateT:
+        """State at another start, after a gap; it keeps what the gap did not change."""
+        ...
+
     def steady_state(self, start: Start) -> StateT:
         """State after a long time at rest, whose variances no longer change."""
         ...
@@ -143,6 +156,21 @@ class Observer(Protocol[StateT]):
 
         `innovation` is that of a new measurement of the height, None where no frame came; `further`
         are those of new samples of further sensors.
+        """
+        ...
+
+    def longest_gap_ns(self, interval_ns: int) -> int:
+        """Longest time without a measurement that a state is worth keeping for.
+
+        Behind a longer one model and observer start again from measurements. `interval_ns` is the
+        usual time between two of them.
+        """
+        ...
+
+    def settling_ns(self, decay_ns: int) -> int:
+        """Time without a disturbance until the estimate has forgotten the last one.
+
+        `decay_ns` is the time in which the closed loop forgets (`rig.closed_loop.settling`).
         """
         ...
 

@@ -99,6 +99,16 @@ def initial_memory(start: Start) -> FusionMemory:
     return FusionMemory((), ((start.t_ns, 0.0),), health, start.t_ns, start.t_ns)
 
 
+def restart_memory(memory: FusionMemory, start: Start) -> FusionMemory:
+    """Memory at another start: a sensor that was left out has to prove itself as before."""
+    health = {
+        channel: SensorHealth(start.t_ns, is_out=item.is_out)
+        for channel, item in memory.health.items()
+    }
+    left_out = tuple(channel for channel, item in health.items() if item.is_out)
+    return replace(initial_memory(start), health=health, left_out=left_out)
+
+
 def fuse_samples(
     follower: ErrorFilter,
     error: ErrorState,

@@ -32,9 +32,12 @@ _TICK_COLOURS = ("--before", "--after")
 _STATUS = {
     "done": ("good", "✓", "Ended in order"),
     "safe": ("bad", "✕", "Ended in its safe state"),
+    "waiting": ("bad", "✕", "No valid height arrived"),
     "failed": ("bad", "✕", "Failed"),
 }
 _KILLED = ("part", "◐", "Killed, or still running")
+_NOT_ALWAYS_VALID = ("part", "◐", "Ended in order, and was not valid all the time")
+_LOST_MODES = ("HOLD", "SAFE")
 
 
 def write_run_report(folder: Path, path: Path) -> None:
@@ -50,7 +53,7 @@ def write_run_report(folder: Path, path: Path) -> None:
         raise InputError(f"{folder}: holds no tick, expected a run to report on")
     struts = list(header.get("config", {}).get("observers", {}))
     ending = header.get("ending") or {}
-    tone, sign, badge = _STATUS.get(str(ending.get("status")), _KILLED)
+    tone, sign, badge = _badge(ending)
     text = render_report(
         "run.html",
         name=folder.resolve().name,
@@ -75,6 +78,27 @@ def write_run_report(folder: Path, path: Path) -> None:
     write_page(text, path)
 
 
+def _badge(ending: Ending) -> tuple[str, str, str]:
+    """Tone, sign and words of how a run ended, and whether it lost its estimate before."""
+    status = str(ending.get("status"))
+    lost_s = sum(ending.get("time_in_mode_s", {}).get(mode, 0.0) for mode in _LOST_MODES)
+    if status == "done" and (lost_s or ending.get("dropped_steps")):
+        return _NOT_ALWAYS_VALID
+    return _STATUS.get(status, _KILLED)
+
+
+def _modes(ending: Ending) -> str:
+    """How long the estimate was valid, and what it was else."""
+    times_s = dict(ending.get("time_in_mode_s", {}))
+    if not times_s:
+        return ""
+    valid_s = times_s.pop("RUNNING", 0.0)
+    others = ", ".join(f"{mode} {time_s:.3g} s" for mode, time_s in times_s.items())
+    lacks = ending.get("dropped_steps")
+    lost = f" The log lacks {lacks} ticks." if lacks else ""
+    return f" Valid for {valid_s:.1f} s; {others or 'all the time'}.{lost}"
+
+
 def _headline(header: RunHeader, follower: RunFollower, ending: Ending) -> str:
     begin_s, end_s = follower.span_s
     rate_hz = header.get("config", {}).get("rate_hz", "?")
@@ -84,7 +108,9 @@ def _headline(header: RunHeader, follower: RunFollower, ending: Ending) -> str:
     counts = dict(_counts(ending))
     missed = counts.pop("overruns", 0)
     faults = ", ".join(f"{count} {name}" for name, count in counts.items())
-    return f"{text}, {missed or 'no'} ticks missed; counted: {faults or 'no fault'}."
+    return (
+        f"{text}, {missed or 'no'} ticks missed; counted: {faults or 'no fault'}.{_modes(ending)}"
+    )
 
 
 def _counts(ending: Ending) -> list[tuple[str, int]]:

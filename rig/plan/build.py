@@ -1,6 +1,6 @@
 """The bridge that a plan describes, and the model in it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
 from can_dbc.database import Message
@@ -10,12 +10,15 @@ from dart_model.protocol import AnyPlant
 from dart_model.spec import ModelSpec
 from rig.bridge.bridge import Bridge
 from rig.bridge.estimator import AnyEstimator
-from rig.bridge.free_model import FreeModelEstimator
+from rig.bridge.free_model import FreeModelEstimator, SettlingTimes
 from rig.bridge.incoming_messages import Alarm, Incoming, compile_incoming
 from rig.bridge.mode_supervisor import Supervisor
 from rig.bridge.outgoing_messages import compile_outgoing
 from rig.bridge.prescribed_motion import PrescribedMotionEstimator
 from rig.channels.channel import Channel
+from rig.closed_loop.loop import SampleTiming
+from rig.closed_loop.settling import settling_times_ns
+from rig.observers.protocol import AnyObserver
 from rig.plan.plan import Plan
 
 ENGINES: Mapping[str, Callable[[ModelSpec], AnyPlant]] = MappingProxyType({"dart": DartPlant})
@@ -61,7 +64,37 @@ def _build_estimator(plan: Plan) -> AnyEstimator:
     if motion is not None:
         model = PrescribedStrut(plan.model)
         return PrescribedMotionEstimator(model, motion.settling_s, plan.channels, stale_after_ns)
-    return FreeModelEstimator(build_plant(plan), plan.observers, plan.channels, stale_after_ns)
+    plant = build_plant(plan)
+    return FreeModelEstimator(
+        plant, plan.observers, plan.channels, stale_after_ns, settling_times(plan)
+    )
+
+
+def settling_times(plan: Plan) -> SettlingTimes:
+    """Settling times with other observers: those of the closed loop at rest, or the configured."""
+    settling_s = plan.config.supervision.settling_s
+    if settling_s is not None:
+        return lambda observers: [round(settling_s * 1e9)] * len(observers)
+    rest_m = [strut.free_length_m for strut in plan.struts]
+    # The laws are steeper at rest than in motion, friction above all: without them the model is
+    # damped as little as it ever is. Both are models of their own, since this one may be running.
+    bare = [strut.model_copy(update={"effects": ()}) for strut in plan.model.struts]
+    plans = (plan, plan.with_model(plan.model.model_copy(update={"struts": tuple(bare)})))
+    timing = SampleTiming.of(
+        plan.period_ns,
+        max(strut.interval_ns for strut in plan.struts),
+        max(strut.delay_ns for strut in plan.struts),
+    )
+
+    def longest_times_ns(observers: Sequence[AnyObserver]) -> list[int | None]:
+        models = [build_plant(item) for item in plans]
+        every = [settling_times_ns(model, observers, rest_m, timing) for model in models]
+        return [
+            max((time_ns for time_ns in times if time_ns is not None), default=None)
+            for times in zip(*every, strict=True)
+        ]
+
+    return longest_times_ns
 
 
 def _compile_incoming(plan: Plan) -> list[Incoming]:

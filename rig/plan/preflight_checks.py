@@ -15,7 +15,7 @@ from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import Pole, closed_loop_poles
 from rig.observers.protocol import Remark, SensorStep
-from rig.plan.build import build_bridge, build_plant
+from rig.plan.build import build_bridge, build_plant, settling_times
 from rig.plan.plan import Plan
 
 LITTLE_DAMPING = 0.02
@@ -211,7 +211,10 @@ def _stability(plan: Plan, plant: AnyPlant) -> list[Finding]:
         max(strut.delay_ns for strut in plan.struts),
     )
     poles = closed_loop_poles(plant, plan.observers, rest, timing)
-    findings = [_worst(poles), *_bandwidths(plan)]
+    findings = [_worst(poles)]
+    if findings[0].severity is not Severity.ERROR:
+        findings += _settling(plan)
+    findings += _bandwidths(plan)
     late = closed_loop_poles(plant, plan.observers, rest, timing._replace(delay=timing.delay + 1))
     worst = max(pole.magnitude for pole in late)
     text = f"largest |z| {worst:.5f} with measurements one cycle late"
@@ -220,6 +223,22 @@ def _stability(plan: Plan, plant: AnyPlant) -> list[Finding]:
     elif findings[0].severity is not Severity.ERROR:
         text += ": unstable; keep bench and bridge in step, or lower K_P or raise the rate"
         findings.append(Finding(Severity.WARNING, "poles, one cycle late", text))
+    return findings
+
+
+def _settling(plan: Plan) -> list[Finding]:
+    """How long each strut's estimate is invalid after a start, a gap or a change of gains."""
+    findings: list[Finding] = []
+    for strut, time_ns in zip(plan.struts, settling_times(plan)(plan.observers), strict=True):
+        subject = f"settling of {strut.name}"
+        if time_ns is None:
+            text = "never: the estimate would not become valid; see the poles, and rig tune"
+            findings.append(Finding(Severity.ERROR, subject, text))
+        elif strut.observer.requires_height:
+            text = f"{time_ns * 1e-9:.2g} s"
+            if strut.observer.knows_std:
+                text += " after its variance has"
+            findings.append(Finding(Severity.OK, subject, text))
     return findings
 
 

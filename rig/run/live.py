@@ -30,6 +30,9 @@ _DEFAULT_CONTROL = RunControl()
 _BENCH_PORTION_NS = 20_000_000
 """Simulated time after which the bench reads its bus, while it catches up."""
 
+_MOST_READINGS = 1000
+"""Readings of the bus before the first tick, which a bus that is never empty must not delay."""
+
 _SPINNING_SHARE = 5
 """At most this part of a period is spun away before a deadline."""
 
@@ -66,12 +69,26 @@ def live(
     with real_time(plan.config) as (granted, clock):
         link = _open_link(plan, bridge, clock, listen_only=listen_only)
         port = BusPort(link)
-        endpoint = Endpoint(port, clock, link.figures, granted, acknowledge=port.acknowledge)
+        endpoint = Endpoint(
+            port,
+            clock,
+            link.figures,
+            granted,
+            begin=partial(_discard_queued, link, clock),
+            acknowledge=port.acknowledge,
+        )
         try:
             with on_signal(signal.SIGUSR1, port.acknowledge):
                 return run_logged(plan, bridge, endpoint, folder, control, trace=trace)
         finally:
             link.close()
+
+
+def _discard_queued(link: Link, clock: Clock) -> None:
+    """Discard what has come since the bus was opened: the first tick would take it for new."""
+    for _ in range(_MOST_READINGS):
+        if not link.receive(clock.now_ns()):
+            return
 
 
 def _open_link(plan: Plan, bridge: Bridge, clock: Clock, *, listen_only: bool = False) -> Link:

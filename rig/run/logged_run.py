@@ -15,13 +15,14 @@ from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from dart_model.spec import copy_files, dump_model, files_of
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
+from rig.bridge.counts import Conditions
 from rig.bridge.values import Mode
 from rig.bus.link import LinkFigures
 from rig.files.folders import claim
 from rig.files.hashes import hash_files
-from rig.log.file_names import CHANGES_FILE, DBC_FILE, HISTOGRAMS_FILE, MODEL_FILE
+from rig.log.file_names import CHANGES_FILE, DBC_FILE, EVENTS_FILE, HISTOGRAMS_FILE, MODEL_FILE
 from rig.log.reader import RUN_SCHEMA, ConfigEntry, RunHeader
-from rig.log.step_columns import LogColumns, Step
+from rig.log.step_columns import ACKNOWLEDGED, LogColumns, Step
 from rig.log.writer import LogOptions, RunWriter
 from rig.machine.clock import Clock, OccupiedClock
 from rig.machine.installed_versions import version_of
@@ -30,6 +31,7 @@ from rig.plan.plan import Plan
 from rig.run.change_requests import Requests
 from rig.run.changed_settings import Changes, no_changes
 from rig.run.loop import SHOWN_EVERY_NS, Look, Port, RunControl, Sink, regular_ticks, run
+from rig.run.mode_events import ModeEvents
 from rig.run.ports import InformedPort
 from rig.run.timing import Timing
 from rig.run.trace import Trace
@@ -37,12 +39,18 @@ from rig.run.trace import Trace
 _MOST_REPORTS = 1000
 """Changes of the devices' state that `run.yaml` lists; the counts go on."""
 
+_LAST_FRAMES = 3
+"""Frames of each message at the end of a run, one a tick: one of them may be lost on the bus."""
+
+_STATUS = {Mode.SAFE: "safe", Mode.WAITING: "waiting"}
+"""Mode at the end -> how `run.yaml` says that the run ended, where it was not as it should be."""
+
 _PACKAGES = ("rig", "dartpy", "python-can", "cantools", "numpy", "pyarrow", "autosar-e2e")
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How a run ended; of the model's last divergence strut and time."""
+    """How a run ended; of the model's last divergence strut and time, and what the log lacks."""
 
     folder: Path
     state: BridgeState
@@ -52,6 +60,7 @@ class Ended:
     ticks: int
     period_ns: int
     diverged: Mapping[str, object] | None
+    dropped_steps: int
 
     def summary(self) -> dict[str, object]:
         """Every figure, for `summary.json`."""
@@ -63,6 +72,7 @@ class Ended:
             "timing": self.timing.summary(),
             "granted": None if self.granted is None else self.granted.as_dict(),
             "log_fault": self.log_fault,
+            "dropped_steps": self.dropped_steps,
         }
 
 
@@ -146,6 +156,13 @@ class _LoggedRun:
         self._reports = _FaultReports([device.name for device in plan.devices])
         self._state = bridge.init(0)
         self._ticks, self._shown_ns, self._status = 0, 0, "failed"
+        self._last_frames: list[Frame] = []
+        self._events = ModeEvents(
+            partial(self._log.note, EVENTS_FILE),
+            plan.strut_names,
+            [device.name for device in plan.devices],
+        )
+        self._acknowledged = False
 
     def run(self, trace: Trace | None) -> None:
         plan, endpoint, clock = self._plan, self._endpoint, self._endpoint.clock
@@ -163,11 +180,17 @@ class _LoggedRun:
         with contextlib.ExitStack() as around:
             around.enter_context(on_signal(signal.SIGUSR2, lambda: self._log.trigger("user")))
             changes = self._changes(around)
-            self._state = run(self._bridge, self._state, due, source, sink, self._columns, changes)
-        self._status = "safe" if self._state.mode is Mode.SAFE else "done"
+            ticks = run(self._bridge, due, source, sink, self._columns, changes)
+            try:
+                for state in ticks:
+                    self._state = state
+                    self._events.update(state, acknowledged=self._acknowledged)
+            finally:
+                self._publish_end(informed.conditions)
+        self._status = _STATUS.get(self._state.mode, "done")
 
     def close(self) -> None:
-        self._log.close(self._ending)
+        self._log.close(self._ending, self._last_frames)
 
     def outcome(self) -> Ended:
         return Ended(
@@ -179,6 +202,7 @@ class _LoggedRun:
             self._ticks,
             self._plan.period_ns,
             self._divergence(),
+            self._log.dropped,
         )
 
     def _keep(
@@ -188,6 +212,7 @@ class _LoggedRun:
         self._log.add(received, sent, step)
         t_ns = step.t_ns
         self._reports.note(t_ns, result.device_faults)
+        self._acknowledged = bool(step.flags & ACKNOWLEDGED)
         self._ticks += 1
         self._control.progress(t_ns, result.output.mode)
         if t_ns >= self._shown_ns:
@@ -197,6 +222,16 @@ class _LoggedRun:
             self._control.watch(
                 Look(t_ns, self._ticks, result.output, result.counts, late_ns, result.device_faults)
             )
+
+    def _publish_end(self, conditions: Conditions) -> None:
+        """Publish the safe output, whatever has ended the loop, as the last that is on the bus."""
+        endpoint, state = self._endpoint, self._state
+        t_ns = state.supervised.t_ns
+        for _ in range(_LAST_FRAMES):
+            t_ns += self._plan.period_ns
+            endpoint.clock.wait_until(t_ns)
+            state, frames = self._bridge.end(state, t_ns, conditions)
+            self._last_frames += endpoint.port.send(frames)
 
     def _changes(self, around: contextlib.ExitStack) -> Changes:
         """Changes that are requested while the run is going on."""
@@ -208,7 +243,14 @@ class _LoggedRun:
             self._folder, self._plan, self._bridge, acknowledge, note, self._priority
         )
         around.enter_context(requests.serve())
-        return requests.changes
+
+        def changes(t_ns: int) -> Bridge | None:
+            changed = requests.changes(t_ns)
+            if changed is not None:
+                self._bridge = changed
+            return changed
+
+        return changes
 
     def _ending(self) -> dict[str, object]:
         """The last section of `run.yaml`."""
@@ -216,6 +258,12 @@ class _LoggedRun:
             "ending": {
                 "status": self._status,
                 "ticks": self._ticks,
+                "mode": self._state.mode.name,
+                "time_in_mode_s": {
+                    mode.name: ticks * self._plan.period_ns * 1e-9
+                    for mode, ticks in self._events.ticks.items()
+                    if ticks
+                },
                 "counts": self._state.counts._asdict(),
                 "diverged": self._divergence(),
                 "timing": self._timing.summary(),

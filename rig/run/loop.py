@@ -1,5 +1,6 @@
 """The one loop: live, simulated and replayed runs differ only in ticks, source and sink."""
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -127,19 +128,25 @@ def regular_ticks(
 
 def run(
     bridge: Bridge,
-    state: BridgeState,
     ticks: Iterator[Tick],
     port: Port,
     sink: Sink,
     columns: LogColumns,
     changes: Changes = no_changes,
-) -> BridgeState:
-    """Run the bridge over ticks, from a state on; gives the state at the end.
+) -> Iterator[BridgeState]:
+    """Run the bridge over ticks; yields the state after each of them.
 
-    The record of every tick goes to `sink`; `changes` may give another bridge from a tick on.
+    Whatever has an age is as old as the first tick: setting up may have taken seconds. The record
+    of every tick goes to `sink`; `changes` may give another bridge from a tick on.
     """
-    for tick in ticks:
-        bridge = changes(tick.t_ns) or bridge
+    first = next(ticks, None)
+    if first is None:
+        return
+    state = bridge.init(first.t_ns)
+    for tick in itertools.chain((first,), ticks):
+        changed = changes(tick.t_ns)
+        if changed is not None:
+            bridge, state = changed, changed.take_over(state, bridge, tick.t_ns)
         frames, conditions = port.receive(tick.t_ns)
         if tick.overruns:
             conditions = conditions._replace(overruns=tick.overruns)
@@ -149,7 +156,7 @@ def run(
         numbers = columns.numbers(result.step_input, output)
         step = Step(tick.t_ns, tick.overruns, len(frames), output.mode, _flags(conditions), numbers)
         sink(frames, sent, result, step)
-    return state
+        yield state
 
 
 def _flags(conditions: Conditions) -> int:

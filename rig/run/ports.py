@@ -70,6 +70,11 @@ class InformedPort:
             self._latest = _figures(self._timing)
             self._calm = Conditions(timing=self._latest)
 
+    @property
+    def conditions(self) -> Conditions:
+        """State of log and timing, without anything of the bus."""
+        return self._calm._replace(log_fault=self._log.fault is not None)
+
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
         """Frames of the port, with the state of log and timing."""
         frames, conditions = self._port.receive(t_ns)

@@ -3,6 +3,7 @@
 The ticks, the frames of each and what the loop knew come from the log; nothing is sent.
 """
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,8 @@ from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.bridge.bridge import TickResult
 from rig.bridge.counts import Conditions
-from rig.log.reader import RunFolder, last_frame_ns, read_run
+from rig.log.file_names import RUN_FILE
+from rig.log.reader import RUN_SCHEMA, RunFolder, last_frame_ns, read_run
 from rig.log.received_frames import FrameColumns, read_frame_columns
 from rig.log.step_columns import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, LogColumns, Step, StepRows
 from rig.plan.build import build_bridge
@@ -65,6 +67,12 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
         InputError: The run is damaged.
     """
     run_folder = read_run(folder)
+    schema = run_folder.header["schema"]
+    if schema != RUN_SCHEMA:
+        raise InputError(
+            f"{folder / RUN_FILE}: schema: {schema}: expected {RUN_SCHEMA}: an estimate was valid "
+            "before it had settled; replay the run with the version that logged it (0.2)"
+        )
     own = plan_of_header(folder, run_folder.header)
     plan = plan or own
     bridge = build_bridge(plan, sending=False)
@@ -87,7 +95,8 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
     port = _LogPort(frames, ticks)
     # With another plan the run's own changes would undo what is tried.
     changes = changes_for_replay(folder, own, bridge) if plan is own else no_changes
-    state = run(bridge, bridge.init(0), port.ticks(make_batch), port, keep, columns, changes)
+    again = port.ticks(make_batch)
+    last = deque(run(bridge, again, port, keep, columns, changes), maxlen=1)
     steps = pa.Table.from_batches(batches, schema=rows.schema)
     different = _find_differences(run_folder.steps, steps)
     return Replay(
@@ -95,7 +104,7 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
         run_folder.steps.num_rows,
         len(different),
         int(ticks.t_ns[different[0]]) if len(different) else None,
-        state.counts.refused,
+        last[0].counts.refused if last else 0,
     )
 
 

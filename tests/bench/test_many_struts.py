@@ -135,6 +135,7 @@ def bridge_of(folder: Path, model: str, names: list[str], observer: dict[str, ob
                 name: {"message": f"HEIGHT_{k}", "signal": "VALUE"} for k, name in enumerate(names)
             }
         },
+        "supervision": {"settling_s": 0.0},
         "observers": dict.fromkeys(names, observer)
         | {f"tyre_{name}": {"kind": "none"} for name in FullCar.corners if len(names) > 1},
         "publish": {
@@ -167,7 +168,8 @@ def ticks_of(bridge: Bridge, folder: Path, count: int) -> Subject:
     state: BridgeState = bridge.init(0)
     for tick in range(BEFORE):
         state, result = bridge.tick(state, tick * MS, frames(tick))
-    assert result.output.mode is Mode.RUNNING
+    # A model that does not answer leads the noise-aware observer to the limit of its force.
+    assert result.output.mode in (Mode.RUNNING, Mode.SETTLING)
     assert len(result.frames) == count
     given = [(tick * MS, frames(tick)) for tick in range(BEFORE, BEFORE + TICKS)]
 

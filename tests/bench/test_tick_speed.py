@@ -23,7 +23,7 @@ from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, load_model
 from rig.bridge.bridge import Bridge, BridgeState
 from rig.bridge.mode_supervisor import SupervisedState, Supervision, Supervisor
-from rig.bridge.values import StepInput
+from rig.bridge.values import Mode, StepInput
 from rig.bus.bus import Bus, BusConfig
 from rig.channels.channel import Sample
 from rig.observers.pi import PiState
@@ -32,7 +32,7 @@ from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.replay import replay
-from tests.bridge.cores import GAINS, core, measured
+from tests.bridge.cores import FIRST, GAINS, core, measured, resting, run
 from tests.run.listed import MS, ListPort, bench_frames, live
 
 TICKS = 300
@@ -129,7 +129,7 @@ def scalar_loop(*, observing: bool) -> Subject:
 
 
 def bridge_and_frames() -> tuple[Bridge, BridgeState, list[list[Frame]]]:
-    """One BENCH_MEASUREMENT in, one RIG_ESTIMATE out."""
+    """One BENCH_MEASUREMENT in, one RIG_ESTIMATE out, from the first valid estimate on."""
     ready = load_plan(CONFIGS / "reference.yaml")
     signals = ready.config.signals.model_copy(update={"load_cell_force": None, "temperature": None})
     keys = ("force", "virtual_force", "valid")
@@ -137,13 +137,22 @@ def bridge_and_frames() -> tuple[Bridge, BridgeState, list[list[Frame]]]:
         name: {key: mapped[key] for key in keys} for name, mapped in ready.config.publish.items()
     }
     config = ready.config.model_copy(
-        update={"signals": signals, "publish": publish, "status": None, "timing": None}
+        update={
+            "signals": signals,
+            "publish": publish,
+            "status": None,
+            "timing": None,
+            "supervision": ready.config.supervision.model_copy(update={"settling_s": 0.0}),
+        }
     )
     ready = ready.with_config(config)
-    frames = bench_frames(ready, TICKS + 1, {})
+    frames = bench_frames(ready, TICKS + FIRST, {})
     bridge = build_bridge(ready)
-    state, _ = bridge.tick(bridge.init(0), 0, frames[0])
-    return bridge, state, [frames[tick] for tick in range(1, TICKS + 1)]
+    state = bridge.init(0)
+    for tick in range(FIRST):
+        state, _ = bridge.tick(state, tick * MS, frames[tick])
+    assert state.mode is Mode.RUNNING
+    return bridge, state, [frames[tick] for tick in range(FIRST, TICKS + FIRST)]
 
 
 def whole_ticks() -> Subject:
@@ -151,7 +160,7 @@ def whole_ticks() -> Subject:
 
     def ticks() -> None:
         state = start
-        for tick, received in enumerate(frames, start=1):
+        for tick, received in enumerate(frames, start=FIRST):
             state, _ = bridge.tick(state, tick * MS, received)
 
     return ticks
@@ -168,10 +177,11 @@ def steps(rig: Supervisor, start: SupervisedState, inputs: list[StepInput]) -> S
 
 def core_steps(model: str, heights: tuple[float, ...], *, observing: bool) -> Subject:
     rig = core(model, supervision=Supervision(stale_after_s=1e6, safe_after_s=1e7))
-    start, _, _ = rig.step(rig.init(0), measured(0, *heights))
+    begun, _ = run(rig, resting(*heights))
+    assert begun[-1].mode is Mode.RUNNING
     given = heights if observing else (None,) * len(heights)
-    inputs = [measured(tick, *given, applied_n=10.0) for tick in range(1, TICKS + 1)]
-    return steps(rig, start, inputs)
+    inputs = [measured(tick, *given, applied_n=10.0) for tick in range(FIRST, TICKS + FIRST)]
+    return steps(rig, begun[-1], inputs)
 
 
 def test_a_whole_tick_against_the_bare_dart_loop(capsys):
@@ -239,7 +249,7 @@ def test_a_tick_over_a_virtual_bus(capsys):
     near, far = Bus(config, bridge.filters), Bus(config)
     work_us: list[float] = []
     try:
-        for tick, received in enumerate(frames, start=1):
+        for tick, received in enumerate(frames, start=FIRST):
             for frame in received:
                 far.send(frame)
             start = perf_counter_ns()

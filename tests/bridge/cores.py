@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dart_model.plant import DartPlant
 from dart_model.protocol import AnyPlant
 from dart_model.spec import MODELS, load_model
-from rig.bridge.free_model import FreeModelEstimator
+from rig.bridge.free_model import FreeModelEstimator, SettlingTimes
 from rig.bridge.mode_supervisor import SupervisedState, Supervision, Supervisor
 from rig.bridge.values import StepInput, StepOutput
 from rig.channels.channel import Channel, Role, Sample
@@ -31,6 +31,18 @@ def gains(proportional: float, integral: float, limit_n: float = 5000.0) -> PiOb
 
 GAINS = gains(1e5, 1e4)
 SUPERVISION = Supervision(stale_after_s=0.01, safe_after_s=0.5)
+
+
+FIRST = GAINS.measurements_to_start
+"""Measurements from which a model starts, at the tick of the last of them."""
+
+
+def settle_at_once(observers: Sequence[AnyObserver]) -> Sequence[int | None]:
+    """Estimates that are valid from the start: the tests of the arithmetic are not about settling.
+
+    An observer that knows its variance still has to settle with it.
+    """
+    return [0] * len(observers)
 
 
 def channels(
@@ -69,19 +81,30 @@ def supervised(
     observers: Sequence[AnyObserver],
     supervision: Supervision = SUPERVISION,
     bench: Sequence[Channel] | None = None,
+    settling_times: SettlingTimes = settle_at_once,
 ) -> Supervisor:
     """A supervised estimator of a model."""
     bench = channels(plant.struts) if bench is None else bench
-    estimator = FreeModelEstimator(plant, observers, bench, supervision.stale_after_ns)
+    estimator = FreeModelEstimator(
+        plant, observers, bench, supervision.stale_after_ns, settling_times
+    )
     return Supervisor(estimator, supervision)
 
 
 def core(
-    model: str = "reference", observer: PiObserver = GAINS, supervision: Supervision = SUPERVISION
+    model: str = "reference",
+    observer: PiObserver = GAINS,
+    supervision: Supervision = SUPERVISION,
+    settling_times: SettlingTimes = settle_at_once,
 ) -> Supervisor:
     """The estimator of a shipped model with the same gains for every strut."""
     spec = load_model(MODELS / f"{model}.yaml")
-    return supervised(DartPlant(spec), (observer,) * len(spec.struts), supervision)
+    return supervised(
+        DartPlant(spec),
+        (observer,) * len(spec.struts),
+        supervision,
+        settling_times=settling_times,
+    )
 
 
 def bench_sample(struts: int, quantity: Quantity, value: float, t_ns: int) -> Sample:
@@ -92,11 +115,11 @@ def bench_sample(struts: int, quantity: Quantity, value: float, t_ns: int) -> Sa
 def measured(
     tick: int,
     *heights_m: float | None,
-    applied_n: float | None = None,
+    applied_n: float | None = 0.0,
     temperature_c: float | None = None,
     late_ns: int = 0,
 ) -> StepInput:
-    """Input of a tick at 1 kHz."""
+    """Input of a tick at 1 kHz; the applied force comes with each, as a bench sends it."""
     t_ns, struts = tick * MS, len(heights_m)
     samples = [
         Sample(strut, height_m, t_ns - late_ns)
@@ -107,6 +130,16 @@ def measured(
         if value is not None:
             samples.append(bench_sample(struts, quantity, value, t_ns))
     return StepInput(t_ns, tuple(samples))
+
+
+def resting(*heights_m: float, ticks: int = FIRST, begin: int = 0) -> list[StepInput]:
+    """Inputs of a bench that stands still, by default just those that start a model there."""
+    return [measured(tick, *heights_m) for tick in range(begin, begin + ticks)]
+
+
+def silent(begin: int, end: int) -> list[StepInput]:
+    """Inputs of ticks for which no frame came."""
+    return [StepInput(tick * MS) for tick in range(begin, end)]
 
 
 def run(

@@ -18,7 +18,7 @@ from rig.bridge import (
 from rig.bridge.counts import Conditions
 from rig.bridge.values import Mode
 from rig.simulated_bench.trajectory import simulate
-from tests.faults.trial import BEGIN_NS, MS, Trial, after
+from tests.faults.trial import BEGIN_MS, BEGIN_NS, MS, Trial, after
 
 STATUS = cantools.database.load_file(DEFAULT_DATABASE).get_message_by_name("RIG_STATUS")
 
@@ -32,9 +32,11 @@ def test_ticks_in_hold_are_stale():
     def gap(t_ns, frames):
         return [] if t_ns < BEGIN_NS + 40 * MS else frames
 
-    ticks = Trial().run(700, after(BEGIN_NS, gap))
+    ticks = Trial().run(BEGIN_MS + 400, after(BEGIN_NS, gap))
     held = [tick for tick in ticks if tick.mode is Mode.HOLD]
-    assert len(held) > 20
+    # Too old after 10 ms, and the model starts again with the twelfth of the next measurements.
+    assert [held[0].t_ns - BEGIN_NS, held[-1].t_ns - BEGIN_NS] == [10 * MS, 50 * MS]
+    assert len(held) == 41
     assert ticks[-1].counts.stale == len(held)
     assert last_status(ticks)["STALE_FRAMES"] == len(held)
 
@@ -52,7 +54,7 @@ def test_missed_ticks_and_ticks_with_a_fault_of_the_bus_add_up():
 
 def test_ticks_beyond_a_limit_are_counted():
     limits = [{"value": "force_n", "high": 20.0, "action": "warn"}]
-    ticks = Trial(limits=limits).run(1000)
+    ticks = Trial(limits=limits, settling_s=0.0).run(1000)
     beyond = [tick for tick in ticks if tick.is_valid and tick.force_n > 20.0]
     assert beyond
     assert ticks[-1].counts.limited == len(beyond)

@@ -6,6 +6,7 @@ import cantools.database
 import pytest
 
 from can_dbc.database import DEFAULT_DATABASE
+from rig.bridge.values import Mode, StrutOutput
 from tests.faults.trial import MS, Trial
 
 DBC = cantools.database.load_file(DEFAULT_DATABASE)
@@ -41,9 +42,10 @@ def test_counters_go_up_by_one(ticks):
 
 
 def test_what_is_sent_is_what_the_core_published(ticks):
-    by_time = {
-        tick.t_ns: tick.result.output.struts[0] for tick in ticks if tick.result.output.struts
-    }
+    nothing = StrutOutput(0.0, 0.0, False, 0.0, 0.0, 0.0, 0.0)
+    by_time = {tick.t_ns: (*tick.result.output.struts, nothing)[0] for tick in ticks}
+    valid = {by_time[t_ns].valid for t_ns, _ in sent(ticks, "RIG_ESTIMATE")}
+    assert valid == {False, True}
     for t_ns, values in sent(ticks, "RIG_ESTIMATE"):
         strut = by_time[t_ns]
         assert values["SPRING_DAMPER_FORCE"] == pytest.approx(strut.force_n, abs=0.0026)
@@ -55,3 +57,17 @@ def test_what_is_sent_is_what_the_core_published(ticks):
         assert values["MODEL_VELOCITY"] == pytest.approx(strut.velocity_m_per_s, abs=1.1e-3)
         assert values["MODEL_ACCELERATION"] == pytest.approx(strut.acceleration_m_per_s2, abs=0.06)
         assert values["INNOVATION"] == pytest.approx(strut.innovation_m, abs=2.6e-6)
+
+
+def test_every_message_is_sent_from_the_first_tick_on_and_says_in_what_mode(ticks):
+    """Zeros and invalid while there is no model; invalid until its estimate has settled."""
+    assert {tick.mode for tick in ticks} == {Mode.WAITING, Mode.SETTLING, Mode.RUNNING}
+    modes = {tick.t_ns: tick.mode for tick in ticks}
+    for t_ns, values in sent(ticks, "RIG_ESTIMATE"):
+        assert values["VALID"] == (modes[t_ns] is Mode.RUNNING)
+        if modes[t_ns] is Mode.WAITING:
+            assert values["SPRING_DAMPER_FORCE"] == values["VIRTUAL_FORCE"] == 0.0
+    for t_ns, values in sent(ticks, "RIG_STATUS"):
+        assert values["STATE"] == modes[t_ns]
+    for name in ("RIG_ESTIMATE", "RIG_KINEMATICS", "RIG_STATUS", "RIG_TIMING"):
+        assert sent(ticks, name)[0][0] == 0

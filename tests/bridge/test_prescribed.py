@@ -33,6 +33,9 @@ struts:
     damping_n_s_per_m: 2000.0
 """
 TICK_NS = 1_000_000
+SETTLED = 18
+"""Tick after that of the first height at which the motion is believed."""
+
 SUPERVISION = Supervision(stale_after_s=0.005, safe_after_s=0.05)
 
 
@@ -165,8 +168,34 @@ def test_nothing_is_said_before_both_channels_came() -> None:
     assert output.mode is Mode.WAITING
     assert output.struts == ()
     state, output, _ = core.step(state, step_input(1, 12.0))
-    assert output.mode is Mode.RUNNING
+    assert output.mode is Mode.SETTLING
     assert output.struts[0].force_n == 12.0
+
+
+def test_the_motion_is_valid_when_the_filter_has_forgotten_its_start() -> None:
+    """Nine time constants of 2 ms, from the first height on."""
+    core = dyno(plant())
+    state = core.init(0)
+    for number in range(40):
+        state, output, _ = core.step(state, step_input(number, 12.0))
+        assert output.mode is (Mode.SETTLING if number < SETTLED else Mode.RUNNING)
+        assert output.struts[0].valid == (number >= SETTLED)
+
+
+def test_after_a_gap_of_more_than_ten_heights_the_motion_settles_again() -> None:
+    core = dyno(plant())
+    for missing in (9, 10):
+        state = core.init(0)
+        modes: list[Mode] = []
+        for number in range(90):
+            is_there = not 40 <= number < 40 + missing
+            state, output, _ = core.step(state, step_input(number, 12.0, measured=is_there))
+            modes.append(output.mode)
+        back = 40 + missing
+        assert modes[back - 1] is Mode.HOLD
+        settling = SETTLED if missing == 10 else 0
+        assert set(modes[back : back + settling]) == ({Mode.SETTLING} if settling else set())
+        assert set(modes[back + settling :]) == {Mode.RUNNING}
 
 
 @pytest.mark.parametrize("silent", ["height", "cell"])
@@ -184,10 +213,17 @@ def test_a_channel_that_falls_silent_ends_in_the_safe_state(silent: str) -> None
     assert modes[70:72] == [Mode.HOLD, Mode.SAFE]
     assert output.struts[0].force_n == 0.0
     assert not output.struts[0].valid
-    acknowledged = StepInput(120 * TICK_NS, acknowledged=True)
-    state, output, _ = core.step(state, acknowledged)
-    assert output.mode is Mode.WAITING
-    state, output, _ = core.step(state, step_input(121, 5.0))
+    for given in (StepInput(119 * TICK_NS), step_input(120, 5.0)):
+        acknowledged = StepInput(given.t_ns, given.samples, acknowledged=True)
+        state, output, _ = core.step(state, acknowledged)
+        # Without a fresh measurement of both it is refused.
+        assert output.mode is (Mode.WAITING if given.samples else Mode.SAFE)
+    # A motion that was measured all the time has settled in the safe state.
+    settling = SETTLED - 1 if silent == "height" else 0
+    for number in range(121, 121 + settling):
+        state, output, _ = core.step(state, step_input(number, 5.0))
+        assert output.mode is Mode.SETTLING
+    state, output, _ = core.step(state, step_input(121 + settling, 5.0))
     assert output.mode is Mode.RUNNING
 
 

@@ -11,7 +11,17 @@ from rig.bridge.mode_supervisor import Supervision
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.poles import Pole, closed_loop_poles
 from rig.observers.pi import PiObserver
-from tests.bridge.cores import GAINS, MS, gains, measured, run, supervised
+from tests.bridge.cores import (
+    FIRST,
+    GAINS,
+    MS,
+    channels,
+    gains,
+    measured,
+    resting,
+    run,
+    supervised,
+)
 
 REST_M = 0.5 - 10.0 * 9.81 / 500.0
 ALWAYS_FRESH = Supervision(stale_after_s=1e6, safe_after_s=1e7)
@@ -28,12 +38,11 @@ def poles(observer: PiObserver, every: int = 1, delay: int = 0) -> list[Pole]:
 def ringing(observer: PiObserver, every: int) -> tuple[float, float]:
     """Decay per measurement and frequency (Hz) of the simulated loop's innovation."""
     rig = supervised(reference(), (observer,), ALWAYS_FRESH)
-    count = 600 * every
-    inputs = [measured(0, REST_M + 1e-3)] + [
-        measured(tick, REST_M if tick % every == 0 else None) for tick in range(1, count)
+    inputs = [
+        measured(FIRST + tick, REST_M if tick % every == 0 else None) for tick in range(600 * every)
     ]
-    _, outputs = run(rig, inputs)
-    innovation = np.array([output.struts[0].innovation_m for output in outputs])[::every]
+    _, outputs = run(rig, resting(REST_M + 1e-3) + inputs)
+    innovation = np.array([output.struts[0].innovation_m for output in outputs[FIRST::every]])
     # An oscillation obeys x[k+2] = 2 r cos(phi) x[k+1] - r² x[k]; the slow pole is fitted with it.
     window = innovation[5:300]
     rows = np.column_stack([window[2:-1], window[1:-2], window[:-3]])
@@ -88,12 +97,16 @@ def test_a_loop_that_runs_away_has_a_pole_outside(gains, every, delay):
 
 def test_a_slow_measurement_that_runs_away_does_so_at_the_speed_of_its_pole():
     fastest = max(pole.magnitude for pole in poles(GAINS, 10))
-    rig = supervised(reference(), (gains(1e5, 1e4, 1e12),), ALWAYS_FRESH)
-    inputs = [measured(0, REST_M + 1e-6)] + [
-        measured(tick, REST_M if tick % 10 == 0 else None) for tick in range(1, 600)
+    bench = channels(1, interval_ns=10 * MS)
+    rig = supervised(reference(), (gains(1e5, 1e4, 1e12),), ALWAYS_FRESH, bench)
+    began = 10 * (FIRST - 1)
+    heights_m = [REST_M + 1e-6 * (tick <= began) for tick in range(began + 611)]
+    inputs = [
+        measured(tick, height_m if tick % 10 == 0 else None)
+        for tick, height_m in enumerate(heights_m)
     ]
     _, outputs = run(rig, inputs)
-    peaks = np.abs([output.struts[0].innovation_m for output in outputs[::10]])
+    peaks = np.abs([output.struts[0].innovation_m for output in outputs[began + 10 :: 10]])
     growth = (peaks[40:59].max() / peaks[20:39].max()) ** (1.0 / 20.0)
     assert growth == pytest.approx(fastest, rel=0.02)
 

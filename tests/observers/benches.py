@@ -109,7 +109,8 @@ def judged(truth, steps, first):
     force_n = steps.column(f"{STRUT}.force_n").to_numpy()[first:]
     std_n = steps.column(f"{STRUT}.force_std_n").to_numpy()[first:]
     missed = force_n - truth.force_n[first : first + len(force_n)]
-    if not np.all(mode == Mode.RUNNING):
+    # The error counts whether or not it is published as valid.
+    if not np.all((mode == Mode.RUNNING) | (mode == Mode.SETTLING)):
         return np.inf, np.nan
     share = float(np.sqrt(np.mean(missed**2)) / np.ptp(truth.force_n[first:]) * 2.0)
     return share, float(np.mean(np.abs(missed) < 1.96 * std_n))

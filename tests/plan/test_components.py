@@ -78,6 +78,7 @@ class Held(NamedTuple):
     measured_ns: int
     force_std_n: float = float("nan")
     left_out: tuple = ()
+    is_disturbed: bool = False
 
     @property
     def residual_force_n(self):
@@ -102,6 +103,15 @@ class Proportional:
             return state
         force_n = self.gain_n_per_m * innovation.value
         return Held(innovation.value, force_n, innovation.t_ns)
+
+    def longest_gap_ns(self, interval_ns):
+        return 10 * interval_ns
+
+    def settling_ns(self, decay_ns):
+        return decay_ns
+
+    def restart(self, state, start):
+        return self.init(start)
 
     def numbers(self, state):
         return (state.virtual_force_n,)

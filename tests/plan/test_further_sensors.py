@@ -89,7 +89,7 @@ def test_sensors_are_used_logged_and_replayed(tmp_path):
 
 def test_a_silent_sensor_is_counted_and_published(tmp_path):
     steps, ended = run(tmp_path, {"strut": {"cell": CELL}}, losses=(0.0, 0.0, 1.0))
-    assert np.all(steps["mode"][20:] == Mode.RUNNING)
+    assert np.all(steps["mode"][100:] == Mode.RUNNING)
     assert steps["strut.cell.left_out"][100:].all()
     assert ended.state.counts.left_out > 1800
 

@@ -20,6 +20,7 @@ from rig.run.logged_run import Endpoint, run_logged
 from rig.run.loop import RunControl
 from rig.run.ports import BusPort
 from rig.run.replay import replay
+from tests.bridge.cores import FIRST
 from tests.bus_and_log.at_once import AtOnce
 
 DBC = """VERSION ""
@@ -116,8 +117,11 @@ def test_what_was_proposed_runs_over_a_bus_and_replays(dbc, tmp_path):
         peer.close()
     assert (ended.ticks, ended.state.counts.refused) == (300, 0)
     # The body's weight of 98.1 N, carried by the strut at rest, in steps of a newton.
-    assert bench.forces[-1] * 1000.0 == pytest.approx(98.0, abs=25.0)
-    assert len(bench.forces) == 300
+    *during, last = bench.forces[:300]
+    assert last * 1000.0 == pytest.approx(98.0, abs=25.0)
+    # Nothing is known before the model starts, and nothing is said after the end.
+    assert during[: FIRST - 1] == [0.0] * (FIRST - 1)
+    assert bench.forces[300:] == [0.0] * 3
     found = replay(tmp_path / "run")
     assert (found.logged, found.different) == (300, 0)
 

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,12 +17,17 @@ from rig.bridge.prescribed_motion import PrescribedMotionEstimator
 from rig.bridge.published_quantities import STATUS, STRUT, TIMING
 from rig.bridge.values import Mode, StepInput, StepOutput, StrutOutput
 from rig.channels.channel import Sample
-from rig.channels.measured_quantities import BENCH_QUANTITIES, LOAD_CELL_FORCE, STRUT_QUANTITIES
+from rig.channels.measured_quantities import (
+    APPLIED_FORCE,
+    BENCH_QUANTITIES,
+    LOAD_CELL_FORCE,
+    STRUT_QUANTITIES,
+)
 from rig.observers import OBSERVERS
 from rig.observers.protocol import Innovation, SensorStep, Start, TuningTask
 from rig.observers.strut_sensors import STRUT_SENSORS, Instant
 from rig.plan.build import ENGINES
-from tests.bridge.cores import GAINS, MS, bench_sample, channels
+from tests.bridge.cores import FIRST, GAINS, MS, bench_sample, channels
 
 START = Start(0, 0.1, MS, 0, 50.0, 10.0)
 EXAMPLES = {
@@ -76,36 +82,67 @@ def test_a_tunable_observer_is_searched_within_what_a_configuration_accepts(kind
     assert faster.bandwidth_hz(0.1) == pytest.approx(1.5 * middle.bandwidth_hz(0.1), rel=1e-12)
 
 
+SETTLING_TICKS = 18
+"""Of both estimators: nine time constants of the dyno's filter."""
+
+
 def estimators():
     spec = load_model(MODELS / "reference.yaml")
     bench = channels(1)
-    yield FreeModelEstimator(DartPlant(spec), (GAINS,), bench, 10 * MS)
+    settling_times = partial(map, lambda _: SETTLING_TICKS * MS)
+    yield FreeModelEstimator(DartPlant(spec), (GAINS,), bench, 10 * MS, settling_times)
     yield PrescribedMotionEstimator(PrescribedStrut(spec), 0.002, bench, 10 * MS)
 
 
 @pytest.mark.parametrize("estimator", list(estimators()), ids=lambda made: type(made).__name__)
 def test_an_estimator_waits_starts_stops_and_waits_again(estimator):
-    def measured(t_ns):
+    def measured(t_ns, age_ns=0):
         cell = bench_sample(1, LOAD_CELL_FORCE, 5.0, t_ns)
-        return StepInput(t_ns, (Sample(0, 0.4, t_ns), cell))
+        applied = bench_sample(1, APPLIED_FORCE, 5.0, t_ns)
+        return StepInput(t_ns, (Sample(0, 0.4, t_ns - age_ns), cell, applied))
+
+    def fed(estimator, state, begin, age_ns=0):
+        """State and estimate after as many measurements as any needs to start."""
+        for tick in range(begin, begin + FIRST):
+            state, estimate = estimator.step(state, measured(tick * MS, age_ns))
+        return state, estimate
 
     state, estimate = estimator.step(estimator.init(0), StepInput(0))
     assert estimate is None
     assert list(estimator.heights_m(state)) == []
-    before, estimate = estimator.step(state, measured(MS))
+    before, estimate = fed(estimator, state, 1)
     assert estimate is not None
     assert len(estimate.struts) == estimator.struts
-    assert (estimate.measured_ns, estimate.diverged, estimate.left_out) == (MS, -1, ())
+    found = (estimate.measured_ns, estimate.diverged, estimate.left_out)
+    assert found == (FIRST * MS, -1, ())
     assert list(estimator.heights_m(before)) == pytest.approx([0.4])
-    after, _ = estimator.step(before, measured(2 * MS))
+    after, _ = estimator.step(before, measured((FIRST + 1) * MS))
     assert list(estimator.heights_m(estimator.discard(before, after))) == pytest.approx([0.4])
-    waiting = estimator.restart(after, 2 * MS)
-    assert estimator.step(waiting, StepInput(3 * MS))[1] is None
-    # A measurement that is too old starts nothing.
-    old = StepInput(50 * MS, (Sample(0, 0.4, 3 * MS), *measured(50 * MS).samples[1:]))
-    assert estimator.step(waiting, old)[1] is None
+    waiting = estimator.restart(after, (FIRST + 1) * MS)
+    assert estimator.step(waiting, StepInput((FIRST + 2) * MS))[1] is None
+    # Measurements that are too old start nothing.
+    assert fed(estimator, waiting, 60, 47 * MS)[1] is None
     same = estimator.with_settings((GAINS,), 100 * MS)
-    assert same.step(waiting, old)[1] is not None
+    assert fed(same, waiting, 60, 47 * MS)[1] is not None
+
+
+@pytest.mark.parametrize("estimator", list(estimators()), ids=lambda made: type(made).__name__)
+def test_an_estimator_has_settled_after_some_time_and_again_after_a_change(estimator):
+    def settled(state, begin):
+        """The first tick with a settled estimate, and the state then."""
+        for tick in range(begin, begin + 100):
+            bench = [bench_sample(1, item, 5.0, tick * MS) for item in BENCH_QUANTITIES]
+            given = StepInput(tick * MS, (Sample(0, 0.4, tick * MS), *bench))
+            state, estimate = estimator.step(state, given)
+            if estimate is not None and estimate.is_settled:
+                return tick, state
+        return None
+
+    first, state = settled(estimator.init(0), 0)
+    assert first in (SETTLING_TICKS, FIRST - 1 + SETTLING_TICKS)
+    assert settled(state, first + 1)[0] == first + 1
+    changed = estimator.unsettle(state, first * MS)
+    assert settled(changed, first + 1)[0] == first + SETTLING_TICKS
 
 
 @pytest.mark.parametrize("engine", ENGINES)

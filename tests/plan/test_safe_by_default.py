@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from rig.bridge.values import Mode
 from rig.cli.main import main
 from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
@@ -96,4 +97,7 @@ def test_a_model_that_diverges_is_told_with_its_strut_and_time(tmp_path):
     steps = read_run(tmp_path / "run").steps
     t_ns = round(ended.diverged["t_s"] * 1e9)
     at = steps.column("t_ns").to_pylist().index(t_ns)
-    assert steps.column("mode").to_pylist()[at - 1 : at + 1] == [2, 4]
+    assert steps.column("mode").to_pylist()[at - 1 : at + 1] == [
+        Mode.SETTLING,
+        Mode.SAFE,
+    ]

@@ -13,6 +13,7 @@ from dart_model.effects import CATALOGUE, FAMILY_WORDS
 from rig.guide.reference import write_reference
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
+from tests.bridge.cores import FIRST
 from tests.public.bench import heights
 from tests.run.listed import ListPort, bench_frames, live
 
@@ -38,8 +39,10 @@ def test_a_run_is_arrays_by_column(tmp_path):
     run = rig.open_run(tmp_path / "run")
     assert run.t_s.tolist() == pytest.approx(np.arange(300) * 1e-3)
     assert run["strut.height_m"].shape == run["applied_force_n"].shape == (300,)
-    assert np.isfinite(run["strut.force_n"][1:]).all()
-    assert run.header["schema"] == 2
+    started = FIRST - 1
+    assert np.isnan(run["strut.force_n"][:started]).all()
+    assert np.isfinite(run["strut.force_n"][started:]).all()
+    assert run.header["schema"] == 3
     with pytest.raises(KeyError, match=r"nosuch: expected one of .*strut\.height_m"):
         run["nosuch"]
 

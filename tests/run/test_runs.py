@@ -181,7 +181,8 @@ def test_a_run_that_was_cut_off_replays_to_its_last_frame(poor_run, tmp_path, se
     # Steps are flushed after their frames: they are never ahead of them by much.
     steps_bytes = int(rng.integers(0, steps_size * frames_bytes // frames_size))
     folder = cut(poor_run, tmp_path / "run", frames_bytes, steps_bytes)
-    last_line = (folder / FRAMES_FILE).read_bytes().rpartition(b"\n")[0].rpartition(b"\n")[2]
+    lines = (folder / FRAMES_FILE).read_bytes().rpartition(b"\n")[0].split(b"\n")
+    last_line = next(line for line in reversed(lines) if line.endswith(b" R"))
     last_ns = round(float(last_line.split()[0].strip(b"()")) * 1e9)
     found = replay(folder)
     assert found.different == 0

@@ -120,7 +120,7 @@ def diagnosed(line: Line, folder: Path, seconds: float) -> dict[str, Any]:
     ended = run(config, folder / "run", seconds, lambda _t_s: None)
     assert ended.state.mode is Mode.RUNNING
     counts = ended.state.counts
-    assert (counts.device_faulty, counts.wrong_length, counts.no_value) == (0, 0, 0)
+    assert (counts.device_faulty, counts.wrong_length, counts.no_value) == (0, 0, 0), counts
     assert replay(folder / "run").different == 0
     out = folder / "diagnosis"
     rig("diagnose", folder / "run", "--model", config.parent / "dyno.yaml", "--out", out)

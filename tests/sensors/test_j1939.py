@@ -5,6 +5,7 @@ import math
 import struct
 
 import pytest
+from msgspec.structs import replace
 
 from can_dbc.codec import compile_decoder, si_range
 from can_dbc.database import load_database
@@ -16,6 +17,7 @@ from rig.plan.build import build_bridge
 from rig.plan.load import load_plan
 from rig.sensors.j1939 import AddressClaim, address_claims, group_messages, group_number
 from rig.sensors.proposed_config import configuration_text, dbc_text
+from tests.bridge.cores import FIRST
 from tests.faults.trial import height_of
 
 MS = 1_000_000
@@ -79,12 +81,14 @@ def test_levels_are_described(ready):
 
 
 def driven(ready, given):
-    """Ticks of 10 ms with frames by tick."""
+    """Ticks with frames by tick."""
     bridge = build_bridge(ready)
     state = bridge.init(0)
     results = []
     for index in range(max(given) + 1):
-        state, result = bridge.tick(state, index * 10 * MS, given.get(index, []))
+        t_ns = index * ready.period_ns
+        frames = [replace(frame, t_ns=t_ns) for frame in given.get(index, [])]
+        state, result = bridge.tick(state, t_ns, frames)
         results.append(result)
     return results, state
 
@@ -111,18 +115,19 @@ def test_a_device_that_moves_is_followed(ready):
 
 
 def test_an_address_that_somebody_else_takes_is_not_believed(ready):
-    given = {
-        0: [levels(0x20, 0.4)],
-        1: [claim(0x20, name=5)],
-        2: [levels(0x20, 0.9)],
-        3: [claim(0x30), levels(0x30, 0.4)],
+    last = FIRST - 1
+    given = {tick: [levels(0x20, 0.4)] for tick in range(FIRST)} | {
+        last + 1: [claim(0x20, name=5)],
+        last + 2: [levels(0x20, 0.9)],
+        last + 3: [claim(0x30), levels(0x30, 0.4)],
     }
     results, _ = driven(ready, given)
-    assert results[1].device_faults == ((0, "has no address"),)
-    assert results[1].output.mode is Mode.HOLD
-    assert height_of(results[2]) is None
-    assert height_of(results[3]) is not None
-    assert results[3].device_faults == ()
+    assert results[last].output.mode is Mode.SETTLING
+    assert results[last + 1].device_faults == ((0, "has no address"),)
+    assert results[last + 1].output.mode is Mode.HOLD
+    assert height_of(results[last + 2]) is None
+    assert height_of(results[last + 3]) is not None
+    assert results[last + 3].device_faults == ()
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])

@@ -151,7 +151,7 @@ def states(tmp_path, run):
     grown_old(folders["killed"])
     (folders["live"] / "frames.log").touch()
     (folders["empty"] / "steps.arrow").write_bytes(b"")
-    text = (run / "run.yaml").read_text().replace("schema: 2", "schema: 1")
+    text = (run / "run.yaml").read_text().replace("schema: 3", "schema: 1")
     (folders["schema"] / "run.yaml").write_text(text)
     folders["no_run"].mkdir()
     folders["file"] = tmp_path / "file"
@@ -172,7 +172,7 @@ def test_the_page_says_what_a_folder_is(states):
         "file": "unreadable",
         "absent": "absent",
     }
-    assert "schema: 1: expected 2" in found["schema"]["words"]
+    assert "schema: 1: expected 3" in found["schema"]["words"]
     assert "rig replay" in found["killed"]["words"]
     assert 0 < found["killed"]["steps"] < COUNT
     assert found["live"]["steps"] > 0

@@ -298,7 +298,7 @@ at("acknowledge").addEventListener("click", () => change({ acknowledge: true }))
 
 // --- The diagnosis of a finished run -----------------------------------------------------------
 
-const FINISHED = ["done", "safe", "failed", "killed"];
+const FINISHED = ["done", "safe", "waiting", "failed", "killed"];
 const diagnosed = () => Number(at("diagnosed").value);
 
 function offerDiagnosis() {

@@ -110,7 +110,11 @@ class WatchedRun:
         status = str(header.get("ending", {}).get("status"))
         if not self.follower.steps:
             return "empty", f"Ended ({status}) without a single tick."
-        words = {"done": "Ended in order.", "safe": "Ended in its safe state."}
+        words = {
+            "done": "Ended in order.",
+            "safe": "Ended in its safe state.",
+            "waiting": "Ended without a valid height.",
+        }
         return status, words.get(status, f"Ended: {status}.")
 
     def _age_s(self) -> float:
