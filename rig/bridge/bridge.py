@@ -14,6 +14,7 @@ from rig.bridge.frame_checks import CheckMemory, FrameChecks, Reception
 from rig.bridge.incoming_messages import Incoming
 from rig.bridge.mode_supervisor import NO_REPORTS, Reports, SupervisedState, Supervision, Supervisor
 from rig.bridge.outgoing_messages import Outgoing
+from rig.bridge.supervision_limits import LimitsByStrut
 from rig.bridge.values import Mode, StepInput, StepOutput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.observers.protocol import AnyObserver
@@ -34,6 +35,16 @@ class Sending(Struct, frozen=True, gc=False):
     due_ns: int
 
 
+_FADING = 1.0 - 1.0 / 200.0
+"""Of the share of missed ticks, at each tick."""
+
+_MOST_AT_ONCE = 20
+"""Missed ticks of one pause that count: ages judge a single one, however long it is."""
+
+_LEAST_SHARE = 1e-3
+"""Share of missed ticks below which it is none."""
+
+
 class BridgeState(Struct, frozen=True, gc=False):
     """State of the bridge between two ticks.
 
@@ -43,6 +54,7 @@ class BridgeState(Struct, frozen=True, gc=False):
         memory: Memory of the frame checks.
         sendings: State of each outgoing message.
         reported: Counts at the last status that was sent.
+        missed_share: Share of missed ticks, over the last few hundred.
     """
 
     supervised: SupervisedState
@@ -50,6 +62,7 @@ class BridgeState(Struct, frozen=True, gc=False):
     memory: CheckMemory
     sendings: tuple[Sending, ...]
     reported: Counts
+    missed_share: float = 0.0
 
     @property
     def counts(self) -> Counts:
@@ -90,7 +103,7 @@ class Bridge:
         incoming: Sequence[Incoming],
         outgoing: Sequence[Outgoing],
         devices: Sequence[Device],
-        supervision: Supervision,
+        limits: LimitsByStrut,
     ) -> None:
         self._supervisor = supervisor
         self._channels = tuple(channels)
@@ -98,7 +111,7 @@ class Bridge:
         self._devices = tuple(devices)
         own = frozenset(item.message.key for item in outgoing)
         struts = supervisor.estimator.struts
-        self._checks = FrameChecks(incoming, own, devices, supervision.limits, struts)
+        self._checks = FrameChecks(incoming, own, devices, limits)
         self._nothing = (StrutOutput(0.0, 0.0, False, 0.0, 0.0, 0.0, 0.0),) * struts
         self._is_height = [channel.role is Role.HEIGHT for channel in channels]
         self._is_reading = [channel.role is Role.SENSOR for channel in channels]
@@ -120,17 +133,19 @@ class Bridge:
         """Index of the incoming message that a frame is of."""
         return self._checks.directory
 
-    def with_settings(self, observers: Sequence[AnyObserver], supervision: Supervision) -> "Bridge":
+    def with_settings(
+        self, observers: Sequence[AnyObserver], supervision: Supervision, limits: LimitsByStrut
+    ) -> "Bridge":
         """The same with other observers and limits; it continues from a state of this one."""
         estimator = self._supervisor.estimator.with_settings(observers, supervision.stale_after_ns)
-        supervisor = Supervisor(estimator, supervision)
+        supervisor = Supervisor(estimator, supervision, limits)
         return Bridge(
             supervisor,
             self._channels,
             self.incoming,
             self._outgoing,
             self._devices,
-            supervision,
+            limits,
         )
 
     def init(self, t_ns: int) -> BridgeState:
@@ -173,17 +188,22 @@ class Bridge:
         wrong: tuple[tuple[int, str], ...] = ()
         if self._devices:
             wrong = faults(self._devices, memory.healths, t_ns)
-        gap_ns = t_ns - state.supervised.t_ns if conditions.overruns else 0
-        if wrong or reception.action or gap_ns:
+        missed = conditions.overruns
+        gap_ns = t_ns - state.supervised.t_ns if missed else 0
+        share = _missed_share(state.missed_share, missed) if missed or state.missed_share else 0.0
+        excessive = share if share > self._supervisor.overload_share else 0.0
+        if wrong or reception.action or gap_ns or excessive:
             vital = [index for index, _ in wrong if self._devices[index].is_vital]
-            reports = Reports(reception.action, reception.excess, gap_ns, *vital[:1])
+            reports = Reports(reception.action, reception.excess, gap_ns, excessive, *vital[:1])
         supervised, output, action = self._supervisor.step(supervised, step_input, reports)
         counts = count_tick(memory.counts, output, action, conditions, len(wrong))
         sent = self._send(state, t_ns, output, counts, conditions)
         sendings, sent_frames, counts, reported = sent
         if counts is not memory.counts:
             memory = replace(memory, counts=counts)
-        after = BridgeState(supervised, tuple(reception.sequences), memory, sendings, reported)
+        after = BridgeState(
+            supervised, tuple(reception.sequences), memory, sendings, reported, share
+        )
         return after, TickResult(sent_frames, step_input, output, counts, wrong)
 
     def _receive(
@@ -260,6 +280,12 @@ class Bridge:
             if saturated:
                 counts = counts._replace(saturated=counts.saturated + 1)
         return tuple(after), frames, counts, reported
+
+
+def _missed_share(share: float, missed: int) -> float:
+    """Share of missed ticks after some that were missed and one that was not, fading."""
+    share = _FADING * (1.0 - (1.0 - share) * _FADING ** min(missed, _MOST_AT_ONCE))
+    return share if share > _LEAST_SHARE else 0.0
 
 
 def _filters(

@@ -41,7 +41,7 @@ from rig.bridge.incoming_messages import Incoming, Values
 from rig.bridge.supervision_limits import (
     Action,
     Excess,
-    Limit,
+    LimitsByStrut,
     Plausibility,
     explain_height,
     judge_height,
@@ -117,8 +117,7 @@ class FrameChecks:
         incoming: Sequence[Incoming],
         own: frozenset[tuple[int, bool]],
         devices: Sequence[Device],
-        limits: Sequence[Limit],
-        struts: int,
+        limits: LimitsByStrut,
     ) -> None:
         self.incoming = tuple(incoming)
         self.directory = Directory(item.message for item in incoming)
@@ -126,8 +125,7 @@ class FrameChecks:
         self._own = own
         self._devices = tuple(devices)
         self._device_of_id = {key: index for index, item in enumerate(devices) for key in item.ids}
-        self._limits = tuple(limit for limit in limits if limit.value.is_measured)
-        self._struts = struts
+        self._limits = [[row for row in rows if row.value.is_measured] for rows in limits]
         self._checks = [self._checks_of(item) for item in incoming]
         self._index_of = self.directory.index_of
 
@@ -136,7 +134,7 @@ class FrameChecks:
         messages = len(self.incoming)
         memory = CheckMemory(
             (Strays(),) * messages,
-            (None,) * self._struts,
+            (None,) * len(self._limits),
             tuple(initial_health(device, t_ns) for device in self._devices),
             Counts(),
         )
@@ -215,7 +213,7 @@ class FrameChecks:
         if incoming.device is not None:
             index, device = incoming.device, self._devices[incoming.device]
             checks += [_sent_by_device(index, device), _healthy_sender(incoming, index, device)]
-        if self._limits and incoming.heights:
+        if any(self._limits[target.strut] for target in incoming.heights):
             checks.append(_plausible(incoming, self._limits))
         return tuple(checks)
 
@@ -258,14 +256,14 @@ def _healthy_sender(incoming: Incoming, index: int, device: Device) -> FrameChec
     return check
 
 
-def _plausible(incoming: Incoming, limits: Sequence[Limit]) -> FrameCheck:
+def _plausible(incoming: Incoming, limits_of: LimitsByStrut) -> FrameCheck:
     """A check for heights within the limits: a frame is used whole or not at all."""
     shortest_ns = max(1, (incoming.message.cycle_time_ns or 0) // 2)
 
     def check(reception: Reception, frame: Frame, values: Values) -> Values | None:
         heights, action = list(reception.memory.heights), 0
         for target in incoming.heights:
-            height_m = values[target.value]
+            height_m, limits = values[target.value], limits_of[target.strut]
             memory = heights[target.strut]
             if memory is None:
                 memory = Plausibility(height_m, frame.t_ns, frame.t_ns, shortest_ns)

@@ -1,8 +1,8 @@
 """The state machine that owns the mode: the only place where it changes.
 
 What may change it is an event: the age of the measurements, a model that diverged, a limit, a
-device, the user. A tick may show several; they are applied one after the other: age, divergence,
-limits, devices. What is published follows from the mode.
+device, the user. A tick may show several; they are applied one after the other: age, overload,
+divergence, limits, devices. What is published follows from the mode.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,7 +17,16 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from can_dbc.yaml_file import NotNegative, Positive
 from rig.bridge.estimator import AnyEstimator, Estimate
 from rig.bridge.measurement_age import is_too_old
-from rig.bridge.supervision_limits import Action, Excess, Limit, find_excess, worst_action
+from rig.bridge.supervision_limits import (
+    Action,
+    Excess,
+    Limit,
+    LimitsByStrut,
+    bounds_of_estimate,
+    find_excess,
+    is_within,
+    worst_action,
+)
 from rig.bridge.values import Divergence, Mode, StepInput, StepOutput, StrutOutput
 
 
@@ -29,6 +38,7 @@ class Event(Enum):
     FRESH = "fresh"
     STALE = "stale"
     TIMEOUT = "timeout"
+    OVERLOADED = "overloaded"
     DIVERGED = "diverged"
     SETTLED = "settled"
     UNSETTLED = "unsettled"
@@ -43,6 +53,7 @@ TRANSITIONS: dict[tuple[Mode, Event], Mode] = {
     (Mode.SETTLING, Event.STALE): Mode.HOLD,
     (Mode.SETTLING, Event.TIMEOUT): Mode.SAFE,
     (Mode.SETTLING, Event.TICKS_MISSING): Mode.SAFE,
+    (Mode.SETTLING, Event.OVERLOADED): Mode.HOLD,
     (Mode.SETTLING, Event.DIVERGED): Mode.SAFE,
     (Mode.SETTLING, Event.BEYOND_HOLD): Mode.HOLD,
     (Mode.SETTLING, Event.BEYOND_SAFE): Mode.SAFE,
@@ -51,6 +62,7 @@ TRANSITIONS: dict[tuple[Mode, Event], Mode] = {
     (Mode.RUNNING, Event.STALE): Mode.HOLD,
     (Mode.RUNNING, Event.TIMEOUT): Mode.SAFE,
     (Mode.RUNNING, Event.TICKS_MISSING): Mode.SAFE,
+    (Mode.RUNNING, Event.OVERLOADED): Mode.HOLD,
     (Mode.RUNNING, Event.DIVERGED): Mode.SAFE,
     (Mode.RUNNING, Event.BEYOND_HOLD): Mode.HOLD,
     (Mode.RUNNING, Event.BEYOND_SAFE): Mode.SAFE,
@@ -80,8 +92,11 @@ class Supervision(BaseModel):
             estimate is valid. By default that in which a step of the residual force decays to a
             hundredth in the closed loop; none for an observer that knows its variance, which
             settles with it.
+        overload_share: Share of missed ticks, over the last few hundred, from which the estimate is
+            marked invalid.
         safe_output: Force that the safe state publishes: `zero`, or the `last` valid one.
-        limits: What is done beyond which values, row by row.
+        limits: What is done beyond which values, row by row. Where none stands for a value, the
+            DBC's ranges limit measured height, model height and published force.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -89,6 +104,7 @@ class Supervision(BaseModel):
     stale_after_s: Positive = 0.01
     safe_after_s: Positive = 0.5
     settling_s: NotNegative | None = None
+    overload_share: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
     safe_output: Literal["zero", "last"] = "zero"
     limits: Annotated[tuple[Limit, ...], Field(max_length=100)] = ()
 
@@ -165,12 +181,14 @@ class Reports(Struct, frozen=True, gc=False):
         action: Severest action that the limits on measurements require, 0 if none.
         excess: The measurement beyond them; None if there is none.
         gap_ns: Time without a tick before this one, if any was missed.
+        missed_share: Share of missed ticks, if it is too large, else 0.
         faulty_device: Index of a device at fault that the estimate rests on; -1 if there is none.
     """
 
     action: int = 0
     excess: Excess | None = None
     gap_ns: int = 0
+    missed_share: float = 0.0
     faulty_device: int = -1
 
 
@@ -188,14 +206,18 @@ _RUNNING, _SAFE = Mode.RUNNING, Mode.SAFE
 
 
 class Supervisor:
-    """Steps an estimator and decides what is published of it."""
+    """Steps an estimator and decides what is published of it, within the limits of each strut."""
 
-    def __init__(self, estimator: AnyEstimator, settings: Supervision) -> None:
+    def __init__(
+        self, estimator: AnyEstimator, settings: Supervision, limits: LimitsByStrut
+    ) -> None:
         self.estimator = estimator
+        self.overload_share = settings.overload_share
         self._settings = settings
         self._stale_after_ns = settings.stale_after_ns
         self._safe_after_ns = settings.safe_after_ns
-        self._limits = tuple(limit for limit in settings.limits if not limit.value.is_measured)
+        self._limits = [[row for row in rows if not row.value.is_measured] for rows in limits]
+        self._bounds = [bounds_of_estimate(rows) for rows in self._limits]
 
     def init(self, t_ns: int) -> SupervisedState:
         """State before the first step."""
@@ -213,8 +235,9 @@ class Supervisor:
         if estimate is None:
             return *self._wait(state, t_ns, after, reports), reports.action
         action = reports.action
-        if self._limits:
-            action = max(action, *[worst_action(self._limits, item) for item in estimate.struts])
+        for bounds, limits, strut in zip(self._bounds, self._limits, estimate.struts, strict=True):
+            if not is_within(bounds, strut):
+                action = max(action, worst_action(limits, strut))
         is_calm = (
             mode is _RUNNING
             and estimate.is_settled
@@ -271,6 +294,9 @@ class Supervisor:
         """What a tick with an estimate shows, in order."""
         yield from self._missing_ticks(reports)
         yield self._age(estimate.measured_ns, t_ns)
+        if reports.missed_share:
+            limit = self._settings.overload_share
+            yield Cause(Event.OVERLOADED, -1, "missed_share", reports.missed_share, limit)
         if estimate.diverged >= 0:
             yield Cause(Event.DIVERGED, estimate.diverged)
         yield Cause(Event.SETTLED if estimate.is_settled else Event.UNSETTLED)

@@ -47,10 +47,12 @@ def _of_strut(key: str, dimension: Dimension, attribute: str, signal: str) -> Pu
     )
 
 
+FORCE = _of_strut("force", Dimension.FORCE, "force_n", "SPRING_DAMPER_FORCE")
+VALID = _of_strut("valid", Dimension.NUMBER, "valid", "VALID")
 ESTIMATE = (
-    _of_strut("force", Dimension.FORCE, "force_n", "SPRING_DAMPER_FORCE"),
+    FORCE,
     _of_strut("virtual_force", Dimension.FORCE, "virtual_force_n", "VIRTUAL_FORCE"),
-    _of_strut("valid", Dimension.NUMBER, "valid", "VALID"),
+    VALID,
 )
 KINEMATICS = (
     _of_strut("height", Dimension.LENGTH, "height_m", "MODEL_HEIGHT"),
@@ -113,6 +115,9 @@ STATUS = (
 )
 """What is published of the bridge. Faults of encoding, limits, devices and bus are those since the
 last status, the others are of now."""
+
+STATUS_MESSAGE = "RIG_STATUS"
+"""Message that publishes it where a DBC has one of this name."""
 
 
 def _timing(key: str, value: Callable[[TimingFigures], float]) -> Publication:

@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from enum import Enum, IntEnum
-from math import nan
-from typing import Literal, NamedTuple
+from math import inf, nan
+from typing import Annotated, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.yaml_file import Finite
 from rig.bridge.values import StrutOutput
@@ -50,9 +50,10 @@ _MEASURED = (
 
 
 class Limit(BaseModel):
-    """One row of the table of limits, for every strut.
+    """One row of the table of limits.
 
     Attributes:
+        strut: Strut that it is for; every strut if absent.
         value: What is limited, with its unit. Of the measurement: `measured_height_m`,
             `measured_rate_m_per_s`, `unchanged_s` (how long it may stay exactly the same). Of the
             estimate: `height_m`, `force_n`, `virtual_force_n`, `innovation_m`.
@@ -64,6 +65,7 @@ class Limit(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    strut: Annotated[str, Field(min_length=1, max_length=255)] | None = None
     value: LimitedValue
     low: Finite | None = None
     high: Finite | None = None
@@ -94,6 +96,10 @@ class Limit(BaseModel):
         is_low = self.low is not None and value < self.low
         bound = self.low if is_low or self.high is None else self.high
         return nan if bound is None else bound
+
+
+LimitsByStrut = Sequence[Sequence[Limit]]
+"""The limits of each strut, in the model's order."""
 
 
 class Excess(NamedTuple):
@@ -164,13 +170,53 @@ def judge_height(
     return last._replace(height_m=height_m, t_ns=t_ns, since_ns=since_ns), action
 
 
-def find_excess(
-    limits: Sequence[Limit], struts: Sequence[StrutOutput], action: int
-) -> Excess | None:
+class EstimateBounds(NamedTuple):
+    """Bounds within which no limit on a strut's estimate requires anything."""
+
+    low_m: float
+    high_m: float
+    low_n: float
+    high_n: float
+    low_virtual_n: float
+    high_virtual_n: float
+    low_innovation_m: float
+    high_innovation_m: float
+
+
+_BOUNDED = (
+    LimitedValue.HEIGHT_M,
+    LimitedValue.FORCE_N,
+    LimitedValue.VIRTUAL_FORCE_N,
+    LimitedValue.INNOVATION_M,
+)
+
+
+def bounds_of_estimate(limits: Sequence[Limit]) -> EstimateBounds:
+    """The narrowest bounds of a strut's limits."""
+    bounds: list[float] = []
+    for value in _BOUNDED:
+        rows = [limit for limit in limits if limit.value is value]
+        bounds.append(max([row.low for row in rows if row.low is not None], default=-inf))
+        bounds.append(min([row.high for row in rows if row.high is not None], default=inf))
+    return EstimateBounds(*bounds)
+
+
+def is_within(bounds: EstimateBounds, strut: StrutOutput) -> bool:
+    """Whether an estimate is within all bounds; one that is not a number is not."""
+    low_m, high_m, low_n, high_n, low_virtual_n, high_virtual_n, low, high = bounds
+    return (
+        low_m <= strut.height_m <= high_m
+        and low_n <= strut.force_n <= high_n
+        and low_virtual_n <= strut.virtual_force_n <= high_virtual_n
+        and low <= strut.innovation_m <= high
+    )
+
+
+def find_excess(limits: LimitsByStrut, struts: Sequence[StrutOutput], action: int) -> Excess | None:
     """The first estimate that requires an action, and its limit."""
     for index, strut in enumerate(struts):
         values = _estimates(strut)
-        for limit in limits:
+        for limit in limits[index]:
             number = values[limit.value]
             if limit.action_at(number) == action:
                 return Excess(index, limit.value, number, limit.bound_beyond(number))

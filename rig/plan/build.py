@@ -32,15 +32,14 @@ def build_bridge(plan: Plan, *, sending: bool = True) -> Bridge:
         InputError: The model cannot be built.
         DatabaseError: A signal does not fit its quantity.
     """
-    supervision = plan.config.supervision
     outgoing = plan.outgoing if sending else ()
     return Bridge(
-        Supervisor(_build_estimator(plan), supervision),
+        Supervisor(_build_estimator(plan), plan.config.supervision, plan.limits),
         plan.channels,
         _compile_incoming(plan),
         [compile_outgoing(item.message, item.signals) for item in outgoing],
         plan.devices,
-        supervision,
+        plan.limits,
     )
 
 

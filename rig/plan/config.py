@@ -221,6 +221,17 @@ def _mapping(choices: Sequence[Publication]) -> Callable[[object], object]:
     return read
 
 
+class Unsafe(_Frozen):
+    """What is refused unless the user takes it upon themselves.
+
+    Attributes:
+        publish_without_valid: Publish a strut's force without the signal that marks it as invalid:
+            a receiver takes the force of a lost estimate for the strut's.
+    """
+
+    publish_without_valid: bool = False
+
+
 class LogConfig(_Frozen):
     """How the log of a run is kept.
 
@@ -278,6 +289,7 @@ class RunConfig(_Frozen):
         timing: How well the rate is kept, by the keys of
             `rig.bridge.published_quantities.TIMING`, or a message; nothing by default.
         supervision: Ages and safe state.
+        unsafe: What is done although a bench can be hurt by it.
         realtime: What is asked of the machine.
         log: Rotation, and windows that are kept apart.
     """
@@ -299,6 +311,7 @@ class RunConfig(_Frozen):
     status: Annotated[Mapped, BeforeValidator(_mapping(STATUS))] | None = None
     timing: Annotated[Mapped, BeforeValidator(_mapping(TIMING))] | None = None
     supervision: Supervision = Supervision()
+    unsafe: Unsafe = Unsafe()
     realtime: Realtime = Realtime()
     log: LogConfig = LogConfig()
 

@@ -16,19 +16,23 @@ from rig.bridge.incoming_messages import Alarm
 from rig.bridge.outgoing_messages import PublishedSignal
 from rig.bridge.published_quantities import (
     ESTIMATE,
+    FORCE,
     KINEMATICS,
     STATUS,
+    STATUS_MESSAGE,
     STRUT,
     TIMING,
     UNCERTAINTY,
     Publication,
 )
+from rig.bridge.supervision_limits import Limit
 from rig.bus.secoc import FD_LENGTHS, Authentication, AuthenticationSettings
 from rig.channels.channel import Channel, Role, SignalName
 from rig.channels.measured_quantities import HEIGHT, LOAD_CELL_FORCE, Quantity
 from rig.observers.pi import PiObserver
 from rig.observers.protocol import AnyObserver
 from rig.plan.config import HeightSignal, Mapped, RunConfig, SensorSignal
+from rig.plan.limits import limits_by_strut
 
 _LARGEST_DELAY_DIFFERENCE_S = 0.02
 """Between the sensors of one strut: a filter that goes back by more at every reading takes half a
@@ -70,6 +74,7 @@ class Plan:
         config: The configuration, with every strut and every published signal named.
         channels: Channels of the bench: heights, quantities of the bench, further sensors.
         alarms: Messages with alarms of the devices, and the alarms.
+        limits: Limits of each strut: the configured ones, and those that follow from the DBC.
         authentication: How frames are authenticated; None where they are not, and for the plan of
             a run, whose folder contains no key.
     """
@@ -83,6 +88,7 @@ class Plan:
     outgoing: tuple[PlannedMessage, ...]
     devices: tuple[Device, ...]
     alarms: tuple[tuple[Message, Alarm], ...]
+    limits: tuple[tuple[Limit, ...], ...]
     authentication: Authentication | None = None
 
     @property
@@ -190,6 +196,18 @@ def resolve(config: RunConfig, source: Path, model: ModelSpec, database: Databas
         outgoing,
         _devices(config, channels),
         alarms,
+        limits_by_strut(
+            config.supervision.limits,
+            list(config.observers),
+            [channel for channel in channels if channel.role is Role.HEIGHT],
+            {
+                item.strut: (planned.message, item.signal)
+                for planned in outgoing
+                for item in planned.signals
+                if item.publication is FORCE
+            },
+            source,
+        ),
     )
     if config.authentication is not None:
         _check_authentication(config, config.authentication, plan.messages(), source)
@@ -224,7 +242,7 @@ def _with_names(config: RunConfig, model: ModelSpec, database: Database, source:
                 )
     status = config.status
     if "status" not in config.model_fields_set:
-        status = _signals_of("RIG_STATUS", STATUS, database) or None
+        status = _signals_of(STATUS_MESSAGE, STATUS, database) or None
     observers = {name: config.observers.get(name, PiObserver()) for name in struts}
     _check_heights(config, observers, list(heights), source)
     height = {name: heights[name] for name in struts if name in heights}

@@ -9,6 +9,8 @@ from can_dbc.codec import si_step
 from can_dbc.database import Message
 from dart_model.protocol import AnyPlant
 from dart_model.spec import InlineSkeleton
+from rig.bridge.published_quantities import FORCE, VALID
+from rig.bridge.supervision_limits import Limit
 from rig.channels.channel import Channel
 from rig.channels.measured_quantities import LOAD_CELL_FORCE
 from rig.closed_loop.loop import SampleTiming
@@ -21,6 +23,9 @@ from rig.plan.plan import Plan
 LITTLE_DAMPING = 0.02
 """Damping ratio below which a pole gives a warning: its oscillation takes about 9 periods to decay
 to one third."""
+
+_IN_STEP = "virtual"
+"""Interface within one process: a simulated bench on it is in step with the bridge."""
 
 _OTHERS_MAY_READ = stat.S_IRGRP | stat.S_IROTH
 FULL_LOAD, HIGH_LOAD = 1.0, 0.7
@@ -75,6 +80,8 @@ def check(plan: Plan) -> list[Finding]:
             if message.cycle_time_ns is None
         ],
         _staleness(plan, heights),
+        *_publication(plan),
+        *_limits(plan),
         _load(plan),
         *_authentication(plan),
     ]
@@ -166,6 +173,41 @@ def _staleness(plan: Plan, heights: list[Message]) -> Finding:
     return Finding(severity, "supervision.stale_after_s", text)
 
 
+def _publication(plan: Plan) -> list[Finding]:
+    """Whether a receiver can see that an estimate is invalid, and why."""
+    findings: list[Finding] = []
+    for name, published in (plan.config.publish or {}).items():
+        if FORCE.key not in published or VALID.key in published:
+            continue
+        text = "the force is published without valid: what is sent after lost frames looks like"
+        text += " a force of the strut; expected publish.valid"
+        if plan.config.unsafe.publish_without_valid:
+            findings.append(Finding(Severity.WARNING, f"publish.{name}", text))
+        else:
+            text += ", or unsafe: {publish_without_valid: true}"
+            findings.append(Finding(Severity.ERROR, f"publish.{name}", text))
+    if not plan.config.status:
+        text = "none is published: the bus does not show the bridge's mode"
+        findings.append(Finding(Severity.WARNING, "status", text))
+    return findings
+
+
+def _limits(plan: Plan) -> list[Finding]:
+    """The limits of each strut, those that follow from the DBC included."""
+    findings: list[Finding] = []
+    for name, rows in zip(plan.strut_names, plan.limits, strict=True):
+        text = "; ".join(f"{row.value.value} {_bounds(row)}: {row.action}" for row in rows)
+        severity = Severity.OK if rows else Severity.WARNING
+        findings.append(Finding(severity, f"limits of {name}", text or "none"))
+    return findings
+
+
+def _bounds(limit: Limit) -> str:
+    if limit.low is None:
+        return f"up to {limit.high:.4g}"
+    return f"from {limit.low:.4g}" + ("" if limit.high is None else f" to {limit.high:.4g}")
+
+
 def _authentication(plan: Plan) -> list[Finding]:
     settings = plan.config.authentication
     if settings is None:
@@ -221,8 +263,11 @@ def _stability(plan: Plan, plant: AnyPlant) -> list[Finding]:
     if worst < 1.0:
         findings.append(Finding(Severity.OK, "poles, one cycle late", text))
     elif findings[0].severity is not Severity.ERROR:
-        text += ": unstable; keep bench and bridge in step, or lower K_P or raise the rate"
-        findings.append(Finding(Severity.WARNING, "poles, one cycle late", text))
+        # On a bus between two machines nothing keeps the bench in step.
+        is_real = plan.config.bus.interface != _IN_STEP
+        text += ": unstable; lower the gains or raise the rate (`rig tune` finds gains)"
+        severity = Severity.ERROR if is_real else Severity.WARNING
+        findings.append(Finding(severity, "poles, one cycle late", text))
     return findings
 
 

@@ -1,11 +1,18 @@
-"""A configuration proposed from a DBC: which signals look like what the bridge needs."""
+"""A configuration proposed from a DBC: which signals look like what the bridge needs.
 
+What is proposed is safe to start with: an observer that is slow and stable until it is tuned, a
+signal that marks the estimate as invalid, and limits on what a height sensor can send.
+"""
+
+import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+from can_dbc.codec import si_step
 from can_dbc.database import Database, Message, Signal
 from can_dbc.errors import DatabaseError, InputError
 from can_dbc.units import Dimension, si_conversion
+from rig.bridge.published_quantities import FORCE, STATUS_MESSAGE, VALID
 from rig.channels.measured_quantities import (
     APPLIED_FORCE,
     HEIGHT,
@@ -13,6 +20,7 @@ from rig.channels.measured_quantities import (
     TEMPERATURE,
     Quantity,
 )
+from rig.observers.kalman import KalmanObserver
 
 _WORDS: dict[Quantity, tuple[str, ...]] = {
     HEIGHT: ("height", "hoehe", "stroke", "travel", "weg", "displ", "pos", "length", "lvdt"),
@@ -22,7 +30,24 @@ _WORDS: dict[Quantity, tuple[str, ...]] = {
 }
 """Parts of names by which a signal is preferred among those of the right unit."""
 
+_STRUT = "strut"
+"""Strut of the model that is proposed."""
+
+_UNKNOWN_NOISE_M, _UNKNOWN_INTERVAL_NS = 1e-5, 10_000_000
+"""Where the DBC does not state a step or a cycle."""
+
 _ESTIMATE_WORDS = ("estim", "schaetz", "calc", "spring", "damper", "cmd", "set", "out", "soll")
+_VALID_WORDS = ("valid", "gueltig", "qual", "ok")
+_STATE_WORDS = ("state", "mode", "status", "zustand")
+_LEAST_STATE_BITS = 3
+"""A mode is a number from 0 to 5."""
+
+_STALE_CYCLES = 3
+_LEAST_STALE_S = 0.01
+_LARGEST_RATE_M_PER_S = 10.0
+"""Of a height: several times what a damper is tested at."""
+
+_FROZEN_S = 1.0
 _MOST_OTHERS = 4
 """Other candidates that are named in a comment."""
 
@@ -77,17 +102,80 @@ def propose(database: Database) -> str:
             used.add((found[0].message.name, found[0].signal.name))
     listened = {name for name, _ in used}
     free = [item for item in others if item.name not in listened]
-    estimates = _candidates(free, Dimension.FORCE, _ESTIMATE_WORDS)
-    if estimates:
-        lines += ["publish:", _line("  ", "force", estimates)]
-    else:
-        lines.append("# publish: no other message has a signal with a unit of force")
+    lines += [*_published(free), *_observer(heights[0]), *_supervision(heights[0])]
     return "\n".join(lines) + "\n"
+
+
+def _published(free: Sequence[Message]) -> list[str]:
+    """Lines of what could carry the estimate, its validity and the bridge's mode."""
+    estimates = _candidates(free, Dimension.FORCE, _ESTIMATE_WORDS)
+    if not estimates:
+        return ["# publish: no other message has a signal with a unit of force"]
+    lines = ["publish:", _line("  ", FORCE.key, estimates)]
+    chosen = estimates[0].message
+    valid = _named([chosen], _VALID_WORDS, 1) or _named(free, _VALID_WORDS, 1)
+    if valid:
+        lines.append(_line("  ", VALID.key, valid))
+    else:
+        lines += [
+            "  # valid: no signal looks like it; without one a lost estimate looks like a force:",
+            "  # unsafe: {publish_without_valid: true} accepts that",
+        ]
+    states = _named(free, _STATE_WORDS, _LEAST_STATE_BITS)
+    if any(item.name == STATUS_MESSAGE for item in free):
+        lines.append(f"status: {STATUS_MESSAGE}")
+    elif states:
+        lines += ["status:", _line("  ", "state", states)]
+    return lines
+
+
+def _observer(height: _Candidate) -> list[str]:
+    """Lines of an observer that is stable until it is tuned."""
+    message, name = height.message, height.signal.name
+    noise_std_m = si_step(message, name, HEIGHT.dimension) / math.sqrt(12.0) or _UNKNOWN_NOISE_M
+    interval_ns = message.cycle_time_ns or _UNKNOWN_INTERVAL_NS
+    observer = KalmanObserver.before_tuning(noise_std_m, interval_ns).to_four_digits()
+    found = observer.filter
+    return [
+        "observers:",
+        f"  {_STRUT}:   # slow and stable; rig tune finds a better one",
+        f"    kind: {observer.kind}",
+        f"    filter: {{bandwidth_hz: {found.bandwidth_hz:.4g}, "
+        f"noise_std_m: {found.noise_std_m:.3e}}}",
+    ]
+
+
+def _supervision(height: _Candidate) -> list[str]:
+    """Lines of ages and limits that follow from the height's message."""
+    cycle_s = (height.message.cycle_time_ns or _UNKNOWN_INTERVAL_NS) * 1e-9
+    stale_s = max(_LEAST_STALE_S, _STALE_CYCLES * cycle_s)
+    rate = _LARGEST_RATE_M_PER_S
+    return [
+        "supervision:",
+        f"  stale_after_s: {stale_s:g}",
+        f"  safe_after_s: {max(0.5, 5.0 * stale_s):g}",
+        "  limits:",
+        f"    - {{value: measured_rate_m_per_s, low: {-rate:g}, high: {rate:g}, action: refuse}}",
+        "    # A sensor that has frozen; remove the line for one that repeats itself at rest.",
+        f"    - {{value: unchanged_s, high: {_FROZEN_S:g}, action: hold}}",
+    ]
+
+
+def _named(messages: Iterable[Message], words: Sequence[str], bits: int) -> list[_Candidate]:
+    """Integer signals with one of some words in their names and no unit, the best name first."""
+    found = [
+        _Candidate(sum(word in signal.name.lower() for word in words), message, signal)
+        for message in messages
+        for signal in message.signals.values()
+        if not signal.unit and not signal.is_float and signal.length_bits >= bits
+    ]
+    named = [item for item in found if item.score]
+    return sorted(named, key=lambda item: (-item.score, item.signal.length_bits))
 
 
 def _line(indent: str, key: str, found: Sequence[_Candidate]) -> str:
     best, *rest = found
-    comment = f"   # {best.signal.unit}"
+    comment = f"   # {best.signal.unit or 'no unit'}"
     if rest:
         named = [f"{item.message.name}.{item.signal.name}" for item in rest[:_MOST_OTHERS]]
         comment += f"; or {', '.join(named)}" + (", ..." if len(rest) > _MOST_OTHERS else "")

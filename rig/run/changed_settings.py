@@ -100,7 +100,7 @@ def _assign(section: object, names: Sequence[str], value: object, source: str, k
 
 def bridge_with_settings(bridge: Bridge, plan: Plan) -> Bridge:
     """The bridge with a plan's observers and limits; model and messages are its own."""
-    return bridge.with_settings(plan.observers, plan.config.supervision)
+    return bridge.with_settings(plan.observers, plan.config.supervision, plan.limits)
 
 
 def change_line(t_ns: int, assignments: Assignments) -> str:

@@ -88,7 +88,7 @@ def supervised(
     estimator = FreeModelEstimator(
         plant, observers, bench, supervision.stale_after_ns, settling_times
     )
-    return Supervisor(estimator, supervision)
+    return Supervisor(estimator, supervision, [supervision.limits] * plant.struts)
 
 
 def core(

@@ -61,13 +61,14 @@ class Drawn:
         self.action = rng.choice((0, 0, 0, 0, Action.WARN, Action.HOLD, Action.SAFE))
         self.faulty_device = rng.choice((-1, -1, -1, -1, -1, 0))
         self.gap_ns = rng.choice((0, 0, 0, 0, 0, 0, 5, 60)) * MS
+        self.missed_share = rng.choice((0.0,) * 12 + (0.7,))
         if not calm and rng.random() < 0.5:
             self.age_ns, self.action = before.age_ns, before.action
             self.faulty_device = before.faulty_device
         self.measured_ns = t_ns - self.age_ns
 
     def reports(self):
-        reports = Reports(self.action, None, self.gap_ns, self.faulty_device)
+        reports = Reports(self.action, None, self.gap_ns, self.missed_share, self.faulty_device)
         return NO_REPORTS if reports == NO_REPORTS else reports
 
     def is_sound(self, mode):
@@ -82,6 +83,7 @@ class Drawn:
             and self.age_ns <= SUPERVISION.stale_after_ns
             and self.action < Action.HOLD
             and self.faulty_device < 0
+            and not self.missed_share
             and (mode is Mode.WAITING or self.gap_ns <= SUPERVISION.safe_after_ns)
         )
 
@@ -89,7 +91,7 @@ class Drawn:
 def drive(seed, steps=200):
     rng = random.Random(seed)
     estimator = Scripted()
-    supervisor = Supervisor(estimator, SUPERVISION)
+    supervisor = Supervisor(estimator, SUPERVISION, [SUPERVISION.limits])
     state, drawn, t_ns = supervisor.init(0), None, 0
     for _ in range(steps):
         t_ns += MS

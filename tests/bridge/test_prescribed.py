@@ -59,7 +59,7 @@ def step_input(number: int, cell_n: float | None, *, measured: bool = True) -> S
 def dyno(strut: PrescribedStrut, supervision: Supervision = SUPERVISION) -> Supervisor:
     stale_after_ns = supervision.stale_after_ns
     estimator = PrescribedMotionEstimator(strut, 0.002, channels(1), stale_after_ns)
-    return Supervisor(estimator, supervision)
+    return Supervisor(estimator, supervision, [supervision.limits])
 
 
 def test_the_filter_follows_a_constant_acceleration_without_lag() -> None:

@@ -164,7 +164,7 @@ def test_settling_times_are_computed_on_a_model_of_their_own(monkeypatch):
 
     monkeypatch.setattr(rig.plan.build, "settling_times_ns", record)
     running = bridge._supervisor.estimator._plant
-    bridge.with_settings((gains(2e5, 1e4),), plan.config.supervision)
+    bridge.with_settings((gains(2e5, 1e4),), plan.config.supervision, plan.limits)
     assert used
     assert all(plant is not running for plant in used)
 
@@ -192,7 +192,7 @@ def supervisor(truth, observer):
     estimator = FreeModelEstimator(
         truth.plant, (observer,), bench, supervision.stale_after_ns, settling_times
     )
-    return Supervisor(estimator, supervision)
+    return Supervisor(estimator, supervision, [()])
 
 
 def follow(truth, heights_m, observer, first=0, gap=range(0), acknowledged=-1):

@@ -1,6 +1,7 @@
 """The table of limits, and the way into the safe state and out of it."""
 
 import dataclasses
+import math
 
 import cantools.database
 import pytest
@@ -93,6 +94,31 @@ def test_safe_is_held_with_its_defined_output_until_it_is_acknowledged(safe_outp
     again = trial.run(803)[800:]
     assert [tick.mode for tick in again] == [Mode.WAITING] + [Mode.RUNNING] * 2
     assert again[-1].is_valid
+
+
+def test_a_bridge_that_misses_most_of_its_ticks_is_not_running():
+    trial = Trial(settling_s=0.0)
+    trial.run(BEGIN_MS)
+    ticks = trial.run(BEGIN_MS + 200, conditions=lambda _t_ns: Conditions(overruns=3))[BEGIN_MS:]
+    # Three of four are missed: their fading share passes a half after 200 ln 3 of them.
+    first = next(index for index, tick in enumerate(ticks) if tick.mode is Mode.HOLD)
+    assert first * 4 == pytest.approx(200 * math.log(3.0), abs=8)
+    assert {tick.mode for tick in ticks[first:]} == {Mode.HOLD}
+    cause = trial.state.supervised.first_cause
+    assert (cause.event, cause.quantity, cause.limit) == (Event.OVERLOADED, "missed_share", 0.5)
+    again = trial.run(BEGIN_MS + 400)[BEGIN_MS + 200 :]
+    assert again[-1].mode is Mode.RUNNING
+
+
+def test_a_bridge_that_misses_every_third_tick_is_running():
+    trial = Trial(settling_s=0.0)
+    trial.run(BEGIN_MS)
+
+    def conditions(t_ns):
+        return Conditions(overruns=1 if t_ns // MS % 2 else 0)
+
+    ticks = trial.run(BEGIN_MS + 500, conditions=conditions)[BEGIN_MS:]
+    assert {tick.mode for tick in ticks} == {Mode.RUNNING}
 
 
 def test_an_implausible_height_is_refused_with_all_of_its_frame():
@@ -201,11 +227,11 @@ def test_with_other_gains_the_estimate_settles_again_and_with_other_ages_it_does
     ages = trial.ready.config.supervision.model_copy(update={"stale_after_s": 0.02})
     (observer,) = trial.bridge.observers
     softer = dataclasses.replace(observer, proportional_n_per_m=5e4)
-    patient = trial.bridge.with_settings(trial.bridge.observers, ages)
+    patient = trial.bridge.with_settings(trial.bridge.observers, ages, trial.ready.limits)
     trial.state = patient.take_over(trial.state, trial.bridge, BEGIN_NS)
     trial.bridge = patient
     assert trial.run(BEGIN_MS + 1)[-1].mode is Mode.RUNNING
-    changed = patient.with_settings((softer,), ages)
+    changed = patient.with_settings((softer,), ages, trial.ready.limits)
     since_ms = BEGIN_MS + 1
     trial.state = changed.take_over(trial.state, patient, since_ms * MS)
     trial.bridge = changed
@@ -263,6 +289,7 @@ NEXT = {
     Mode.SETTLING: {
         Event.SETTLED: Mode.RUNNING,
         Event.STALE: Mode.HOLD,
+        Event.OVERLOADED: Mode.HOLD,
         Event.BEYOND_HOLD: Mode.HOLD,
         Event.DEVICE_FAULT: Mode.HOLD,
         Event.TIMEOUT: Mode.SAFE,
@@ -273,6 +300,7 @@ NEXT = {
     Mode.RUNNING: {
         Event.UNSETTLED: Mode.SETTLING,
         Event.STALE: Mode.HOLD,
+        Event.OVERLOADED: Mode.HOLD,
         Event.BEYOND_HOLD: Mode.HOLD,
         Event.DEVICE_FAULT: Mode.HOLD,
         Event.TIMEOUT: Mode.SAFE,

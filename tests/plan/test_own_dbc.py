@@ -1,4 +1,4 @@
-"""A foreign bus: one message in and one out, big-endian, without protection, in seven lines."""
+"""A foreign bus: one message in and one out, big-endian, without protection."""
 
 from pathlib import Path
 
@@ -9,12 +9,15 @@ import yaml
 
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.errors import InputError
+from can_dbc.frame import Frame
+from rig.bridge.values import Mode
 from rig.bus.bus import Bus
 from rig.bus.link import Link, LinkFigures
 from rig.machine.clock import VirtualClock
 from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
+from rig.plan.preflight_checks import Severity, check, errors
 from rig.plan.proposal import propose
 from rig.run.logged_run import Endpoint, run_logged
 from rig.run.loop import RunControl
@@ -22,6 +25,8 @@ from rig.run.ports import BusPort
 from rig.run.replay import replay
 from tests.bridge.cores import FIRST
 from tests.bus_and_log.at_once import AtOnce
+
+MS = 1_000_000
 
 DBC = """VERSION ""
 
@@ -63,7 +68,23 @@ def test_a_proposal_finds_height_temperature_and_where_to_publish(dbc):
             "temperature": {"message": "SENSOR_1", "signal": "OilTemp"},
         },
         "publish": {"force": {"message": "CONTROL_1", "signal": "EstimatedForce"}},
+        "observers": {
+            "strut": {
+                "kind": "kalman",
+                # A tenth of a radian an interval of 1 ms, steps of 0.05 mm over the root of 12.
+                "filter": {"bandwidth_hz": 15.92, "noise_std_m": 1.443e-5},
+            }
+        },
+        "supervision": {
+            "stale_after_s": 0.01,
+            "safe_after_s": 0.5,
+            "limits": [
+                {"value": "measured_rate_m_per_s", "low": -10, "high": 10, "action": "refuse"},
+                {"value": "unchanged_s", "high": 1, "action": "hold"},
+            ],
+        },
     }
+    assert "unsafe: {publish_without_valid: true}" in text
     assert "or CONTROL_1.Setpoint" in text
 
 
@@ -78,9 +99,9 @@ def test_what_was_proposed_runs_over_a_bus_and_replays(dbc, tmp_path):
     text = propose(load_database(dbc)).replace("interface: socketcan", "interface: virtual")
     text = text.replace("channel: can0", "channel: own-dbc")
     lines = [line for line in text.splitlines() if "temperature" not in line]
-    assert len(lines) == 7
-    config.write_text("\n".join(lines))
+    config.write_text("\n".join([*lines, "unsafe: {publish_without_valid: true}"]))
     ready = load_plan(config, duration_s=0.3)
+    assert not errors(ready)
     bridge = build_bridge(ready)
     clock = VirtualClock()
     bus = ready.config.bus
@@ -138,8 +159,59 @@ def test_several_messages_of_the_bench_leave_the_estimate_to_another_node(dbc):
 
 
 def test_the_packages_own_dbc_gives_its_own_estimate():
-    published = yaml.safe_load(propose(load_database(DEFAULT_DATABASE)))["publish"]
-    assert published["force"]["signal"] == "SPRING_DAMPER_FORCE"
+    proposed = yaml.safe_load(propose(load_database(DEFAULT_DATABASE)))
+    assert proposed["publish"] == {
+        "force": {"message": "RIG_ESTIMATE", "signal": "SPRING_DAMPER_FORCE"},
+        "valid": {"message": "RIG_ESTIMATE", "signal": "VALID"},
+    }
+    assert proposed["status"] == "RIG_STATUS"
+
+
+def test_a_signal_that_says_valid_and_one_of_the_mode_are_proposed(dbc, tmp_path):
+    dbc.write_text(
+        DBC.replace(
+            " SG_ Setpoint",
+            ' SG_ ForceOk : 40|1@0+ (1,0) [0|1] "" SENSOR\n'
+            ' SG_ BridgeState : 55|4@0+ (1,0) [0|15] "" SENSOR\n SG_ Setpoint',
+        )
+    )
+    text = propose(load_database(dbc))
+    proposed = yaml.safe_load(text)
+    assert proposed["publish"]["valid"] == {"message": "CONTROL_1", "signal": "ForceOk"}
+    assert proposed["status"] == {"state": {"message": "CONTROL_1", "signal": "BridgeState"}}
+    (tmp_path / "my.yaml").write_text(text)
+    assert not errors(load_plan(tmp_path / "my.yaml"))
+
+
+def test_a_force_without_valid_is_an_error_that_the_user_may_take_upon_themselves(dbc, tmp_path):
+    path = tmp_path / "my.yaml"
+    path.write_text(propose(load_database(dbc)))
+    (found,) = errors(load_plan(path))
+    assert found.what == "publish.strut"
+    assert "expected publish.valid, or unsafe: {publish_without_valid: true}" in found.text
+    path.write_text(path.read_text() + "unsafe: {publish_without_valid: true}\n")
+    assert not errors(load_plan(path))
+    assert Severity.WARNING in [
+        it.severity for it in check(load_plan(path)) if it.what == "publish.strut"
+    ]
+
+
+def test_a_frozen_height_is_no_estimate_as_it_was_proposed(dbc, tmp_path):
+    """The measured height stays the same for longer than a sensor's noise allows."""
+    (tmp_path / "my.yaml").write_text(
+        propose(load_database(dbc)) + "unsafe: {publish_without_valid: true}\n"
+    )
+    bridge = build_bridge(load_plan(tmp_path / "my.yaml"))
+    encode = cantools.database.load_file(dbc).encode_message
+    state, modes = bridge.init(0), []
+    for tick in range(2000):
+        height_mm = 300.0 + 0.05 * (tick % 3 if tick < 500 else 0)
+        data = encode("SENSOR_1", {"Travel": height_mm, "OilTemp": 25})
+        state, result = bridge.tick(state, tick * MS, [Frame(tick * MS, 288, data)])
+        modes.append(result.output.mode)
+    assert modes[1000] is Mode.RUNNING
+    assert set(modes[1502:]) == {Mode.HOLD}
+    assert state.supervised.cause.quantity == "unchanged_s"
 
 
 def test_an_engine_that_is_not_there_is_one_line(tmp_path):

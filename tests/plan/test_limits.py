@@ -1,0 +1,104 @@
+"""Limits of each strut: those of a configuration, and those that follow from the DBC."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from can_dbc.database import DEFAULT_DATABASE, load_database
+from can_dbc.errors import InputError
+from rig.bridge.estimator import Estimate
+from rig.bridge.mode_supervisor import Supervisor
+from rig.bridge.supervision_limits import Limit, LimitedValue
+from rig.bridge.values import Mode, StepInput
+from rig.channels.channel import Channel, Role
+from rig.channels.measured_quantities import HEIGHT
+from rig.plan.limits import limits_by_strut
+from tests.bridge.test_modes import MS, STRUT, SUPERVISION, Scripted
+
+SOURCE = Path("rig.yaml")
+DATABASE = load_database(DEFAULT_DATABASE)
+MESSAGE = DATABASE.message("BENCH_MEASUREMENT")
+
+
+def height(strut=0, message=MESSAGE):
+    return Channel(strut, Role.HEIGHT, HEIGHT, "", "", strut, 1, message=message, signal="HEIGHT")
+
+
+def row(**keys):
+    return Limit(**{"low": None, "high": None, "action": "hold"} | keys)
+
+
+def with_range(low, high):
+    """The measurement with another range in the DBC."""
+    signal = dataclasses.replace(MESSAGE.signal("HEIGHT"), minimum=low, maximum=high)
+    return dataclasses.replace(MESSAGE, signals={**MESSAGE.signals, "HEIGHT": signal})
+
+
+def resolved(configured=(), struts=("strut",), heights=None, forces=None):
+    heights = [height()] if heights is None else heights
+    return limits_by_strut(configured, struts, heights, forces or {}, SOURCE)
+
+
+def test_the_bits_limit_what_the_range_does_not():
+    ((model,),) = resolved()
+    assert (model.value, model.action) == (LimitedValue.HEIGHT_M, "safe")
+    # 20 bits of 2 um, and a tenth of them on both sides.
+    assert model.high - model.low == pytest.approx(1.2 * 2e-6 * (2**20 - 1))
+
+
+def test_a_height_beyond_the_dbcs_range_is_refused():
+    ((measured, model),) = resolved(heights=[height(message=with_range(0.1, 0.6))])
+    assert (measured.value, measured.action) == (LimitedValue.MEASURED_HEIGHT_M, "refuse")
+    assert measured.action_at(0.1) == measured.action_at(0.6) == 0
+    assert measured.action_at(0.0999)
+    assert measured.action_at(0.6001)
+    assert (model.low, model.high) == (pytest.approx(0.05), pytest.approx(0.65))
+
+
+def test_a_force_that_its_signal_cannot_carry_is_invalid():
+    forces = {0: (DATABASE.message("RIG_ESTIMATE"), "SPRING_DAMPER_FORCE")}
+    ((_, force),) = resolved(forces=forces)
+    assert (force.value, force.action) == (LimitedValue.FORCE_N, "hold")
+    assert (force.low, force.high) == (-40_000.0, 40_000.0)
+
+
+def test_a_row_of_the_configuration_replaces_what_would_follow_for_its_value():
+    own = row(value="height_m", low=0.0, high=1.0)
+    assert resolved([own]) == ((own,),)
+
+
+def test_a_row_with_a_strut_is_for_that_strut_alone():
+    own = row(strut="rear", value="height_m", low=0.0, high=1.0)
+    every = row(value="force_n", high=100.0)
+    front, rear = resolved([own, every], ("front", "rear"), [height(0), height(1)])
+    assert front[0] is every
+    assert [item.value for item in front] == [LimitedValue.FORCE_N, LimitedValue.HEIGHT_M]
+    assert front[1].action == "safe"
+    assert rear == (own, every)
+
+
+def test_a_row_of_a_strut_that_is_not_there_is_one_line():
+    own = row(strut="front", value="force_n", high=100.0)
+    with pytest.raises(InputError, match=r"limits\.0\.strut: front: no such strut, expected strut"):
+        resolved([own])
+
+
+def test_a_strut_without_a_height_has_no_limit_of_it():
+    assert resolved(heights=[]) == ((),)
+
+
+def test_the_estimate_of_a_strut_is_judged_by_its_own_limits():
+    estimator = Scripted()
+    estimator.struts = 2
+    limits = [[row(value="force_n", high=10.0)], [row(value="force_n", high=4.0)]]
+    supervisor = Supervisor(estimator, SUPERVISION, limits)
+    state = supervisor.init(0)
+    for force_n, expected in ((3.0, Mode.RUNNING), (5.0, Mode.HOLD)):
+        struts = (STRUT, STRUT) if force_n == STRUT.force_n else (STRUT, replace(STRUT, force_n=3))
+        estimator.estimate = Estimate(struts, state.t_ns + MS, True)
+        state, output, _ = supervisor.step(state, StepInput(state.t_ns + MS))
+        assert output.mode is expected
+    cause = state.cause
+    assert (cause.strut, cause.value, cause.limit) == (1, 5.0, 4.0)
