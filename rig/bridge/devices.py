@@ -147,7 +147,8 @@ def update_by_frame(device: Device, health: DeviceHealth, frame: Frame) -> Devic
     state = data[0] & ~_TOGGLE
     if state == _BOOT_UP:
         return replace(initial_health(device, frame.t_ns), state=state)
-    return replace(health, since_ns=frame.t_ns, state=state)
+    # One that queued before the start makes the device no older than the start.
+    return replace(health, since_ns=max(health.since_ns, frame.t_ns), state=state)
 
 
 def update_by_claim(device: Device, health: DeviceHealth, frame: Frame) -> DeviceHealth:

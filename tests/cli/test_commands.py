@@ -168,7 +168,7 @@ def test_an_interface_that_is_not_there_is_one_line_and_exit_code_2(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = write_config(tmp_path, {"bus": {"interface": "carrier_pigeon"}})
-    assert rig(monkeypatch, "run", config, "--out", tmp_path / "run") == 2
+    assert rig(monkeypatch, "run", config, "--force", "--out", tmp_path / "run") == 2
     assert "carrier_pigeon" in one_line(capsys)
 
 

@@ -231,6 +231,15 @@ def test_frames_of_another_length_say_nothing():
         assert update_by_frame(device, health, Frame(1, key, data, is_extended=False)) == health
 
 
+def test_a_heartbeat_that_queued_before_the_start_makes_no_device_silent():
+    device = Device("D", NODE, EMERGENCY, MS)
+    health = initial_health(device, 10 * MS)
+    queued = Frame(2 * MS, HEARTBEAT, b"\x05", is_extended=False)
+    health = update_by_frame(device, health, queued)
+    assert fault(device, health, 11 * MS) is None
+    assert fault(device, health, 11 * MS + 1) == "no heartbeat"
+
+
 def test_alarms_are_kept_apart():
     device = Device("D", NODE, EMERGENCY, 0, alarms=2)
     health = update_by_alarm(update_by_alarm(initial_health(device, 0), 0, 3), 1, 9)

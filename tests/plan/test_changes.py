@@ -118,7 +118,7 @@ def test_a_limit_goes_by_the_number_of_its_row(ready):
     assert found.config.supervision.limits[0].high == 700.0
     with pytest.raises(InputError, match=r"limits.1.high: no '1', expected one of 0"):
         assign(limited, {"supervision.limits.1.high": 700.0}, "set")
-    with pytest.raises(InputError, match=r"limits.0: expected one of supervision.limits.0.value"):
+    with pytest.raises(InputError, match=r"limits.0: expected one of supervision.limits.0.strut"):
         assign(limited, {"supervision.limits.0": 700.0}, "set")
 
 

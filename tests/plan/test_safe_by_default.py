@@ -79,17 +79,35 @@ def test_a_key_that_others_can_read_is_refused(tmp_path, monkeypatch, capsys, mo
     assert ("can be read by others" in capsys.readouterr().err) is (code == 2)
 
 
-def test_a_model_that_diverges_is_told_with_its_strut_and_time(tmp_path):
+def run_away(tmp_path, **supervision):
+    """A run whose model runs away."""
     data = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
     data["observers"] = {"strut": {"proportional_n_per_m": 1e9, "force_limit_n": 1e300}}
+    data["supervision"] = data.get("supervision", {}) | supervision
     path = tmp_path / "my.yaml"
     path.write_text(yaml.safe_dump(data))
-    ended = with_bench(
+    return with_bench(
         load_plan(path, duration_s=1.0),
         load_bench_config(CONFIGS / "reference_bench.yaml"),
         tmp_path / "run",
         lockstep=True,
     )
+
+
+def test_a_model_that_runs_away_is_stopped_at_the_range_of_the_height(tmp_path):
+    ended = run_away(tmp_path)
+    supervised = ended.state.supervised
+    assert supervised.mode is Mode.SAFE
+    assert supervised.cause.quantity == "height_m"
+    (stopped_m,) = supervised.stopped_m
+    # 20 bits of 2 um to both sides of zero, and a tenth of the range.
+    assert abs(supervised.cause.limit) == pytest.approx(1.2 * 1.048576, abs=1e-5)
+    assert abs(stopped_m) > abs(supervised.cause.limit)
+
+
+def test_a_model_that_diverges_is_told_with_its_strut_and_time(tmp_path):
+    none = [{"value": item, "high": 1e300, "action": "warn"} for item in ("height_m", "force_n")]
+    ended = run_away(tmp_path, limits=none)
     assert ended.diverged is not None
     assert ended.diverged["strut"] == "strut"
     ending = read_run(tmp_path / "run").header["ending"]
