@@ -29,7 +29,8 @@ from rig.cli import (
     view,
 )
 from rig.cli import set as set_
-from rig.cli.terminal import OK, WRONG_INPUT
+from rig.cli.terminal import FAILED, OK, WRONG_INPUT
+from rig.log.errors import DamageError
 from rig.machine.installed_versions import version_of
 
 __all__ = ["app", "main"]
@@ -105,6 +106,9 @@ def main() -> None:
         sys.argv.append("--help")
     try:
         ended = app(standalone_mode=False)
+    except DamageError as error:
+        _print_error(str(error))
+        sys.exit(FAILED)
     except InputError as error:
         _refuse(str(error))
     except OSError as error:

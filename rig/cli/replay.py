@@ -15,6 +15,7 @@ def replay_command(
     as_json: JsonFlag = False,
 ) -> None:
     """Compute a run again from its frames and compare it with its log, bit for bit."""
+    from rig.log.checksums import refuse_damage
     from rig.log.reader import find_changed_files
     from rig.run.replay import replay
 
@@ -46,5 +47,6 @@ def replay_command(
             console.print(f"{name} is not the one that ran: its hash differs.", style="yellow")
         if result.different:
             console.print("The replay differs from the log.", style="red")
-    if result.different or result.steps.num_rows == 0:
+    refuse_damage(folder)
+    if result.different or changed or result.steps.num_rows == 0:
         raise typer.Exit(FAILED)

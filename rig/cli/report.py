@@ -22,6 +22,7 @@ def report(
     ] = False,
 ) -> None:
     """Write a page about a run: what ran, how well, timing, faults. One file, no network."""
+    from rig.log.checksums import refuse_damage
     from rig.pages.browser_print import print_page
     from rig.pages.run_report import write_run_report
 
@@ -37,3 +38,4 @@ def report(
     if pdf:
         print_page(path, paper)
         print_text(f"Printed: {paper}")
+    refuse_damage(run)

@@ -8,10 +8,10 @@ import pyarrow as pa
 
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
-from rig.log.file_names import FRAMES_FILE, STEPS_FILE
+from rig.log.file_names import CHECKSUMS_FILE, FRAMES_FILE, STEPS_FILE
 from rig.log.reader import RunFolder
 
-_NOT_COPIED = (FRAMES_FILE, STEPS_FILE, "reserve.tmp")
+_NOT_COPIED = (FRAMES_FILE, STEPS_FILE, CHECKSUMS_FILE, "reserve.tmp")
 _LARGEST_FILE_BYTES = 64 * 1024 * 1024
 
 

@@ -9,6 +9,7 @@
     events.jsonl    changes of the mode, with their causes
     timing.json     histograms of its ticks
     trace.arrow     parts of its late ticks, if they were traced
+    checksums.txt   lengths and checksums of the finished files of frames and steps
     captures/       windows around its faults, each a run folder
 
 Where a run was rotated, `frames.0001.log` and `steps.0001.arrow` follow, and so on; after 9999
@@ -20,7 +21,7 @@ from pathlib import Path
 RUN_FILE, FRAMES_FILE, STEPS_FILE = "run.yaml", "frames.log", "steps.arrow"
 MODEL_FILE, DBC_FILE = "model.yaml", "bus.dbc"
 CHANGES_FILE, HISTOGRAMS_FILE, TRACE_FILE = "changes.jsonl", "timing.json", "trace.arrow"
-CAPTURES_FOLDER, EVENTS_FILE = "captures", "events.jsonl"
+CAPTURES_FOLDER, EVENTS_FILE, CHECKSUMS_FILE = "captures", "events.jsonl", "checksums.txt"
 
 
 def parts(folder: Path, name: str) -> list[Path]:

@@ -15,6 +15,7 @@ from can_dbc.frame import Frame
 from can_dbc.yaml_file import parse_mapping, read_text
 from rig.files.hashes import hash_files
 from rig.log.candump import LATEST_S, line_error, parse_frame
+from rig.log.checksums import Damage, find_damage
 from rig.log.errors import LogError
 from rig.log.file_names import FRAMES_FILE, RUN_FILE, STEPS_FILE, parts
 from rig.log.step_columns import step_schema
@@ -88,12 +89,17 @@ class RunHeader(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A run that is read back; of its steps what a kill cut off is missing."""
+    """A run that is read back.
+
+    Of its steps what a kill cut off is missing, and every file whose checksum differs: a changed
+    bit may be a height of any size.
+    """
 
     folder: Path
     header: RunHeader
     steps: pa.Table
     epoch_ns: int
+    damage: tuple[Damage, ...] = ()
 
     @property
     def frame_files(self) -> list[Path]:
@@ -135,7 +141,10 @@ def read_run(folder: Path) -> RunFolder:
         if not (folder / name).is_file():
             raise LogError(f"{folder}: {name} is missing, expected a run")
     header = read_header(folder)
-    return RunFolder(folder, header, _read_steps(parts(folder, STEPS_FILE)), header["epoch_ns"])
+    damage = find_damage(folder)
+    altered = [item.name for item in damage if not item.is_readable]
+    steps = _read_steps(parts(folder, STEPS_FILE), altered)
+    return RunFolder(folder, header, steps, header["epoch_ns"], damage)
 
 
 def read_header(folder: Path) -> RunHeader:
@@ -208,12 +217,15 @@ def last_frame_ns(folder: Path, epoch_ns: int) -> int:
     return -1
 
 
-def _read_steps(paths: list[Path]) -> pa.Table:
+def _read_steps(paths: list[Path], altered: Sequence[str]) -> pa.Table:
     tables = [
-        _read_part(path, is_mapped=number < _MOST_MAPPED) for number, path in enumerate(paths)
-    ]
+        _read_part(path, is_mapped=number < _MOST_MAPPED)
+        for number, path in enumerate(paths)
+        if path.name not in altered
+    ] or [step_schema().empty_table()]
+    paths = [path for path in paths if path.name not in altered]
     first = tables[0]
-    for path, table in zip(paths, tables, strict=True):
+    for path, table in zip(paths, tables, strict=bool(paths)):
         if table.num_rows and table.schema != first.schema:
             raise LogError(f"{path}: its columns are not those of {paths[0].name}")
     return pa.concat_tables([first, *[table for table in tables[1:] if table.num_rows]])

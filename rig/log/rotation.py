@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
+from rig.log.checksums import checksum_line
 from rig.log.file_names import FRAMES_FILE, STEPS_FILE, part_name
 from rig.log.step_columns import END_OF_STREAM
 from rig.log.whole_file import WholeFile
@@ -44,6 +45,13 @@ class Part:
     def size(self) -> int:
         """Bytes of both files."""
         return self.frames.size + self.steps.size
+
+    @property
+    def checksums(self) -> str:
+        """Lines of `CHECKSUMS_FILE` for both files, once they are closed."""
+        return "".join(
+            checksum_line(file.name, file.size, file.crc32) for file in (self.frames, self.steps)
+        )
 
     def close(self) -> None:
         """End the Arrow stream and close both files."""

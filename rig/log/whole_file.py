@@ -1,6 +1,7 @@
 """A file that grows by whole pieces, whatever the disk does."""
 
 import contextlib
+import zlib
 from pathlib import Path
 
 
@@ -12,9 +13,12 @@ class WholeFile:
     """
 
     def __init__(self, path: Path) -> None:
+        self.name = path.name
         self._file = path.open("wb", buffering=0)
         self.size = 0
         """Bytes of the pieces that are in it."""
+        self.crc32 = 0
+        """CRC-32 of them."""
 
     def append(self, piece: bytes) -> None:
         """Append a piece.
@@ -35,6 +39,7 @@ class WholeFile:
                 self._file.truncate()
             raise
         self.size += len(piece)
+        self.crc32 = zlib.crc32(piece, self.crc32)
 
     def close(self) -> None:
         """Close the file.

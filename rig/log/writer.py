@@ -22,7 +22,7 @@ from can_dbc.frame import Frame
 from rig.log.candump import format_frame
 from rig.log.captures import Capture, Captures, CaptureWindow, Entry
 from rig.log.errors import LogError
-from rig.log.file_names import CAPTURES_FOLDER, RUN_FILE
+from rig.log.file_names import CAPTURES_FOLDER, CHECKSUMS_FILE, RUN_FILE
 from rig.log.reader import RunHeader
 from rig.log.rotation import Part, Rotation
 from rig.log.step_columns import Step, StepRows
@@ -208,8 +208,8 @@ class RunWriter:
                 self._flush()
             finally:
                 with contextlib.ExitStack() as files:  # all of them, whichever fails
-                    for file in self._noted.values():
-                        files.callback(file.close)
+                    files.callback(self._close_notes)
+                    files.callback(self._write_checksums, self._part)
                     files.callback(self._part.close)
         except OSError as error:
             self._set_fault(str(error.strerror))
@@ -267,6 +267,11 @@ class RunWriter:
             self._noted[name].append(line.encode())
             self._notes.popleft()
 
+    def _close_notes(self) -> None:
+        with contextlib.ExitStack() as files:
+            for file in self._noted.values():
+                files.callback(file.close)
+
     def _give_way(self) -> None:
         """Let the loop have the interpreter, if it waits for it."""
         if self._has_thread:
@@ -313,6 +318,13 @@ class RunWriter:
         if is_full or is_long:
             self._part = Part(self.folder, part.number + 1, self._rows.schema, now_ns)
             part.close()
+            self._write_checksums(part)
+
+    def _write_checksums(self, part: Part) -> None:
+        """Add the checksums of a part that is closed."""
+        if CHECKSUMS_FILE not in self._noted:
+            self._noted[CHECKSUMS_FILE] = WholeFile(self.folder / CHECKSUMS_FILE)
+        self._noted[CHECKSUMS_FILE].append(part.checksums.encode())
 
     def _write_capture(self, capture: Capture) -> None:
         folder = self.folder / CAPTURES_FOLDER / f"{capture.number:03d}_{capture.why}"
@@ -331,6 +343,7 @@ class RunWriter:
                 rows.clear()
                 self._give_way()
             part.close()
+            write_whole(folder / CHECKSUMS_FILE, part.checksums)
             for name in self._header.get("files_sha256", {}):
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(self.folder / name, folder / name)

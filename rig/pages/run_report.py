@@ -1,11 +1,14 @@
 """The report of a run: configuration, timing, faults and curves. One file, no network."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
+from rig.log.checksums import Damage, describe_damage, find_damage
+from rig.log.errors import DamageError
 from rig.log.follower import RunFollower
 from rig.log.reader import Ending, RunHeader, read_header
 from rig.pages.html import render_report, write_page
@@ -44,9 +47,12 @@ def write_run_report(folder: Path, path: Path) -> None:
     """Write the report of a run's folder.
 
     Raises:
+        DamageError: Frames or steps are not what was written; what is merely cut off is reported.
         InputError: The folder holds no run, or a run without a tick, or the file cannot be written.
     """
-    header = read_header(folder)
+    header, damage = read_header(folder), find_damage(folder)
+    if not all(item.is_readable for item in damage):
+        raise DamageError(describe_damage(folder, damage))
     follower = RunFollower(folder)
     follower.update(_ALL_STEPS)
     if not follower.steps:
@@ -61,7 +67,7 @@ def write_run_report(folder: Path, path: Path) -> None:
         tone=tone,
         sign=sign,
         badge=badge,
-        headline=_headline(header, follower, ending),
+        headline=_headline(header, follower, ending) + _lost(damage),
         start=np.datetime64(int(header.get("epoch_ns", 0)), "ns").astype("datetime64[s]"),
         header=header,
         ending=ending,
@@ -97,6 +103,10 @@ def _modes(ending: Ending) -> str:
     lacks = ending.get("dropped_steps")
     lost = f" The log lacks {lacks} ticks." if lacks else ""
     return f" Valid for {valid_s:.1f} s; {others or 'all the time'}.{lost}"
+
+
+def _lost(damage: Sequence[Damage]) -> str:
+    return "".join(f" Damaged: {item.text}." for item in damage)
 
 
 def _headline(header: RunHeader, follower: RunFollower, ending: Ending) -> str:

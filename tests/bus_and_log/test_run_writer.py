@@ -131,6 +131,7 @@ def test_how_the_run_ended_is_written_to_a_full_disk_out_of_what_was_kept_back(t
     assert (tmp_path / "run" / "reserve.tmp").stat().st_size >= 50_000
     log.close(ending)
     assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [
+        "checksums.txt",
         "frames.log",
         "run.yaml",
         "steps.arrow",

@@ -79,7 +79,7 @@ def test_a_file_that_is_not_the_one_that_ran_is_named(run, monkeypatch, capsys):
     model = run / "model.yaml"
     model.write_text(model.read_text() + "# by hand\n")
     assert find_changed_files(run) == ["model.yaml"]
-    assert rig(monkeypatch, "replay", run) == 0
+    assert rig(monkeypatch, "replay", run) == 1
     assert "model.yaml is not the one that ran" in capsys.readouterr().out
 
 
