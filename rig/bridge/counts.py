@@ -34,8 +34,8 @@ class Counts(NamedTuple):
         left_out: Ticks at which a further sensor was left out, one for each sensor.
         device_faulty: Ticks at which a device was at fault, one for each device.
         from_faulty_device: Frames refused because their device was at fault.
-        no_value: Frames refused because a signal holds no value: an error or "not available" of
-            J1939, or a float that is not finite.
+        no_value: Frames refused because a signal holds no value: the sensor itself says so
+            (`valid`), an error or "not available" of J1939, or a float that is not finite.
     """
 
     lost: int = 0

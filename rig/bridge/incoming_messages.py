@@ -116,12 +116,14 @@ def compile_incoming(
     Raises:
         DatabaseError: A signal is missing, or its unit does not fit its quantity.
     """
+    required = [channel.valid for channel in channels if channel.valid is not None]
     # A load cell may be recorded and also be a further sensor: one value, two channels.
     signals = list(
         dict.fromkeys(
             [
                 *((channel.signal, channel.quantity.dimension) for channel in channels),
                 *((alarm.signal, Dimension.NUMBER) for alarm in alarms),
+                *((item.signal, Dimension.NUMBER) for item in required),
             ]
         )
     )
@@ -143,6 +145,11 @@ def compile_incoming(
     are_values = _check_of_values(message, signals)
     if are_values is not None:
         read = _with_check(read, are_values)
+    if required:
+        expected = {signals.index((item.signal, Dimension.NUMBER)): item.value for item in required}
+        read = _with_check(
+            read, lambda values: all(values[index] == expected[index] for index in expected)
+        )
     return Incoming(
         message,
         read,

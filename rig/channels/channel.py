@@ -8,6 +8,7 @@ from msgspec import Struct
 from pydantic import BaseModel, ConfigDict, Field
 
 from can_dbc.database import Message
+from can_dbc.yaml_file import Finite
 from rig.channels.measured_quantities import Quantity
 
 
@@ -23,6 +24,33 @@ class SignalName(BaseModel):
 
     message: Annotated[str, Field(min_length=1, max_length=255)]
     signal: Annotated[str, Field(min_length=1, max_length=255)]
+
+
+class ValidSignal(BaseModel):
+    """What says that a measured value is valid.
+
+    Attributes:
+        signal: Signal of the same message, an integer or a float without a unit.
+        value: Its value while the measured one is valid.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    signal: Annotated[str, Field(min_length=1, max_length=255)]
+    value: Finite = 1.0
+
+
+class MeasuredSignal(SignalName):
+    """Where a measured value stands on the bus, and what says that it is valid.
+
+    Attributes:
+        message: Message of the DBC.
+        signal: Signal of the message; its unit is converted.
+        valid: Signal of the same message that says whether the sensor measures; a frame in which it
+            has another value is refused. Every value counts if absent.
+    """
+
+    valid: ValidSignal | None = None
 
 
 class Role(Enum):
@@ -49,6 +77,7 @@ class Channel:
         delay_ns: How much later a sample arrives than it is true.
         noise_std: Standard deviation of a sample in SI, quantisation included; of a further sensor.
         message: Message that carries it; None for a channel that is on no bus.
+        valid: What says that it is valid; None where nothing does.
     """
 
     index: int
@@ -62,6 +91,7 @@ class Channel:
     noise_std: float = 0.0
     message: Message | None = None
     signal: str = ""
+    valid: ValidSignal | None = None
 
     @property
     def column(self) -> str:

@@ -22,7 +22,7 @@ from rig.bridge.mode_supervisor import Supervision
 from rig.bridge.published_quantities import STATUS, STRUT, TIMING, Publication
 from rig.bus.bus import BusConfig
 from rig.bus.secoc import AuthenticationSettings
-from rig.channels.channel import SignalName
+from rig.channels.channel import MeasuredSignal, SignalName
 from rig.channels.measured_quantities import (
     APPLIED_FORCE,
     BENCH_QUANTITIES,
@@ -70,12 +70,13 @@ class OneOf:
         return tagged_union_schema(choices, self._kind)
 
 
-class HeightSignal(SignalName):
+class HeightSignal(MeasuredSignal):
     """Where a height stands on the bus, and its delay.
 
     Attributes:
         message: Message of the DBC.
         signal: Signal of the message; its unit is converted.
+        valid: Signal of the same message that says whether the sensor measures.
         delay_s: How much later its frame arrives than it was true: filters of the sensor, its
             cycle, the bus. The model's height of that time is compared with it.
     """
@@ -126,6 +127,7 @@ def _sensor_settings(quantity: Quantity) -> type[SensorSignal]:
     Attributes:
         message: Message of the DBC.
         signal: Signal of the message; its unit is converted.
+        valid: Signal of the same message that says whether the sensor measures.
         delay_s: Time from the measurement to the arrival of its frame.
         measures: What it measures: `{quantity.key}`.
         {noise.key}: Standard deviation of a reading, quantisation included.
@@ -148,7 +150,7 @@ class Signals(_Frozen):
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")
-    __pydantic_extra__: dict[str, SignalName | None] = Field(  # pyright: ignore[reportIncompatibleVariableOverride] - pydantic's own way
+    __pydantic_extra__: dict[str, MeasuredSignal | None] = Field(  # pyright: ignore[reportIncompatibleVariableOverride] - pydantic's own way
         init=False
     )
 
@@ -167,7 +169,7 @@ class Signals(_Frozen):
         return cast("object", data)
 
     @property
-    def bench(self) -> dict[Quantity, SignalName]:
+    def bench(self) -> dict[Quantity, MeasuredSignal]:
         """Signals of the quantities of the bench, in the order of `BENCH_QUANTITIES`."""
         given = self.__pydantic_extra__
         entries = ((quantity, given.get(quantity.key)) for quantity in BENCH_QUANTITIES)

@@ -27,7 +27,7 @@ from rig.bridge.published_quantities import (
 )
 from rig.bridge.supervision_limits import Limit
 from rig.bus.secoc import FD_LENGTHS, Authentication, AuthenticationSettings
-from rig.channels.channel import Channel, Role, SignalName
+from rig.channels.channel import Channel, MeasuredSignal, Role, SignalName, ValidSignal
 from rig.channels.measured_quantities import HEIGHT, LOAD_CELL_FORCE, Quantity
 from rig.observers.pi import PiObserver
 from rig.observers.protocol import AnyObserver
@@ -335,9 +335,11 @@ class _SignalReader:
         channels: list[Channel] = []
 
         def add(
-            role: Role, quantity: Quantity, name: str, key: str, strut: int, entry: SignalName
+            role: Role, quantity: Quantity, name: str, key: str, strut: int, entry: MeasuredSignal
         ) -> None:
             message = self._message(entry, key)
+            if entry.valid is not None:
+                self._check_valid(message, entry.valid, f"{key}.valid.signal")
             interval_ns = message.cycle_time_ns or self._config.period_ns
             delay_ns = entry.delay_ns if isinstance(entry, HeightSignal) else 0
             noise_std = entry.noise_std if isinstance(entry, SensorSignal) else 0.0
@@ -354,6 +356,7 @@ class _SignalReader:
                     noise_std,
                     message,
                     entry.signal,
+                    entry.valid,
                 )
             )
 
@@ -424,6 +427,18 @@ class _SignalReader:
         except DatabaseError as error:
             raise InputError(f"{self._source}: {key}: {error}") from error
         return message
+
+    def _check_valid(self, message: Message, valid: ValidSignal, key: str) -> None:
+        """Refuse a signal that cannot say whether a value of its message is valid."""
+        try:
+            signal = message.signal(valid.signal)
+        except DatabaseError as error:
+            raise InputError(f"{self._source}: {key}: {error}") from error
+        if signal.unit:
+            raise InputError(
+                f"{self._source}: {key}: {valid.signal} has the unit {signal.unit}, expected a "
+                "signal without a unit"
+            )
 
     def _check_sensor(self, strut: str, sensor: str) -> None:
         """Refuse a further sensor whose signal is in use, or whose delay differs too much."""

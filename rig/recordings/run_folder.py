@@ -11,6 +11,7 @@ from can_dbc.codec import decode_log
 from can_dbc.database import Message
 from can_dbc.errors import InputError
 from can_dbc.protection import check_crc_log
+from can_dbc.units import Dimension
 from rig.channels.channel import Channel
 from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE
 from rig.log.reader import RunFolder
@@ -104,6 +105,10 @@ def _samples(payloads: _Payloads, channel: Channel) -> tuple[Array, Array]:
     signal = channel.signal
     values = decode_log(message, [signal], [channel.quantity.dimension], data)[signal]
     good &= np.isfinite(values)
+    valid = channel.valid
+    if valid is not None:
+        said = decode_log(message, [valid.signal], [Dimension.NUMBER], data)[valid.signal]
+        good &= said == valid.value
     t_s, first = np.unique(_sample_times_s(t_ns[good], message), return_index=True)
     return t_s, values[good][first]
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import can
 import cantools
+import numpy as np
 import pytest
 import yaml
 
@@ -19,6 +20,7 @@ from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.plan.preflight_checks import Severity, check, errors
 from rig.plan.proposal import propose
+from rig.recordings.run_folder import _samples
 from rig.run.logged_run import Endpoint, run_logged
 from rig.run.loop import RunControl
 from rig.run.ports import BusPort
@@ -212,6 +214,70 @@ def test_a_frozen_height_is_no_estimate_as_it_was_proposed(dbc, tmp_path):
     assert modes[1000] is Mode.RUNNING
     assert set(modes[1502:]) == {Mode.HOLD}
     assert state.supervised.cause.quantity == "unchanged_s"
+
+
+VALID_DBC = DBC.replace(
+    " SG_ OilTemp", ' SG_ TravelOk : 32|2@0+ (1,0) [0|3] "" CONTROL\n SG_ OilTemp'
+)
+
+
+def with_valid(folder, valid):
+    """A configuration whose height has a signal that says whether it is valid."""
+    (folder / "my.dbc").write_text(VALID_DBC)
+    config = yaml.safe_load(propose(load_database(folder / "my.dbc")))
+    config["signals"]["height"]["valid"] = valid
+    config["unsafe"] = {"publish_without_valid": True}
+    path = folder / "my.yaml"
+    path.write_text(yaml.safe_dump(config))
+    return path
+
+
+def test_frames_whose_sensor_says_that_it_does_not_measure_are_refused(tmp_path):
+    bridge = build_bridge(load_plan(with_valid(tmp_path, {"signal": "TravelOk", "value": 2})))
+    encode = cantools.database.load_file(tmp_path / "my.dbc").encode_message
+    state, modes = bridge.init(0), []
+    for tick in range(1300):
+        # It says so in the frames of 100 ms, whose heights are far off.
+        is_valid = not 900 <= tick < 1000
+        height_mm = 300.0 + 0.05 * (tick % 3) if is_valid else 0.0
+        said = 2 if is_valid else tick % 2
+        data = encode("SENSOR_1", {"Travel": height_mm, "TravelOk": said, "OilTemp": 25})
+        state, result = bridge.tick(state, tick * MS, [Frame(tick * MS, 288, data)])
+        modes.append(result.output.mode)
+    assert (state.counts.no_value, state.counts.refused) == (100, 100)
+    assert modes[899] is modes[-1] is Mode.RUNNING
+    assert set(modes[911:1000]) == {Mode.HOLD}
+
+
+def test_a_diagnosis_leaves_out_what_the_sensor_does_not_measure(tmp_path):
+    (channel,) = load_plan(with_valid(tmp_path, {"signal": "TravelOk", "value": 2})).heights
+    encode = cantools.database.load_file(tmp_path / "my.dbc").encode_message
+    data = [
+        encode(
+            "SENSOR_1", {"Travel": 10.0 * tick, "TravelOk": 2 if tick != 3 else 1, "OilTemp": 25}
+        )
+        for tick in range(6)
+    ]
+    payloads = np.frombuffer(b"".join(data), np.uint8).reshape(6, 8)
+    t_s, height_m = _samples({"SENSOR_1": (np.arange(6) * MS, payloads)}, channel)
+    assert t_s == pytest.approx([0.0, 0.001, 0.002, 0.004, 0.005])
+    assert height_m == pytest.approx([0.0, 0.01, 0.02, 0.04, 0.05])
+
+
+@pytest.mark.parametrize(
+    ("valid", "text"),
+    [
+        ({"signal": "Nothing"}, r"height\.strut\.valid\.signal: .*Nothing"),
+        (
+            {"signal": "OilTemp"},
+            r"valid\.signal: OilTemp has the unit degC, expected a",
+        ),
+        ({"signal": "TravelOk", "value": "yes"}, r"valid\.value"),
+    ],
+)
+def test_a_signal_that_cannot_say_it_is_one_line(valid, text, tmp_path):
+    with pytest.raises(InputError, match=text):
+        load_plan(with_valid(tmp_path, valid))
 
 
 def test_an_engine_that_is_not_there_is_one_line(tmp_path):
