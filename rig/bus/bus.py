@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import socket
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field
 from types import MappingProxyType
@@ -25,7 +26,11 @@ _QUEUE_BYTES, _SO_RCVBUFFORCE = 4_000_000, 33
 """Some 5 000 frames wait for a tick that is late; more than usual is granted to root alone."""
 
 _MOST_KNOWN = 10_000
-"""Identifiers remembered as accepted or not; a flood of others must not fill the memory."""
+"""Identifiers remembered as accepted or not, and frames that may come back: none must fill the
+memory."""
+
+_RETURN_OWN_FRAMES = ("udp_multicast",)
+"""Interfaces that return what is sent on them, whatever they are asked for."""
 
 _LISTEN_ONLY_OPTIONS: dict[str, dict[str, object]] = {
     "pcan": {"state": can.BusState.PASSIVE},
@@ -102,6 +107,10 @@ class Bus:
         self.epoch_ns = epoch_ns
         """Unix time that stamps are relative to; to be updated when the system's clock was set."""
         self._bus = open_bus(config, self._filters, listen_only=listen_only)
+        returns_own = config.options.get("receive_own_messages", False)
+        self._sent: Counter[tuple[int, bool, bytes]] | None = None
+        if config.interface in _RETURN_OWN_FRAMES or returns_own:
+            self._sent = Counter()
         self._receive = self._bus.recv
         self._send = None if listen_only else self._bus.send
 
@@ -120,11 +129,23 @@ class Bus:
                 message = receive(0)
                 if message is None:
                     break
+                if self._sent is not None and self._is_own(message):
+                    continue
                 if message.is_error_frame or self._accepts(message):
                     frames.append(self._frame(message))
         except Exception as error:  # drivers raise whatever they like
             raise BusError(f"receiving failed: {_describe(error)}") from error
         return frames
+
+    def _is_own(self, message: can.Message) -> bool:
+        """Whether a frame is one that was sent here and comes back: it is no second sender's."""
+        key = message.arbitration_id, message.is_extended_id, bytes(message.data)
+        if self._sent is None or key not in self._sent:
+            return False
+        self._sent[key] -= 1
+        if not self._sent[key]:
+            del self._sent[key]
+        return True
 
     def _accepts(self, message: can.Message) -> bool:
         if self._filters is None:
@@ -178,6 +199,10 @@ class Bus:
             self._send(message)
         except Exception as error:  # drivers raise whatever they like
             raise _sending_error(error) from error
+        if self._sent is not None:
+            if len(self._sent) > _MOST_KNOWN:
+                self._sent.clear()
+            self._sent[frame.arbitration_id, frame.is_extended, frame.data] += 1
 
     def close(self) -> None:
         """Close the interface; an interface that is gone already is closed."""

@@ -124,6 +124,25 @@ def test_a_flood_of_foreign_identifiers_fills_no_memory(opened, peer):
     assert len(bus._accepted) <= 10_001
 
 
+def test_frames_that_come_back_are_no_second_senders():
+    config = BusConfig("virtual", "returning", options={"receive_own_messages": True})
+    bus, other = Bus(config), Bus(BusConfig("virtual", "returning"))
+    own = Frame(0, 0x110, b"\x01", is_extended=False)
+    try:
+        for _ in range(2):
+            bus.send(own)
+        assert bus.receive() == []
+        # One of the same content that was not sent here is a second sender's, whichever it is.
+        bus.send(own)
+        other.send(own)
+        assert [frame.data for frame in bus.receive()] == [b"\x01"]
+        other.send(own)
+        assert [frame.data for frame in bus.receive()] == [b"\x01"]
+    finally:
+        bus.close()
+        other.close()
+
+
 OF_THE_USER = {"receive_own_messages": "True", "data_bitrate": "8000000"}
 """Settings of python-can that a user's own files may hold, for other programs."""
 
