@@ -192,9 +192,17 @@ class Bridge:
         gap_ns = t_ns - state.supervised.t_ns if missed else 0
         share = _missed_share(state.missed_share, missed) if missed or state.missed_share else 0.0
         excessive = share if share > self._supervisor.overload_share else 0.0
-        if wrong or reception.action or gap_ns or excessive:
+        is_log_lost = conditions.log_fault and self._supervisor.requires_log
+        if wrong or reception.action or gap_ns or excessive or is_log_lost:
             vital = [index for index, _ in wrong if self._devices[index].is_vital]
-            reports = Reports(reception.action, reception.excess, gap_ns, excessive, *vital[:1])
+            reports = Reports(
+                reception.action,
+                reception.excess,
+                gap_ns,
+                excessive,
+                vital[0] if vital else -1,
+                is_log_lost,
+            )
         supervised, output, action = self._supervisor.step(supervised, step_input, reports)
         counts = count_tick(memory.counts, output, action, conditions, len(wrong))
         sent = self._send(state, t_ns, output, counts, conditions)

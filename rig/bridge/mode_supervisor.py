@@ -2,7 +2,7 @@
 
 What may change it is an event: the age of the measurements, a model that diverged, a limit, a
 device, the user. A tick may show several; they are applied one after the other: age, overload,
-divergence, limits, devices. What is published follows from the mode.
+divergence, limits, devices, log. What is published follows from the mode.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -45,6 +45,7 @@ class Event(Enum):
     BEYOND_HOLD = "beyond_hold"
     BEYOND_SAFE = "beyond_safe"
     DEVICE_FAULT = "device_fault"
+    LOG_LOST = "log_lost"
 
 
 TRANSITIONS: dict[tuple[Mode, Event], Mode] = {
@@ -58,6 +59,7 @@ TRANSITIONS: dict[tuple[Mode, Event], Mode] = {
     (Mode.SETTLING, Event.BEYOND_HOLD): Mode.HOLD,
     (Mode.SETTLING, Event.BEYOND_SAFE): Mode.SAFE,
     (Mode.SETTLING, Event.DEVICE_FAULT): Mode.HOLD,
+    (Mode.SETTLING, Event.LOG_LOST): Mode.SAFE,
     (Mode.RUNNING, Event.UNSETTLED): Mode.SETTLING,
     (Mode.RUNNING, Event.STALE): Mode.HOLD,
     (Mode.RUNNING, Event.TIMEOUT): Mode.SAFE,
@@ -67,11 +69,13 @@ TRANSITIONS: dict[tuple[Mode, Event], Mode] = {
     (Mode.RUNNING, Event.BEYOND_HOLD): Mode.HOLD,
     (Mode.RUNNING, Event.BEYOND_SAFE): Mode.SAFE,
     (Mode.RUNNING, Event.DEVICE_FAULT): Mode.HOLD,
+    (Mode.RUNNING, Event.LOG_LOST): Mode.SAFE,
     (Mode.HOLD, Event.FRESH): Mode.SETTLING,
     (Mode.HOLD, Event.TIMEOUT): Mode.SAFE,
     (Mode.HOLD, Event.TICKS_MISSING): Mode.SAFE,
     (Mode.HOLD, Event.DIVERGED): Mode.SAFE,
     (Mode.HOLD, Event.BEYOND_SAFE): Mode.SAFE,
+    (Mode.HOLD, Event.LOG_LOST): Mode.SAFE,
     (Mode.SAFE, Event.ACKNOWLEDGED): Mode.WAITING,
 }
 """Mode and event -> next mode; a pair that is not listed changes nothing."""
@@ -94,6 +98,7 @@ class Supervision(BaseModel):
             settles with it.
         overload_share: Share of missed ticks, over the last few hundred, from which the estimate is
             marked invalid.
+        log_fault: What follows when the log cannot be written: `continue`, or the `safe` state.
         safe_output: Force that the safe state publishes: `zero`, or the `last` valid one.
         limits: What is done beyond which values, row by row. Where none stands for a value, the
             DBC's ranges limit measured height, model height and published force.
@@ -105,6 +110,7 @@ class Supervision(BaseModel):
     safe_after_s: Positive = 0.5
     settling_s: NotNegative | None = None
     overload_share: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
+    log_fault: Literal["continue", "safe"] = "continue"
     safe_output: Literal["zero", "last"] = "zero"
     limits: Annotated[tuple[Limit, ...], Field(max_length=100)] = ()
 
@@ -183,6 +189,7 @@ class Reports(Struct, frozen=True, gc=False):
         gap_ns: Time without a tick before this one, if any was missed.
         missed_share: Share of missed ticks, if it is too large, else 0.
         faulty_device: Index of a device at fault that the estimate rests on; -1 if there is none.
+        is_log_lost: Whether the log cannot be written, and the run requires it.
     """
 
     action: int = 0
@@ -190,6 +197,7 @@ class Reports(Struct, frozen=True, gc=False):
     gap_ns: int = 0
     missed_share: float = 0.0
     faulty_device: int = -1
+    is_log_lost: bool = False
 
 
 NO_REPORTS = Reports()
@@ -213,6 +221,7 @@ class Supervisor:
     ) -> None:
         self.estimator = estimator
         self.overload_share = settings.overload_share
+        self.requires_log = settings.log_fault == "safe"
         self._settings = settings
         self._stale_after_ns = settings.stale_after_ns
         self._safe_after_ns = settings.safe_after_ns
@@ -307,6 +316,8 @@ class Supervisor:
             yield _beyond(action, excess)
         if reports.faulty_device >= 0:
             yield Cause(Event.DEVICE_FAULT, device=reports.faulty_device)
+        if reports.is_log_lost:
+            yield Cause(Event.LOG_LOST)
 
     def _missing_ticks(self, reports: Reports) -> Iterator[Cause]:
         """A gap between two ticks that left the bench alone for too long."""
@@ -335,6 +346,8 @@ class Supervisor:
             causes = [*self._missing_ticks(reports), age]
             if reports.action >= Action.HOLD:
                 causes.append(_beyond(reports.action, reports.excess))
+            if reports.is_log_lost:
+                causes.append(Cause(Event.LOG_LOST))
             state, _ = _apply(state, causes)
             if state.mode is Mode.SAFE:
                 return self._stop(state, t_ns, estimator)
@@ -348,11 +361,16 @@ class Supervisor:
         """State and output of the safe state, which an acknowledgement leaves.
 
         It does so only when what has led there is over: the model could start from fresh
-        measurements, and neither a limit on them nor a device is in the way.
+        measurements, and neither a limit on them nor a device nor the log is in the way.
         """
         estimator, can_start = self.estimator.collect(state.estimator, step_input)
         state = replace(state, t_ns=step_input.t_ns, estimator=estimator)
-        is_over = can_start and reports.action < Action.HOLD and reports.faulty_device < 0
+        is_over = (
+            can_start
+            and reports.action < Action.HOLD
+            and reports.faulty_device < 0
+            and not reports.is_log_lost
+        )
         if not (step_input.acknowledged and is_over):
             return state, self._safe_output(state)
         state, _ = _apply(replace(state, stopped_m=()), (Cause(Event.ACKNOWLEDGED),))

@@ -149,8 +149,9 @@ def status_line(
 
 
 def _describe_faults(look: "Look", channels: Sequence[str], devices: Sequence[str]) -> str:
-    """Devices with a fault, with its reason, and sensors that are left out."""
-    text = "".join(f"  {devices[index]}: {why}" for index, why in look.device_faults)
+    """A log that is not written, devices at fault, each with the reason, and sensors left out."""
+    text = "" if look.log_fault is None else f"  NOT LOGGED: {look.log_fault}"
+    text += "".join(f"  {devices[index]}: {why}" for index, why in look.device_faults)
     if look.output.left_out:
         text += f"  left out {', '.join(channels[index] for index in look.output.left_out)}"
     return text

@@ -220,7 +220,15 @@ class _LoggedRun:
             is_paced = self._endpoint.granted is not None
             late_ns = int(self._timing.extremes_ns[0]) if is_paced else None
             self._control.watch(
-                Look(t_ns, self._ticks, result.output, result.counts, late_ns, result.device_faults)
+                Look(
+                    t_ns,
+                    self._ticks,
+                    result.output,
+                    result.counts,
+                    late_ns,
+                    result.device_faults,
+                    self._log.fault,
+                )
             )
 
     def _publish_end(self, conditions: Conditions) -> None:

@@ -55,6 +55,7 @@ class Look(NamedTuple):
     counts: Counts
     late_ns: int | None
     device_faults: tuple[tuple[int, str], ...] = ()
+    log_fault: str | None = None
 
 
 Watch = Callable[[Look], None]

@@ -61,6 +61,7 @@ class Drawn:
         self.action = rng.choice((0, 0, 0, 0, Action.WARN, Action.HOLD, Action.SAFE))
         self.faulty_device = rng.choice((-1, -1, -1, -1, -1, 0))
         self.gap_ns = rng.choice((0, 0, 0, 0, 0, 0, 5, 60)) * MS
+        self.is_log_lost = rng.random() < 0.03
         self.missed_share = rng.choice((0.0,) * 12 + (0.7,))
         if not calm and rng.random() < 0.5:
             self.age_ns, self.action = before.age_ns, before.action
@@ -68,7 +69,14 @@ class Drawn:
         self.measured_ns = t_ns - self.age_ns
 
     def reports(self):
-        reports = Reports(self.action, None, self.gap_ns, self.missed_share, self.faulty_device)
+        reports = Reports(
+            self.action,
+            None,
+            self.gap_ns,
+            self.missed_share,
+            self.faulty_device,
+            self.is_log_lost,
+        )
         return NO_REPORTS if reports == NO_REPORTS else reports
 
     def is_sound(self, mode):
@@ -84,6 +92,7 @@ class Drawn:
             and self.action < Action.HOLD
             and self.faulty_device < 0
             and not self.missed_share
+            and not self.is_log_lost
             and (mode is Mode.WAITING or self.gap_ns <= SUPERVISION.safe_after_ns)
         )
 
@@ -123,6 +132,7 @@ def check(before, drawn, state, output):
         assert drawn.can_start
         assert drawn.action < Action.HOLD
         assert drawn.faulty_device < 0
+        assert not drawn.is_log_lost
     if before.first_cause is not None:
         # The first cause stays until the bridge runs again.
         assert state.first_cause is before.first_cause or (

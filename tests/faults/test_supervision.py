@@ -110,6 +110,22 @@ def test_a_bridge_that_misses_most_of_its_ticks_is_not_running():
     assert again[-1].mode is Mode.RUNNING
 
 
+@pytest.mark.parametrize(
+    ("log_fault", "expected"), [("continue", Mode.RUNNING), ("safe", Mode.SAFE)]
+)
+def test_a_log_that_cannot_be_written_is_what_the_user_makes_of_it(log_fault, expected):
+    trial = Trial(settling_s=0.0, log_fault=log_fault)
+    trial.run(BEGIN_MS)
+    lost = Conditions(log_fault=True)
+    ticks = trial.run(BEGIN_MS + 50, conditions=lambda _t_ns: lost)[BEGIN_MS:]
+    assert {tick.mode for tick in ticks} == {expected}
+    # As long as it lasts, an acknowledgement does not leave the safe state.
+    acknowledged = Conditions(acknowledged=True, log_fault=True)
+    assert trial.run(BEGIN_MS + 51, conditions=lambda _t_ns: acknowledged)[-1].mode is expected
+    again = trial.run(BEGIN_MS + 52, conditions=lambda _t_ns: Conditions(acknowledged=True))[-1]
+    assert again.mode is (Mode.RUNNING if expected is Mode.RUNNING else Mode.WAITING)
+
+
 def test_a_bridge_that_misses_every_third_tick_is_running():
     trial = Trial(settling_s=0.0)
     trial.run(BEGIN_MS)
@@ -296,6 +312,7 @@ NEXT = {
         Event.TICKS_MISSING: Mode.SAFE,
         Event.DIVERGED: Mode.SAFE,
         Event.BEYOND_SAFE: Mode.SAFE,
+        Event.LOG_LOST: Mode.SAFE,
     },
     Mode.RUNNING: {
         Event.UNSETTLED: Mode.SETTLING,
@@ -307,6 +324,7 @@ NEXT = {
         Event.TICKS_MISSING: Mode.SAFE,
         Event.DIVERGED: Mode.SAFE,
         Event.BEYOND_SAFE: Mode.SAFE,
+        Event.LOG_LOST: Mode.SAFE,
     },
     Mode.HOLD: {
         Event.FRESH: Mode.SETTLING,
@@ -314,6 +332,7 @@ NEXT = {
         Event.TICKS_MISSING: Mode.SAFE,
         Event.DIVERGED: Mode.SAFE,
         Event.BEYOND_SAFE: Mode.SAFE,
+        Event.LOG_LOST: Mode.SAFE,
     },
     Mode.SAFE: {Event.ACKNOWLEDGED: Mode.WAITING},
 }
