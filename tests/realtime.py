@@ -36,6 +36,7 @@ from rig.simulated_bench.schema import BenchConfig
 from tests.soak import force_error_n, load_cell
 
 ESTIMATE = SignalName(message="RIG_ESTIMATE", signal="SPRING_DAMPER_FORCE")
+VALID = SignalName(message="RIG_ESTIMATE", signal="VALID")
 
 CLASSIC_CAN_HZ = 3703
 """What 1 Mbit/s carries of one frame in and one out, with the most stuff bits."""
@@ -86,7 +87,7 @@ def at_rate(
     config = ready.config.model_copy(
         update={
             "rate_hz": rate_hz,
-            "publish": {"strut": {"force": ESTIMATE}},
+            "publish": {"strut": {"force": ESTIMATE, "valid": VALID}},
             "realtime": realtime,
         }
     )

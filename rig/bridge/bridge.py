@@ -188,21 +188,10 @@ class Bridge:
         wrong: tuple[tuple[int, str], ...] = ()
         if self._devices:
             wrong = faults(self._devices, memory.healths, t_ns)
-        missed = conditions.overruns
-        gap_ns = t_ns - state.supervised.t_ns if missed else 0
-        share = _missed_share(state.missed_share, missed) if missed or state.missed_share else 0.0
-        excessive = share if share > self._supervisor.overload_share else 0.0
-        is_log_lost = conditions.log_fault and self._supervisor.requires_log
-        if wrong or reception.action or gap_ns or excessive or is_log_lost:
-            vital = [index for index, _ in wrong if self._devices[index].is_vital]
-            reports = Reports(
-                reception.action,
-                reception.excess,
-                gap_ns,
-                excessive,
-                vital[0] if vital else -1,
-                is_log_lost,
-            )
+        share = state.missed_share
+        if wrong or reception.action or share or conditions.overruns or conditions.log_fault:
+            share = _missed_share(share, conditions.overruns)
+            reports = self._reports(state, t_ns, reception, conditions, share, wrong)
         supervised, output, action = self._supervisor.step(supervised, step_input, reports)
         counts = count_tick(memory.counts, output, action, conditions, len(wrong))
         sent = self._send(state, t_ns, output, counts, conditions)
@@ -213,6 +202,27 @@ class Bridge:
             supervised, tuple(reception.sequences), memory, sendings, reported, share
         )
         return after, TickResult(sent_frames, step_input, output, counts, wrong)
+
+    def _reports(
+        self,
+        state: BridgeState,
+        t_ns: int,
+        reception: Reception,
+        conditions: Conditions,
+        missed_share: float,
+        wrong: Sequence[tuple[int, str]],
+    ) -> Reports:
+        """What the supervisor is given of a tick that is not as it should be."""
+        vital = [index for index, _ in wrong if self._devices[index].is_vital]
+        reports = Reports(
+            reception.action,
+            reception.excess,
+            t_ns - state.supervised.t_ns if conditions.overruns else 0,
+            missed_share if missed_share > self._supervisor.overload_share else 0.0,
+            vital[0] if vital else -1,
+            conditions.log_fault and self._supervisor.requires_log,
+        )
+        return NO_REPORTS if reports == NO_REPORTS else reports
 
     def _receive(
         self,

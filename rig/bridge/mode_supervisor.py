@@ -21,10 +21,10 @@ from rig.bridge.supervision_limits import (
     Action,
     Excess,
     Limit,
+    LimitedValue,
     LimitsByStrut,
-    bounds_of_estimate,
     find_excess,
-    is_within,
+    range_of_estimate,
     worst_action,
 )
 from rig.bridge.values import Divergence, Mode, StepInput, StepOutput, StrutOutput
@@ -226,7 +226,11 @@ class Supervisor:
         self._stale_after_ns = settings.stale_after_ns
         self._safe_after_ns = settings.safe_after_ns
         self._limits = [[row for row in rows if not row.value.is_measured] for rows in limits]
-        self._bounds = [bounds_of_estimate(rows) for rows in self._limits]
+        self._ranges = [range_of_estimate(rows) for rows in self._limits]
+        ranged = (LimitedValue.HEIGHT_M, LimitedValue.FORCE_N)
+        self._has_further_limits = any(
+            row.value not in ranged for rows in self._limits for row in rows
+        )
 
     def init(self, t_ns: int) -> SupervisedState:
         """State before the first step."""
@@ -244,19 +248,21 @@ class Supervisor:
         if estimate is None:
             return *self._wait(state, t_ns, after, reports), reports.action
         action = reports.action
-        for bounds, limits, strut in zip(self._bounds, self._limits, estimate.struts, strict=True):
-            if not is_within(bounds, strut):
-                action = max(action, worst_action(limits, strut))
+        struts, measured_ns, is_within = estimate.struts, estimate.measured_ns, True
+        for strut, (low_m, high_m, low_n, high_n) in zip(struts, self._ranges, strict=False):
+            if not (low_m <= strut.height_m <= high_m and low_n <= strut.force_n <= high_n):
+                is_within = False
+        if not is_within or self._has_further_limits:
+            action = max(action, *map(worst_action, self._limits, struts))
         is_calm = (
             mode is _RUNNING
             and estimate.is_settled
             and estimate.diverged < 0
             and not action
             and reports is NO_REPORTS
-            and not is_too_old(estimate.measured_ns, t_ns, self._stale_after_ns)
+            and t_ns - measured_ns <= self._stale_after_ns
         )
         if is_calm:
-            struts, measured_ns = estimate.struts, estimate.measured_ns
             state = SupervisedState(
                 t_ns, mode, after, struts, (), state.diverged, measured_ns, state.cause
             )

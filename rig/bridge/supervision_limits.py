@@ -170,46 +170,15 @@ def judge_height(
     return last._replace(height_m=height_m, t_ns=t_ns, since_ns=since_ns), action
 
 
-class EstimateBounds(NamedTuple):
-    """Bounds within which no limit on a strut's estimate requires anything."""
-
-    low_m: float
-    high_m: float
-    low_n: float
-    high_n: float
-    low_virtual_n: float
-    high_virtual_n: float
-    low_innovation_m: float
-    high_innovation_m: float
-
-
-_BOUNDED = (
-    LimitedValue.HEIGHT_M,
-    LimitedValue.FORCE_N,
-    LimitedValue.VIRTUAL_FORCE_N,
-    LimitedValue.INNOVATION_M,
-)
-
-
-def bounds_of_estimate(limits: Sequence[Limit]) -> EstimateBounds:
-    """The narrowest bounds of a strut's limits."""
+def range_of_estimate(limits: Sequence[Limit]) -> tuple[float, float, float, float]:
+    """Range of height in m, then of force in N, within which none of a strut's limits is passed."""
     bounds: list[float] = []
-    for value in _BOUNDED:
+    for value in (LimitedValue.HEIGHT_M, LimitedValue.FORCE_N):
         rows = [limit for limit in limits if limit.value is value]
         bounds.append(max([row.low for row in rows if row.low is not None], default=-inf))
         bounds.append(min([row.high for row in rows if row.high is not None], default=inf))
-    return EstimateBounds(*bounds)
-
-
-def is_within(bounds: EstimateBounds, strut: StrutOutput) -> bool:
-    """Whether an estimate is within all bounds; one that is not a number is not."""
-    low_m, high_m, low_n, high_n, low_virtual_n, high_virtual_n, low, high = bounds
-    return (
-        low_m <= strut.height_m <= high_m
-        and low_n <= strut.force_n <= high_n
-        and low_virtual_n <= strut.virtual_force_n <= high_virtual_n
-        and low <= strut.innovation_m <= high
-    )
+    low_m, high_m, low_n, high_n = bounds
+    return low_m, high_m, low_n, high_n
 
 
 def find_excess(limits: LimitsByStrut, struts: Sequence[StrutOutput], action: int) -> Excess | None:
