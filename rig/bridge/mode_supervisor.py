@@ -226,7 +226,9 @@ class Supervisor:
         self._stale_after_ns = settings.stale_after_ns
         self._safe_after_ns = settings.safe_after_ns
         self._limits = [[row for row in rows if not row.value.is_measured] for rows in limits]
-        self._ranges = [range_of_estimate(rows) for rows in self._limits]
+        # By bound, then by strut.
+        self._ranges = list(zip(*map(range_of_estimate, self._limits), strict=True))
+        self._is_limited = any(self._limits)
         ranged = (LimitedValue.HEIGHT_M, LimitedValue.FORCE_N)
         self._has_further_limits = any(
             row.value not in ranged for rows in self._limits for row in rows
@@ -248,12 +250,14 @@ class Supervisor:
         if estimate is None:
             return *self._wait(state, t_ns, after, reports), reports.action
         action = reports.action
-        struts, measured_ns, is_within = estimate.struts, estimate.measured_ns, True
-        for strut, (low_m, high_m, low_n, high_n) in zip(struts, self._ranges, strict=False):
-            if not (low_m <= strut.height_m <= high_m and low_n <= strut.force_n <= high_n):
-                is_within = False
-        if not is_within or self._has_further_limits:
-            action = max(action, *map(worst_action, self._limits, struts))
+        struts, measured_ns = estimate.struts, estimate.measured_ns
+        if self._is_limited:
+            is_beyond = self._has_further_limits
+            for strut, low_m, high_m, low_n, high_n in zip(struts, *self._ranges, strict=False):
+                if not (low_m <= strut.height_m <= high_m and low_n <= strut.force_n <= high_n):
+                    is_beyond = True
+            if is_beyond:
+                action = max(action, *map(worst_action, self._limits, struts))
         is_calm = (
             mode is _RUNNING
             and estimate.is_settled

@@ -206,8 +206,9 @@ def test_a_whole_tick_against_the_bare_dart_loop(capsys):
     )
     tick = found["whole tick, frame in and frame out"]
     # The budget is 9. Measured: 8.2 to 9.1, in one process of ten 9.7: where memory lies matters;
-    # on another machine 9.5 to 10.3 of the same code.
-    assert tick / found["DART, scalar functions"] <= 11.0
+    # on another machine 9.5 to 10.3 of the same code. Settling and limits on every estimate took 2
+    # to 6 % more, measured in turns with the code before: 10.5 to 11.6 there, by the hour.
+    assert tick / found["DART, scalar functions"] <= 12.0
 
 
 def test_an_observer_adds_less_than_a_quarter(capsys):
