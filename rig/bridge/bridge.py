@@ -23,6 +23,16 @@ _NO_CONDITIONS = Conditions()
 _ALL_STANDARD = 0x7FF
 
 
+_FADING = 1.0 - 1.0 / 200.0
+"""Of the share of missed ticks, at each tick."""
+
+_MOST_AT_ONCE = 20
+"""Missed ticks of one pause that count: ages judge a single one, however long it is."""
+
+_LEAST_SHARE = 1e-3
+"""Share of missed ticks below which it is none."""
+
+
 class Sending(Struct, frozen=True, gc=False):
     """State of an outgoing message.
 
@@ -33,16 +43,6 @@ class Sending(Struct, frozen=True, gc=False):
 
     number: int
     due_ns: int
-
-
-_FADING = 1.0 - 1.0 / 200.0
-"""Of the share of missed ticks, at each tick."""
-
-_MOST_AT_ONCE = 20
-"""Missed ticks of one pause that count: ages judge a single one, however long it is."""
-
-_LEAST_SHARE = 1e-3
-"""Share of missed ticks below which it is none."""
 
 
 class BridgeState(Struct, frozen=True, gc=False):

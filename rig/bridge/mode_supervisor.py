@@ -18,10 +18,10 @@ from can_dbc.yaml_file import NotNegative, Positive
 from rig.bridge.estimator import AnyEstimator, Estimate
 from rig.bridge.measurement_age import is_too_old
 from rig.bridge.supervision_limits import (
+    RANGED,
     Action,
     Excess,
     Limit,
-    LimitedValue,
     LimitsByStrut,
     find_excess,
     range_of_estimate,
@@ -229,9 +229,8 @@ class Supervisor:
         # By bound, then by strut.
         self._ranges = list(zip(*map(range_of_estimate, self._limits), strict=True))
         self._is_limited = any(self._limits)
-        ranged = (LimitedValue.HEIGHT_M, LimitedValue.FORCE_N)
         self._has_further_limits = any(
-            row.value not in ranged for rows in self._limits for row in rows
+            row.value not in RANGED for rows in self._limits for row in rows
         )
 
     def init(self, t_ns: int) -> SupervisedState:
@@ -324,10 +323,7 @@ class Supervisor:
             if action > reports.action:
                 excess = find_excess(self._limits, estimate.struts, action)
             yield _beyond(action, excess)
-        if reports.faulty_device >= 0:
-            yield Cause(Event.DEVICE_FAULT, device=reports.faulty_device)
-        if reports.is_log_lost:
-            yield Cause(Event.LOG_LOST)
+        yield from _surroundings(reports)
 
     def _missing_ticks(self, reports: Reports) -> Iterator[Cause]:
         """A gap between two ticks that left the bench alone for too long."""
@@ -356,8 +352,7 @@ class Supervisor:
             causes = [*self._missing_ticks(reports), age]
             if reports.action >= Action.HOLD:
                 causes.append(_beyond(reports.action, reports.excess))
-            if reports.is_log_lost:
-                causes.append(Cause(Event.LOG_LOST))
+            causes += _surroundings(reports)
             state, _ = _apply(state, causes)
             if state.mode is Mode.SAFE:
                 return self._stop(state, t_ns, estimator)
@@ -436,6 +431,14 @@ def _apply(state: SupervisedState, causes: Iterable[Cause]) -> tuple[SupervisedS
     elif mode in _LOST:
         first = first or last
     return replace(state, mode=mode, cause=last, first_cause=first), last
+
+
+def _surroundings(reports: Reports) -> Iterator[Cause]:
+    """What devices and log show."""
+    if reports.faulty_device >= 0:
+        yield Cause(Event.DEVICE_FAULT, device=reports.faulty_device)
+    if reports.is_log_lost:
+        yield Cause(Event.LOG_LOST)
 
 
 def _beyond(action: int, excess: Excess | None) -> Cause:

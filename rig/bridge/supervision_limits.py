@@ -145,12 +145,7 @@ def explain_height(
 ) -> Excess | None:
     """Why a new height (index of its strut, and m) requires an action; None if it does not."""
     strut, height_m = height
-    values = _measured(last, height_m, t_ns)
-    for limit in limits:
-        number = values[limit.value]
-        if limit.action_at(number) == action:
-            return Excess(strut, limit.value, number, limit.bound_beyond(number))
-    return None
+    return _first_excess(limits, strut, _measured(last, height_m, t_ns), action)
 
 
 def judge_height(
@@ -170,10 +165,14 @@ def judge_height(
     return last._replace(height_m=height_m, t_ns=t_ns, since_ns=since_ns), action
 
 
+RANGED = (LimitedValue.HEIGHT_M, LimitedValue.FORCE_N)
+"""Values of an estimate that `range_of_estimate` holds the limits of."""
+
+
 def range_of_estimate(limits: Sequence[Limit]) -> tuple[float, float, float, float]:
     """Range of height in m, then of force in N, within which none of a strut's limits is passed."""
     bounds: list[float] = []
-    for value in (LimitedValue.HEIGHT_M, LimitedValue.FORCE_N):
+    for value in RANGED:
         rows = [limit for limit in limits if limit.value is value]
         bounds.append(max([row.low for row in rows if row.low is not None], default=-inf))
         bounds.append(min([row.high for row in rows if row.high is not None], default=inf))
@@ -184,11 +183,20 @@ def range_of_estimate(limits: Sequence[Limit]) -> tuple[float, float, float, flo
 def find_excess(limits: LimitsByStrut, struts: Sequence[StrutOutput], action: int) -> Excess | None:
     """The first estimate that requires an action, and its limit."""
     for index, strut in enumerate(struts):
-        values = _estimates(strut)
-        for limit in limits[index]:
-            number = values[limit.value]
-            if limit.action_at(number) == action:
-                return Excess(index, limit.value, number, limit.bound_beyond(number))
+        excess = _first_excess(limits[index], index, _estimates(strut), action)
+        if excess is not None:
+            return excess
+    return None
+
+
+def _first_excess(
+    limits: Sequence[Limit], strut: int, values: Mapping[LimitedValue, float], action: int
+) -> Excess | None:
+    """The first value of a strut that requires an action, and its limit."""
+    for limit in limits:
+        number = values[limit.value]
+        if limit.action_at(number) == action:
+            return Excess(strut, limit.value, number, limit.bound_beyond(number))
     return None
 
 

@@ -107,10 +107,9 @@ class Bus:
         self.epoch_ns = epoch_ns
         """Unix time that stamps are relative to; to be updated when the system's clock was set."""
         self._bus = open_bus(config, self._filters, listen_only=listen_only)
-        returns_own = config.options.get("receive_own_messages", False)
-        self._sent: Counter[tuple[int, bool, bytes]] | None = None
-        if config.interface in _RETURN_OWN_FRAMES or returns_own:
-            self._sent = Counter()
+        asked_for_own = bool(config.options.get("receive_own_messages", False))
+        self._returns_own = config.interface in _RETURN_OWN_FRAMES or asked_for_own
+        self._sent: Counter[tuple[int, bool, bytes]] = Counter()
         self._receive = self._bus.recv
         self._send = None if listen_only else self._bus.send
 
@@ -129,7 +128,7 @@ class Bus:
                 message = receive(0)
                 if message is None:
                     break
-                if self._sent is not None and self._is_own(message):
+                if self._returns_own and self._is_own(message):
                     continue
                 if message.is_error_frame or self._accepts(message):
                     frames.append(self._frame(message))
@@ -140,7 +139,7 @@ class Bus:
     def _is_own(self, message: can.Message) -> bool:
         """Whether a frame is one that was sent here and comes back: it is no second sender's."""
         key = message.arbitration_id, message.is_extended_id, bytes(message.data)
-        if self._sent is None or key not in self._sent:
+        if key not in self._sent:
             return False
         self._sent[key] -= 1
         if not self._sent[key]:
@@ -199,7 +198,7 @@ class Bus:
             self._send(message)
         except Exception as error:  # drivers raise whatever they like
             raise _sending_error(error) from error
-        if self._sent is not None:
+        if self._returns_own:
             if len(self._sent) > _MOST_KNOWN:
                 self._sent.clear()
             self._sent[frame.arbitration_id, frame.is_extended, frame.data] += 1
@@ -288,7 +287,7 @@ def open_bus(
         )
         if config.interface == "socketcan":
             _widen(cast("Any", bus).socket)
-    except Exception as error:
+    except Exception as error:  # drivers raise whatever they like
         raise BusError(
             f"bus.interface {config.interface!r}, bus.channel {config.channel!r}: "
             f"cannot be opened: {_describe(error)}"

@@ -63,11 +63,11 @@ def export_command(
         return
     if bench or strut is not None:
         raise InputError("--bench and --strut: expected --fmu with them")
-    from rig.log.checksums import refuse_damage
+    from rig.log.checksums import find_damage, refuse_damage
 
     for path in _export_run(source, kind or "", out, smoothed):
         print_text(f"Written: {path}")
-    refuse_damage(source)
+    refuse_damage(source, find_damage(source))
 
 
 def _export_run(source: Path, kind: str, out: Path, smoothed: bool) -> list[Path]:

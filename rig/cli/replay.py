@@ -47,6 +47,6 @@ def replay_command(
             console.print(f"{name} is not the one that ran: its hash differs.", style="yellow")
         if result.different:
             console.print("The replay differs from the log.", style="red")
-    refuse_damage(folder)
+    refuse_damage(folder, result.damage)
     if result.different or changed or result.steps.num_rows == 0:
         raise typer.Exit(FAILED)

@@ -33,9 +33,9 @@ def report(
     for existing in (path, paper) if pdf else (path,):
         if existing.exists():
             raise InputError(f"{existing}: exists, expected another name (--out)")
-    write_run_report(run, path)
+    damage = write_run_report(run, path)
     print_text(f"Written: {path}")
     if pdf:
         print_page(path, paper)
         print_text(f"Printed: {paper}")
-    refuse_damage(run)
+    refuse_damage(run, damage)

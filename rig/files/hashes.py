@@ -1,6 +1,7 @@
-"""Hashes of files, as `run.yaml` and `diagnosis.json` hold them."""
+"""Hashes and checksums of files, as a run and `diagnosis.json` hold them."""
 
-from collections.abc import Iterable
+import zlib
+from collections.abc import Iterable, Iterator
 from hashlib import sha256
 from pathlib import Path
 
@@ -13,7 +14,24 @@ def hash_files(paths: Iterable[Path]) -> str:
     """
     digest = sha256()
     for path in paths:
-        with path.open("rb") as file:
-            while piece := file.read(1 << 20):
-                digest.update(piece)
+        for piece in _pieces(path):
+            digest.update(piece)
     return digest.hexdigest()
+
+
+def compute_crc32(path: Path) -> int:
+    """CRC-32 of a file.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    crc32 = 0
+    for piece in _pieces(path):
+        crc32 = zlib.crc32(piece, crc32)
+    return crc32
+
+
+def _pieces(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        while piece := file.read(1 << 20):
+            yield piece

@@ -5,16 +5,15 @@ in bytes, name. A file without a line was cut off by a kill, and is checked by i
 """
 
 import re
-import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from can_dbc.yaml_file import read_text
+from rig.files.hashes import compute_crc32
 from rig.log.errors import DamageError, LogError
 from rig.log.file_names import CHECKSUMS_FILE
 
-_READ_BYTES = 1 << 20
 _LINE = re.compile(r"([0-9a-f]{8}) ([0-9]{1,18}) ((?:frames|steps)[.0-9a-z]*)")
 
 
@@ -37,21 +36,15 @@ class Damage(NamedTuple):
     is_readable: bool
 
 
-def refuse_damage(folder: Path) -> None:
+def refuse_damage(folder: Path, damage: Iterable[Damage]) -> None:
     """Refuse a run whose frames or steps have changed since they were written.
 
     Raises:
-        DamageError: They have.
-        LogError: As for `find_damage`.
+        DamageError: They have; one line that names what is lost.
     """
-    damage = find_damage(folder)
-    if damage:
-        raise DamageError(describe_damage(folder, damage))
-
-
-def describe_damage(folder: Path, damage: Iterable[Damage]) -> str:
-    """One line that names what is lost."""
-    return f"{folder}: damaged: {'; '.join(item.text for item in damage)}"
+    text = "; ".join(item.text for item in damage)
+    if text:
+        raise DamageError(f"{folder}: damaged: {text}")
 
 
 def find_damage(folder: Path) -> tuple[Damage, ...]:
@@ -75,7 +68,7 @@ def _damages(folder: Path, lines: Iterable[str], path: Path) -> Iterator[Damage]
             found = file.stat().st_size
             if found < size:
                 yield Damage(name, f"{name} has {found} bytes of {size}", is_readable=True)
-            elif found > size or _crc32(file) != expected_crc:
+            elif found > size or compute_crc32(file) != expected_crc:
                 text = f"{name} is not what was written: its checksum differs"
                 yield Damage(name, text, is_readable=False)
         except OSError as error:
@@ -87,11 +80,3 @@ def _parse(line: str, where: str) -> tuple[int, int, str]:
     if found is None:
         raise LogError(f"{where}: {line[:60]!r}: expected a checksum, a length and a file's name")
     return int(found[1], 16), int(found[2]), found[3]
-
-
-def _crc32(path: Path) -> int:
-    crc32 = 0
-    with path.open("rb") as file:
-        while piece := file.read(_READ_BYTES):
-            crc32 = zlib.crc32(piece, crc32)
-    return crc32

@@ -143,7 +143,7 @@ def read_run(folder: Path) -> RunFolder:
     header = read_header(folder)
     damage = find_damage(folder)
     altered = [item.name for item in damage if not item.is_readable]
-    steps = _read_steps(parts(folder, STEPS_FILE), altered)
+    steps = _read_steps([it for it in parts(folder, STEPS_FILE) if it.name not in altered])
     return RunFolder(folder, header, steps, header["epoch_ns"], damage)
 
 
@@ -174,7 +174,7 @@ def find_changed_files(folder: Path) -> list[str]:
     Raises:
         LogError: A file cannot be read, or is none of the run's folder.
     """
-    recorded = read_run(folder).header.get("files_sha256")
+    recorded = read_header(folder).get("files_sha256")
     if not isinstance(recorded, dict):
         return []
     changed: list[str] = []
@@ -217,15 +217,14 @@ def last_frame_ns(folder: Path, epoch_ns: int) -> int:
     return -1
 
 
-def _read_steps(paths: list[Path], altered: Sequence[str]) -> pa.Table:
+def _read_steps(paths: list[Path]) -> pa.Table:
+    if not paths:
+        return step_schema().empty_table()
     tables = [
-        _read_part(path, is_mapped=number < _MOST_MAPPED)
-        for number, path in enumerate(paths)
-        if path.name not in altered
-    ] or [step_schema().empty_table()]
-    paths = [path for path in paths if path.name not in altered]
+        _read_part(path, is_mapped=number < _MOST_MAPPED) for number, path in enumerate(paths)
+    ]
     first = tables[0]
-    for path, table in zip(paths, tables, strict=bool(paths)):
+    for path, table in zip(paths, tables, strict=True):
         if table.num_rows and table.schema != first.schema:
             raise LogError(f"{path}: its columns are not those of {paths[0].name}")
     return pa.concat_tables([first, *[table for table in tables[1:] if table.num_rows]])

@@ -209,8 +209,8 @@ class RunWriter:
             finally:
                 with contextlib.ExitStack() as files:  # all of them, whichever fails
                     files.callback(self._close_notes)
-                    files.callback(self._write_checksums, self._part)
-                    files.callback(self._part.close)
+                    files.callback(self._write_notes)
+                    files.callback(self._end_part, self._part)
         except OSError as error:
             self._set_fault(str(error.strerror))
 
@@ -317,14 +317,14 @@ class RunWriter:
         is_long = limit.time_ns is not None and now_ns - part.begin_ns >= limit.time_ns
         if is_full or is_long:
             self._part = Part(self.folder, part.number + 1, self._rows.schema, now_ns)
-            part.close()
-            self._write_checksums(part)
+            self._end_part(part)
 
-    def _write_checksums(self, part: Part) -> None:
-        """Add the checksums of a part that is closed."""
-        if CHECKSUMS_FILE not in self._noted:
-            self._noted[CHECKSUMS_FILE] = WholeFile(self.folder / CHECKSUMS_FILE)
-        self._noted[CHECKSUMS_FILE].append(part.checksums.encode())
+    def _end_part(self, part: Part) -> None:
+        """Close a part and note its checksums."""
+        try:
+            part.close()
+        finally:
+            self.note(CHECKSUMS_FILE, part.checksums)
 
     def _write_capture(self, capture: Capture) -> None:
         folder = self.folder / CAPTURES_FOLDER / f"{capture.number:03d}_{capture.why}"

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from can_dbc.errors import InputError
-from rig.log.checksums import Damage, describe_damage, find_damage
-from rig.log.errors import DamageError
+from rig.log.checksums import Damage, find_damage, refuse_damage
 from rig.log.follower import RunFollower
 from rig.log.reader import Ending, RunHeader, read_header
 from rig.pages.html import render_report, write_page
@@ -43,8 +42,8 @@ _NOT_ALWAYS_VALID = ("part", "◐", "Ended in order, and was not valid all the t
 _LOST_MODES = ("HOLD", "SAFE")
 
 
-def write_run_report(folder: Path, path: Path) -> None:
-    """Write the report of a run's folder.
+def write_run_report(folder: Path, path: Path) -> tuple[Damage, ...]:
+    """Write the report of a run's folder; returns what of the run is damaged.
 
     Raises:
         DamageError: Frames or steps are not what was written; what is merely cut off is reported.
@@ -52,7 +51,7 @@ def write_run_report(folder: Path, path: Path) -> None:
     """
     header, damage = read_header(folder), find_damage(folder)
     if not all(item.is_readable for item in damage):
-        raise DamageError(describe_damage(folder, damage))
+        refuse_damage(folder, damage)
     follower = RunFollower(folder)
     follower.update(_ALL_STEPS)
     if not follower.steps:
@@ -82,6 +81,7 @@ def write_run_report(folder: Path, path: Path) -> None:
         timing_plot=_timing_plot(folder),
     )
     write_page(text, path)
+    return damage
 
 
 def _badge(ending: Ending) -> tuple[str, str, str]:

@@ -69,6 +69,15 @@ def _build_estimator(plan: Plan) -> AnyEstimator:
     )
 
 
+def sample_timing(plan: Plan) -> SampleTiming:
+    """Timing of the closed loop: that of the strut that is measured least often, and latest."""
+    return SampleTiming.of(
+        plan.period_ns,
+        max(strut.interval_ns for strut in plan.struts),
+        max(strut.delay_ns for strut in plan.struts),
+    )
+
+
 def settling_times(plan: Plan) -> SettlingTimes:
     """Settling times with other observers: those of the closed loop at rest, or the configured."""
     settling_s = plan.config.supervision.settling_s
@@ -79,11 +88,7 @@ def settling_times(plan: Plan) -> SettlingTimes:
     # damped as little as it ever is. Both are models of their own, since this one may be running.
     bare = [strut.model_copy(update={"effects": ()}) for strut in plan.model.struts]
     plans = (plan, plan.with_model(plan.model.model_copy(update={"struts": tuple(bare)})))
-    timing = SampleTiming.of(
-        plan.period_ns,
-        max(strut.interval_ns for strut in plan.struts),
-        max(strut.delay_ns for strut in plan.struts),
-    )
+    timing = sample_timing(plan)
 
     def longest_times_ns(observers: Sequence[AnyObserver]) -> list[int | None]:
         models = [build_plant(item) for item in plans]

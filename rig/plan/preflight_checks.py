@@ -13,11 +13,10 @@ from rig.bridge.published_quantities import FORCE, VALID
 from rig.bridge.supervision_limits import Limit
 from rig.channels.channel import Channel
 from rig.channels.measured_quantities import LOAD_CELL_FORCE
-from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import Pole, closed_loop_poles
 from rig.observers.protocol import Remark, SensorStep
-from rig.plan.build import build_bridge, build_plant, settling_times
+from rig.plan.build import build_bridge, build_plant, sample_timing, settling_times
 from rig.plan.plan import Plan
 
 LITTLE_DAMPING = 0.02
@@ -247,11 +246,7 @@ def _load(plan: Plan) -> Finding:
 
 def _stability(plan: Plan, plant: AnyPlant) -> list[Finding]:
     rest = tuple(strut.free_length_m for strut in plan.struts)
-    timing = SampleTiming.of(
-        plan.period_ns,
-        max(strut.interval_ns for strut in plan.struts),
-        max(strut.delay_ns for strut in plan.struts),
-    )
+    timing = sample_timing(plan)
     poles = closed_loop_poles(plant, plan.observers, rest, timing)
     findings = [_worst(poles)]
     if findings[0].severity is not Severity.ERROR:

@@ -43,11 +43,15 @@ _LEAST_STATE_BITS = 3
 """A mode is a number from 0 to 5."""
 
 _STALE_CYCLES = 3
+"""Cycles after which a height is stale: two frames in a row may be lost."""
+
 _LEAST_STALE_S = 0.01
 _LARGEST_RATE_M_PER_S = 10.0
 """Of a height: several times what a damper is tested at."""
 
 _FROZEN_S = 1.0
+"""A reading that is the same for longer is taken for frozen: noise changes it in some samples."""
+
 _MOST_OTHERS = 4
 """Other candidates that are named in a comment."""
 
@@ -134,7 +138,7 @@ def _observer(height: _Candidate) -> list[str]:
     message, name = height.message, height.signal.name
     noise_std_m = si_step(message, name, HEIGHT.dimension) / math.sqrt(12.0) or _UNKNOWN_NOISE_M
     interval_ns = message.cycle_time_ns or _UNKNOWN_INTERVAL_NS
-    observer = KalmanObserver.before_tuning(noise_std_m, interval_ns).to_four_digits()
+    observer = KalmanObserver.before_tuning(noise_std_m, interval_ns)
     found = observer.filter
     return [
         "observers:",

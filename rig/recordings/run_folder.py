@@ -14,6 +14,7 @@ from can_dbc.protection import check_crc_log
 from can_dbc.units import Dimension
 from rig.channels.channel import Channel
 from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE
+from rig.log.checksums import refuse_damage
 from rig.log.reader import RunFolder
 from rig.log.reader import read_run as read_run_folder
 from rig.plan.load import plan_of_header
@@ -27,10 +28,12 @@ def read_run(folder: Path) -> Recording:
     channels are linear between their samples.
 
     Raises:
+        DamageError: Its frames or steps have changed since they were written.
         InputError: The run is damaged, or holds no height.
         RecordingError: It holds heights alone.
     """
     run = read_run_folder(folder)
+    refuse_damage(folder, run.damage)
     plan = plan_of_header(folder, run.header)
     applied, cell, temperature = map(
         plan.bench_channel, (APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE)
@@ -107,8 +110,8 @@ def _samples(payloads: _Payloads, channel: Channel) -> tuple[Array, Array]:
     good &= np.isfinite(values)
     valid = channel.valid
     if valid is not None:
-        said = decode_log(message, [valid.signal], [Dimension.NUMBER], data)[valid.signal]
-        good &= said == valid.value
+        validity = decode_log(message, [valid.signal], [Dimension.NUMBER], data)[valid.signal]
+        good &= validity == valid.value
     t_s, first = np.unique(_sample_times_s(t_ns[good], message), return_index=True)
     return t_s, values[good][first]
 

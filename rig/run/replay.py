@@ -16,6 +16,7 @@ from can_dbc.errors import InputError
 from can_dbc.frame import Frame
 from rig.bridge.bridge import TickResult
 from rig.bridge.counts import Conditions
+from rig.log.checksums import Damage
 from rig.log.file_names import RUN_FILE
 from rig.log.reader import RUN_SCHEMA, RunFolder, last_frame_ns, read_run
 from rig.log.received_frames import FrameColumns, read_frame_columns
@@ -44,6 +45,7 @@ class Replay:
     different: int
     first_different_ns: int | None
     refused_frames: int
+    damage: tuple[Damage, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,7 @@ def replay(folder: Path, *, plan: Plan | None = None, progress: Progress = no_pr
         len(different),
         int(ticks.t_ns[different[0]]) if len(different) else None,
         last[0].counts.refused if last else 0,
+        run_folder.damage,
     )
 
 

@@ -1,6 +1,7 @@
 """How a run ends on the bus: whatever ends it, the last that is said is invalid.
 
-The listener is python-can's own bus, and cantools decodes what it heard; the run's log is not used.
+The listener is python-can's own bus, and cantools decodes what it received; the run's log is not
+used.
 """
 
 import itertools
@@ -32,15 +33,15 @@ ESTIMATE, STATUS = DBC.get_message_by_name("RIG_ESTIMATE"), DBC.get_message_by_n
 
 
 class Listener:
-    """What an independent node on the bus has heard."""
+    """What an independent node on the bus has received."""
 
     def __init__(self, channel):
         self._bus = can.Bus(interface="virtual", channel=channel, receive_own_messages=False)
-        self.heard = []
+        self.received = []
 
     def listen(self):
         while (message := self._bus.recv(0)) is not None:
-            self.heard.append(message)
+            self.received.append(message)
 
     def close(self):
         self.listen()
@@ -49,7 +50,7 @@ class Listener:
     def decoded(self, message):
         return [
             message.decode(frame.data, decode_choices=False)
-            for frame in self.heard
+            for frame in self.received
             if frame.arbitration_id == message.frame_id
         ]
 
@@ -134,11 +135,11 @@ def test_an_exception_within_a_tick(tmp_path, monkeypatch):
         return step(self, *arguments)
 
     monkeypatch.setattr(DartPlant, "step", fail_late)
-    heard = []
-    monkeypatch.setattr(Listener, "close", lambda self: (self.listen(), heard.append(self)))
+    received = []
+    monkeypatch.setattr(Listener, "close", lambda self: (self.listen(), received.append(self)))
     with pytest.raises(ZeroDivisionError):
         run_until(tmp_path / "run", "ends_exception", lambda _tick: False)
-    assert_ends_invalid(heard[0])
+    assert_ends_invalid(received[0])
     assert read_run(tmp_path / "run").header["ending"]["status"] == "failed"
 
 
@@ -177,8 +178,8 @@ def test_the_end_is_in_the_log_and_replays(tmp_path):
     found = read_run(tmp_path / "run")
     sent = [frame.data for frame, direction in found.frames() if direction == "T"]
     own = {0x110, 0x120, 0x300, 0x310}
-    heard = [bytes(item.data) for item in listener.heard if item.arbitration_id in own]
-    assert sent == heard
+    received = [bytes(item.data) for item in listener.received if item.arbitration_id in own]
+    assert sent == received
     again = replay(tmp_path / "run")
     assert (again.logged, again.different, again.steps.num_rows) == (3000, 0, 3000)
 

@@ -299,33 +299,24 @@ def test_an_open_limit_has_no_end():
     assert open_above.action_at(float("nan")) == Action.SAFE
 
 
+LOSSES = {
+    Event.STALE: Mode.HOLD,
+    Event.OVERLOADED: Mode.HOLD,
+    Event.BEYOND_HOLD: Mode.HOLD,
+    Event.DEVICE_FAULT: Mode.HOLD,
+    Event.TIMEOUT: Mode.SAFE,
+    Event.TICKS_MISSING: Mode.SAFE,
+    Event.DIVERGED: Mode.SAFE,
+    Event.BEYOND_SAFE: Mode.SAFE,
+    Event.LOG_LOST: Mode.SAFE,
+}
+"""What a model that follows its bench loses its estimate by."""
+
 NEXT = {
     Mode.INIT: {},
     Mode.WAITING: {Event.FRESH: Mode.SETTLING},
-    Mode.SETTLING: {
-        Event.SETTLED: Mode.RUNNING,
-        Event.STALE: Mode.HOLD,
-        Event.OVERLOADED: Mode.HOLD,
-        Event.BEYOND_HOLD: Mode.HOLD,
-        Event.DEVICE_FAULT: Mode.HOLD,
-        Event.TIMEOUT: Mode.SAFE,
-        Event.TICKS_MISSING: Mode.SAFE,
-        Event.DIVERGED: Mode.SAFE,
-        Event.BEYOND_SAFE: Mode.SAFE,
-        Event.LOG_LOST: Mode.SAFE,
-    },
-    Mode.RUNNING: {
-        Event.UNSETTLED: Mode.SETTLING,
-        Event.STALE: Mode.HOLD,
-        Event.OVERLOADED: Mode.HOLD,
-        Event.BEYOND_HOLD: Mode.HOLD,
-        Event.DEVICE_FAULT: Mode.HOLD,
-        Event.TIMEOUT: Mode.SAFE,
-        Event.TICKS_MISSING: Mode.SAFE,
-        Event.DIVERGED: Mode.SAFE,
-        Event.BEYOND_SAFE: Mode.SAFE,
-        Event.LOG_LOST: Mode.SAFE,
-    },
+    Mode.SETTLING: {Event.SETTLED: Mode.RUNNING, **LOSSES},
+    Mode.RUNNING: {Event.UNSETTLED: Mode.SETTLING, **LOSSES},
     Mode.HOLD: {
         Event.FRESH: Mode.SETTLING,
         Event.TIMEOUT: Mode.SAFE,
