@@ -12,11 +12,13 @@ from rig.bridge.counts import Conditions, Counts, Report, count_tick
 from rig.bridge.devices import CLAIM, CLAIM_MASK, Device, faults
 from rig.bridge.frame_checks import CheckMemory, FrameChecks, Reception
 from rig.bridge.incoming_messages import Incoming
+from rig.bridge.late_samples import Past, PastStep, arrival_ns, remember, steps_of, use_late_samples
 from rig.bridge.mode_supervisor import NO_REPORTS, Reports, SupervisedState, Supervision, Supervisor
 from rig.bridge.outgoing_messages import Outgoing
+from rig.bridge.sample_times import SenderClock
 from rig.bridge.supervision_limits import LimitsByStrut
 from rig.bridge.values import Mode, StepInput, StepOutput, StrutOutput
-from rig.channels.channel import Channel, Role, Sample
+from rig.channels.channel import Channel, Sample
 from rig.observers.protocol import AnyObserver
 
 _NO_CONDITIONS = Conditions()
@@ -25,6 +27,8 @@ _ALL_STANDARD = 0x7FF
 
 _FADING = 1.0 - 1.0 / 200.0
 """Of the share of missed ticks, at each tick."""
+
+_NO_MODEL = (Mode.WAITING, Mode.SAFE)
 
 _MOST_AT_ONCE = 20
 """Missed ticks of one pause that count: ages judge a single one, however long it is."""
@@ -55,6 +59,8 @@ class BridgeState(Struct, frozen=True, gc=False):
         sendings: State of each outgoing message.
         reported: Counts at the last status that was sent.
         missed_share: Share of missed ticks, over the last few hundred.
+        clocks: Clock of each incoming message's sender; None before its first frame.
+        past: Steps that late samples may belong to.
     """
 
     supervised: SupervisedState
@@ -63,6 +69,8 @@ class BridgeState(Struct, frozen=True, gc=False):
     sendings: tuple[Sending, ...]
     reported: Counts
     missed_share: float = 0.0
+    clocks: tuple[SenderClock | None, ...] = ()
+    past: Past = ()
 
     @property
     def counts(self) -> Counts:
@@ -113,8 +121,9 @@ class Bridge:
         struts = supervisor.estimator.struts
         self._checks = FrameChecks(incoming, own, devices, limits)
         self._nothing = (StrutOutput(0.0, 0.0, False, 0.0, 0.0, 0.0, 0.0),) * struts
-        self._is_height = [channel.role is Role.HEIGHT for channel in channels]
-        self._is_reading = [channel.role is Role.SENSOR for channel in channels]
+        self._awaited = tuple(
+            index for index, item in enumerate(incoming) if item.is_awaited and item.follow
+        )
         self.filters = _filters(incoming, outgoing, devices)
         """What admits the frames that the bridge subscribes to, its own among them."""
 
@@ -153,7 +162,8 @@ class Bridge:
         sendings = (Sending(0, t_ns),) * len(self._outgoing)
         sequences, memory = self._checks.init(t_ns)
         supervised = self._supervisor.init(t_ns)
-        return BridgeState(supervised, sequences, memory, sendings, memory.counts)
+        clocks = (None,) * len(self.incoming)
+        return BridgeState(supervised, sequences, memory, sendings, memory.counts, 0.0, clocks)
 
     def take_over(self, state: BridgeState, before: "Bridge", t_ns: int) -> BridgeState:
         """State of a bridge that ran before; with other observers it has to settle again."""
@@ -161,7 +171,7 @@ class Bridge:
             return state
         supervised = state.supervised
         estimator = self._supervisor.estimator.unsettle(supervised.estimator, t_ns)
-        return replace(state, supervised=replace(supervised, estimator=estimator))
+        return replace(state, supervised=replace(supervised, estimator=estimator), past=())
 
     def end(
         self, state: BridgeState, t_ns: int, conditions: Conditions = _NO_CONDITIONS
@@ -181,9 +191,9 @@ class Bridge:
         conditions: Conditions = _NO_CONDITIONS,
     ) -> tuple[BridgeState, TickResult]:
         """State after a tick, and what it did; frames of other ids are passed over."""
-        reception = Reception(state.sequences, state.memory)
-        supervised, samples = self._receive(state.supervised, reception, t_ns, frames)
-        step_input = StepInput(t_ns, tuple(samples), conditions.acknowledged)
+        reception = Reception(state.sequences, state.clocks, state.memory)
+        supervised, past, samples = self._receive(state, reception, t_ns, frames)
+        step_input = StepInput(t_ns, samples, conditions.acknowledged)
         memory, reports = reception.memory, NO_REPORTS
         wrong: tuple[tuple[int, str], ...] = ()
         if self._devices:
@@ -199,7 +209,14 @@ class Bridge:
         if counts is not memory.counts:
             memory = replace(memory, counts=counts)
         after = BridgeState(
-            supervised, tuple(reception.sequences), memory, sendings, reported, share
+            supervised,
+            tuple(reception.sequences),
+            memory,
+            sendings,
+            reported,
+            share,
+            tuple(reception.clocks),
+            () if supervised.mode in _NO_MODEL else past,
         )
         return after, TickResult(sent_frames, step_input, output, counts, wrong)
 
@@ -225,47 +242,67 @@ class Bridge:
         return NO_REPORTS if reports == NO_REPORTS else reports
 
     def _receive(
-        self,
-        supervised: SupervisedState,
-        reception: Reception,
-        t_ns: int,
-        frames: Sequence[Frame],
-    ) -> tuple[SupervisedState, list[Sample]]:
+        self, state: BridgeState, reception: Reception, t_ns: int, frames: Sequence[Frame]
+    ) -> tuple[SupervisedState, Past, tuple[Sample, ...]]:
         """Pass every frame through the checks; returns the samples of the tick's last step.
 
-        A late tick finds several measurements of one strut. Each is used in a step at its own time,
-        or the model would run away under a force that was constant over the whole gap.
+        Before it come the steps that late samples belong to, and those that a late tick missed.
         """
+        before, past = state.supervised, state.past
+        last_ns = before.t_ns
         samples: list[Sample] = []
-        measured = 0
-        for incoming, values, frame_ns in self._checks.receive(reception, frames):
-            if measured & incoming.first_strut:
-                supervised, samples = self._catch_up(supervised, samples)
-                measured = 0
-            arrived_ns = min(frame_ns, t_ns)
+        measured, awaited, is_in_order = 0, 0, True
+        for incoming, values, frame_ns, _ in self._checks.receive(reception, frames):
+            due_ns = min(frame_ns, t_ns)
+            if incoming.is_awaited:
+                if due_ns <= last_ns:
+                    if past and due_ns <= past[0].since_ns:
+                        reception.count_refusal("untimed")
+                        continue
+                    is_in_order = False
+                elif measured & incoming.first_strut:
+                    is_in_order = False
+                awaited += 1
+                measured |= incoming.struts
             for value, channel, delay_ns in incoming.deliveries:
-                samples.append(Sample(channel, values[value], arrived_ns - delay_ns))
-            measured |= incoming.struts
-        return supervised, samples
+                samples.append(Sample(channel, values[value], due_ns - delay_ns))
+        step = PastStep(last_ns, t_ns, before.estimator, tuple(samples))
+        if is_in_order:
+            if awaited != len(self._awaited):
+                past = remember(past, step, self._awaited_ns(reception, last_ns))
+            else:
+                past = (step,)
+            return before, past, step.samples
+        return self._receive_in_order(before, past, step, self._awaited_ns(reception, last_ns))
 
-    def _catch_up(
-        self, supervised: SupervisedState, samples: Sequence[Sample]
-    ) -> tuple[SupervisedState, list[Sample]]:
-        """State at the time of measurements that newer ones follow, and the samples after it."""
-        arrivals_ns = [
-            item.t_ns + self._channels[item.channel].delay_ns
-            for item in samples
-            if self._is_height[item.channel]
-        ]
-        t_ns = max([supervised.t_ns, *arrivals_ns])
-        used: list[Sample] = []
-        later: list[Sample] = []
-        for item in samples:
-            is_later = self._is_reading[item.channel] and item.t_ns > t_ns
-            (later if is_later else used).append(item)
-        after, _, _ = self._supervisor.step(supervised, StepInput(t_ns, tuple(used)))
-        # Nothing of this step is published.
-        return replace(after, last_valid=supervised.last_valid), later
+    def _awaited_ns(self, reception: Reception, t_ns: int) -> int:
+        """Time up to which no sample can come any more: each message has sent a newer one."""
+        times_ns = [clock.due_ns for index in self._awaited if (clock := reception.clocks[index])]
+        return min(times_ns) if len(times_ns) == len(self._awaited) > 0 else t_ns
+
+    def _receive_in_order(
+        self, supervised: SupervisedState, past: Past, step: PastStep, awaited_ns: int
+    ) -> tuple[SupervisedState, Past, tuple[Sample, ...]]:
+        """State before the last step of a tick with samples that belong to earlier ones."""
+
+        def due_ns(sample: Sample) -> int:
+            return arrival_ns(self._channels, sample)
+
+        samples = sorted(step.samples, key=due_ns)
+        late = [item for item in samples if due_ns(item) <= step.since_ns] if past else []
+        if late:
+            estimator = self._supervisor.estimator
+            after, past = use_late_samples(estimator, self._channels, past, late)
+            supervised = replace(supervised, estimator=after)
+            samples = samples[len(late) :]
+        step = PastStep(step.since_ns, step.t_ns, supervised.estimator, tuple(samples))
+        last_valid = supervised.last_valid
+        *missed, last = steps_of(self._channels, samples, step.t_ns, step.since_ns)
+        for step_input in missed:
+            # Nothing of this step is published.
+            supervised, _, _ = self._supervisor.step(supervised, step_input)
+            supervised = replace(supervised, last_valid=last_valid)
+        return supervised, remember(past, step, awaited_ns), last.samples
 
     def _send(
         self,

@@ -36,6 +36,8 @@ class Counts(NamedTuple):
         from_faulty_device: Frames refused because their device was at fault.
         no_value: Frames refused because a signal holds no value: the sensor itself says so
             (`valid`), an error or "not available" of J1939, or a float that is not finite.
+        untimed: Frames refused because it is not known when their values were sampled, or because
+            that was too long ago.
     """
 
     lost: int = 0
@@ -57,6 +59,7 @@ class Counts(NamedTuple):
     device_faulty: int = 0
     from_faulty_device: int = 0
     no_value: int = 0
+    untimed: int = 0
 
     def plus(self, **increments: int) -> "Counts":
         """Counts with increments, by their names."""

@@ -4,9 +4,10 @@
    may be a heartbeat, an emergency or an address claim of a device, or a second sender.
 2. protected: its length, CRC and counter are right (`can_dbc.protection`), and its signals hold
    values (`Incoming.read`).
-3. sent by its device: its sender is the configured device (`_sent_by_device`).
-4. healthy sender: that device is not at fault (`_healthy_sender`).
-5. plausible: no limit refuses its heights (`_plausible`).
+3. timed: it is known when its values were sampled (`rig.bridge.sample_times`).
+4. sent by its device: its sender is the configured device (`_sent_by_device`).
+5. healthy sender: that device is not at fault (`_healthy_sender`).
+6. plausible: no limit refuses its heights (`_plausible`).
 
 Whether a frame is authentic is decided before, on the bus (`rig.bus.secoc`). No measurement of a
 refused frame is used; alarms in it count. It is counted where it was refused (`rig.bridge.counts`);
@@ -38,6 +39,13 @@ from rig.bridge.devices import (
     update_by_frame,
 )
 from rig.bridge.incoming_messages import Incoming, Values
+from rig.bridge.sample_times import (
+    EARLY,
+    IN_TIME,
+    LATE,
+    SenderClock,
+    Timing,
+)
 from rig.bridge.supervision_limits import (
     Action,
     Excess,
@@ -48,7 +56,7 @@ from rig.bridge.supervision_limits import (
 )
 
 # Looking up a member of an enum costs as much as the CRC of a frame.
-_OK = FrameStatus.OK
+_OK, _FIRST, _NO_VALUE = FrameStatus.OK, FrameStatus.FIRST, FrameStatus.NO_VALUE
 
 SECOND_SENDER_FRAMES = 12
 """Frames out of sequence in close succession that only a second sender explains: a restarted sender
@@ -74,6 +82,10 @@ class CheckMemory(Struct, frozen=True, gc=False):
     counts: Counts
 
 
+Passed = tuple[Incoming, Values, int, Timing]
+"""A frame that passed: its message, its values, when it was due, and what is known of that."""
+
+
 class Reception:
     """What the frames of one tick change while they pass; written in place.
 
@@ -81,10 +93,16 @@ class Reception:
     first measurement that requires it.
     """
 
-    __slots__ = ("action", "excess", "memory", "sequences")
+    __slots__ = ("action", "clocks", "excess", "memory", "sequences")
 
-    def __init__(self, sequences: Sequence[SequenceState], memory: CheckMemory) -> None:
+    def __init__(
+        self,
+        sequences: Sequence[SequenceState],
+        clocks: Sequence[SenderClock | None],
+        memory: CheckMemory,
+    ) -> None:
         self.sequences = list(sequences)
+        self.clocks = list(clocks)
         self.memory = memory
         self.action = 0
         self.excess: Excess | None = None
@@ -140,12 +158,11 @@ class FrameChecks:
         )
         return (INITIAL,) * messages, memory
 
-    def receive(
-        self, reception: Reception, frames: Sequence[Frame]
-    ) -> list[tuple[Incoming, Values, int]]:
-        """Message, values and arrival time of each frame that no check refused."""
-        passed: list[tuple[Incoming, Values, int]] = []
-        index_of, sequences = self._index_of, reception.sequences
+    def receive(self, reception: Reception, frames: Sequence[Frame]) -> list[Passed]:
+        """What passed of some frames: those that no check refused."""
+        passed: list[Passed] = []
+        is_timed = True
+        index_of, sequences, clocks = self._index_of, reception.sequences, reception.clocks
         for frame in frames:
             index = index_of(frame.arbitration_id, frame.is_extended)
             if index is None or frame.is_error:
@@ -155,11 +172,21 @@ class FrameChecks:
             sequences[index], status, values = incoming.read(sequences[index], frame)
             if status is not _OK:
                 self._record_status(reception, index, frame.t_ns, status)
+            due_ns, timing = frame.t_ns, IN_TIME
+            follow = incoming.follow
+            if follow is not None and (values is not None or status in _COUNTED):
+                before = None if status is _FIRST else clocks[index]
+                clock = clocks[index] = follow(before, due_ns, 1 + sequences[index].lost)
+                due_ns, timing = clock.due_ns, clock.timing
+                if timing is not IN_TIME:
+                    is_timed = False
             if values is not None and (checks := self._checks[index]):
+                if due_ns != frame.t_ns:
+                    frame = replace(frame, t_ns=due_ns)  # noqa: PLW2901
                 values = _pass(checks, reception, frame, values)
             if values is not None:
-                passed.append((incoming, values, frame.t_ns))
-        return passed
+                passed.append((incoming, values, due_ns, timing))
+        return passed if is_timed else _timed(reception, passed)
 
     def _receive_other(self, reception: Reception, frame: Frame) -> None:
         """Receive a frame of no incoming message: of a device, or of a second sender."""
@@ -216,6 +243,33 @@ class FrameChecks:
         if any(self._limits[target.strut] for target in incoming.heights):
             checks.append(_plausible(incoming, self._limits))
         return tuple(checks)
+
+
+_COUNTED = (_OK, _NO_VALUE)
+"""Status of a frame without values whose counter counts all the same."""
+
+
+def _timed(reception: Reception, passed: Sequence[Passed]) -> list[Passed]:
+    """The frames whose time is known, of some of which it may not be.
+
+    A late one had waited if one behind it came less late. Where one came early, those before it
+    had waited, without its being seen.
+    """
+    kept: list[Passed] = []
+    behind: dict[int, Timing] = {}
+    for item in reversed(passed):
+        incoming, _, _, timing = item
+        key = id(incoming)
+        next_timing = behind.get(key)
+        is_kept = next_timing is not EARLY and (
+            timing is IN_TIME or (timing is LATE and next_timing is IN_TIME)
+        )
+        if is_kept:
+            kept.append(item)
+        else:
+            reception.count_refusal("untimed")
+        behind[key] = EARLY if EARLY in (timing, next_timing) else IN_TIME if is_kept else LATE
+    return kept[::-1]
 
 
 def _pass(

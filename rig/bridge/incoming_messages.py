@@ -13,7 +13,9 @@ from can_dbc.database import Message
 from can_dbc.frame import Frame
 from can_dbc.protection import FrameStatus, SequenceState, compile_checker
 from can_dbc.units import Dimension
+from rig.bridge.sample_times import Follower, compile_follower
 from rig.channels.channel import Channel, Role
+from rig.channels.measured_quantities import APPLIED_FORCE
 
 Values = tuple[float, ...]
 """Values of a frame in SI, in the order of the message's signals that are read."""
@@ -93,6 +95,8 @@ class Incoming:
         device: Index of the device that sends it; None if none is configured.
         struts: Struts whose reference heights it carries, a bit each.
         first_strut: The bit of the first of them; 0 if there is none.
+        follow: Follows the clock of its sender; None if its counter states no time.
+        is_awaited: Whether an estimate rests on its values, so that late ones are used in the past.
     """
 
     message: Message
@@ -103,6 +107,8 @@ class Incoming:
     device: int | None = None
     struts: int = 0
     first_strut: int = 0
+    follow: Follower | None = None
+    is_awaited: bool = False
 
 
 def compile_incoming(
@@ -162,7 +168,18 @@ def compile_incoming(
         device,
         sum({1 << height.strut for height in heights}),
         1 << heights[0].strut if heights else 0,
+        compile_follower(message.cycle_time_ns or 0) if has_clock(message) and channels else None,
+        any(_is_awaited(channel) for channel in channels),
     )
+
+
+def has_clock(message: Message) -> bool:
+    """Whether counter and cycle time of a message state when its values were sampled."""
+    return message.protection is not None and bool(message.cycle_time_ns)
+
+
+def _is_awaited(channel: Channel) -> bool:
+    return channel.role is not Role.BENCH or channel.quantity is APPLIED_FORCE
 
 
 _Check = Callable[[Values], bool]

@@ -9,6 +9,7 @@ from can_dbc.codec import si_step
 from can_dbc.database import Message
 from dart_model.protocol import AnyPlant
 from dart_model.spec import InlineSkeleton
+from rig.bridge.incoming_messages import has_clock
 from rig.bridge.published_quantities import FORCE, VALID
 from rig.bridge.supervision_limits import Limit
 from rig.channels.channel import Channel
@@ -68,6 +69,7 @@ def check(plan: Plan) -> list[Finding]:
         Finding(Severity.OK, "signals", f"all in {named}, units converted to SI"),
         *map(_protection, read.values()),
         *[_rate(message, plan.period_ns) for message in heights],
+        *map(_sample_times, read.values()),
         *_resolution(plan),
         *[
             Finding(
@@ -151,6 +153,14 @@ def _weight_n(plan: Plan) -> float | None:
         return None
     mass_kg = sum(body.mass_kg for body in skeleton.bodies)
     return mass_kg * abs(plan.model.gravity_m_per_s2) or None
+
+
+def _sample_times(message: Message) -> Finding:
+    """Where the times of a message's samples come from."""
+    text = "when their frames arrive: expected a protected counter and a cycle time in the DBC"
+    if has_clock(message):
+        text = "by counter and cycle time, whatever the frames wait on their way"
+    return Finding(Severity.OK, f"sample times of {message.name}", text)
 
 
 def _staleness(plan: Plan, heights: list[Message]) -> Finding:

@@ -9,6 +9,7 @@ from can_dbc.codec import compile_decoder
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from rig.bridge.frame_checks import SECOND_SENDER_FRAMES
+from rig.bridge.sample_times import TRUST
 from rig.bridge.values import Mode
 from tests.faults.trial import (
     BEGIN_MS,
@@ -108,28 +109,55 @@ def test_reordering(row, undisturbed_n):
     )
 
 
-def test_delay(row):
-    limits = [{"value": "innovation_m", "low": -0.005, "high": 0.005, "action": "safe"}]
+def test_delay(row, undisturbed_n):
     queue = []
 
-    def late(_t_ns, frames):
+    def late(t_ns, frames):
         queue.append(frames)
-        return queue.pop(0) if len(queue) > 3 else []
+        arriving = queue.pop(0) if len(queue) > 3 else []
+        return [replace(frame, t_ns=t_ns) for frame in arriving]
 
-    trial = Trial(limits=limits)
-    ticks = trial.run(END_MS, after(BEGIN_NS, late))
-    assert ticks[-1].mode is Mode.SAFE
-    assert not any(tick.is_valid for tick in ticks[-100:])
-    assert (
-        max(abs(tick.result.output.struts[0].innovation_m) for tick in ticks if tick.is_valid)
-        <= 0.005
-    )
+    trial = Trial()
+    ticks = trial.run(END_MS + 2000, after(BEGIN_NS, late))
+    refused = ticks[-1].counts.untimed
+    assert 0 < refused < 2 * TRUST
+    settled = [tick for tick in ticks if tick.t_ns > BEGIN_NS + 100 * MS and tick.is_valid]
+    # Three milliseconds of the bench's motion are not to be seen in frames that all come so.
+    error_n = force_error_n(ticks, settled[0].t_ns)
+    assert error_n < 5.0 * undisturbed_n
     row(
         4,
-        "delay: everything 3 ms late, at the reference case's gains unstable",
-        "the limit on the innovation (5 mm) enters the safe state",
-        first_ms(ticks, lambda tick: tick.mode is Mode.SAFE),
-        NOTHING_RECEIVED,
+        "delay: everything 3 ms later from a moment on, stamped on arrival",
+        f"refuses {refused} frames, which contradict their sender's clock, and the estimate "
+        "settles again; then the delay is taken for the sender's: force error "
+        f"{error_n:.1f} N instead of {undisturbed_n:.1f} N RMS (`delay_s`)",
+        first_ms(ticks, lambda tick: not tick.is_valid),
+        "the refused frames",
+    )
+
+
+def test_held_back(row, undisturbed_n):
+    held = []
+
+    def gateway(t_ns, frames):
+        held.extend(frames)
+        if t_ns // MS % 250 < 8:
+            return []
+        arriving = [replace(frame, t_ns=t_ns) for frame in held]
+        held.clear()
+        return arriving
+
+    ticks = Trial().run(END_MS, after(BEGIN_NS, gateway))
+    assert ticks[-1].counts.untimed == ticks[-1].counts.lost == 0
+    error_n = force_error_n(ticks)
+    assert error_n == pytest.approx(undisturbed_n, rel=0.05)
+    row(
+        4,
+        "frames held back for 8 ms, four times a second, stamped on arrival",
+        "uses each at its own time, by its sender's clock, and is in SETTLING until then; force "
+        f"error {error_n:.1f} N instead of {undisturbed_n:.1f} N RMS",
+        first_ms(ticks, lambda tick: not tick.is_valid),
+        "nothing",
     )
 
 

@@ -80,7 +80,8 @@ def test_mutated_frames():
     possible = [verdict for verdict in FrameStatus if verdict is not FrameStatus.NO_VALUE]
     causes = [verdict.value for verdict in possible if not verdict.is_accepted]
     assert all(getattr(counts, cause) > 0 for cause in causes)
-    assert sum(getattr(counts, cause) for cause in causes) == counts.refused
+    # Frames that are repeated or held back contradict their sender's clock too.
+    assert sum(getattr(counts, cause) for cause in causes) + counts.untimed == counts.refused
 
 
 @pytest.mark.long

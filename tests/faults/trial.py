@@ -10,6 +10,7 @@ from rig.bridge.bridge import Bridge, BridgeState, TickResult
 from rig.bridge.counts import Conditions, Counts
 from rig.bridge.values import Mode, StepInput
 from rig.channels.channel import Sample
+from rig.observers.protocol import AnyObserver
 from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
@@ -69,8 +70,13 @@ class Tick(NamedTuple):
 class Trial:
     """A bridge and a bench, joined tick by tick."""
 
-    def __init__(self, devices: object = None, **supervision: object) -> None:
+    def __init__(
+        self, devices: object = None, observer: AnyObserver | None = None, **supervision: object
+    ) -> None:
         ready = load_plan(CONFIGS / "reference.yaml")
+        if observer is not None:
+            observers = {"observers": {ready.model.struts[0].name: observer}}
+            ready = ready.with_config(ready.config.model_copy(update=observers))
         content = ready.config.model_dump(mode="json")
         content["supervision"] |= supervision
         config = ready.config.model_validate(content | {"devices": devices or {}})

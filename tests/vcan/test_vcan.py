@@ -1,6 +1,7 @@
 """The bridge on the kernel's CAN stack, against programs that nobody here wrote."""
 
 import subprocess
+from bisect import bisect_left
 from math import isnan
 from pathlib import Path
 
@@ -199,7 +200,9 @@ def force_by_measurement(found: RunFolder) -> dict[bytes, float]:
         for t_ns, n in zip(used_ns, force_n, strict=True)
         if not isnan(t_ns) and not isnan(n)
     ]
-    return {frames[int(t_ns)]: n for t_ns, n in used}
+    # A frame arrives when its values were sampled, or less than a cycle later.
+    arrivals_ns = sorted(frames)
+    return {frames[arrivals_ns[bisect_left(arrivals_ns, int(t_ns))]]: n for t_ns, n in used}
 
 
 def test_canplayers_bench_gives_the_same_steps(recorded, bridge, second_vcan, tmp_path):
