@@ -200,7 +200,7 @@ class Bridge:
             wrong = faults(self._devices, memory.healths, t_ns)
         share = state.missed_share
         if wrong or reception.action or share or conditions.overruns or conditions.log_fault:
-            share = _missed_share(share, conditions.overruns)
+            share = _share_of_overruns(share, conditions.overruns)
             reports = self._reports(state, t_ns, reception, conditions, share, wrong)
         supervised, output, action = self._supervisor.step(supervised, step_input, reports)
         counts = count_tick(memory.counts, output, action, conditions, len(wrong))
@@ -269,13 +269,15 @@ class Bridge:
         step = PastStep(last_ns, t_ns, before.estimator, tuple(samples))
         if is_in_order:
             if awaited != len(self._awaited):
-                past = remember(past, step, self._awaited_ns(reception, last_ns))
+                past = remember(past, step, self._find_oldest_clock_ns(reception, last_ns))
             else:
                 past = (step,)
             return before, past, step.samples
-        return self._receive_in_order(before, past, step, self._awaited_ns(reception, last_ns))
+        return self._receive_in_order(
+            before, past, step, self._find_oldest_clock_ns(reception, last_ns)
+        )
 
-    def _awaited_ns(self, reception: Reception, t_ns: int) -> int:
+    def _find_oldest_clock_ns(self, reception: Reception, t_ns: int) -> int:
         """Time up to which no sample can come any more: each message has sent a newer one."""
         times_ns = [clock.due_ns for index in self._awaited if (clock := reception.clocks[index])]
         return min(times_ns) if len(times_ns) == len(self._awaited) > 0 else t_ns
@@ -337,7 +339,7 @@ class Bridge:
         return tuple(after), frames, counts, reported
 
 
-def _missed_share(share: float, missed: int) -> float:
+def _share_of_overruns(share: float, missed: int) -> float:
     """Share of missed ticks after some that were missed and one that was not, fading."""
     share = _FADING * (1.0 - (1.0 - share) * _FADING ** min(missed, _MOST_AT_ONCE))
     return share if share > _LEAST_SHARE else 0.0

@@ -43,8 +43,8 @@ from rig.bridge.sample_times import (
     EARLY,
     IN_TIME,
     LATE,
+    FrameTime,
     SenderClock,
-    Timing,
 )
 from rig.bridge.supervision_limits import (
     Action,
@@ -82,7 +82,7 @@ class CheckMemory(Struct, frozen=True, gc=False):
     counts: Counts
 
 
-Passed = tuple[Incoming, Values, int, Timing]
+Passed = tuple[Incoming, Values, int, FrameTime]
 """A frame that passed: its message, its values, when it was due, and what is known of that."""
 
 
@@ -186,7 +186,7 @@ class FrameChecks:
                 values = _pass(checks, reception, frame, values)
             if values is not None:
                 passed.append((incoming, values, due_ns, timing))
-        return passed if is_timed else _timed(reception, passed)
+        return passed if is_timed else _drop_unclear(reception, passed)
 
     def _receive_other(self, reception: Reception, frame: Frame) -> None:
         """Receive a frame of no incoming message: of a device, or of a second sender."""
@@ -249,14 +249,14 @@ _COUNTED = (_OK, _NO_VALUE)
 """Status of a frame without values whose counter counts all the same."""
 
 
-def _timed(reception: Reception, passed: Sequence[Passed]) -> list[Passed]:
+def _drop_unclear(reception: Reception, passed: Sequence[Passed]) -> list[Passed]:
     """The frames whose time is known, of some of which it may not be.
 
     A late one had waited if one behind it came less late. Where one came early, those before it
     had waited, without its being seen.
     """
     kept: list[Passed] = []
-    behind: dict[int, Timing] = {}
+    behind: dict[int, FrameTime] = {}
     for item in reversed(passed):
         incoming, _, _, timing = item
         key = id(incoming)

@@ -169,7 +169,7 @@ def compile_incoming(
         sum({1 << height.strut for height in heights}),
         1 << heights[0].strut if heights else 0,
         compile_follower(message.cycle_time_ns or 0) if has_clock(message) and channels else None,
-        any(_is_awaited(channel) for channel in channels),
+        any(_bears_estimate(channel) for channel in channels),
     )
 
 
@@ -178,7 +178,7 @@ def has_clock(message: Message) -> bool:
     return message.protection is not None and bool(message.cycle_time_ns)
 
 
-def _is_awaited(channel: Channel) -> bool:
+def _bears_estimate(channel: Channel) -> bool:
     return channel.role is not Role.BENCH or channel.quantity is APPLIED_FORCE
 
 

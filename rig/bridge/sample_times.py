@@ -52,7 +52,7 @@ _MOST_DOUBT = 6
 """As many of them are remembered."""
 
 
-class Timing(Enum):
+class FrameTime(Enum):
     """What is known of the time at which a frame was due.
 
     IN_TIME: what its clock says. LATE: it came more than a cycle after that, and only a frame
@@ -67,7 +67,12 @@ class Timing(Enum):
 
 
 # Looking up a member of an enum costs as much as the CRC of a frame.
-IN_TIME, LATE, EARLY, UNKNOWN = Timing.IN_TIME, Timing.LATE, Timing.EARLY, Timing.UNKNOWN
+IN_TIME, LATE, EARLY, UNKNOWN = (
+    FrameTime.IN_TIME,
+    FrameTime.LATE,
+    FrameTime.EARLY,
+    FrameTime.UNKNOWN,
+)
 
 Point = tuple[int, int]
 """Arrival in ns, and cycles of the sender's until then."""
@@ -121,7 +126,7 @@ class SenderClock(Struct, frozen=True, gc=False):
     lowest: Lowest
     wait_ns: int
     line: Line
-    timing: Timing = IN_TIME
+    timing: FrameTime = IN_TIME
 
 
 Follower = Callable[[SenderClock | None, int, int], SenderClock]

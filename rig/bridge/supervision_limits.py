@@ -124,7 +124,9 @@ class Plausibility(NamedTuple):
     shortest_ns: int = 1
 
 
-def _measured(last: Plausibility, height_m: float, t_ns: int) -> Mapping[LimitedValue, float]:
+def _values_of_height(
+    last: Plausibility, height_m: float, t_ns: int
+) -> Mapping[LimitedValue, float]:
     """What limits on measurements are set on, of a new height."""
     change_m = height_m - last.height_m
     # Heights with one time stamp, as of a queue that is read late, are not simultaneous.
@@ -145,7 +147,7 @@ def explain_height(
 ) -> Excess | None:
     """Why a new height (index of its strut, and m) requires an action; None if it does not."""
     strut, height_m = height
-    return _first_excess(limits, strut, _measured(last, height_m, t_ns), action)
+    return _first_excess(limits, strut, _values_of_height(last, height_m, t_ns), action)
 
 
 def judge_height(
@@ -156,7 +158,7 @@ def judge_height(
     Before the first measurement there is no memory; `t_ns` is the time of arrival.
     """
     last = memory or Plausibility(height_m, t_ns, t_ns)
-    values = _measured(last, height_m, t_ns)
+    values = _values_of_height(last, height_m, t_ns)
     action = max([limit.action_at(values[limit.value]) for limit in limits], default=0)
     if action >= Action.REFUSE:
         # What was used last stays the reference, but only for as long as the rate allows for.

@@ -106,18 +106,18 @@ def propose(database: Database) -> str:
             used.add((found[0].message.name, found[0].signal.name))
     listened = {name for name, _ in used}
     free = [item for item in others if item.name not in listened]
-    lines += [*_published(free), *_observer(heights[0]), *_supervision(heights[0])]
+    lines += [*_propose_publish(free), *_observer(heights[0]), *_supervision(heights[0])]
     return "\n".join(lines) + "\n"
 
 
-def _published(free: Sequence[Message]) -> list[str]:
+def _propose_publish(free: Sequence[Message]) -> list[str]:
     """Lines of what could carry the estimate, its validity and the bridge's mode."""
     estimates = _candidates(free, Dimension.FORCE, _ESTIMATE_WORDS)
     if not estimates:
         return ["# publish: no other message has a signal with a unit of force"]
     lines = ["publish:", _line("  ", FORCE.key, estimates)]
     chosen = estimates[0].message
-    valid = _named([chosen], _VALID_WORDS, 1) or _named(free, _VALID_WORDS, 1)
+    valid = _find_integers([chosen], _VALID_WORDS, 1) or _find_integers(free, _VALID_WORDS, 1)
     if valid:
         lines.append(_line("  ", VALID.key, valid))
     else:
@@ -125,7 +125,7 @@ def _published(free: Sequence[Message]) -> list[str]:
             "  # valid: no signal looks like it; without one a lost estimate looks like a force:",
             "  # unsafe: {publish_without_valid: true} accepts that",
         ]
-    states = _named(free, _STATE_WORDS, _LEAST_STATE_BITS)
+    states = _find_integers(free, _STATE_WORDS, _LEAST_STATE_BITS)
     if any(item.name == STATUS_MESSAGE for item in free):
         lines.append(f"status: {STATUS_MESSAGE}")
     elif states:
@@ -165,7 +165,9 @@ def _supervision(height: _Candidate) -> list[str]:
     ]
 
 
-def _named(messages: Iterable[Message], words: Sequence[str], bits: int) -> list[_Candidate]:
+def _find_integers(
+    messages: Iterable[Message], words: Sequence[str], bits: int
+) -> list[_Candidate]:
     """Integer signals with one of some words in their names and no unit, the best name first."""
     found = [
         _Candidate(sum(word in signal.name.lower() for word in words), message, signal)

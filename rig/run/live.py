@@ -74,7 +74,7 @@ def live(
             clock,
             link.figures,
             granted,
-            begin=partial(_discard_queued, link, clock),
+            begin=partial(_drain_queue, link, clock),
             acknowledge=port.acknowledge,
         )
         try:
@@ -84,7 +84,7 @@ def live(
             link.close()
 
 
-def _discard_queued(link: Link, clock: Clock) -> None:
+def _drain_queue(link: Link, clock: Clock) -> None:
     """Discard what has come since the bus was opened: the first tick would take it for new."""
     for _ in range(_MOST_READINGS):
         if not link.receive(clock.now_ns()):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.bridge.sample_times import SenderClock, Timing, compile_follower
+from rig.bridge.sample_times import FrameTime, SenderClock, compile_follower
 
 MS = 1_000_000
 
@@ -34,7 +34,7 @@ def test_a_sender_that_does_not_wait_is_due_when_it_arrives(drift_ppm, cycle_ns)
     arrivals_ns = np.arange(400) * (cycle_ns + cycle_ns * drift_ppm // 1_000_000)
     clocks = follow(arrivals_ns, cycle_ns)
     assert dues(clocks).tolist() == arrivals_ns.tolist()
-    assert {clock.timing for clock in clocks} == {Timing.IN_TIME}
+    assert {clock.timing for clock in clocks} == {FrameTime.IN_TIME}
 
 
 @given(st.lists(st.integers(0, 30 * MS), min_size=2, max_size=300))
@@ -50,7 +50,7 @@ def test_waits_at_random(drift_ppm, wait_ms):
     true_ns = sampled_ns(2000, drift_ppm)
     arrivals_ns = true_ns + rng.uniform(0.0, wait_ms * MS, 2000).astype(np.int64)
     clocks = follow(np.maximum.accumulate(arrivals_ns))
-    assert {clock.timing for clock in clocks[200:]} == {Timing.IN_TIME}
+    assert {clock.timing for clock in clocks[200:]} == {FrameTime.IN_TIME}
     errors_ns = dues(clocks)[200:] - true_ns[200:]
     # The least of 64 waits is a 65th of their range in the mean, and its slope as uncertain.
     assert np.sqrt(np.mean(errors_ns**2)) < wait_ms * MS / 16
@@ -64,18 +64,18 @@ def test_frames_that_are_held_back_keep_their_times(held):
     for begin in range(500, 3000, 250):
         arrivals_ns[begin : begin + held] = true_ns[begin + held]
     clocks = follow(arrivals_ns)
-    late = [item.timing is Timing.LATE for item in clocks]
+    late = [item.timing is FrameTime.LATE for item in clocks]
     # The first of each batch alone: the next ones show that it had waited.
     assert sum(late) == (10 if held > 1 else 0)
-    assert {item.timing for item in clocks} == {Timing.IN_TIME, Timing.LATE}
+    assert {item.timing for item in clocks} == {FrameTime.IN_TIME, FrameTime.LATE}
     assert np.abs(dues(clocks) - true_ns)[200:].max() <= 1000
 
 
 def test_a_queue_at_the_start_states_no_times():
     arrivals_ns = np.concatenate([np.full(200, 5 * MS), 6 * MS + np.arange(100) * MS])
     timings = [clock.timing for clock in follow(arrivals_ns)]
-    assert Timing.IN_TIME not in timings[1:207]
-    assert set(timings[210:]) == {Timing.IN_TIME}
+    assert FrameTime.IN_TIME not in timings[1:207]
+    assert set(timings[210:]) == {FrameTime.IN_TIME}
 
 
 def test_a_gap_beyond_the_counters_round():
@@ -87,8 +87,8 @@ def test_a_gap_beyond_the_counters_round():
     for number, arrival_ns in enumerate(arrivals_ns):
         clock = follower(clock, int(arrival_ns), 16 if number == 400 else 1)
         timings.append(clock.timing)
-    assert Timing.IN_TIME not in timings[400:421]
-    assert set(timings[430:]) == {Timing.IN_TIME}
+    assert FrameTime.IN_TIME not in timings[400:421]
+    assert set(timings[430:]) == {FrameTime.IN_TIME}
     assert clock.due_ns == arrivals_ns[-1]
 
 
@@ -97,8 +97,8 @@ def test_a_sender_that_pauses_is_followed_again():
     arrivals_ns[300:] += 3 * MS
     clocks = follow(arrivals_ns)
     timings = [clock.timing for clock in clocks]
-    assert set(timings[300:307]) == {Timing.LATE}
-    assert set(timings[307:]) == {Timing.IN_TIME}
+    assert set(timings[300:307]) == {FrameTime.LATE}
+    assert set(timings[307:]) == {FrameTime.IN_TIME}
     assert dues(clocks)[307:].tolist() == arrivals_ns[307:].tolist()
 
 
@@ -108,7 +108,7 @@ def test_a_sender_that_waits_between_frames_has_no_clock():
     clocks = follow(arrivals_ns)
     is_arrival = dues(clocks)[1000:] == arrivals_ns[1000:]
     assert is_arrival.mean() > 0.8
-    assert sum(clock.timing is not Timing.IN_TIME for clock in clocks[1000:]) < 20
+    assert sum(clock.timing is not FrameTime.IN_TIME for clock in clocks[1000:]) < 20
 
 
 def test_lost_frames_are_no_wait():
