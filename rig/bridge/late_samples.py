@@ -97,5 +97,7 @@ def use_late_samples(
 
 def remember(past: Past, step: PastStep, awaited_ns: int) -> Past:
     """Steps with a further one, as far back as samples may still come: those due from a time on."""
-    kept = [item for item in past if item.t_ns > awaited_ns]
-    return (*kept[1 - MOST_STEPS :], step)
+    first = max(0, len(past) + 1 - MOST_STEPS)
+    while first < len(past) and past[first].t_ns <= awaited_ns:
+        first += 1
+    return (*past[first:], step)
