@@ -30,7 +30,7 @@ _LEAST_IN_PHASE = 4
 """Gaps in phase that are no coincidence: of twenty at random, as many are in one in a thousand."""
 
 
-class LostTimeCause(Enum):
+class LossCause(Enum):
     """Cause of lost time, as far as the kernel accounts for it."""
 
     QUOTA = "the host's CPU quota: gaps end in phase with periods of 100 ms"
@@ -58,12 +58,12 @@ class LateTick(NamedTuple):
     t_ns: int
     missed: int
     part: str
-    cause: LostTimeCause
+    cause: LossCause
     excess_ns: int
     end_ns: int
 
 
-def by_cause(late: Sequence[LateTick]) -> list[tuple[LostTimeCause, int, int]]:
+def by_cause(late: Sequence[LateTick]) -> list[tuple[LossCause, int, int]]:
     """Cause, number of gaps and number of missed ticks, the most frequent cause first."""
     gaps = Counter(item.cause for item in late)
     return [
@@ -118,19 +118,19 @@ def _explain(before: TraceRow, row: TraceRow, period_ns: int, usual: dict[str, f
 
 def _cause(
     before: TraceRow, row: TraceRow, excess_ns: int, *, is_wait: bool, own: bool
-) -> LostTimeCause:
+) -> LossCause:
     """The first account of the guest's kernel that explains the excess; the surest come first."""
     switched = row.voluntary - before.voluntary
     accounts = (
-        (row.run_delay_ns - before.run_delay_ns > _MOSTLY * excess_ns, LostTimeCause.OTHER_THREAD),
-        (row.major_faults > before.major_faults, LostTimeCause.DISK),
+        (row.run_delay_ns - before.run_delay_ns > _MOSTLY * excess_ns, LossCause.OTHER_THREAD),
+        (row.major_faults > before.major_faults, LossCause.DISK),
         # Once to wait for the deadline; a second time for the interpreter.
-        (is_wait and row.log_busy and switched > 1, LostTimeCause.INTERPRETER),
-        (row.involuntary > before.involuntary, LostTimeCause.KERNEL),
-        (row.minor_faults - before.minor_faults > _MANY_FAULTS, LostTimeCause.FAULTS),
-        (own, LostTimeCause.OWN),
+        (is_wait and row.log_busy and switched > 1, LossCause.INTERPRETER),
+        (row.involuntary > before.involuntary, LossCause.KERNEL),
+        (row.minor_faults - before.minor_faults > _MANY_FAULTS, LossCause.FAULTS),
+        (own, LossCause.OWN),
     )
-    return next((cause for holds, cause in accounts if holds), LostTimeCause.UNACCOUNTED)
+    return next((cause for holds, cause in accounts if holds), LossCause.UNACCOUNTED)
 
 
 def _by_host(late: list[LateTick], stolen_ns: int) -> list[LateTick]:
@@ -138,16 +138,12 @@ def _by_host(late: list[LateTick], stolen_ns: int) -> list[LateTick]:
 
     Stolen time is counted in steps of 10 ms, which no single gap is as long as.
     """
-    unaccounted = [item for item in late if item.cause is LostTimeCause.UNACCOUNTED]
+    unaccounted = [item for item in late if item.cause is LossCause.UNACCOUNTED]
     in_phase = _in_phase(unaccounted)
     rest_ns = sum(item.excess_ns for item in unaccounted if item not in in_phase)
     stolen_ns -= sum(item.excess_ns for item in in_phase)
-    rest = (
-        LostTimeCause.HOST
-        if rest_ns and stolen_ns >= _MOSTLY * rest_ns
-        else LostTimeCause.UNACCOUNTED
-    )
-    causes = {item: LostTimeCause.QUOTA if item in in_phase else rest for item in unaccounted}
+    rest = LossCause.HOST if rest_ns and stolen_ns >= _MOSTLY * rest_ns else LossCause.UNACCOUNTED
+    causes = {item: LossCause.QUOTA if item in in_phase else rest for item in unaccounted}
     return [item._replace(cause=causes.get(item, item.cause)) for item in late]
 
 

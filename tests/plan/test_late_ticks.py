@@ -6,7 +6,7 @@ import pytest
 
 from can_dbc.errors import InputError
 from rig.machine.clock import VirtualClock
-from rig.run.late_ticks import LostTimeCause, find_late_ticks
+from rig.run.late_ticks import LossCause, find_late_ticks
 from rig.run.trace import Trace, TraceRow, read_trace
 
 MS = 1_000_000
@@ -42,14 +42,14 @@ def rows(late, *, ticks=400, stolen_ns=0):
 @pytest.mark.parametrize(
     ("story", "part", "cause"),
     [
-        ({"overslept_ns": 3 * MS, "run_delay_ns": 2 * MS}, "wait", LostTimeCause.OTHER_THREAD),
-        ({"overslept_ns": 3 * MS, "major_faults": 1}, "wait", LostTimeCause.DISK),
-        ({"overslept_ns": 3 * MS, "voluntary": 1, "log_busy": 1}, "wait", LostTimeCause.INTERPRETER),
-        ({"overslept_ns": 3 * MS, "voluntary": 1}, "wait", LostTimeCause.UNACCOUNTED),
-        ({"overslept_ns": 3 * MS, "involuntary": 1}, "wait", LostTimeCause.KERNEL),
-        ({"overslept_ns": 3 * MS, "minor_faults": 400}, "wait", LostTimeCause.FAULTS),
-        ({"overslept_ns": 3 * MS}, "wait", LostTimeCause.UNACCOUNTED),
-        ({"busy_ns": 4 * MS, "involuntary": 1}, "between", LostTimeCause.KERNEL),
+        ({"overslept_ns": 3 * MS, "run_delay_ns": 2 * MS}, "wait", LossCause.OTHER_THREAD),
+        ({"overslept_ns": 3 * MS, "major_faults": 1}, "wait", LossCause.DISK),
+        ({"overslept_ns": 3 * MS, "voluntary": 1, "log_busy": 1}, "wait", LossCause.INTERPRETER),
+        ({"overslept_ns": 3 * MS, "voluntary": 1}, "wait", LossCause.UNACCOUNTED),
+        ({"overslept_ns": 3 * MS, "involuntary": 1}, "wait", LossCause.KERNEL),
+        ({"overslept_ns": 3 * MS, "minor_faults": 400}, "wait", LossCause.FAULTS),
+        ({"overslept_ns": 3 * MS}, "wait", LossCause.UNACCOUNTED),
+        ({"busy_ns": 4 * MS, "involuntary": 1}, "between", LossCause.KERNEL),
     ],
 )
 def test_each_account_is_told_from_the_others(story, part, cause):
@@ -72,7 +72,7 @@ def test_gaps_in_phase_with_a_tenth_of_a_second_are_the_hosts_quota():
     late[203] = {"overslept_ns": 3 * MS}
     found = find_late_ticks(rows(late), MS)
     assert [item.cause for item in found] == [
-        LostTimeCause.QUOTA, LostTimeCause.QUOTA, LostTimeCause.UNACCOUNTED, LostTimeCause.QUOTA, LostTimeCause.QUOTA
+        LossCause.QUOTA, LossCause.QUOTA, LossCause.UNACCOUNTED, LossCause.QUOTA, LossCause.QUOTA
     ]  # fmt: skip
 
 
@@ -82,14 +82,14 @@ def test_gaps_at_random_times_are_not_put_down_to_a_quota():
     for _ in range(200):
         ticks = random.sample(range(10, 1990, 6), 8)
         found = find_late_ticks(rows({k: {"overslept_ns": 2 * MS} for k in ticks}, ticks=2000), MS)
-        wrong += any(item.cause is LostTimeCause.QUOTA for item in found)
+        wrong += any(item.cause is LossCause.QUOTA for item in found)
     assert wrong < 20
 
 
 def test_what_was_stolen_as_long_as_nobody_accounts_for_is_the_hosts():
     late = {k: {"overslept_ns": 2 * MS} for k in (31, 77, 140, 263)}
     causes = {item.cause for item in find_late_ticks(rows(late, stolen_ns=10 * MS), MS)}
-    assert causes == {LostTimeCause.HOST}
+    assert causes == {LossCause.HOST}
 
 
 def test_a_trace_keeps_late_ticks_with_the_one_before(tmp_path):
