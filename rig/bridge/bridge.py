@@ -279,7 +279,8 @@ class Bridge:
 
     def _find_oldest_clock_ns(self, reception: Reception, t_ns: int) -> int:
         """Time up to which no sample can come any more: each message has sent a newer one."""
-        times_ns = [clock.due_ns for index in self._awaited if (clock := reception.clocks[index])]
+        clocks = [clock for index in self._awaited if (clock := reception.clocks[index])]
+        times_ns = [min(clock.due_ns, clock.arrival_ns) for clock in clocks]
         return min(times_ns) if len(times_ns) == len(self._awaited) > 0 else t_ns
 
     def _receive_in_order(

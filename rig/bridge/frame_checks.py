@@ -40,7 +40,6 @@ from rig.bridge.devices import (
 )
 from rig.bridge.incoming_messages import Incoming, Values
 from rig.bridge.sample_times import (
-    EARLY,
     IN_TIME,
     LATE,
     FrameTime,
@@ -250,25 +249,17 @@ _COUNTED = (_OK, _NO_VALUE)
 
 
 def _drop_unclear(reception: Reception, passed: Sequence[Passed]) -> list[Passed]:
-    """The frames whose time is known, of some of which it may not be.
-
-    A late one had waited if one behind it came less late. Where one came early, those before it
-    had waited, without its being seen.
-    """
+    """The frames whose time is known: a late one had waited if the one behind it came less late."""
     kept: list[Passed] = []
-    behind: dict[int, FrameTime] = {}
+    behind: dict[int, bool] = {}
     for item in reversed(passed):
         incoming, _, _, timing = item
-        key = id(incoming)
-        next_timing = behind.get(key)
-        is_kept = next_timing is not EARLY and (
-            timing is IN_TIME or (timing is LATE and next_timing is IN_TIME)
-        )
+        is_kept = timing is IN_TIME or (timing is LATE and behind.get(id(incoming), False))
         if is_kept:
             kept.append(item)
         else:
             reception.count_refusal("untimed")
-        behind[key] = EARLY if EARLY in (timing, next_timing) else IN_TIME if is_kept else LATE
+        behind[id(incoming)] = is_kept
     return kept[::-1]
 
 

@@ -8,11 +8,11 @@ The envelope is followed frame by frame. An arrival before the line lowers it at
 block of cycles the line goes through the block's lowest arrival, its slope being that since the
 lowest of four blocks before. For a sender whose frames do not wait, a frame is due when it arrives.
 
-Three things are no wait. Frames that all come later by the same time were delayed by the sender:
-the line is raised. A frame that comes well before the line shows that those before it had waited:
-their times were wrong. And where the lowest arrivals of blocks scatter as much as the frames
-within a block, the sender waits between frames instead of following a clock, and its counter states
-no time: then arrivals are all there is.
+Three things are no wait. Frames that all come later by the same time were delayed by the sender,
+and frames that all come well before the line show that those before them had waited: the line goes
+through them. And where the lowest arrivals of blocks scatter as much as the frames within a block,
+the sender waits between frames instead of following a clock, and its counter states no time: then
+arrivals are all there is.
 
 Reference: Moon, Skelly, Towsley, "Estimation and removal of clock skew from network delay
 measurements" (INFOCOM 1999): the line below all arrivals.
@@ -35,8 +35,12 @@ _FIRST_DRIFT = 100
 """A hundredth: how fast the line may rise in a cycle before the drift is known. Controllers without
 a crystal are within it."""
 
-TRUST = 8
-"""Frames in a row after which the line is believed again, or is raised to them."""
+LATE_FRAMES = 8
+"""Frames in a row that come late by the same time, after which the line goes through them."""
+
+_EARLY_FRAMES = 3
+"""Frames in a row that come early by the same time, after which the line goes through them. One or
+two are another sender's, such as random frames of which one in 256 has the right CRC."""
 
 _MOST_CYCLES = 8
 """Cycles between two frames that the counter alone determines; it goes round after 15 or more."""
@@ -56,23 +60,17 @@ class FrameTime(Enum):
     """What is known of the time at which a frame was due.
 
     IN_TIME: what its clock says. LATE: it came more than a cycle after that, and only a frame
-    behind it shows whether it had waited. EARLY: it came before the line, so that frames before it
-    had waited. UNKNOWN: the line is not believed yet.
+    behind it shows whether it had waited. EARLY: it contradicts the clock: it came before the line,
+    or after a silence at a time that does not fit.
     """
 
     IN_TIME = "in_time"
     LATE = "late"
     EARLY = "early"
-    UNKNOWN = "unknown"
 
 
 # Looking up a member of an enum costs as much as the CRC of a frame.
-IN_TIME, LATE, EARLY, UNKNOWN = (
-    FrameTime.IN_TIME,
-    FrameTime.LATE,
-    FrameTime.EARLY,
-    FrameTime.UNKNOWN,
-)
+IN_TIME, LATE, EARLY = FrameTime.IN_TIME, FrameTime.LATE, FrameTime.EARLY
 
 Point = tuple[int, int]
 """Arrival in ns, and cycles of the sender's until then."""
@@ -92,8 +90,8 @@ class Line(Struct, frozen=True, gc=False):
         is_step_known: Whether blocks have shown the step.
         doubt: Blocks whose lowest arrival was far from where the line had it, less the others.
         is_clock: Whether the counter states times.
-        raised: Frames in a row that came late by the same time.
-        untrusted: Further frames in a row before the line is believed.
+        alike: Frames in a row off the line by the same time.
+        is_guess: Whether the number of cycles since the last frame on the line is a guess.
     """
 
     step_ns: int
@@ -103,8 +101,8 @@ class Line(Struct, frozen=True, gc=False):
     is_step_known: bool = False
     doubt: int = 0
     is_clock: bool = True
-    raised: int = 0
-    untrusted: int = 0
+    alike: int = 0
+    is_guess: bool = False
 
 
 class SenderClock(Struct, frozen=True, gc=False):
@@ -165,37 +163,32 @@ def compile_follower(cycle_ns: int) -> Follower:
 
 
 def _judge(clock: SenderClock, after: SenderClock, late_ns: int, cycle_ns: int) -> SenderClock:
-    """Clock at a frame that came early, or late, or before the line is believed."""
+    """Clock at a frame that is off the line, or behind one that was."""
     line, quarter_ns, cycles = clock.line, cycle_ns // 4, after.cycles - clock.cycles
+    is_on_line = -quarter_ns <= late_ns <= quarter_ns
     # After a silence the counter has gone round: the number of cycles is a guess of the arrival.
-    is_guess = cycles > _MOST_CYCLES
-    if late_ns < -quarter_ns or (is_guess and late_ns > quarter_ns):
-        line = replace(line, untrusted=TRUST, is_believed=False)
-        after = replace(after, line=line, due_ns=after.arrival_ns, timing=EARLY)
-        return _begin_again(after, is_unsteady=not clock.line.untrusted)
+    is_guess = line.is_guess or (cycles > _MOST_CYCLES and not is_on_line)
+    if is_on_line and not is_guess:
+        return replace(after, line=replace(line, alike=0, is_believed=line.is_clock))
     change_ns = after.arrival_ns - clock.arrival_ns - cycles * cycle_ns
-    is_raised = late_ns > quarter_ns and abs(change_ns) < cycle_ns // 8
-    # The first late frame is of the same wait as those that follow it.
-    raised = line.raised + 1 if is_raised else int(late_ns > quarter_ns)
-    untrusted = max(line.untrusted - 1, 0)
-    if raised >= TRUST:
-        return _begin_again(replace(after, due_ns=after.arrival_ns), is_unsteady=True)
-    timing = IN_TIME
-    if untrusted:
-        timing = UNKNOWN
-    elif late_ns > cycle_ns and change_ns > -quarter_ns:
-        timing = LATE
-    # A frame in time is to end what is counted of late ones: not a usual one until then.
-    line = replace(line, raised=raised, untrusted=untrusted, is_believed=not raised + untrusted)
-    return replace(after, line=line, timing=timing)
+    alike = line.alike + 1 if line.alike and abs(change_ns) < cycle_ns // 8 else 1
+    if alike >= (LATE_FRAMES if late_ns > 0 and not is_guess else _EARLY_FRAMES):
+        return _begin_again(after)
+    line = replace(line, alike=alike, is_guess=is_guess, is_believed=False)
+    if is_guess or late_ns < 0:
+        # It leaves the line where it is.
+        due_ns = after.arrival_ns - late_ns
+        return replace(after, due_ns=due_ns, lowest=clock.lowest, line=line, timing=EARLY)
+    is_late = late_ns > cycle_ns and change_ns > -quarter_ns
+    return replace(after, line=line, timing=LATE if is_late else IN_TIME)
 
 
-def _begin_again(clock: SenderClock, *, is_unsteady: bool) -> SenderClock:
+def _begin_again(clock: SenderClock) -> SenderClock:
     """Clock whose line goes through its last frame; the blocks before show nothing of it."""
-    line = replace(clock.line, before=(), raised=0, ends_at=clock.cycles + _BLOCK)
-    if is_unsteady:
-        line = _with_doubt(line, is_unsteady=True)
-    return replace(clock, lowest=(0, clock.arrival_ns, clock.cycles), wait_ns=0, line=line)
+    at, arrival_ns = clock.cycles, clock.arrival_ns
+    line = replace(clock.line, before=(), ends_at=at + _BLOCK, alike=0, is_guess=False)
+    line = _with_doubt(line, is_unsteady=True)
+    return replace(clock, due_ns=arrival_ns, lowest=(0, arrival_ns, at), wait_ns=0, line=line)
 
 
 def _end_block(clock: SenderClock, cycle_ns: int) -> SenderClock:
@@ -233,5 +226,5 @@ def _with_doubt(line: Line, *, is_unsteady: bool) -> Line:
     """Line that was as expected, or was not, in one more block."""
     doubt = min(line.doubt + 1, _MOST_DOUBT) if is_unsteady else max(line.doubt - 1, 0)
     is_clock = doubt < _UNSTEADY if line.is_clock else doubt == 0
-    is_believed = is_clock and not line.untrusted + line.raised
+    is_believed = is_clock and not line.alike
     return replace(line, doubt=doubt, is_clock=is_clock, is_believed=is_believed)

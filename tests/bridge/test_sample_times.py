@@ -40,7 +40,8 @@ def test_a_sender_that_does_not_wait_is_due_when_it_arrives(drift_ppm, cycle_ns)
 @given(st.lists(st.integers(0, 30 * MS), min_size=2, max_size=300))
 def test_no_sample_is_newer_than_its_frame(steps_ns):
     arrivals_ns = np.cumsum(steps_ns)
-    assert (dues(follow(arrivals_ns)) <= arrivals_ns).all()
+    used = [clock for clock in follow(arrivals_ns) if clock.timing is FrameTime.IN_TIME]
+    assert all(clock.due_ns <= clock.arrival_ns for clock in used)
 
 
 @pytest.mark.parametrize("drift_ppm", [-200.0, 0.0, 80.0, 5000.0])
@@ -74,8 +75,8 @@ def test_frames_that_are_held_back_keep_their_times(held):
 def test_a_queue_at_the_start_states_no_times():
     arrivals_ns = np.concatenate([np.full(200, 5 * MS), 6 * MS + np.arange(100) * MS])
     timings = [clock.timing for clock in follow(arrivals_ns)]
-    assert FrameTime.IN_TIME not in timings[1:207]
-    assert set(timings[210:]) == {FrameTime.IN_TIME}
+    assert FrameTime.IN_TIME not in timings[1:201]
+    assert set(timings[201:]) == {FrameTime.IN_TIME}
 
 
 def test_a_gap_beyond_the_counters_round():
@@ -87,9 +88,18 @@ def test_a_gap_beyond_the_counters_round():
     for number, arrival_ns in enumerate(arrivals_ns):
         clock = follower(clock, int(arrival_ns), 16 if number == 400 else 1)
         timings.append(clock.timing)
-    assert FrameTime.IN_TIME not in timings[400:421]
-    assert set(timings[430:]) == {FrameTime.IN_TIME}
+    assert FrameTime.IN_TIME not in timings[400:422]
+    assert set(timings[422:]) == {FrameTime.IN_TIME}
     assert clock.due_ns == arrivals_ns[-1]
+
+
+def test_a_first_frame_that_waited():
+    arrivals_ns = sampled_ns(100)
+    arrivals_ns[0] += MS * 2 // 3
+    clocks = follow(arrivals_ns)
+    assert [clock.timing for clock in clocks[1:3]] == [FrameTime.EARLY] * 2
+    assert {clock.timing for clock in clocks[3:]} == {FrameTime.IN_TIME}
+    assert dues(clocks)[3:].tolist() == arrivals_ns[3:].tolist()
 
 
 def test_a_sender_that_pauses_is_followed_again():
@@ -109,6 +119,17 @@ def test_a_sender_that_waits_between_frames_has_no_clock():
     is_arrival = dues(clocks)[1000:] == arrivals_ns[1000:]
     assert is_arrival.mean() > 0.8
     assert sum(clock.timing is not FrameTime.IN_TIME for clock in clocks[1000:]) < 20
+
+
+def test_a_frame_of_another_sender_leaves_the_clock_as_it_is():
+    follower, clock = compile_follower(MS), None
+    for number in range(100):
+        clock = follower(clock, number * MS, 1)
+    # One with a right CRC by chance, a third of a cycle later, and the two that it has refused.
+    clock = follower(clock, 99 * MS + MS // 3, 3)
+    assert clock.timing is FrameTime.EARLY
+    clock = follower(clock, 103 * MS, 1)
+    assert (clock.timing, clock.due_ns) == (FrameTime.IN_TIME, 103 * MS)
 
 
 def test_lost_frames_are_no_wait():

@@ -9,7 +9,7 @@ from can_dbc.codec import compile_decoder
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from rig.bridge.frame_checks import SECOND_SENDER_FRAMES
-from rig.bridge.sample_times import TRUST
+from rig.bridge.sample_times import LATE_FRAMES
 from rig.bridge.values import Mode
 from tests.faults.trial import (
     BEGIN_MS,
@@ -120,7 +120,7 @@ def test_delay(row, undisturbed_n):
     trial = Trial()
     ticks = trial.run(END_MS + 2000, after(BEGIN_NS, late))
     refused = ticks[-1].counts.untimed
-    assert 0 < refused < 2 * TRUST
+    assert 0 < refused < LATE_FRAMES
     settled = [tick for tick in ticks if tick.t_ns > BEGIN_NS + 100 * MS and tick.is_valid]
     # Three milliseconds of the bench's motion are not to be seen in frames that all come so.
     error_n = force_error_n(ticks, settled[0].t_ns)

