@@ -157,7 +157,9 @@ def compile_follower(cycle_ns: int) -> Follower:
             after = replace(after, due_ns=arrival_ns)
         elif not (line.is_believed and -quarter_ns <= late_ns <= quarter_ns):
             after = _judge(clock, after, late_ns, cycle_ns)
-        return after if at < after.line.ends_at else _end_block(after, cycle_ns)
+        if at < after.line.ends_at or after.timing is EARLY:
+            return after
+        return _end_block(after, cycle_ns)
 
     return follow
 
