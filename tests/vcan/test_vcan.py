@@ -215,7 +215,9 @@ def test_canplayers_bench_gives_the_same_steps(recorded, bridge, second_vcan, tm
     part.write_text("\n".join(bench) + "\n")
     with running(["canplayer", "-I", part, f"{second_vcan}=vcan0"]):
         ended = bridge(second_vcan, 30.0)
-    assert ended.state.counts.refused == ended.state.counts.lost == 0
+    counts = ended.state.counts
+    assert counts.refused == counts.untimed <= 4  # at the start, as above
+    assert counts.lost == 0
     first, second = read_run(run), read_run(ended.folder)
     assert_rate_was_kept(second)
     assert replay(ended.folder).different == 0
