@@ -181,8 +181,8 @@ def test_a_replay_is_the_same_bit_for_bit(recorded):
     ending = yaml.safe_load((run / "run.yaml").read_text())["ending"]
     print(f"overruns {ending['counts']['overruns']}, timing {ending['timing']}")
     assert again.logged == ending["ticks"]
-    # A first frame that waited while its process started, and the two that show it.
-    assert ending["counts"]["refused"] == ending["counts"]["untimed"] <= 4
+    # Where the sender's process waited for this machine's files, its clock is followed again.
+    assert ending["counts"]["refused"] == ending["counts"]["untimed"] <= 0.01 * ending["ticks"]
     assert ending["counts"]["lost"] == 0
     assert ending["ticks"] + ending["counts"]["overruns"] == RECORDED_S * RATE_HZ
 
@@ -216,7 +216,7 @@ def test_canplayers_bench_gives_the_same_steps(recorded, bridge, second_vcan, tm
     with running(["canplayer", "-I", part, f"{second_vcan}=vcan0"]):
         ended = bridge(second_vcan, 30.0)
     counts = ended.state.counts
-    assert counts.refused == counts.untimed <= 4  # at the start, as above
+    assert counts.refused == counts.untimed <= 0.01 * 30.0 * RATE_HZ
     assert counts.lost == 0
     first, second = read_run(run), read_run(ended.folder)
     assert_rate_was_kept(second)
