@@ -129,7 +129,7 @@ class SenderClock(Struct, frozen=True, gc=False):
 
 Follower = Callable[[SenderClock | None, int, int], SenderClock]
 """Clock at the last frame, arrival of the next one in ns, and cycles between them (one, and one for
-each frame that was lost) -> the clock at that frame. A sender that starts anew has none before."""
+each frame that was lost) -> the clock at that frame. A sender that starts again has none before."""
 
 
 def compile_follower(cycle_ns: int) -> Follower:
