@@ -1,6 +1,7 @@
 """Frames in, frames out: one tick of the bridge, without bus, clock or file."""
 
 from collections.abc import Sequence
+from functools import partial
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -24,11 +25,11 @@ from rig.observers.protocol import AnyObserver
 _NO_CONDITIONS = Conditions()
 _ALL_STANDARD = 0x7FF
 
+_NO_MODEL = (Mode.WAITING, Mode.SAFE)
+"""Modes in which no step has to be taken again: there is no model, or it stands still."""
 
 _FADING = 1.0 - 1.0 / 200.0
 """Of the share of missed ticks, at each tick."""
-
-_NO_MODEL = (Mode.WAITING, Mode.SAFE)
 
 _MOST_AT_ONCE = 20
 """Missed ticks of one pause that count: ages judge a single one, however long it is."""
@@ -163,7 +164,7 @@ class Bridge:
         sequences, memory = self._checks.init(t_ns)
         supervised = self._supervisor.init(t_ns)
         clocks = (None,) * len(self.incoming)
-        return BridgeState(supervised, sequences, memory, sendings, memory.counts, 0.0, clocks)
+        return BridgeState(supervised, sequences, memory, sendings, memory.counts, clocks=clocks)
 
     def take_over(self, state: BridgeState, before: "Bridge", t_ns: int) -> BridgeState:
         """State of a bridge that ran before; with other observers it has to settle again."""
@@ -267,15 +268,12 @@ class Bridge:
             for value, channel, delay_ns in incoming.deliveries:
                 samples.append(Sample(channel, values[value], due_ns - delay_ns))
         step = PastStep(last_ns, t_ns, before.estimator, tuple(samples))
+        if is_in_order and awaited == len(self._awaited):
+            return before, (step,), step.samples
+        awaited_ns = self._find_oldest_clock_ns(reception, last_ns)
         if is_in_order:
-            if awaited != len(self._awaited):
-                past = remember(past, step, self._find_oldest_clock_ns(reception, last_ns))
-            else:
-                past = (step,)
-            return before, past, step.samples
-        return self._receive_in_order(
-            before, past, step, self._find_oldest_clock_ns(reception, last_ns)
-        )
+            return before, remember(past, step, awaited_ns), step.samples
+        return self._receive_in_order(before, past, step, awaited_ns)
 
     def _find_oldest_clock_ns(self, reception: Reception, t_ns: int) -> int:
         """Time up to which no sample can come any more: each message has sent a newer one."""
@@ -287,10 +285,7 @@ class Bridge:
         self, supervised: SupervisedState, past: Past, step: PastStep, awaited_ns: int
     ) -> tuple[SupervisedState, Past, tuple[Sample, ...]]:
         """State before the last step of a tick with samples that belong to earlier ones."""
-
-        def due_ns(sample: Sample) -> int:
-            return arrival_ns(self._channels, sample)
-
+        due_ns = partial(arrival_ns, self._channels)
         samples = sorted(step.samples, key=due_ns)
         late = [item for item in samples if due_ns(item) <= step.since_ns] if past else []
         if late:

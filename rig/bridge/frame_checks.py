@@ -39,12 +39,7 @@ from rig.bridge.devices import (
     update_by_frame,
 )
 from rig.bridge.incoming_messages import Incoming, Values
-from rig.bridge.sample_times import (
-    IN_TIME,
-    LATE,
-    FrameTime,
-    SenderClock,
-)
+from rig.bridge.sample_times import IN_TIME, LATE, FrameTime, SenderClock
 from rig.bridge.supervision_limits import (
     Action,
     Excess,
@@ -56,6 +51,9 @@ from rig.bridge.supervision_limits import (
 
 # Looking up a member of an enum costs as much as the CRC of a frame.
 _OK, _FIRST, _NO_VALUE = FrameStatus.OK, FrameStatus.FIRST, FrameStatus.NO_VALUE
+
+_COUNTED = (_OK, _NO_VALUE)
+"""Status of a frame without values whose counter counts all the same."""
 
 SECOND_SENDER_FRAMES = 12
 """Frames out of sequence in close succession that only a second sender explains: a restarted sender
@@ -180,9 +178,8 @@ class FrameChecks:
                 if timing is not IN_TIME:
                     is_timed = False
             if values is not None and (checks := self._checks[index]):
-                if due_ns != frame.t_ns:
-                    frame = replace(frame, t_ns=due_ns)  # noqa: PLW2901
-                values = _pass(checks, reception, frame, values)
+                timed = frame if due_ns == frame.t_ns else replace(frame, t_ns=due_ns)
+                values = _pass(checks, reception, timed, values)
             if values is not None:
                 passed.append((incoming, values, due_ns, timing))
         return passed if is_timed else _drop_unclear(reception, passed)
@@ -242,10 +239,6 @@ class FrameChecks:
         if any(self._limits[target.strut] for target in incoming.heights):
             checks.append(_plausible(incoming, self._limits))
         return tuple(checks)
-
-
-_COUNTED = (_OK, _NO_VALUE)
-"""Status of a frame without values whose counter counts all the same."""
 
 
 def _drop_unclear(reception: Reception, passed: Sequence[Passed]) -> list[Passed]:

@@ -14,7 +14,7 @@ from can_dbc.frame import Frame
 from can_dbc.protection import FrameStatus, SequenceState, compile_checker
 from can_dbc.units import Dimension
 from rig.bridge.sample_times import Follower, compile_follower
-from rig.channels.channel import Channel, Role
+from rig.channels.channel import Channel, Role, ValidSignal
 from rig.channels.measured_quantities import APPLIED_FORCE
 
 Values = tuple[float, ...]
@@ -122,14 +122,14 @@ def compile_incoming(
     Raises:
         DatabaseError: A signal is missing, or its unit does not fit its quantity.
     """
-    required = [channel.valid for channel in channels if channel.valid is not None]
+    valid = [channel.valid for channel in channels if channel.valid is not None]
     # A load cell may be recorded and also be a further sensor: one value, two channels.
     signals = list(
         dict.fromkeys(
             [
                 *((channel.signal, channel.quantity.dimension) for channel in channels),
                 *((alarm.signal, Dimension.NUMBER) for alarm in alarms),
-                *((item.signal, Dimension.NUMBER) for item in required),
+                *((item.signal, Dimension.NUMBER) for item in valid),
             ]
         )
     )
@@ -148,14 +148,9 @@ def compile_incoming(
         if channel.role is Role.HEIGHT
     ]
     read = _compile_reader(message, decode)
-    are_values = _check_of_values(message, signals)
-    if are_values is not None:
-        read = _with_check(read, are_values)
-    if required:
-        expected = {signals.index((item.signal, Dimension.NUMBER)): item.value for item in required}
-        read = _with_check(
-            read, lambda values: all(values[index] == expected[index] for index in expected)
-        )
+    for check in (_check_of_values(message, signals), _check_of_validity(valid, signals)):
+        if check is not None:
+            read = _with_check(read, check)
     return Incoming(
         message,
         read,
@@ -168,14 +163,14 @@ def compile_incoming(
         device,
         sum({1 << height.strut for height in heights}),
         1 << heights[0].strut if heights else 0,
-        compile_follower(message.cycle_time_ns or 0) if has_clock(message) and channels else None,
+        compile_follower(cycle_ns) if channels and (cycle_ns := clock_cycle_ns(message)) else None,
         any(_bears_estimate(channel) for channel in channels),
     )
 
 
-def has_clock(message: Message) -> bool:
-    """Whether counter and cycle time of a message state when its values were sampled."""
-    return message.protection is not None and bool(message.cycle_time_ns)
+def clock_cycle_ns(message: Message) -> int:
+    """Cycle time of a message whose counter states when its values were sampled, else 0."""
+    return 0 if message.protection is None else message.cycle_time_ns or 0
 
 
 def _bears_estimate(channel: Channel) -> bool:
@@ -202,6 +197,16 @@ def _check_of_values(message: Message, signals: Sequence[tuple[str, Dimension]])
     if any(message.signal(name).is_float for name, _ in signals):
         return lambda values: all(map(isfinite, values))
     return None
+
+
+def _check_of_validity(
+    valid: Sequence[ValidSignal], signals: Sequence[tuple[str, Dimension]]
+) -> _Check | None:
+    """Check that the sensors say that they measure; None where none says so."""
+    expected = [(signals.index((item.signal, Dimension.NUMBER)), item.value) for item in valid]
+    if not expected:
+        return None
+    return lambda values: all(values[index] == value for index, value in expected)
 
 
 def _with_check(read: Reader, are_values: _Check) -> Reader:

@@ -10,6 +10,7 @@ Reference: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Trackin
 """
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 
 from msgspec import Struct
 
@@ -79,10 +80,7 @@ def use_late_samples(
 
     None of the samples is older than the first step.
     """
-
-    def due_ns(sample: Sample) -> int:
-        return arrival_ns(channels, sample)
-
+    due_ns = partial(arrival_ns, channels)
     first_ns = min(map(due_ns, late))
     first = next(i for i, step in enumerate(past) if step.t_ns >= first_ns)
     state, taken = past[first].estimator, list(past[:first])

@@ -151,11 +151,12 @@ def compile_follower(cycle_ns: int) -> Follower:
             if late_ns < lowest[0]:
                 lowest = (late_ns, arrival_ns, at)
         after = SenderClock(arrival_ns, due_ns, at, lowest, wait_ns, line)
-        if at < line.ends_at and line.is_believed and -quarter_ns <= late_ns <= quarter_ns:
+        is_usual = line.is_believed and -quarter_ns <= late_ns <= quarter_ns
+        if is_usual and at < line.ends_at:
             return after
         if not line.is_clock:
             after = replace(after, due_ns=arrival_ns)
-        elif not (line.is_believed and -quarter_ns <= late_ns <= quarter_ns):
+        elif not is_usual:
             after = _judge(clock, after, late_ns, cycle_ns)
         if at < after.line.ends_at or after.timing is EARLY:
             return after

@@ -9,7 +9,7 @@ from can_dbc.codec import si_step
 from can_dbc.database import Message
 from dart_model.protocol import AnyPlant
 from dart_model.spec import InlineSkeleton
-from rig.bridge.incoming_messages import has_clock
+from rig.bridge.incoming_messages import clock_cycle_ns
 from rig.bridge.published_quantities import FORCE, VALID
 from rig.bridge.supervision_limits import Limit
 from rig.channels.channel import Channel
@@ -158,7 +158,7 @@ def _weight_n(plan: Plan) -> float | None:
 def _sample_times(message: Message) -> Finding:
     """Where the times of a message's samples come from."""
     text = "when their frames arrive: expected a protected counter and a cycle time in the DBC"
-    if has_clock(message):
+    if clock_cycle_ns(message):
         text = "by counter and cycle time, whatever the frames wait on their way"
     return Finding(Severity.OK, f"sample times of {message.name}", text)
 

@@ -6,26 +6,9 @@ from msgspec.structs import replace
 
 from rig.bridge.values import Mode
 from rig.observers.kalman import KalmanObserver
-from tests.faults.trial import BEGIN_MS, BEGIN_NS, MS, Trial, after
+from tests.faults.trial import BEGIN_MS, BEGIN_NS, MS, Gateway, Trial, after
 
 END_MS = BEGIN_MS + 1000
-
-
-class Gateway:
-    """Holds all frames back for some ticks, every so often; they are stamped when they come out."""
-
-    def __init__(self, held: int, every: int, apart: int = 0) -> None:
-        self._held, self._every, self._apart_ns = held, every, apart
-        self._kept: list = []
-        self.is_holding = False
-
-    def __call__(self, t_ns, frames):
-        self._kept += frames
-        self.is_holding = (t_ns // MS) % self._every < self._held
-        if self.is_holding:
-            return []
-        kept, self._kept = self._kept, []
-        return [replace(frame, t_ns=t_ns) for frame in kept]
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from tests.faults.trial import (
     BEGIN_NS,
     MEASUREMENT,
     MS,
+    Gateway,
     Trial,
     after,
     first_ms,
@@ -137,17 +138,7 @@ def test_delay(row, undisturbed_n):
 
 
 def test_held_back(row, undisturbed_n):
-    held = []
-
-    def gateway(t_ns, frames):
-        held.extend(frames)
-        if t_ns // MS % 250 < 8:
-            return []
-        arriving = [replace(frame, t_ns=t_ns) for frame in held]
-        held.clear()
-        return arriving
-
-    ticks = Trial().run(END_MS, after(BEGIN_NS, gateway))
+    ticks = Trial().run(END_MS, after(BEGIN_NS, Gateway(8, 250)))
     assert ticks[-1].counts.untimed == ticks[-1].counts.lost == 0
     error_n = force_error_n(ticks)
     assert error_n == pytest.approx(undisturbed_n, rel=0.05)

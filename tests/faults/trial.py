@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
 from can_dbc.frame import Frame
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
@@ -127,6 +128,23 @@ def measurements_only(change: Callable[[Frame], list[Frame]]) -> Inject:
         return arriving
 
     return inject
+
+
+class Gateway:
+    """Holds all frames back for some ticks, every so often; they are stamped when they come out."""
+
+    def __init__(self, held: int, every: int) -> None:
+        self._held, self._every = held, every
+        self._kept: list[Frame] = []
+        self.is_holding = False
+
+    def __call__(self, t_ns: int, frames: list[Frame]) -> list[Frame]:
+        self._kept += frames
+        self.is_holding = (t_ns // MS) % self._every < self._held
+        if self.is_holding:
+            return []
+        kept, self._kept = self._kept, []
+        return [replace(frame, t_ns=t_ns) for frame in kept]
 
 
 def first_ms(ticks: list[Tick], when: Callable[[Tick], bool], begin_ns: int = BEGIN_NS) -> float:
