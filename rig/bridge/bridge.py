@@ -9,16 +9,18 @@ from msgspec.structs import replace
 from can_dbc.addressing import Directory, Filter
 from can_dbc.frame import Frame
 from can_dbc.protection import SequenceState
+from rig.bridge.arming import Arming
 from rig.bridge.counts import Conditions, Counts, Report, count_tick
 from rig.bridge.devices import CLAIM, CLAIM_MASK, Device, faults
 from rig.bridge.frame_checks import CheckMemory, FrameChecks, Reception
 from rig.bridge.incoming_messages import Incoming
 from rig.bridge.late_samples import Past, PastStep, arrival_ns, remember, steps_of, use_late_samples
 from rig.bridge.mode_supervisor import NO_REPORTS, Reports, SupervisedState, Supervision, Supervisor
+from rig.bridge.operation import NOT_OPERATED, Operation, OperationState
 from rig.bridge.outgoing_messages import Outgoing
 from rig.bridge.sample_times import SenderClock
 from rig.bridge.supervision_limits import LimitsByStrut
-from rig.bridge.values import Mode, StepInput, StepOutput, StrutOutput
+from rig.bridge.values import Mode, Request, StepInput, StepOutput, StrutOutput
 from rig.channels.channel import Channel, Sample
 from rig.observers.protocol import AnyObserver
 
@@ -62,6 +64,7 @@ class BridgeState(Struct, frozen=True, gc=False):
         missed_share: Share of missed ticks, over the last few hundred.
         clocks: Clock of each incoming message's sender; None before its first frame.
         past: Steps that late samples may belong to.
+        operation: State of arming and ramps.
     """
 
     supervised: SupervisedState
@@ -72,6 +75,7 @@ class BridgeState(Struct, frozen=True, gc=False):
     missed_share: float = 0.0
     clocks: tuple[SenderClock | None, ...] = ()
     past: Past = ()
+    operation: OperationState = NOT_OPERATED
 
     @property
     def counts(self) -> Counts:
@@ -115,6 +119,9 @@ class Bridge:
         limits: LimitsByStrut,
     ) -> None:
         self._supervisor = supervisor
+        settings = supervisor.settings
+        arming = Arming(settings.arming, channels, settings.safe_after_ns)
+        self._operation = Operation(arming, settings.fade_in_s, settings.slew_n_per_s)
         self._channels = tuple(channels)
         self._outgoing = tuple(outgoing)
         self._devices = tuple(devices)
@@ -164,7 +171,16 @@ class Bridge:
         sequences, memory = self._checks.init(t_ns)
         supervised = self._supervisor.init(t_ns)
         clocks = (None,) * len(self.incoming)
-        return BridgeState(supervised, sequences, memory, sendings, memory.counts, clocks=clocks)
+        operation = OperationState(t_ns)
+        return BridgeState(
+            supervised,
+            sequences,
+            memory,
+            sendings,
+            memory.counts,
+            clocks=clocks,
+            operation=operation,
+        )
 
     def take_over(self, state: BridgeState, before: "Bridge", t_ns: int) -> BridgeState:
         """State of a bridge that ran before; with other observers it has to settle again."""
@@ -179,10 +195,21 @@ class Bridge:
     ) -> tuple[BridgeState, list[Frame]]:
         """State and frames at the end of a run: every message once, with the safe output."""
         due = tuple(Sending(item.number, t_ns) for item in state.sendings)
-        state = replace(state, sendings=due)
         output = self._supervisor.end(state.supervised)
+        safe_n = self._supervisor.safe_forces_n(state.supervised)
+        operation, output = self._operation.publish(state.operation, t_ns, output, safe_n)
+        state = replace(state, sendings=due, operation=operation)
         sent = self._send(state, t_ns, output, state.counts, conditions)
         return replace(state, sendings=sent[0]), sent[1]
+
+    def is_at_rest(self, state: BridgeState) -> bool:
+        """Whether the published force has arrived at the safe output; at the end of a run."""
+        safe_n = self._supervisor.safe_forces_n(state.supervised)
+        return self._operation.is_at_rest(state.operation, safe_n)
+
+    def stop_ramp(self, state: BridgeState) -> BridgeState:
+        """State whose next output is the safe one, wherever a ramp has come."""
+        return replace(state, operation=replace(state.operation, published_n=()))
 
     def tick(
         self,
@@ -194,7 +221,7 @@ class Bridge:
         """State after a tick, and what it did; frames of other ids are passed over."""
         reception = Reception(state.sequences, state.clocks, state.memory)
         supervised, past, samples = self._receive(state, reception, t_ns, frames)
-        step_input = StepInput(t_ns, samples, conditions.acknowledged)
+        step_input = StepInput(t_ns, samples, conditions.request)
         memory, reports = reception.memory, NO_REPORTS
         wrong: tuple[tuple[int, str], ...] = ()
         if self._devices:
@@ -203,7 +230,16 @@ class Bridge:
         if wrong or reception.action or share or conditions.overruns or conditions.log_fault:
             share = _share_of_overruns(share, conditions.overruns)
             reports = self._reports(state, t_ns, reception, conditions, share, wrong)
+        operation, is_operated = state.operation, self._operation.is_used
+        if is_operated:
+            if step_input.request is Request.ACKNOWLEDGE and not self.is_at_rest(state):
+                step_input = replace(step_input, request=None)
+            operation = self._operation.update(operation, step_input, supervised.mode)
+            reports = self._with_permission(reports, operation, t_ns)
         supervised, output, action = self._supervisor.step(supervised, step_input, reports)
+        if is_operated:
+            safe_n = self._supervisor.safe_forces_n(supervised)
+            operation, output = self._operation.publish(operation, t_ns, output, safe_n)
         counts = count_tick(memory.counts, output, action, conditions, len(wrong))
         sent = self._send(state, t_ns, output, counts, conditions)
         sendings, sent_frames, counts, reported = sent
@@ -218,6 +254,7 @@ class Bridge:
             share,
             tuple(reception.clocks),
             () if supervised.mode in _NO_MODEL else past,
+            operation,
         )
         return after, TickResult(sent_frames, step_input, output, counts, wrong)
 
@@ -232,15 +269,24 @@ class Bridge:
     ) -> Reports:
         """What the supervisor is given of a tick that is not as it should be."""
         vital = [index for index, _ in wrong if self._devices[index].is_vital]
+        settings = self._supervisor.settings
         reports = Reports(
             reception.action,
             reception.excess,
             t_ns - state.supervised.t_ns if conditions.overruns else 0,
-            missed_share if missed_share > self._supervisor.overload_share else 0.0,
+            missed_share if missed_share > settings.overload_share else 0.0,
             vital[0] if vital else -1,
-            conditions.log_fault and self._supervisor.requires_log,
+            conditions.log_fault and settings.log_fault == "safe",
         )
         return NO_REPORTS if reports == NO_REPORTS else reports
+
+    def _with_permission(self, reports: Reports, operation: OperationState, t_ns: int) -> Reports:
+        """Reports with whether an estimate may be valid."""
+        is_withheld = self._operation.is_withheld(operation, t_ns)
+        interlock = self._operation.find_open_interlock(operation, t_ns)
+        if not is_withheld and interlock is None:
+            return reports
+        return replace(reports, is_withheld=is_withheld, open_interlock=interlock)
 
     def _receive(
         self, state: BridgeState, reception: Reception, t_ns: int, frames: Sequence[Frame]
@@ -273,7 +319,10 @@ class Bridge:
         awaited_ns = self._find_oldest_clock_ns(reception, last_ns)
         if is_in_order:
             return before, remember(past, step, awaited_ns), step.samples
-        return self._receive_in_order(before, past, step, awaited_ns)
+        reports = NO_REPORTS
+        if self._operation.is_used:
+            reports = self._with_permission(reports, state.operation, last_ns)
+        return self._receive_in_order(before, past, step, awaited_ns, reports)
 
     def _find_oldest_clock_ns(self, reception: Reception, t_ns: int) -> int:
         """Time up to which no sample can come any more: each message has sent a newer one."""
@@ -282,9 +331,17 @@ class Bridge:
         return min(times_ns) if len(times_ns) == len(self._awaited) > 0 else t_ns
 
     def _receive_in_order(
-        self, supervised: SupervisedState, past: Past, step: PastStep, awaited_ns: int
+        self,
+        supervised: SupervisedState,
+        past: Past,
+        step: PastStep,
+        awaited_ns: int,
+        reports: Reports,
     ) -> tuple[SupervisedState, Past, tuple[Sample, ...]]:
-        """State before the last step of a tick with samples that belong to earlier ones."""
+        """State before the last step of a tick with samples that belong to earlier ones.
+
+        `reports` are those of the steps that a late tick missed.
+        """
         due_ns = partial(arrival_ns, self._channels)
         samples = sorted(step.samples, key=due_ns)
         late = [item for item in samples if due_ns(item) <= step.since_ns] if past else []
@@ -292,13 +349,15 @@ class Bridge:
             estimator = self._supervisor.estimator
             after, past = use_late_samples(estimator, self._channels, past, late)
             supervised = replace(supervised, estimator=after)
-            samples = samples[len(late) :]
+            # A switch has no past: what it reports counts from now on.
+            switches = [item for item in late if item.channel in self._operation.switches]
+            samples = [*switches, *samples[len(late) :]]
         step = PastStep(step.since_ns, step.t_ns, supervised.estimator, tuple(samples))
         last_valid = supervised.last_valid
         *missed, last = steps_of(self._channels, samples, step.t_ns, step.since_ns)
         for step_input in missed:
             # Nothing of this step is published.
-            supervised, _, _ = self._supervisor.step(supervised, step_input)
+            supervised, _, _ = self._supervisor.step(supervised, step_input, reports)
             supervised = replace(supervised, last_valid=last_valid)
         return supervised, remember(past, step, awaited_ns), last.samples
 
@@ -316,7 +375,7 @@ class Bridge:
         if not sendings:
             return sendings, frames, counts, reported
         if not output.struts:
-            output = StepOutput(output.mode, self._nothing)
+            output = replace(output, struts=self._nothing)
         after = list(sendings)
         for index, item in enumerate(self._outgoing):
             sending = sendings[index]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from msgspec import Struct
 
-from rig.bridge.values import Mode, StepOutput
+from rig.bridge.values import Mode, Request, StepOutput
 
 
 class Counts(NamedTuple):
@@ -97,14 +97,14 @@ class Conditions(NamedTuple):
 
     Attributes:
         overruns: Ticks missed since the last one.
-        acknowledged: The user acknowledged the safe state.
+        request: What an operator requests; None for nothing.
         bus_fault: The bus could not be read or written.
         log_fault: The log could not be written.
         timing: Timing figures, for the bus; nothing else depends on them.
     """
 
     overruns: int = 0
-    acknowledged: bool = False
+    request: Request | None = None
     bus_fault: bool = False
     log_fault: bool = False
     timing: TimingFigures = NO_TIMING

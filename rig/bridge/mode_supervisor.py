@@ -2,7 +2,7 @@
 
 What may change it is an event: the age of the measurements, a model that diverged, a limit, a
 device, the user. A tick may show several; they are applied one after the other: age, overload,
-divergence, limits, devices, log. What is published follows from the mode.
+divergence, limits, devices, log, interlock. What is published follows from the mode.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -15,19 +15,23 @@ from msgspec.structs import replace
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.yaml_file import NotNegative, Positive
+from rig.bridge.arming import ArmingKind, OpenInterlock
 from rig.bridge.estimator import AnyEstimator, Estimate
 from rig.bridge.measurement_age import is_too_old
 from rig.bridge.supervision_limits import (
     RANGED,
     Action,
+    Delay,
     Excess,
     Limit,
     LimitsByStrut,
     find_excess,
     range_of_estimate,
+    update_delays,
     worst_action,
+    worst_delayed_action,
 )
-from rig.bridge.values import Divergence, Mode, StepInput, StepOutput, StrutOutput
+from rig.bridge.values import Divergence, Mode, Request, StepInput, StepOutput, StrutOutput
 
 
 class Event(Enum):
@@ -42,41 +46,47 @@ class Event(Enum):
     DIVERGED = "diverged"
     SETTLED = "settled"
     UNSETTLED = "unsettled"
+    WITHHELD = "withheld"
     BEYOND_HOLD = "beyond_hold"
     BEYOND_SAFE = "beyond_safe"
     DEVICE_FAULT = "device_fault"
     LOG_LOST = "log_lost"
+    INTERLOCK_OPEN = "interlock_open"
 
+
+_LOSSES = {
+    Event.STALE: Mode.HOLD,
+    Event.TIMEOUT: Mode.SAFE,
+    Event.TICKS_MISSING: Mode.SAFE,
+    Event.OVERLOADED: Mode.HOLD,
+    Event.DIVERGED: Mode.SAFE,
+    Event.BEYOND_HOLD: Mode.HOLD,
+    Event.BEYOND_SAFE: Mode.SAFE,
+    Event.DEVICE_FAULT: Mode.HOLD,
+    Event.LOG_LOST: Mode.SAFE,
+    Event.INTERLOCK_OPEN: Mode.SAFE,
+}
+"""Event -> next mode, wherever the model follows the bench."""
+
+CAUSE_NUMBERS = {event: number for number, event in enumerate(_LOSSES, start=1)}
+"""What an estimate is lost to -> its number on the bus."""
 
 TRANSITIONS: dict[tuple[Mode, Event], Mode] = {
     (Mode.WAITING, Event.FRESH): Mode.SETTLING,
     (Mode.SETTLING, Event.SETTLED): Mode.RUNNING,
-    (Mode.SETTLING, Event.STALE): Mode.HOLD,
-    (Mode.SETTLING, Event.TIMEOUT): Mode.SAFE,
-    (Mode.SETTLING, Event.TICKS_MISSING): Mode.SAFE,
-    (Mode.SETTLING, Event.OVERLOADED): Mode.HOLD,
-    (Mode.SETTLING, Event.DIVERGED): Mode.SAFE,
-    (Mode.SETTLING, Event.BEYOND_HOLD): Mode.HOLD,
-    (Mode.SETTLING, Event.BEYOND_SAFE): Mode.SAFE,
-    (Mode.SETTLING, Event.DEVICE_FAULT): Mode.HOLD,
-    (Mode.SETTLING, Event.LOG_LOST): Mode.SAFE,
+    (Mode.SETTLING, Event.WITHHELD): Mode.READY,
+    (Mode.READY, Event.SETTLED): Mode.RUNNING,
+    (Mode.READY, Event.UNSETTLED): Mode.SETTLING,
+    (Mode.RUNNING, Event.WITHHELD): Mode.READY,
     (Mode.RUNNING, Event.UNSETTLED): Mode.SETTLING,
-    (Mode.RUNNING, Event.STALE): Mode.HOLD,
-    (Mode.RUNNING, Event.TIMEOUT): Mode.SAFE,
-    (Mode.RUNNING, Event.TICKS_MISSING): Mode.SAFE,
-    (Mode.RUNNING, Event.OVERLOADED): Mode.HOLD,
-    (Mode.RUNNING, Event.DIVERGED): Mode.SAFE,
-    (Mode.RUNNING, Event.BEYOND_HOLD): Mode.HOLD,
-    (Mode.RUNNING, Event.BEYOND_SAFE): Mode.SAFE,
-    (Mode.RUNNING, Event.DEVICE_FAULT): Mode.HOLD,
-    (Mode.RUNNING, Event.LOG_LOST): Mode.SAFE,
     (Mode.HOLD, Event.FRESH): Mode.SETTLING,
-    (Mode.HOLD, Event.TIMEOUT): Mode.SAFE,
-    (Mode.HOLD, Event.TICKS_MISSING): Mode.SAFE,
-    (Mode.HOLD, Event.DIVERGED): Mode.SAFE,
-    (Mode.HOLD, Event.BEYOND_SAFE): Mode.SAFE,
-    (Mode.HOLD, Event.LOG_LOST): Mode.SAFE,
     (Mode.SAFE, Event.ACKNOWLEDGED): Mode.WAITING,
+    **{
+        (mode, event): after
+        for event, after in _LOSSES.items()
+        for mode in (Mode.SETTLING, Mode.READY, Mode.RUNNING, Mode.HOLD)
+        if after is not mode
+    },
 }
 """Mode and event -> next mode; a pair that is not listed changes nothing."""
 
@@ -87,7 +97,7 @@ def next_mode(mode: Mode, event: Event) -> Mode:
 
 
 class Supervision(BaseModel):
-    """Ages of the measurement, the output of the safe state, and the table of limits.
+    """Ages of the measurement, arming, ramps, the output of the safe state, the table of limits.
 
     Attributes:
         stale_after_s: Age of a height from which the estimate is marked invalid.
@@ -98,6 +108,13 @@ class Supervision(BaseModel):
             settles with it.
         overload_share: Share of missed ticks, over the last few hundred, from which the estimate is
             marked invalid.
+        arming: `automatic`: an estimate is valid as soon as it has settled. `manual`: an operator
+            has to arm the bridge first, after each start and each safe state.
+        fade_in_s: Time in which the published force fades in, from the safe output to the
+            estimate, before it is valid.
+        slew_n_per_s: Rate at which a published force that is no longer valid moves to the safe
+            output. With neither of the two it is that of the model in HOLD, and in SAFE at once
+            the safe output.
         log_fault: What follows when the log cannot be written: `continue`, or the `safe` state.
         safe_output: Force that the safe state publishes: `zero`, or the `last` valid one.
         limits: What is done beyond which values, row by row. Where none stands for a value, the
@@ -110,6 +127,9 @@ class Supervision(BaseModel):
     safe_after_s: Positive = 0.5
     settling_s: NotNegative | None = None
     overload_share: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
+    arming: ArmingKind = "automatic"
+    fade_in_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
+    slew_n_per_s: Positive | None = None
     log_fault: Literal["continue", "safe"] = "continue"
     safe_output: Literal["zero", "last"] = "zero"
     limits: Annotated[tuple[Limit, ...], Field(max_length=100)] = ()
@@ -167,6 +187,7 @@ class SupervisedState(Struct, frozen=True, gc=False):
         measured_ns: Time of the measurements that the last estimate rests on.
         cause: Why the mode is what it is.
         first_cause: Why the estimate was last lost; None while the bridge is running.
+        delays: State of the limits that are passed only after a time.
     """
 
     t_ns: int
@@ -178,6 +199,7 @@ class SupervisedState(Struct, frozen=True, gc=False):
     measured_ns: int = 0
     cause: Cause | None = None
     first_cause: Cause | None = None
+    delays: tuple[Delay, ...] = ()
 
 
 class Reports(Struct, frozen=True, gc=False):
@@ -190,6 +212,8 @@ class Reports(Struct, frozen=True, gc=False):
         missed_share: Share of missed ticks, if it is too large, else 0.
         faulty_device: Index of a device at fault that the estimate rests on; -1 if there is none.
         is_log_lost: Whether the log cannot be written, and the run requires it.
+        is_withheld: Whether an estimate may not be valid yet, although it has settled.
+        open_interlock: Why the interlock counts as open; None if it does not.
     """
 
     action: int = 0
@@ -198,6 +222,8 @@ class Reports(Struct, frozen=True, gc=False):
     missed_share: float = 0.0
     faulty_device: int = -1
     is_log_lost: bool = False
+    is_withheld: bool = False
+    open_interlock: OpenInterlock | None = None
 
 
 NO_REPORTS = Reports()
@@ -220,12 +246,13 @@ class Supervisor:
         self, estimator: AnyEstimator, settings: Supervision, limits: LimitsByStrut
     ) -> None:
         self.estimator = estimator
-        self.overload_share = settings.overload_share
-        self.requires_log = settings.log_fault == "safe"
-        self._settings = settings
+        self.settings = settings
         self._stale_after_ns = settings.stale_after_ns
         self._safe_after_ns = settings.safe_after_ns
-        self._limits = [[row for row in rows if not row.value.is_measured] for rows in limits]
+        estimates = [[row for row in rows if not row.value.is_measured] for rows in limits]
+        self._rows = estimates
+        self._limits = [[row for row in rows if not row.for_s] for rows in estimates]
+        self._delayed = [(i, row) for i, rows in enumerate(estimates) for row in rows if row.for_s]
         # By bound, then by strut.
         self._ranges = list(zip(*map(range_of_estimate, self._limits), strict=True))
         self._is_limited = any(self._limits)
@@ -257,12 +284,17 @@ class Supervisor:
                     is_beyond = True
             if is_beyond:
                 action = max(action, *map(worst_action, self._limits, struts))
+        if self._delayed:
+            delays = update_delays(self._delayed, state.delays, struts, t_ns)
+            state = replace(state, delays=delays)
+            action = max(action, worst_delayed_action(self._delayed, delays))
         is_calm = (
             mode is _RUNNING
             and estimate.is_settled
             and estimate.diverged < 0
             and not action
             and reports is NO_REPORTS
+            and not self._delayed
             and t_ns - measured_ns <= self._stale_after_ns
         )
         if is_calm:
@@ -304,7 +336,8 @@ class Supervisor:
             last_valid=struts if is_running else state.last_valid,
             measured_ns=estimate.measured_ns,
         )
-        return state, StepOutput(state.mode, struts, estimate.left_out)
+        first_cause = _number_of(state.first_cause)
+        return state, StepOutput(state.mode, struts, estimate.left_out, first_cause)
 
     def _causes(
         self, t_ns: int, estimate: Estimate, action: int, reports: Reports
@@ -313,15 +346,18 @@ class Supervisor:
         yield from self._missing_ticks(reports)
         yield self._age(estimate.measured_ns, t_ns)
         if reports.missed_share:
-            limit = self._settings.overload_share
+            limit = self.settings.overload_share
             yield Cause(Event.OVERLOADED, -1, "missed_share", reports.missed_share, limit)
         if estimate.diverged >= 0:
             yield Cause(Event.DIVERGED, estimate.diverged)
-        yield Cause(Event.SETTLED if estimate.is_settled else Event.UNSETTLED)
+        if estimate.is_settled:
+            yield Cause(Event.WITHHELD if reports.is_withheld else Event.SETTLED)
+        else:
+            yield Cause(Event.UNSETTLED)
         if action >= Action.HOLD:
             excess = reports.excess
             if action > reports.action:
-                excess = find_excess(self._limits, estimate.struts, action)
+                excess = find_excess(self._rows, estimate.struts, action)
             yield _beyond(action, excess)
         yield from _surroundings(reports)
 
@@ -335,9 +371,9 @@ class Supervisor:
         """What the age of the oldest measurement means."""
         age_s = (t_ns - measured_ns) * 1e-9
         if is_too_old(measured_ns, t_ns, self._safe_after_ns):
-            return Cause(Event.TIMEOUT, -1, "age_s", age_s, self._settings.safe_after_s)
+            return Cause(Event.TIMEOUT, -1, "age_s", age_s, self.settings.safe_after_s)
         if is_too_old(measured_ns, t_ns, self._stale_after_ns):
-            return Cause(Event.STALE, -1, "age_s", age_s, self._settings.stale_after_s)
+            return Cause(Event.STALE, -1, "age_s", age_s, self.settings.stale_after_s)
         return Cause(Event.FRESH)
 
     def _wait(
@@ -358,7 +394,7 @@ class Supervisor:
                 return self._stop(state, t_ns, estimator)
         after = replace(state, t_ns=t_ns, estimator=estimator)
         struts = () if state.mode is Mode.WAITING else _as_invalid(state.last_valid)
-        return after, StepOutput(state.mode, struts)
+        return after, StepOutput(state.mode, struts, (), _number_of(state.first_cause))
 
     def _stand(
         self, state: SupervisedState, step_input: StepInput, reports: Reports
@@ -366,7 +402,7 @@ class Supervisor:
         """State and output of the safe state, which an acknowledgement leaves.
 
         It does so only when what has led there is over: the model could start from fresh
-        measurements, and neither a limit on them nor a device nor the log is in the way.
+        measurements, and neither a limit on them nor a device, log or interlock is in the way.
         """
         estimator, can_start = self.estimator.collect(state.estimator, step_input)
         state = replace(state, t_ns=step_input.t_ns, estimator=estimator)
@@ -375,11 +411,12 @@ class Supervisor:
             and reports.action < Action.HOLD
             and reports.faulty_device < 0
             and not reports.is_log_lost
+            and reports.open_interlock is None
         )
-        if not (step_input.acknowledged and is_over):
+        if not (step_input.request is Request.ACKNOWLEDGE and is_over):
             return state, self._safe_output(state)
         state, _ = _apply(replace(state, stopped_m=()), (Cause(Event.ACKNOWLEDGED),))
-        return state, StepOutput(state.mode, ())
+        return state, StepOutput(state.mode, (), (), _number_of(state.first_cause))
 
     def _stop(
         self, state: SupervisedState, t_ns: int, estimator: object
@@ -400,14 +437,18 @@ class Supervisor:
 
     def _safe_output(self, state: SupervisedState) -> StepOutput:
         """The defined output of the safe state: the model stands still."""
-        forces = [0.0] * len(state.stopped_m)
-        if self._settings.safe_output == "last" and state.last_valid and forces:
-            forces = [strut.force_n for strut in state.last_valid]
+        forces = self.safe_forces_n(state)
         struts = tuple(
             StrutOutput(force_n, 0.0, False, height_m, 0.0, 0.0, 0.0)
-            for force_n, height_m in zip(forces, state.stopped_m, strict=True)
+            for force_n, height_m in zip(forces, state.stopped_m, strict=False)
         )
-        return StepOutput(state.mode, struts)
+        return StepOutput(state.mode, struts, (), _number_of(state.first_cause))
+
+    def safe_forces_n(self, state: SupervisedState) -> Sequence[float]:
+        """Force of each strut that the safe state publishes."""
+        if self.settings.safe_output == "last" and state.last_valid:
+            return [strut.force_n for strut in state.last_valid]
+        return [0.0] * self.estimator.struts
 
 
 def _apply(state: SupervisedState, causes: Iterable[Cause]) -> tuple[SupervisedState, Cause | None]:
@@ -434,11 +475,14 @@ def _apply(state: SupervisedState, causes: Iterable[Cause]) -> tuple[SupervisedS
 
 
 def _surroundings(reports: Reports) -> Iterator[Cause]:
-    """What devices and log show."""
+    """What devices, log and interlock show."""
     if reports.faulty_device >= 0:
         yield Cause(Event.DEVICE_FAULT, device=reports.faulty_device)
     if reports.is_log_lost:
         yield Cause(Event.LOG_LOST)
+    interlock = reports.open_interlock
+    if interlock is not None:
+        yield Cause(Event.INTERLOCK_OPEN, -1, interlock.quantity, interlock.value, interlock.limit)
 
 
 def _beyond(action: int, excess: Excess | None) -> Cause:
@@ -447,6 +491,11 @@ def _beyond(action: int, excess: Excess | None) -> Cause:
     if excess is None:
         return Cause(event)
     return Cause(event, excess.strut, excess.value.value, excess.number, excess.bound)
+
+
+def _number_of(cause: Cause | None) -> int:
+    """Number of a cause on the bus; 0 for none."""
+    return 0 if cause is None else CAUSE_NUMBERS[cause.event]
 
 
 def _as_invalid(struts: Sequence[StrutOutput]) -> tuple[StrutOutput, ...]:

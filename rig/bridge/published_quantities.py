@@ -97,7 +97,7 @@ def _is_bus_faulty(report: Report) -> bool:
 def _is_measurement_faulty(report: Report) -> bool:
     """Whether the estimate is not fresh, a sensor is left out, or a device is at fault."""
     output, counts, reported = report.output, report.counts, report.reported
-    is_out = output.mode is not Mode.RUNNING or bool(output.left_out)
+    is_out = output.mode not in (Mode.RUNNING, Mode.READY) or bool(output.left_out)
     return is_out or counts.device_faulty > reported.device_faulty
 
 
@@ -108,6 +108,7 @@ STATUS = (
     _status("lost_frames", lambda report: report.counts.lost),
     _status("refused_frames", lambda report: report.counts.refused),
     _status("stale_frames", lambda report: report.counts.stale),
+    _status("first_cause", lambda report: report.output.first_cause),
     _status("measurement_fault", _is_measurement_faulty),
     _status("limit_fault", lambda report: report.counts.limited > report.reported.limited),
     _status("bus_fault", _is_bus_faulty),

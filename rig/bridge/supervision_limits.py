@@ -7,7 +7,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from can_dbc.yaml_file import Finite
+from can_dbc.yaml_file import Finite, NotNegative
 from rig.bridge.values import StrutOutput
 
 
@@ -59,6 +59,8 @@ class Limit(BaseModel):
             estimate: `height_m`, `force_n`, `virtual_force_n`, `innovation_m`.
         low: Smallest value within.
         high: Largest value within.
+        for_s: How long an estimate has to be beyond the limit until the action begins, and within
+            it until the action ends; for estimates alone.
         action: `warn` reports it in the status; `refuse` drops the measurement; `hold` marks the
             estimate invalid as long as it lasts; `safe` enters the safe state.
     """
@@ -69,6 +71,7 @@ class Limit(BaseModel):
     value: LimitedValue
     low: Finite | None = None
     high: Finite | None = None
+    for_s: NotNegative = 0.0
     action: Literal["warn", "refuse", "hold", "safe"]
 
     @model_validator(mode="after")
@@ -82,6 +85,11 @@ class Limit(BaseModel):
                 f"action refuse of {self.value.value}: expected warn, hold or safe, "
                 "because only a measurement can be refused"
             )
+        if self.for_s and self.value.is_measured:
+            raise ValueError(
+                f"for_s of {self.value.value}: expected none, because a measurement is judged by "
+                "itself; unchanged_s is a time already"
+            )
         return self
 
     def action_at(self, value: float) -> int:
@@ -89,6 +97,11 @@ class Limit(BaseModel):
         is_high_enough = self.low is None or value >= self.low
         if is_high_enough and (self.high is None or value <= self.high):
             return 0
+        return self.severity
+
+    @property
+    def severity(self) -> int:
+        """The action as a number that grows with its severity."""
         return Action[self.action.upper()]
 
     def bound_beyond(self, value: float) -> float:
@@ -215,3 +228,42 @@ def _estimates(strut: StrutOutput) -> Mapping[LimitedValue, float]:
         LimitedValue.VIRTUAL_FORCE_N: strut.virtual_force_n,
         LimitedValue.INNOVATION_M: strut.innovation_m,
     }
+
+
+class Delay(NamedTuple):
+    """State of a limit with a delay: whether it counts as passed, and since when it is not so."""
+
+    is_passed: bool
+    since_ns: int
+
+
+def update_delays(
+    rows: Sequence[tuple[int, Limit]],
+    delays: Sequence[Delay],
+    struts: Sequence[StrutOutput],
+    t_ns: int,
+) -> tuple[Delay, ...]:
+    """State of limits with a delay, each with the index of its strut, after a step.
+
+    Without a state, as after a change of the limits, none of them counts as passed.
+    """
+    if len(delays) != len(rows):
+        delays = [Delay(is_passed=False, since_ns=t_ns)] * len(rows)
+    return tuple(
+        _update_delay(delay, row, _estimates(struts[strut])[row.value], t_ns)
+        for delay, (strut, row) in zip(delays, rows, strict=True)
+    )
+
+
+def _update_delay(delay: Delay, row: Limit, number: float, t_ns: int) -> Delay:
+    if bool(row.action_at(number)) is delay.is_passed:
+        return Delay(delay.is_passed, t_ns)
+    if t_ns - delay.since_ns < round(row.for_s * 1e9):
+        return delay
+    return Delay(not delay.is_passed, t_ns)
+
+
+def worst_delayed_action(rows: Sequence[tuple[int, Limit]], delays: Sequence[Delay]) -> int:
+    """The severest action of limits that count as passed, 0 if none does."""
+    passed = [row.severity for (_, row), delay in zip(rows, delays, strict=True) if delay.is_passed]
+    return max(passed, default=0)

@@ -1,6 +1,6 @@
 """What a step is given and what it publishes."""
 
-from enum import IntEnum
+from enum import Enum, IntEnum
 from math import nan
 
 from msgspec import Struct
@@ -11,9 +11,10 @@ from rig.channels.channel import Sample
 class Mode(IntEnum):
     """State of the bridge, with the numbers it has on the bus.
 
-    WAITING has no model yet, SETTLING one whose estimate is not to be believed yet. RUNNING alone
-    publishes valid estimates. HOLD goes without fresh measurements, or is beyond a limit; SAFE has
-    stopped the model until the user acknowledges.
+    WAITING has no model yet, SETTLING one whose estimate is not to be believed yet, READY one that
+    is not armed, or whose published force is still fading in. RUNNING alone publishes valid
+    estimates. HOLD goes without fresh measurements, or is beyond a limit; SAFE has stopped the
+    model until the user acknowledges.
     """
 
     INIT = 0
@@ -22,6 +23,18 @@ class Mode(IntEnum):
     HOLD = 3
     SAFE = 4
     SETTLING = 5
+    READY = 6
+
+
+class Request(Enum):
+    """What an operator requests of the bridge.
+
+    ACKNOWLEDGE leaves the safe state, ARM lets estimates become valid, DISARM takes that back.
+    """
+
+    ACKNOWLEDGE = "acknowledge"
+    ARM = "arm"
+    DISARM = "disarm"
 
 
 class StepInput(Struct, frozen=True, gc=False):
@@ -31,12 +44,12 @@ class StepInput(Struct, frozen=True, gc=False):
         t_ns: Time of the step.
         samples: Samples that arrived since the last one, in the order of their arrival; at most one
             of each reference height.
-        acknowledged: The user acknowledged the safe state.
+        request: What an operator requests at this step; None for nothing.
     """
 
     t_ns: int
     samples: tuple[Sample, ...] = ()
-    acknowledged: bool = False
+    request: Request | None = None
 
 
 class StrutOutput(Struct, frozen=True, gc=False):
@@ -68,12 +81,15 @@ class StrutOutput(Struct, frozen=True, gc=False):
 class StepOutput(Struct, frozen=True, gc=False):
     """What a tick publishes: of each strut in the model's order, nothing before measurements.
 
-    `left_out` are the channels of further sensors that are not used now.
+    Attributes:
+        left_out: Channels of further sensors that are not used now.
+        first_cause: Number of what the estimate was lost to; 0 while it is valid, or never was.
     """
 
     mode: Mode
     struts: tuple[StrutOutput, ...]
     left_out: tuple[int, ...] = ()
+    first_cause: int = 0
 
 
 class Divergence(Struct, frozen=True, gc=False):

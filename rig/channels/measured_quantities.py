@@ -69,6 +69,14 @@ LOAD_CELL_FORCE = Quantity(
 TEMPERATURE = Quantity(
     "temperature", "temperature_c", Dimension.TEMPERATURE, "temperature of the damper"
 )
+INTERLOCK = Quantity(
+    "interlock", "interlock", Dimension.NUMBER, "interlock of the bench: other than 0 when closed"
+)
+ENABLE = Quantity(
+    "enable", "enable", Dimension.NUMBER, "enable signal of the bench's controller: other than 0"
+)
+SWITCHES = (INTERLOCK, ENABLE)
+"""What permits valid estimates, or forbids them; `rig.bridge.arming` uses them."""
 
-BENCH_QUANTITIES = (APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE)
+BENCH_QUANTITIES = (APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE, *SWITCHES)
 """What a bench sends once, and not for each strut, in the order of the log's columns."""

@@ -10,7 +10,7 @@ from rig.cli.terminal import console
 
 EXAMPLES = (
     "Examples: `rig set runs/7 observers.strut.proportional_n_per_m=2e5` · "
-    "`rig set runs/7 --acknowledge`"
+    "`rig set runs/7 --acknowledge` · `rig set runs/7 --arm`"
 )
 
 
@@ -26,19 +26,26 @@ def set_command(
     acknowledge: Annotated[
         bool, typer.Option("--acknowledge", help="Acknowledge the safe state.")
     ] = False,
+    arm: Annotated[
+        bool, typer.Option("--arm", help="Let estimates be valid, with `arming: manual`.")
+    ] = False,
+    disarm: Annotated[bool, typer.Option("--disarm", help="Let no estimate be valid.")] = False,
     force: Annotated[
         bool, typer.Option("--force", help="Change it although `rig check` finds an error.")
     ] = False,
 ) -> None:
-    """Change gains or limits of a run in progress, or acknowledge its safe state."""
+    """Change gains or limits of a run in progress, acknowledge its safe state, or arm it."""
     from rig.run.change_requests import ask
     from rig.run.changed_settings import parse_assignments
+    from rig.run.operator import user_name
 
-    if acknowledge == bool(assignments):
-        raise InputError("rig set: expected KEY=VALUE, or --acknowledge")
-    if acknowledge:
-        ask(run, {"acknowledge": True})
-        console.print("Acknowledged.")
+    given = {"acknowledge": acknowledge, "arm": arm, "disarm": disarm}
+    requests = [request for request, is_given in given.items() if is_given]
+    if len(requests) + bool(assignments) != 1:
+        raise InputError("rig set: expected KEY=VALUE, --acknowledge, --arm or --disarm")
+    if requests:
+        ask(run, {"request": requests[0], "by": user_name()})
+        console.print(f"Requested: {requests[0]}.")
         return
     found = ask(run, {"set": parse_assignments(assignments or ())}, force=force)
     console.print(f"Changed from {found.get('t_ns', 0) * 1e-9:.3f} s on.")

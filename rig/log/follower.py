@@ -16,14 +16,19 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from rig.bridge.values import Request
 from rig.log.file_names import STEPS_FILE, part_name
-from rig.log.step_columns import ACKNOWLEDGED, BUS_FAULT, END_OF_STREAM, LOG_FAULT, step_schema
+from rig.log.step_columns import BUS_FAULT, END_OF_STREAM, LOG_FAULT, REQUEST_FLAGS, step_schema
 
 Array = NDArray[np.float64]
 BUCKET = 64
 """Steps of which the extremes are kept: a screen's width of them is a minute at 1 kHz."""
 
-FLAGS = {"acknowledged": ACKNOWLEDGED, "bus_fault": BUS_FAULT, "log_fault": LOG_FAULT}
+FLAGS = {
+    "acknowledged": REQUEST_FLAGS[Request.ACKNOWLEDGE],
+    "bus_fault": BUS_FAULT,
+    "log_fault": LOG_FAULT,
+}
 """Columns that the bits of `flags` become: of a sum of bits the largest says little."""
 
 _NEWEST = 131_072

@@ -13,11 +13,20 @@ import pyarrow as pa
 from msgspec import Struct
 from msgspec.structs import astuple
 
-from rig.bridge.values import StepInput, StepOutput, StrutOutput
+from rig.bridge.values import Request, StepInput, StepOutput, StrutOutput
 from rig.channels.channel import Channel, Role
 
-ACKNOWLEDGED, BUS_FAULT, LOG_FAULT = 1, 2, 4
+BUS_FAULT, LOG_FAULT = 2, 4
+REQUEST_FLAGS = {Request.ACKNOWLEDGE: 1, Request.ARM: 8, Request.DISARM: 16}
 """Bits of `Step.flags`."""
+
+_REQUESTS = 1 | 8 | 16
+
+
+def request_of(flags: int) -> Request | None:
+    """What an operator requested at a tick; None for nothing."""
+    return next((it for it, bit in REQUEST_FLAGS.items() if flags & _REQUESTS == bit), None)
+
 
 END_OF_STREAM = b"\xff\xff\xff\xff\0\0\0\0"
 """Last bytes of an Arrow stream that was closed."""
@@ -33,7 +42,7 @@ class Step(Struct, frozen=True, gc=False):
     """The record of one tick.
 
     received: Frames received, so that a replay gives each tick the same ones.
-    flags: Bit 0 acknowledged, bit 1 bus fault, bit 2 log fault.
+    flags: Bit 0 acknowledged, bit 1 bus fault, bit 2 log fault, bit 3 armed, bit 4 disarmed.
     numbers: Measured and published values, as the log's further columns are named.
     """
 

@@ -1,4 +1,4 @@
-"""Requests to a run in progress, through its folder: gains, limits, acknowledgement.
+"""Requests to a run in progress, through its folder: gains, limits, acknowledgement, arming.
 
 Whoever may write into the folder may ask; nothing listens on a network. A request is a file, which
 a thread of the run reads, checks and answers with another; the loop only takes what is ready.
@@ -17,6 +17,7 @@ from typing import TypedDict, cast
 from can_dbc.atomic_file import write_whole
 from can_dbc.errors import InputError
 from rig.bridge.bridge import Bridge
+from rig.bridge.values import Request
 from rig.log.file_names import RUN_FILE
 from rig.log.reader import read_header
 from rig.machine.realtime import follow
@@ -39,13 +40,15 @@ _ANSWER_S = 5.0
 """Longest wait for an answer: many looks, and a tick of the slowest rate that is of use."""
 
 _MOST_BYTES = 100_000
+_LONGEST_NAME = 100
+"""Characters of a name that stand in the run's events."""
 
 
 class Answer(TypedDict, total=False):
-    """`t_ns` of the first tick with the change, or `acknowledged`; or `error`."""
+    """`t_ns` of the first tick with the change, or what was `requested`; or `error`."""
 
     t_ns: int
-    acknowledged: bool
+    requested: str
     error: str
 
 
@@ -57,13 +60,13 @@ class Requests:
         folder: Path,
         plan: Plan,
         bridge: Bridge,
-        acknowledge: Callable[[], None],
+        ask_bridge: Callable[[Request, str], None],
         log: Callable[[str], None],
         priority: int,
     ) -> None:
         self._folder = folder / _FOLDER
         self._plan, self._bridge = plan, bridge
-        self._acknowledge, self._log = acknowledge, log
+        self._ask_bridge, self._log = ask_bridge, log
         self._priority = priority
         self._waiting: tuple[Bridge, Assignments] | None = None
         self._taken_ns = 0
@@ -113,14 +116,23 @@ class Requests:
         try:
             with path.open("rb") as file:
                 content = json.loads(file.read(_MOST_BYTES))
-            if content == {"acknowledge": True}:
-                self._acknowledge()
-                return {"acknowledged": True}
+            if "request" in content:
+                by = str(content["by"])[:_LONGEST_NAME]
+                return self._pass_on(Request(content["request"]), by)
             return self._change(path, dict(content["set"]))
         except InputError as error:
             return {"error": str(error)}
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return {"error": f"{path.name}: is not a valid request"}
+
+    def _pass_on(self, request: Request, by: str) -> Answer:
+        if request is not Request.ACKNOWLEDGE and self._plan.config.supervision.arming != "manual":
+            raise InputError(
+                f"{request.value}: the run is armed by itself, expected `supervision.arming: "
+                "manual` in its configuration"
+            )
+        self._ask_bridge(request, by)
+        return {"requested": request.value}
 
     def _change(self, path: Path, assignments: Assignments) -> Answer:
         plan = assign(self._plan, assignments, "set")
@@ -140,8 +152,9 @@ class Requests:
 def ask(folder: Path, content: Mapping[str, object], *, force: bool = False) -> Answer:
     """Send a request to a running run, and wait for its answer.
 
-    It contains ``{"set": assignments}`` or ``{"acknowledge": True}``; `force` sends it although the
-    check of the changed configuration finds an error.
+    It contains ``{"set": assignments}``, or ``{"request": "acknowledge"}`` (or ``arm``, ``disarm``)
+    with the name of who makes it ``by``; `force` sends it although the check of the changed
+    configuration finds an error.
 
     Raises:
         InputError: It is no run, it has ended, the check finds an error, or it refuses.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from rig.bridge.bridge import Bridge
-from rig.bridge.values import Mode
+from rig.bridge.values import Mode, Request
 from rig.bus.bus import Bus, BusConfig
 from rig.bus.link import Link
 from rig.bus.secoc import Authentication, Authenticator
@@ -75,10 +75,11 @@ def live(
             link.figures,
             granted,
             begin=partial(_drain_queue, link, clock),
-            acknowledge=port.acknowledge,
+            operator=port.operator,
         )
+        acknowledge = partial(port.operator.ask, Request.ACKNOWLEDGE, "SIGUSR1")
         try:
-            with on_signal(signal.SIGUSR1, port.acknowledge):
+            with on_signal(signal.SIGUSR1, acknowledge):
                 return run_logged(plan, bridge, endpoint, folder, control, trace=trace)
         finally:
             link.close()
@@ -145,7 +146,7 @@ def with_bench(
                 endpoint,
                 granted=granted,
                 begin=partial(on_bus.begin, clock),
-                acknowledge=port.acknowledge,
+                operator=port.operator,
             )
         return run_logged(plan, bridge, endpoint, folder, control, trace=trace)
 

@@ -22,7 +22,7 @@ from rig.files.folders import claim
 from rig.files.hashes import hash_files
 from rig.log.file_names import CHANGES_FILE, DBC_FILE, EVENTS_FILE, HISTOGRAMS_FILE, MODEL_FILE
 from rig.log.reader import RUN_SCHEMA, ConfigEntry, RunHeader
-from rig.log.step_columns import ACKNOWLEDGED, LogColumns, Step
+from rig.log.step_columns import LogColumns, Step, request_of
 from rig.log.writer import LogOptions, RunWriter
 from rig.machine.clock import Clock, OccupiedClock
 from rig.machine.installed_versions import version_of
@@ -32,6 +32,7 @@ from rig.run.change_requests import Requests
 from rig.run.changed_settings import Changes, no_changes
 from rig.run.loop import SHOWN_EVERY_NS, Look, Port, RunControl, Sink, regular_ticks, run
 from rig.run.mode_events import ModeEvents
+from rig.run.operator import Asked, Operator
 from rig.run.ports import InformedPort
 from rig.run.timing import Timing
 from rig.run.trace import Trace
@@ -41,6 +42,9 @@ _MOST_REPORTS = 1000
 
 _LAST_FRAMES = 3
 """Frames of each message at the end of a run, one a tick: one of them may be lost on the bus."""
+
+_LONGEST_RAMP_NS = 5_000_000_000
+"""After this time a run that has ended publishes the safe output, wherever its ramp has come."""
 
 _STATUS = {Mode.SAFE: "safe", Mode.WAITING: "waiting"}
 """Mode at the end -> how `run.yaml` says that the run ended, where it was not as it should be."""
@@ -88,7 +92,7 @@ class Endpoint:
         granted: What the machine granted; None for simulated time, which then waits for the disk.
         begin: Called when all is set up, before the first tick.
         while_waiting: Called before each wait with the time that is awaited.
-        acknowledge: Acknowledges the safe state; with it, the run accepts requests to change it.
+        operator: Where requests of operators arrive; with it, the run accepts them, and changes.
     """
 
     port: Port
@@ -97,7 +101,7 @@ class Endpoint:
     granted: Granted | None = None
     begin: Callable[[], None] = _no_setup
     while_waiting: Sequence[Callable[[int], None]] = ()
-    acknowledge: Callable[[], None] | None = None
+    operator: Operator | None = None
 
 
 def run_logged(
@@ -162,7 +166,7 @@ class _LoggedRun:
             plan.strut_names,
             [device.name for device in plan.devices],
         )
-        self._acknowledged = False
+        self._asked: Asked | None = None
 
     def run(self, trace: Trace | None) -> None:
         plan, endpoint, clock = self._plan, self._endpoint, self._endpoint.clock
@@ -184,7 +188,7 @@ class _LoggedRun:
             try:
                 for state in ticks:
                     self._state = state
-                    self._events.update(state, acknowledged=self._acknowledged)
+                    self._events.update(state, self._asked)
             finally:
                 self._publish_end(informed.conditions)
         self._status = _STATUS.get(self._state.mode, "done")
@@ -212,7 +216,8 @@ class _LoggedRun:
         self._log.add(received, sent, step)
         t_ns = step.t_ns
         self._reports.note(t_ns, result.device_faults)
-        self._acknowledged = bool(step.flags & ACKNOWLEDGED)
+        operator = self._endpoint.operator
+        self._asked = operator.last if operator and request_of(step.flags) else None
         self._ticks += 1
         self._control.progress(t_ns, result.output.mode)
         if t_ns >= self._shown_ns:
@@ -235,20 +240,25 @@ class _LoggedRun:
         """Publish the safe output, whatever has ended the loop, as the last that is on the bus."""
         endpoint, state = self._endpoint, self._state
         t_ns = state.supervised.t_ns
-        for _ in range(_LAST_FRAMES):
+        latest_ns = t_ns + _LONGEST_RAMP_NS
+        last = 0
+        while last < _LAST_FRAMES:
             t_ns += self._plan.period_ns
             endpoint.clock.wait_until(t_ns)
+            if t_ns > latest_ns:
+                state = self._bridge.stop_ramp(state)
             state, frames = self._bridge.end(state, t_ns, conditions)
             self._last_frames += endpoint.port.send(frames)
+            last += self._bridge.is_at_rest(state)
 
     def _changes(self, around: contextlib.ExitStack) -> Changes:
         """Changes that are requested while the run is going on."""
-        acknowledge = self._endpoint.acknowledge
-        if acknowledge is None:
+        operator = self._endpoint.operator
+        if operator is None:
             return no_changes
         note = partial(self._log.note, CHANGES_FILE)
         requests = Requests(
-            self._folder, self._plan, self._bridge, acknowledge, note, self._priority
+            self._folder, self._plan, self._bridge, operator.ask, note, self._priority
         )
         around.enter_context(requests.serve())
 

@@ -11,7 +11,7 @@ from can_dbc.frame import Frame
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
 from rig.bridge.counts import Conditions, Counts
 from rig.bridge.values import Mode, StepOutput
-from rig.log.step_columns import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, LogColumns, Step
+from rig.log.step_columns import BUS_FAULT, LOG_FAULT, REQUEST_FLAGS, LogColumns, Step
 from rig.machine.clock import Clock
 from rig.run.changed_settings import Changes, no_changes
 from rig.run.timing import BINS, Timing
@@ -161,10 +161,11 @@ def run(
 
 
 def _flags(conditions: Conditions) -> int:
-    if not (conditions.acknowledged or conditions.bus_fault or conditions.log_fault):
+    request = conditions.request
+    if not (request or conditions.bus_fault or conditions.log_fault):
         return 0
     return (
-        ACKNOWLEDGED * conditions.acknowledged
+        (0 if request is None else REQUEST_FLAGS[request])
         + BUS_FAULT * conditions.bus_fault
         + LOG_FAULT * conditions.log_fault
     )

@@ -5,8 +5,9 @@ from collections.abc import Callable, Sequence
 from math import isfinite
 
 from rig.bridge.bridge import BridgeState
-from rig.bridge.mode_supervisor import Cause
-from rig.bridge.values import Mode
+from rig.bridge.mode_supervisor import Cause, SupervisedState
+from rig.bridge.values import Mode, Request
+from rig.run.operator import Asked
 
 _MOST_EVENTS = 100_000
 """Lines of `events.jsonl`: a mode that flutters at every tick must not fill the disk."""
@@ -32,17 +33,27 @@ class ModeEvents:
         self.ticks = dict.fromkeys(Mode, 0)
         """Ticks in each mode."""
 
-    def update(self, state: BridgeState, *, acknowledged: bool) -> None:
-        """Note what the state after a tick shows; `acknowledged` is whether the user did."""
+    def update(self, state: BridgeState, asked: Asked | None = None) -> None:
+        """Note what the state after a tick shows, and what was requested at the tick."""
         supervised = state.supervised
         mode, cause = supervised.mode, supervised.cause
         self.ticks[mode] += 1
+        if asked is not None:
+            self._write_request(asked, supervised)
         if mode is not self._mode or cause is not self._cause:
             self._write(state, cause)
             self._mode, self._cause = mode, cause
-        if acknowledged and mode is Mode.SAFE:
-            line = {"t_s": supervised.t_ns * 1e-9, "refused": "acknowledged"}
-            self._write_line({**line, "first_cause": self._text(supervised.first_cause)})
+
+    def _write_request(self, asked: Asked, supervised: SupervisedState) -> None:
+        line: dict[str, object] = {
+            "t_s": supervised.t_ns * 1e-9,
+            "request": asked.request.value,
+            "by": asked.by,
+        }
+        if asked.request is Request.ACKNOWLEDGE and supervised.mode is Mode.SAFE:
+            line["refused"] = True
+            line["first_cause"] = self._text(supervised.first_cause)
+        self._write_line(line)
 
     def _write(self, state: BridgeState, cause: Cause | None) -> None:
         supervised = state.supervised

@@ -11,6 +11,7 @@ from rig.bus.secoc import Authenticator
 from rig.log.writer import RunWriter
 from rig.machine.clock import Clock
 from rig.run.loop import Port
+from rig.run.operator import Operator
 from rig.run.timing import Timing
 from rig.simulated_bench.bench import SimulatedBench
 
@@ -27,24 +28,20 @@ class BusPort:
 
     def __init__(self, link: Link) -> None:
         self.link = link
-        self._acknowledged = False
+        self.operator = Operator()
+        self._waiting = self.operator.waiting
         self._refused = 0
-
-    def acknowledge(self) -> None:
-        """Acknowledge the safe state at the next tick."""
-        self._acknowledged = True
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
         """Frames that have come since the last tick."""
         link = self.link
         frames = link.receive(t_ns)
         failures = link.authentication_failures
-        if link.fault is None and not self._acknowledged and failures == self._refused:
+        if link.fault is None and not self._waiting and failures == self._refused:
             return frames, _NO_CONDITIONS
         bus_fault = link.fault is not None or failures > self._refused
         self._refused = failures
-        acknowledged, self._acknowledged = self._acknowledged, False
-        return frames, Conditions(acknowledged=acknowledged, bus_fault=bus_fault)
+        return frames, Conditions(request=self.operator.take(), bus_fault=bus_fault)
 
     def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
         """Send; returns what was sent."""

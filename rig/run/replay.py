@@ -20,7 +20,7 @@ from rig.log.checksums import Damage
 from rig.log.file_names import RUN_FILE
 from rig.log.reader import RUN_SCHEMA, RunFolder, last_frame_ns, read_run
 from rig.log.received_frames import FrameColumns, read_frame_columns
-from rig.log.step_columns import ACKNOWLEDGED, BUS_FAULT, LOG_FAULT, LogColumns, Step, StepRows
+from rig.log.step_columns import BUS_FAULT, LOG_FAULT, LogColumns, Step, StepRows, request_of
 from rig.plan.build import build_bridge
 from rig.plan.load import plan_of_header
 from rig.plan.plan import Plan
@@ -149,7 +149,7 @@ class _LogPort:
 
 def _conditions(flags: int) -> Conditions:
     return Conditions(
-        acknowledged=bool(flags & ACKNOWLEDGED),
+        request=request_of(flags),
         bus_fault=bool(flags & BUS_FAULT),
         log_fault=bool(flags & LOG_FAULT),
     )

@@ -11,8 +11,8 @@ from rig.bridge.values import StepInput, StepOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import (
     APPLIED_FORCE,
-    BENCH_QUANTITIES,
     HEIGHT,
+    LOAD_CELL_FORCE,
     TEMPERATURE,
     Quantity,
 )
@@ -30,6 +30,9 @@ def gains(proportional: float, integral: float, limit_n: float = 5000.0) -> PiOb
 
 
 GAINS = gains(1e5, 1e4)
+MEASURED = (APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE)
+"""Quantities of the bench that the channels here have."""
+
 SUPERVISION = Supervision(stale_after_s=0.01, safe_after_s=0.5)
 
 
@@ -70,7 +73,7 @@ def channels(
                 delays[strut],
             )
         )
-    for quantity in BENCH_QUANTITIES:
+    for quantity in MEASURED:
         key = f"signals.{quantity.key}"
         made.append(Channel(len(made), Role.BENCH, quantity, quantity.key, key, -1, MS))
     return [*made, *sensors]
@@ -109,7 +112,7 @@ def core(
 
 def bench_sample(struts: int, quantity: Quantity, value: float, t_ns: int) -> Sample:
     """A sample of a quantity of the bench, with the channels of `channels`."""
-    return Sample(struts + BENCH_QUANTITIES.index(quantity), value, t_ns)
+    return Sample(struts + MEASURED.index(quantity), value, t_ns)
 
 
 def measured(

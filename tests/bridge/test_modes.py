@@ -4,10 +4,11 @@ import random
 
 import pytest
 
+from rig.bridge.arming import OpenInterlock
 from rig.bridge.estimator import Estimate
 from rig.bridge.mode_supervisor import NO_REPORTS, Event, Reports, Supervision, Supervisor
 from rig.bridge.supervision_limits import Action
-from rig.bridge.values import Mode, StepInput, StrutOutput
+from rig.bridge.values import Mode, Request, StepInput, StrutOutput
 
 MS = 1_000_000
 SUPERVISION = Supervision(stale_after_s=0.01, safe_after_s=0.05)
@@ -62,10 +63,13 @@ class Drawn:
         self.faulty_device = rng.choice((-1, -1, -1, -1, -1, 0))
         self.gap_ns = rng.choice((0, 0, 0, 0, 0, 0, 5, 60)) * MS
         self.is_log_lost = rng.random() < 0.03
+        self.is_withheld = rng.random() < 0.1
+        self.open_interlock = OpenInterlock("interlock", 0.0) if rng.random() < 0.03 else None
         self.missed_share = rng.choice((0.0,) * 12 + (0.7,))
         if not calm and rng.random() < 0.5:
             self.age_ns, self.action = before.age_ns, before.action
             self.faulty_device = before.faulty_device
+            self.is_withheld, self.open_interlock = before.is_withheld, before.open_interlock
         self.measured_ns = t_ns - self.age_ns
 
     def reports(self):
@@ -76,6 +80,8 @@ class Drawn:
             self.missed_share,
             self.faulty_device,
             self.is_log_lost,
+            self.is_withheld,
+            self.open_interlock,
         )
         return NO_REPORTS if reports == NO_REPORTS else reports
 
@@ -93,6 +99,8 @@ class Drawn:
             and self.faulty_device < 0
             and not self.missed_share
             and not self.is_log_lost
+            and not self.is_withheld
+            and self.open_interlock is None
             and (mode is Mode.WAITING or self.gap_ns <= SUPERVISION.safe_after_ns)
         )
 
@@ -112,7 +120,8 @@ def drive(seed, steps=200):
             else None
         )
         before = state
-        step_input = StepInput(t_ns, (), drawn.acknowledged)
+        request = Request.ACKNOWLEDGE if drawn.acknowledged else None
+        step_input = StepInput(t_ns, (), request)
         state, output, _ = supervisor.step(before, step_input, drawn.reports())
         yield before, drawn, state, output
 
@@ -133,6 +142,7 @@ def check(before, drawn, state, output):
         assert drawn.action < Action.HOLD
         assert drawn.faulty_device < 0
         assert not drawn.is_log_lost
+        assert drawn.open_interlock is None
     if before.first_cause is not None:
         # The first cause stays until the bridge runs again.
         assert state.first_cause is before.first_cause or (

@@ -14,7 +14,7 @@ from rig.bridge.prescribed_motion import (
     predict_motion,
     update_motion,
 )
-from rig.bridge.values import Mode, StepInput
+from rig.bridge.values import Mode, Request, StepInput
 from rig.channels.channel import Sample
 from rig.channels.measured_quantities import LOAD_CELL_FORCE, TEMPERATURE
 from tests.bridge.cores import bench_sample, channels
@@ -214,7 +214,7 @@ def test_a_channel_that_falls_silent_ends_in_the_safe_state(silent: str) -> None
     assert output.struts[0].force_n == 0.0
     assert not output.struts[0].valid
     for given in (StepInput(119 * TICK_NS), step_input(120, 5.0)):
-        acknowledged = StepInput(given.t_ns, given.samples, acknowledged=True)
+        acknowledged = StepInput(given.t_ns, given.samples, request=Request.ACKNOWLEDGE)
         state, output, _ = core.step(state, acknowledged)
         # Without a fresh measurement of both it is refused.
         assert output.mode is (Mode.WAITING if given.samples else Mode.SAFE)

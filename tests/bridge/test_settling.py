@@ -14,7 +14,7 @@ from dart_model.plant import DartPlant
 from dart_model.spec import MODELS, EffectSpec, load_model
 from rig.bridge.free_model import FreeModelEstimator
 from rig.bridge.mode_supervisor import Supervision, Supervisor
-from rig.bridge.values import Mode, StepInput
+from rig.bridge.values import Mode, Request, StepInput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import APPLIED_FORCE, HEIGHT
 from rig.closed_loop.loop import LinearLoop, Loop, SampleTiming
@@ -208,7 +208,8 @@ def follow(truth, heights_m, observer, first=0, gap=range(0), acknowledged=-1):
                 Sample(0, float(heights_m[tick]), t_ns),
                 Sample(1, float(truth.applied_n[tick]), t_ns),
             )
-        state, output, _ = core.step(state, StepInput(t_ns, samples, tick == acknowledged))
+        request = Request.ACKNOWLEDGE if tick == acknowledged else None
+        state, output, _ = core.step(state, StepInput(t_ns, samples, request))
         errors += [abs(strut.force_n - truth.force_n[tick]) for strut in output.struts] or [0.0]
         valid.append(output.mode is Mode.RUNNING)
     return np.array(errors), np.array(valid)

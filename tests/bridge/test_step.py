@@ -15,7 +15,7 @@ from dart_model.spec import MODELS, load_model
 from rig.bridge.free_model import FreeModelEstimator
 from rig.bridge.mode_supervisor import Event, Reports, Supervisor
 from rig.bridge.supervision_limits import Action
-from rig.bridge.values import Mode, StepInput, StepOutput, StrutOutput
+from rig.bridge.values import Mode, Request, StepInput, StepOutput, StrutOutput
 from rig.channels.channel import Channel
 from tests.bridge.cores import (
     FIRST,
@@ -268,7 +268,7 @@ def test_the_safe_output_is_held_until_it_is_acknowledged(safe_output):
         before_stale if safe_output == "last" else 0.0, 0.0, False, safe.height_m, 0.0, 0.0, 0.0
     )
     assert math.isfinite(last_valid)
-    acknowledged = StepInput(580 * MS, acknowledged=True)
+    acknowledged = StepInput(580 * MS, request=Request.ACKNOWLEDGE)
     states, outputs = run(rig, [acknowledged, *resting(0.45, begin=581)], states[-1])
     # The measurements of the safe state start the model at once.
     assert [output.mode for output in outputs] == [Mode.WAITING] + [Mode.RUNNING] * FIRST
@@ -280,7 +280,7 @@ def test_an_acknowledgement_means_nothing_elsewhere():
     states, outputs = run(rig, resting(0.4, ticks=20))
     assert outputs[-1].mode is Mode.RUNNING
     plain = measured(20, 0.4)
-    acknowledged = StepInput(plain.t_ns, plain.samples, acknowledged=True)
+    acknowledged = StepInput(plain.t_ns, plain.samples, request=Request.ACKNOWLEDGE)
     assert rig.step(states[-1], acknowledged) == rig.step(states[-1], plain)
 
 
@@ -301,7 +301,7 @@ def test_a_model_that_diverges_goes_to_the_safe_state(model, bad, capfd):
         assert strut.height_m == pytest.approx(last.height_m, abs=1e-3)
     # What led there is over when a start's worth of good measurements has come.
     every = [
-        StepInput(item.t_ns, item.samples, acknowledged=True)
+        StepInput(item.t_ns, item.samples, request=Request.ACKNOWLEDGE)
         for item in resting(*heights, begin=24, ticks=FIRST)
     ]
     _, outputs = run(rig, every, states[-1])
@@ -345,7 +345,7 @@ def test_a_run_continues_identically_from_any_of_its_states(drawn, cut, stride, 
         StepInput(
             (begun + tick * stride) * MS,
             measured(begun + tick * stride, tyre, suspension, applied_n=applied_n).samples,
-            acknowledged=acknowledged,
+            request=Request.ACKNOWLEDGE if acknowledged else None,
         )
         for tick, (tyre, suspension, applied_n, acknowledged) in enumerate(drawn)
     ]

@@ -16,7 +16,7 @@ from can_dbc.yaml_file import load_yaml
 from rig.bridge.counts import Conditions
 from rig.bridge.mode_supervisor import TRANSITIONS, Event, next_mode
 from rig.bridge.supervision_limits import Action, Limit, LimitedValue, judge_height
-from rig.bridge.values import Mode
+from rig.bridge.values import Mode, Request
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.settling import settling_times_ns
 from rig.plan.build import build_plant
@@ -90,7 +90,7 @@ def test_safe_is_held_with_its_defined_output_until_it_is_acknowledged(safe_outp
     assert {tick.force_n for tick in ticks[first:]} == {held}
     assert not any(tick.is_valid for tick in ticks[first:])
     # Acknowledged, the bridge starts from the measurements that have come meanwhile.
-    trial.run(801, conditions=lambda _t_ns: Conditions(acknowledged=True))
+    trial.run(801, conditions=lambda _t_ns: Conditions(request=Request.ACKNOWLEDGE))
     again = trial.run(803)[800:]
     assert [tick.mode for tick in again] == [Mode.WAITING] + [Mode.RUNNING] * 2
     assert again[-1].is_valid
@@ -120,9 +120,10 @@ def test_a_log_that_cannot_be_written_is_what_the_user_makes_of_it(log_fault, ex
     ticks = trial.run(BEGIN_MS + 50, conditions=lambda _t_ns: lost)[BEGIN_MS:]
     assert {tick.mode for tick in ticks} == {expected}
     # As long as it lasts, an acknowledgement does not leave the safe state.
-    acknowledged = Conditions(acknowledged=True, log_fault=True)
+    acknowledged = Conditions(request=Request.ACKNOWLEDGE, log_fault=True)
     assert trial.run(BEGIN_MS + 51, conditions=lambda _t_ns: acknowledged)[-1].mode is expected
-    again = trial.run(BEGIN_MS + 52, conditions=lambda _t_ns: Conditions(acknowledged=True))[-1]
+    acknowledged = Conditions(request=Request.ACKNOWLEDGE)
+    again = trial.run(BEGIN_MS + 52, conditions=lambda _t_ns: acknowledged)[-1]
     assert again.mode is (Mode.RUNNING if expected is Mode.RUNNING else Mode.WAITING)
 
 
@@ -309,14 +310,16 @@ LOSSES = {
     Event.DIVERGED: Mode.SAFE,
     Event.BEYOND_SAFE: Mode.SAFE,
     Event.LOG_LOST: Mode.SAFE,
+    Event.INTERLOCK_OPEN: Mode.SAFE,
 }
 """What a model that follows its bench loses its estimate by."""
 
 NEXT = {
     Mode.INIT: {},
     Mode.WAITING: {Event.FRESH: Mode.SETTLING},
-    Mode.SETTLING: {Event.SETTLED: Mode.RUNNING, **LOSSES},
-    Mode.RUNNING: {Event.UNSETTLED: Mode.SETTLING, **LOSSES},
+    Mode.SETTLING: {Event.SETTLED: Mode.RUNNING, Event.WITHHELD: Mode.READY, **LOSSES},
+    Mode.READY: {Event.SETTLED: Mode.RUNNING, Event.UNSETTLED: Mode.SETTLING, **LOSSES},
+    Mode.RUNNING: {Event.WITHHELD: Mode.READY, Event.UNSETTLED: Mode.SETTLING, **LOSSES},
     Mode.HOLD: {
         Event.FRESH: Mode.SETTLING,
         Event.TIMEOUT: Mode.SAFE,
@@ -324,12 +327,13 @@ NEXT = {
         Event.DIVERGED: Mode.SAFE,
         Event.BEYOND_SAFE: Mode.SAFE,
         Event.LOG_LOST: Mode.SAFE,
+        Event.INTERLOCK_OPEN: Mode.SAFE,
     },
     Mode.SAFE: {Event.ACKNOWLEDGED: Mode.WAITING},
 }
 """Mode -> event -> next mode, without the events that change nothing."""
 
-FAR_FROM_RUNNING = [Mode.RUNNING, Mode.SETTLING, Mode.HOLD, Mode.SAFE]
+FAR_FROM_RUNNING = [Mode.RUNNING, Mode.READY, Mode.SETTLING, Mode.HOLD, Mode.SAFE]
 """Modes in which there is a model, the one that publishes valid estimates first."""
 
 
@@ -341,14 +345,17 @@ def test_the_table_of_modes(mode, event):
     assert ((mode, event) in TRANSITIONS) == (event in NEXT[mode])
 
 
+_GOOD = (Event.FRESH, Event.SETTLED, Event.WITHHELD, Event.ACKNOWLEDGED)
+
+
 def test_an_estimate_becomes_valid_by_settling_and_in_no_other_way():
     ways = {pair for pair, after in TRANSITIONS.items() if after is Mode.RUNNING}
-    assert ways == {(Mode.SETTLING, Event.SETTLED)}
+    assert ways == {(Mode.SETTLING, Event.SETTLED), (Mode.READY, Event.SETTLED)}
 
 
 @pytest.mark.parametrize(
     "event",
-    [event for event in Event if event not in (Event.FRESH, Event.SETTLED, Event.ACKNOWLEDGED)],
+    [event for event in Event if event not in _GOOD],
 )
 def test_no_fault_leads_towards_a_valid_estimate(event):
     for mode in FAR_FROM_RUNNING:

@@ -142,7 +142,7 @@ def test_a_group_of_values_is_not_replaced(ready):
 
 def test_a_run_that_has_ended_takes_no_request(tmp_path):
     with pytest.raises(InputError, match="the run has ended"):
-        ask(make_run(tmp_path / "run", 20), {"acknowledge": True})
+        ask(make_run(tmp_path / "run", 20), {"request": "acknowledge", "by": "a user"})
 
 
 def test_a_replay_changes_where_the_run_did(tmp_path):

@@ -11,6 +11,7 @@ from can_dbc.frame import Frame
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
 from rig.bridge.counts import Conditions
+from rig.bridge.values import Request
 from rig.bus.link import LinkFigures
 from rig.machine.clock import VirtualClock
 from rig.plan.build import build_bridge
@@ -29,9 +30,8 @@ class ListPort:
         self._acknowledged = acknowledged
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
-        return self._frames.get(t_ns // MS, []), Conditions(
-            acknowledged=t_ns // MS in self._acknowledged
-        )
+        request = Request.ACKNOWLEDGE if t_ns // MS in self._acknowledged else None
+        return self._frames.get(t_ns // MS, []), Conditions(request=request)
 
     def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
         return frames

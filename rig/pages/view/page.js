@@ -281,7 +281,7 @@ async function demand(action, run, content) {
 async function change(content) {
   const found = await demand("set", runs.findIndex((item) => item.state === "live"), content);
   at("answer").className = found.error ? "bad" : "good";
-  at("answer").textContent = found.error ?? (found.acknowledged ? "Acknowledged." : `Changed from ${(found.t_ns * 1e-9).toFixed(3)} s on.`);
+  at("answer").textContent = found.error ?? (found.requested ? `Requested: ${found.requested}.` : `Changed from ${(found.t_ns * 1e-9).toFixed(3)} s on.`);
 }
 
 at("change").addEventListener("submit", (event) => {
@@ -294,7 +294,9 @@ at("change").addEventListener("submit", (event) => {
   }
   change({ set: { [at("key").value]: value } });
 });
-at("acknowledge").addEventListener("click", () => change({ acknowledge: true }));
+for (const request of ["acknowledge", "arm", "disarm"]) {
+  at(request).addEventListener("click", () => change({ request }));
+}
 
 // --- The diagnosis of a finished run -----------------------------------------------------------
 

@@ -467,7 +467,7 @@ _Body = dict[str, Any]
 
 
 def _set(view: ViewServer, query: _Query, body: _Body) -> Mapping[str, object]:
-    return ask(query.run(view).folder, body)
+    return ask(query.run(view).folder, {**body, "by": "page"} if "request" in body else body)
 
 
 def _diagnose(view: ViewServer, query: _Query, body: _Body) -> Mapping[str, object]:
