@@ -115,6 +115,8 @@ class Supervision(BaseModel):
         slew_n_per_s: Rate at which a published force that is no longer valid moves to the safe
             output. With neither of the two it is that of the model in HOLD, and in SAFE at once
             the safe output.
+        watchdog: Whether a second process sends the safe output when the loop stands still for
+            `safe_after_s`, or its process dies; where several processes can share the interface.
         log_fault: What follows when the log cannot be written: `continue`, or the `safe` state.
         safe_output: Force that the safe state publishes: `zero`, or the `last` valid one.
         limits: What is done beyond which values, row by row. Where none stands for a value, the
@@ -130,6 +132,7 @@ class Supervision(BaseModel):
     arming: ArmingKind = "automatic"
     fade_in_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
     slew_n_per_s: Positive | None = None
+    watchdog: bool = True
     log_fault: Literal["continue", "safe"] = "continue"
     safe_output: Literal["zero", "last"] = "zero"
     limits: Annotated[tuple[Limit, ...], Field(max_length=100)] = ()

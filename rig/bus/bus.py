@@ -32,6 +32,9 @@ memory."""
 _RETURN_OWN_FRAMES = ("udp_multicast",)
 """Interfaces that return what is sent on them, whatever they are asked for."""
 
+SHARED_INTERFACES = ("socketcan", "udp_multicast")
+"""Interfaces that several processes can use at once."""
+
 _LISTEN_ONLY_OPTIONS: dict[str, dict[str, object]] = {
     "pcan": {"state": can.BusState.PASSIVE},
     "slcan": {"listen_only": True},

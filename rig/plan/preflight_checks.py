@@ -12,8 +12,9 @@ from dart_model.spec import InlineSkeleton
 from rig.bridge.incoming_messages import clock_cycle_ns
 from rig.bridge.published_quantities import FORCE, VALID
 from rig.bridge.supervision_limits import Limit
+from rig.bus.bus import SHARED_INTERFACES
 from rig.channels.channel import Channel
-from rig.channels.measured_quantities import LOAD_CELL_FORCE
+from rig.channels.measured_quantities import LOAD_CELL_FORCE, SWITCHES
 from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import Pole, closed_loop_poles
 from rig.observers.protocol import Remark, SensorStep
@@ -81,6 +82,8 @@ def check(plan: Plan) -> list[Finding]:
             if message.cycle_time_ns is None
         ],
         _staleness(plan, heights),
+        *_switches(plan),
+        *_watchdog(plan),
         *_publication(plan),
         *_limits(plan),
         _load(plan),
@@ -180,6 +183,45 @@ def _staleness(plan: Plan, heights: list[Message]) -> Finding:
         )
     severity = Severity.ERROR if is_short else Severity.OK
     return Finding(severity, "supervision.stale_after_s", text)
+
+
+def _switches(plan: Plan) -> list[Finding]:
+    """Whether interlock and enable signal come often enough, and protected."""
+    findings: list[Finding] = []
+    safe_ns = plan.config.supervision.safe_after_ns
+    for channel in filter(None, map(plan.bench_channel, SWITCHES)):
+        message = _message(channel)
+        cycle_ns = message.cycle_time_ns
+        what = channel.key
+        if cycle_ns is not None and cycle_ns + plan.period_ns > safe_ns:
+            text = (
+                f"{message.name} comes every {cycle_ns * 1e-6:g} ms, open after "
+                f"{safe_ns * 1e-6:g} ms without it: expected a longer supervision.safe_after_s"
+            )
+            findings.append(Finding(Severity.ERROR, what, text))
+        else:
+            text = f"open after {safe_ns * 1e-6:g} ms without {message.name}"
+            findings.append(Finding(Severity.OK, what, text))
+        if message not in [_message(height) for height in plan.heights]:
+            findings.append(_protection(message))
+    return findings
+
+
+def _watchdog(plan: Plan) -> list[Finding]:
+    """Whether anything is sent when the loop stands still or its process dies."""
+    config = plan.config
+    if not plan.outgoing or config.bus.interface == _IN_STEP:
+        return []
+    duty = "the bench has to notice itself that its frames stop"
+    if not config.supervision.watchdog:
+        text = f"switched off: when the loop stands still or dies, {duty}"
+    elif config.bus.interface not in SHARED_INTERFACES:
+        text = f"none: no second process can use {config.bus.interface}; {duty}"
+    else:
+        after_ms = config.supervision.safe_after_ns * 1e-6
+        text = f"sends the safe output {after_ms:g} ms after the last tick"
+        return [Finding(Severity.OK, "supervision.watchdog", text)]
+    return [Finding(Severity.WARNING, "supervision.watchdog", text)]
 
 
 def _publication(plan: Plan) -> list[Finding]:

@@ -22,6 +22,7 @@ from rig.run.logged_run import Ended, Endpoint, on_signal, run_logged
 from rig.run.loop import RunControl
 from rig.run.ports import BenchOnBus, BusPort
 from rig.run.trace import Trace
+from rig.run.watchdog import Watchdog, can_watch
 from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.schema import BenchConfig
 
@@ -66,8 +67,9 @@ def live(
         BusError: The bus cannot be opened.
     """
     bridge = build_bridge(plan)
-    with real_time(plan.config) as (granted, clock):
+    with real_time(plan.config) as (granted, clock), contextlib.ExitStack() as stack:
         link = _open_link(plan, bridge, clock, listen_only=listen_only)
+        stack.callback(link.close)
         port = BusPort(link)
         endpoint = Endpoint(
             port,
@@ -77,12 +79,13 @@ def live(
             begin=partial(_drain_queue, link, clock),
             operator=port.operator,
         )
+        if can_watch(plan.config, listen_only=listen_only):
+            watchdog = Watchdog(plan, folder)
+            stack.callback(watchdog.stop)
+            endpoint = replace(endpoint, watchdog=watchdog)
         acknowledge = partial(port.operator.ask, Request.ACKNOWLEDGE, "SIGUSR1")
-        try:
-            with on_signal(signal.SIGUSR1, acknowledge):
-                return run_logged(plan, bridge, endpoint, folder, control, trace=trace)
-        finally:
-            link.close()
+        stack.enter_context(on_signal(signal.SIGUSR1, acknowledge))
+        return run_logged(plan, bridge, endpoint, folder, control, trace=trace)
 
 
 def _drain_queue(link: Link, clock: Clock) -> None:

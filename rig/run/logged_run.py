@@ -36,6 +36,7 @@ from rig.run.operator import Asked, Operator
 from rig.run.ports import InformedPort
 from rig.run.timing import Timing
 from rig.run.trace import Trace
+from rig.run.watchdog import Watchdog
 
 _MOST_REPORTS = 1000
 """Changes of the devices' state that `run.yaml` lists; the counts go on."""
@@ -84,6 +85,10 @@ def _no_setup() -> None:
     """Nothing to do before the first tick."""
 
 
+def _no_beat(_state: BridgeState) -> None:
+    """Nothing that has to know of a tick."""
+
+
 @dataclass(frozen=True)
 class Endpoint:
     """What a run has instead of a bench: where frames come from and go to, and when.
@@ -93,6 +98,7 @@ class Endpoint:
         begin: Called when all is set up, before the first tick.
         while_waiting: Called before each wait with the time that is awaited.
         operator: Where requests of operators arrive; with it, the run accepts them, and changes.
+        watchdog: Sends the safe output when the loop cannot.
     """
 
     port: Port
@@ -102,6 +108,7 @@ class Endpoint:
     begin: Callable[[], None] = _no_setup
     while_waiting: Sequence[Callable[[int], None]] = ()
     operator: Operator | None = None
+    watchdog: Watchdog | None = None
 
 
 def run_logged(
@@ -123,6 +130,8 @@ def run_logged(
         _copy_inputs(plan, folder)
         running = _LoggedRun(plan, bridge, endpoint, folder, control)
     try:
+        if endpoint.watchdog is not None:
+            endpoint.watchdog.start()
         endpoint.begin()
         running.run(trace)
     finally:
@@ -184,10 +193,12 @@ class _LoggedRun:
         with contextlib.ExitStack() as around:
             around.enter_context(on_signal(signal.SIGUSR2, lambda: self._log.trigger("user")))
             changes = self._changes(around)
+            beat = _no_beat if endpoint.watchdog is None else endpoint.watchdog.write
             ticks = run(self._bridge, due, source, sink, self._columns, changes)
             try:
                 for state in ticks:
                     self._state = state
+                    beat(state)
                     self._events.update(state, self._asked)
             finally:
                 self._publish_end(informed.conditions)
@@ -245,6 +256,8 @@ class _LoggedRun:
         while last < _LAST_FRAMES:
             t_ns += self._plan.period_ns
             endpoint.clock.wait_until(t_ns)
+            if endpoint.watchdog is not None:
+                endpoint.watchdog.write(state)
             if t_ns > latest_ns:
                 state = self._bridge.stop_ramp(state)
             state, frames = self._bridge.end(state, t_ns, conditions)
@@ -272,6 +285,7 @@ class _LoggedRun:
 
     def _ending(self) -> dict[str, object]:
         """The last section of `run.yaml`."""
+        watchdog = self._endpoint.watchdog
         return {
             "ending": {
                 "status": self._status,
@@ -289,6 +303,7 @@ class _LoggedRun:
                 "log_fault": self._log.trouble,
                 "dropped_steps": self._log.dropped,
                 "devices": self._reports.listed,
+                "watchdog": watchdog and watchdog.describe(),
             }
         }
 

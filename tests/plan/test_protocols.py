@@ -27,7 +27,7 @@ from rig.observers import OBSERVERS
 from rig.observers.protocol import Innovation, SensorStep, Start, TuningTask
 from rig.observers.strut_sensors import STRUT_SENSORS, Instant
 from rig.plan.build import ENGINES
-from tests.bridge.cores import FIRST, GAINS, MS, bench_sample, channels
+from tests.bridge.cores import FIRST, GAINS, MEASURED, MS, bench_sample, channels
 
 START = Start(0, 0.1, MS, 0, 50.0, 10.0)
 EXAMPLES = {
@@ -131,7 +131,7 @@ def test_an_estimator_has_settled_after_some_time_and_again_after_a_change(estim
     def settled(state, begin):
         """The first tick with a settled estimate, and the state then."""
         for tick in range(begin, begin + 100):
-            bench = [bench_sample(1, item, 5.0, tick * MS) for item in BENCH_QUANTITIES]
+            bench = [bench_sample(1, item, 5.0, tick * MS) for item in MEASURED]
             given = StepInput(tick * MS, (Sample(0, 0.4, tick * MS), *bench))
             state, estimate = estimator.step(state, given)
             if estimate is not None and estimate.is_settled:

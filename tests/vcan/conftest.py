@@ -16,6 +16,7 @@ import yaml
 
 from can_dbc.database import DEFAULT_DATABASE
 from rig.bus.bus import BusConfig
+from rig.cli.progress import stoppable
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.plan.plan import Plan
@@ -129,6 +130,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
             "supervision": {
                 "stale_after_s": 0.5,
                 "safe_after_s": 5.0,
+                # Importing all anew takes minutes in emulation.
+                "watchdog": False,
                 "limits": [
                     {"value": "measured_height_m", "low": 0.1, "high": 0.7, "action": "refuse"},
                 ],
@@ -175,6 +178,15 @@ def run_until_terminated(bench: Path, channel: str, dbc: Path) -> None:
         dbc,
         RunControl(stop=lambda: bool(asked), progress=lambda _t_ns, _mode: None),
     )
+
+
+def run_until_signal(config: Path, folder: Path, watchdog: bool) -> None:
+    """What `rig run` does until a signal ends it."""
+    ready = load_plan(config)
+    supervision = ready.config.supervision.model_copy(update={"watchdog": watchdog})
+    ready = ready.with_config(ready.config.model_copy(update={"supervision": supervision}))
+    with stoppable() as stop:
+        live(ready, folder, control=RunControl(stop=stop))
 
 
 def run_for(config: Path, folder: Path, seconds: float) -> None:

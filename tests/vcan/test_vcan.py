@@ -1,6 +1,9 @@
 """The bridge on the kernel's CAN stack, against programs that nobody here wrote."""
 
+import os
+import signal
 import subprocess
+import time
 from bisect import bisect_left
 from math import isnan
 from pathlib import Path
@@ -25,7 +28,15 @@ from rig.plan.load import load_plan
 from rig.run.replay import replay
 from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.config import load_bench_config
-from tests.vcan.conftest import BENCH_IDS, RATE_HZ, Files, in_process, run_for, running
+from tests.vcan.conftest import (
+    BENCH_IDS,
+    RATE_HZ,
+    Files,
+    in_process,
+    run_for,
+    run_until_signal,
+    running,
+)
 
 pytestmark = pytest.mark.vcan
 
@@ -346,6 +357,42 @@ def test_frames_that_a_gateway_corrupts_are_all_refused(bench, second_vcan, brid
     assert not (found.steps["strut.valid"].to_numpy()[late] == 1.0).any()
     assert counts.wrong_crc + counts.masquerade > 1.5 * RATE_HZ
     assert ended.state.mode is Mode.SAFE
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGKILL"])
+def test_the_last_that_candump_receives_is_invalid(name, bench, files, tmp_path):
+    """In order, or in place of a bridge that was killed."""
+    record, number = tmp_path / "candump.log", signal.Signals[name]
+    message = cantools.database.load_file(files.dbc).get_message_by_name("RIG_ESTIMATE")
+    arguments = (files.bridge(bench), tmp_path / "run", name == "SIGKILL")
+
+    def valid():
+        lines = record.read_text().rpartition("\n")[0].splitlines()
+        frames = [parse_frame(line, 0)[0] for line in lines]
+        return [
+            message.decode(frame.data, decode_choices=False)["VALID"]
+            for frame in frames
+            if frame.arbitration_id == message.frame_id
+        ]
+
+    with (
+        record.open("wb") as out,
+        running(["candump", "-L", bench], stdout=out),
+        in_process(run_until_signal, *arguments) as process,
+    ):
+        wait_until(lambda: sum(valid()[-50:]) > 40, 600.0)
+        os.kill(process.pid, number)
+        process.join(300.0)
+        wait_until(lambda: valid()[-3:] == [0, 0, 0], 300.0)
+    assert process.exitcode == (-number if name == "SIGKILL" else 0)
+    assert valid()[-1] == 0
+
+
+def wait_until(is_true, longest_s):
+    end_s = time.monotonic() + longest_s
+    while not is_true():
+        assert time.monotonic() < end_s
+        time.sleep(0.5)
 
 
 def test_listening_only_sends_nothing(bench, bridge, tmp_path):

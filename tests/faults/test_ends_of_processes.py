@@ -1,0 +1,50 @@
+"""The ends of a real `rig run` on a real bus, as an independent process receives them."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.long
+
+SIGNALS = ("SIGKILL", "SIGSTOP", "SIGTERM", "SIGHUP", "SIGINT")
+
+
+@pytest.fixture(scope="module")
+def ends(tmp_path_factory):
+    """What followed each signal; the bus is in a network that no other process is in."""
+    isolated = [shutil.which("unshare") or "unshare", "-rn"]
+    try:
+        subprocess.run([*isolated, "true"], check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("this machine lets nobody make a network of their own (unshare -rn)")
+    folder = tmp_path_factory.mktemp("ends")
+    command = [*isolated, sys.executable, "-P", "-m", "tests.faults.on_a_network", str(folder)]
+    found = subprocess.run(
+        [*command, *SIGNALS], check=True, capture_output=True, text=True, timeout=300.0
+    )
+    return {end["signal"]: end for end in map(json.loads, found.stdout.splitlines())}
+
+
+@pytest.mark.parametrize("name", SIGNALS)
+def test_the_last_that_the_bus_receives_is_invalid(ends, name):
+    end = ends[name]
+    assert end["last_valid"] == 0
+    assert end["in_sequence"]
+    assert end["invalid_frames"] >= 3
+
+
+def test_how_soon(ends):
+    """In order at the next tick; killed, within a second; a standstill after `safe_after_s`."""
+    assert all(ends[name]["first_invalid_s"] < 0.2 for name in ("SIGTERM", "SIGHUP", "SIGINT"))
+    assert ends["SIGKILL"]["first_invalid_s"] < 0.5
+    assert 0.45 < ends["SIGSTOP"]["first_invalid_s"] < 1.0
+
+
+def test_the_exit_codes(ends):
+    assert ends["SIGKILL"]["exit"] == -9
+    assert [ends[name]["exit"] for name in ("SIGTERM", "SIGHUP", "SIGINT")] == [0, 0, 0]
+    # Woken up again it finds that ticks are missing: the safe state.
+    assert ends["SIGSTOP"]["exit"] == 1
