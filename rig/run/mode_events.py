@@ -46,7 +46,7 @@ class ModeEvents:
 
     def _write_request(self, asked: Asked, supervised: SupervisedState) -> None:
         line: dict[str, object] = {
-            "t_s": supervised.t_ns * 1e-9,
+            "t_s": supervised.t_ns / 1e9,
             "request": asked.request.value,
             "by": asked.by,
         }
@@ -58,7 +58,7 @@ class ModeEvents:
     def _write(self, state: BridgeState, cause: Cause | None) -> None:
         supervised = state.supervised
         line: dict[str, object] = {
-            "t_s": supervised.t_ns * 1e-9,
+            "t_s": supervised.t_ns / 1e9,
             "from": self._mode.name,
             "to": supervised.mode.name,
             **self._text(cause),

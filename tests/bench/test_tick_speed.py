@@ -299,7 +299,7 @@ def test_a_tick_over_a_virtual_bus(capsys):
 def test_a_replay_against_a_loop_by_hand(tmp_path: Path, capsys):
     ticks = 20_000
     ready = load_plan(CONFIGS / "reference.yaml", duration_s=ticks / 1000)
-    live(ready, tmp_path / "run", ListPort(bench_frames(ready, ticks, {}), set()))
+    live(ready, tmp_path / "run", ListPort(bench_frames(ready, ticks, {})))
     by_hand, per_tick_us = hand_written_loop(), []
     by_hand_us: list[float] = []
     for _ in range(5):

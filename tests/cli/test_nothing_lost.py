@@ -24,7 +24,7 @@ def rig(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     ready = load_plan(CONFIGS / "reference.yaml", duration_s=0.2)
-    live(ready, tmp_path / "run", ListPort(bench_frames(ready, 200, {}), set()))
+    live(ready, tmp_path / "run", ListPort(bench_frames(ready, 200, {})))
     return tmp_path / "run"
 
 
@@ -104,7 +104,7 @@ def test_a_channel_of_any_name_gives_a_log_that_can_be_read(tmp_path, channel, w
     ready = load_plan(CONFIGS / "reference.yaml", duration_s=0.05)
     bus = dataclasses.replace(ready.config.bus, channel=channel)
     ready = ready.with_config(ready.config.model_copy(update={"bus": bus}))
-    live(ready, tmp_path / "run", ListPort(bench_frames(ready, 50, {}), set()))
+    live(ready, tmp_path / "run", ListPort(bench_frames(ready, 50, {})))
     assert len(list(read_run(tmp_path / "run").frames())) > 50
     assert f" {written} " in (tmp_path / "run" / "frames.log").read_text().splitlines()[0]
 
@@ -180,7 +180,7 @@ def test_a_run_with_heights_alone_is_not_diagnosed(tmp_path, monkeypatch, capsys
     )
     config = ready.config.model_copy(update={"signals": signals})
     ready = ready.with_config(config)
-    live(ready, tmp_path / "run", ListPort(bench_frames(ready, 1000, {}), set()))
+    live(ready, tmp_path / "run", ListPort(bench_frames(ready, 1000, {})))
     arguments = ("diagnose", tmp_path / "run", "--model", "reference", "--out", tmp_path / "found")
     assert rig(monkeypatch, *arguments) == 2
     error = capsys.readouterr().err

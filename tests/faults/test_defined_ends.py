@@ -106,7 +106,7 @@ class Heard(ListPort):
     """A bench of its own that keeps what it is sent."""
 
     def __init__(self, frames):
-        super().__init__(frames, set())
+        super().__init__(frames)
         self.sent = []
 
     def send(self, frames):

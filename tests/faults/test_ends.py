@@ -15,17 +15,23 @@ import pytest
 
 from can_dbc.database import DEFAULT_DATABASE
 from dart_model.plant import DartPlant
-from rig.bridge.values import Mode
+from rig.bridge.counts import Conditions
+from rig.bridge.values import Mode, Request
 from rig.bus.bus import Bus
+from rig.bus.link import LinkFigures
 from rig.cli.progress import stoppable
 from rig.log.reader import read_run
+from rig.machine.clock import VirtualClock
 from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.live import with_bench
+from rig.run.logged_run import Endpoint, run_logged
 from rig.run.loop import RunControl
+from rig.run.operator import Operator
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
+from tests.run.listed import ListPort, bench_frames
 
 S = 1_000_000_000
 DBC = cantools.database.load_file(DEFAULT_DATABASE)
@@ -191,6 +197,38 @@ def test_before_a_bench_sends_the_bridge_says_that_it_waits():
     assert ESTIMATE.decode(by_id[ESTIMATE.frame_id])["VALID"] == "INVALID"
     assert STATUS.decode(by_id[STATUS.frame_id])["STATE"] == "WAITING"
     assert state.mode is Mode.WAITING
+
+
+def test_requests_are_on_record_with_who_made_them(tmp_path):
+    plan = load_plan(CONFIGS / "reference.yaml", duration_s=0.6)
+    supervision = plan.config.supervision.model_copy(update={"settling_s": 0.1, "arming": "manual"})
+    plan = plan.with_config(plan.config.model_copy(update={"supervision": supervision}))
+    port = ListPort(bench_frames(plan, 600, {}))
+    operator = Operator()
+
+    class Asked:
+        """A port that an operator makes requests to, as a bus has one."""
+
+        send = port.send
+
+        def receive(self, t_ns):
+            frames, _ = port.receive(t_ns)
+            for tick, request in ((300, Request.ARM), (400, Request.DISARM)):
+                if t_ns == tick * 1_000_000:
+                    operator.ask(request, "anna")
+            return frames, Conditions(request=operator.take())
+
+    endpoint = Endpoint(Asked(), VirtualClock(), LinkFigures(), operator=operator)
+    run_logged(plan, build_bridge(plan), endpoint, tmp_path / "run", RunControl())
+    text = (tmp_path / "run" / "events.jsonl").read_text()
+    lines = [json.loads(line) for line in text.splitlines()]
+    asked = [line for line in lines if "request" in line]
+    assert asked == [
+        {"t_s": 0.3, "request": "arm", "by": "anna"},
+        {"t_s": 0.4, "request": "disarm", "by": "anna"},
+    ]
+    changes = [(line["t_s"], line["to"]) for line in lines if "to" in line]
+    assert changes[-2:] == [(0.3, "RUNNING"), (0.4, "READY")]
 
 
 def test_events_and_times_in_each_mode_are_on_record(tmp_path):

@@ -65,6 +65,6 @@ def test_a_version_is_found_by_the_name_of_the_package(package):
 
 def test_a_run_has_the_version_under_the_name_rig(tmp_path):
     plan = load_plan(CONFIGS / "reference.yaml", duration_s=0.05)
-    live(plan, tmp_path / "run", ListPort(bench_frames(plan, 50, {}), set()))
+    live(plan, tmp_path / "run", ListPort(bench_frames(plan, 50, {})))
     header = yaml.safe_load((tmp_path / "run" / "run.yaml").read_text("utf-8"))
     assert header["versions"]["rig"] == PROJECT["version"]

@@ -35,7 +35,7 @@ def test_a_model_comes_by_name():
 
 def test_a_run_is_arrays_by_column(tmp_path):
     ready = load_plan(CONFIGS / "reference.yaml", duration_s=0.3)
-    live(ready, tmp_path / "run", ListPort(bench_frames(ready, 300, {}), set()))
+    live(ready, tmp_path / "run", ListPort(bench_frames(ready, 300, {})))
     run = rig.open_run(tmp_path / "run")
     assert run.t_s.tolist() == pytest.approx(np.arange(300) * 1e-3)
     assert run["strut.height_m"].shape == run["applied_force_n"].shape == (300,)

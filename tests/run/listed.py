@@ -1,8 +1,9 @@
 """Runs whose frames were thought up beforehand, without a bench or a bus."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from msgspec.structs import replace
 
@@ -23,15 +24,19 @@ MS = 1_000_000
 
 
 class ListPort:
-    """Frames that were thought up beforehand, tick by tick."""
+    """Frames, and requests of operators, that were thought up beforehand, tick by tick."""
 
-    def __init__(self, frames: dict[int, list[Frame]], acknowledged: set[int]) -> None:
+    def __init__(
+        self,
+        frames: Mapping[int, list[Frame]],
+        requests: Mapping[int, Request] = MappingProxyType({}),
+    ) -> None:
         self._frames = frames
-        self._acknowledged = acknowledged
+        self._requests = requests
 
     def receive(self, t_ns: int) -> tuple[Sequence[Frame], Conditions]:
-        request = Request.ACKNOWLEDGE if t_ns // MS in self._acknowledged else None
-        return self._frames.get(t_ns // MS, []), Conditions(request=request)
+        tick = t_ns // MS
+        return self._frames.get(tick, []), Conditions(request=self._requests.get(tick))
 
     def send(self, frames: Sequence[Frame]) -> Sequence[Frame]:
         return frames

@@ -75,7 +75,7 @@ def test_one_of_several_runs_is_written_and_the_others_write_nothing(
 
     def run(_):
         try:
-            live(ready, folder, ListPort(bench_frames(ready, 100, {}), set()))
+            live(ready, folder, ListPort(bench_frames(ready, 100, {})))
         except InputError as error:
             return str(error)
         return None

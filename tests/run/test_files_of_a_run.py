@@ -47,7 +47,7 @@ def run(tmp_path):
     text = (CONFIGS / "reference.yaml").read_text().replace("model: reference", "model: bench.yaml")
     (source / "bench_run.yaml").write_text(text + "log: {most_captures: 1}\n")
     ready = load_plan(source / "bench_run.yaml", duration_s=2.0)
-    live(ready, tmp_path / "run", ListPort(bench_frames(ready, 1000, {}), set()))
+    live(ready, tmp_path / "run", ListPort(bench_frames(ready, 1000, {})))
     shutil.rmtree(source)
     return tmp_path / "run"
 

@@ -19,7 +19,7 @@ COUNT = 800
 def make_run(folder, count=COUNT):
     """A run of the reference case, on a fake clock."""
     ready = load_plan(CONFIGS / "reference.yaml", duration_s=count * 1e-3)
-    live(ready, folder, ListPort(bench_frames(ready, count, {}), set()))
+    live(ready, folder, ListPort(bench_frames(ready, count, {})))
     return folder
 
 
