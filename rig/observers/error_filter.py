@@ -36,6 +36,14 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from scipy.linalg import expm  # pyright: ignore[reportUnknownVariableType]
 
+from rig.observers.filter_lag import (
+    NO_LAG,
+    Lag,
+    LagFilter,
+    lag_variance,
+    make_lag_filter,
+    update_lag,
+)
 from rig.observers.protocol import Innovation, Remark, Start, TuningTask
 
 Array = NDArray[np.float64]
@@ -74,6 +82,9 @@ _NO_ERROR: Mean = (0.0, 0.0, 0.0, 0.0, 0.0)
 _FORGOTTEN = 20.0
 """Time without a measurement, in units of 1 / omega, after which what was known is worth nothing: a
 polynomial of third order is 20³ times as uncertain as at one."""
+
+_MOST_HELD = 20
+"""Missing measurements for which an innovation stands in the derivatives that show a lag."""
 
 _STEP_OF_MODEL = 0.5
 """Of a step of the mean, in radians or time constants of the model's own law: a ten-thousandth of
@@ -122,6 +133,7 @@ class Constants(Struct, frozen=True, gc=False):
         forgotten_ns: Time after which the last measurement says nothing more.
         own_per_s: How fast the model's own law moves it: the larger one of its damping and the
             root of its stiffness, over the mass.
+        lag: Filter of the innovations that shows a lag.
     """
 
     steady: Steady
@@ -134,6 +146,7 @@ class Constants(Struct, frozen=True, gc=False):
     longest_ns: int
     forgotten_ns: int
     own_per_s: float
+    lag: LagFilter
 
 
 class ErrorState(Struct, frozen=True, gc=False):
@@ -146,6 +159,7 @@ class ErrorState(Struct, frozen=True, gc=False):
         scale: Variance of the sensor over the configured one, as the innovations show it.
         inputs: Accelerations by the virtual force, and from when on; the first one from `t_ns` or
             before.
+        lag: Lag behind a force that changes faster than the filter allows for.
     """
 
     t_ns: int
@@ -155,6 +169,7 @@ class ErrorState(Struct, frozen=True, gc=False):
     inputs: tuple[tuple[int, float], ...]
     start: Start
     constants: Constants
+    lag: Lag = NO_LAG
 
 
 @dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
@@ -254,24 +269,30 @@ class ErrorFilter:
         if elapsed_ns > constants.forgotten_ns:
             return self.restart(state, innovation)
         mean = mean_at(state, t_ns)
-        covariance, scale = state.covariance, state.scale
+        covariance, scale, lag = state.covariance, state.scale, state.lag
         # What is new in a measurement: its distance from the error that was predicted.
         new_m = innovation.value - mean[0]
         if covariance is None and elapsed_ns < constants.next_ns:
             gain = constants.gain
             scale = update_scale(constants, scale, new_m * new_m / constants.innovation_m2)
+            lag = update_lag(lag, constants.lag, new_m)
         else:
             steady = constants.steady.covariance
             before = steady if covariance is None else covariance
             number = max(1, round(elapsed_ns / state.start.interval_ns))
-            in_units, covariance = _gain(predict_covariance(before, self.pace(state.start), number))
+            ahead = predict_covariance(before, self.pace(state.start), number)
+            # As large as it would be were the filter steady.
+            share = math.sqrt(constants.steady.innovation / (float(ahead[0, 0]) + 1.0))
+            for _ in range(min(number, _MOST_HELD)):
+                lag = update_lag(lag, constants.lag, share * new_m)
+            in_units, covariance = _gain(ahead)
             gain = in_si(in_units, constants.omega)
             limit = np.diagonal(steady)
             if np.all(np.abs(np.diagonal(covariance) - limit) <= _SETTLED * limit):
                 covariance = None
         inputs = inputs_since(state.inputs, t_ns)
         mean = correct(mean, gain, new_m)
-        return ErrorState(t_ns, mean, covariance, scale, inputs, state.start, constants)
+        return ErrorState(t_ns, mean, covariance, scale, inputs, state.start, constants, lag)
 
     def restart(self, state: ErrorState, innovation: Innovation) -> ErrorState:
         """State at a measurement before which everything known has become worthless."""
@@ -304,11 +325,15 @@ class ErrorFilter:
         if state.covariance is not None:
             variance = _ahead(state.covariance, self.pace(state.start), number)
         elif number < 1:
-            return math.sqrt(state.scale) * constants.residual_std
+            variance_of_noise = state.scale * constants.residual_std**2
+            return math.sqrt(
+                variance_of_noise + lag_variance(state.lag, constants.lag, state.scale)
+            )
         else:
             variance = _steady_ahead(self.pace(state.start), number)
-        std = math.sqrt(state.scale * max(variance, 0.0))
-        return std * self.noise_std_m * constants.omega**2
+        unit = self.noise_std_m * constants.omega**2
+        variance_of_noise = state.scale * max(variance, 0.0) * unit * unit
+        return math.sqrt(variance_of_noise + lag_variance(state.lag, constants.lag, state.scale))
 
     def with_input(self, state: ErrorState, t_ns: int, acceleration: float) -> ErrorState:
         """State after the virtual force has changed."""
@@ -327,6 +352,7 @@ class ErrorFilter:
             inputs,
             state.start,
             state.constants,
+            state.lag,
         )
 
     def numbers(self, state: ErrorState) -> tuple[float, ...]:
@@ -348,9 +374,10 @@ class ErrorFilter:
     def _constants(self, start: Start) -> Constants:
         steady, omega, interval_ns = _steady(self.pace(start)), self.omega, start.interval_ns
         variance_m2 = self.noise_std_m**2
+        gain = in_si(steady.gain, omega)
         return Constants(
             steady,
-            in_si(steady.gain, omega),
+            gain,
             steady.innovation * variance_m2,
             math.sqrt(max(steady.residual, 0.0) * variance_m2) * omega**2,
             min(1.0, interval_ns * 1e-9 / _FADING_S),
@@ -359,6 +386,7 @@ class ErrorFilter:
             start.delay_ns + 2 * interval_ns + round(1e9 / omega),
             self.forgotten_ns,
             max(abs(start.damping_per_s), math.sqrt(abs(start.stiffness_per_s2))),
+            make_lag_filter(omega, interval_ns * 1e-9, gain[:2], steady.innovation * variance_m2),
         )
 
     def pace(self, start: Start) -> "Pace":

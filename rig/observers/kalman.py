@@ -26,6 +26,7 @@ from pydantic.dataclasses import dataclass
 
 from can_dbc.yaml_file import Positive
 from rig.observers.error_filter import ErrorFilter, ErrorState
+from rig.observers.filter_lag import NO_LAG
 from rig.observers.protocol import (
     AnyObserver,
     Innovation,
@@ -107,11 +108,12 @@ class KalmanObserver:
         return self._initial(self.filter.init(start), start)
 
     def restart(self, state: KalmanState, start: Start) -> KalmanState:
-        """The state of a start, with the health of the further sensors."""
+        """The state of a start, with the lag there was and the health of the further sensors."""
         begun = self.init(start)
-        if state.fusion is None:
-            return begun
-        return structs.replace(begun, fusion=restart_memory(state.fusion, start))
+        lag = NO_LAG._replace(square=state.error.lag.square, peak=state.error.lag.peak)
+        error = structs.replace(begun.error, lag=lag)
+        fusion = None if state.fusion is None else restart_memory(state.fusion, start)
+        return structs.replace(begun, error=error, fusion=fusion)
 
     def steady_state(self, start: Start) -> KalmanState:
         return self._initial(self.filter.steady_state(start), start)
