@@ -77,9 +77,9 @@ class Arming:
         """Whether estimates may be valid: all that has to permit them does."""
         if self.is_manual and not state.is_armed:
             return False
-        if self._enable >= 0 and not self._is_closed(state.enable, t_ns):
+        if self._enable >= 0 and not self._permits_now(state.enable, t_ns):
             return False
-        return self._interlock < 0 or self._is_closed(state.interlock, t_ns)
+        return self._interlock < 0 or self._permits_now(state.interlock, t_ns)
 
     def find_open(self, state: ArmingState, t_ns: int) -> OpenInterlock | None:
         """Why the interlock counts as open; None if it does not.
@@ -87,14 +87,14 @@ class Arming:
         One that was never received permits nothing, and counts as open at no time.
         """
         sample = state.interlock
-        if sample is None or self._is_closed(sample, t_ns):
+        if sample is None or self._permits_now(sample, t_ns):
             return None
         if not sample.value:
             return OpenInterlock("interlock", 0.0)
         age_s = (t_ns - sample.t_ns) * 1e-9
         return OpenInterlock("age_s", age_s, self._safe_after_ns * 1e-9)
 
-    def _is_closed(self, sample: Sample | None, t_ns: int) -> bool:
+    def _permits_now(self, sample: Sample | None, t_ns: int) -> bool:
         return (
             sample is not None
             and bool(sample.value)

@@ -282,10 +282,13 @@ class FreeModelEstimator:
     ) -> tuple[FreeModelState, Estimate | None]:
         """Advance the model to the tick and correct it with what was measured.
 
-        After too long a gap the model starts again from the measurements behind it instead.
+        After too long a gap in a height or in the applied force the model starts again from the
+        measurements behind it instead.
         """
         heights, readings = received.heights, received.readings
         applied, temperature_c = received.applied or state.applied, received.temperature_c
+        if self._is_behind_gap(received.applied, state.applied):
+            return self._start_if_possible(self.restart(state, t_ns), t_ns, received)
         applied_n = loaded.applied_force_n if applied is None else applied.value
         if temperature_c is None:
             temperature_c = loaded.temperature_c
@@ -336,6 +339,12 @@ class FreeModelEstimator:
             until_ns = applied.t_ns + self._applied_grace_ns
             oldest_ns = min(oldest_ns, until_ns)
         return self._estimate(after, loaded, oldest_ns)
+
+    def _is_behind_gap(self, new: Sample | None, last: Sample | None) -> bool:
+        """Whether an applied force is so much newer than the last that this was too old."""
+        if new is None or last is None:
+            return False
+        return new.t_ns - last.t_ns > self._applied_grace_ns + self._stale_after_ns
 
     def _recent_instants(
         self, state: FreeModelState, before: LoadedModel[ModelState], now: Instant

@@ -181,7 +181,7 @@ def safe_frames(
     return [item.frame(report, t_ns)[0] for item, report in zip(outgoing, reports, strict=True)]
 
 
-class Look(NamedTuple):
+class Wake(NamedTuple):
     """A look at the pipe: its time, and what came through it; nothing if it was closed."""
 
     t_ns: int
@@ -189,7 +189,7 @@ class Look(NamedTuple):
 
 
 def watch(
-    beat: Beat, safe_after_ns: int, wait: Callable[[], Look], send: Callable[[int], None]
+    beat: Beat, safe_after_ns: int, wait: Callable[[], Wake], send: Callable[[int], None]
 ) -> int | None:
     """Send the safe output as long as the loop stands still; returns when its process ends.
 
@@ -252,9 +252,9 @@ def main() -> None:
     supervision = plan.config.supervision
     is_last = supervision.safe_output == "last"
 
-    def wait() -> Look:
+    def wait() -> Wake:
         ready, _, _ = select.select([pipe], [], [], _EVERY_S)
-        return Look(time.monotonic_ns(), os.read(pipe, 100) if ready else None)
+        return Wake(time.monotonic_ns(), os.read(pipe, 100) if ready else None)
 
     def send(sent: int) -> None:
         for frame in safe_frames(outgoing, beat, sent, time.time_ns(), is_last=is_last):

@@ -30,6 +30,7 @@ _HEAD = ("Fault", "What the bridge does", "Within", "What is lost")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--fault-table", metavar="FILE", help="write the table of faults there")
+    parser.addoption("--promise-table", metavar="FILE", help="write what VALID promises there")
 
 
 @pytest.fixture(scope="session")
@@ -54,5 +55,46 @@ def row(rows: list[Row]) -> Callable[..., None]:
     def add(order: int, fault: str, reaction: str, within_ms: float | str, lost: str) -> None:
         within = within_ms if isinstance(within_ms, str) else f"{within_ms:.0f} ms"
         rows.append(Row(order, fault, reaction, within, lost))
+
+    return add
+
+
+_PROMISE = (
+    "Event",
+    "Modes",
+    "First frame invalid",
+    "Valid again",
+    "Largest valid error",
+    "The bench",
+)
+
+
+@pytest.fixture(scope="session")
+def promises(request: pytest.FixtureRequest) -> Iterator[list[tuple[int, tuple[str, ...]]]]:
+    """What the tests of the promise measured; written at the end, if asked for."""
+    found: list[tuple[int, tuple[str, ...]]] = []
+    yield found
+    target = request.config.getoption("--promise-table")
+    if target:
+        lines = [_line(_PROMISE), _line(("---",) * 6), *[_line(row) for _, row in sorted(found)]]
+        Path(target).write_text("\n".join(lines) + "\n", "utf-8")
+
+
+@pytest.fixture
+def promise(promises: list[tuple[int, tuple[str, ...]]]) -> Callable[..., None]:
+    """Adds a row; times are those of the noise-aware observer, errors those of all."""
+
+    def add(
+        order: int,
+        event: str,
+        modes: list[str],
+        within: str,
+        again_ms: int | None,
+        ratios: dict[str, float],
+        duty: str,
+    ) -> None:
+        again = "" if again_ms is None else f"after {again_ms + 1} ms"
+        errors = " / ".join(f"{ratio:.2f}" for ratio in ratios.values())
+        promises.append((order, (event, ", ".join(modes), within, again, errors, duty)))
 
     return add

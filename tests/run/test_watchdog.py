@@ -14,7 +14,7 @@ from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.watchdog import (
     Beat,
-    Look,
+    Wake,
     Watchdog,
     _as_values,  # pyright: ignore[reportPrivateUsage]
     _secure,  # pyright: ignore[reportPrivateUsage]
@@ -75,7 +75,7 @@ class Scripted:
         self.now += 1
         if self._ticking(self.now):
             self._beat.ticks[0] += 1
-        return Look(self.now * 10 * MS, self._received(self.now))
+        return Wake(self.now * 10 * MS, self._received(self.now))
 
     def send(self, sent):
         self.sent.append((self.now, sent))

@@ -1,0 +1,304 @@
+"""What VALID promises, event by event and for every kind of observer, as a node on the bus sees it.
+
+The node decodes the bridge's frames with cantools; the run's log and the bridge's own values are
+not used. `pytest tests/faults -n 0 --promise-table FILE` writes what was measured.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import cantools
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from can_dbc.codec import compile_decoder, compile_encoder
+from can_dbc.database import DEFAULT_DATABASE
+from can_dbc.frame import Frame
+from can_dbc.protection import compile_protector
+from can_dbc.units import Dimension
+from rig.bridge.counts import Conditions
+from rig.bridge.values import Mode, Request
+from rig.observers.error_filter import ErrorFilter
+from rig.observers.kalman import KalmanObserver
+from rig.observers.pi import PiObserver
+from rig.plan.build import build_bridge
+from rig.simulated_bench.trajectory import simulate
+from tests.bridge.test_operation import Switches, trial_with_switches
+from tests.faults.trial import BEGIN_MS, MS, Gateway, Trial
+
+DBC = cantools.database.load_file(DEFAULT_DATABASE)
+ESTIMATE, STATUS = DBC.get_message_by_name("RIG_ESTIMATE"), DBC.get_message_by_name("RIG_STATUS")
+FILTER = ErrorFilter(bandwidth_hz=19.0, noise_std_m=2e-6)
+OBSERVERS = {
+    "published PI": None,
+    "damped PI": PiObserver(
+        proportional_n_per_m=2e4,
+        integral_n_per_m_s=1e4,
+        derivative_n_s_per_m=600.0,
+        filter=ErrorFilter(bandwidth_hz=60.0, noise_std_m=2e-6),
+    ),
+    "noise-aware": KalmanObserver("kalman", FILTER),
+}
+END_MS = BEGIN_MS + 4500
+MOST = 3.0
+"""Largest error of a valid force, over the largest of the settled run."""
+
+
+class Event(NamedTuple):
+    """An event, and what it does to a run.
+
+    Attributes:
+        words: What happens.
+        duty: What the bench has to do itself.
+        frames: Time of a tick in ms and the bench's frames -> those that arrive.
+        conditions: Time of a tick in ms -> what the loop knows.
+        missed: First and last of the ticks that do not take place.
+        supervision: Settings.
+    """
+
+    words: str
+    duty: str = "nothing"
+    frames: Callable[[int, list[Frame]], list[Frame]] = lambda _ms, frames: frames
+    conditions: Callable[[int], Conditions] = lambda _ms: Conditions()
+    missed: range = range(0)
+    supervision: dict[str, object] = {}  # noqa: RUF012 - never changed
+
+
+class Received(NamedTuple):
+    """What the node received at a tick; state and first cause are those of the last status."""
+
+    ms: int
+    is_valid: bool
+    force_n: float
+    mode: Mode
+
+
+def follow(trial: Trial, event: Event, end_ms: int = END_MS, first_ms: int = 0) -> list[Received]:
+    """Run a trial through an event; returns what a node on the bus received."""
+    received: list[Received] = []
+    mode, missed = Mode.INIT, 0
+    queue: list[Frame] = []
+    trial.state = trial.bridge.init(first_ms * MS)
+    for ms in range(end_ms):
+        queue += event.frames(ms, trial.bench.update(ms * MS)[0])
+        if ms < first_ms:
+            queue = []
+            continue
+        if ms in event.missed:
+            missed += 1
+            continue
+        conditions = event.conditions(ms)._replace(overruns=missed)
+        trial.state, result = trial.bridge.tick(trial.state, ms * MS, queue, conditions)
+        queue, missed = [], 0
+        for frame in result.frames:
+            if frame.arbitration_id == STATUS.frame_id:
+                mode = Mode(STATUS.decode(frame.data, decode_choices=False)["STATE"])
+        [data] = [it.data for it in result.frames if it.arbitration_id == ESTIMATE.frame_id]
+        values = ESTIMATE.decode(data, decode_choices=False)
+        received.append(Received(ms, bool(values["VALID"]), values["SPRING_DAMPER_FORCE"], mode))
+    return received
+
+
+@pytest.fixture(scope="module")
+def truth_n():
+    return simulate(Trial().bench.config, END_MS * MS, MS).strut_force_n[:, 0]
+
+
+@pytest.fixture(scope="module")
+def settled_n(truth_n):
+    """Largest error of each observer's settled run, and the time from which it is valid."""
+    found = {}
+    for name, observer in OBSERVERS.items():
+        received = follow(Trial(observer=observer), Event("none"))
+        errors_n = [abs(it.force_n - truth_n[it.ms]) for it in received if it.is_valid]
+        found[name] = max(errors_n)
+    return found
+
+
+def missing(length):
+    return lambda ms, frames: [] if BEGIN_MS <= ms < BEGIN_MS + length else frames
+
+
+def gateway(held, every):
+    hold = Gateway(held, every)
+    return lambda ms, frames: hold(ms * MS, frames) if ms >= BEGIN_MS else frames
+
+
+class Frozen:
+    """The height of one moment for 600 ms, in frames that are right in all else."""
+
+    def __init__(self) -> None:
+        message = Trial().ready.database.message("BENCH_MEASUREMENT")
+        names, dimensions = ["HEIGHT", "APPLIED_FORCE"], [Dimension.LENGTH, Dimension.FORCE]
+        self._decode = compile_decoder(message, names, dimensions)
+        self._encode = compile_encoder(message, names, dimensions)
+        self._protect = compile_protector(message.protection)
+        self._height_m = None
+
+    def __call__(self, ms, frames):
+        if not BEGIN_MS <= ms < BEGIN_MS + 600:
+            return frames
+        found = []
+        for frame in frames:
+            if frame.arbitration_id == 0x100:
+                height_m, applied_n = self._decode(frame.data)
+                self._height_m = height_m if self._height_m is None else self._height_m
+                data = self._encode([self._height_m, applied_n])[0]
+                frame = replace(frame, data=self._protect(data, frame.data[1] & 0x0F))  # noqa: PLW2901
+            found.append(frame)
+        return found
+
+
+def acknowledged(ms):
+    """An operator who acknowledges once a second."""
+    is_asked = ms > BEGIN_MS and ms % 1000 == 900
+    return Conditions(request=Request.ACKNOWLEDGE if is_asked else None)
+
+
+def overloaded(ms):
+    return Conditions(overruns=3 if BEGIN_MS <= ms < BEGIN_MS + 500 else 0)
+
+
+def disk_full(ms):
+    is_full = BEGIN_MS <= ms < BEGIN_MS + 500
+    return acknowledged(ms)._replace(log_fault=is_full)
+
+
+STOP = "stop using the force while VALID is 0"
+EVENTS = [
+    Event("frames missing for 5 ms", frames=missing(5)),
+    Event("frames missing for 100 ms", STOP, missing(100)),
+    Event("frames missing for 200 ms", STOP, missing(200)),
+    Event("frames missing for 1 s, then acknowledged", STOP, missing(1000), acknowledged),
+    Event("frames held back for 8 ms, every 2 s (a gateway)", frames=gateway(8, 2000)),
+    Event("frames held back for 20 ms, every 2 s", STOP, gateway(20, 2000)),
+    Event("the loop stands still for 100 ms", STOP, missed=range(BEGIN_MS, BEGIN_MS + 100)),
+    Event(
+        "the loop stands still for 2 s (suspend), then acknowledged",
+        "as above; where there is no watchdog, notice that the frames stop",
+        conditions=acknowledged,
+        missed=range(BEGIN_MS, BEGIN_MS + 2000),
+    ),
+    Event("most ticks are missed for 500 ms (overload)", STOP, conditions=overloaded),
+    Event(
+        "the height is frozen for 600 ms (limit `unchanged_s: 0.02`), then acknowledged",
+        STOP,
+        Frozen(),
+        acknowledged,
+        supervision={"limits": [{"value": "unchanged_s", "high": 0.02, "action": "refuse"}]},
+    ),
+    Event(
+        "the disk is full for 500 ms (`log_fault: safe`), then acknowledged",
+        STOP,
+        conditions=disk_full,
+        supervision={"log_fault": "safe"},
+    ),
+]
+
+
+def largest_error_n(received, truth_n):
+    return max(abs(it.force_n - truth_n[it.ms]) for it in received if it.is_valid)
+
+
+def describe(received, begin_ms):
+    """Modes that followed, and the time from the event to the first invalid frame."""
+    modes = []
+    for item in received:
+        if item.ms >= begin_ms and item.mode.name not in modes[-1:]:
+            modes.append(item.mode.name)
+    invalid = next(
+        (it.ms - begin_ms for it in received if it.ms >= begin_ms and not it.is_valid), None
+    )
+    again = next((it.ms - begin_ms for it in reversed(received) if not it.is_valid), None)
+    within = "stays valid" if invalid is None else f"{max(invalid, 0)} ms"
+    return modes, within, again
+
+
+@pytest.mark.parametrize("order", range(len(EVENTS)), ids=lambda order: EVENTS[order].words)
+def test_no_valid_force_errs_by_more_than_three_times_the_settled_one(
+    order, promise, truth_n, settled_n
+):
+    event = EVENTS[order]
+    ratios = {}
+    for name, observer in OBSERVERS.items():
+        trial = Trial(observer=observer, **event.supervision)
+        received = follow(trial, event)
+        ratios[name] = largest_error_n(received, truth_n) / settled_n[name]
+        assert ratios[name] <= MOST
+        assert received[-1].is_valid
+        if name == "noise-aware":
+            modes, within, again = describe(received, BEGIN_MS)
+    promise(order, event.words, modes, within, again, ratios, event.duty)
+
+
+@pytest.mark.parametrize("first_ms", [700, 1200])
+def test_a_bridge_that_joins(first_ms, promise, truth_n, settled_n):
+    ratios = {}
+    for name, observer in OBSERVERS.items():
+        received = follow(Trial(observer=observer), Event("joins"), first_ms=first_ms)
+        ratios[name] = largest_error_n(received, truth_n) / settled_n[name]
+        assert ratios[name] <= MOST
+        modes, within, again = describe(received, first_ms)
+    if first_ms == 1200:
+        words = "the bridge joins a bench that moves"
+        promise(-2, words, modes, within, again, ratios, STOP)
+
+
+def test_an_interlock_that_opens(promise, truth_n, settled_n):
+    ratios = {}
+    for name, observer in OBSERVERS.items():
+        trial = trial_with_switches("interlock", observer=observer)
+        switches = Switches(trial, interlock=True)
+
+        def frames(ms, frames, switches=switches):
+            switches.closed["interlock"] = not BEGIN_MS <= ms < BEGIN_MS + 300
+            return switches(ms * MS, frames)
+
+        event = Event("", frames=frames, conditions=acknowledged)
+        received = follow(trial, event)
+        ratios[name] = largest_error_n(received, truth_n) / settled_n[name]
+        assert ratios[name] <= MOST
+        assert received[-1].is_valid
+        modes, within, again = describe(received, BEGIN_MS)
+    duty = "be switched off by hardware itself"
+    promise(
+        50, "the interlock opens for 300 ms, then acknowledged", modes, within, again, ratios, duty
+    )
+
+
+def test_an_applied_force_of_its_own_message_that_stops(promise, truth_n, settled_n):
+    ratios = {}
+    for name, observer in OBSERVERS.items():
+        trial = Trial(observer=observer)
+        content = trial.ready.config.model_dump(mode="json")
+        other = {"message": "BENCH_MEASUREMENT_2", "signal": "APPLIED_FORCE"}
+        content["signals"]["applied_force"] = other
+        trial.ready = trial.ready.with_config(trial.ready.config.model_validate(content))
+        trial.bridge = build_bridge(trial.ready)
+        message = trial.ready.database.message("BENCH_MEASUREMENT_2")
+        protect = compile_protector(message.protection)
+
+        def frames(ms, frames, protect=protect):
+            if BEGIN_MS <= ms < BEGIN_MS + 300:
+                return frames
+            copies = [
+                replace(frame, arbitration_id=0x101, data=protect(frame.data, frame.data[1] & 0x0F))
+                for frame in frames
+                if frame.arbitration_id == 0x100
+            ]
+            return [*frames, *copies]
+
+        received = follow(trial, Event("", frames=frames))
+        ratios[name] = largest_error_n(received, truth_n) / settled_n[name]
+        assert ratios[name] <= MOST
+        assert received[-1].is_valid
+        modes, within, again = describe(received, BEGIN_MS)
+    words = "the applied force has a message of its own, which stops for 300 ms"
+    promise(40, words, modes, within, again, ratios, STOP)
+
+
+def test_the_errors_are_held_against_a_force_that_a_wrong_one_would_exceed(truth_n, settled_n):
+    """The bound is one: it is far below what went out as valid before there was settling."""
+    peak_n = np.abs(truth_n).max()
+    assert all(MOST * error_n < 0.15 * peak_n for error_n in settled_n.values())
