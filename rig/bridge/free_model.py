@@ -9,9 +9,11 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
+from can_dbc.codec import si_step
 from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant, LoadedModel, ModelState
 from rig.bridge.estimator import Estimate, find_divergence, is_sensible
+from rig.bridge.innovation_band import InnovationBand, update_band
 from rig.bridge.measurement_age import is_too_old
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
@@ -50,6 +52,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
         applied: Last applied force; None before the first.
         is_settled: Whether every strut's estimate has settled.
         longest_gaps_ns: Of each strut the longest time without a measurement.
+        bands: Of each strut the band of its innovations.
     """
 
     t_ns: int
@@ -62,6 +65,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
     applied: Sample | None = None
     is_settled: bool = False
     longest_gaps_ns: tuple[int, ...] = ()
+    bands: tuple[InnovationBand, ...] = ()
 
 
 class _Received(Struct, frozen=True, gc=False):
@@ -111,6 +115,7 @@ class FreeModelEstimator:
         self._heights = {
             channel.strut: channel for channel in channels if channel.role is Role.HEIGHT
         }
+        self._sensing = [_sensing(self._heights.get(strut)) for strut in range(plant.struts)]
         sensors = [channel for channel in channels if channel.role is Role.SENSOR]
         self._sensors = tuple(
             tuple(channel for channel in sensors if channel.strut == strut)
@@ -151,6 +156,7 @@ class FreeModelEstimator:
             ((),) * self.struts,
             observers=state.observers,
             applied=state.applied,
+            bands=state.bands,
         )
 
     def discard(self, before: FreeModelState, after: FreeModelState) -> FreeModelState:
@@ -202,7 +208,9 @@ class FreeModelEstimator:
         )
         temperature_c = _latest(received.temperature_c, state.temperature_c)
         applied = received.applied or state.applied
-        state = FreeModelState(t_ns, temperature_c, first, state.observers, applied=applied)
+        state = FreeModelState(
+            t_ns, temperature_c, first, state.observers, applied=applied, bands=state.bands
+        )
         return state, self._can_start(state, required)
 
     def _start_if_possible(
@@ -247,6 +255,7 @@ class FreeModelEstimator:
             observers=tuple(observers),
             model=loaded,
             longest_gaps_ns=tuple(longest_gaps_ns),
+            bands=state.bands or (InnovationBand(),) * len(first),
         )
         started = self.unsettle(started, t_ns)
         return self._estimate(started, loaded, self._newest_ns(state))
@@ -282,12 +291,13 @@ class FreeModelEstimator:
     ) -> tuple[FreeModelState, Estimate | None]:
         """Advance the model to the tick and correct it with what was measured.
 
-        After too long a gap in a height or in the applied force the model starts again from the
+        After too long a gap in a height or the applied force the model starts again from the
         measurements behind it instead.
         """
         heights, readings = received.heights, received.readings
         applied, temperature_c = received.applied or state.applied, received.temperature_c
-        if self._is_behind_gap(received.applied, state.applied):
+        if self._is_behind_gap(received.applied, state):
+            # The observers took what was missing of the force for one of the strut.
             return self._start_if_possible(self.restart(state, t_ns), t_ns, received)
         applied_n = loaded.applied_force_n if applied is None else applied.value
         if temperature_c is None:
@@ -304,7 +314,7 @@ class FreeModelEstimator:
             further = self._compare(readings, instants)
         observers: list[ObserverState] = []
         virtual_n: list[float] = []
-        oldest_ns = t_ns
+        oldest_ns, bands, is_settled = t_ns, list(state.bands), state.is_settled
         for strut, observer in enumerate(self.observers):
             measured = heights[strut]
             innovation = None
@@ -314,7 +324,15 @@ class FreeModelEstimator:
                 if measured_ns - before.measured_ns > state.longest_gaps_ns[strut]:
                     return self._start_if_possible(self.restart(state, t_ns), t_ns, received)
                 model_m = model_height_m(measured_ns, strut, t_ns, model.struts, instants)
-                innovation = Innovation(measured.value - model_m, measured_ns)
+                innovation_m = measured.value - model_m
+                innovation = Innovation(innovation_m, measured_ns)
+                bands[strut] = update_band(
+                    bands[strut],
+                    innovation_m,
+                    measured_ns,
+                    self._sensing[strut],
+                    is_settled=is_settled,
+                )
             if further:
                 observed = observer.step(before, t_ns, innovation, further[strut])
             else:
@@ -332,19 +350,24 @@ class FreeModelEstimator:
             instants[1:] if instants else state.past,
             state.disturbed_ns,
             applied,
-            state.is_settled,
+            is_settled,
             state.longest_gaps_ns,
+            tuple(bands),
         )
         if applied is not None:
             until_ns = applied.t_ns + self._applied_grace_ns
             oldest_ns = min(oldest_ns, until_ns)
         return self._estimate(after, loaded, oldest_ns)
 
-    def _is_behind_gap(self, new: Sample | None, last: Sample | None) -> bool:
-        """Whether an applied force is so much newer than the last that this was too old."""
+    def _is_behind_gap(self, new: Sample | None, state: FreeModelState) -> bool:
+        """Whether an applied force was missing for too long, while heights were there."""
+        last = state.applied
         if new is None or last is None:
             return False
-        return new.t_ns - last.t_ns > self._applied_grace_ns + self._stale_after_ns
+        longest_ns = self._applied_grace_ns + self._stale_after_ns
+        if new.t_ns - last.t_ns <= longest_ns:
+            return False
+        return min(it.measured_ns for it in state.observers) > last.t_ns + longest_ns
 
     def _recent_instants(
         self, state: FreeModelState, before: LoadedModel[ModelState], now: Instant
@@ -383,6 +406,8 @@ class FreeModelEstimator:
         for strut, observer in enumerate(state.observers):
             if observer.is_disturbed or t_ns - observer.measured_ns > longest_gaps_ns[strut]:
                 is_calm = False
+            if state.bands[strut].is_left:
+                is_calm = False
             height_m, velocity_m_per_s = loaded.state.struts[strut]
             law_force_n = loaded.forces_n[strut]
             force_n = law_force_n + observer.residual_force_n
@@ -415,7 +440,7 @@ class FreeModelEstimator:
         for strut, settling_ns in enumerate(self._settling_ns):
             observer = state.observers[strut]
             is_old = t_ns - observer.measured_ns > state.longest_gaps_ns[strut]
-            if is_old or observer.is_disturbed:
+            if is_old or observer.is_disturbed or state.bands[strut].is_left:
                 disturbed_ns[strut] = t_ns
                 is_settled = False
             elif settling_ns is None or t_ns - disturbed_ns[strut] < settling_ns:
@@ -473,6 +498,14 @@ def _route(channel: Channel) -> int:
     if channel.role is Role.SENSOR:
         return _READING
     return {APPLIED_FORCE: _APPLIED, TEMPERATURE: _TEMPERATURE}.get(channel.quantity, _UNUSED)
+
+
+def _sensing(channel: Channel | None) -> tuple[float, int]:
+    """Step in m and interval in ns of a height's sensor; a step of 0 where it is on no bus."""
+    if channel is None or channel.message is None or not channel.signal:
+        return 0.0, 0 if channel is None else channel.interval_ns
+    step_m = si_step(channel.message, channel.signal, channel.quantity.dimension)
+    return step_m, channel.interval_ns
 
 
 def _has_cycle(channel: Channel) -> bool:

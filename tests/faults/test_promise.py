@@ -40,7 +40,8 @@ OBSERVERS = {
     ),
     "noise-aware": KalmanObserver("kalman", FILTER),
 }
-END_MS = BEGIN_MS + 4500
+END_MS = BEGIN_MS + 4800
+LAST_MS = BEGIN_MS + 2500
 MOST = 3.0
 """Largest error of a valid force, over the largest of the settled run."""
 
@@ -122,13 +123,14 @@ def missing(length):
 
 def gateway(held, every):
     hold = Gateway(held, every)
-    return lambda ms, frames: hold(ms * MS, frames) if ms >= BEGIN_MS else frames
+    return lambda ms, frames: hold(ms * MS, frames) if BEGIN_MS <= ms < LAST_MS else frames
 
 
 class Frozen:
     """The height of one moment for 600 ms, in frames that are right in all else."""
 
-    def __init__(self) -> None:
+    def __init__(self, begin_ms: int = BEGIN_MS) -> None:
+        self._begin_ms = begin_ms
         message = Trial().ready.database.message("BENCH_MEASUREMENT")
         names, dimensions = ["HEIGHT", "APPLIED_FORCE"], [Dimension.LENGTH, Dimension.FORCE]
         self._decode = compile_decoder(message, names, dimensions)
@@ -136,15 +138,18 @@ class Frozen:
         self._protect = compile_protector(message.protection)
         self._height_m = None
 
+    def change(self, height_m: float) -> float:
+        self._height_m = height_m if self._height_m is None else self._height_m
+        return self._height_m
+
     def __call__(self, ms, frames):
-        if not BEGIN_MS <= ms < BEGIN_MS + 600:
+        if not self._begin_ms <= ms < self._begin_ms + 600:
             return frames
         found = []
         for frame in frames:
             if frame.arbitration_id == 0x100:
                 height_m, applied_n = self._decode(frame.data)
-                self._height_m = height_m if self._height_m is None else self._height_m
-                data = self._encode([self._height_m, applied_n])[0]
+                data = self._encode([self.change(height_m), applied_n])[0]
                 frame = replace(frame, data=self._protect(data, frame.data[1] & 0x0F))  # noqa: PLW2901
             found.append(frame)
         return found
@@ -232,6 +237,34 @@ def test_no_valid_force_errs_by_more_than_three_times_the_settled_one(
     promise(order, event.words, modes, within, again, ratios, event.duty)
 
 
+@pytest.mark.parametrize("name", OBSERVERS)
+def test_a_height_that_freezes_anywhere_in_its_motion(name, truth_n, settled_n):
+    """Fast, or at a turning point: before the observer has turned it into a force."""
+    limits = [{"value": "unchanged_s", "high": 0.02, "action": "refuse"}]
+    for begin_ms in range(BEGIN_MS + 100, BEGIN_MS + 730, 70):
+        trial = Trial(observer=OBSERVERS[name], limits=limits)
+        received = follow(trial, Event("", frames=Frozen(begin_ms)), begin_ms + 300)
+        assert largest_error_n(received, truth_n) <= MOST * settled_n[name]
+        assert not received[-1].is_valid
+
+
+@pytest.mark.parametrize("offset_m", [-0.05, 0.001, 0.05])
+def test_a_height_that_jumps(offset_m, truth_n, settled_n):
+    """A foot that slips, another zero: valid again when the observer has followed."""
+    for name, observer in OBSERVERS.items():
+        jump = Frozen()
+        jump.change = lambda height_m: height_m + offset_m
+        received = follow(Trial(observer=observer), Event("", frames=jump), BEGIN_MS + 400)
+        invalid = [it.ms for it in received if it.ms >= BEGIN_MS and not it.is_valid]
+        assert invalid[0] == BEGIN_MS
+        errors_n = [
+            abs(it.force_n - truth_n[it.ms])
+            for it in received
+            if it.is_valid and it.ms < BEGIN_MS + 30
+        ]
+        assert max(errors_n) <= MOST * settled_n[name]
+
+
 @pytest.mark.parametrize("first_ms", [700, 1200])
 def test_a_bridge_that_joins(first_ms, promise, truth_n, settled_n):
     ratios = {}
@@ -298,7 +331,7 @@ def test_an_applied_force_of_its_own_message_that_stops(promise, truth_n, settle
     promise(40, words, modes, within, again, ratios, STOP)
 
 
-def test_the_errors_are_held_against_a_force_that_a_wrong_one_would_exceed(truth_n, settled_n):
-    """The bound is one: it is far below what went out as valid before there was settling."""
+def test_the_bound_is_one(truth_n, settled_n):
+    """Far below the kilonewtons that a height which is wrong at once turns into."""
     peak_n = np.abs(truth_n).max()
-    assert all(MOST * error_n < 0.15 * peak_n for error_n in settled_n.values())
+    assert all(MOST * error_n < 0.25 * peak_n for error_n in settled_n.values())

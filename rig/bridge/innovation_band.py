@@ -1,0 +1,77 @@
+"""A band for what is new in an innovation.
+
+Model and bench carry the same loads but for the residual force: from one measurement to the next
+the rate of their distance hardly changes, whatever the observer. A sensor that freezes, jumps or
+shows another scale changes it at its first sample by many times what is usual, before the observer
+turns that into a force. What is usual is learnt from the run: the root of the mean square of the
+last second in which the estimate was settled.
+
+Over 20 s of simulated benches with friction, backlash, stops and 5 um of noise the change was at
+most 5.5 times what was usual under the PI observer, 7.3 times under the noise-aware and 9.2 times
+under the damped one; without stops of 5e6 N/m^1.5, 4.4 times.
+"""
+
+from msgspec import Struct
+
+_BAND = 8.0**2
+"""Square of the change over the mean one, beyond which it is outside."""
+
+_WIDENING = 4.0
+"""Of the mean square, each time that the band is left: a bench that moves more has a wider one."""
+
+_USUAL_S = 1.0
+_FEWEST = 50
+"""Time over which the mean is taken, and changes that it needs to be one."""
+
+
+class InnovationBand(Struct, frozen=True, gc=False):
+    """What is known of a strut's innovations.
+
+    Attributes:
+        innovation_m: The last one.
+        rate_m_per_s: Its rate.
+        t_ns: Its time.
+        square: Mean square of the rate's change, in m²/s².
+        count: Changes that it is the mean of.
+        is_left: Whether the last change was outside.
+    """
+
+    innovation_m: float = 0.0
+    rate_m_per_s: float = 0.0
+    t_ns: int = 0
+    square: float = 0.0
+    count: int = 0
+    is_left: bool = False
+
+
+def update_band(
+    band: InnovationBand,
+    innovation_m: float,
+    t_ns: int,
+    sensor: tuple[float, int],
+    *,
+    is_settled: bool,
+) -> InnovationBand:
+    """State after an innovation of a sensor with steps in m, at intervals in ns.
+
+    While the estimate settles nothing is usual, and nothing outside.
+    """
+    step_m, interval_ns = sensor
+    elapsed_ns = t_ns - band.t_ns
+    if elapsed_ns <= 0:
+        return band
+    elapsed_s = elapsed_ns * 1e-9
+    rate = (innovation_m - band.innovation_m) / elapsed_s
+    square, count = band.square, band.count
+    if not is_settled:
+        return InnovationBand(innovation_m, rate, t_ns, square, count)
+    change = abs(rate - band.rate_m_per_s)
+    if elapsed_ns > interval_ns:  # some are missing
+        change *= interval_ns / elapsed_ns
+    # Rounding alone changes the rate by a step over the time.
+    new = max(change, step_m / elapsed_s)
+    new *= new
+    if count >= _FEWEST and new > _BAND * square:
+        return InnovationBand(innovation_m, rate, t_ns, _WIDENING * square, count, is_left=True)
+    share = max(1.0 / (count + 1), min(elapsed_s / _USUAL_S, 1.0))
+    return InnovationBand(innovation_m, rate, t_ns, square + share * (new - square), count + 1)

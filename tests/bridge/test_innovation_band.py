@@ -1,0 +1,97 @@
+"""The band of what is new in an innovation: what is usual is learnt, and what is not is seen."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.bridge.innovation_band import InnovationBand, update_band
+
+MS = 1_000_000
+SENSOR = (2e-6, MS)
+NOTHING = InnovationBand()
+
+
+def follow(innovations_m, band=NOTHING, begin=0, *, is_settled=True):
+    """Bands after each of some innovations, a millisecond apart."""
+    bands = []
+    for number, innovation_m in enumerate(innovations_m, start=begin + 1):
+        band = update_band(band, float(innovation_m), number * MS, SENSOR, is_settled=is_settled)
+        bands.append(band)
+    return bands
+
+
+def noise(count, std_m=1e-5, seed=0):
+    return np.random.default_rng(seed).normal(0.0, std_m, count)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_is_within_and_its_change_is_learnt(seed):
+    """The second difference of white noise has six times its variance."""
+    bands = follow(noise(5000, seed=seed))
+    assert not any(band.is_left for band in bands)
+    changes_m = np.sqrt([band.square for band in bands[2000:]]) * 1e-3
+    assert np.mean(changes_m) == pytest.approx(1e-5 * np.sqrt(6.0), rel=0.1)
+
+
+@pytest.mark.parametrize("height_m", [1e-3, -1e-3, 0.1])
+def test_a_jump_is_seen_at_its_first_sample(height_m):
+    band = follow(noise(1000))[-1]
+    assert follow([height_m], band, 1000)[0].is_left
+
+
+def test_a_ramp_that_begins_is_seen_at_its_first_sample():
+    """A sensor that freezes while its bench moves at 0.5 m/s."""
+    band = follow(noise(1000, 1e-6))[-1]
+    assert follow([band.innovation_m + 5e-4], band, 1000)[0].is_left
+
+
+def test_a_smooth_change_of_any_size_is_within():
+    t_s = np.arange(6000) * 1e-3
+    amplitude_m = np.where(t_s < 3.0, 1e-4, 1e-4 * (1.0 + 10.0 * (t_s - 3.0)))
+    bands = follow(amplitude_m * np.sin(2.0 * np.pi * 2.0 * t_s))
+    assert not any(band.is_left for band in bands)
+
+
+def test_a_bench_that_moves_more_gets_a_wider_band():
+    """Each excess doubles the band: forty times as much noise is usual after four of them."""
+    band = follow(noise(2000))[-1]
+    bands = follow(noise(3000, 4e-4, seed=1), band, 2000)
+    left = [number for number, item in enumerate(bands) if item.is_left]
+    assert 2 <= len(left) <= 6
+    assert left[-1] < 100
+
+
+def test_rounding_alone_is_within():
+    steps_m = 2e-6 * np.random.default_rng(2).integers(-1, 2, 3000)
+    bands = follow([*np.zeros(1000), *steps_m])
+    assert not any(band.is_left for band in bands)
+
+
+def test_nothing_is_judged_before_there_is_a_mean_nor_while_the_estimate_settles():
+    assert not any(band.is_left for band in follow([*np.zeros(40), 0.1, -0.1]))
+    band = follow(noise(1000))[-1]
+    settling = follow([0.1, -0.1, 0.2], band, 1000, is_settled=False)
+    assert not any(item.is_left for item in settling)
+    # What was usual is still.
+    assert {item.square for item in settling} == {band.square}
+
+
+@given(st.integers(1, 4))
+def test_missing_samples_are_no_excess(missing):
+    """Of a smooth innovation: its rate changes for longer."""
+    t_ms = np.arange(1500)
+    innovation_m = 1e-4 * np.sin(2.0 * np.pi * 5.0 * t_ms * 1e-3)
+    band = InnovationBand()
+    left = []
+    for t in t_ms:
+        if t > 1000 and t % 50 < missing:
+            continue
+        band = update_band(band, innovation_m[t], int(t + 1) * MS, SENSOR, is_settled=True)
+        left.append(band.is_left)
+    assert not any(left)
+
+
+def test_a_sample_that_is_not_newer_changes_nothing():
+    band = follow(noise(100))[-1]
+    assert update_band(band, 1.0, band.t_ns, SENSOR, is_settled=True) is band
