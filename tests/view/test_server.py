@@ -368,6 +368,32 @@ def test_a_wrong_length_of_a_request_is_refused(run, capfd, length):
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.parametrize(
+    "head",
+    [
+        *(f"Content-Length: {length}" for length in ("5", "9" * 5000, "-1", "", "x", "\xb2")),
+        "Content-Length: 0\r\nContent-Length: 5",
+        "Transfer-Encoding: chunked",
+    ],
+)
+@pytest.mark.parametrize(("method", "status"), [("GET", 400), ("HEAD", 501)])
+def test_what_follows_a_request_that_has_no_body_is_not_the_next_request(
+    server, capfd, method, status, head
+):
+    host = f"Host: {HOST}:{server.server_address[1]}"
+    request = f"{method} /runs HTTP/1.1\r\n{host}\r\n{head}\r\n\r\n"
+    body = f"GET /page.css HTTP/1.1\r\n{host}\r\n\r\n"
+    with connect(server, (request + body).encode("latin-1")) as asking:
+        answer = received(asking)  # to the end of the connection
+    assert answer.startswith(f"HTTP/1.1 {status} ".encode())
+    assert answer.count(b"HTTP/1.1 ") == 1
+    assert capfd.readouterr().err == ""
+
+
+def test_a_request_that_says_that_it_has_no_body_is_answered(server):
+    assert get(server, "/runs", headers={"Content-Length": "0"})[0] == 200
+
+
 def test_a_request_for_no_address_is_one_for_nothing(server, capfd):
     with connect(server) as asking:
         host = f"{HOST}:{server.server_address[1]}"

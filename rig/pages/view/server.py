@@ -230,6 +230,9 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer a request."""
         if not self._check_host():
             return
+        if self._has_body():
+            self._send(HTTPStatus.BAD_REQUEST, b"expected a request without a body", "text/plain")
+            return
         url = self._url()
         if url.path == "/":
             self._send(HTTPStatus.OK, live_page().encode(), _HTML)
@@ -299,6 +302,11 @@ class _Handler(BaseHTTPRequestHandler):
             return True
         self._send(HTTPStatus.FORBIDDEN, b"another host", "text/plain")
         return False
+
+    def _has_body(self) -> bool:
+        """Whether a body follows, of whatever length: it would be taken for the next request."""
+        lengths = self.headers.get_all("Content-Length", [])
+        return "Transfer-Encoding" in self.headers or any(length != "0" for length in lengths)
 
     def _send(
         self, status: HTTPStatus, content: bytes, kind: str, policy: dict[str, str] = _POLICY
