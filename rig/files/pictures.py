@@ -2,10 +2,16 @@
 
 import contextlib
 from collections.abc import Generator, Mapping
+from pathlib import Path
 from typing import Any, cast
 
-import matplotlib as mpl
-from matplotlib.figure import Figure
+# matplotlib takes settings from a `matplotlibrc` of the working directory.
+with contextlib.chdir(Path(__file__).parent):
+    import matplotlib as mpl
+    from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+    from matplotlib.figure import Figure
+
+__all__ = ["AutoDateLocator", "ConciseDateFormatter", "Figure", "new_figure"]
 
 
 @contextlib.contextmanager

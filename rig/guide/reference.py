@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
@@ -24,6 +23,7 @@ from dart_model.effects.law import Force, Rate
 from dart_model.spec import ModelSpec
 from rig.bridge.published_quantities import STATUS, STRUT, TIMING
 from rig.channels.measured_quantities import BENCH_QUANTITIES, HEIGHT
+from rig.files.pictures import Figure
 from rig.observers import OBSERVERS
 from rig.pages.html import render
 from rig.plan.config import OneOf, RunConfig

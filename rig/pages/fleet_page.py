@@ -3,9 +3,7 @@
 from datetime import date
 from pathlib import Path
 
-from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
-
-from rig.files.pictures import new_figure
+from rig.files.pictures import AutoDateLocator, ConciseDateFormatter, new_figure
 from rig.fleet.overview import Overview, Series
 from rig.fleet.sentences import alarm_sentences, series_name
 from rig.pages.html import render_report, svg_url, write_page

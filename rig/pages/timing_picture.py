@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from rig.files.pictures import Figure
 from rig.run.logged_run import Ended
 
 TIMING_PICTURE = "timing.png"

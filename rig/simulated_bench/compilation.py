@@ -4,9 +4,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from rig.files.numba_alone import numba
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -13,12 +13,7 @@ import warnings
 from collections.abc import Callable, MutableSequence, Sequence
 from typing import NamedTuple, ParamSpec, TypeVar, cast
 
-import numba
 import numpy as np
-from numba import types
-from numba.core.errors import NumbaExperimentalFeatureWarning
-from numba.core.typing.templates import Signature
-from numba.typed import List
 from numpy.typing import NDArray
 
 from dart_model.effects import effect
@@ -29,6 +24,13 @@ from dart_model.effects.calling import (
     rates_over_arrays,
 )
 from dart_model.effects.law import Writable
+from rig.files.numba_alone import (
+    NumbaExperimentalFeatureWarning,
+    Signature,
+    numba,
+    typed,
+    types,
+)
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -108,7 +110,7 @@ def _rate(name: str) -> RatesOverArrays:
 
 
 def _empty() -> tuple[Forces, Rates]:
-    return List.empty_list(_FORCE), List.empty_list(_RATE)
+    return typed.List.empty_list(_FORCE), typed.List.empty_list(_RATE)
 
 
 def _append(forces: Forces, rates: Rates, force: ForceOverArrays, rate: RatesOverArrays) -> None:

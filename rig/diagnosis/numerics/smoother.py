@@ -15,11 +15,11 @@ References:
 from typing import NamedTuple
 
 import numpy as np
-from numba import types
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from rig.diagnosis.numerics.compiled import compile_loop
+from rig.files.numba_alone import types
 
 Array = NDArray[np.float64]
 
