@@ -25,7 +25,9 @@ _LAST_NODE = 127
 _MOST_FRAMES = 200_000
 """Frames that are kept while listening; a second of a full bus at 1 Mbit/s has some 10 000."""
 
-OPERATIONAL, PRE_OPERATIONAL = 1, 128
+_NO_NODE_ID = 255
+
+OPERATIONAL, PRE_OPERATIONAL, RESET_COMMUNICATION = 1, 128, 130
 """Commands of network management."""
 
 
@@ -145,6 +147,21 @@ class CanOpenNetwork:
             lss.send_switch_state_global(lss.WAITING_STATE)
         except Exception as error:  # the package raises errors of many classes here
             raise BusError(f"the device does not take node id {node_id}: {error}") from error
+
+    def take_node_id_back(self, node_id: int, identity: Sequence[int]) -> None:
+        """Undo `give_node_id` for the device with an identity, as `find_unconfigured` returns it.
+
+        Raises:
+            BusError: It keeps it.
+        """
+        lss = self._network.lss
+        try:
+            lss.send_switch_state_selective(*identity)
+            lss.configure_node_id(_NO_NODE_ID)
+            lss.send_switch_state_global(lss.WAITING_STATE)
+        except Exception as error:  # the package raises errors of many classes here
+            raise BusError(f"the device keeps node id {node_id}: {error}") from error
+        self.command(node_id, RESET_COMMUNICATION)
 
     def _client(self, node_id: int) -> Any:
         client = self._clients.get(node_id)

@@ -24,7 +24,6 @@ from rig.cli.terminal import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rig.bus.canopen_network import CanOpenNetwork
     from rig.sensors.bus_scan import BusSurvey
     from rig.sensors.canopen_device import CanOpenDevice
     from rig.sensors.height_zero import HeightZero
@@ -168,7 +167,7 @@ def set_command(
     """
     from rig.bus.bus import BusConfig
     from rig.bus.canopen_network import CanOpenNetwork
-    from rig.sensors.canopen_set_up import CanOpenSettings, restore
+    from rig.sensors.canopen_set_up import CanOpenSettings, give_node_id, restore
     from rig.sensors.undo_file import configure_with_undo, read_undo
 
     config = BusConfig(interface, channel, bitrate)
@@ -187,21 +186,14 @@ def set_command(
     undo = before or Path(f"sensor-{node_id}-before.yaml")
     with closing(CanOpenNetwork(config)) as network:
         if new:
-            _give_node_id(network, node_id)
+            identity = give_node_id(network, node_id)
+            print_text(f"Node id {node_id} given to {_identity_text(identity)}.")
         settings = CanOpenSettings(cycle_ms, sync, heartbeat_ms)
         changes = configure_with_undo(network, node_id, settings, undo)
     changed = "no object had to be changed."
     if changes:
         changed = f"{len(changes)} objects changed. `rig sensor set --restore {undo}` undoes it."
     print_text(f"Node {node_id}: start requested; {changed}")
-
-
-def _give_node_id(network: "CanOpenNetwork", node_id: int) -> None:
-    identity = network.find_unconfigured()
-    if identity is None:
-        raise InputError("--new: no device without a node id answers")
-    network.give_node_id(node_id)
-    print_text(f"Node id {node_id} given to {_identity_text(identity)}.")
 
 
 def _files_by_node(options: "Sequence[str]") -> dict[int, Path]:

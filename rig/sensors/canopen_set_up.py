@@ -12,6 +12,7 @@ from typing import Annotated, NamedTuple
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from can_dbc.errors import InputError
+from rig.bus.bus import BusError
 from rig.bus.canopen_network import (
     OPERATIONAL,
     PRE_OPERATIONAL,
@@ -36,6 +37,7 @@ from rig.sensors.canopen_device import (
 )
 from rig.sensors.canopen_profiles import ENCODER, MEASURING_DEVICE
 
+_DEVICE_TYPE = 0x1000
 _BY_EVENT, _AT_EVERY_SYNC = 255, 1
 _PRODUCES_SYNC = 1 << 30
 SETTABLE = frozenset(
@@ -123,6 +125,36 @@ class CanOpenSettings(NamedTuple):
     heartbeat_ms: int | None = None
 
 
+def give_node_id(network: CanOpenNetwork, node_id: int) -> Sequence[int]:
+    """Give a node id to the sensor that has none; returns its identity.
+
+    Raises:
+        InputError: Another device has it, no device is without one, or the device is no sensor: it
+            is without one again.
+        BusError: The device does not take it, or keeps it although it is no sensor.
+    """
+    if _answers(network, node_id):
+        raise InputError(f"--new: node {node_id} is on the bus, expected a node id that is free")
+    identity = network.find_unconfigured()
+    if identity is None:
+        raise InputError("--new: no device without a node id answers")
+    network.give_node_id(node_id)
+    try:  # not before, because its objects have no address without a node id
+        _refuse_other_than_sensor(network, node_id)
+    except InputError as error:
+        network.take_node_id_back(node_id, identity)
+        raise InputError(f"{error}; it is without a node id again") from error
+    return identity
+
+
+def _answers(network: CanOpenNetwork, node_id: int) -> bool:
+    try:
+        network.read(node_id, _DEVICE_TYPE)
+    except BusError:
+        return False
+    return True
+
+
 def configure_device(writer: DeviceWriter, settings: CanOpenSettings) -> None:
     """Set cycle and heartbeat of a sensor, and switch it to operational.
 
@@ -142,7 +174,7 @@ def configure_device(writer: DeviceWriter, settings: CanOpenSettings) -> None:
 
 def _refuse_other_than_sensor(network: CanOpenNetwork, node_id: int) -> None:
     """Refuse a device that may move something, such as a drive, before anything is written."""
-    device_type = network.read(node_id, 0x1000)
+    device_type = network.read(node_id, _DEVICE_TYPE)
     if not device_type:
         raise InputError(f"node {node_id}: has no device type (1000h), expected a CANopen device")
     profile = int.from_bytes(device_type, "little") & 0xFFFF
@@ -224,7 +256,7 @@ def _set_event_timer(writer: DeviceWriter, pdo: int, cycle_ms: int) -> None:
     if writer.read(COMMUNICATION + pdo, EVENT) is not None:
         writer.set_value(COMMUNICATION + pdo, EVENT, cycle_ms)
         return
-    profile = (writer.number(0x1000) or 0) & 0xFFFF
+    profile = (writer.number(_DEVICE_TYPE) or 0) & 0xFFFF
     if pdo == 0 and profile == ENCODER and writer.read(CYCLE) is not None:
         writer.set_value(CYCLE, 0, cycle_ms)
         return

@@ -336,6 +336,42 @@ def test_what_is_no_sensor_is_refused_before_anything_is_sent_to_it(
     assert [path.name for path in tmp_path.iterdir()] == ["before.yaml"]
 
 
+def set_new(channel, undo, node_id=9):
+    arguments = ["sensor", "set", str(node_id), "--interface", "virtual", "--channel", channel]
+    return CliRunner().invoke(app, [*arguments, "--new", "--cycle-ms", "3", "--before", str(undo)])
+
+
+def test_a_new_sensor_is_given_a_node_id_and_set(bus, channel, tmp_path):
+    node = encoder(bus(), 0xFF)
+    result = set_new(channel, tmp_path / "before.yaml")
+    assert result.exit_code == 0, result.output
+    assert "Node id 9 given to vendor 0x1a2" in result.stdout
+    assert node.node_id == 9
+    assert node.object_dictionary.read(0x6200, 0) == 3
+
+
+def test_a_new_device_that_is_no_sensor_keeps_no_node_id(bus, channel, tmp_path):
+    node = encoder(bus(), 0xFF)
+    node.object_dictionary.write(0x1000, 0, DRIVE)
+    before = node.object_dictionary.read(0x6200, 0)
+    result = set_new(channel, tmp_path / "before.yaml")
+    assert isinstance(result.exception, InputError)
+    assert str(result.exception).startswith("node 9: device profile 402 (1000h), ")
+    assert str(result.exception).endswith("; it is without a node id again")
+    assert (node.node_id, node.nmt.pending_node_id) == (0xFF, 0xFF)
+    assert node.object_dictionary.read(0x6200, 0) == before
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_node_id_is_not_given_twice(bus, channel, tmp_path):
+    encoder(bus(), 9)
+    unconfigured = encoder(bus(), 0xFF)
+    result = set_new(channel, tmp_path / "before.yaml")
+    assert isinstance(result.exception, InputError)
+    assert "node 9 is on the bus, expected a node id that is free" in str(result.exception)
+    assert unconfigured.node_id == 0xFF
+
+
 def test_an_amplifier_is_set_and_put_back(bus, network, tmp_path):
     node = amplifier(bus(), 6)
     undo = tmp_path / "before.yaml"
