@@ -10,6 +10,7 @@ import numpy as np
 from dart_model.effects import effect
 from dart_model.errors import ModelError
 from dart_model.plant.dart_types import DartBody, DartSkeleton
+from dart_model.skeleton_checks import refuse_fatal
 from dart_model.skeleton_file import MJCF_SUFFIXES, refuse_endless
 from dart_model.spec import WORLD, BodySpec, FileSkeleton, InlineSkeleton, ModelSpec
 
@@ -141,6 +142,7 @@ def _read_skeleton(spec: FileSkeleton, folder: Path) -> DartSkeleton:
     if suffix not in _PARSERS:
         raise ModelError(f"{path}: suffix {suffix!r}: expected {', '.join(_PARSERS)}")
     refuse_endless(path)
+    refuse_fatal(path)
     try:
         skeleton = _PARSERS[suffix](str(path))
     except _OF_THE_PARSERS as error:
