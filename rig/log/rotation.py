@@ -53,10 +53,16 @@ class Part:
             checksum_line(file.name, file.size, file.crc32) for file in (self.frames, self.steps)
         )
 
+    def end(self) -> None:
+        """End the Arrow stream."""
+        self.steps.append(END_OF_STREAM)
+
+    def sync(self) -> None:
+        """Have both files on the disk, as far as they are written."""
+        self.frames.sync()
+        self.steps.sync()
+
     def close(self) -> None:
-        """End the Arrow stream and close both files."""
-        try:
-            self.steps.append(END_OF_STREAM)
-        finally:
-            self.steps.close()
-            self.frames.close()
+        """Close both files."""
+        self.steps.close()
+        self.frames.close()

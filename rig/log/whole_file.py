@@ -1,6 +1,7 @@
 """A file that grows by whole pieces, whatever the disk does."""
 
 import contextlib
+import os
 import zlib
 from pathlib import Path
 
@@ -40,6 +41,14 @@ class WholeFile:
             raise
         self.size += len(piece)
         self.crc32 = zlib.crc32(piece, self.crc32)
+
+    def sync(self) -> None:
+        """Have what was appended on the disk.
+
+        Raises:
+            OSError: The disk failed; what was appended since the last time may be lost.
+        """
+        os.fdatasync(self._file.fileno())
 
     def close(self) -> None:
         """Close the file.

@@ -2,16 +2,19 @@
 
 A thread writes, so that a slow disk does not delay a tick. Frames are written
 unbuffered, at most 10 ms after they came (20 ms while no tick comes); steps are flushed in batches.
-While the disk takes nothing, ticks wait in memory, and what does not fit there is counted.
+While the disk takes nothing, ticks wait in memory, and what does not fit there is counted. The
+system writes to the disk when it likes to; at an interval it is told to, and waited for.
 """
 
 import contextlib
+import math
+import os
 import re
 import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -73,12 +76,15 @@ class LogOptions:
         window: Time captured around faults; None captures nothing.
         capture_name: Name of the capture that a change from one mode to another triggers, if any.
         side_file: Name and content of a file that is rewritten once a second, if any.
+        sync_s: Interval at which the thread that writes has all on the disk; None leaves it to the
+            system.
     """
 
     rotation: Rotation = field(default_factory=Rotation)
     window: CaptureWindow | None = None
     capture_name: Callable[[int, int], str | None] = lambda _before, _now: None
     side_file: tuple[str, Callable[[], bytes]] | None = None
+    sync_s: float | None = None
 
 
 class RunWriter:
@@ -118,6 +124,8 @@ class RunWriter:
         self._channel = re.sub(r"[^!-~]", "_", channel)
         self._columns = tuple(columns)
         self._side_file = options.side_file
+        self._sync_s = options.sync_s
+        self._sync_fault: str | None = None
         self._rows = StepRows(columns)
         self._rotation = options.rotation
         self._captures = (
@@ -184,10 +192,12 @@ class RunWriter:
         self._wake.set()
         if self._has_thread:
             self._thread.join(_CLOSING_S)
-        if self._thread.is_alive():
+        is_stuck = self._thread.is_alive()
+        if is_stuck:
             self._set_fault("the disk is too slow")
         else:
             self._finish(last)
+            self._sync(self._sync_folder)
         self.dropped += len(self._waiting) + self._rows.count
         with contextlib.suppress(OSError):
             (self.folder / _RESERVE_FILE).unlink()
@@ -195,6 +205,8 @@ class RunWriter:
             _write_yaml(self.folder / RUN_FILE, {**self._header, **ending()})
         except OSError as error:
             self._set_fault(str(error.strerror))
+        if not is_stuck:
+            self._sync(lambda: _sync_files((self.folder / RUN_FILE, self.folder)))
 
     def _finish(self, last: Sequence[Frame]) -> None:
         self._write_waiting()
@@ -221,14 +233,38 @@ class RunWriter:
 
     def _run_thread(self, loop_priority: int) -> None:
         follow(loop_priority)
-        due_s = time.monotonic() + _SIDE_FILE_EVERY_S
+        self._sync(self._sync_folder)
+        side_file, sync = _Interval(_SIDE_FILE_EVERY_S), _Interval(self._sync_s or math.inf)
         while not self._closing.is_set():
             self._wake.wait(_LONGEST_PAUSE_S)
             self._wake.clear()
             self._write_waiting()
-            if time.monotonic() >= due_s:
-                due_s += _SIDE_FILE_EVERY_S
+            if side_file.is_over():
                 self._write_side_file()
+            if sync.is_over():
+                self._sync(self._sync_open_files)
+
+    def _sync(self, sync: Callable[[], None]) -> None:
+        """Have files on the disk, where that is wanted; a fault lasts until it works again."""
+        if self._sync_s is None:
+            return
+        try:
+            sync()
+        except OSError as error:
+            self._sync_fault = str(error.strerror)
+            self._set_fault(self._sync_fault)
+        else:
+            self._sync_fault = None
+
+    def _sync_open_files(self) -> None:
+        self._part.sync()
+        for file in self._noted.values():
+            file.sync()
+        _sync_files((self.folder,))  # with the names of files that are new
+
+    def _sync_folder(self) -> None:
+        paths = (path for path in self.folder.rglob("*") if path.is_file() or path.is_dir())
+        _sync_files((*paths, self.folder))
 
     def _write_side_file(self) -> None:
         """Write the side file; a failure is made up for by the next writing."""
@@ -255,7 +291,7 @@ class RunWriter:
         except OSError as error:
             self._set_fault(str(error.strerror))
         else:
-            self.fault = None
+            self.fault = self._sync_fault
         finally:
             self.is_busy = False
 
@@ -322,8 +358,10 @@ class RunWriter:
     def _end_part(self, part: Part) -> None:
         """Close a part and note its checksums."""
         try:
-            part.close()
+            part.end()
+            self._sync(part.sync)
         finally:
+            part.close()
             self.note(CHECKSUMS_FILE, part.checksums)
 
     def _write_capture(self, capture: Capture) -> None:
@@ -342,6 +380,7 @@ class RunWriter:
                 part.steps.append(_serialize(rows))
                 rows.clear()
                 self._give_way()
+            part.end()
             part.close()
             write_whole(folder / CHECKSUMS_FILE, part.checksums)
             for name in self._header.get("files_sha256", {}):
@@ -350,6 +389,33 @@ class RunWriter:
             _write_yaml(folder / RUN_FILE, header)
         except OSError as error:
             self._set_fault(f"capture {folder.name}: {error.strerror}")
+
+
+class _Interval:
+    """Time that passes again and again."""
+
+    def __init__(self, length_s: float) -> None:
+        self._length_s = length_s
+        self._end_s = time.monotonic() + length_s
+
+    def is_over(self) -> bool:
+        """Whether it has passed; then the next one begins."""
+        now_s = time.monotonic()
+        if now_s < self._end_s:
+            return False
+        self._end_s = now_s + self._length_s
+        return True
+
+
+def _sync_files(paths: Iterable[Path]) -> None:
+    """Have files, and the names in folders, on the disk."""
+    for path in paths:
+        with contextlib.suppress(FileNotFoundError):  # requests and claims are removed again
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
 
 
 def _serialize(rows: StepRows) -> bytes:

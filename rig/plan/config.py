@@ -244,6 +244,9 @@ class LogConfig(_Frozen):
         capture_after_s: Time after the fault that is kept apart.
         most_captures: Windows kept apart in one run; 0 for none. A window is opened by HOLD, SAFE,
             a fault of bus or log, and SIGUSR2.
+        sync_s: Interval at which all that is logged is written to the disk itself: what a loss of
+            power takes at most. Null leaves it to the system, which takes half a minute; so does a
+            simulated run, which can be repeated.
     """
 
     rotate_bytes: Annotated[int, Field(ge=100_000)] | None = None
@@ -251,6 +254,7 @@ class LogConfig(_Frozen):
     capture_before_s: Annotated[float, Field(ge=0.0, le=60.0)] = 2.0
     capture_after_s: Annotated[float, Field(ge=0.0, le=60.0)] = 2.0
     most_captures: Annotated[int, Field(ge=0, le=1000)] = 0
+    sync_s: Annotated[float, Field(ge=0.05, le=3600.0)] | None = 1.0
 
     def rotation(self) -> Rotation:
         """Limits of a log file, in nanoseconds and bytes, for the writer."""

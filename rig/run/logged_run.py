@@ -164,6 +164,7 @@ class _LoggedRun:
                 config.log.window(),
                 _capture_name,
                 None if granted is None else (HISTOGRAMS_FILE, self._timing.histograms),
+                sync_s=None if granted is None else config.log.sync_s,
             ),
         )
         self._reports = _FaultReports([device.name for device in plan.devices])

@@ -1,8 +1,12 @@
 """A run's log on disks that fail, are slow, or are long in use."""
 
+import errno
 import math
+import os
 import resource
 import threading
+import time
+from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
@@ -237,6 +241,115 @@ def test_parts_end_with_the_same_tick(tmp_path):
 
 def captured(folder):
     return sorted(path.name for path in (folder / "captures").glob("*"))
+
+
+class Disk:
+    """A disk that is seen to be waited for, and that can fail."""
+
+    def __init__(self, monkeypatch):
+        self.synced = []
+        self.error = None
+        self._again = threading.Event()
+        for name in ("fsync", "fdatasync"):
+            monkeypatch.setattr(os, name, partial(self._sync, getattr(os, name)))
+
+    def _sync(self, sync, descriptor):
+        path = Path(f"/proc/self/fd/{descriptor}").readlink()
+        self.synced.append((path, path.stat().st_size, threading.current_thread().name))
+        self._again.set()
+        if self.error is not None:
+            raise self.error
+        sync(descriptor)
+
+    def wait(self, times=1):
+        """Wait until it is waited for again."""
+        for _ in range(times):
+            self._again.clear()
+            assert self._again.wait(20.0)
+
+
+@pytest.fixture
+def disk(monkeypatch):
+    return Disk(monkeypatch)
+
+
+@pytest.fixture
+def paced_log(tmp_path):
+    """Opens a log with a thread, which ends with the test, also with one that fails."""
+    logs = []
+
+    def make(**options):
+        logs.append(open_log(tmp_path / "run", paced=True, **options))
+        return logs[-1]
+
+    yield make
+    for log in logs:
+        log._closing.set()
+
+
+def test_what_was_logged_is_on_the_disk_after_an_interval(disk, paced_log):
+    log = paced_log(sync_s=0.05)
+    for index in range(500):
+        log.add(*tick(index))
+    log.note("events.jsonl", "{}\n")
+    while (log.folder / STEPS_FILE).stat().st_size < 2000 or log.is_busy:
+        disk.wait()
+    disk.wait(2 * 5)
+    before_the_end = {path: size for path, size, _ in disk.synced}
+    for name in (FRAMES_FILE, STEPS_FILE, "events.jsonl"):
+        assert before_the_end[log.folder / name] == (log.folder / name).stat().st_size > 0
+    assert {log.folder, log.folder / RUN_FILE} <= set(before_the_end)
+    # The loop never waits for it.
+    assert {thread for _, _, thread in disk.synced} == {"run-log"}
+    log.close(ending)
+    assert log.trouble is None
+    at_the_end = {path: size for path, size, _ in disk.synced}
+    for path in (log.folder, *log.folder.iterdir()):
+        assert at_the_end[path] == path.stat().st_size
+
+
+def test_every_file_of_a_rotated_run_is_on_the_disk_before_it_is_closed(tmp_path, disk):
+    log = open_log(tmp_path / "run", sync_s=3600.0, rotation=Rotation(time_ns=300 * MS))
+    for index in range(1000):
+        log.add(*tick(index))
+    first = {path.name: size for path, size, _ in disk.synced}
+    for name in (FRAMES_FILE, STEPS_FILE):
+        assert first[name] == (log.folder / name).stat().st_size
+    log.close(ending)
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])
+def test_a_disk_that_fails_when_it_is_waited_for_is_a_fault_until_it_works_again(
+    disk, paced_log, number
+):
+    log = paced_log(sync_s=0.05)
+    disk.error = OSError(number, os.strerror(number))
+    disk.wait(2)
+    for index in range(100):  # what is written meanwhile succeeds, and is no sign of health
+        log.add(*tick(index))
+        time.sleep(0.002)
+    assert log.fault == log.trouble == os.strerror(number)
+    disk.error = None
+    while log.fault is not None:
+        disk.wait()
+    log.close(ending)
+    assert log.trouble == os.strerror(number)
+    assert_holds(log.folder, 0, 100)
+
+
+def test_a_disk_that_fails_at_the_end_is_in_the_record(tmp_path, disk):
+    log = open_log(tmp_path / "run", sync_s=1.0)
+    log.add(*tick(0))
+    disk.error = OSError(errno.EIO, os.strerror(errno.EIO))
+    log.close(lambda: {"ending": {"log_fault": log.trouble}})
+    assert read_run(log.folder).header["ending"]["log_fault"] == os.strerror(errno.EIO)
+
+
+def test_no_disk_is_waited_for_where_that_is_left_to_the_system(disk, paced_log):
+    log = paced_log()
+    log.add(*tick(0))
+    log.close(ending)
+    assert disk.synced == []
 
 
 def test_a_window_around_a_fault_is_a_run_of_its_own(tmp_path):
