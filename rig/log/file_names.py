@@ -6,7 +6,7 @@
     model.yaml      the model
     bus.dbc         the DBC
     changes.jsonl   changes of the configuration during the run
-    events.jsonl    changes of the mode, with their causes
+    events.jsonl    changes of the mode, with their causes, and what the machine did to the run
     timing.json     histograms of its ticks
     trace.arrow     parts of its late ticks, if they were traced
     checksums.txt   lengths and checksums of the finished files of frames and steps

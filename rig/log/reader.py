@@ -70,6 +70,7 @@ class Ending(TypedDict, total=False):
     log_fault: str | None
     dropped_steps: int
     time_in_mode_s: dict[str, float]
+    machine: dict[str, object] | None
 
 
 class RunHeader(TypedDict, total=False):

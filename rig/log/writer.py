@@ -57,8 +57,8 @@ MOST_WAITING = 120_000
 MANY_WAITING = 2_000
 """Ticks waiting that are a fault."""
 
-_SIDE_FILE_EVERY_S = 1.0
-"""Time between two writings of the side file."""
+_LOOK_EVERY_S = 1.0
+"""Time between two writings of the side file, and two looks at what is to be noted."""
 
 _CLOSING_S = 30.0
 """How long the end of a run waits for a slow disk."""
@@ -76,6 +76,8 @@ class LogOptions:
         window: Time captured around faults; None captures nothing.
         capture_name: Name of the capture that a change from one mode to another triggers, if any.
         side_file: Name and content of a file that is rewritten once a second, if any.
+        watch: Name of a file, and lines to add to it, which are asked for once a second and at the
+            end, if any.
         sync_s: Interval at which the thread that writes has all on the disk; None leaves it to the
             system.
     """
@@ -84,6 +86,7 @@ class LogOptions:
     window: CaptureWindow | None = None
     capture_name: Callable[[int, int], str | None] = lambda _before, _now: None
     side_file: tuple[str, Callable[[], bytes]] | None = None
+    watch: tuple[str, Callable[[], Sequence[str]]] | None = None
     sync_s: float | None = None
 
 
@@ -123,7 +126,7 @@ class RunWriter:
         # A line of the log holds no blanks in its parts, nor anything beyond ASCII.
         self._channel = re.sub(r"[^!-~]", "_", channel)
         self._columns = tuple(columns)
-        self._side_file = options.side_file
+        self._side_file, self._watch = options.side_file, options.watch
         self._sync_s = options.sync_s
         self._sync_fault: str | None = None
         self._rows = StepRows(columns)
@@ -211,7 +214,7 @@ class RunWriter:
     def _finish(self, last: Sequence[Frame]) -> None:
         self._write_waiting()
         self._lines += "".join(self._line(frame, "T") for frame in last).encode("ascii")
-        self._write_side_file()
+        self._look()
         if self._captures is not None:
             self._captures.finish()
         try:
@@ -234,13 +237,13 @@ class RunWriter:
     def _run_thread(self, loop_priority: int) -> None:
         follow(loop_priority)
         self._sync(self._sync_folder)
-        side_file, sync = _Interval(_SIDE_FILE_EVERY_S), _Interval(self._sync_s or math.inf)
+        look, sync = _Interval(_LOOK_EVERY_S), _Interval(self._sync_s or math.inf)
         while not self._closing.is_set():
             self._wake.wait(_LONGEST_PAUSE_S)
             self._wake.clear()
             self._write_waiting()
-            if side_file.is_over():
-                self._write_side_file()
+            if look.is_over():
+                self._look()
             if sync.is_over():
                 self._sync(self._sync_open_files)
 
@@ -266,8 +269,13 @@ class RunWriter:
         paths = (path for path in self.folder.rglob("*") if path.is_file() or path.is_dir())
         _sync_files((*paths, self.folder))
 
-    def _write_side_file(self) -> None:
-        """Write the side file; a failure is made up for by the next writing."""
+    def _look(self) -> None:
+        """Write the side file, and add what is to be noted beside ticks."""
+        if self._watch is not None:
+            name, lines = self._watch
+            for line in lines():
+                self.note(name, line)
+        # A failure is made up for by the next writing.
         if self._side_file is not None:
             name, content = self._side_file
             with contextlib.suppress(OSError):

@@ -1,6 +1,7 @@
 """The bridge on a bus in real time, with or without a simulated bench at its other end."""
 
 import contextlib
+import os
 import signal
 from collections.abc import Generator
 from dataclasses import replace
@@ -14,6 +15,7 @@ from rig.bus.bus import Bus, BusConfig
 from rig.bus.link import Link
 from rig.bus.secoc import Authentication, Authenticator
 from rig.machine.clock import Clock, RealClock, VirtualClock
+from rig.machine.machine_state import MachineReader
 from rig.machine.realtime import Granted, realtime
 from rig.plan.build import build_bridge
 from rig.plan.config import RunConfig
@@ -78,6 +80,7 @@ def live(
             granted,
             begin=partial(_drain_queue, link, clock),
             operator=port.operator,
+            machine=_machine(),
         )
         if can_watch(plan.config, listen_only=listen_only):
             watchdog = Watchdog(plan, folder)
@@ -86,6 +89,11 @@ def live(
         acknowledge = partial(port.operator.ask, Request.ACKNOWLEDGE, "SIGUSR1")
         stack.enter_context(on_signal(signal.SIGUSR1, acknowledge))
         return run_logged(plan, bridge, endpoint, folder, control, trace=trace)
+
+
+def _machine() -> MachineReader:
+    """Reads the state of the machine, with the cores on which the loop may run."""
+    return MachineReader(tuple(sorted(os.sched_getaffinity(0))))
 
 
 def _drain_queue(link: Link, clock: Clock) -> None:
@@ -150,6 +158,7 @@ def with_bench(
                 granted=granted,
                 begin=partial(on_bus.begin, clock),
                 operator=port.operator,
+                machine=_machine(),
             )
         return run_logged(plan, bridge, endpoint, folder, control, trace=trace)
 

@@ -26,11 +26,13 @@ from rig.log.step_columns import LogColumns, Step, request_of
 from rig.log.writer import LogOptions, RunWriter
 from rig.machine.clock import Clock, OccupiedClock
 from rig.machine.installed_versions import version_of
+from rig.machine.machine_state import MachineReader
 from rig.machine.realtime import Granted
 from rig.plan.plan import Plan
 from rig.run.change_requests import Requests
 from rig.run.changed_settings import Changes, no_changes
 from rig.run.loop import SHOWN_EVERY_NS, Look, Port, RunControl, Sink, regular_ticks, run
+from rig.run.machine_events import MachineEvents
 from rig.run.mode_events import ModeEvents
 from rig.run.operator import Asked, Operator
 from rig.run.ports import InformedPort
@@ -99,6 +101,7 @@ class Endpoint:
         while_waiting: Called before each wait with the time that is awaited.
         operator: Where requests of operators arrive; with it, the run accepts them, and changes.
         watchdog: Sends the safe output when the loop cannot.
+        machine: Reads the state of the machine, whose changes are noted; None notes none.
     """
 
     port: Port
@@ -109,6 +112,7 @@ class Endpoint:
     while_waiting: Sequence[Callable[[int], None]] = ()
     operator: Operator | None = None
     watchdog: Watchdog | None = None
+    machine: MachineReader | None = None
 
 
 def run_logged(
@@ -153,6 +157,11 @@ class _LoggedRun:
         self._timing = Timing.empty()
         self._columns = LogColumns(plan.strut_names, plan.channels)
         self._priority = config.realtime.fifo_priority if granted and granted.fifo else 0
+        self._machine = (
+            None
+            if endpoint.machine is None
+            else MachineEvents(endpoint.machine, endpoint.clock.now_ns)
+        )
         self._log = RunWriter(
             folder,
             _header(plan, endpoint.clock.epoch_ns, granted, folder, control),
@@ -164,6 +173,7 @@ class _LoggedRun:
                 config.log.window(),
                 _capture_name,
                 None if granted is None else (HISTOGRAMS_FILE, self._timing.histograms),
+                watch=None if self._machine is None else (EVENTS_FILE, self._machine.look),
                 sync_s=None if granted is None else config.log.sync_s,
             ),
         )
@@ -305,6 +315,7 @@ class _LoggedRun:
                 "dropped_steps": self._log.dropped,
                 "devices": self._reports.listed,
                 "watchdog": watchdog and watchdog.describe(),
+                "machine": None if self._machine is None else self._machine.summary(),
             }
         }
 
