@@ -2,10 +2,13 @@
 
 import re
 import tomllib
+from importlib.metadata import requires
 from pathlib import Path
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from rig.machine.installed_versions import DISTRIBUTION, version_of
 from rig.plan.config import CONFIGS
@@ -16,6 +19,7 @@ ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 OF_OTHERS = ("dask[distributed]",)
 """Projects of others that a message names."""
+HASHES = ".hashes.txt"
 _HINT = re.compile(r"""\bpip\s+install\s+((?:-\S+\s+|[.]constraints[.]txt\s+)*)['"]?([^\s'"`)]+)""")
 _TEXTS = [
     *(path for name in ("rig", "dart_model", "can_dbc") for path in (ROOT / name).rglob("*.*")),
@@ -48,7 +52,8 @@ def test_every_hint_installs_the_local_clone():
     assert [
         (file, wanted)
         for file, options, wanted in found
-        if wanted not in OF_OTHERS and not (re.match(r"\.($|\[)", wanted) and "-e" in options)
+        if wanted not in (*OF_OTHERS, HASHES)
+        and not (re.match(r"\.($|\[)", wanted) and "-e" in options)
     ] == []
 
 
@@ -56,6 +61,36 @@ def test_every_hint_names_an_extra_that_there_is():
     extras = {name for _, _, wanted in hints() for name in re.findall(r"^\.\[(\w+)\]", wanted)}
     assert len(extras) > 5
     assert extras <= set(PROJECT["optional-dependencies"])
+
+
+def pinned(file):
+    """Version of each package, and its hashes, by its name on an index."""
+    text = (ROOT / file).read_text("utf-8").replace("\\\n", " ")
+    lines = [line.split() for line in text.splitlines() if not line.startswith("#")]
+    pins = [(*pin.split("=="), hashes) for pin, *hashes in lines]
+    return {canonicalize_name(name): (version, hashes) for name, version, hashes in pins}
+
+
+def test_hashes_are_those_of_the_versions_that_are_tested_together():
+    versions, hashed = pinned(".constraints.txt"), pinned(HASHES)
+    assert {name: version for name, (version, _) in hashed.items()} == {
+        name: version for name, (version, _) in versions.items() if name in hashed
+    }
+    for _, hashes in hashed.values():
+        assert hashes
+        assert all(re.fullmatch(r"--hash=sha256:[0-9a-f]{64}", item) for item in hashes)
+
+
+def test_what_is_run_has_hashes():
+    waiting = [*PROJECT["dependencies"]]
+    needed = set()
+    while waiting:
+        requirement = Requirement(waiting.pop())
+        name, marker = canonicalize_name(requirement.name), requirement.marker
+        if name not in needed and (marker is None or marker.evaluate({"extra": ""})):
+            needed.add(name)
+            waiting += requires(name) or ()
+    assert {*needed, "setuptools"} <= set(pinned(HASHES))
 
 
 @pytest.mark.parametrize("package", ["rig", "numpy"])
