@@ -106,7 +106,13 @@ def propose(database: Database) -> str:
             used.add((found[0].message.name, found[0].signal.name))
     listened = {name for name, _ in used}
     free = [item for item in others if item.name not in listened]
-    lines += [*_propose_publish(free), *_observer(heights[0]), *_supervision(heights[0])]
+    best = heights[0]
+    step_m = si_step(best.message, best.signal.name, HEIGHT.dimension)
+    lines += [
+        *_propose_publish(free),
+        *propose_observer(step_m, best.message.cycle_time_ns),
+        *_supervision(best),
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -133,12 +139,15 @@ def _propose_publish(free: Sequence[Message]) -> list[str]:
     return lines
 
 
-def _observer(height: _Candidate) -> list[str]:
-    """Lines of an observer that is stable until it is tuned."""
-    message, name = height.message, height.signal.name
-    noise_std_m = si_step(message, name, HEIGHT.dimension) / math.sqrt(12.0) or _UNKNOWN_NOISE_M
-    interval_ns = message.cycle_time_ns or _UNKNOWN_INTERVAL_NS
-    observer = KalmanObserver.before_tuning(noise_std_m, interval_ns)
+def propose_observer(step_m: float, interval_ns: int | None) -> list[str]:
+    """Lines of an observer that is stable until it is tuned.
+
+    Args:
+        step_m: Step of the height; 0 where it is unknown.
+        interval_ns: Time between two heights, if it is known.
+    """
+    noise_std_m = step_m / math.sqrt(12.0) or _UNKNOWN_NOISE_M
+    observer = KalmanObserver.before_tuning(noise_std_m, interval_ns or _UNKNOWN_INTERVAL_NS)
     found = observer.filter
     return [
         "observers:",

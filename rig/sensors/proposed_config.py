@@ -14,6 +14,7 @@ from can_dbc.database import DEFAULT_DATABASE
 from can_dbc.errors import InputError
 from can_dbc.units import Dimension, si_conversion
 from rig.bus.bus import BusConfig
+from rig.plan.proposal import propose_observer
 from rig.sensors.bus_scan import BusSurvey
 from rig.sensors.canopen_device import CanOpenDevice, MappedObject, Pdo
 from rig.sensors.height_zero import HeightZero
@@ -160,6 +161,7 @@ def configuration_text(
             used.append(sources[0])
     lines += _devices_block(devices, groups, claims, used)
     cycle_s = heights[0].cycle_s or 0.0
+    lines += propose_observer(heights[0].step_m, round(cycle_s * 1e9) or None)
     if cycle_s * _STALE_CYCLES > 0.01:
         stale_s = cycle_s * _STALE_CYCLES
         lines.append(

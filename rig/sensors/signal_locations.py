@@ -3,20 +3,25 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from can_dbc.units import Dimension
+from can_dbc.units import Dimension, si_conversion
 from rig.sensors.canopen_device import CanOpenDevice, MappedObject, Pdo
 from rig.sensors.canopen_profiles import Meaning
 from rig.sensors.j1939 import GroupMessage
 
 
 class SignalLocation(NamedTuple):
-    """Location of a measured quantity on the bus; one of J1939 has no node id and no object."""
+    """Location of a measured quantity on the bus; one of J1939 has no node id and no object.
+
+    Attributes:
+        step_m: Step of a length; 0 of a float, and of what is no length.
+    """
 
     message: str
     signal: str
     node_id: int | None
     mapped: MappedObject | None
     cycle_s: float | None
+    step_m: float
 
 
 def locations(devices: Sequence[CanOpenDevice], dimension: Dimension) -> list[SignalLocation]:
@@ -33,7 +38,14 @@ def _select_locations(
     devices: Sequence[CanOpenDevice], is_sought: Callable[[Meaning], bool]
 ) -> list[SignalLocation]:
     return [
-        SignalLocation(message_name(device, pdo), name, device.node_id, item, pdo.cycle_s)
+        SignalLocation(
+            message_name(device, pdo),
+            name,
+            device.node_id,
+            item,
+            pdo.cycle_s,
+            _step_m(item.meaning),
+        )
         for device in devices
         for pdo in device.pdos
         for item, name in signal_names(pdo).items()
@@ -41,10 +53,23 @@ def _select_locations(
     ]
 
 
+def _step_m(meaning: Meaning) -> float:
+    if meaning.is_float or meaning.dimension is not Dimension.LENGTH:
+        return 0.0
+    return abs(meaning.scale) * si_conversion(meaning.unit, Dimension.LENGTH).factor
+
+
 def levels(groups: Sequence[GroupMessage]) -> list[SignalLocation]:
     """Locations of levels that J1939 devices send."""
     return [
-        SignalLocation(item.message_name, parameter.name, None, None, item.group.cycle_s)
+        SignalLocation(
+            item.message_name,
+            parameter.name,
+            None,
+            None,
+            item.group.cycle_s,
+            parameter.scale * si_conversion(parameter.unit, Dimension.LENGTH).factor,
+        )
         for item in groups
         for parameter in item.group.parameters
         if parameter.unit == "mm"

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 
 import can
 import cantools
@@ -17,6 +18,7 @@ from can_dbc.units import Dimension, si_conversion
 from rig.bus.bus import BusConfig
 from rig.bus.canopen_network import CanOpenNetwork
 from rig.cli.main import app
+from rig.observers.kalman import KalmanObserver
 from rig.plan.load import load_plan
 from rig.plan.preflight_checks import check
 from rig.sensors.bus_scan import scan
@@ -148,7 +150,14 @@ def test_dbc_and_configuration_are_read_back(bus, channel, tmp_path):
     assert ready.config.devices["NODE_5"].heartbeat_s == pytest.approx(0.25)
     assert [item.signal for item in ready.config.devices["NODE_5"].alarms] == ["ALARMS"]
     assert [item.signal for item in ready.config.devices["NODE_6"].alarms] == ["STATUS_1"]
-    assert any("step" in finding.text for finding in check(ready))
+    (observer,) = ready.observers
+    expected = KalmanObserver.before_tuning(1e-6 / math.sqrt(12.0), 2_000_000)
+    assert observer.kind == expected.kind
+    assert observer.filter.bandwidth_hz == pytest.approx(expected.filter.bandwidth_hz, rel=1e-3)
+    assert observer.filter.noise_std_m == pytest.approx(expected.filter.noise_std_m, rel=1e-3)
+    findings = check(ready)
+    assert any("step" in finding.text for finding in findings)
+    assert not any("unstable" in finding.text for finding in findings)
 
 
 def test_a_timer_of_its_own_is_set_and_put_back(bus, network, tmp_path):
