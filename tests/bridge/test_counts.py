@@ -1,7 +1,10 @@
 """What the bridge counts, held against what was done to it, and what the status says of it."""
 
+import itertools
+
 import cantools.database
 import msgspec
+import pytest
 
 from can_dbc.database import DEFAULT_DATABASE
 from can_dbc.frame import Frame
@@ -15,8 +18,9 @@ from rig.bridge import (
     prescribed_motion,
     values,
 )
-from rig.bridge.counts import Conditions
-from rig.bridge.values import Mode
+from rig.bridge.counts import Conditions, Counts, TimingFigures, count_tick
+from rig.bridge.supervision_limits import Action
+from rig.bridge.values import Mode, StepOutput
 from rig.simulated_bench.trajectory import simulate
 from tests.faults.trial import BEGIN_MS, BEGIN_NS, MS, Trial, after
 
@@ -165,3 +169,39 @@ def test_nothing_is_counted_at_the_start_and_exactly_what_came_afterwards():
     assert counts.lost == 3  # the counters of those that were cut short
     assert counts.out_of_sequence == counts.masquerade == counts.wrong_crc == 0
     assert counts.implausible == counts.saturated == counts.second_sender == 0
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_a_tick_counts_each_thing_that_is_not_as_it_should_be(mode):
+    before = Counts(*range(100, 100 + len(Counts._fields)))
+    for action, overruns, bus_fault, left_out, faulty in itertools.product(
+        (0, *Action), (0, 3), (False, True), ((), (7,), (7, 9)), (0, 1, 2)
+    ):
+        output = StepOutput(mode, (), left_out)
+        conditions = Conditions(overruns, bus_fault=bus_fault)
+        after = count_tick(before, output, action, conditions, faulty)
+        more = {name: a - b for name, a, b in zip(Counts._fields, after, before, strict=True)}
+        assert {name: number for name, number in more.items() if number} == {
+            name: number
+            for name, number in {
+                "limited": int(action >= Action.WARN),
+                "overruns": overruns,
+                "bus_faulty": int(bus_fault),
+                "left_out": len(left_out),
+                "device_faulty": faulty,
+                "stale": int(mode is Mode.HOLD),
+            }.items()
+            if number
+        }
+        # The state of a tick at which all is well is not built anew.
+        assert (after is before) == (not any(more.values()))
+
+
+def test_a_refusal_counts_twice_in_all_and_by_its_cause():
+    counts = Counts(lost=4).plus_refusal("repeated").plus_refusal("untimed").plus(lost=2)
+    assert counts == Counts(lost=6, refused=2, repeated=1, untimed=1)
+
+
+def test_before_anything_is_known_of_a_tick_all_is_well():
+    assert Conditions() == (0, False, False, False, TimingFigures())
+    assert TimingFigures() == ((0.0,) * 4, (0.0,) * 4, 0.0)
