@@ -1,0 +1,246 @@
+"""A message of the bench as it is compiled: what of it is read, where to, and what is no value."""
+
+import dataclasses
+import math
+import struct
+
+import pytest
+
+from can_dbc.database import load_database
+from can_dbc.frame import Frame
+from can_dbc.protection import INITIAL, FrameStatus, compile_protector
+from rig.bridge.incoming_messages import (
+    Alarm,
+    AlarmDelivery,
+    Delivery,
+    HeightDelivery,
+    clock_cycle_ns,
+    compile_incoming,
+)
+from rig.channels.channel import Channel, Role, ValidSignal
+from rig.channels.measured_quantities import (
+    APPLIED_FORCE,
+    FORCE,
+    HEIGHT,
+    LOAD_CELL_FORCE,
+    TEMPERATURE,
+)
+
+MS = 1_000_000
+DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: BENCH RIG
+BO_ 256 PROTECTED: 8 BENCH
+ SG_ CRC : 0|8@1+ (1,0) [0|0] "" RIG
+ SG_ COUNTER : 8|4@1+ (1,0) [0|0] "" RIG
+ SG_ HEIGHT : 16|8@1+ (0.01,0) [0|0] "m" RIG
+ SG_ OTHER_HEIGHT : 24|8@1+ (0.01,0) [0|0] "m" RIG
+ SG_ FORCE : 32|8@1+ (1,0) [0|0] "N" RIG
+ SG_ STATE : 40|4@1+ (1,0) [0|0] "" RIG
+ SG_ QUALITY : 44|4@1+ (1,0) [0|0] "" RIG
+ SG_ OIL : 48|8@1+ (1,0) [0|0] "degC" RIG
+BO_ 257 PLAIN: 8 BENCH
+ SG_ HEIGHT : 0|32@1- (1,0) [0|0] "m" RIG
+ SG_ OTHER_HEIGHT : 32|32@1- (1,0) [0|0] "m" RIG
+BO_ 2566834432 GROUP: 8 BENCH
+ SG_ HEIGHT : 0|16@1+ (0.1,-3200) [-3200|3225.5] "mm" RIG
+ SG_ OTHER_HEIGHT : 16|16@1+ (0.1,-3200) [-3200|3225.5] "mm" RIG
+ SG_ FORCE : 32|16@1+ (0.1,100) [100|200] "N" RIG
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_ BO_ "E2EProfile" STRING ;
+BA_DEF_ BO_ "E2EDataIds" STRING ;
+BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","reserved","J1939PG";
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_DEF_DEF_ "E2EProfile" "";
+BA_DEF_DEF_ "E2EDataIds" "";
+BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
+BA_ "GenMsgCycleTime" BO_ 256 5;
+BA_ "GenMsgCycleTime" BO_ 257 5;
+BA_ "E2EProfile" BO_ 256 "P02";
+BA_ "E2EDataIds" BO_ 256 "059C063CED1481CCF00933E7181EBE6A";
+BA_ "VFrameFormat" BO_ 2566834432 3;
+SIG_VALTYPE_ 257 HEIGHT : 1;
+SIG_VALTYPE_ 257 OTHER_HEIGHT : 1;
+"""
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory):
+    path = tmp_path_factory.mktemp("incoming") / "bench.dbc"
+    path.write_text(DBC)
+    return load_database(path)
+
+
+@pytest.fixture(scope="module")
+def protected(database):
+    return database.message("PROTECTED")
+
+
+def channel(index, role, quantity, signal, strut=-1, **parts):
+    return Channel(index, role, quantity, "", "", strut, MS, signal=signal, **parts)
+
+
+def height(index, strut, signal="HEIGHT", **parts):
+    return channel(index, Role.HEIGHT, HEIGHT, signal, strut, **parts)
+
+
+CELL = channel(8, Role.SENSOR, FORCE, "FORCE", 1, delay_ns=9)
+RECORDED = channel(9, Role.BENCH, LOAD_CELL_FORCE, "FORCE")
+OIL = channel(6, Role.BENCH, TEMPERATURE, "OIL")
+
+
+def payload(message, *values, number=0):
+    """A protected frame with the bytes of its signals."""
+    return compile_protector(message.protection)(bytes([0, 0, *values]), number)
+
+
+def test_a_value_that_two_channels_have_is_read_once(protected):
+    made = compile_incoming(protected, [RECORDED, height(4, 2, delay_ns=7), CELL])
+    assert made.message is protected
+    assert made.deliveries == (Delivery(0, 9, 0), Delivery(1, 4, 7), Delivery(0, 8, 9))
+    assert made.heights == (HeightDelivery(1, 2),)
+    told = Frame(0, 256, payload(protected, 40, 0, 25, 0, 0, 0))
+    assert made.read(INITIAL, told)[1:] == (FrameStatus.FIRST, (25.0, pytest.approx(0.4)))
+
+
+def test_alarms_and_what_says_that_a_sensor_measures_are_read_with_the_values(protected):
+    valid = ValidSignal(signal="QUALITY", value=2.0)
+    alarms = [Alarm("QUALITY", 3, 1), Alarm("STATE", 0, 5)]
+    made = compile_incoming(protected, [height(0, 0, valid=valid)], alarms, device=3)
+    assert made.alarms == (AlarmDelivery(1, 3, 1), AlarmDelivery(2, 0, 5))
+    assert made.device == 3
+    told = Frame(0, 256, payload(protected, 40, 0, 0, 0x27, 0, 0))
+    assert made.read(INITIAL, told)[2] == (pytest.approx(0.4), 2.0, 7.0)
+
+
+def test_alarms_alone_are_read_without_a_clock(protected):
+    made = compile_incoming(protected, [], [Alarm("STATE", 0, 0)])
+    assert (made.deliveries, made.heights, made.struts, made.first_strut) == ((), (), 0, 0)
+    assert made.alarms == (AlarmDelivery(0, 0, 0),)
+    assert made.device is made.follow is None
+    assert not made.is_awaited
+
+
+def test_the_struts_of_a_message_are_those_of_its_reference_heights(protected):
+    pair = compile_incoming(protected, [CELL, height(0, 2), height(1, 0, "OTHER_HEIGHT")])
+    assert (pair.struts, pair.first_strut) == (0b101, 0b100)
+    assert pair.heights == (HeightDelivery(1, 2), HeightDelivery(2, 0))
+    assert compile_incoming(protected, [CELL]).struts == 0
+
+
+@pytest.mark.parametrize(
+    ("read", "is_awaited"),
+    [
+        ([height(0, 0)], True),
+        ([CELL], True),
+        ([channel(0, Role.BENCH, APPLIED_FORCE, "FORCE")], True),
+        ([RECORDED], False),
+        ([OIL, RECORDED], False),
+        ([OIL, CELL], True),
+    ],
+)
+def test_an_estimate_rests_on_heights_further_sensors_and_the_applied_force(
+    protected, read, is_awaited
+):
+    assert compile_incoming(protected, read).is_awaited == is_awaited
+
+
+def test_a_counter_states_times_where_frames_have_a_cycle(database, protected):
+    plain = database.message("PLAIN")
+    aperiodic = dataclasses.replace(protected, cycle_time_ns=None)
+    assert clock_cycle_ns(protected) == 5 * MS
+    assert clock_cycle_ns(aperiodic) == clock_cycle_ns(plain) == 0
+    for message in (aperiodic, plain):
+        assert compile_incoming(message, [height(0, 0)]).follow is None
+    follow = compile_incoming(protected, [height(0, 0)]).follow
+    clock = None
+    for number in range(3):
+        clock = follow(clock, number * 5 * MS, 1)
+    assert (clock.due_ns, clock.line.step_ns // MS) == (10 * MS, 5)
+
+
+def test_a_frame_is_read_where_its_counter_lets_it_pass(protected):
+    made = compile_incoming(protected, [height(0, 0)])
+    frames = [(0, 0), (1, 1), (1, 2), (4, 4), (5, 5)]
+    sequence, found = INITIAL, []
+    for number, t_ms in frames:
+        data = payload(protected, 40 + number, 0, 0, 0, 0, 0, number=number)
+        sequence, status, values = made.read(sequence, Frame(t_ms * 5 * MS, 256, data))
+        found.append((status.value, values and round(values[0], 9), sequence.lost))
+    assert found == [
+        ("first", 0.4, 0),
+        ("ok", 0.41, 0),
+        ("repeated", None, 0),
+        ("lost", 0.44, 2),
+        ("ok", 0.45, 0),
+    ]
+    data = payload(protected, 46, 0, 0, 0, 0, 0, number=6)
+    for wrong, status in (
+        (data[:-1], FrameStatus.WRONG_LENGTH),
+        (bytes([data[0] ^ 1]) + data[1:], FrameStatus.WRONG_CRC),
+    ):
+        assert made.read(sequence, Frame(30 * MS, 256, wrong)) == (sequence, status, None)
+
+
+def test_a_frame_counts_whose_sensors_all_say_that_they_measure(protected):
+    read = [
+        height(0, 0, valid=ValidSignal(signal="STATE", value=3.0)),
+        height(1, 1, "OTHER_HEIGHT", valid=ValidSignal(signal="QUALITY")),
+    ]
+    made = compile_incoming(protected, read)
+    for said, is_read in ((0x13, True), (0x03, False), (0x12, False), (0x31, False)):
+        told = Frame(0, 256, payload(protected, 40, 50, 0, said, 0, 0))
+        sequence, status, values = made.read(INITIAL, told)
+        assert (status, values is not None) == (
+            (FrameStatus.FIRST, True) if is_read else (FrameStatus.NO_VALUE, False)
+        )
+        assert sequence.counter == 0  # it counts all the same
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_one_float_that_is_no_number_makes_a_frame_without_values(database, number):
+    plain = database.message("PLAIN")
+    made = compile_incoming(plain, [height(0, 0), height(1, 1, "OTHER_HEIGHT")])
+    for pair in ((0.5, number), (number, 0.5)):
+        read = made.read(INITIAL, Frame(0, 257, struct.pack("<2f", *pair)))
+        assert read == (INITIAL, FrameStatus.NO_VALUE, None)
+    read = made.read(INITIAL, Frame(0, 257, struct.pack("<2f", 0.5, 0.25)))
+    assert read == (INITIAL, FrameStatus.OK, (0.5, 0.25))
+    assert made.read(INITIAL, Frame(0, 257, bytes(7))) == (INITIAL, FrameStatus.WRONG_LENGTH, None)
+
+
+@pytest.mark.parametrize(
+    ("raw", "is_value"), [(0, True), (0xFAFF, True), (0xFB00, False), (0xFE00, False)]
+)
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_parameter_of_j1939_holds_values_up_to_its_valid_range(database, place, raw, is_value):
+    group = database.message("GROUP")
+    assert group.is_j1939
+    made = compile_incoming(group, [height(0, 0), height(1, 1, "OTHER_HEIGHT")])
+    words = [32_000, 32_000, 0, 0]
+    words[place] = raw
+    _, status, values = made.read(INITIAL, Frame(0, 0x18FEF500, struct.pack("<4H", *words), True))
+    expected = [0.0, 0.0]
+    expected[place] = (0.1 * raw - 3200.0) / 1000.0
+    if is_value:
+        assert (status, values) == (FrameStatus.OK, pytest.approx(expected))
+    else:
+        assert (status, values) == (FrameStatus.NO_VALUE, None)
+
+
+@pytest.mark.parametrize(("raw", "is_value"), [(0, True), (1000, True), (1001, False)])
+def test_a_parameter_of_j1939_holds_values_in_the_range_of_the_dbc(database, raw, is_value):
+    made = compile_incoming(database.message("GROUP"), [CELL])
+    data = struct.pack("<4H", 0xFFFF, 0xFFFF, raw, 0)
+    _, _, values = made.read(INITIAL, Frame(0, 0x18FEF500, data, True))
+    # What is not read may be anything.
+    assert values == (pytest.approx((100.0 + 0.1 * raw,)) if is_value else None)
+
+
+def test_every_value_of_a_parameter_of_j1939_is_within_its_range(database):
+    """However the scale rounds: a bound is computed in another way than the value there."""
+    made = compile_incoming(database.message("GROUP"), [height(0, 0)])
+    for raw in (*range(0, 0xFB00, 97), 0xFAFE, 0xFAFF):
+        data = struct.pack("<4H", raw, 0xFFFF, 0, 0)
+        assert made.read(INITIAL, Frame(0, 0x18FEF500, data, True))[1] is FrameStatus.OK
