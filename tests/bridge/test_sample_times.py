@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from rig.bridge.sample_times import FrameTime, SenderClock, compile_follower
 
@@ -146,3 +147,233 @@ def test_quick_and_slow_senders_alike(seed):
     slow = follow(sampled_ns(300, cycle_ns=2 * MS) + 2 * waits, 2 * MS)
     quick = follow(sampled_ns(300) + waits)
     assert np.abs((dues(slow) - 5 * MS) - 2 * (dues(quick) - 5 * MS)).max() <= 300
+
+
+BLOCK = 64
+"""Cycles after which the line goes through the lowest arrival again."""
+
+
+def timings_of(clocks: Sequence[SenderClock]) -> list[str]:
+    return [clock.timing.value for clock in clocks]
+
+
+def after_steady(*late_ns: int, frames: int = 300, gaps: Sequence[int] = ()) -> list[SenderClock]:
+    """Clocks at frames by how late they come, behind some that came in time.
+
+    `gaps` are the cycles before each of them, one where none is given.
+    """
+    follower, clock, found = compile_follower(MS), None, []
+    for number in range(frames):
+        clock = follower(clock, number * MS, 1)
+    cycles = frames - 1
+    for number, late in enumerate(late_ns):
+        step = gaps[number] if number < len(gaps) else 1
+        cycles += step
+        clock = follower(clock, cycles * MS + late, step)
+        found.append(replace(clock, due_ns=clock.due_ns - cycles * MS))
+    return found
+
+
+def test_the_line_begins_at_the_first_frame_and_rises_by_a_cycle_and_a_hundredth():
+    follower = compile_follower(MS)
+    first = follower(None, 7 * MS, 1)
+    assert (first.arrival_ns, first.due_ns, first.timing) == (7 * MS, 7 * MS, FrameTime.IN_TIME)
+    for cycles in (1, 2, 5):
+        late = follower(first, 7 * MS + cycles * MS + 200_000, cycles)
+        assert late.due_ns == 7 * MS + cycles * 1_010_000
+        early = follower(first, 7 * MS + cycles * MS, cycles)
+        assert early.due_ns == 7 * MS + cycles * MS
+
+
+@pytest.mark.parametrize(
+    ("step_ns", "known_ns"),
+    [(1_003_000, 1_003_000), (990_000, 990_000), (1_000_000.5, 1_000_001), (800_000, 875_000)],
+)
+def test_the_step_is_known_after_two_blocks(step_ns, known_ns):
+    """Rounded up, and within an eighth of the cycle."""
+    clocks = follow(np.floor(np.arange(200) * step_ns))
+    steps = [clock.line.step_ns for clock in clocks]
+    assert steps[: 2 * BLOCK] == [1_010_000] * 2 * BLOCK
+    assert steps[2 * BLOCK :] == [known_ns] * (200 - 2 * BLOCK)
+
+
+def test_a_sender_much_slower_than_its_cycle_is_followed_up_to_an_eighth_of_it():
+    assert follow(np.arange(129) * 1_150_000)[-1].line.step_ns == 1_125_000
+
+
+def test_the_step_is_that_of_the_last_four_blocks():
+    # Half a nanosecond less than the line rises: the last frame of each block is its lowest.
+    steps_ns = [*[1_000_000, 999_999] * (3 * BLOCK), *[999_744] * (6 * BLOCK)]
+    clocks = follow(np.concatenate([[0], np.cumsum(steps_ns)]))
+    known_ns = [clock.line.step_ns for clock in clocks[6 * BLOCK :: BLOCK]]
+    assert known_ns == [1_000_000, 999_936, 999_872, 999_808, 999_744, 999_744, 999_744]
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(-300, 300))
+def test_behind_blocks_with_one_frame_that_did_not_wait_every_time_is_exact(seed, drift_ns):
+    rng = np.random.default_rng(seed)
+    frames = 14 * BLOCK
+    true_ns = np.arange(frames) * (MS + drift_ns)
+    waits_ns = rng.integers(40_000, 120_000, frames)
+    # It may stand anywhere in its block, which ends with the frame of number 64, 128, ...
+    waits_ns[1 + BLOCK * np.arange(14) + rng.integers(0, BLOCK - 1, 14)] = 0
+    waits_ns[0] = 0
+    found = follow(true_ns + waits_ns)
+    assert dues(found)[10 * BLOCK :].tolist() == true_ns[10 * BLOCK :].tolist()
+    assert all(clock.line.is_clock and clock.line.is_believed for clock in found[10 * BLOCK :])
+
+
+@pytest.mark.parametrize(
+    ("late_ns", "timing", "due_ns"),
+    [
+        (0, "in_time", 0),
+        (1, "in_time", 0),
+        (MS // 4, "in_time", 0),
+        (MS // 4 + 1, "in_time", 0),
+        (MS, "in_time", 0),
+        (MS + 1, "late", 0),
+        (5 * MS, "late", 0),
+        (-1, "in_time", -1),
+        (-MS // 4, "in_time", -MS // 4),
+        (-MS // 4 - 1, "early", 0),
+    ],
+)
+def test_one_frame_off_the_line(late_ns, timing, due_ns):
+    """Late by up to a cycle it may be used; early by a quarter it contradicts the clock."""
+    (clock,) = after_steady(late_ns)
+    assert timings_of([clock]) == [timing]
+    if timing != "early":
+        assert clock.due_ns == due_ns
+    # The line is lower by what the frame was early, and else where it was.
+    behind = after_steady(late_ns, max(late_ns, 0))[1]
+    assert behind.due_ns == min(due_ns, 0)
+
+
+@pytest.mark.parametrize(("gap", "timing"), [(8, "late"), (9, "early")])
+def test_up_to_eight_cycles_the_counter_alone_tells_how_many_they_were(gap, timing):
+    (clock,) = after_steady(2 * MS, gaps=(gap,))
+    assert clock.timing.value == timing
+
+
+def test_a_frame_on_the_line_behind_a_long_silence_is_in_time():
+    (clock,) = after_steady(MS // 4, gaps=(1000,))
+    assert (clock.timing, clock.due_ns) == (FrameTime.IN_TIME, 0)
+
+
+def test_behind_a_silence_three_frames_show_where_the_line_is():
+    # The counter went round: the number of cycles is wrong by some part of a cycle or more.
+    clocks = after_steady(*[400_000] * 4, gaps=(50,))
+    assert timings_of(clocks) == ["early", "early", "in_time", "in_time"]
+    assert [clock.due_ns for clock in clocks[2:]] == [400_000] * 2
+    # On the line by chance, the frames behind it are no less a guess.
+    clocks = after_steady(400_000, 0, 0, 0, gaps=(50,))
+    assert timings_of(clocks) == ["early", "early", "early", "in_time"]
+
+
+@pytest.mark.parametrize(("late_ns", "frames"), [(300_000, 8), (3 * MS, 8), (-300_000, 3)])
+def test_frames_that_are_off_by_the_same_time_move_the_line(late_ns, frames):
+    clocks = after_steady(*[late_ns] * (frames + 1))
+    before, moved = clocks[: frames - 1], clocks[frames - 1 :]
+    assert [clock.due_ns for clock in moved] == [late_ns] * 2
+    assert timings_of(moved) == ["in_time"] * 2
+    assert not any(clock.line.is_believed for clock in before)
+    assert all(clock.line.is_believed for clock in moved)
+    # One fewer, and the line is where it was.
+    assert [clock.due_ns for clock in after_steady(*[late_ns] * (frames - 1), 0)][-1] == 0
+
+
+@pytest.mark.parametrize("late_ns", [300_000, 3 * MS])
+def test_frames_that_are_late_by_different_times_had_waited(late_ns):
+    """Different by an eighth of a cycle, or one in between was on the line."""
+    scattered = [late_ns, late_ns + 125_000] * 10
+    for late in (scattered, [*[late_ns] * 7, 0, *[late_ns] * 7]):
+        clocks = after_steady(*late, 0)
+        assert clocks[-1].due_ns == 0
+        assert not any(clock.due_ns for clock in clocks)
+    alike = [late_ns, late_ns + 124_999] * 4
+    assert after_steady(*alike)[-1].due_ns == late_ns + 124_999
+
+
+def test_early_frames_alike_are_counted_from_the_last_that_differed():
+    clocks = after_steady(-300_000, -450_000, -450_000)
+    assert timings_of(clocks) == ["early"] * 3
+    clocks = after_steady(-300_000, -450_000, -450_000, -450_000)
+    assert timings_of(clocks) == ["early"] * 3 + ["in_time"]
+    assert clocks[-1].due_ns == -450_000
+
+
+def test_frames_that_catch_up_had_waited():
+    """Each a little less late than the one before, until one is in time."""
+    waited = [5 * MS - 600_000 * number for number in range(9)]
+    clocks = after_steady(*waited)
+    assert timings_of(clocks) == ["late"] + ["in_time"] * 8
+    assert [clock.due_ns for clock in clocks] == [0] * 9
+
+
+@pytest.mark.parametrize(("sooner_ns", "timing"), [(249_999, "late"), (250_000, "in_time")])
+def test_a_late_frame_is_clear_where_it_came_a_quarter_sooner_behind_the_last(sooner_ns, timing):
+    clocks = after_steady(3 * MS, 3 * MS - sooner_ns)
+    assert timings_of(clocks) == ["late", timing]
+
+
+def pausing(pauses: int, between: int = 20, behind: int = 600) -> list[SenderClock]:
+    """Clocks of a sender that pauses some times for three cycles, and then no more."""
+    lengths = [200, *[between] * pauses, behind]
+    lates = np.repeat(np.arange(pauses + 2) * 3 * MS, lengths)
+    return follow(np.arange(sum(lengths)) * MS + lates)[200:]
+
+
+def test_a_sender_that_pauses_again_and_again_has_no_clock_until_it_has_gone_steadily():
+    assert all(clock.line.is_clock for clock in pausing(1))
+    clocks = pausing(2)
+    moves = [20 * number + 7 for number in (0, 1, 2)]  # with the eighth frame behind each pause
+    lost = [number for number, clock in enumerate(clocks) if not clock.line.is_clock]
+    # From the third pause on, and for three blocks that are as expected.
+    assert lost == list(range(moves[2], moves[2] + 3 * BLOCK))
+    arrivals = [clocks[number].arrival_ns for number in lost]
+    assert [clocks[number].due_ns for number in lost] == arrivals
+    assert {clocks[number].timing for number in lost} == {FrameTime.IN_TIME}
+    assert all(clock.line.is_believed for clock in clocks[moves[2] + 3 * BLOCK :])
+
+
+def wandering(blocks: int, offset_ns: int, wait_ns: int, steady: int = 24) -> list[SenderClock]:
+    """Clocks of a sender of which every second block is late as a whole, and then none.
+
+    All frames but one of a block wait besides, the last one the longest.
+    """
+    numbers = np.arange((8 + blocks + steady) * BLOCK + 1)
+    block = (numbers - 1) // BLOCK
+    is_off = (block >= 8) & (block < 8 + blocks) & (block % 2 == 0)
+    waits = np.where((numbers - 1) % BLOCK == 30, 0, wait_ns)
+    waits[numbers % BLOCK == 0] = 120_000
+    return follow(numbers * MS + offset_ns * is_off + waits)
+
+
+@pytest.mark.parametrize(
+    ("offset_ns", "wait_ns", "is_clock"),
+    [
+        (14_000, 0, True),  # less than a 64th of a cycle
+        (17_000, 0, False),
+        (20_000, 100_000, True),
+        # A mean wait is 100 us, and the offset besides in a block that has it: two fifths of that.
+        (64_000, 100_000, True),
+        (69_000, 100_000, False),
+    ],
+)
+def test_blocks_that_scatter_as_much_as_their_frames_state_no_time(offset_ns, wait_ns, is_clock):
+    clocks = wandering(16, offset_ns, wait_ns)
+    assert all(clock.line.is_clock for clock in clocks[: 8 * BLOCK])
+    assert all(clock.line.is_clock for clock in clocks[8 * BLOCK : 24 * BLOCK]) == is_clock
+
+
+@pytest.mark.parametrize(("blocks", "steady"), [(1, 0), (2, 0), (4, 4), (6, 6), (40, 6)])
+def test_a_clock_is_lost_in_three_blocks_and_back_after_as_many_steady_ones_six_at_most(
+    blocks, steady
+):
+    clocks = wandering(blocks, 20_000, 0)
+    lost = [number for number, clock in enumerate(clocks) if not clock.line.is_clock]
+    first = (8 + 3) * BLOCK
+    assert lost == list(range(first, (8 + blocks + steady) * BLOCK if steady else first))
+    for number in lost:
+        assert clocks[number].due_ns == clocks[number].arrival_ns
+        assert clocks[number].timing is FrameTime.IN_TIME
