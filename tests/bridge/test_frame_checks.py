@@ -418,6 +418,13 @@ def test_a_frame_with_one_implausible_height_leaves_no_trace_of_the_others():
     assert seen == [(0.4, 9), None, (0.3, 9)]
 
 
+def test_a_frame_is_judged_by_the_heights_that_have_limits():
+    bench = Bench(heights(0, 1), limits=[[], [row("refuse")]])
+    assert len(bench.receive(frame(10, 40))) == 1
+    assert bench.receive(frame(40, 10)) == []
+    assert bench.counts == {"implausible": 1, "refused": 1}
+
+
 def test_the_first_measurement_that_requires_the_severest_action_is_named():
     limits = [[row("warn")], [row("hold")], [row("hold")], [row("warn")]]
     bench = Bench(heights(0, 1, 2, 3), limits=limits)
