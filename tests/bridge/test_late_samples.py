@@ -158,7 +158,7 @@ def test_a_step_between_is_at_the_newest_of_its_heights_and_never_before_the_las
 
 
 def test_a_sensors_sample_waits_for_the_first_step_that_is_not_before_it():
-    # The bench's samples of a time count from their arrival on, a sensor's from when it was true.
+    # What the bench sends once goes with the heights that it came behind.
     told = arriving((0, 20), (2, 60), (2, 61), (3, 21), (0, 30))
     first, last = steps_of(CHANNELS, told, 50, 10)
     assert first.samples == (told[0], told[1], told[3])

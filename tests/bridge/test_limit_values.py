@@ -41,6 +41,11 @@ def test_every_value_is_of_the_measurement_or_of_the_estimate():
     assert {item.value for item in LimitedValue if not item.is_measured} == set(ESTIMATES)
 
 
+def test_actions_are_ordered_by_their_severity_and_none_is_no_action():
+    assert [action.name for action in sorted(Action)] == ["WARN", "REFUSE", "HOLD", "SAFE"]
+    assert all(Action)
+
+
 @pytest.mark.parametrize("value", MEASURED)
 def test_a_measurement_can_be_refused(value):
     assert row(value, "refuse", high=1.0).action_at(2.0) == Action.REFUSE
@@ -210,6 +215,12 @@ def test_within_the_range_of_an_estimate_no_limit_on_height_or_force_is_passed(
     ranged = [item for item in rows if item.value.value in ("height_m", "force_n")]
     is_within = low_m <= height_m <= high_m and low_n <= force_n <= high_n
     assert is_within == (worst_action(ranged, strut) == 0)
+
+
+def test_of_several_limits_the_narrowest_bounds_the_range_of_an_estimate():
+    rows = [row("force_n", "warn", -a, a) for a in (5.0, 3.0, 4.0)]
+    rows += [row("height_m", "warn", 0.3 - a, 0.3 + a) for a in (0.1, 0.05, 0.2)]
+    assert range_of_estimate(rows) == (0.25, 0.35, -3.0, 3.0)
 
 
 def test_without_limits_the_range_of_an_estimate_has_no_end():
