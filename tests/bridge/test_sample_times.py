@@ -178,6 +178,7 @@ def test_the_line_begins_at_the_first_frame_and_rises_by_a_cycle_and_a_hundredth
     follower = compile_follower(MS)
     first = follower(None, 7 * MS, 1)
     assert (first.arrival_ns, first.due_ns, first.timing) == (7 * MS, 7 * MS, FrameTime.IN_TIME)
+    assert first.line.is_believed
     for cycles in (1, 2, 5):
         late = follower(first, 7 * MS + cycles * MS + 200_000, cycles)
         assert late.due_ns == 7 * MS + cycles * 1_010_000
@@ -187,7 +188,13 @@ def test_the_line_begins_at_the_first_frame_and_rises_by_a_cycle_and_a_hundredth
 
 @pytest.mark.parametrize(
     ("step_ns", "known_ns"),
-    [(1_003_000, 1_003_000), (990_000, 990_000), (1_000_000.5, 1_000_001), (800_000, 875_000)],
+    [
+        (1_003_000, 1_003_000),
+        (1_012_000, 1_012_000),
+        (990_000, 990_000),
+        (1_000_000.5, 1_000_001),
+        (800_000, 875_000),
+    ],
 )
 def test_the_step_is_known_after_two_blocks(step_ns, known_ns):
     """Rounded up, and within an eighth of the cycle."""
@@ -270,6 +277,34 @@ def test_behind_a_silence_three_frames_show_where_the_line_is():
     assert timings_of(clocks) == ["early", "early", "early", "in_time"]
 
 
+def test_behind_a_long_gap_after_the_first_frame_three_frames_show_where_the_line_is():
+    # A hundredth in each of 40 cycles is more than a quarter of one.
+    follower = compile_follower(MS)
+    clocks = [follower(None, 0, 1)]
+    for number, cycles in ((40, 40), (41, 1), (42, 1), (43, 1)):
+        clocks.append(follower(clocks[-1], number * MS, cycles))
+    assert timings_of(clocks) == ["in_time", "early", "early", "in_time", "in_time"]
+
+
+@pytest.mark.parametrize("on_line_ns", [0, MS // 4, -MS // 4])
+@pytest.mark.parametrize("gap", [1, 20])
+def test_a_frame_on_the_line_shows_that_the_one_before_it_had_waited(on_line_ns, gap):
+    clocks = after_steady(3 * MS, on_line_ns, gaps=(1, gap))
+    assert timings_of(clocks) == ["late", "in_time"]
+    assert [clock.line.is_believed for clock in clocks] == [False, True]
+
+
+def test_once_the_line_is_known_again_no_number_of_cycles_is_a_guess():
+    clocks = after_steady(*[400_000] * 4, 400_000 + 2 * MS, gaps=(50,))
+    assert timings_of(clocks)[2:] == ["in_time", "in_time", "late"]
+
+
+def test_an_early_frame_that_none_is_like_leaves_the_line_through_the_end_of_a_block():
+    clocks = after_steady(-300_000, *[0] * 2 * BLOCK)
+    assert not any(clock.due_ns for clock in clocks[1:])
+    assert {clock.line.step_ns for clock in clocks} == {MS}
+
+
 @pytest.mark.parametrize(("late_ns", "frames"), [(300_000, 8), (3 * MS, 8), (-300_000, 3)])
 def test_frames_that_are_off_by_the_same_time_move_the_line(late_ns, frames):
     clocks = after_steady(*[late_ns] * (frames + 1))
@@ -316,16 +351,16 @@ def test_a_late_frame_is_clear_where_it_came_a_quarter_sooner_behind_the_last(so
     assert timings_of(clocks) == ["late", timing]
 
 
-def pausing(pauses: int, between: int = 20, behind: int = 600) -> list[SenderClock]:
-    """Clocks of a sender that pauses some times for three cycles, and then no more."""
-    lengths = [200, *[between] * pauses, behind]
-    lates = np.repeat(np.arange(pauses + 2) * 3 * MS, lengths)
-    return follow(np.arange(sum(lengths)) * MS + lates)[200:]
+def pausing(pauses: int, begin: int = 200) -> list[SenderClock]:
+    """Clocks of a sender that pauses for three cycles, every 20 frames, and then no more."""
+    lengths = [begin, *[20] * (pauses - 1), 600]
+    lates = np.repeat(np.arange(pauses + 1) * 3 * MS, lengths)
+    return follow(np.arange(sum(lengths)) * MS + lates)[begin:]
 
 
 def test_a_sender_that_pauses_again_and_again_has_no_clock_until_it_has_gone_steadily():
-    assert all(clock.line.is_clock for clock in pausing(1))
-    clocks = pausing(2)
+    assert all(clock.line.is_clock for clock in pausing(2))
+    clocks = pausing(3)
     moves = [20 * number + 7 for number in (0, 1, 2)]  # with the eighth frame behind each pause
     lost = [number for number, clock in enumerate(clocks) if not clock.line.is_clock]
     # From the third pause on, and for three blocks that are as expected.
@@ -334,6 +369,19 @@ def test_a_sender_that_pauses_again_and_again_has_no_clock_until_it_has_gone_ste
     assert [clocks[number].due_ns for number in lost] == arrivals
     assert {clocks[number].timing for number in lost} == {FrameTime.IN_TIME}
     assert all(clock.line.is_believed for clock in clocks[moves[2] + 3 * BLOCK :])
+
+
+def test_at_the_beginning_a_sender_is_doubted_no_more_and_no_less():
+    assert all(clock.line.is_clock for clock in pausing(2, begin=20))
+    clocks = pausing(3, begin=20)
+    assert [clock.line.is_clock for clock in clocks].index(False) == 47
+
+
+def test_a_sender_that_slows_down_behind_its_first_block_has_a_step_near_its_cycle():
+    # The frame that ends the block is the lowest of this block and of the next one.
+    steps_ns = [MS] * BLOCK + [1_012_000] * (3 * BLOCK)
+    clocks = follow(np.concatenate([[0], np.cumsum(steps_ns)]))
+    assert all(7 * MS <= 8 * clock.line.step_ns <= 9 * MS for clock in clocks)
 
 
 def wandering(blocks: int, offset_ns: int, wait_ns: int, steady: int = 24) -> list[SenderClock]:
@@ -352,7 +400,8 @@ def wandering(blocks: int, offset_ns: int, wait_ns: int, steady: int = 24) -> li
 @pytest.mark.parametrize(
     ("offset_ns", "wait_ns", "is_clock"),
     [
-        (14_000, 0, True),  # less than a 64th of a cycle
+        (14_000, 0, True),
+        (15_625, 0, True),  # a 64th of a cycle
         (17_000, 0, False),
         (20_000, 100_000, True),
         # A mean wait is 100 us, and the offset besides in a block that has it: two fifths of that.
