@@ -43,10 +43,17 @@ BO_ 256 PROTECTED: 8 BENCH
 BO_ 257 PLAIN: 8 BENCH
  SG_ HEIGHT : 0|32@1- (1,0) [0|0] "m" RIG
  SG_ OTHER_HEIGHT : 32|32@1- (1,0) [0|0] "m" RIG
+BO_ 258 MIXED: 8 BENCH
+ SG_ HEIGHT : 0|32@1- (1,0) [0|0] "m" RIG
+ SG_ FORCE : 32|8@1+ (1,0) [0|0] "N" RIG
 BO_ 2566834432 GROUP: 8 BENCH
  SG_ HEIGHT : 0|16@1+ (0.1,-3200) [-3200|3225.5] "mm" RIG
  SG_ OTHER_HEIGHT : 16|16@1+ (0.1,-3200) [-3200|3225.5] "mm" RIG
  SG_ FORCE : 32|16@1+ (0.1,100) [100|200] "N" RIG
+BO_ 2566834688 ENDS: 8 BENCH
+ SG_ UP_FROM_ZERO : 0|16@1+ (1,0) [0|64255] "N" RIG
+ SG_ UP_TO_ZERO : 16|16@1+ (1,-64255) [-64255|0] "N" RIG
+ SG_ BELOW_ZERO : 32|16@1+ (1,-64300) [-64300|-45] "N" RIG
 BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
 BA_DEF_ BO_ "E2EProfile" STRING ;
 BA_DEF_ BO_ "E2EDataIds" STRING ;
@@ -60,8 +67,10 @@ BA_ "GenMsgCycleTime" BO_ 257 5;
 BA_ "E2EProfile" BO_ 256 "P02";
 BA_ "E2EDataIds" BO_ 256 "059C063CED1481CCF00933E7181EBE6A";
 BA_ "VFrameFormat" BO_ 2566834432 3;
+BA_ "VFrameFormat" BO_ 2566834688 3;
 SIG_VALTYPE_ 257 HEIGHT : 1;
 SIG_VALTYPE_ 257 OTHER_HEIGHT : 1;
+SIG_VALTYPE_ 258 HEIGHT : 1;
 """
 
 
@@ -210,6 +219,14 @@ def test_one_float_that_is_no_number_makes_a_frame_without_values(database, numb
     assert made.read(INITIAL, Frame(0, 257, bytes(7))) == (INITIAL, FrameStatus.WRONG_LENGTH, None)
 
 
+def test_a_float_beside_an_integer_is_looked_at_as_well(database):
+    cell = channel(1, Role.BENCH, LOAD_CELL_FORCE, "FORCE")
+    made = compile_incoming(database.message("MIXED"), [height(0, 0), cell])
+    for number, expected in ((0.5, (0.5, 7.0)), (math.nan, None)):
+        data = struct.pack("<fB3x", number, 7)
+        assert made.read(INITIAL, Frame(0, 258, data))[2] == expected
+
+
 @pytest.mark.parametrize(
     ("raw", "is_value"), [(0, True), (0xFAFF, True), (0xFB00, False), (0xFE00, False)]
 )
@@ -236,6 +253,22 @@ def test_a_parameter_of_j1939_holds_values_in_the_range_of_the_dbc(database, raw
     _, _, values = made.read(INITIAL, Frame(0, 0x18FEF500, data, True))
     # What is not read may be anything.
     assert values == (pytest.approx((100.0 + 0.1 * raw,)) if is_value else None)
+
+
+@pytest.mark.parametrize(
+    ("name", "low_n", "high_n"),
+    [
+        ("UP_FROM_ZERO", 0.0, 64_255.0),
+        ("UP_TO_ZERO", -64_255.0, 0.0),
+        ("BELOW_ZERO", -64_300.0, -45.0),
+    ],
+)
+def test_the_ends_of_a_range_are_values_whatever_their_sign(database, name, low_n, high_n):
+    cell = channel(0, Role.BENCH, LOAD_CELL_FORCE, name)
+    made = compile_incoming(database.message("ENDS"), [cell])
+    for raw, expected in ((0, (low_n,)), (0xFAFF, (high_n,)), (0xFB00, None)):
+        data = struct.pack("<4H", raw, raw, raw, raw)
+        assert made.read(INITIAL, Frame(0, 0x18FEF600, data, True))[2] == expected
 
 
 def test_every_value_of_a_parameter_of_j1939_is_within_its_range(database):
