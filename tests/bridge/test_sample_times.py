@@ -317,6 +317,13 @@ def test_frames_that_are_off_by_the_same_time_move_the_line(late_ns, frames):
     assert [clock.due_ns for clock in after_steady(*[late_ns] * (frames - 1), 0)][-1] == 0
 
 
+def test_the_end_of_a_block_makes_no_late_frame_believed():
+    # The fifth of them ends the block.
+    clocks = after_steady(*[3 * MS] * 8, frames=5 * BLOCK - 4)
+    assert [clock.line.ends_at for clock in clocks[3:5]] == [5 * BLOCK, 6 * BLOCK]
+    assert [clock.line.is_believed for clock in clocks] == [False] * 7 + [True]
+
+
 @pytest.mark.parametrize("late_ns", [300_000, 3 * MS])
 def test_frames_that_are_late_by_different_times_had_waited(late_ns):
     """Different by an eighth of a cycle, or one in between was on the line."""
@@ -377,6 +384,23 @@ def test_at_the_beginning_a_sender_is_doubted_no_more_and_no_less():
     assert [clock.line.is_clock for clock in clocks].index(False) == 47
 
 
+def test_behind_a_move_of_the_line_the_next_but_one_block_is_judged():
+    numbers = np.arange(308 + 6 * BLOCK)
+    lates = np.where(numbers < 300, 0, 3 * MS)  # it moves with the eighth of them
+    block = (numbers - 308) // BLOCK
+    lates[(numbers >= 308) & (block % 2 == 1)] += 20_000
+    lates[(numbers >= 308) & ((numbers - 307) % BLOCK == 0)] += 100_000
+    clocks = follow(numbers * MS + lates)
+    assert [clock.line.is_clock for clock in clocks].index(False) == 307 + 4 * BLOCK
+
+
+def test_the_frame_that_a_block_ends_with_is_the_first_of_the_next():
+    numbers = np.arange(20 * BLOCK)
+    waits_ns = np.where(numbers % (2 * BLOCK), 50_000, 0)
+    clocks = follow(numbers * MS + waits_ns)
+    assert dues(clocks)[10 * BLOCK :].tolist() == (numbers * MS)[10 * BLOCK :].tolist()
+
+
 def test_a_sender_that_slows_down_behind_its_first_block_has_a_step_near_its_cycle():
     # The frame that ends the block is the lowest of this block and of the next one.
     steps_ns = [MS] * BLOCK + [1_012_000] * (3 * BLOCK)
@@ -413,6 +437,15 @@ def test_blocks_that_scatter_as_much_as_their_frames_state_no_time(offset_ns, wa
     clocks = wandering(16, offset_ns, wait_ns)
     assert all(clock.line.is_clock for clock in clocks[: 8 * BLOCK])
     assert all(clock.line.is_clock for clock in clocks[8 * BLOCK : 24 * BLOCK]) == is_clock
+
+
+@pytest.mark.parametrize("early_ns", [20_000, 40_000, 60_000])
+def test_however_the_step_changes_no_frame_is_due_after_its_arrival(early_ns):
+    # The step rises when the frame that was early is the oldest that it is measured from.
+    numbers = np.arange(20 * BLOCK)
+    clocks = follow(numbers * MS - np.where(numbers == 8 * BLOCK + 20, early_ns, 0))
+    assert max(clock.line.step_ns for clock in clocks[4 * BLOCK :]) > MS
+    assert all(clock.due_ns <= clock.arrival_ns for clock in clocks)
 
 
 @pytest.mark.parametrize(("blocks", "steady"), [(1, 0), (2, 0), (4, 4), (6, 6), (40, 6)])
