@@ -203,5 +203,6 @@ def test_a_refusal_counts_twice_in_all_and_by_its_cause():
 
 
 def test_before_anything_is_known_of_a_tick_all_is_well():
-    assert Conditions() == (0, False, False, False, TimingFigures())
+    assert not any(value for name, value in Conditions()._asdict().items() if name != "timing")
+    assert Conditions().timing == TimingFigures()
     assert TimingFigures() == ((0.0,) * 4, (0.0,) * 4, 0.0)
