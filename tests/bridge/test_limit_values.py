@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from rig.bridge.supervision_limits import (
     Action,
+    Delay,
     Excess,
     Limit,
     LimitedValue,
@@ -19,7 +20,9 @@ from rig.bridge.supervision_limits import (
     find_excess,
     judge_height,
     range_of_estimate,
+    update_delays,
     worst_action,
+    worst_delayed_action,
 )
 from rig.bridge.values import StrutOutput
 
@@ -226,3 +229,81 @@ def test_of_several_limits_the_narrowest_bounds_the_range_of_an_estimate():
 def test_without_limits_the_range_of_an_estimate_has_no_end():
     others = [row("virtual_force_n", high=1.0), row("innovation_m", low=-1.0)]
     assert range_of_estimate(others) == (-math.inf, math.inf, -math.inf, math.inf)
+
+
+def delayed(value="force_n", action="hold", for_s=0.01, low=None, high=10.0):
+    return Limit(value=value, low=low, high=high, for_s=for_s, action=action)
+
+
+def test_a_delay_is_of_estimates_alone():
+    assert row("force_n", high=1.0).for_s == 0.0
+    for value in MEASURED:
+        assert Limit(value=value, high=1.0, action="warn", for_s=0.0).for_s == 0.0
+        with pytest.raises(ValidationError, match="expected none, because a measurement"):
+            Limit(value=value, high=1.0, action="warn", for_s=0.001)
+    with pytest.raises(ValidationError, match="for_s"):
+        delayed(for_s=-0.001)
+
+
+def passed_at(limit, *forces_n, begin_ns=0, delays=()):
+    """Whether a delayed limit counts as passed, after each of some forces a millisecond apart."""
+    found = []
+    for number, force_n in enumerate(forces_n):
+        struts = [replace(STRUT, force_n=force_n)]
+        delays = update_delays([(0, limit)], delays, struts, begin_ns + number * MS)
+        found.append(delays[0].is_passed)
+    return found
+
+
+@pytest.mark.parametrize("begin_ns", [0, 7 * MS])
+def test_a_delayed_limit_is_passed_and_left_when_it_has_been_so_for_its_time(begin_ns):
+    limit = delayed(for_s=0.003)
+    forces_n = [5.0, *[20.0] * 5, *[5.0] * 5]
+    # The last force within came at 0 ms, and the last one beyond at 5 ms.
+    expected = [False] * 3 + [True] * 5 + [False] * 3
+    assert passed_at(limit, *forces_n, begin_ns=begin_ns) == expected
+
+
+def test_a_delay_is_over_to_the_nanosecond_whatever_its_decimals():
+    limit = delayed(for_s=0.0011)
+    begun, struts = [Delay(is_passed=False, since_ns=0)], [STRUT]
+    for t_ns, is_passed in ((1_099_999, False), (1_100_000, True)):
+        assert update_delays([(0, limit)], begun, struts, t_ns)[0].is_passed == is_passed
+
+
+def test_a_delayed_limit_forgets_what_was_shorter_than_its_time():
+    limit = delayed(for_s=0.003)
+    assert not any(passed_at(limit, *[5.0, 20.0, 20.0] * 5))
+    begun = [Delay(is_passed=True, since_ns=-MS)]
+    assert all(passed_at(limit, *[20.0, 5.0, 5.0] * 5, delays=begun))
+
+
+def test_each_delayed_limit_is_held_against_its_own_strut_and_quantity():
+    rows = [(1, delayed(for_s=0.001)), (0, delayed("height_m", for_s=0.001, high=0.5))]
+    struts = [STRUT, replace(STRUT, force_n=5.0, height_m=0.6)]
+    before = update_delays(rows, (), struts, 0)
+    assert before == (Delay(is_passed=False, since_ns=0),) * 2
+    assert update_delays(rows, before, struts, MS) == (Delay(is_passed=False, since_ns=MS),) * 2
+    struts = [replace(STRUT, height_m=0.6), STRUT]
+    assert update_delays(rows, before, struts, MS - 1) == before
+    assert update_delays(rows, before, struts, MS) == (Delay(is_passed=True, since_ns=MS),) * 2
+
+
+def test_with_other_limits_every_delay_begins_anew():
+    passed = (Delay(is_passed=True, since_ns=0),)
+    rows = [(0, delayed()), (0, delayed("height_m"))]
+    struts = [replace(STRUT, force_n=20.0)]
+    assert update_delays(rows, passed, struts, 5) == (Delay(is_passed=False, since_ns=5),) * 2
+
+
+def test_the_severest_delayed_limit_that_is_passed_counts():
+    rows = [(0, delayed(action=action)) for action in ("warn", "safe", "hold")]
+    for is_passed, expected in (
+        ((False, False, False), 0),
+        ((True, False, False), Action.WARN),
+        ((True, False, True), Action.HOLD),
+        ((True, True, True), Action.SAFE),
+    ):
+        delays = [Delay(is_passed=item, since_ns=0) for item in is_passed]
+        assert worst_delayed_action(rows, delays) == expected
+    assert worst_delayed_action((), ()) == 0
