@@ -97,9 +97,9 @@ def test_a_device_of_canopen_follows_from_its_settings():
     plain = DeviceSettings(node_id=127).device("D", is_vital=True)
     assert plain == Device("D", 127, 0x0FF, 0, 0, True, None, NO_ADDRESS)
     assert plain.ids == (0x0FF, 0x77F)
-    settings = DeviceSettings(node_id=3, emergency_id=0x123, heartbeat_s=0.0011)
+    settings = DeviceSettings(node_id=3, emergency_id=0x123, heartbeat_s=0.0041)
     made = settings.device("D", is_vital=False)
-    assert made == Device("D", 3, 0x123, 1_100_000, 0, False, None, NO_ADDRESS)
+    assert made == Device("D", 3, 0x123, 4_100_000, 0, False, None, NO_ADDRESS)
     assert isinstance(made.heartbeat_ns, int)
     assert made.ids == (0x123, 0x703)
 

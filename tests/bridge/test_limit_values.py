@@ -265,9 +265,9 @@ def test_a_delayed_limit_is_passed_and_left_when_it_has_been_so_for_its_time(beg
 
 
 def test_a_delay_is_over_to_the_nanosecond_whatever_its_decimals():
-    limit = delayed(for_s=0.0011)
+    limit = delayed(for_s=0.0041)
     begun, struts = [Delay(is_passed=False, since_ns=0)], [STRUT]
-    for t_ns, is_passed in ((1_099_999, False), (1_100_000, True)):
+    for t_ns, is_passed in ((4_099_999, False), (4_100_000, True)):
         assert update_delays([(0, limit)], begun, struts, t_ns)[0].is_passed == is_passed
 
 
