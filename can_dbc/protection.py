@@ -92,7 +92,6 @@ class FrameStatus(Enum):
     REPEATED = "repeated"
     OUT_OF_SEQUENCE = "out_of_sequence"
     MASQUERADE = "masquerade"
-    NO_VALUE = "no_value"
 
     @property
     def is_accepted(self) -> bool:

@@ -2,17 +2,18 @@
 
 1. addressed: it is a frame of a message that the bridge reads (`FrameChecks.receive`). What is not
    may be a heartbeat, an emergency or an address claim of a device, or a second sender.
-2. protected: its length, CRC and counter are right (`can_dbc.protection`), and its signals hold
-   values (`Incoming.read`).
-3. timed: it is known when its values were sampled (`rig.bridge.sample_times`).
-4. sent by its device: its sender is the configured device (`_sent_by_device`).
-5. healthy sender: that device is not at fault (`_healthy_sender`).
-6. plausible: no limit refuses its heights (`_plausible`).
+2. sent by its device: its sender is the configured device; one of another sender is none of the
+   message's frames, and is not counted.
+3. protected: its length, CRC and counter are right (`can_dbc.protection`).
+4. timed: it does not contradict its sender's clock (`rig.bridge.sample_times`). Whether a late one
+   had waited is known at the end of the tick.
+5. holding values: its signals do (`Incoming.read`).
+6. healthy sender: its device is not at fault (`_healthy_sender`).
+7. plausible: no limit refuses its heights (`_plausible`).
 
 Whether a frame is authentic is decided before, on the bus (`rig.bus.secoc`). No measurement of a
-refused frame is used; alarms in it count. It is counted where it was refused (`rig.bridge.counts`);
-that of another sender than the device is none of the message's frames, and is not. Whether the
-newest measurement has become too old is decided later (`rig.bridge.measurement_age`).
+refused frame is used; alarms in it count. It is counted where it was refused (`rig.bridge.counts`).
+Whether the newest measurement has become too old is decided later (`rig.bridge.measurement_age`).
 """
 
 from collections.abc import Callable, Sequence
@@ -39,7 +40,7 @@ from rig.bridge.devices import (
     update_by_frame,
 )
 from rig.bridge.incoming_messages import Incoming, Values
-from rig.bridge.sample_times import IN_TIME, LATE, FrameTime, SenderClock
+from rig.bridge.sample_times import EARLY, IN_TIME, LATE, FrameTime, SenderClock
 from rig.bridge.supervision_limits import (
     Action,
     Excess,
@@ -50,10 +51,7 @@ from rig.bridge.supervision_limits import (
 )
 
 # Looking up a member of an enum costs as much as the CRC of a frame.
-_OK, _FIRST, _NO_VALUE = FrameStatus.OK, FrameStatus.FIRST, FrameStatus.NO_VALUE
-
-_COUNTED = (_OK, _NO_VALUE)
-"""Status of a frame without values whose counter counts all the same."""
+_OK, _FIRST = FrameStatus.OK, FrameStatus.FIRST
 
 SECOND_SENDER_FRAMES = 12
 """Frames out of sequence in close succession that only a second sender explains: a restarted sender
@@ -120,8 +118,8 @@ class Reception:
             self.memory = replace(self.memory, healths=healths)
 
 
-FrameCheck = Callable[[Reception, Frame, Values], Values | None]
-"""Passes a frame's values on, or refuses the frame: None."""
+FrameCheck = Callable[[Reception, Frame, Values], bool]
+"""Whether it passes a frame with some values; what it refuses it counts."""
 
 
 class FrameChecks:
@@ -166,23 +164,45 @@ class FrameChecks:
                 self._receive_other(reception, frame)
                 continue
             incoming = self.incoming[index]
+            if incoming.device is not None and not self._is_of_device(reception, incoming, frame):
+                continue
             sequences[index], status, values = incoming.read(sequences[index], frame)
             if status is not _OK:
                 self._record_status(reception, index, frame.t_ns, status)
             due_ns, timing = frame.t_ns, IN_TIME
             follow = incoming.follow
-            if follow is not None and (values is not None or status in _COUNTED):
+            if follow is not None and (status is _OK or status.is_accepted):
                 before = None if status is _FIRST else clocks[index]
                 clock = clocks[index] = follow(before, due_ns, 1 + sequences[index].lost)
                 due_ns, timing = clock.due_ns, clock.timing
                 if timing is not IN_TIME:
                     is_timed = False
-            if values is not None and (checks := self._checks[index]):
-                timed = frame if due_ns == frame.t_ns else replace(frame, t_ns=due_ns)
-                values = _pass(checks, reception, timed, values)
-            if values is not None:
+            if values is None:
+                continue
+            # One that contradicts its sender's clock leaves nothing behind.
+            if timing is EARLY or self._pass(reception, index, frame, due_ns, values):
                 passed.append((incoming, values, due_ns, timing))
         return passed if is_timed else _drop_unclear(reception, passed)
+
+    def _pass(
+        self, reception: Reception, index: int, frame: Frame, due_ns: int, values: Values
+    ) -> bool:
+        """Whether a frame of a message holds values, and no check refuses it."""
+        if not values:
+            reception.count_refusal("no_value")
+            return False
+        checks = self._checks[index]
+        if not checks:
+            return True
+        timed = frame if due_ns == frame.t_ns else replace(frame, t_ns=due_ns)
+        return all(check(reception, timed, values) for check in checks)
+
+    def _is_of_device(self, reception: Reception, incoming: Incoming, frame: Frame) -> bool:
+        """Whether a frame is of its message's device: another one may send the same group."""
+        if incoming.device is None:
+            return True
+        health = reception.memory.healths[incoming.device]
+        return is_from(self._devices[incoming.device], health, frame)
 
     def _receive_other(self, reception: Reception, frame: Frame) -> None:
         """Receive a frame of no incoming message: of a device, or of a second sender."""
@@ -235,7 +255,7 @@ class FrameChecks:
         checks: list[FrameCheck] = []
         if incoming.device is not None:
             index, device = incoming.device, self._devices[incoming.device]
-            checks += [_sent_by_device(index, device), _healthy_sender(incoming, index, device)]
+            checks.append(_healthy_sender(incoming, index, device))
         if any(self._limits[target.strut] for target in incoming.heights):
             checks.append(_plausible(incoming, self._limits))
         return tuple(checks)
@@ -256,40 +276,19 @@ def _drop_unclear(reception: Reception, passed: Sequence[Passed]) -> list[Passed
     return kept[::-1]
 
 
-def _pass(
-    checks: Sequence[FrameCheck], reception: Reception, frame: Frame, values: Values
-) -> Values | None:
-    """Values of a frame behind some checks; None if one of them refused the frame."""
-    for check in checks:
-        passed = check(reception, frame, values)
-        if passed is None:
-            return None
-        values = passed
-    return values
-
-
-def _sent_by_device(index: int, device: Device) -> FrameCheck:
-    """A check for frames of the device alone: another one may send the same group."""
-
-    def check(reception: Reception, frame: Frame, values: Values) -> Values | None:
-        return values if is_from(device, reception.memory.healths[index], frame) else None
-
-    return check
-
-
 def _healthy_sender(incoming: Incoming, index: int, device: Device) -> FrameCheck:
     """A check for frames of a healthy device; alarms in the frame itself count."""
 
-    def check(reception: Reception, frame: Frame, values: Values) -> Values | None:
+    def check(reception: Reception, frame: Frame, values: Values) -> bool:
         reception.set_health(index, update_by_data(device, reception.memory.healths[index]))
         for alarm in incoming.alarms:
             health = reception.memory.healths[alarm.device]
             raw = int(values[alarm.value])
             reception.set_health(alarm.device, update_by_alarm(health, alarm.alarm, raw))
         if fault(device, reception.memory.healths[index], frame.t_ns) is None:
-            return values
+            return True
         reception.count_refusal("from_faulty_device")
-        return None
+        return False
 
     return check
 
@@ -298,7 +297,7 @@ def _plausible(incoming: Incoming, limits_of: LimitsByStrut) -> FrameCheck:
     """A check for heights within the limits: a frame is used whole or not at all."""
     shortest_ns = max(1, (incoming.message.cycle_time_ns or 0) // 2)
 
-    def check(reception: Reception, frame: Frame, values: Values) -> Values | None:
+    def check(reception: Reception, frame: Frame, values: Values) -> bool:
         heights, action = list(reception.memory.heights), 0
         for target in incoming.heights:
             height_m, limits = values[target.value], limits_of[target.strut]
@@ -313,8 +312,8 @@ def _plausible(incoming: Incoming, limits_of: LimitsByStrut) -> FrameCheck:
             action = max(action, required)
         if action < Action.REFUSE:
             reception.memory = replace(reception.memory, heights=tuple(heights))
-            return values
+            return True
         reception.count_refusal("implausible")
-        return None
+        return False
 
     return check

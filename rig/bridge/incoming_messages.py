@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import NamedTuple
 
-from can_dbc.codec import Decoder, compile_decoder, si_range
+from can_dbc.codec import Decoder, compile_decoder, si_range, si_step
 from can_dbc.database import Message
 from can_dbc.frame import Frame
 from can_dbc.protection import FrameStatus, SequenceState, compile_checker
@@ -21,8 +21,10 @@ Values = tuple[float, ...]
 """Values of a frame in SI, in the order of the message's signals that are read."""
 
 Reading = tuple[SequenceState, FrameStatus, Values | None]
-"""State of the message's counter after a frame, the frame's status, and its values; None where
-there are none to be used."""
+"""State of the message's counter after a frame, the frame's status, and its values: none in a
+refused frame or another page, `NO_VALUES` where a signal holds no value."""
+
+NO_VALUES: Values = ()
 
 Reader = Callable[[SequenceState, Frame], Reading]
 """State of a message's counter, and a frame of the message -> its reading."""
@@ -184,19 +186,24 @@ _Check = Callable[[Values], bool]
 def _check_of_values(message: Message, signals: Sequence[tuple[str, Dimension]]) -> _Check | None:
     """Check for errors, "not available" and NaN; None where a signal always holds a value."""
     if message.is_j1939:
-        ranges = [si_range(message, name, dimension) for name, dimension in signals]
+        ranges = [_range_of_values(message, name, dimension) for name, dimension in signals]
 
         def within(values: Values) -> bool:
-            # A bound may differ from the value there in its last bits.
             return all(
-                low - 1e-9 * abs(low) <= value <= high + 1e-9 * abs(high)
-                for value, (low, high) in zip(values, ranges, strict=True)
+                low <= value <= high for value, (low, high) in zip(values, ranges, strict=True)
             )
 
         return within
     if any(message.signal(name).is_float for name, _ in signals):
         return lambda values: all(map(isfinite, values))
     return None
+
+
+def _range_of_values(message: Message, name: str, dimension: Dimension) -> tuple[float, float]:
+    """Range of a signal in SI; a bound may differ from the value there in its last bits."""
+    low, high = si_range(message, name, dimension)
+    margin = 0.25 * si_step(message, name, dimension)
+    return low - margin, high + margin
 
 
 def _check_of_validity(
@@ -216,7 +223,7 @@ def _with_check(read: Reader, are_values: _Check) -> Reader:
         sequence, status, values = read(sequence, frame)
         if values is None or are_values(values):
             return sequence, status, values
-        return sequence, FrameStatus.NO_VALUE, None
+        return sequence, status, NO_VALUES
 
     return read_values
 

@@ -66,12 +66,15 @@ def update_band(
     if not is_settled:
         return InnovationBand(innovation_m, rate, t_ns, square, count)
     change = abs(rate - band.rate_m_per_s)
-    if elapsed_ns > interval_ns:  # some are missing
+    are_missing = 2 * elapsed_ns > 3 * interval_ns
+    if are_missing:
         change *= interval_ns / elapsed_ns
     # Rounding alone changes the rate by a step over the time.
     new = max(change, step_m / elapsed_s)
     new *= new
     if count >= _FEWEST and new > _BAND * square:
         return InnovationBand(innovation_m, rate, t_ns, _WIDENING * square, count, is_left=True)
+    if are_missing:
+        return InnovationBand(innovation_m, rate, t_ns, square, count)
     share = max(1.0 / (count + 1), min(elapsed_s / _USUAL_S, 1.0))
     return InnovationBand(innovation_m, rate, t_ns, square + share * (new - square), count + 1)

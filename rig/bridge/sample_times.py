@@ -27,6 +27,9 @@ from msgspec.structs import replace
 _BLOCK = 64
 """Cycles of a block: of as many waits spread over a range, the least is a 64th of it."""
 
+_LEAST_APART = _BLOCK // 2
+"""Cycles between two arrivals that show the step between frames."""
+
 _BLOCKS = 4
 """Blocks over which the slope is measured: by the least of their waits, it errs by less than a
 hundredth of the waits' range in a block."""
@@ -197,22 +200,25 @@ def _begin_again(clock: SenderClock) -> SenderClock:
 def _end_block(clock: SenderClock, cycle_ns: int) -> SenderClock:
     """Clock whose line goes through the lowest arrival of the block that ends."""
     line, step_ns, (_, lowest_ns, lowest_at) = clock.line, clock.line.step_ns, clock.lowest
-    is_unsteady = False
+    is_unsteady, is_step_known = False, line.is_step_known
     if line.before:
         newest_ns, newest_at = line.before[-1]
         off_ns = abs(lowest_ns - newest_ns - (lowest_at - newest_at) * step_ns)
         least_ns = max(_SCATTER * clock.wait_ns, cycle_ns) / _BLOCK
         is_unsteady = line.is_step_known and off_ns > least_ns
         oldest_ns, oldest_at = line.before[0]
-        # Rounded up: the frames of a sender that drifts are due when they arrive.
-        step_ns = -((oldest_ns - lowest_ns) // max(lowest_at - oldest_at, 1))
-        step_ns = min(max(step_ns, cycle_ns * 7 // 8), cycle_ns * 9 // 8)
+        # Of two that are close to each other the waits would make a step of any size.
+        if lowest_at - oldest_at >= _LEAST_APART:
+            # Rounded up: the frames of a sender that drifts are due when they arrive.
+            step_ns = -((oldest_ns - lowest_ns) // (lowest_at - oldest_at))
+            step_ns = min(max(step_ns, cycle_ns * 7 // 8), cycle_ns * 9 // 8)
+            is_step_known = True
     line = replace(
         _with_doubt(line, is_unsteady=is_unsteady),
         step_ns=step_ns,
         ends_at=clock.cycles + _BLOCK,
         before=(*line.before[1 - _BLOCKS :], (lowest_ns, lowest_at)),
-        is_step_known=line.is_step_known or bool(line.before),
+        is_step_known=is_step_known,
     )
     arrival_ns, due_ns = clock.arrival_ns, lowest_ns + (clock.cycles - lowest_at) * step_ns
     due_ns = min(arrival_ns, due_ns) if line.is_clock else arrival_ns

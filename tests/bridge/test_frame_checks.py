@@ -22,7 +22,10 @@ MS = 1_000_000
 MESSAGE = load_database(DEFAULT_DATABASE).message("BENCH_MEASUREMENT")
 STATUSES = list(FrameStatus)
 NONE = 0xFF
-"""Byte of a frame that has no value."""
+"""Byte of a frame of another page: there is no value to read."""
+
+EMPTY = 0xFE
+"""Byte of a frame whose signal holds no value."""
 
 FIRST_ID, OWN_ID = 0x100, 0x110
 
@@ -33,7 +36,7 @@ def message(index=0, cycle_ns=MS):
 
 def read(sequence, frame):
     status, lost, *values = frame.data
-    number = tuple(value / 100 for value in values)
+    number = () if EMPTY in values else tuple(value / 100 for value in values)
     return (
         replace(sequence, lost=lost, t_ns=frame.t_ns),
         STATUSES[status],
@@ -221,7 +224,7 @@ def test_the_senders_clock_is_told_each_frame_that_its_counter_counts():
     bench = Bench(incoming(follow=clock))
     bench.receive(frame(t_ns=100, status=FrameStatus.FIRST))
     bench.receive(frame(t_ns=110), frame(NONE, t_ns=120))
-    bench.receive(frame(NONE, t_ns=130, status=FrameStatus.NO_VALUE, lost=2))
+    bench.receive(frame(NONE, t_ns=130, status=FrameStatus.LOST, lost=2))
     bench.receive(frame(t_ns=140, status=FrameStatus.LOST, lost=3))
     for status in (FrameStatus.WRONG_CRC, FrameStatus.REPEATED, FrameStatus.WRONG_LENGTH):
         bench.receive(frame(NONE, t_ns=145, status=status))
@@ -469,3 +472,39 @@ def test_the_sender_of_a_height_is_judged_before_the_height():
     assert bench.receive(frame(10)) == []
     assert bench.counts == {"from_faulty_device": 1, "refused": 1}
     assert (bench.action, bench.memory.heights) == (0, (None,))
+
+
+def test_what_was_lost_before_a_frame_without_values_is_counted():
+    bench = Bench(incoming())
+    bench.receive(frame(t_ns=100, status=FrameStatus.FIRST))
+    assert bench.receive(frame(EMPTY, t_ns=130, status=FrameStatus.LOST, lost=2)) == []
+    assert bench.counts == {"started": 1, "lost": 2, "refused": 1, "no_value": 1}
+
+
+def test_a_frame_without_values_begins_a_senders_clock_and_carries_it_on():
+    clock = Clock()
+    bench = Bench(incoming(follow=clock))
+    bench.receive(frame(EMPTY, t_ns=100, status=FrameStatus.FIRST))
+    bench.receive(frame(EMPTY, t_ns=130, status=FrameStatus.LOST, lost=2), frame(t_ns=140))
+    assert clock.asked == [(None, 100, 1), (100, 130, 3), (130, 140, 1)]
+
+
+def test_a_frame_that_contradicts_its_senders_clock_leaves_nothing_behind():
+    """Neither a limit on its height acts, nor does it become what the next one is held against."""
+    limits = (Limit(value=LimitedValue.MEASURED_HEIGHT_M, high=1.0, action="safe"),)
+    heights = (HeightDelivery(0, 0),)
+    bench = Bench(
+        incoming(follow=lambda _before, due_ns, _cycles: FrameDue(due_ns, EARLY), heights=heights),
+        limits=(limits,),
+    )
+    assert bench.receive(frame(200)) == []
+    assert (bench.action, bench.counts) == (0, {"refused": 1, "untimed": 1})
+    assert bench.memory.heights == (None,)
+
+
+@pytest.mark.parametrize("status", [FrameStatus.WRONG_LENGTH, FrameStatus.WRONG_CRC])
+def test_a_frame_of_another_sender_than_the_device_is_not_read(status):
+    device = Device("A", 0, 0, MS, j1939_name=5, address=0x20)
+    bench = Bench(incoming(device=0), devices=[device])
+    assert bench.receive(frame(EMPTY, status=status)) == []
+    assert bench.counts == {}

@@ -92,6 +92,14 @@ def test_missing_samples_are_no_excess(missing):
     assert not any(left)
 
 
+def test_a_gap_teaches_nothing():
+    """Over a second the rate hardly changes: that is not usual from one sample to the next."""
+    band = follow(noise(1000))[-1]
+    behind = update_band(band, band.innovation_m, 2000 * MS, SENSOR, is_settled=True)
+    assert behind.square == band.square
+    assert not any(item.is_left for item in follow(noise(500, seed=4), behind, 2000))
+
+
 def test_a_sample_that_is_not_newer_changes_nothing():
     band = follow(noise(100))[-1]
     assert update_band(band, 1.0, band.t_ns, SENSOR, is_settled=True) is band

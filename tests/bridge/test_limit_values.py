@@ -17,12 +17,12 @@ from rig.bridge.supervision_limits import (
     LimitedValue,
     Plausibility,
     explain_height,
+    find_delayed_action,
     find_excess,
     judge_height,
     range_of_estimate,
     update_delays,
     worst_action,
-    worst_delayed_action,
 )
 from rig.bridge.values import StrutOutput
 
@@ -305,5 +305,5 @@ def test_the_severest_delayed_limit_that_is_passed_counts():
         ((True, True, True), Action.SAFE),
     ):
         delays = [Delay(is_passed=item, since_ns=0) for item in is_passed]
-        assert worst_delayed_action(rows, delays) == expected
-    assert worst_delayed_action((), ()) == 0
+        assert find_delayed_action(rows, delays) == expected
+    assert find_delayed_action((), ()) == 0
