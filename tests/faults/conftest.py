@@ -89,11 +89,10 @@ def promise(promises: list[tuple[int, tuple[str, ...]]]) -> Callable[..., None]:
         event: str,
         modes: list[str],
         within: str,
-        again_ms: int | None,
+        again: str,
         ratios: dict[str, float],
         duty: str,
     ) -> None:
-        again = "" if again_ms is None else f"after {again_ms + 1} ms"
         errors = " / ".join(f"{ratio:.2f}" for ratio in ratios.values())
         promises.append((order, (event, ", ".join(modes), within, again, errors, duty)))
 

@@ -89,7 +89,9 @@ def follow(trial: Trial, event: Event, end_ms: int = END_MS, first_ms: int = 0) 
         if ms in event.missed:
             missed += 1
             continue
-        conditions = event.conditions(ms)._replace(overruns=missed)
+        conditions = event.conditions(ms)
+        if missed:
+            conditions = conditions._replace(overruns=missed)
         trial.state, result = trial.bridge.tick(trial.state, ms * MS, queue, conditions)
         queue, missed = [], 0
         for frame in result.frames:
@@ -207,17 +209,16 @@ def largest_error_n(received, truth_n):
 
 
 def describe(received, begin_ms):
-    """Modes that followed, and the time from the event to the first invalid frame."""
+    """Modes that followed, when a frame was invalid first, and when one was valid again."""
     modes = []
     for item in received:
         if item.ms >= begin_ms and item.mode.name not in modes[-1:]:
             modes.append(item.mode.name)
-    invalid = next(
-        (it.ms - begin_ms for it in received if it.ms >= begin_ms and not it.is_valid), None
-    )
-    again = next((it.ms - begin_ms for it in reversed(received) if not it.is_valid), None)
-    within = "stays valid" if invalid is None else f"{max(invalid, 0)} ms"
-    return modes, within, again
+    first = next((it.ms for it in received if it.ms >= begin_ms and not it.is_valid), None)
+    if first is None:
+        return modes, "none", ""
+    again = next(it.ms for it in received if it.ms > first and it.is_valid)
+    return modes, f"after {first - begin_ms} ms", f"after {again - begin_ms} ms"
 
 
 @pytest.mark.parametrize("order", range(len(EVENTS)), ids=lambda order: EVENTS[order].words)
