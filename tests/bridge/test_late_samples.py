@@ -63,7 +63,7 @@ def settled_n():
     }
 
 
-@pytest.mark.parametrize("held", [2, 5, 8, 13, 20, 60, 200])
+@pytest.mark.parametrize("held", [2, 8, 20, 200])
 @pytest.mark.parametrize("name", OBSERVERS)
 def test_no_valid_force_is_far_from_the_truth(name, held, settled_n):
     trial = Trial(observer=OBSERVERS[name])

@@ -242,7 +242,7 @@ def test_no_valid_force_errs_by_more_than_three_times_the_settled_one(
 def test_a_height_that_freezes_anywhere_in_its_motion(name, truth_n, settled_n):
     """Fast, or at a turning point: before the observer has turned it into a force."""
     limits = [{"value": "unchanged_s", "high": 0.02, "action": "refuse"}]
-    for begin_ms in range(BEGIN_MS + 100, BEGIN_MS + 730, 70):
+    for begin_ms in range(BEGIN_MS + 100, BEGIN_MS + 730, 105):
         trial = Trial(observer=OBSERVERS[name], limits=limits)
         received = follow(trial, Event("", frames=Frozen(begin_ms)), begin_ms + 300)
         assert largest_error_n(received, truth_n) <= MOST * settled_n[name]
