@@ -130,6 +130,7 @@ class FreeModelEstimator:
         applied = [channel for channel in channels if channel.quantity is APPLIED_FORCE]
         self._has_applied = bool(applied)
         self._applied_grace_ns = _grace_ns(applied, stale_after_ns)
+        self._longest_silence_ns = self._applied_grace_ns + stale_after_ns
 
     @property
     def struts(self) -> int:
@@ -172,9 +173,19 @@ class FreeModelEstimator:
     ) -> tuple[FreeModelState, Estimate | None]:
         """Advance the model to a time and correct it with what was measured."""
         received = self._sort(step_input.samples)
+        t_ns, new, last = step_input.t_ns, received.applied, state.applied
         if state.model is not None:
-            return self._observe(state, state.model, step_input.t_ns, received)
-        return self._start_if_possible(state, step_input.t_ns, received)
+            if (
+                new is not None
+                and last is not None
+                and new.t_ns - last.t_ns > self._longest_silence_ns
+                and self._have_moved_since(last.t_ns + self._longest_silence_ns, state)
+            ):
+                # The observers took what was missing of the force for one of the strut.
+                state = self.restart(state, t_ns)
+                return self._start_if_possible(state, t_ns, received)
+            return self._observe(state, state.model, t_ns, received)
+        return self._start_if_possible(state, t_ns, received)
 
     def _sort(self, samples: Sequence[Sample]) -> _Received:
         """Samples by what they are used for; of a quantity of the bench the newest."""
@@ -296,9 +307,6 @@ class FreeModelEstimator:
         """
         heights, readings = received.heights, received.readings
         applied, temperature_c = received.applied or state.applied, received.temperature_c
-        if self._is_behind_gap(received.applied, state):
-            # The observers took what was missing of the force for one of the strut.
-            return self._start_if_possible(self.restart(state, t_ns), t_ns, received)
         applied_n = loaded.applied_force_n if applied is None else applied.value
         if temperature_c is None:
             temperature_c = loaded.temperature_c
@@ -314,11 +322,12 @@ class FreeModelEstimator:
             further = self._compare(readings, instants)
         observers: list[ObserverState] = []
         virtual_n: list[float] = []
-        oldest_ns, bands, is_settled = t_ns, list(state.bands), state.is_settled
+        bands: list[InnovationBand] = []
+        oldest_ns, is_settled = t_ns, state.is_settled
         for strut, observer in enumerate(self.observers):
             measured = heights[strut]
             innovation = None
-            before = state.observers[strut]
+            before, band = state.observers[strut], state.bands[strut]
             if measured is not None:
                 measured_ns = measured.t_ns
                 if measured_ns - before.measured_ns > state.longest_gaps_ns[strut]:
@@ -326,17 +335,14 @@ class FreeModelEstimator:
                 model_m = model_height_m(measured_ns, strut, t_ns, model.struts, instants)
                 innovation_m = measured.value - model_m
                 innovation = Innovation(innovation_m, measured_ns)
-                bands[strut] = update_band(
-                    bands[strut],
-                    innovation_m,
-                    measured_ns,
-                    self._sensing[strut],
-                    is_settled=is_settled,
+                band = update_band(
+                    band, innovation_m, measured_ns, self._sensing[strut], is_settled
                 )
             if further:
                 observed = observer.step(before, t_ns, innovation, further[strut])
             else:
                 observed = observer.step(before, t_ns, innovation)
+            bands.append(band)
             observers.append(observed)
             virtual_n.append(observed.virtual_force_n)
             oldest_ns = min(oldest_ns, observed.measured_ns)
@@ -359,15 +365,9 @@ class FreeModelEstimator:
             oldest_ns = min(oldest_ns, until_ns)
         return self._estimate(after, loaded, oldest_ns)
 
-    def _is_behind_gap(self, new: Sample | None, state: FreeModelState) -> bool:
-        """Whether an applied force was missing for too long, while heights were there."""
-        last = state.applied
-        if new is None or last is None:
-            return False
-        longest_ns = self._applied_grace_ns + self._stale_after_ns
-        if new.t_ns - last.t_ns <= longest_ns:
-            return False
-        return min(it.measured_ns for it in state.observers) > last.t_ns + longest_ns
+    def _have_moved_since(self, t_ns: int, state: FreeModelState) -> bool:
+        """Whether heights of every strut have come since a time."""
+        return min([observer.measured_ns for observer in state.observers]) > t_ns
 
     def _recent_instants(
         self, state: FreeModelState, before: LoadedModel[ModelState], now: Instant
@@ -404,9 +404,11 @@ class FreeModelEstimator:
         size = loaded.applied_force_n
         is_calm, t_ns, longest_gaps_ns = state.is_settled, state.t_ns, state.longest_gaps_ns
         for strut, observer in enumerate(state.observers):
-            if observer.is_disturbed or t_ns - observer.measured_ns > longest_gaps_ns[strut]:
-                is_calm = False
-            if state.bands[strut].is_left:
+            if (
+                observer.is_disturbed
+                or state.bands[strut].is_left
+                or t_ns - observer.measured_ns > longest_gaps_ns[strut]
+            ):
                 is_calm = False
             height_m, velocity_m_per_s = loaded.state.struts[strut]
             law_force_n = loaded.forces_n[strut]

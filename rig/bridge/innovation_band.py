@@ -49,14 +49,12 @@ def update_band(
     innovation_m: float,
     t_ns: int,
     sensor: tuple[float, int],
-    *,
     is_settled: bool,
 ) -> InnovationBand:
     """State after an innovation of a sensor with steps in m, at intervals in ns.
 
     While the estimate settles nothing is usual, and nothing outside.
     """
-    step_m, interval_ns = sensor
     elapsed_ns = t_ns - band.t_ns
     if elapsed_ns <= 0:
         return band
@@ -65,6 +63,7 @@ def update_band(
     square, count = band.square, band.count
     if not is_settled:
         return InnovationBand(innovation_m, rate, t_ns, square, count)
+    step_m, interval_ns = sensor
     change = abs(rate - band.rate_m_per_s)
     are_missing = 2 * elapsed_ns > 3 * interval_ns
     if are_missing:
@@ -73,8 +72,8 @@ def update_band(
     new = max(change, step_m / elapsed_s)
     new *= new
     if count >= _FEWEST and new > _BAND * square:
-        return InnovationBand(innovation_m, rate, t_ns, _WIDENING * square, count, is_left=True)
+        return InnovationBand(innovation_m, rate, t_ns, _WIDENING * square, count, True)
     if are_missing:
         return InnovationBand(innovation_m, rate, t_ns, square, count)
-    share = max(1.0 / (count + 1), min(elapsed_s / _USUAL_S, 1.0))
+    share = elapsed_s / _USUAL_S if count * elapsed_s > _USUAL_S else 1.0 / (count + 1)
     return InnovationBand(innovation_m, rate, t_ns, square + share * (new - square), count + 1)
