@@ -11,6 +11,7 @@ from rig.log.checksums import Damage, find_damage, refuse_damage
 from rig.log.follower import RunFollower
 from rig.log.reader import Ending, RunHeader, read_header
 from rig.pages.html import render_report, write_page
+from rig.pages.mode_band import list_events, make_band, read_events
 from rig.pages.plotted_quantities import TICK_CURVES, TICK_TIME, TIME, TIME_PLOTS, Origin
 from rig.pages.report.figures import LineStyle, Panel, Plot, plot
 from rig.run.changed_settings import read_changes
@@ -59,6 +60,8 @@ def write_run_report(folder: Path, path: Path) -> tuple[Damage, ...]:
     struts = list(header.get("config", {}).get("observers", {}))
     ending = header.get("ending") or {}
     tone, sign, badge = _badge(ending)
+    events = read_events(folder)
+    listed, further = list_events(events)
     text = render_report(
         "run.html",
         name=folder.resolve().name,
@@ -67,6 +70,10 @@ def write_run_report(folder: Path, path: Path) -> tuple[Damage, ...]:
         sign=sign,
         badge=badge,
         headline=_headline(header, follower, ending) + _lost(damage),
+        band=make_band(events, *follower.span_s),
+        span_s=follower.span_s,
+        events=listed,
+        further_events=further,
         start=np.datetime64(int(header.get("epoch_ns", 0)), "ns").astype("datetime64[s]"),
         header=header,
         ending=ending,

@@ -37,12 +37,28 @@ const Charts = (() => {
       return size !== 0 && (size < 1e-3 || size >= 1e5) ? v.toExponential(0) : String(+v.toPrecision(6));
     });
 
+  // A channel that is sampled less often than the ticks has no value at most of them: its line goes
+  // on. Where several samples are missing there was none, and the line has a gap.
+  const MISSING = 5;
+
+  function longGaps(u, index, first, last, gaps) {
+    const [x, y] = [u.data[0], u.data[index]];
+    const places = [];
+    for (let i = first; i <= last; i++) {
+      if (y[i] !== null && y[i] !== undefined) places.push(u.valToPos(x[i], "x", true));
+    }
+    const steps = places.slice(1).map((place, i) => place - places[i]).sort((a, b) => a - b);
+    const usual = steps[Math.floor(steps.length / 2)] ?? 0;
+    return gaps.filter(([from, to]) => to - from > MISSING * usual);
+  }
+
   const line = (item) => ({
     label: item.label,
     stroke: () => colour(item.colour),
     width: item.width ?? 1,
     dash: item.dash,
-    spanGaps: item.spanGaps ?? false,
+    spanGaps: false,
+    ...(item.spanGaps ? { gaps: longGaps } : {}),
     points: { show: item.points ?? false, size: 4 },
     paths: item.paths,
     value: (_u, v) => `${number(v)}${item.unit ? ` ${item.unit}` : ""}`,
