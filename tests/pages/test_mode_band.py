@@ -70,14 +70,8 @@ def test_events_are_in_words_with_their_causes():
 
 
 def test_lines_that_are_cut_off_or_wrong_are_left_out(tmp_path):
-    lines = [
-        json.dumps(change(1.0, "HOLD")),
     cut = '{"t_s": 2.0, "to": "SA'
     lines = [json.dumps(change(1.0, "HOLD")), "[1]", '{"t_s": "now"}', "{}", cut]
-        '{"t_s": "now"}',
-        "{}",
-        '{"t_s": 2.0, "to": "SA',
-    ]
     (tmp_path / "events.jsonl").write_text("\n".join(lines))
     assert read_events(tmp_path) == [change(1.0, "HOLD")]
     assert read_events(tmp_path / "other") == []
