@@ -179,7 +179,7 @@ class FreeModelEstimator:
                 new is not None
                 and last is not None
                 and new.t_ns - last.t_ns > self._longest_silence_ns
-                and self._have_moved_since(last.t_ns + self._longest_silence_ns, state)
+                and self._has_heights_since(last.t_ns + self._longest_silence_ns, state)
             ):
                 # The observers took what was missing of the force for one of the strut.
                 state = self.restart(state, t_ns)
@@ -336,7 +336,12 @@ class FreeModelEstimator:
                 innovation_m = measured.value - model_m
                 innovation = Innovation(innovation_m, measured_ns)
                 band = update_band(
-                    band, innovation_m, measured_ns, self._sensing[strut], is_settled
+                    band,
+                    measured.value,
+                    innovation_m,
+                    measured_ns,
+                    self._sensing[strut],
+                    is_settled,
                 )
             if further:
                 observed = observer.step(before, t_ns, innovation, further[strut])
@@ -365,7 +370,7 @@ class FreeModelEstimator:
             oldest_ns = min(oldest_ns, until_ns)
         return self._estimate(after, loaded, oldest_ns)
 
-    def _have_moved_since(self, t_ns: int, state: FreeModelState) -> bool:
+    def _has_heights_since(self, t_ns: int, state: FreeModelState) -> bool:
         """Whether heights of every strut have come since a time."""
         return min([observer.measured_ns for observer in state.observers]) > t_ns
 

@@ -11,6 +11,8 @@ most 5.5 times what was usual under the PI observer, 7.3 times under the noise-a
 under the damped one; without stops of 5e6 N/m^1.5, 4.4 times.
 """
 
+from math import nan
+
 from msgspec import Struct
 
 _BAND = 8.0**2
@@ -33,7 +35,8 @@ class InnovationBand(Struct, frozen=True, gc=False):
         t_ns: Its time.
         square: Mean square of the rate's change, in m²/s².
         count: Changes that it is the mean of.
-        is_left: Whether the last change was outside.
+        is_left: Whether a change was outside, and the height is still the same since.
+        height_m: The measured height.
     """
 
     innovation_m: float = 0.0
@@ -42,18 +45,21 @@ class InnovationBand(Struct, frozen=True, gc=False):
     square: float = 0.0
     count: int = 0
     is_left: bool = False
+    height_m: float = nan
 
 
 def update_band(
     band: InnovationBand,
+    height_m: float,
     innovation_m: float,
     t_ns: int,
     sensor: tuple[float, int],
     is_settled: bool,
 ) -> InnovationBand:
-    """State after an innovation of a sensor with steps in m, at intervals in ns.
+    """State after a measured height and its innovation; the sensor has steps in m, intervals in ns.
 
-    While the estimate settles nothing is usual, and nothing outside.
+    While the estimate settles nothing is usual, and nothing outside; a height that has left the
+    band and stays what it is, frozen or at rest, does not return to it.
     """
     elapsed_ns = t_ns - band.t_ns
     if elapsed_ns <= 0:
@@ -62,7 +68,8 @@ def update_band(
     rate = (innovation_m - band.innovation_m) / elapsed_s
     square, count = band.square, band.count
     if not is_settled:
-        return InnovationBand(innovation_m, rate, t_ns, square, count)
+        is_left = band.is_left and height_m == band.height_m
+        return InnovationBand(innovation_m, rate, t_ns, square, count, is_left, height_m)
     step_m, interval_ns = sensor
     change = abs(rate - band.rate_m_per_s)
     are_missing = 2 * elapsed_ns > 3 * interval_ns
@@ -72,7 +79,8 @@ def update_band(
     new = max(change, step_m / elapsed_s)
     new *= new
     if count >= _FEWEST and new > _BAND * square:
-        return InnovationBand(innovation_m, rate, t_ns, _WIDENING * square, count, True)
+        square *= _WIDENING
+        return InnovationBand(innovation_m, rate, t_ns, square, count, True, height_m)
     if are_missing:
         return InnovationBand(innovation_m, rate, t_ns, square, count)
     share = elapsed_s / _USUAL_S if count * elapsed_s > _USUAL_S else 1.0 / (count + 1)

@@ -25,7 +25,7 @@ from rig.bridge.supervision_limits import (
     Excess,
     Limit,
     LimitsByStrut,
-    find_delayed_action,
+    find_action_of_delays,
     find_excess,
     range_of_estimate,
     update_delays,
@@ -290,7 +290,7 @@ class Supervisor:
         if self._delayed:
             delays = update_delays(self._delayed, state.delays, struts, t_ns)
             state = replace(state, delays=delays)
-            action = max(action, find_delayed_action(self._delayed, delays))
+            action = max(action, find_action_of_delays(self._delayed, delays))
         is_calm = (
             mode is _RUNNING
             and estimate.is_settled

@@ -263,7 +263,7 @@ def _update_delay(delay: Delay, row: Limit, number: float, t_ns: int) -> Delay:
     return Delay(not delay.is_passed, t_ns)
 
 
-def find_delayed_action(rows: Sequence[tuple[int, Limit]], delays: Sequence[Delay]) -> int:
+def find_action_of_delays(rows: Sequence[tuple[int, Limit]], delays: Sequence[Delay]) -> int:
     """The severest action of limits that count as passed, 0 if none does."""
     passed = [row.severity for (_, row), delay in zip(rows, delays, strict=True) if delay.is_passed]
     return max(passed, default=0)

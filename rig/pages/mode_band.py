@@ -25,7 +25,7 @@ _TONES = {
 }
 
 
-class Stretch(NamedTuple):
+class BandPiece(NamedTuple):
     """A stretch of the band: mode and tone, begin and length in percent of the run."""
 
     mode: str
@@ -62,7 +62,7 @@ def read_events(folder: Path) -> list[Event]:
     return events
 
 
-def make_band(events: Sequence[Event], begin_s: float, end_s: float) -> list[Stretch]:
+def make_band(events: Sequence[Event], begin_s: float, end_s: float) -> list[BandPiece]:
     """The modes between two times, stretch by stretch."""
     changes = [
         (float(str(event["t_s"])), Mode[str(event["to"])])
@@ -78,13 +78,13 @@ def make_band(events: Sequence[Event], begin_s: float, end_s: float) -> list[Str
         for piece in range(first, max(first, last - (to_s < end_s)) + 1):
             pieces[piece] = max(pieces[piece], _SEVERITY.index(mode))
     share = 100.0 / _PIECES
-    stretches: list[Stretch] = []
+    stretches: list[BandPiece] = []
     begin = 0
     for severity, group in itertools.groupby(pieces):
         length = len(list(group))
         mode = _SEVERITY[max(severity, 0)]
         tone = _TONES.get(mode, "idle")
-        stretches.append(Stretch(mode.name, tone, begin * share, length * share))
+        stretches.append(BandPiece(mode.name, tone, begin * share, length * share))
         begin += length
     return stretches
 

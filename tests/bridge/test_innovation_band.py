@@ -16,7 +16,7 @@ def follow(innovations_m, band=NOTHING, begin=0, *, is_settled=True):
     """Bands after each of some innovations, a millisecond apart."""
     bands = []
     for number, innovation_m in enumerate(innovations_m, start=begin + 1):
-        band = update_band(band, float(innovation_m), number * MS, SENSOR, is_settled)
+        band = update_band(band, number, float(innovation_m), number * MS, SENSOR, is_settled)
         bands.append(band)
     return bands
 
@@ -87,7 +87,7 @@ def test_missing_samples_are_no_excess(missing):
     for t in t_ms:
         if t > 1000 and t % 50 < missing:
             continue
-        band = update_band(band, innovation_m[t], int(t + 1) * MS, SENSOR, True)
+        band = update_band(band, t, innovation_m[t], int(t + 1) * MS, SENSOR, True)
         left.append(band.is_left)
     assert not any(left)
 
@@ -95,11 +95,20 @@ def test_missing_samples_are_no_excess(missing):
 def test_a_gap_teaches_nothing():
     """Over a second the rate hardly changes: that is not usual from one sample to the next."""
     band = follow(noise(1000))[-1]
-    behind = update_band(band, band.innovation_m, 2000 * MS, SENSOR, True)
+    behind = update_band(band, 0.0, band.innovation_m, 2000 * MS, SENSOR, True)
     assert behind.square == band.square
     assert not any(item.is_left for item in follow(noise(500, seed=4), behind, 2000))
 
 
 def test_a_sample_that_is_not_newer_changes_nothing():
     band = follow(noise(100))[-1]
-    assert update_band(band, 1.0, band.t_ns, SENSOR, True) is band
+    assert update_band(band, 0.0, 1.0, band.t_ns, SENSOR, True) is band
+
+
+def test_a_height_that_is_frozen_does_not_return_to_its_band():
+    band = follow(noise(1000))[-1]
+    band = update_band(band, 0.3, 0.1, 1001 * MS, SENSOR, True)
+    for number in range(1002, 3000):
+        band = update_band(band, 0.3, 0.1, number * MS, SENSOR, False)
+        assert band.is_left
+    assert not update_band(band, 0.3 + 2e-6, 0.1, 3000 * MS, SENSOR, False).is_left

@@ -17,7 +17,7 @@ from rig.bridge.supervision_limits import (
     LimitedValue,
     Plausibility,
     explain_height,
-    find_delayed_action,
+    find_action_of_delays,
     find_excess,
     judge_height,
     range_of_estimate,
@@ -305,5 +305,5 @@ def test_the_severest_delayed_limit_that_is_passed_counts():
         ((True, True, True), Action.SAFE),
     ):
         delays = [Delay(is_passed=item, since_ns=0) for item in is_passed]
-        assert find_delayed_action(rows, delays) == expected
-    assert find_delayed_action((), ()) == 0
+        assert find_action_of_delays(rows, delays) == expected
+    assert find_action_of_delays((), ()) == 0

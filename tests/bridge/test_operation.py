@@ -19,7 +19,7 @@ from rig.bridge.supervision_limits import (
     Delay,
     Limit,
     LimitedValue,
-    find_delayed_action,
+    find_action_of_delays,
     update_delays,
 )
 from rig.bridge.values import Mode, Request, StepInput, StepOutput, StrutOutput
@@ -285,7 +285,7 @@ def test_a_delayed_limit_acts_after_its_time_and_ends_after_it(is_beyond, delay_
         # Since the last tick that was otherwise, as long as the delay has gone by.
         if all(it is not passed for it in history[1:]):
             passed = not passed
-        assert find_delayed_action([(0, row)], delays) == (Action.HOLD if passed else 0)
+        assert find_action_of_delays([(0, row)], delays) == (Action.HOLD if passed else 0)
 
 
 def test_a_delayed_limit_holds_the_estimate_and_names_its_cause():

@@ -249,6 +249,14 @@ def test_a_height_that_freezes_anywhere_in_its_motion(name, truth_n, settled_n):
         assert not received[-1].is_valid
 
 
+@pytest.mark.parametrize("name", OBSERVERS)
+def test_a_height_that_stays_frozen_is_never_believed_without_any_limit(name):
+    frozen = Frozen()
+    received = follow(Trial(observer=OBSERVERS[name]), Event("", frames=frozen), BEGIN_MS + 590)
+    # The first frozen height is the right one.
+    assert not any(it.is_valid for it in received if it.ms > BEGIN_MS)
+
+
 @pytest.mark.parametrize("offset_m", [-0.05, 0.001, 0.05])
 def test_a_height_that_jumps(offset_m, truth_n, settled_n):
     """A foot that slips, another zero: valid again when the observer has followed."""
