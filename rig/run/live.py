@@ -68,8 +68,13 @@ def live(
         InputError: The configuration is wrong, or the folder cannot be written.
         BusError: The bus cannot be opened.
     """
-    bridge = build_bridge(plan)
-    with real_time(plan.config) as (granted, clock), contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
+        watchdog = None
+        if can_watch(plan.config, listen_only=listen_only):
+            watchdog = Watchdog(plan, folder)
+            stack.callback(watchdog.stop)
+        bridge = build_bridge(plan)
+        granted, clock = stack.enter_context(real_time(plan.config))
         link = _open_link(plan, bridge, clock, listen_only=listen_only)
         stack.callback(link.close)
         port = BusPort(link)
@@ -80,12 +85,9 @@ def live(
             granted,
             begin=partial(_drain_queue, link, clock),
             operator=port.operator,
+            watchdog=watchdog,
             machine=_machine(),
         )
-        if can_watch(plan.config, listen_only=listen_only):
-            watchdog = Watchdog(plan, folder)
-            stack.callback(watchdog.stop)
-            endpoint = replace(endpoint, watchdog=watchdog)
         acknowledge = partial(port.operator.ask, Request.ACKNOWLEDGE, "SIGUSR1")
         stack.enter_context(on_signal(signal.SIGUSR1, acknowledge))
         return run_logged(plan, bridge, endpoint, folder, control, trace=trace)

@@ -108,37 +108,34 @@ class Watchdog:
         self._memory = mmap.mmap(self._file.fileno(), 0)
         self._beat = Beat.on(self._memory, messages)
         self.write = self._beat.write
-        self._process: subprocess.Popen[bytes] | None = None
-        self._orders = -1
-
-    def start(self) -> None:
-        """Start it, and wait until it is ready; the run's folder has its inputs.
-
-        Raises:
-            BusError: It cannot open the bus, or does not get ready.
-        """
-        memory = self._file.fileno()
         orders, self._orders = os.pipe()
-        answers, answering = os.pipe()
+        self._answers, answering = os.pipe()
+        # Now: what it imports takes as long as the run's own setting up.
         self._process = subprocess.Popen(  # noqa: S603 - a module of rig's
             [*PYTHON, "-m", __name__],
             stdin=orders,
             stdout=answering,
-            pass_fds=(memory,),
+            pass_fds=(self._file.fileno(),),
             # Ctrl-C in a terminal is for the run.
             start_new_session=True,
         )
         os.close(orders)
         os.close(answering)
+
+    def start(self) -> None:
+        """Let it watch, and wait until it is ready; the run's folder has its inputs.
+
+        Raises:
+            BusError: It cannot open the bus, or does not get ready.
+        """
         order: _Order = {
             "folder": str(self._folder.resolve()),
-            "memory": memory,
+            "memory": self._file.fileno(),
             "authentication": _as_values(self._plan.authentication),
         }
         os.write(self._orders, json.dumps(order).encode())
-        ready, _, _ = select.select([answers], [], [], _READY_S)
-        answer = os.read(answers, 1000).decode() if ready else f"not ready in {_READY_S:g} s"
-        os.close(answers)
+        ready, _, _ = select.select([self._answers], [], [], _READY_S)
+        answer = os.read(self._answers, 1000).decode() if ready else f"not ready in {_READY_S:g} s"
         if answer != _READY:
             self._process.kill()
             self._process.wait()
@@ -149,16 +146,16 @@ class Watchdog:
 
     def describe(self) -> str:
         """Whether it still watches, for `run.yaml`."""
-        code = None if self._process is None else self._process.poll()
+        code = self._process.poll()
         return "watched" if code is None else f"ended before the run, exit code {code}"
 
     def stop(self) -> None:
         """End it."""
-        if self._process is not None:
-            with contextlib.suppress(BrokenPipeError):  # it has ended
-                os.write(self._orders, _END)
-            self._process.wait()
-            os.close(self._orders)
+        with contextlib.suppress(BrokenPipeError):  # it has ended
+            os.write(self._orders, _END)
+        self._process.wait()
+        os.close(self._orders)
+        os.close(self._answers)
         for view in self._beat:
             view.release()
         self._memory.close()
@@ -238,7 +235,10 @@ def main() -> None:
     # The loop's core is its own.
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     pipe = sys.stdin.fileno()
-    order: _Order = json.loads(os.read(pipe, 100_000))
+    given = os.read(pipe, 100_000)
+    if given in (b"", _END):  # the run was not begun
+        return
+    order: _Order = json.loads(given)
     try:
         plan = plan_of_run(Path(order["folder"]))
         outgoing = [compile_outgoing(item.message, item.signals) for item in plan.outgoing]
