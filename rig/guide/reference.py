@@ -63,6 +63,11 @@ def write_reference(folder: Path, commands: Mapping[str, str]) -> Path:
     path = folder / "index.html"
     if path.exists():
         raise InputError(f"{path}: exists, expected a folder without it")
+    try:
+        # Before the work of some seconds.
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
     text = render(
         "reference/page.html",
         families={
@@ -91,7 +96,6 @@ def write_reference(folder: Path, commands: Mapping[str, str]) -> Path:
         commands=commands,
     )
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         path.write_text(text, "utf-8")
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error

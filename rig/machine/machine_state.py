@@ -18,7 +18,7 @@ class ClockOffset(NamedTuple):
     low_ns: int
     high_ns: int
 
-    def moved_ns(self, before: "ClockOffset") -> int:
+    def shift_ns(self, before: "ClockOffset") -> int:
         """By how much it has moved since before; 0 where it need not have."""
         if self.low_ns <= before.high_ns and before.low_ns <= self.high_ns:
             return 0

@@ -63,8 +63,8 @@ class MachineEvents:
 
 def _follow(before: ClockOffset, now: ClockOffset) -> tuple[ClockOffset, int]:
     """What to compare the next offset with, and by how much this one has moved."""
-    moved_ns = now.moved_ns(before)
-    if abs(moved_ns) >= _SMALLEST_MOVE_NS:
-        return now, moved_ns
+    shift_ns = now.shift_ns(before)
+    if abs(shift_ns) >= _SMALLEST_MOVE_NS:
+        return now, shift_ns
     # Where the thread lost its core between two clocks the bounds are wide, and would hide a step.
     return min(before, now, key=lambda offset: offset.high_ns - offset.low_ns), 0

@@ -78,9 +78,14 @@ def test_a_diagnosis_shows_itself_and_is_written(tmp_path):
     assert shares[-1] == 1.0
 
 
-def test_the_reference_holds_every_effect_key_and_command(tmp_path):
-    path = write_reference(tmp_path / "reference", {"run": "Usage: rig run CONFIG"})
-    text = path.read_text("utf-8")
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reference") / "new"
+    return write_reference(folder, {"run": "Usage: rig run CONFIG"}).read_text("utf-8")
+
+
+def test_the_reference_holds_every_effect_key_and_command(reference):
+    text = reference
     for name, effect in CATALOGUE.items():
         if effect.family not in FAMILY_WORDS:
             continue  # the null partner of all effects
@@ -92,8 +97,8 @@ def test_the_reference_holds_every_effect_key_and_command(tmp_path):
     assert "http" not in text.replace("https://", "").replace("http://www.w3.org", "")
 
 
-def test_the_reference_says_what_every_key_means(tmp_path):
-    text = write_reference(tmp_path, {}).read_text("utf-8")
+def test_the_reference_says_what_every_key_means(reference):
+    text = reference
     configuration = text[text.index('id="configuration"') : text.index('id="bus"')]
     assert "<td></td></tr>" not in configuration
 

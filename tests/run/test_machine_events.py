@@ -121,8 +121,8 @@ def test_a_thread_that_lost_its_core_between_two_clocks_sees_no_step_and_hides_n
 
 
 def test_bounds_that_touch_have_not_moved():
-    assert ClockOffset(5, 7).moved_ns(ClockOffset(7, 9)) == 0
-    assert ClockOffset(5, 7).moved_ns(ClockOffset(8, 10)) == -3
+    assert ClockOffset(5, 7).shift_ns(ClockOffset(7, 9)) == 0
+    assert ClockOffset(5, 7).shift_ns(ClockOffset(8, 10)) == -3
 
 
 @pytest.mark.parametrize(
