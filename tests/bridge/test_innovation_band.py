@@ -112,3 +112,78 @@ def test_a_height_that_is_frozen_does_not_return_to_its_band():
         band = update_band(band, 0.3, 0.1, number * MS, SENSOR, False)
         assert band.is_left
     assert not update_band(band, 0.3 + 2e-6, 0.1, 3000 * MS, SENSOR, False).is_left
+
+
+def advance(band, change_m_per_s, elapsed_ns=MS, *, height_m=0.0, is_settled=True):
+    """The band after an innovation whose rate has changed by so much."""
+    rate = band.rate_m_per_s + change_m_per_s
+    innovation_m = band.innovation_m + rate * elapsed_ns * 1e-9
+    return update_band(band, height_m, innovation_m, band.t_ns + elapsed_ns, SENSOR, is_settled)
+
+
+USUAL_M_PER_S = 0.02
+
+
+def usual(count, band=NOTHING):
+    """A band after changes of one size, to and fro."""
+    for number in range(count):
+        band = advance(band, USUAL_M_PER_S * (-1) ** number)
+    return band
+
+
+def test_up_to_a_second_the_mean_is_that_of_all_changes():
+    innovations_m = noise(800, 1e-4)
+    rates = np.diff([0.0, *innovations_m]) / 1e-3
+    changes = np.diff([0.0, *rates])
+    band = follow(innovations_m)[-1]
+    least = SENSOR[0] / 1e-3  # of a sensor with steps
+    assert band.square == pytest.approx(np.mean(np.maximum(np.abs(changes), least) ** 2), rel=1e-9)
+    assert band.count == 800
+    assert (band.innovation_m, band.t_ns) == (innovations_m[-1], 800 * MS)
+    assert band.rate_m_per_s == pytest.approx(rates[-1])
+
+
+def test_behind_it_older_changes_fade_within_a_second():
+    band = usual(1500)
+    for number in range(1000):
+        band = advance(band, 2.0 * USUAL_M_PER_S * (-1) ** number)
+    share = (1.0 - 1e-3) ** 1000
+    assert band.square == pytest.approx(USUAL_M_PER_S**2 * (4.0 - 3.0 * share), rel=1e-6)
+
+
+@pytest.mark.parametrize(("times", "is_left"), [(7.9, False), (8.1, True)])
+def test_eight_times_what_is_usual_is_outside(times, is_left):
+    before = usual(1000)
+    after = advance(before, times * USUAL_M_PER_S)
+    assert after.is_left is is_left
+    if is_left:
+        assert after.square == 4.0 * before.square
+        assert (after.count, after.t_ns) == (before.count, before.t_ns + MS)
+
+
+@pytest.mark.parametrize(("count", "is_left"), [(49, False), (50, True)])
+def test_fifty_changes_are_a_mean(count, is_left):
+    assert advance(usual(count), 20.0 * USUAL_M_PER_S).is_left is is_left
+
+
+@pytest.mark.parametrize(("cycles", "is_learnt"), [(1.0, True), (1.4, True), (1.6, False)])
+def test_what_comes_after_a_missing_sample_is_judged_and_not_learnt(cycles, is_learnt):
+    before = usual(1000)
+    after = advance(before, 2.0 * USUAL_M_PER_S, round(cycles * MS))
+    assert (after.square != before.square) is is_learnt
+    assert after.count == before.count + is_learnt
+
+
+@pytest.mark.parametrize(("times", "is_left"), [(23.0, False), (25.0, True)])
+def test_over_three_cycles_the_rate_may_change_three_times_as_much(times, is_left):
+    assert advance(usual(1000), times * USUAL_M_PER_S, 3 * MS).is_left is is_left
+
+
+def test_while_the_estimate_settles_the_last_innovation_is_kept():
+    before = usual(1000)
+    after = advance(before, 1.0, height_m=0.3, is_settled=False)
+    assert after.rate_m_per_s == pytest.approx(before.rate_m_per_s + 1.0)
+    assert after.innovation_m == pytest.approx(before.innovation_m + after.rate_m_per_s * 1e-3)
+    assert (after.square, after.count) == (before.square, before.count)
+    # The same height as before is no sign of a fault by itself.
+    assert not advance(after, 0.0, height_m=0.3, is_settled=False).is_left

@@ -322,3 +322,35 @@ def test_only_an_operator_of_a_bridge_armed_by_hand_and_its_switches_count():
     assert not arming.permits(state, 501 * MS)
     assert arming.find_open(state, 500 * MS) is None
     assert arming.find_open(state, 501 * MS).quantity == "age_s"
+
+
+@pytest.mark.parametrize("quantity", [ENABLE, INTERLOCK])
+def test_a_switch_may_be_the_first_channel(quantity):
+    arming = Arming("automatic", [SimpleNamespace(index=0, quantity=quantity)], 500 * MS)
+    assert arming.switches == {0}
+    assert arming.is_used is True
+    before = OperationState(0).arming
+    assert arming.permits(before, 0) is False
+    closed = arming.update(before, StepInput(0, (Sample(0, 1.0, 0),)))
+    assert arming.permits(closed, 0) is True
+    assert arming.permits(arming.update(closed, StepInput(MS, (Sample(0, 0.0, MS),))), MS) is False
+
+
+def test_without_switches_and_by_itself_nothing_has_to_permit():
+    arming = Arming("automatic", (), 500 * MS)
+    assert arming.switches == frozenset()
+    assert arming.is_used is False
+    assert arming.permits(OperationState(0).arming, 10**12) is True
+    assert arming.find_open(OperationState(0).arming, 10**12) is None
+
+
+def test_an_estimate_that_is_no_longer_permitted_does_not_fade_in():
+    arming = Arming("manual", (), 500 * MS)
+    operation = Operation(arming, 0.1, None)
+    armed = arming.update(OperationState(0).arming, StepInput(0, (), Request.ARM))
+    output = StepOutput(Mode.READY, (STRUT,))
+    state, shown = operation.publish(OperationState(0, armed), 50 * MS, output, [0.0])
+    assert (state.share, shown.struts[0].force_n) == (pytest.approx(0.5), pytest.approx(2.5))
+    disarmed = arming.update(armed, StepInput(0, (), Request.DISARM))
+    state, shown = operation.publish(OperationState(0, disarmed, 0.5), 50 * MS, output, [0.0])
+    assert (state.share, shown.struts[0].force_n) == (0.0, 0.0)
