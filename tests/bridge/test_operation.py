@@ -321,7 +321,10 @@ def test_only_an_operator_of_a_bridge_armed_by_hand_and_its_switches_count():
     assert arming.permits(state, 500 * MS)
     assert not arming.permits(state, 501 * MS)
     assert arming.find_open(state, 500 * MS) is None
-    assert arming.find_open(state, 501 * MS).quantity == "age_s"
+    found = arming.find_open(state, 501 * MS)
+    assert found == ("age_s", pytest.approx(0.501), pytest.approx(0.5))
+    later = arming.update(state, StepInput(100 * MS, (Sample(3, 1.0, 100 * MS),)))
+    assert arming.find_open(later, 700 * MS).value == pytest.approx(0.6)
 
 
 @pytest.mark.parametrize("quantity", [ENABLE, INTERLOCK])
