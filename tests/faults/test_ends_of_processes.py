@@ -20,6 +20,8 @@ def ends(tmp_path_factory):
         subprocess.run([*isolated, "true"], check=True, capture_output=True)
     except (OSError, subprocess.CalledProcessError):
         pytest.skip("this machine lets nobody make a network of their own (unshare -rn)")
+    if shutil.which("ip") is None:
+        pytest.skip("ip is not installed (iproute2)")
     folder = tmp_path_factory.mktemp("ends")
     command = [*isolated, sys.executable, "-P", "-m", "tests.faults.on_a_network", str(folder)]
     found = subprocess.run(
