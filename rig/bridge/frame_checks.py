@@ -164,7 +164,8 @@ class FrameChecks:
                 self._receive_other(reception, frame)
                 continue
             incoming = self.incoming[index]
-            if incoming.device is not None and not self._is_of_device(reception, incoming, frame):
+            device = incoming.device
+            if device is not None and not self._is_from(reception, device, frame):
                 continue
             sequences[index], status, values = incoming.read(sequences[index], frame)
             if status is not _OK:
@@ -197,12 +198,9 @@ class FrameChecks:
         timed = frame if due_ns == frame.t_ns else replace(frame, t_ns=due_ns)
         return all(check(reception, timed, values) for check in checks)
 
-    def _is_of_device(self, reception: Reception, incoming: Incoming, frame: Frame) -> bool:
-        """Whether a frame is of its message's device: another one may send the same group."""
-        if incoming.device is None:
-            return True
-        health = reception.memory.healths[incoming.device]
-        return is_from(self._devices[incoming.device], health, frame)
+    def _is_from(self, reception: Reception, index: int, frame: Frame) -> bool:
+        """Whether a frame is from a device: another one may send the same group."""
+        return is_from(self._devices[index], reception.memory.healths[index], frame)
 
     def _receive_other(self, reception: Reception, frame: Frame) -> None:
         """Receive a frame of no incoming message: of a device, or of a second sender."""

@@ -22,8 +22,10 @@ _WIDENING = 4.0
 """Of the mean square, each time that the band is left: a bench that moves more has a wider one."""
 
 _USUAL_S = 1.0
+"""Time over which the mean is taken: some periods of a bench's motion."""
+
 _FEWEST = 50
-"""Time over which the mean is taken, and changes that it needs to be one."""
+"""Changes that the mean needs: of as many its root errs by a tenth."""
 
 
 class InnovationBand(Struct, frozen=True, gc=False):

@@ -26,6 +26,7 @@ _MOST_FRAMES = 200_000
 """Frames that are kept while listening; a second of a full bus at 1 Mbit/s has some 10 000."""
 
 _NO_NODE_ID = 255
+"""Of a device that has none (CiA 305)."""
 
 OPERATIONAL, PRE_OPERATIONAL, RESET_COMMUNICATION = 1, 128, 130
 """Commands of network management."""

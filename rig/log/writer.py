@@ -3,7 +3,7 @@
 A thread writes, so that a slow disk does not delay a tick. Frames are written
 unbuffered, at most 10 ms after they came (20 ms while no tick comes); steps are flushed in batches.
 While the disk takes nothing, ticks wait in memory, and what does not fit there is counted. The
-system writes to the disk when it likes to; at an interval it is told to, and waited for.
+system writes to the disk when it likes to; at an interval it is made to, and waited for.
 """
 
 import contextlib
@@ -248,7 +248,7 @@ class RunWriter:
                 self._sync(self._sync_open_files)
 
     def _sync(self, sync: Callable[[], None]) -> None:
-        """Have files on the disk, where that is wanted; a fault lasts until it works again."""
+        """Write files to the disk, where the run asks for it; a fault lasts until it works again."""
         if self._sync_s is None:
             return
         try:

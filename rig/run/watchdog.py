@@ -133,7 +133,7 @@ class Watchdog:
             "memory": self._file.fileno(),
             "authentication": _as_values(self._plan.authentication),
         }
-        os.write(self._orders, json.dumps(order).encode())
+        self._write(json.dumps(order).encode())
         ready, _, _ = select.select([self._answers], [], [], _READY_S)
         answer = os.read(self._answers, 1000).decode() if ready else f"not ready in {_READY_S:g} s"
         if answer != _READY:
@@ -144,6 +144,10 @@ class Watchdog:
                 "(supervision.watchdog: false runs without it)"
             )
 
+    def _write(self, text: bytes) -> None:
+        with contextlib.suppress(BrokenPipeError):  # it has ended, which shows elsewhere
+            os.write(self._orders, text)
+
     def describe(self) -> str:
         """Whether it still watches, for `run.yaml`."""
         code = self._process.poll()
@@ -151,8 +155,7 @@ class Watchdog:
 
     def stop(self) -> None:
         """End it."""
-        with contextlib.suppress(BrokenPipeError):  # it has ended
-            os.write(self._orders, _END)
+        self._write(_END)
         self._process.wait()
         os.close(self._orders)
         os.close(self._answers)

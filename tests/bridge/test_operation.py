@@ -7,9 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from can_dbc.codec import compile_encoder
-from can_dbc.protection import compile_protector
-from can_dbc.units import Dimension
 from rig.bridge.arming import Arming
 from rig.bridge.counts import Conditions
 from rig.bridge.mode_supervisor import Event
@@ -25,50 +22,20 @@ from rig.bridge.supervision_limits import (
 from rig.bridge.values import Mode, Request, StepInput, StepOutput, StrutOutput
 from rig.channels.channel import Sample
 from rig.channels.measured_quantities import ENABLE, INTERLOCK
-from rig.plan.build import build_bridge
-from tests.faults.trial import BEGIN_MS, MS, Trial
+from tests.faults.trial import (
+    BEGIN_MS,
+    MS,
+    SWITCH_CYCLE_MS,
+    Switches,
+    Trial,
+    trial_with_switches,
+)
 
-SWITCHES = 0x200
 SAFE_AFTER_MS = 500
-SWITCH_CYCLE_MS = 10
 
 
 def request(what):
     return lambda _t_ns: Conditions(request=what)
-
-
-def trial_with_switches(*names, **supervision):
-    """A trial whose bench has an interlock, an enable signal, or both."""
-    trial = Trial(**supervision)
-    content = trial.ready.config.model_dump(mode="json")
-    for name in names:
-        content["signals"][name] = {"message": "BENCH_AUXILIARY", "signal": name.upper()}
-    trial.ready = trial.ready.with_config(trial.ready.config.model_validate(content))
-    trial.bridge = build_bridge(trial.ready)
-    trial.state = trial.bridge.init(0)
-    return trial
-
-
-class Switches:
-    """Frames of the switches, every 10 ms, in place of the bench's own ones of that message."""
-
-    def __init__(self, trial, **closed):
-        message = trial.ready.database.message("BENCH_AUXILIARY")
-        self._names = [name.upper() for name in closed]
-        self._encode = compile_encoder(message, self._names, [Dimension.NUMBER] * len(closed))
-        self._protect = compile_protector(message.protection)
-        self._counter = 0
-        self.closed = closed
-        self.is_silent = False
-
-    def __call__(self, t_ns, frames):
-        kept = [frame for frame in frames if frame.arbitration_id != SWITCHES]
-        if self.is_silent or t_ns // MS % SWITCH_CYCLE_MS:
-            return kept
-        data = self._encode([float(value) for value in self.closed.values()])[0]
-        data = self._protect(data, self._counter)
-        self._counter += 1
-        return [*kept, frames[0].__class__(t_ns, SWITCHES, data)]
 
 
 def modes(ticks):

@@ -8,24 +8,19 @@ end.
 import itertools
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
 import can
 import cantools
-import yaml
 
-from can_dbc.database import DEFAULT_DATABASE
 from rig.plan.config import CONFIGS
+from tests.slow_reference import SLOW_DBC, running, write_slow_bridge, write_slow_dbc
 
-RATE_HZ = 100
 GROUP = "239.74.163.2"
 RIG = (sys.executable, "-P", "-m", "rig")
 _LONGEST_WAIT_S = 60.0
@@ -33,22 +28,10 @@ _LONGEST_WAIT_S = 60.0
 
 def write_files(folder: Path) -> Path:
     """The reference case at 100 Hz on the network; returns its configuration."""
-    slower = re.sub(r'("GenMsgCycleTime" BO_ \d+) 1;', r"\1 10;", DEFAULT_DATABASE.read_text())
-    (folder / "slow.dbc").write_text(slower)
-    config = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
-    # Soft enough for two processes whose ticks are up to two cycles apart.
-    gains = {"proportional_n_per_m": 2000.0, "integral_n_per_m_s": 5000.0}
-    config |= {
-        "rate_hz": RATE_HZ,
-        "dbc": "slow.dbc",
-        "bus": {"interface": "udp_multicast", "channel": GROUP},
-        "observers": {"strut": gains | {"force_limit_n": 5000.0}},
-        "supervision": {"stale_after_s": 0.2, "safe_after_s": 0.5, "settling_s": 0.2},
-        "realtime": {"fifo_priority": 0, "lock_memory": False},
-    }
-    path = folder / "rig.yaml"
-    path.write_text(yaml.safe_dump(config))
-    return path
+    write_slow_dbc(folder)
+    bus = {"interface": "udp_multicast", "channel": GROUP}
+    ages = {"stale_after_s": 0.2, "safe_after_s": 0.5, "settling_s": 0.2}
+    return write_slow_bridge(folder / "rig.yaml", bus, ages)
 
 
 class Listener:
@@ -76,18 +59,6 @@ class Listener:
         self._bus.shutdown()
 
 
-@contextmanager
-def running(command: Sequence[str | Path], **options: object) -> Iterator[subprocess.Popen[bytes]]:
-    """A program that runs meanwhile, and is ended in order."""
-    process = subprocess.Popen([str(part) for part in command], **options)  # pyright: ignore
-    try:
-        yield process
-    finally:
-        process.send_signal(signal.SIGCONT)
-        process.terminate()
-        process.wait(60.0)
-
-
 def wait_for(is_true: object, what: str) -> None:
     end_s = time.monotonic() + _LONGEST_WAIT_S
     while not is_true():  # pyright: ignore
@@ -98,7 +69,7 @@ def wait_for(is_true: object, what: str) -> None:
 
 def end_by(name: str, config: Path, folder: Path) -> dict[str, object]:
     """Run a bridge until its estimate is valid, send it a signal, and see what follows."""
-    listener = Listener(config.parent / "slow.dbc")
+    listener = Listener(config.parent / SLOW_DBC)
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     with running([*RIG, "run", config, "--out", folder], **quiet) as bridge:
         wait_for(lambda: sum(valid for _, valid, _ in listener.received[-50:]) > 40, "valid")
@@ -133,7 +104,7 @@ def main() -> None:
     subprocess.run(["ip", "link", "set", "lo", "up", "multicast", "on"], check=True)
     subprocess.run(["ip", "route", "add", "224.0.0.0/4", "dev", "lo"], check=True)
     bench = [*RIG, "bench", CONFIGS / "reference_bench.yaml", "--interface", "udp_multicast"]
-    bench += ["--channel", GROUP, "--dbc", config.parent / "slow.dbc"]
+    bench += ["--channel", GROUP, "--dbc", config.parent / SLOW_DBC]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     with running(bench, **quiet):
         for name in names:

@@ -24,8 +24,7 @@ from rig.observers.kalman import KalmanObserver
 from rig.observers.pi import PiObserver
 from rig.plan.build import build_bridge
 from rig.simulated_bench.trajectory import simulate
-from tests.bridge.test_operation import Switches, trial_with_switches
-from tests.faults.trial import BEGIN_MS, MS, Gateway, Trial
+from tests.faults.trial import BEGIN_MS, MS, Gateway, Switches, Trial, trial_with_switches
 
 DBC = cantools.database.load_file(DEFAULT_DATABASE)
 ESTIMATE, STATUS = DBC.get_message_by_name("RIG_ESTIMATE"), DBC.get_message_by_name("RIG_STATUS")

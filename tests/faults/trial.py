@@ -6,7 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
+from can_dbc.codec import compile_encoder
 from can_dbc.frame import Frame
+from can_dbc.protection import compile_protector
+from can_dbc.units import Dimension
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
 from rig.bridge.counts import Conditions, Counts
 from rig.bridge.values import Mode, StepInput
@@ -160,3 +163,41 @@ def force_error_n(ticks: list[Tick], begin_ns: int = BEGIN_NS) -> float:
         tick.force_n - tick.truth_n for tick in ticks if tick.t_ns >= begin_ns and tick.is_valid
     ]
     return float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan")
+
+
+SWITCHES = 0x200
+SWITCH_CYCLE_MS = 10
+
+
+def trial_with_switches(*names: str, **supervision: object) -> Trial:
+    """A trial whose bench has an interlock, an enable signal, or both."""
+    trial = Trial(**supervision)
+    content = trial.ready.config.model_dump(mode="json")
+    for name in names:
+        content["signals"][name] = {"message": "BENCH_AUXILIARY", "signal": name.upper()}
+    trial.ready = trial.ready.with_config(trial.ready.config.model_validate(content))
+    trial.bridge = build_bridge(trial.ready)
+    trial.state = trial.bridge.init(0)
+    return trial
+
+
+class Switches:
+    """Frames of the switches, every 10 ms, in place of the bench's own ones of that message."""
+
+    def __init__(self, trial, **closed):
+        message = trial.ready.database.message("BENCH_AUXILIARY")
+        self._names = [name.upper() for name in closed]
+        self._encode = compile_encoder(message, self._names, [Dimension.NUMBER] * len(closed))
+        self._protect = compile_protector(message.protection)
+        self._counter = 0
+        self.closed = closed
+        self.is_silent = False
+
+    def __call__(self, t_ns, frames):
+        kept = [frame for frame in frames if frame.arbitration_id != SWITCHES]
+        if self.is_silent or t_ns // MS % SWITCH_CYCLE_MS:
+            return kept
+        data = self._encode([float(value) for value in self.closed.values()])[0]
+        data = self._protect(data, self._counter)
+        self._counter += 1
+        return [*kept, frames[0].__class__(t_ns, SWITCHES, data)]

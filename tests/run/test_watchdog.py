@@ -81,6 +81,11 @@ class Scripted:
         self.sent.append((self.now, sent))
 
 
+def ending_at(look, received=b"end"):
+    """What comes through the pipe at a look; nothing where the process died."""
+    return lambda now: received if now == look else None
+
+
 def watched(ticking, received):
     beat = Beat.on(mmap.mmap(-1, Beat.size_of(1, 1)), 1)
     scripted = Scripted(beat, ticking, received)
@@ -88,13 +93,11 @@ def watched(ticking, received):
 
 
 def test_a_loop_that_ticks_is_left_alone():
-    end = lambda now: b"end" if now == 1000 else None  # noqa: E731
-    assert watched(lambda _now: True, end) == (None, [])
+    assert watched(lambda _now: True, ending_at(1000)) == (None, [])
 
 
 def test_it_sends_from_the_age_on_until_the_loop_ticks_again():
-    end = lambda now: b"end" if now == 400 else None  # noqa: E731
-    found = watched(lambda now: now <= 100 or 200 <= now <= 300, end)
+    found = watched(lambda now: now <= 100 or 200 <= now <= 300, ending_at(400))
     # The last ticks are seen at looks 100 and 300: half a second is 50 of them.
     first = [(now, now - 151) for now in range(151, 200)]
     second = [(now, now - 351) for now in range(351, 400)]
@@ -102,14 +105,14 @@ def test_it_sends_from_the_age_on_until_the_loop_ticks_again():
 
 
 def test_before_the_first_tick_there_is_nothing_to_watch():
-    assert watched(lambda _now: False, lambda now: b"" if now == 300 else None) == (None, [])
-    assert watched(lambda _now: False, lambda now: b"end" if now == 300 else None) == (None, [])
+    assert watched(lambda _now: False, ending_at(300, b"")) == (None, [])
+    assert watched(lambda _now: False, ending_at(300)) == (None, [])
 
 
 def test_a_process_that_died_is_told_from_one_that_ended():
-    assert watched(lambda _now: True, lambda now: b"" if now == 30 else None) == (0, [])
+    assert watched(lambda _now: True, ending_at(30, b"")) == (0, [])
     # It stood still before: the counters go on from there.
-    found, sent = watched(lambda now: now <= 10, lambda now: b"" if now == 70 else None)
+    found, sent = watched(lambda now: now <= 10, ending_at(70, b""))
     assert found == len(sent) == 70 - 10 - 50 - 1
 
 

@@ -1,20 +1,17 @@
 """Virtual CAN interfaces of the kernel, or a skip that says what is missing."""
 
 import multiprocessing
-import re
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-import yaml
 
-from can_dbc.database import DEFAULT_DATABASE
 from rig.bus.bus import BusConfig
 from rig.cli.progress import stoppable
 from rig.plan.config import CONFIGS
@@ -24,11 +21,9 @@ from rig.run.live import live, run_bench
 from rig.run.logged_run import Ended
 from rig.run.loop import Progress, RunControl
 from rig.simulated_bench.config import load_bench_config
+from tests.slow_reference import write_slow_bridge, write_slow_dbc
 
 TOOLS = ("ip", "candump", "canplayer", "cangen", "cangw", "cansend")
-
-RATE_HZ = 100
-"""The kernel of these tests is emulated: sending and receiving one frame takes 370 us there."""
 
 BENCH_IDS = ("100", "200")
 
@@ -113,47 +108,22 @@ class Files(NamedTuple):
 def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     """The reference case at 100 Hz."""
     folder = tmp_path_factory.mktemp("files")
-    dbc = folder / "slow.dbc"
-    slower = re.sub(r'("GenMsgCycleTime" BO_ \d+) 1;', r"\1 10;", DEFAULT_DATABASE.read_text())
-    dbc.write_text(slower)
+    dbc = write_slow_dbc(folder)
 
     def bridge(channel: str) -> Path:
-        config = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
-        # Soft enough for two processes whose ticks are up to two cycles apart: at that delay the
-        # slowest pole is at 0.986 and the least damping ratio 0.09.
-        gains = {"proportional_n_per_m": 2000.0, "integral_n_per_m_s": 5000.0}
-        config |= {
-            "rate_hz": RATE_HZ,
-            "dbc": "slow.dbc",
-            "bus": {"interface": "socketcan", "channel": channel},
-            "observers": {"strut": gains | {"force_limit_n": 5000.0}},
-            "supervision": {
-                "stale_after_s": 0.5,
-                "safe_after_s": 5.0,
-                # Importing all anew takes minutes in emulation.
-                "watchdog": False,
-                "limits": [
-                    {"value": "measured_height_m", "low": 0.1, "high": 0.7, "action": "refuse"},
-                ],
-            },
-            "realtime": {"fifo_priority": 0, "lock_memory": False},
+        supervision = {
+            "stale_after_s": 0.5,
+            "safe_after_s": 5.0,
+            # Importing all anew takes minutes in emulation.
+            "watchdog": False,
+            "limits": [
+                {"value": "measured_height_m", "low": 0.1, "high": 0.7, "action": "refuse"},
+            ],
         }
-        path = folder / f"{channel}.yaml"
-        path.write_text(yaml.safe_dump(config))
-        return path
+        bus = {"interface": "socketcan", "channel": channel}
+        return write_slow_bridge(folder / f"{channel}.yaml", bus, supervision)
 
     return Files(dbc, CONFIGS / "reference_bench.yaml", bridge)
-
-
-@contextmanager
-def running(command: Sequence[str | Path], **options: object) -> Iterator[subprocess.Popen[bytes]]:
-    """A program that runs meanwhile, and is ended in order."""
-    process = subprocess.Popen([str(part) for part in command], **options)  # pyright: ignore
-    try:
-        yield process
-    finally:
-        process.terminate()
-        process.wait(120.0)
 
 
 @contextmanager

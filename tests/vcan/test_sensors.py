@@ -20,7 +20,8 @@ from tests.sensors.story import (
     rig,
     with_faults,
 )
-from tests.vcan.conftest import in_process, running
+from tests.slow_reference import running
+from tests.vcan.conftest import in_process
 
 pytestmark = pytest.mark.vcan
 

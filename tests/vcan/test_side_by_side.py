@@ -9,7 +9,8 @@ import pytest
 import yaml
 
 from rig.log.reader import read_run
-from tests.vcan.conftest import RATE_HZ, Files, in_process, run_for, run_until_terminated
+from tests.slow_reference import RATE_HZ
+from tests.vcan.conftest import Files, in_process, run_for, run_until_terminated
 
 pytestmark = pytest.mark.vcan
 

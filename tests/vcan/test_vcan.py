@@ -28,14 +28,13 @@ from rig.plan.load import load_plan
 from rig.run.replay import replay
 from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.config import load_bench_config
+from tests.slow_reference import RATE_HZ, running
 from tests.vcan.conftest import (
     BENCH_IDS,
-    RATE_HZ,
     Files,
     in_process,
     run_for,
     run_until_signal,
-    running,
 )
 
 pytestmark = pytest.mark.vcan
