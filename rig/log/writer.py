@@ -248,7 +248,7 @@ class RunWriter:
                 self._sync(self._sync_open_files)
 
     def _sync(self, sync: Callable[[], None]) -> None:
-        """Write files to the disk, where the run asks for it; a fault lasts until it works again."""
+        """Write files to the disk, where the run asks for it; a fault lasts until that works."""
         if self._sync_s is None:
             return
         try:
