@@ -170,8 +170,7 @@ class Differences(NamedTuple):
                 if len(slopes) == sides:
                     break
             if slopes:
-                with np.errstate(over="ignore"):  # A column that overflows is the larger one.
-                    columns[part, i] = min(slopes, key=lambda column: float(column @ column))
+                columns[part, i] = min(slopes, key=_sum_of_squares)
 
         if self.threads == 1:
             for i in range(len(x)):
@@ -189,7 +188,7 @@ def solve(
     """Least squares from first parameters (k,); None if there is no residual there."""
     x = space.inner(start)
     r = differences.residual_of(space.outer(x))
-    if r is None or not np.all(np.isfinite(r)):
+    if r is None or not np.isfinite(_sum_of_squares(r)):
         return None
     known, damping = prior or Prior(np.zeros_like(x), np.zeros_like(x)), _FIRST_DAMPING
     level = known.level(r)
@@ -219,7 +218,7 @@ def solve(
             jacobian, fresh = differences.jacobian(x, r, space, 1), True
     if effort.sides > 1 or not fresh:
         jacobian = differences.jacobian(x, r, space, effort.sides)
-    return Solution(space.outer(x), r, jacobian, float(r @ r), level, level * known.weight**2)
+    return Solution(space.outer(x), r, jacobian, _sum_of_squares(r), level, level * known.weight**2)
 
 
 class _Point(NamedTuple):
@@ -234,7 +233,13 @@ class _Point(NamedTuple):
     def cost(self) -> float:
         """Sum of squares, the prior's included."""
         offset = self.x - self.centre
-        return float(self.residual @ self.residual + offset @ (self.precision * offset))
+        return _sum_of_squares(self.residual) + float(offset @ (self.precision * offset))
+
+
+def _sum_of_squares(residual: Array) -> float:
+    """Infinite where it overflows: a model that runs away has no lower cost than any other."""
+    with np.errstate(over="ignore"):
+        return float(residual @ residual)
 
 
 def _lower_cost(

@@ -430,6 +430,7 @@ def is_compatible(at: StrutEffect, laws: Sequence[StrutEffect]) -> bool:
     )
 
 
+@np.errstate(over="ignore", invalid="ignore")  # No start is taken from what overflows.
 def _evaluate_start(this: _Round, at: StrutEffect, start: Array) -> _Start | None:
     """Cost and parameters of a law at a start, its size by least squares where it has one."""
     column = response(this.coarse, at, start)

@@ -1,0 +1,47 @@
+"""Least squares for simulations, some of which run away."""
+
+import numpy as np
+import pytest
+
+from rig.diagnosis.numerics.least_squares import Differences, Effort, Space, solve
+
+FREE = Space(
+    low=np.full(2, -1e6), high=np.full(2, 1e6), scale=np.ones(2), logarithmic=np.zeros(2, np.bool_)
+)
+MATRIX = np.array([[1.0, 0.0], [0.5, 2.0], [-1.0, 1.0], [0.2, 0.1]])
+MEASURED = np.array([3.0, 1.0, -2.0, 0.5])
+
+
+def test_a_linear_problem_has_the_solution_of_the_normal_equations():
+    solution = solve(
+        Differences(lambda x: MATRIX @ x - MEASURED), np.zeros(2), FREE, Effort(steps=20)
+    )
+    assert solution is not None
+    expected = np.linalg.solve(MATRIX.T @ MATRIX, MATRIX.T @ MEASURED)
+    np.testing.assert_allclose(solution.values, expected, rtol=1e-6)
+    assert solution.cost == pytest.approx(
+        float(np.sum((MATRIX @ expected - MEASURED) ** 2)), rel=1e-9
+    )
+
+
+@pytest.mark.parametrize("runaway", [1e201, np.inf])
+def test_a_model_that_runs_away_beyond_a_limit_does_not_end_the_search(runaway):
+    """The square of such a residual is beyond what a float holds."""
+    away = []
+
+    def residual_of(x):
+        if x[0] > 2.5:  # the undamped first step goes to x = 3 at once
+            away.append(x[0])
+            return np.full(2, runaway)
+        return np.array([x[0] ** 2 + 2.0 * x[0] - 8.0, x[1]])
+
+    solution = solve(Differences(residual_of), np.array([0.2, 1.0]), FREE, Effort(steps=50))
+    assert away
+    assert solution is not None
+    np.testing.assert_allclose(solution.values, [2.0, 0.0], atol=1e-3)
+
+
+@pytest.mark.parametrize("residual", [None, np.full(2, 1e201), np.array([0.0, np.nan])])
+def test_a_start_without_a_finite_cost_has_no_solution(residual):
+    solution = solve(Differences(lambda _: residual), np.zeros(2), FREE, Effort(steps=5))
+    assert solution is None
