@@ -24,7 +24,7 @@ from cantools.database.can import Signal as CantoolsSignal
 from cantools.database.errors import Error as CantoolsError
 
 from can_dbc.errors import DatabaseError
-from can_dbc.protection import NEVER_NS, Identity, Profile, Protection
+from can_dbc.protection import AliveCounter, Identity, Profile, Protection
 
 __all__ = ["DEFAULT_DATABASE", "Database", "DatabaseError", "Message", "Signal", "load_database"]
 
@@ -39,6 +39,7 @@ _LAYOUTS_MAX = 65_536  # a 16-bit multiplexer; cantools takes about 3 s for as m
 _RANGES_SUM_MAX = 2_000_000
 _STANDARD_ID_MAX = 0x7FF
 _EXTENDED_ID_MAX = 0x1FFF_FFFF
+_COUNTER_LARGEST = 2**32
 _MAX_DELTA_DEFAULT = 7  # half of the counter's round: less is a loss, more went backwards
 
 
@@ -361,12 +362,32 @@ def _protection(
         length_bytes=message.length,
         crc_signal=crc_signal,
         counter_signal=counter_signal,
-        counter_modulus=profile.counter_modulus,
-        max_delta_counter=_max_delta(where, message, profile),
-        cycle_time_ns=cycle_time_ns,
-        silence_ns=profile.counter_modulus * cycle_time_ns if cycle_time_ns else NEVER_NS,
+        counter=AliveCounter(
+            profile.counter_modulus, _max_delta(where, message, profile), cycle_time_ns
+        ),
         foreign=(),
     )
+
+
+def alive_counter(message: Message, name: str) -> AliveCounter:
+    """The alive counter that a signal of a message without protection is.
+
+    Raises:
+        DatabaseError: The signal is missing, or is no counter: a plain integer from 0 on.
+    """
+    signal = message.signal(name)
+    last = 2**signal.length_bits - 1
+    is_plain = (signal.scale, signal.offset, signal.minimum or 0.0) == (1.0, 0.0, 0.0)
+    if signal.is_signed or signal.is_float or not is_plain or not 1 < last < _COUNTER_LARGEST:
+        raise DatabaseError(
+            f"{message.path}: message {message.name}: signal {name}: expected an unsigned integer "
+            "of 2 to 32 bits from 0 on, with a scale of 1"
+        )
+    if signal.maximum:
+        last = min(last, int(signal.maximum))
+    modulus = last + 1
+    most = max(1, min(_MAX_DELTA_DEFAULT, modulus // 2 - 1))
+    return AliveCounter(modulus, most, message.cycle_time_ns)
 
 
 def _check_position(

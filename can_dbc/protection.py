@@ -54,15 +54,36 @@ class Identity(Struct, frozen=True, gc=False):
     data_ids: bytes
 
 
+NEVER_NS = 2**63 - 1
+"""A time that no run reaches, in ns."""
+
+
+@dataclass(frozen=True, slots=True)
+class AliveCounter:
+    """An alive counter: one more with every frame of its message.
+
+    Attributes:
+        modulus: Number of its values, from 0 on.
+        max_delta: Largest step that is read as lost frames.
+        cycle_time_ns: Cycle time of the message; None where the DBC gives none.
+    """
+
+    modulus: int
+    max_delta: int
+    cycle_time_ns: int | None
+
+    @property
+    def silence_ns(self) -> int:
+        """Silence after which the counter may have gone round, in ns."""
+        return self.modulus * self.cycle_time_ns if self.cycle_time_ns else NEVER_NS
+
+
 @dataclass(frozen=True, slots=True)
 class Protection:
     """How the frames of one message are protected.
 
     Attributes:
         length_bytes: Payload length; a frame of any other length is refused.
-        max_delta_counter: Largest step of the counter that is read as lost frames.
-        silence_ns: Silence after which the counter may have gone round, in ns (`NEVER_NS` where
-            the DBC gives no cycle time).
         foreign: Identities of the database's other messages, for recognising their frames here.
     """
 
@@ -70,15 +91,8 @@ class Protection:
     length_bytes: int
     crc_signal: str
     counter_signal: str
-    counter_modulus: int
-    max_delta_counter: int
-    cycle_time_ns: int | None
-    silence_ns: int
+    counter: AliveCounter
     foreign: tuple[Identity, ...]
-
-
-NEVER_NS = 2**63 - 1
-"""A time that no run reaches, in ns."""
 
 
 class FrameStatus(Enum):
@@ -144,6 +158,10 @@ Checker = Callable[[SequenceState, bytes | bytearray, int], tuple[SequenceState,
 """State of the check (`INITIAL` at first), payload, time of reception in ns -> the state after the
 frame, and the frame's status."""
 
+CounterChecker = Callable[[SequenceState, int, int], tuple[SequenceState, FrameStatus]]
+"""State of the check, the counter of a frame, time of reception in ns -> the state after the frame,
+and the frame's status."""
+
 Protector = Callable[[bytes | bytearray, int], bytes]
 """Payload, and number of the frame (any integer of at least 0; it is sent modulo the profile's
 number of counter values) -> the payload to send. Raises `ValueError` for another length."""
@@ -151,7 +169,7 @@ number of counter values) -> the payload to send. Raises `ValueError` for anothe
 
 def compile_protector(protection: Protection) -> Protector:
     """Build the function that writes counter and CRC into the frames of a message."""
-    length, modulus = protection.length_bytes, protection.counter_modulus
+    length, modulus = protection.length_bytes, protection.counter.modulus
     _, put_crc, identity = _crc(protection.identity)
 
     def protect(data: bytes | bytearray, number: int) -> bytes:
@@ -178,10 +196,10 @@ def compile_checker(protection: Protection) -> Checker:
     A corrupted frame may by chance carry the CRC of another message; it is then called
     MASQUERADE and not WRONG_CRC. Both are refused.
     """
-    length, modulus = protection.length_bytes, protection.counter_modulus
+    length, alive = protection.length_bytes, protection.counter
     # The last one is for counter -1, before the first frame, which nothing follows.
-    following = (*range(1, modulus), 0, None)
-    silence_ns, (crc_fits, _, identity) = protection.silence_ns, _crc(protection.identity)
+    following = (*range(1, alive.modulus), 0, None)
+    silence_ns, (crc_fits, _, identity) = alive.silence_ns, _crc(protection.identity)
     foreign = [_crc(other) for other in protection.foreign]
 
     def check(
@@ -195,7 +213,20 @@ def compile_checker(protection: Protection) -> Checker:
         # The frequent case first: next in sequence and in time.
         if counter == following[state.counter] and t_ns - state.t_ns < silence_ns:
             return SequenceState(counter, t_ns), _OK
-        return _check_sequence(state, counter, t_ns, protection)
+        return _check_sequence(state, counter, t_ns, alive)
+
+    return check
+
+
+def compile_counter_checker(alive: AliveCounter) -> CounterChecker:
+    """Build the check of an alive counter that no CRC protects, as `compile_checker` has it."""
+
+    def check(
+        state: SequenceState, counter: int, t_ns: int
+    ) -> tuple[SequenceState, FrameStatus]:
+        if not 0 <= counter < alive.modulus:
+            return state, FrameStatus.OUT_OF_SEQUENCE
+        return _check_sequence(state, counter, t_ns, alive)
 
     return check
 
@@ -217,7 +248,7 @@ def check_crc_log(data: NDArray[np.uint8], protection: Protection) -> NDArray[np
         crc = _crc_over_columns(np.zeros(len(data), dtype=np.uint8), head, _TABLE_1D)
         crc = _crc_over_columns(crc, data[:, 1:], _TABLE_1D)
     # Profile 1 has no counter of 15, and refuses one whatever its CRC.
-    return (crc == data[:, 0]) & (data[:, 1] & 0x0F < protection.counter_modulus)
+    return (crc == data[:, 0]) & (data[:, 1] & 0x0F < protection.counter.modulus)
 
 
 class _Crc(NamedTuple):
@@ -246,17 +277,17 @@ def _wrong_crc(data: bytes | bytearray, foreign: Sequence[_Crc]) -> FrameStatus:
 
 
 def _check_sequence(
-    state: SequenceState, counter: int, t_ns: int, protection: Protection
+    state: SequenceState, counter: int, t_ns: int, alive: AliveCounter
 ) -> tuple[SequenceState, FrameStatus]:
-    modulus = protection.counter_modulus
+    modulus = alive.modulus
     if state.counter < 0:
         return SequenceState(counter, t_ns), FrameStatus.FIRST
     delta = (counter - state.counter) % modulus
-    cycles = _cycles_since(state.t_ns, t_ns, protection)
+    cycles = _cycles_since(state.t_ns, t_ns, alive)
     silent = cycles >= modulus
     if delta == 0 and not silent:
         return replace(state, t_ns=t_ns, lost=0), FrameStatus.REPEATED
-    if not silent and delta > max(protection.max_delta_counter, cycles + 1):
+    if not silent and delta > max(alive.max_delta, cycles + 1):
         return _resynchronise(state, counter, t_ns, modulus)
     lost = _lost_in_silence(delta, cycles, modulus) if silent else delta - 1
     return SequenceState(counter, t_ns, lost), FrameStatus.LOST if lost else _OK
@@ -273,10 +304,8 @@ def _resynchronise(
     return refused, FrameStatus.OUT_OF_SEQUENCE
 
 
-def _cycles_since(last_ns: int, t_ns: int, protection: Protection) -> int:
-    if not protection.cycle_time_ns:
-        return 0
-    return (t_ns - last_ns) // protection.cycle_time_ns
+def _cycles_since(last_ns: int, t_ns: int, alive: AliveCounter) -> int:
+    return (t_ns - last_ns) // alive.cycle_time_ns if alive.cycle_time_ns else 0
 
 
 def _lost_in_silence(delta: int, cycles: int, modulus: int) -> int:

@@ -154,10 +154,8 @@ class Bridge:
         self, observers: Sequence[AnyObserver], supervision: Supervision, limits: LimitsByStrut
     ) -> "Bridge":
         """The same with other observers and limits; it continues from a state of this one."""
-        estimator = self._supervisor.estimator.with_settings(observers, supervision.stale_after_ns)
-        supervisor = Supervisor(estimator, supervision, limits)
         return Bridge(
-            supervisor,
+            self._supervisor.with_settings(observers, supervision, limits),
             self._channels,
             self.incoming,
             self._outgoing,

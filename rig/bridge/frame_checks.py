@@ -171,10 +171,15 @@ class FrameChecks:
             if status is not _OK:
                 self._record_status(reception, index, frame.t_ns, status)
             due_ns, timing = frame.t_ns, IN_TIME
-            follow = incoming.follow
-            if follow is not None and (status is _OK or status.is_accepted):
+            follow, stamp = incoming.follow, incoming.stamp
+            is_accepted = status is _OK or status.is_accepted
+            # A frame that states no time, on another page or without values, is not followed.
+            if follow is not None and is_accepted and (values or stamp < 0):
                 before = None if status is _FIRST else clocks[index]
-                clock = clocks[index] = follow(before, due_ns, 1 + sequences[index].lost)
+                since = 1 + sequences[index].lost
+                if values and stamp >= 0:
+                    since = round(values[stamp] * 1e9)
+                clock = clocks[index] = follow(before, due_ns, since)
                 due_ns, timing = clock.due_ns, clock.timing
                 if timing is not IN_TIME:
                     is_timed = False

@@ -5,15 +5,22 @@ The order of the checks that their frames pass is that of `rig.bridge.frame_chec
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from math import isfinite
 from typing import NamedTuple
 
 from can_dbc.codec import Decoder, compile_decoder, si_range, si_step
-from can_dbc.database import Message
+from can_dbc.database import Message, alive_counter
 from can_dbc.frame import Frame
-from can_dbc.protection import FrameStatus, SequenceState, compile_checker
+from can_dbc.protection import (
+    AliveCounter,
+    FrameStatus,
+    SequenceState,
+    compile_checker,
+    compile_counter_checker,
+)
 from can_dbc.units import Dimension
-from rig.bridge.sample_times import Follower, compile_follower
+from rig.bridge.sample_times import Follower, compile_follower, compile_stamped_follower
 from rig.channels.channel import Channel, Role, ValidSignal
 from rig.channels.measured_quantities import APPLIED_FORCE
 
@@ -97,7 +104,8 @@ class Incoming:
         device: Index of the device that sends it; None if none is configured.
         struts: Struts whose reference heights it carries, a bit each.
         first_strut: The bit of the first of them; 0 if there is none.
-        follow: Follows the clock of its sender; None if its counter states no time.
+        follow: Follows the clock of its sender; None if neither counter nor time signal states it.
+        stamp: Index of the value that is the sender's time; -1 if its counter states it.
         is_awaited: Whether an estimate rests on its values, so that late ones are used in the past.
     """
 
@@ -110,6 +118,7 @@ class Incoming:
     struts: int = 0
     first_strut: int = 0
     follow: Follower | None = None
+    stamp: int = -1
     is_awaited: bool = False
 
 
@@ -125,6 +134,8 @@ def compile_incoming(
         DatabaseError: A signal is missing, or its unit does not fit its quantity.
     """
     valid = [channel.valid for channel in channels if channel.valid is not None]
+    # One for all channels of a message; frames of alarms alone are not followed.
+    counter, time = (channels[0].counter, channels[0].time) if channels else ("", "")
     # A load cell may be recorded and also be a further sensor: one value, two channels.
     signals = list(
         dict.fromkeys(
@@ -132,6 +143,8 @@ def compile_incoming(
                 *((channel.signal, channel.quantity.dimension) for channel in channels),
                 *((alarm.signal, Dimension.NUMBER) for alarm in alarms),
                 *((item.signal, Dimension.NUMBER) for item in valid),
+                *([(counter, Dimension.NUMBER)] if counter else []),
+                *([(time, Dimension.TIME)] if time else []),
             ]
         )
     )
@@ -150,6 +163,9 @@ def compile_incoming(
         if channel.role is Role.HEIGHT
     ]
     read = _compile_reader(message, decode)
+    if counter:
+        index = signals.index((counter, Dimension.NUMBER))
+        read = _with_counter(read, index, alive_counter(message, counter))
     for check in (_check_of_values(message, signals), _check_of_validity(valid, signals)):
         if check is not None:
             read = _with_check(read, check)
@@ -165,14 +181,41 @@ def compile_incoming(
         device,
         sum({1 << height.strut for height in heights}),
         1 << heights[0].strut if heights else 0,
-        compile_follower(cycle_ns) if channels and (cycle_ns := clock_cycle_ns(message)) else None,
+        compile_follower_of(channels[0], message) if channels else None,
+        signals.index((time, Dimension.TIME)) if time else -1,
         any(_bears_estimate(channel) for channel in channels),
     )
 
 
-def clock_cycle_ns(message: Message) -> int:
-    """Cycle time of a message whose counter states when its values were sampled, else 0."""
-    return 0 if message.protection is None else message.cycle_time_ns or 0
+class ClockSource(Enum):
+    """What states when a message's values were sampled."""
+
+    TIME_SIGNAL = "time signal"
+    COUNTER = "counter and cycle time"
+    ARRIVAL = "arrival"
+
+
+def clock_source(channel: Channel, message: Message) -> ClockSource:
+    """What states when the values of a channel's message were sampled."""
+    if channel.time:
+        return ClockSource.TIME_SIGNAL
+    if message.cycle_time_ns and (channel.counter or message.protection is not None):
+        return ClockSource.COUNTER
+    return ClockSource.ARRIVAL
+
+
+def compile_follower_of(channel: Channel, message: Message) -> Follower | None:
+    """What follows the clock of a message's sender; None where arrivals are all there is."""
+    source = clock_source(channel, message)
+    if source is ClockSource.TIME_SIGNAL:
+        low_s, high_s = si_range(message, channel.time, Dimension.TIME)
+        round_s = high_s - low_s + si_step(message, channel.time, Dimension.TIME)
+        return compile_stamped_follower(
+            channel.interval_ns, round(round_s * 1e9) if isfinite(round_s) else 0
+        )
+    if source is ClockSource.COUNTER and message.cycle_time_ns:
+        return compile_follower(message.cycle_time_ns)
+    return None
 
 
 def _bears_estimate(channel: Channel) -> bool:
@@ -226,6 +269,20 @@ def _with_check(read: Reader, are_values: _Check) -> Reader:
         return sequence, status, NO_VALUES
 
     return read_values
+
+
+def _with_counter(read: Reader, index: int, alive: AliveCounter) -> Reader:
+    """A reader that also checks a counter, one of the values."""
+    check = compile_counter_checker(alive)
+
+    def read_counted(sequence: SequenceState, frame: Frame) -> Reading:
+        sequence, status, values = read(sequence, frame)
+        if values is None:
+            return sequence, status, None
+        sequence, status = check(sequence, int(values[index]), frame.t_ns)
+        return sequence, status, values if status.is_accepted else None
+
+    return read_counted
 
 
 def _compile_reader(message: Message, decode: Decoder) -> Reader:

@@ -17,11 +17,14 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from can_dbc.yaml_file import NotNegative, Positive
 from rig.bridge.arming import ArmingKind, OpenInterlock
 from rig.bridge.estimator import AnyEstimator, Estimate
+from rig.bridge.force_history import NO_HISTORY, ForceComparison, ForceHistory
 from rig.bridge.measurement_age import is_too_old
 from rig.bridge.supervision_limits import (
+    COMPARED,
     RANGED,
     Action,
     Delay,
+    EstimateValues,
     Excess,
     Limit,
     LimitsByStrut,
@@ -29,9 +32,13 @@ from rig.bridge.supervision_limits import (
     find_excess,
     range_of_estimate,
     update_delays,
+    values_of_estimate,
+    values_with_history,
     worst_action,
 )
 from rig.bridge.values import Divergence, Mode, Request, StepInput, StepOutput, StrutOutput
+from rig.channels.channel import Channel
+from rig.observers.protocol import AnyObserver
 
 
 class Event(Enum):
@@ -191,6 +198,7 @@ class SupervisedState(Struct, frozen=True, gc=False):
         cause: Why the mode is what it is.
         first_cause: Why the estimate was last lost; None while the bridge is running.
         delays: State of the limits that are passed only after a time.
+        history: Forces before, where a limit needs them.
     """
 
     t_ns: int
@@ -203,6 +211,7 @@ class SupervisedState(Struct, frozen=True, gc=False):
     cause: Cause | None = None
     first_cause: Cause | None = None
     delays: tuple[Delay, ...] = ()
+    history: ForceHistory = NO_HISTORY
 
 
 class Reports(Struct, frozen=True, gc=False):
@@ -243,10 +252,18 @@ _RUNNING, _SAFE = Mode.RUNNING, Mode.SAFE
 
 
 class Supervisor:
-    """Steps an estimator and decides what is published of it, within the limits of each strut."""
+    """Steps an estimator and decides what is published of it, within the limits of each strut.
+
+    Args:
+        cell: Channel of the load cell that the estimate is compared with; None without one.
+    """
 
     def __init__(
-        self, estimator: AnyEstimator, settings: Supervision, limits: LimitsByStrut
+        self,
+        estimator: AnyEstimator,
+        settings: Supervision,
+        limits: LimitsByStrut,
+        cell: Channel | None = None,
     ) -> None:
         self.estimator = estimator
         self.settings = settings
@@ -254,14 +271,30 @@ class Supervisor:
         self._safe_after_ns = settings.safe_after_ns
         estimates = [[row for row in rows if not row.value.is_measured] for rows in limits]
         self._rows = estimates
-        self._limits = [[row for row in rows if not row.for_s] for rows in estimates]
-        self._delayed = [(i, row) for i, rows in enumerate(estimates) for row in rows if row.for_s]
+        self._limits = [[row for row in rows if not row.has_memory] for rows in estimates]
+        self._delayed = [
+            (index, row) for index, rows in enumerate(estimates) for row in rows if row.has_memory
+        ]
+        self._limits_before = [
+            [row for row in rows if row.value not in COMPARED] for rows in self._limits
+        ]
         # By bound, then by strut.
         self._ranges = list(zip(*map(range_of_estimate, self._limits), strict=True))
         self._is_limited = any(self._limits)
-        self._has_further_limits = any(
-            row.value not in RANGED for rows in self._limits for row in rows
-        )
+        limited = {row.value for rows in estimates for row in rows}
+        self._is_judged_always = bool(limited.difference(RANGED) or self._delayed)
+        self._comparison = None
+        if limited.intersection(COMPARED):
+            self._comparison = ForceComparison(cell, settings.stale_after_ns)
+        self._cell = cell
+        self._has_memory = bool(self._delayed) or self._comparison is not None
+
+    def with_settings(
+        self, observers: Sequence[AnyObserver], settings: Supervision, limits: LimitsByStrut
+    ) -> "Supervisor":
+        """The same with other observers and limits; a state of one is a state of the other."""
+        estimator = self.estimator.with_settings(observers, settings.stale_after_ns)
+        return Supervisor(estimator, settings, limits, self._cell)
 
     def init(self, t_ns: int) -> SupervisedState:
         """State before the first step."""
@@ -280,24 +313,22 @@ class Supervisor:
             return *self._wait(state, t_ns, after, reports), reports.action
         action = reports.action
         struts, measured_ns = estimate.struts, estimate.measured_ns
+        values: Sequence[EstimateValues] = ()
+        is_judged = self._is_judged_always
         if self._is_limited:
-            is_beyond = self._has_further_limits
             for strut, low_m, high_m, low_n, high_n in zip(struts, *self._ranges, strict=False):
                 if not (low_m <= strut.height_m <= high_m and low_n <= strut.force_n <= high_n):
-                    is_beyond = True
-            if is_beyond:
-                action = max(action, *map(worst_action, self._limits, struts))
-        if self._delayed:
-            delays = update_delays(self._delayed, state.delays, struts, t_ns)
-            state = replace(state, delays=delays)
-            action = max(action, find_action_of_delays(self._delayed, delays))
+                    is_judged = True
+        if is_judged:
+            state, values, required = self._judge(state, step_input, estimate)
+            action = max(action, required)
         is_calm = (
             mode is _RUNNING
             and estimate.is_settled
             and estimate.diverged < 0
             and not action
             and reports is NO_REPORTS
-            and not self._delayed
+            and not self._has_memory
             and t_ns - measured_ns <= self._stale_after_ns
         )
         if is_calm:
@@ -307,8 +338,28 @@ class Supervisor:
             return state, StepOutput(mode, struts, estimate.left_out), action
         if estimate.diverged >= 0:
             state = replace(state, diverged=Divergence(estimate.diverged, t_ns))
-        causes = self._causes(t_ns, estimate, action, reports)
+        causes = self._causes(t_ns, estimate, values, action, reports)
         return *self._change(state, t_ns, after, estimate, causes), action
+
+    def _judge(
+        self, state: SupervisedState, step_input: StepInput, estimate: Estimate
+    ) -> tuple[SupervisedState, Sequence[EstimateValues], int]:
+        """State, what limits on an estimate are set on, and the severest action they require."""
+        struts, t_ns = estimate.struts, step_input.t_ns
+        if self._comparison is None:
+            values = list(map(values_of_estimate, struts))
+        else:
+            history = self._comparison.update(state.history, t_ns, struts, step_input.samples)
+            state = replace(state, history=history)
+            values = values_with_history(struts, history)
+        limits = self._limits if estimate.is_settled else self._limits_before
+        action = max(map(worst_action, limits, values), default=0)
+        if self._delayed:
+            delays = update_delays(self._delayed, state.delays, values, t_ns)
+            state = replace(state, delays=delays)
+            delayed = find_action_of_delays(self._delayed, delays, is_settled=estimate.is_settled)
+            action = max(action, delayed)
+        return state, values, action
 
     def end(self, state: SupervisedState) -> StepOutput:
         """What is published when the run ends: the safe output, whatever the mode was."""
@@ -343,7 +394,12 @@ class Supervisor:
         return state, StepOutput(state.mode, struts, estimate.left_out, first_cause)
 
     def _causes(
-        self, t_ns: int, estimate: Estimate, action: int, reports: Reports
+        self,
+        t_ns: int,
+        estimate: Estimate,
+        values: Sequence[EstimateValues],
+        action: int,
+        reports: Reports,
     ) -> Iterator[Cause]:
         """What a tick with an estimate shows, in order."""
         yield from self._missing_ticks(reports)
@@ -360,7 +416,7 @@ class Supervisor:
         if action >= Action.HOLD:
             excess = reports.excess
             if action > reports.action:
-                excess = find_excess(self._rows, estimate.struts, action)
+                excess = find_excess(self._rows, values, action)
             yield _beyond(action, excess)
         yield from _surroundings(reports)
 

@@ -1,8 +1,9 @@
 """When a message's values were sampled: by the sender's clock, not by the arrival of the frame.
 
-A frame may wait in a gateway, a switch or an adapter. Its counter and the message's cycle time give
-the sender's time up to an offset and a drift: arrivals are the sender's time on a line, and a wait,
-which is never negative. The line is the lower envelope of the arrivals; a frame was *due* on it.
+A frame may wait in a gateway, a switch or an adapter. Its time signal, or its counter and the
+message's cycle time, give the sender's time up to an offset and a drift: arrivals are the sender's
+time on a line, and a wait, which is never negative. The line is the lower envelope of the arrivals;
+a frame was *due* on it.
 
 The envelope is followed frame by frame. An arrival before the line lowers it at once. After each
 block of cycles the line goes through the block's lowest arrival, its slope being that since the
@@ -119,6 +120,8 @@ class SenderClock(Struct, frozen=True, gc=False):
         wait_ns: Sum of the waits in the block so far.
         line: The line.
         timing: What is known of the time at which it was due.
+        stamp_ns: The sender's time, where a signal holds it.
+        phase_ns: How much later than a whole number of cycles after the first frame that is.
     """
 
     arrival_ns: int
@@ -128,11 +131,14 @@ class SenderClock(Struct, frozen=True, gc=False):
     wait_ns: int
     line: Line
     timing: FrameTime = IN_TIME
+    stamp_ns: int = 0
+    phase_ns: int = 0
 
 
 Follower = Callable[[SenderClock | None, int, int], SenderClock]
 """Clock at the last frame, arrival of the next one in ns, and cycles between them (one, and one for
-each frame that was lost) -> the clock at that frame. A sender that starts again has none before."""
+each frame that was lost) or the sender's time in ns -> the clock at that frame. A sender that
+starts again has none before."""
 
 
 def compile_follower(cycle_ns: int) -> Follower:
@@ -164,6 +170,41 @@ def compile_follower(cycle_ns: int) -> Follower:
         if at < after.line.ends_at or after.timing is EARLY:
             return after
         return _end_block(after, cycle_ns)
+
+    return follow
+
+
+def compile_stamped_follower(cycle_ns: int, round_ns: int) -> Follower:
+    """Build what follows the clock of a sender whose frames hold its time.
+
+    The frames are followed as if each had been sampled, and had arrived, at the whole cycle nearest
+    to its time: waits are the same there.
+
+    Args:
+        cycle_ns: Time between two samples, about.
+        round_ns: Time after which the sender's time begins again; 0 if it does not.
+    """
+    follow_cycles = compile_follower(cycle_ns)
+
+    def follow(clock: SenderClock | None, arrival_ns: int, stamp_ns: int) -> SenderClock:
+        if clock is None:
+            return replace(follow_cycles(None, arrival_ns, 0), stamp_ns=stamp_ns)
+        elapsed_ns = stamp_ns - clock.stamp_ns
+        if round_ns:
+            # As many rounds as come nearest to the arrival.
+            missing_ns = arrival_ns - clock.arrival_ns - elapsed_ns
+            elapsed_ns += round_ns * ((2 * missing_ns + round_ns) // (2 * round_ns))
+        before_ns = clock.phase_ns
+        cycles = (2 * (before_ns + elapsed_ns) + cycle_ns) // (2 * cycle_ns)
+        phase_ns = before_ns + elapsed_ns - cycles * cycle_ns
+        whole = replace(
+            clock, arrival_ns=clock.arrival_ns - before_ns, due_ns=clock.due_ns - before_ns
+        )
+        after = follow_cycles(whole, arrival_ns - phase_ns, cycles)
+        due_ns = after.due_ns + phase_ns
+        return replace(
+            after, arrival_ns=arrival_ns, due_ns=due_ns, stamp_ns=stamp_ns, phase_ns=phase_ns
+        )
 
     return follow
 

@@ -8,6 +8,7 @@ from typing import Annotated, Literal, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.yaml_file import Finite, NotNegative
+from rig.bridge.force_history import ForceHistory
 from rig.bridge.values import StrutOutput
 
 
@@ -35,12 +36,17 @@ class LimitedValue(Enum):
     FORCE_N = "force_n"
     VIRTUAL_FORCE_N = "virtual_force_n"
     INNOVATION_M = "innovation_m"
+    FORCE_RATE_N_PER_S = "force_rate_n_per_s"
+    FORCE_DIFFERENCE_N = "force_difference_n"
 
     @property
     def is_measured(self) -> bool:
         """Whether it is of the measurement."""
         return self in _MEASURED
 
+
+_CROSSING_S = 1.0
+"""Between two zero crossings of a motion of 0.5 Hz, slower than which few tests are."""
 
 _MEASURED = (
     LimitedValue.MEASURED_HEIGHT_M,
@@ -56,11 +62,15 @@ class Limit(BaseModel):
         strut: Strut that it is for; every strut if absent.
         value: What is limited, with its unit. Of the measurement: `measured_height_m`,
             `measured_rate_m_per_s`, `unchanged_s` (how long it may stay exactly the same). Of the
-            estimate: `height_m`, `force_n`, `virtual_force_n`, `innovation_m`.
+            estimate: `height_m`, `force_n`, `virtual_force_n`, `innovation_m`; and of one that has
+            settled `force_rate_n_per_s` (its change since the last tick) and `force_difference_n`
+            (the estimated force less that of the load cell).
         low: Smallest value within.
         high: Largest value within.
-        for_s: How long an estimate has to be beyond the limit until the action begins, and within
-            it until the action ends; for estimates alone.
+        for_s: How long an estimate has to be beyond the limit until the action begins; for
+            estimates alone.
+        clear_s: How long it has to be within the limit until the action ends: `for_s` by default;
+            1 s for `force_difference_n`, since a wrong force that swings crosses the right one.
         action: `warn` reports it in the status; `refuse` drops the measurement; `hold` marks the
             estimate invalid as long as it lasts; `safe` enters the safe state.
     """
@@ -72,6 +82,7 @@ class Limit(BaseModel):
     low: Finite | None = None
     high: Finite | None = None
     for_s: NotNegative = 0.0
+    clear_s: NotNegative | None = None
     action: Literal["warn", "refuse", "hold", "safe"]
 
     @model_validator(mode="after")
@@ -85,12 +96,26 @@ class Limit(BaseModel):
                 f"action refuse of {self.value.value}: expected warn, hold or safe, "
                 "because only a measurement can be refused"
             )
-        if self.for_s and self.value.is_measured:
-            raise ValueError(
-                f"for_s of {self.value.value}: expected none, because a measurement is judged by "
-                "itself; unchanged_s is a time already"
-            )
+        for key, time_s in (("for_s", self.for_s), ("clear_s", self.clear_s)):
+            if time_s and self.value.is_measured:
+                raise ValueError(
+                    f"{key} of {self.value.value}: expected none, because a measurement is judged "
+                    "by itself; unchanged_s is a time already"
+                )
         return self
+
+    @property
+    def cleared_after_s(self) -> float:
+        """How long an estimate has to be within the limit until the action ends."""
+        if self.clear_s is not None:
+            return self.clear_s
+        is_difference = self.value is LimitedValue.FORCE_DIFFERENCE_N
+        return max(self.for_s, _CROSSING_S) if is_difference else self.for_s
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether the action begins or ends later than a value passes the limit."""
+        return self.for_s > 0.0 or self.cleared_after_s > 0.0
 
     def action_at(self, value: float) -> int:
         """Action at a value, 0 within the limit; a value that is not a number is beyond it."""
@@ -195,10 +220,46 @@ def range_of_estimate(limits: Sequence[Limit]) -> tuple[float, float, float, flo
     return low_m, high_m, low_n, high_n
 
 
-def find_excess(limits: LimitsByStrut, struts: Sequence[StrutOutput], action: int) -> Excess | None:
+EstimateValues = Mapping[LimitedValue, float]
+"""What limits on estimates are set on, of one strut."""
+
+
+def values_of_estimate(strut: StrutOutput) -> EstimateValues:
+    """The values of a strut's estimate that need nothing else."""
+    return {
+        LimitedValue.HEIGHT_M: strut.height_m,
+        LimitedValue.FORCE_N: strut.force_n,
+        LimitedValue.VIRTUAL_FORCE_N: strut.virtual_force_n,
+        LimitedValue.INNOVATION_M: strut.innovation_m,
+    }
+
+
+COMPARED = (LimitedValue.FORCE_RATE_N_PER_S, LimitedValue.FORCE_DIFFERENCE_N)
+"""Values of an estimate that need its history; they require nothing before it has settled."""
+
+
+def values_with_history(
+    struts: Sequence[StrutOutput], history: ForceHistory
+) -> list[EstimateValues]:
+    """The values of each strut's estimate, and those that need what was before."""
+    return [
+        {
+            **values_of_estimate(strut),
+            LimitedValue.FORCE_RATE_N_PER_S: rate_n_per_s,
+            LimitedValue.FORCE_DIFFERENCE_N: difference_n,
+        }
+        for strut, rate_n_per_s, difference_n in zip(
+            struts, history.rates_n_per_s, history.differences_n, strict=True
+        )
+    ]
+
+
+def find_excess(
+    limits: LimitsByStrut, values: Sequence[EstimateValues], action: int
+) -> Excess | None:
     """The first estimate that requires an action, and its limit."""
-    for index, strut in enumerate(struts):
-        excess = _first_excess(limits[index], index, _estimates(strut), action)
+    for index, own in enumerate(values):
+        excess = _first_excess(limits[index], index, own, action)
         if excess is not None:
             return excess
     return None
@@ -215,19 +276,9 @@ def _first_excess(
     return None
 
 
-def worst_action(limits: Sequence[Limit], strut: StrutOutput) -> int:
+def worst_action(limits: Sequence[Limit], values: EstimateValues) -> int:
     """The severest action that limits on estimates require of a strut, 0 if it is within them."""
-    values = _estimates(strut)
     return max([limit.action_at(values[limit.value]) for limit in limits], default=0)
-
-
-def _estimates(strut: StrutOutput) -> Mapping[LimitedValue, float]:
-    return {
-        LimitedValue.HEIGHT_M: strut.height_m,
-        LimitedValue.FORCE_N: strut.force_n,
-        LimitedValue.VIRTUAL_FORCE_N: strut.virtual_force_n,
-        LimitedValue.INNOVATION_M: strut.innovation_m,
-    }
 
 
 class Delay(NamedTuple):
@@ -240,7 +291,7 @@ class Delay(NamedTuple):
 def update_delays(
     rows: Sequence[tuple[int, Limit]],
     delays: Sequence[Delay],
-    struts: Sequence[StrutOutput],
+    values: Sequence[EstimateValues],
     t_ns: int,
 ) -> tuple[Delay, ...]:
     """State of limits with a delay, each with the index of its strut, after a step.
@@ -250,7 +301,7 @@ def update_delays(
     if len(delays) != len(rows):
         delays = [Delay(is_passed=False, since_ns=t_ns)] * len(rows)
     return tuple(
-        _update_delay(delay, row, _estimates(struts[strut])[row.value], t_ns)
+        _update_delay(delay, row, values[strut][row.value], t_ns)
         for delay, (strut, row) in zip(delays, rows, strict=True)
     )
 
@@ -258,12 +309,19 @@ def update_delays(
 def _update_delay(delay: Delay, row: Limit, number: float, t_ns: int) -> Delay:
     if bool(row.action_at(number)) is delay.is_passed:
         return Delay(delay.is_passed, t_ns)
-    if t_ns - delay.since_ns < round(row.for_s * 1e9):
+    time_s = row.cleared_after_s if delay.is_passed else row.for_s
+    if t_ns - delay.since_ns < round(time_s * 1e9):
         return delay
     return Delay(not delay.is_passed, t_ns)
 
 
-def find_action_of_delays(rows: Sequence[tuple[int, Limit]], delays: Sequence[Delay]) -> int:
+def find_action_of_delays(
+    rows: Sequence[tuple[int, Limit]], delays: Sequence[Delay], *, is_settled: bool
+) -> int:
     """The severest action of limits that count as passed, 0 if none does."""
-    passed = [row.severity for (_, row), delay in zip(rows, delays, strict=True) if delay.is_passed]
+    passed = [
+        row.severity
+        for (_, row), delay in zip(rows, delays, strict=True)
+        if delay.is_passed and (is_settled or row.value not in COMPARED)
+    ]
     return max(passed, default=0)

@@ -26,6 +26,10 @@ class SignalName(BaseModel):
     signal: Annotated[str, Field(min_length=1, max_length=255)]
 
 
+SignalOfMessage = Annotated[str, Field(min_length=1, max_length=255)]
+"""Name of a signal of the message that a value stands in."""
+
+
 class ValidSignal(BaseModel):
     """What says that a measured value is valid.
 
@@ -36,7 +40,7 @@ class ValidSignal(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    signal: Annotated[str, Field(min_length=1, max_length=255)]
+    signal: SignalOfMessage
     value: Finite = 1.0
 
 
@@ -48,9 +52,16 @@ class MeasuredSignal(SignalName):
         signal: Signal of the message; its unit is converted.
         valid: Signal of the same message that says whether the sensor measures; a frame in which it
             has another value is refused. Every value counts if absent.
+        counter: Signal of the same message that is one more with every frame, where no CRC protects
+            it: it shows frames that are lost, repeated or out of sequence, and with the cycle time
+            when they were sampled.
+        time: Signal of the same message with the sensor's time of the sample; it may begin again
+            at the end of its range.
     """
 
     valid: ValidSignal | None = None
+    counter: SignalOfMessage | None = None
+    time: SignalOfMessage | None = None
 
 
 class Role(Enum):
@@ -78,6 +89,9 @@ class Channel:
         noise_std: Standard deviation of a sample in SI, quantisation included; of a further sensor.
         message: Message that carries it; None for a channel that is on no bus.
         valid: What says that it is valid; None where nothing does.
+        counter: Signal that counts its message's frames; empty where the message is protected, or
+            nothing counts them.
+        time: Signal with the sensor's time of a sample; empty where there is none.
     """
 
     index: int
@@ -92,6 +106,8 @@ class Channel:
     message: Message | None = None
     signal: str = ""
     valid: ValidSignal | None = None
+    counter: str = ""
+    time: str = ""
 
     @property
     def column(self) -> str:

@@ -16,6 +16,7 @@ from rig.bridge.mode_supervisor import Supervisor
 from rig.bridge.outgoing_messages import compile_outgoing
 from rig.bridge.prescribed_motion import PrescribedMotionEstimator
 from rig.channels.channel import Channel
+from rig.channels.measured_quantities import LOAD_CELL_FORCE
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.settling import settling_times_ns
 from rig.observers.protocol import AnyObserver
@@ -34,7 +35,12 @@ def build_bridge(plan: Plan, *, sending: bool = True) -> Bridge:
     """
     outgoing = plan.outgoing if sending else ()
     return Bridge(
-        Supervisor(_build_estimator(plan), plan.config.supervision, plan.limits),
+        Supervisor(
+            _build_estimator(plan),
+            plan.config.supervision,
+            plan.limits,
+            plan.bench_channel(LOAD_CELL_FORCE),
+        ),
         plan.channels,
         _compile_incoming(plan),
         [compile_outgoing(item.message, item.signals) for item in outgoing],

@@ -26,6 +26,8 @@ def limits_by_strut(
     heights: Iterable[Channel],
     forces: Mapping[int, tuple[Message, str]],
     source: Path,
+    *,
+    can_compare: bool,
 ) -> tuple[tuple[Limit, ...], ...]:
     """Limits of each strut.
 
@@ -34,12 +36,16 @@ def limits_by_strut(
         struts: Names of the model's struts.
         heights: Channels of the measured heights.
         forces: Strut -> message and signal that publish its force.
+        can_compare: Whether the bench has a load cell with which an estimate can be compared.
         source: File of the configuration, for messages.
 
     Raises:
-        InputError: A row names a strut that the model does not have.
+        InputError: A row names a strut that the model does not have, or needs a load cell that the
+            bench does not have.
     """
     for index, row in enumerate(configured):
+        if row.value is LimitedValue.FORCE_DIFFERENCE_N:
+            _check_comparison(row, f"{source}: supervision.limits.{index}", struts, can_compare)
         if row.strut is not None and row.strut not in struts:
             raise InputError(
                 f"{source}: supervision.limits.{index}.strut: {row.strut}: no such strut, expected "
@@ -57,6 +63,20 @@ def limits_by_strut(
         ]
         every.append((*own, *(row for row in defaults if row.value not in taken)))
     return tuple(every)
+
+
+def _check_comparison(row: Limit, where: str, struts: Sequence[str], can_compare: bool) -> None:
+    """Refuse a limit on the difference from a load cell whose strut is not known, or of none."""
+    if not can_compare:
+        raise InputError(
+            f"{where}.value: {row.value.value}: expected signals.load_cell_force and no "
+            "prescribed_motion, because the estimate is compared with the load cell"
+        )
+    if row.strut is None and len(struts) > 1:
+        raise InputError(
+            f"{where}.strut: expected the strut that the load cell measures, one of "
+            f"{', '.join(struts)}"
+        )
 
 
 def _of_height(channel: Channel) -> Iterator[Limit]:

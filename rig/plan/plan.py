@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
-from can_dbc.database import Database, Message
+from can_dbc.codec import si_range
+from can_dbc.database import Database, Message, alive_counter
 from can_dbc.errors import DatabaseError, InputError
+from can_dbc.units import Dimension
 from dart_model.spec import ModelSpec
 from rig.bridge.devices import Device
 from rig.bridge.incoming_messages import Alarm
@@ -27,7 +29,7 @@ from rig.bridge.published_quantities import (
 )
 from rig.bridge.supervision_limits import Limit
 from rig.bus.secoc import FD_LENGTHS, Authentication, AuthenticationSettings
-from rig.channels.channel import Channel, MeasuredSignal, Role, SignalName, ValidSignal
+from rig.channels.channel import Channel, MeasuredSignal, Role, SignalName
 from rig.channels.measured_quantities import HEIGHT, LOAD_CELL_FORCE, Quantity
 from rig.observers.pi import PiObserver
 from rig.observers.protocol import AnyObserver
@@ -207,6 +209,9 @@ def resolve(config: RunConfig, source: Path, model: ModelSpec, database: Databas
                 if item.publication is FORCE
             },
             source,
+            can_compare=(
+                config.prescribed_motion is None and LOAD_CELL_FORCE in config.signals.bench
+            ),
         ),
     )
     if config.authentication is not None:
@@ -327,6 +332,7 @@ class _SignalReader:
     def __init__(self, config: RunConfig, database: Database, source: Path) -> None:
         self._config, self._database, self._source = config, database, source
         self._used = [(item.message, item.signal) for item in config.signals.height.values()]
+        self._of_sender: dict[tuple[str, str], str | None] = {}
         self.read: dict[str, Message] = {}
 
     def channels(self) -> tuple[Channel, ...]:
@@ -339,7 +345,8 @@ class _SignalReader:
         ) -> None:
             message = self._message(entry, key)
             if entry.valid is not None:
-                self._check_valid(message, entry.valid, f"{key}.valid.signal")
+                self._check_number(message, entry.valid.signal, f"{key}.valid.signal")
+            self._check_sender(message, entry, key)
             interval_ns = message.cycle_time_ns or self._config.period_ns
             delay_ns = entry.delay_ns if isinstance(entry, HeightSignal) else 0
             noise_std = entry.noise_std if isinstance(entry, SensorSignal) else 0.0
@@ -357,6 +364,8 @@ class _SignalReader:
                     message,
                     entry.signal,
                     entry.valid,
+                    entry.counter or "",
+                    entry.time or "",
                 )
             )
 
@@ -428,17 +437,42 @@ class _SignalReader:
             raise InputError(f"{self._source}: {key}: {error}") from error
         return message
 
-    def _check_valid(self, message: Message, valid: ValidSignal, key: str) -> None:
-        """Refuse a signal that cannot say whether a value of its message is valid."""
-        try:
-            signal = message.signal(valid.signal)
-        except DatabaseError as error:
-            raise InputError(f"{self._source}: {key}: {error}") from error
-        if signal.unit:
+    def _check_number(self, message: Message, name: str, key: str) -> None:
+        """Refuse a signal that is no plain number of its message."""
+        unit = self._signal(SignalName(message=message.name, signal=name), key).signal(name).unit
+        if unit:
             raise InputError(
-                f"{self._source}: {key}: {valid.signal} has the unit {signal.unit}, expected a "
-                "signal without a unit"
+                f"{self._source}: {key}: {name} has the unit {unit}, expected a signal without a "
+                "unit"
             )
+
+    def _check_sender(self, message: Message, entry: MeasuredSignal, key: str) -> None:
+        """Refuse a counter or time signal that cannot be one, or another than the message has."""
+        if entry.counter is not None:
+            where = f"{self._source}: {key}.counter"
+            self._check_number(message, entry.counter, f"{key}.counter")
+            if message.protection is not None:
+                raise InputError(
+                    f"{where}: {message.name} is protected, expected none: its counter is "
+                    f"{message.protection.counter_signal}"
+                )
+            try:
+                alive_counter(message, entry.counter)
+            except DatabaseError as error:
+                raise InputError(f"{where}: {error}") from error
+        if entry.time is not None:
+            self._signal(SignalName(message=message.name, signal=entry.time), f"{key}.time")
+            try:
+                si_range(message, entry.time, Dimension.TIME)
+            except DatabaseError as error:
+                raise InputError(f"{self._source}: {key}.time: {error}") from error
+        for name, own in (("counter", entry.counter), ("time", entry.time)):
+            known = self._of_sender.setdefault((message.name, name), own)
+            if own != known:
+                raise InputError(
+                    f"{self._source}: {key}.{name}: {own or 'none'}, expected {known or 'none'}, "
+                    f"as for the other signals of {message.name}"
+                )
 
     def _check_sensor(self, strut: str, sensor: str) -> None:
         """Refuse a further sensor whose signal is in use, or whose delay differs too much."""

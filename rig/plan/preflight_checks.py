@@ -9,9 +9,9 @@ from can_dbc.codec import si_step
 from can_dbc.database import Message
 from dart_model.protocol import AnyPlant
 from dart_model.spec import InlineSkeleton
-from rig.bridge.incoming_messages import clock_cycle_ns
+from rig.bridge.incoming_messages import ClockSource, clock_source
 from rig.bridge.published_quantities import FORCE, VALID
-from rig.bridge.supervision_limits import Limit
+from rig.bridge.supervision_limits import Limit, LimitedValue
 from rig.bus.bus import SHARED_INTERFACES
 from rig.channels.channel import Channel
 from rig.channels.measured_quantities import LOAD_CELL_FORCE, SWITCHES
@@ -65,12 +65,13 @@ def check(plan: Plan) -> list[Finding]:
     sensors = {message.name: message for message in map(_message, plan.sensors)}
     further = dict(sorted(sensors.items()))
     read = {message.name: message for message in heights} | further
+    channel_of = {_message(it).name: it for it in (*plan.heights, *plan.sensors)}
     named = plan.database.path.name
     findings = [
         Finding(Severity.OK, "signals", f"all in {named}, units converted to SI"),
         *map(_protection, read.values()),
         *[_rate(message, plan.period_ns) for message in heights],
-        *map(_sample_times, read.values()),
+        *map(_sample_times, channel_of.values()),
         *_resolution(plan),
         *[
             Finding(
@@ -158,11 +159,15 @@ def _weight_n(plan: Plan) -> float | None:
     return mass_kg * abs(plan.model.gravity_m_per_s2) or None
 
 
-def _sample_times(message: Message) -> Finding:
+def _sample_times(channel: Channel) -> Finding:
     """Where the times of a message's samples come from."""
-    text = "when their frames arrive: expected a protected counter and a cycle time in the DBC"
-    if clock_cycle_ns(message):
-        text = "by counter and cycle time, whatever the frames wait on their way"
+    message = _message(channel)
+    text = {
+        ClockSource.TIME_SIGNAL: f"by {channel.time}, whatever the frames wait on their way",
+        ClockSource.COUNTER: "by counter and cycle time, whatever the frames wait on their way",
+        ClockSource.ARRIVAL: "when their frames arrive: expected a time signal, or a counter and a "
+        "cycle time in the DBC",
+    }[clock_source(channel, message)]
     return Finding(Severity.OK, f"sample times of {message.name}", text)
 
 
@@ -246,6 +251,12 @@ def _publication(plan: Plan) -> list[Finding]:
 def _limits(plan: Plan) -> list[Finding]:
     """The limits of each strut, those that follow from the DBC included."""
     findings: list[Finding] = []
+    values = {row.value for rows in plan.limits for row in rows}
+    has_cell = plan.bench_channel(LOAD_CELL_FORCE) is not None and not plan.is_prescribed
+    if has_cell and LimitedValue.FORCE_DIFFERENCE_N not in values:
+        text = "none on force_difference_n: a scale that is wrong in the DBC would not be noticed, "
+        text += "although the bench has a load cell that shows it"
+        findings.append(Finding(Severity.WARNING, "limits of the load cell", text))
     for name, rows in zip(plan.strut_names, plan.limits, strict=True):
         text = "; ".join(f"{row.value.value} {_bounds(row)}: {row.action}" for row in rows)
         severity = Severity.OK if rows else Severity.WARNING

@@ -40,7 +40,7 @@ _ESTIMATE_WORDS = ("estim", "schaetz", "calc", "spring", "damper", "cmd", "set",
 _VALID_WORDS = ("valid", "gueltig", "qual", "ok")
 _STATE_WORDS = ("state", "mode", "status", "zustand")
 _LEAST_STATE_BITS = 3
-"""A mode is a number from 0 to 5."""
+"""A mode is a number from 0 to 6."""
 
 _STALE_CYCLES = 3
 """Cycles after which a height is stale: two frames in a row may be lost."""
@@ -51,6 +51,11 @@ _LARGEST_RATE_M_PER_S = 10.0
 
 _FROZEN_S = 1.0
 """A reading that is the same for longer is taken for frozen: noise changes it in some samples."""
+
+_CELL_LIMIT = (
+    "    # Against a wrong scale or mass: how far the estimate may be from the load cell, in N.",
+    "    # - {value: force_difference_n, low: -100, high: 100, action: hold}",
+)
 
 _MOST_OTHERS = 4
 """Other candidates that are named in a comment."""
@@ -104,6 +109,7 @@ def propose(database: Database) -> str:
         if found and (found[0].score > 0 or quantity is TEMPERATURE):
             lines.append(_line("  ", quantity.key, found))
             used.add((found[0].message.name, found[0].signal.name))
+    has_cell = any(line.startswith(f"  {LOAD_CELL_FORCE.key}:") for line in lines)
     listened = {name for name, _ in used}
     free = [item for item in others if item.name not in listened]
     best = heights[0]
@@ -111,7 +117,7 @@ def propose(database: Database) -> str:
     lines += [
         *_propose_publish(free),
         *propose_observer(step_m, best.message.cycle_time_ns),
-        *_supervision(best),
+        *_supervision(best, has_cell=has_cell),
     ]
     return "\n".join(lines) + "\n"
 
@@ -158,7 +164,7 @@ def propose_observer(step_m: float, interval_ns: int | None) -> list[str]:
     ]
 
 
-def _supervision(height: _Candidate) -> list[str]:
+def _supervision(height: _Candidate, *, has_cell: bool) -> list[str]:
     """Lines of ages and limits that follow from the height's message."""
     cycle_s = (height.message.cycle_time_ns or _UNKNOWN_INTERVAL_NS) * 1e-9
     stale_s = max(_LEAST_STALE_S, _STALE_CYCLES * cycle_s)
@@ -171,6 +177,7 @@ def _supervision(height: _Candidate) -> list[str]:
         f"    - {{value: measured_rate_m_per_s, low: {-rate:g}, high: {rate:g}, action: refuse}}",
         "    # A sensor that has frozen; remove the line for one that repeats itself at rest.",
         f"    - {{value: unchanged_s, high: {_FROZEN_S:g}, action: hold}}",
+        *(_CELL_LIMIT if has_cell else ()),
     ]
 
 

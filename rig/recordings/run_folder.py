@@ -12,6 +12,7 @@ from can_dbc.database import Message
 from can_dbc.errors import InputError
 from can_dbc.protection import check_crc_log
 from can_dbc.units import Dimension
+from rig.bridge.incoming_messages import compile_follower_of
 from rig.channels.channel import Channel
 from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE
 from rig.log.checksums import refuse_damage
@@ -112,8 +113,26 @@ def _samples(payloads: _Payloads, channel: Channel) -> tuple[Array, Array]:
     if valid is not None:
         validity = decode_log(message, [valid.signal], [Dimension.NUMBER], data)[valid.signal]
         good &= validity == valid.value
-    t_s, first = np.unique(_sample_times_s(t_ns[good], message), return_index=True)
+    if channel.time:
+        stamps_s = decode_log(message, [channel.time], [Dimension.TIME], data)[channel.time]
+        good &= np.isfinite(stamps_s)
+        times_s = _stamped_times_s(t_ns[good], stamps_s[good], channel)
+    else:
+        times_s = _sample_times_s(t_ns[good], message)
+    t_s, first = np.unique(times_s, return_index=True)
     return t_s, values[good][first]
+
+
+def _stamped_times_s(t_ns: NDArray[np.int64], stamps_s: Array, channel: Channel) -> Array:
+    """Times of sampling in s by the sender's time in the frames, as the bridge followed it."""
+    follow = compile_follower_of(channel, _message(channel))
+    times_ns: list[int] = []
+    clock = None
+    for arrival_ns, stamp_s in zip(t_ns.tolist(), stamps_s.tolist(), strict=True):
+        if follow is not None:
+            clock = follow(clock, arrival_ns, round(stamp_s * 1e9))
+            times_ns.append(clock.due_ns)
+    return np.array(times_ns) * 1e-9
 
 
 def _sample_times_s(t_ns: NDArray[np.int64], message: Message) -> Array:

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from can_dbc.codec import Encoder, compile_encoder
-from can_dbc.database import Database, Message
+from can_dbc.codec import Encoder, compile_encoder, si_range, si_step
+from can_dbc.database import Database, Message, alive_counter
 from can_dbc.frame import Frame
 from can_dbc.protection import compile_protector
 from can_dbc.units import Dimension
@@ -63,11 +63,18 @@ class _Sender:
         sources = np.random.SeedSequence([config.seed, index]).spawn(6)
         self._jitter, self._loss, *noises = [np.random.default_rng(source) for source in sources]
         self._channels = _channels(config, self.transmission, noises)
-        self._encode: Encoder = compile_encoder(
-            self.message,
-            tuple(channel.signal for channel in self._channels),
-            tuple(channel.dimension for channel in self._channels),
-        )
+        self._modulus = self._round_s = 0.0
+        further: list[tuple[str, Dimension]] = []
+        if (name := self.transmission.counter) is not None:
+            self._modulus = alive_counter(self.message, name).modulus
+            further.append((name, Dimension.NUMBER))
+        if (name := self.transmission.time) is not None:
+            low_s, high_s = si_range(self.message, name, Dimension.TIME)
+            self._round_s = high_s - low_s + si_step(self.message, name, Dimension.TIME)
+            further.append((name, Dimension.TIME))
+        signals = [*((channel.signal, channel.dimension) for channel in self._channels), *further]
+        names, dimensions = zip(*signals, strict=True)
+        self._encode: Encoder = compile_encoder(self.message, names, dimensions)
         protection = self.message.protection
         self._protect = None if protection is None else compile_protector(protection)
         self._counter = 0
@@ -76,6 +83,10 @@ class _Sender:
     def send(self, record: list[float], start_ns: int) -> Frame | None:
         """Build the frame of one sample; None if it is lost on the way."""
         values = [channel.measure(record) for channel in self._channels]
+        if self._modulus:
+            values.append(self._counter % self._modulus)
+        if self._round_s:
+            values.append(self.next_sample_ns * 1e-9 % self._round_s)
         data, saturated = self._encode(values)
         self.saturated_frames += bool(saturated)
         if self._protect is not None:

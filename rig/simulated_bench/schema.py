@@ -362,6 +362,8 @@ class Transmission(_Section):
         applied_force: Sensor of the applied force, if the message carries one.
         strut_force: Load cell, if the message carries one.
         temperature: Thermometer, if the message carries one.
+        counter: Signal that counts the frames of a message without protection.
+        time: Signal with the bench's time of the sample, which begins again at its range's end.
     """
 
     message: str
@@ -373,6 +375,8 @@ class Transmission(_Section):
     applied_force: AppliedForceSensor | None = None
     strut_force: LoadCell | None = None
     temperature: Thermometer | None = None
+    counter: str | None = None
+    time: str | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Self:

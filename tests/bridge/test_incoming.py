@@ -4,18 +4,22 @@ import dataclasses
 import math
 import struct
 
+import numpy as np
 import pytest
 
-from can_dbc.database import load_database
+from can_dbc.database import alive_counter, load_database
+from can_dbc.errors import DatabaseError
 from can_dbc.frame import Frame
 from can_dbc.protection import INITIAL, FrameStatus, compile_protector
+from rig.bridge.frame_checks import FrameChecks, Reception
 from rig.bridge.incoming_messages import (
     NO_VALUES,
     Alarm,
     AlarmDelivery,
+    ClockSource,
     Delivery,
     HeightDelivery,
-    clock_cycle_ns,
+    clock_source,
     compile_incoming,
 )
 from rig.channels.channel import Channel, Role, ValidSignal
@@ -47,6 +51,13 @@ BO_ 257 PLAIN: 8 BENCH
 BO_ 258 MIXED: 8 BENCH
  SG_ HEIGHT : 0|32@1- (1,0) [0|0] "m" RIG
  SG_ FORCE : 32|8@1+ (1,0) [0|0] "N" RIG
+BO_ 259 COUNTED: 8 BENCH
+ SG_ HEIGHT : 0|16@1+ (0.01,0) [0|0] "m" RIG
+ SG_ COUNT : 16|4@1+ (1,0) [0|11] "" RIG
+ SG_ STAMP : 24|16@1+ (50,0) [0|0] "us" RIG
+ SG_ STATE : 40|4@1+ (1,0) [0|0] "" RIG
+ SG_ SHIFTED : 44|4@1+ (1,1) [0|0] "" RIG
+ SG_ BIT : 48|1@1+ (1,0) [0|0] "" RIG
 BO_ 2566834432 GROUP: 8 BENCH
  SG_ HEIGHT : 0|16@1+ (0.1,-3200) [-3200|3225.5] "mm" RIG
  SG_ OTHER_HEIGHT : 16|16@1+ (0.1,-3200) [-3200|3225.5] "mm" RIG
@@ -65,6 +76,7 @@ BA_DEF_DEF_ "E2EDataIds" "";
 BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
 BA_ "GenMsgCycleTime" BO_ 256 5;
 BA_ "GenMsgCycleTime" BO_ 257 5;
+BA_ "GenMsgCycleTime" BO_ 259 10;
 BA_ "E2EProfile" BO_ 256 "P02";
 BA_ "E2EDataIds" BO_ 256 "059C063CED1481CCF00933E7181EBE6A";
 BA_ "VFrameFormat" BO_ 2566834432 3;
@@ -159,15 +171,107 @@ def test_an_estimate_rests_on_heights_further_sensors_and_the_applied_force(
 def test_a_counter_states_times_where_frames_have_a_cycle(database, protected):
     plain = database.message("PLAIN")
     aperiodic = dataclasses.replace(protected, cycle_time_ns=None)
-    assert clock_cycle_ns(protected) == 5 * MS
-    assert clock_cycle_ns(aperiodic) == clock_cycle_ns(plain) == 0
+    assert clock_source(height(0, 0), protected) is ClockSource.COUNTER
     for message in (aperiodic, plain):
+        assert clock_source(height(0, 0), message) is ClockSource.ARRIVAL
         assert compile_incoming(message, [height(0, 0)]).follow is None
     follow = compile_incoming(protected, [height(0, 0)]).follow
     clock = None
     for number in range(3):
         clock = follow(clock, number * 5 * MS, 1)
     assert (clock.due_ns, clock.line.step_ns // MS) == (10 * MS, 5)
+
+
+def counted(made, counts, cycle_ns=10 * MS):
+    """Statuses of frames with some counts, a cycle apart, and which of them are used."""
+    sequence, found = INITIAL, []
+    for number, count in enumerate(counts):
+        frame = Frame(number * cycle_ns, 259, bytes([50 + number, 0, count, 0, 0, 0, 0, 0]))
+        sequence, status, values = made.read(sequence, frame)
+        found.append((status, None if values is None else round(100.0 * values[0]) - 50))
+    return found
+
+
+def test_a_counter_without_a_crc_shows_frames_that_are_lost_or_repeated(database):
+    message = database.message("COUNTED")
+    made = compile_incoming(message, [height(0, 0, counter="COUNT")])
+    statuses = FrameStatus
+    # The DBC's range ends at 11.
+    assert counted(made, [9, 10, 11, 0, 3, 3, 4, 2]) == [
+        (statuses.FIRST, 0),
+        (statuses.OK, 1),
+        (statuses.OK, 2),
+        (statuses.OK, 3),
+        (statuses.LOST, 4),
+        (statuses.REPEATED, None),
+        (statuses.OK, 6),
+        (statuses.OUT_OF_SEQUENCE, None),
+    ]
+    # A value that no counter of this range has is no step either way.
+    assert counted(made, [3, 12, 4])[1:] == [(statuses.OUT_OF_SEQUENCE, None), (statuses.OK, 2)]
+    # Without the key nothing is checked.
+    assert all(
+        status is statuses.OK
+        for status, _ in counted(compile_incoming(message, [height(0, 0)]), [3, 3, 9])
+    )
+
+
+def test_a_counter_without_a_crc_states_times(database):
+    message = database.message("COUNTED")
+    channel = height(0, 0, counter="COUNT")
+    assert clock_source(channel, message) is ClockSource.COUNTER
+    follow = compile_incoming(message, [channel]).follow
+    assert follow(follow(None, 0, 1), 10 * MS, 1).due_ns == 10 * MS
+    unknown = dataclasses.replace(message, cycle_time_ns=None)
+    assert clock_source(channel, unknown) is ClockSource.ARRIVAL
+
+
+@pytest.mark.parametrize("name", ["SHIFTED", "BIT", "HEIGHT"])
+def test_a_signal_that_is_no_counter_is_one_line(database, name):
+    with pytest.raises(DatabaseError, match=f"{name}: expected an unsigned integer"):
+        alive_counter(database.message("COUNTED"), name)
+
+
+def test_a_time_signal_is_read_in_seconds_and_goes_round(database):
+    message = database.message("COUNTED")
+    channel = height(0, 0, time="STAMP")
+    assert clock_source(channel, message) is ClockSource.TIME_SIGNAL
+    made = compile_incoming(message, [channel])
+    # 65 536 steps of 50 us.
+    round_ms = 65_536 * 50 // 1000
+    clock = None
+    for ms in (0, 10, round_ms - 4, round_ms + 6, 3 * round_ms + 26):
+        raw = (ms * 20) % 65_536
+        frame = Frame(ms * MS, 259, bytes([50, 0, 0, raw & 0xFF, raw >> 8, 0, 0, 0]))
+        _, _, values = made.read(INITIAL, frame)
+        stamp_ns = round(values[made.stamp] * 1e9)
+        assert stamp_ns == raw * 50_000
+        clock = made.follow(clock, ms * MS, stamp_ns)
+    assert clock.cycles * channel.interval_ns + clock.phase_ns == (3 * round_ms + 26) * MS
+
+
+def test_the_frames_of_one_that_states_its_time_follow_each_other_by_it(database):
+    """Frames that are held back are due when they were sampled, at no constant interval."""
+    message = database.message("COUNTED")
+    channel = dataclasses.replace(height(0, 0, time="STAMP"), interval_ns=10 * MS)
+    made = compile_incoming(message, [channel])
+    checks = FrameChecks([made], frozenset(), (), ((),))
+    sequences, memory = checks.init(0)
+    reception = Reception(sequences, (None,), memory)
+    rng = np.random.default_rng(3)
+    sampled_ms = np.cumsum(rng.integers(6, 15, 300))
+    frames = []
+    for number, ms in enumerate(sampled_ms.tolist()):
+        raw = ms * 20 % 65_536
+        # Ten frames of every hundred wait for the last of them.
+        arrival_ms = sampled_ms[number - number % 10 + 9] if number % 100 >= 90 else ms
+        data = bytes([50, 0, 0, raw & 0xFF, raw >> 8, 0, 0, 0])
+        frames.append(Frame(int(arrival_ms) * MS, 259, data))
+    dues_ms = [due_ns / MS for _, _, due_ns, _ in checks.receive(reception, frames)]
+    # Before two blocks have shown the sender's drift, it may be a hundredth of a wait.
+    assert dues_ms == pytest.approx(sampled_ms.tolist(), abs=1.0)
+    assert dues_ms[128:] == pytest.approx(sampled_ms[128:].tolist(), abs=0.001)
+    assert not reception.memory.counts.refused
 
 
 def test_a_frame_is_read_where_its_counter_lets_it_pass(protected):

@@ -18,6 +18,7 @@ from rig.bridge.supervision_limits import (
     LimitedValue,
     find_action_of_delays,
     update_delays,
+    values_of_estimate,
 )
 from rig.bridge.values import Mode, Request, StepInput, StepOutput, StrutOutput
 from rig.channels.channel import Sample
@@ -28,7 +29,7 @@ from tests.faults.trial import (
     SWITCH_CYCLE_MS,
     Switches,
     Trial,
-    trial_with_switches,
+    trial_with_auxiliary,
 )
 
 SAFE_AFTER_MS = 500
@@ -74,7 +75,7 @@ def test_the_safe_state_disarms_and_a_hold_does_not():
 
 
 def test_an_open_interlock_leads_to_the_safe_state_until_it_is_closed_and_acknowledged():
-    trial = trial_with_switches("interlock", settling_s=0.0)
+    trial = trial_with_auxiliary("interlock", settling_s=0.0)
     switches = Switches(trial, interlock=True)
     assert trial.run(BEGIN_MS, switches)[-1].is_valid
     switches.closed["interlock"] = False
@@ -98,7 +99,7 @@ def test_an_open_interlock_leads_to_the_safe_state_until_it_is_closed_and_acknow
     ids=["interlock", "enable"],
 )
 def test_a_switch_that_is_silent_counts_as_open(name, lost):
-    trial = trial_with_switches(name, settling_s=0.0)
+    trial = trial_with_auxiliary(name, settling_s=0.0)
     switches = Switches(trial, **{name: True})
     trial.run(BEGIN_MS + 1, switches)
     switches.is_silent = True
@@ -110,7 +111,7 @@ def test_a_switch_that_is_silent_counts_as_open(name, lost):
 
 @pytest.mark.parametrize("name", ["interlock", "enable"])
 def test_nothing_is_valid_before_a_switch_was_ever_received(name):
-    trial = trial_with_switches(name, settling_s=0.0)
+    trial = trial_with_auxiliary(name, settling_s=0.0)
     switches = Switches(trial, **{name: True})
     switches.is_silent = True
     ticks = trial.run(BEGIN_MS, switches)
@@ -121,7 +122,7 @@ def test_nothing_is_valid_before_a_switch_was_ever_received(name):
 
 
 def test_an_enable_signal_is_followed_at_its_level():
-    trial = trial_with_switches("enable", settling_s=0.0)
+    trial = trial_with_auxiliary("enable", settling_s=0.0)
     switches = Switches(trial, enable=False)
     assert trial.run(BEGIN_MS, switches)[-1].mode is Mode.READY
     for cycle in range(4):
@@ -132,7 +133,7 @@ def test_an_enable_signal_is_followed_at_its_level():
 
 def test_a_switch_within_a_late_frame_counts_at_once():
     """A frame that was held back has samples of the past, and a switch of now."""
-    trial = trial_with_switches("interlock", settling_s=0.0)
+    trial = trial_with_auxiliary("interlock", settling_s=0.0)
     switches = Switches(trial, interlock=True)
     kept = []
 
@@ -247,12 +248,14 @@ def test_a_delayed_limit_acts_after_its_time_and_ends_after_it(is_beyond, delay_
     history = [False] * (delay_ms + 1)
     for number, beyond in enumerate(is_beyond, start=1):
         strut = StrutOutput(20.0 if beyond else 0.0, 0.0, True, 0.4, 0.0, 0.0, 0.0)
-        delays = update_delays([(0, row)], delays, (strut,), number * MS)
+        delays = update_delays([(0, row)], delays, [values_of_estimate(strut)], number * MS)
         history = [*history[1:], beyond]
         # Since the last tick that was otherwise, as long as the delay has gone by.
         if all(it is not passed for it in history[1:]):
             passed = not passed
-        assert find_action_of_delays([(0, row)], delays) == (Action.HOLD if passed else 0)
+        assert find_action_of_delays([(0, row)], delays, is_settled=True) == (
+            Action.HOLD if passed else 0
+        )
 
 
 def test_a_delayed_limit_holds_the_estimate_and_names_its_cause():

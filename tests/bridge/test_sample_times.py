@@ -8,7 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from rig.bridge.sample_times import FrameTime, SenderClock, compile_follower
+from rig.bridge.sample_times import (
+    FrameTime,
+    SenderClock,
+    compile_follower,
+    compile_stamped_follower,
+)
 
 MS = 1_000_000
 
@@ -459,3 +464,56 @@ def test_a_clock_is_lost_in_three_blocks_and_back_after_as_many_steady_ones_six_
     for number in lost:
         assert clocks[number].due_ns == clocks[number].arrival_ns
         assert clocks[number].timing is FrameTime.IN_TIME
+
+
+def follow_stamps(arrivals_ns, stamps_ns, cycle_ns=MS, round_ns=0):
+    follower, clock, found = compile_stamped_follower(cycle_ns, round_ns), None, []
+    for arrival_ns, stamp_ns in zip(arrivals_ns, stamps_ns, strict=True):
+        clock = follower(clock, int(arrival_ns), int(stamp_ns))
+        found.append(clock)
+    return found
+
+
+@pytest.mark.parametrize("drift_ppm", [-200.0, 0.0, 80.0])
+@pytest.mark.parametrize("round_ns", [0, 1 << 16, 1 << 26])
+def test_a_sender_that_states_its_time_may_sample_when_it_likes(drift_ppm, round_ns):
+    """Its interval is anything, its clock has an offset and drifts, its frames wait."""
+    rng = np.random.default_rng(6)
+    true_ns = 7 * MS + np.cumsum(rng.integers(MS // 2, 3 * MS, 3000))
+    unit = MS // 1000 if round_ns == 1 << 16 else 1
+    stamps_ns = 123_456_789 + np.round((true_ns - true_ns[0]) * (1 - 1e-6 * drift_ppm))
+    stamps_ns = stamps_ns.astype(np.int64)
+    if round_ns:
+        stamps_ns %= round_ns * unit
+    arrivals_ns = true_ns + rng.uniform(0.0, 0.4 * MS, 3000).astype(np.int64)
+    for begin in range(500, 3000, 250):
+        arrivals_ns[begin : begin + 8] = arrivals_ns[begin + 8]
+    clocks = follow_stamps(arrivals_ns, stamps_ns, round_ns=round_ns * unit)
+    used = [
+        (clock.due_ns, true)
+        for clock, true in zip(clocks[300:], true_ns[300:], strict=True)
+        if clock.timing is FrameTime.IN_TIME
+    ]
+    assert len(used) > 2600
+    errors_ns = np.array([due - true for due, true in used])
+    assert np.sqrt(np.mean(errors_ns**2)) < 0.4 * MS / 16
+
+
+@given(st.integers(-9_000, 9_000), st.integers(0, 2**40))
+def test_stamps_a_cycle_apart_are_a_counter(drift_ppm, first_ns):
+    arrivals_ns = np.arange(400) * (MS + MS * drift_ppm // 1_000_000)
+    by_counter = follow(arrivals_ns)
+    by_stamp = follow_stamps(arrivals_ns, first_ns + np.arange(400) * MS)
+    assert dues(by_stamp).tolist() == dues(by_counter).tolist()
+    assert [it.timing for it in by_stamp] == [it.timing for it in by_counter]
+
+
+def test_a_sender_of_times_that_starts_again_is_followed_again():
+    arrivals_ns = sampled_ns(600)
+    stamps_ns = np.concatenate([np.arange(300), np.arange(300)]) * MS
+    for round_ns in (0, 2**32 * 1000):
+        clocks = follow_stamps(arrivals_ns, stamps_ns, round_ns=round_ns)
+        timings = [clock.timing for clock in clocks]
+        assert FrameTime.IN_TIME not in timings[300:307]
+        assert set(timings[308:]) == {FrameTime.IN_TIME}
+        assert dues(clocks)[308:].tolist() == arrivals_ns[308:].tolist()

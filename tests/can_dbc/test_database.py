@@ -63,8 +63,8 @@ def test_protection_from_attributes(write_dbc: Callable[..., Path]) -> None:
     assert protection is not None
     assert protection.identity.profile is Profile.P02
     assert protection.identity.data_ids == bytes(range(16))
-    assert protection.max_delta_counter == 3
-    assert protection.silence_ns == 16 * 5_000_000
+    assert protection.counter.max_delta == 3
+    assert protection.counter.silence_ns == 16 * 5_000_000
 
 
 def test_unknown_names_bring_near_ones(rig: Database) -> None:

@@ -108,7 +108,9 @@ def test_the_end_of_the_duration(tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal(number, tmp_path):
+def test_a_signal(number, tmp_path, monkeypatch):
+    # Under `nohup` a hang-up is ignored, by the tests as well.
+    monkeypatch.setattr(signal, "getsignal", lambda _number: signal.SIG_DFL)
     with stoppable() as is_stopped:
 
         def ended_by(tick):

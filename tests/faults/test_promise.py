@@ -24,7 +24,7 @@ from rig.observers.kalman import KalmanObserver
 from rig.observers.pi import PiObserver
 from rig.plan.build import build_bridge
 from rig.simulated_bench.trajectory import simulate
-from tests.faults.trial import BEGIN_MS, MS, Gateway, Switches, Trial, trial_with_switches
+from tests.faults.trial import BEGIN_MS, MS, Gateway, Switches, Trial, trial_with_auxiliary
 
 DBC = cantools.database.load_file(DEFAULT_DATABASE)
 ESTIMATE, STATUS = DBC.get_message_by_name("RIG_ESTIMATE"), DBC.get_message_by_name("RIG_STATUS")
@@ -273,6 +273,39 @@ def test_a_height_that_jumps(offset_m, truth_n, settled_n):
         assert max(errors_n) <= MOST * settled_n[name]
 
 
+CELL_LIMIT = {"value": "force_difference_n", "low": -45.0, "high": 45.0, "action": "hold"}
+
+
+def with_scale(scale):
+    """The frames of a sensor whose DBC has another scale, from the beginning."""
+    wrong = Frozen(0)
+    wrong.change = lambda height_m: scale * height_m
+    return lambda _ms, frames: wrong(0, frames)
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+def test_a_scale_that_is_wrong_by_two(scale, promise):
+    """Nothing but a load cell contradicts it."""
+    ratios = {}
+    for name, observer in OBSERVERS.items():
+        trial = trial_with_auxiliary("load_cell_force", observer=observer, limits=[CELL_LIMIT])
+        received = follow(trial, Event("", frames=with_scale(scale)))
+        assert not any(it.is_valid for it in received)
+        ratios[name] = 0.0
+    if scale == 2.0:
+        words = f"a height's scale is wrong by two, from the start (limit `{CELL_LIMIT['value']}`)"
+        duty = "have a load cell, or compare a known displacement before the run"
+        promise(60, words, [received[-1].mode.name], "from the start", "", ratios, duty)
+
+
+@pytest.mark.parametrize("name", OBSERVERS)
+def test_a_right_scale_passes_the_load_cell(name):
+    trial = trial_with_auxiliary("load_cell_force", observer=OBSERVERS[name], limits=[CELL_LIMIT])
+    received = follow(trial, Event("none"))
+    first = next(it.ms for it in received if it.is_valid)
+    assert all(it.is_valid for it in received if it.ms >= first)
+
+
 @pytest.mark.parametrize("first_ms", [700, 1200])
 def test_a_bridge_that_joins(first_ms, promise, truth_n, settled_n):
     ratios = {}
@@ -289,7 +322,7 @@ def test_a_bridge_that_joins(first_ms, promise, truth_n, settled_n):
 def test_an_interlock_that_opens(promise, truth_n, settled_n):
     ratios = {}
     for name, observer in OBSERVERS.items():
-        trial = trial_with_switches("interlock", observer=observer)
+        trial = trial_with_auxiliary("interlock", observer=observer)
         switches = Switches(trial, interlock=True)
 
         def frames(ms, frames, switches=switches):

@@ -169,8 +169,8 @@ SWITCHES = 0x200
 SWITCH_CYCLE_MS = 10
 
 
-def trial_with_switches(*names: str, **supervision: object) -> Trial:
-    """A trial whose bench has an interlock, an enable signal, or both."""
+def trial_with_auxiliary(*names: str, **supervision: object) -> Trial:
+    """A trial whose bridge reads some quantities of the auxiliary message, by their keys."""
     trial = Trial(**supervision)
     content = trial.ready.config.model_dump(mode="json")
     for name in names:

@@ -36,9 +36,11 @@ def with_range(low, high):
     return dataclasses.replace(MESSAGE, signals={**MESSAGE.signals, "HEIGHT": signal})
 
 
-def resolved(configured=(), struts=("strut",), heights=None, forces=None):
+def resolved(configured=(), struts=("strut",), heights=None, forces=None, can_compare=False):
     heights = [height()] if heights is None else heights
-    return limits_by_strut(configured, struts, heights, forces or {}, SOURCE)
+    return limits_by_strut(
+        configured, struts, heights, forces or {}, SOURCE, can_compare=can_compare
+    )
 
 
 def test_the_bits_limit_what_the_range_does_not():
@@ -83,6 +85,17 @@ def test_a_row_of_a_strut_that_is_not_there_is_one_line():
     own = row(strut="front", value="force_n", high=100.0)
     with pytest.raises(InputError, match=r"limits\.0\.strut: front: no such strut, expected strut"):
         resolved([own])
+
+
+def test_a_difference_from_a_load_cell_needs_one_and_its_strut():
+    own = row(value="force_difference_n", high=100.0)
+    with pytest.raises(InputError, match=r"limits\.0\.value: force_difference_n: expected signals"):
+        resolved([own])
+    assert resolved([own], can_compare=True)[0][0] is own
+    with pytest.raises(InputError, match=r"limits\.0\.strut: expected the strut .* front, rear"):
+        resolved([own], ("front", "rear"), can_compare=True)
+    named = row(value="force_difference_n", high=100.0, strut="rear")
+    assert named in resolved([named], ("front", "rear"), can_compare=True)[1]
 
 
 def test_a_strut_without_a_height_has_no_limit_of_it():
