@@ -19,7 +19,7 @@ from rig.bridge.mode_supervisor import NO_REPORTS, Reports, SupervisedState, Sup
 from rig.bridge.operation import NOT_OPERATED, Operation, OperationState
 from rig.bridge.outgoing_messages import Outgoing
 from rig.bridge.sample_times import SenderClock
-from rig.bridge.supervision_limits import LimitsByStrut
+from rig.bridge.supervision_limits import Limits
 from rig.bridge.values import Mode, Request, StepInput, StepOutput, StrutOutput
 from rig.channels.channel import Channel, Sample
 from rig.observers.protocol import AnyObserver
@@ -116,7 +116,7 @@ class Bridge:
         incoming: Sequence[Incoming],
         outgoing: Sequence[Outgoing],
         devices: Sequence[Device],
-        limits: LimitsByStrut,
+        limits: Limits,
     ) -> None:
         self._supervisor = supervisor
         settings = supervisor.settings
@@ -127,7 +127,7 @@ class Bridge:
         self._devices = tuple(devices)
         own = frozenset(item.message.key for item in outgoing)
         struts = supervisor.estimator.struts
-        self._checks = FrameChecks(incoming, own, devices, limits)
+        self._checks = FrameChecks(incoming, own, devices, channels, limits.channels)
         self._nothing = (StrutOutput(0.0, 0.0, False, 0.0, 0.0, 0.0, 0.0),) * struts
         self._awaited = tuple(
             index for index, item in enumerate(incoming) if item.is_awaited and item.follow
@@ -151,11 +151,11 @@ class Bridge:
         return self._checks.directory
 
     def with_settings(
-        self, observers: Sequence[AnyObserver], supervision: Supervision, limits: LimitsByStrut
+        self, observers: Sequence[AnyObserver], supervision: Supervision, limits: Limits
     ) -> "Bridge":
         """The same with other observers and limits; it continues from a state of this one."""
         return Bridge(
-            self._supervisor.with_settings(observers, supervision, limits),
+            self._supervisor.with_settings(observers, supervision, limits.struts),
             self._channels,
             self.incoming,
             self._outgoing,

@@ -9,7 +9,7 @@
    had waited is known at the end of the tick.
 5. holding values: its signals do (`Incoming.read`).
 6. healthy sender: its device is not at fault (`_healthy_sender`).
-7. plausible: no limit refuses its heights (`_plausible`).
+7. plausible: no limit refuses what it measures (`_plausible`).
 
 Whether a frame is authentic is decided before, on the bus (`rig.bus.secoc`). No measurement of a
 refused frame is used; alarms in it count. It is counted where it was refused (`rig.bridge.counts`).
@@ -42,13 +42,16 @@ from rig.bridge.devices import (
 from rig.bridge.incoming_messages import Incoming, Values
 from rig.bridge.sample_times import EARLY, IN_TIME, LATE, FrameTime, SenderClock
 from rig.bridge.supervision_limits import (
+    RANGES_OF_MEASUREMENTS,
     Action,
     Excess,
-    LimitsByStrut,
+    Limit,
     Plausibility,
-    explain_height,
-    judge_height,
+    explain_measurement,
+    judge_measurement,
+    range_of_measurement,
 )
+from rig.channels.channel import Channel
 
 # Looking up a member of an enum costs as much as the CRC of a frame.
 _OK, _FIRST = FrameStatus.OK, FrameStatus.FIRST
@@ -72,7 +75,7 @@ class CheckMemory(Struct, frozen=True, gc=False):
     """What the checks remember between two ticks; most ticks leave it as it is."""
 
     strays: tuple[Strays, ...]
-    heights: tuple[Plausibility | None, ...]
+    measured: tuple[Plausibility | None, ...]
     healths: tuple[DeviceHealth, ...]
     counts: Counts
 
@@ -123,14 +126,18 @@ FrameCheck = Callable[[Reception, Frame, Values], bool]
 
 
 class FrameChecks:
-    """The checks of a bridge; its `own` messages are identified as by `Message.key`."""
+    """The checks of a bridge; its `own` messages are identified as by `Message.key`.
+
+    `limits` are those on what each of the `channels` measures.
+    """
 
     def __init__(
         self,
         incoming: Sequence[Incoming],
         own: frozenset[tuple[int, bool]],
         devices: Sequence[Device],
-        limits: LimitsByStrut,
+        channels: Sequence[Channel],
+        limits: Sequence[Sequence[Limit]],
     ) -> None:
         self.incoming = tuple(incoming)
         self.directory = Directory(item.message for item in incoming)
@@ -138,7 +145,7 @@ class FrameChecks:
         self._own = own
         self._devices = tuple(devices)
         self._device_of_id = {key: index for index, item in enumerate(devices) for key in item.ids}
-        self._limits = [[row for row in rows if row.value.is_measured] for rows in limits]
+        self._channels, self._limits = tuple(channels), tuple(limits)
         self._checks = [self._checks_of(item) for item in incoming]
         self._index_of = self.directory.index_of
 
@@ -259,8 +266,18 @@ class FrameChecks:
         if incoming.device is not None:
             index, device = incoming.device, self._devices[incoming.device]
             checks.append(_healthy_sender(incoming, index, device))
-        if any(self._limits[target.strut] for target in incoming.heights):
-            checks.append(_plausible(incoming, self._limits))
+        limited = [
+            _Limited(
+                delivery.value,
+                delivery.channel,
+                self._channels[delivery.channel].strut,
+                self._limits[delivery.channel],
+            )
+            for delivery in incoming.deliveries
+            if self._limits[delivery.channel]
+        ]
+        if limited:
+            checks.append(_plausible(incoming, limited))
         return tuple(checks)
 
 
@@ -296,27 +313,47 @@ def _healthy_sender(incoming: Incoming, index: int, device: Device) -> FrameChec
     return check
 
 
-def _plausible(incoming: Incoming, limits_of: LimitsByStrut) -> FrameCheck:
-    """A check for heights within the limits: a frame is used whole or not at all."""
+class _Limited(NamedTuple):
+    """A value of a frame that has limits: its index, channel and strut."""
+
+    value: int
+    channel: int
+    strut: int
+    limits: Sequence[Limit]
+
+
+def _plausible(incoming: Incoming, limited: Sequence[_Limited]) -> FrameCheck:
+    """A check for values within the limits: a frame is used whole or not at all."""
     shortest_ns = max(1, (incoming.message.cycle_time_ns or 0) // 2)
 
     def check(reception: Reception, frame: Frame, values: Values) -> bool:
-        heights, action = list(reception.memory.heights), 0
-        for target in incoming.heights:
-            height_m, limits = values[target.value], limits_of[target.strut]
-            memory = heights[target.strut]
+        measured, action = list(reception.memory.measured), 0
+        for index, channel, strut, limits in limited:
+            value, memory = values[index], measured[channel]
             if memory is None:
-                memory = Plausibility(height_m, frame.t_ns, frame.t_ns, shortest_ns)
-            heights[target.strut], required = judge_height(limits, memory, height_m, frame.t_ns)
+                memory = Plausibility(value, frame.t_ns, frame.t_ns, shortest_ns)
+            measured[channel], required = judge_measurement(limits, memory, value, frame.t_ns)
             if required > reception.action:
-                height = target.strut, height_m
-                reception.excess = explain_height(limits, memory, height, frame.t_ns, required)
+                reception.excess = explain_measurement(
+                    limits, memory, (strut, value), frame.t_ns, required
+                )
                 reception.action = required
             action = max(action, required)
         if action < Action.REFUSE:
-            reception.memory = replace(reception.memory, heights=tuple(heights))
+            reception.memory = replace(reception.memory, measured=tuple(measured))
             return True
         reception.count_refusal("implausible")
         return False
 
-    return check
+    if not all(row.value in RANGES_OF_MEASUREMENTS for it in limited for row in it.limits):
+        return check
+    ranges = [(it.value, *range_of_measurement(it.limits)) for it in limited]
+
+    def check_ranges(reception: Reception, frame: Frame, values: Values) -> bool:
+        # Ranges need no memory, and their values are within them in most frames.
+        for index, low, high in ranges:
+            if not low <= values[index] <= high:
+                return check(reception, frame, values)
+        return True
+
+    return check_ranges

@@ -79,18 +79,6 @@ class AlarmDelivery(NamedTuple):
     alarm: int
 
 
-class HeightDelivery(NamedTuple):
-    """A value of a frame that is the reference height of a strut.
-
-    Attributes:
-        value: Index of the value among the frame's.
-        strut: Index of the strut.
-    """
-
-    value: int
-    strut: int
-
-
 @dataclass(frozen=True, slots=True)
 class Incoming:
     """A message of the bench.
@@ -99,7 +87,6 @@ class Incoming:
         message: Its definition.
         read: Reads its frames.
         deliveries: Values that go to channels.
-        heights: Values that are reference heights.
         alarms: Values that are alarms.
         device: Index of the device that sends it; None if none is configured.
         struts: Struts whose reference heights it carries, a bit each.
@@ -112,7 +99,6 @@ class Incoming:
     message: Message
     read: Reader
     deliveries: tuple[Delivery, ...]
-    heights: tuple[HeightDelivery, ...] = ()
     alarms: tuple[AlarmDelivery, ...] = ()
     device: int | None = None
     struts: int = 0
@@ -157,11 +143,7 @@ def compile_incoming(
         )
         for channel in channels
     ]
-    heights = [
-        HeightDelivery(delivery.value, channel.strut)
-        for delivery, channel in zip(deliveries, channels, strict=True)
-        if channel.role is Role.HEIGHT
-    ]
+    struts = [channel.strut for channel in channels if channel.role is Role.HEIGHT]
     read = _compile_reader(message, decode)
     if counter:
         index = signals.index((counter, Dimension.NUMBER))
@@ -173,14 +155,13 @@ def compile_incoming(
         message,
         read,
         tuple(deliveries),
-        tuple(heights),
         tuple(
             AlarmDelivery(signals.index((item.signal, Dimension.NUMBER)), item.device, item.alarm)
             for item in alarms
         ),
         device,
-        sum({1 << height.strut for height in heights}),
-        1 << heights[0].strut if heights else 0,
+        sum({1 << strut for strut in struts}),
+        1 << struts[0] if struts else 0,
         compile_follower_of(channels[0], message) if channels else None,
         signals.index((time, Dimension.TIME)) if time else -1,
         any(_bears_estimate(channel) for channel in channels),

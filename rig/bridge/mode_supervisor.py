@@ -549,7 +549,7 @@ def _beyond(action: int, excess: Excess | None) -> Cause:
     event = _EVENT_OF_ACTION[Action(action)]
     if excess is None:
         return Cause(event)
-    return Cause(event, excess.strut, excess.value.value, excess.number, excess.bound)
+    return Cause(event, excess.strut, excess.quantity, excess.number, excess.bound)
 
 
 def _number_of(cause: Cause | None) -> int:

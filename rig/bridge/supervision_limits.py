@@ -1,6 +1,6 @@
 """Limits on measurements and estimates, and what is done beyond them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import Enum, IntEnum
 from math import inf, nan
 from typing import Annotated, Literal, NamedTuple
@@ -27,10 +27,12 @@ class Action(IntEnum):
 
 
 class LimitedValue(Enum):
-    """What a limit is set on: the first three of the measurement, the others of the estimate."""
+    """What a limit is set on: the first five of a measurement, the others of the estimate."""
 
     MEASURED_HEIGHT_M = "measured_height_m"
     MEASURED_RATE_M_PER_S = "measured_rate_m_per_s"
+    MEASURED = "measured"
+    MEASURED_RATE_PER_S = "measured_rate_per_s"
     UNCHANGED_S = "unchanged_s"
     HEIGHT_M = "height_m"
     FORCE_N = "force_n"
@@ -51,8 +53,12 @@ _CROSSING_S = 1.0
 _MEASURED = (
     LimitedValue.MEASURED_HEIGHT_M,
     LimitedValue.MEASURED_RATE_M_PER_S,
+    LimitedValue.MEASURED,
+    LimitedValue.MEASURED_RATE_PER_S,
     LimitedValue.UNCHANGED_S,
 )
+_OF_CHANNELS = _MEASURED[2:]
+_OF_CHANNELS_ALONE = (LimitedValue.MEASURED, LimitedValue.MEASURED_RATE_PER_S)
 
 
 class Limit(BaseModel):
@@ -60,11 +66,14 @@ class Limit(BaseModel):
 
     Attributes:
         strut: Strut that it is for; every strut if absent.
-        value: What is limited, with its unit. Of the measurement: `measured_height_m`,
-            `measured_rate_m_per_s`, `unchanged_s` (how long it may stay exactly the same). Of the
-            estimate: `height_m`, `force_n`, `virtual_force_n`, `innovation_m`; and of one that has
-            settled `force_rate_n_per_s` (its change since the last tick) and `force_difference_n`
-            (the estimated force less that of the load cell).
+        channel: Other measured signal that it is for: a key of `signals` such as `applied_force`,
+            or a further sensor as `strut.sensor`.
+        value: What is limited, with its unit. Of a measured height: `measured_height_m`,
+            `measured_rate_m_per_s`, `unchanged_s` (how long it may stay exactly the same). Of
+            another measured signal: `measured` and `measured_rate_per_s` in its unit by SI,
+            `unchanged_s`. Of the estimate: `height_m`, `force_n`, `virtual_force_n`,
+            `innovation_m`; and of one that has settled `force_rate_n_per_s` (its change since the
+            last tick) and `force_difference_n` (the estimated force less that of the load cell).
         low: Smallest value within.
         high: Largest value within.
         for_s: How long an estimate has to be beyond the limit until the action begins; for
@@ -78,6 +87,7 @@ class Limit(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     strut: Annotated[str, Field(min_length=1, max_length=255)] | None = None
+    channel: Annotated[str, Field(min_length=1, max_length=511)] | None = None
     value: LimitedValue
     low: Finite | None = None
     high: Finite | None = None
@@ -96,6 +106,15 @@ class Limit(BaseModel):
                 f"action refuse of {self.value.value}: expected warn, hold or safe, "
                 "because only a measurement can be refused"
             )
+        of_channel = self.channel is not None
+        if of_channel and (self.strut is not None or self.value not in _OF_CHANNELS):
+            names = ", ".join(value.value for value in _OF_CHANNELS)
+            raise ValueError(
+                f"{self.value.value} of channel {self.channel}: expected one of {names}, and no "
+                "strut"
+            )
+        if not of_channel and self.value in _OF_CHANNELS_ALONE:
+            raise ValueError(f"{self.value.value}: expected the key channel, such as applied_force")
         for key, time_s in (("for_s", self.for_s), ("clear_s", self.clear_s)):
             if time_s and self.value.is_measured:
                 raise ValueError(
@@ -140,84 +159,119 @@ LimitsByStrut = Sequence[Sequence[Limit]]
 """The limits of each strut, in the model's order."""
 
 
+class Limits(NamedTuple):
+    """The limits of a bridge.
+
+    Attributes:
+        struts: Of each strut, in the model's order; those on its measured height included.
+        channels: Of each channel of the bench those on what it measures.
+    """
+
+    struts: LimitsByStrut
+    channels: Sequence[Sequence[Limit]]
+
+
 class Excess(NamedTuple):
-    """A value beyond a limit: its strut, what it is, and the bound that it is beyond."""
+    """A value beyond a limit: its strut, what it is, and the bound that it is beyond.
+
+    Attributes:
+        channel: The channel that measured it, where the limit names one.
+    """
 
     strut: int
     value: LimitedValue
     number: float
     bound: float
+    channel: str = ""
+
+    @property
+    def quantity(self) -> str:
+        """What it is, in words of the configuration."""
+        return f"{self.channel} {self.value.value}".lstrip()
 
 
 class Plausibility(NamedTuple):
-    """Last measured height of a strut that was used, its time, and since when it is the same.
+    """Last value of a channel that was used, its time, and since when it is the same.
 
     Attributes:
         shortest_ns: Time between two measurements at least: half a cycle.
     """
 
-    height_m: float
+    value: float
     t_ns: int
     since_ns: int
     shortest_ns: int = 1
 
 
-def _values_of_height(
-    last: Plausibility, height_m: float, t_ns: int
+def _values_of_measurement(
+    last: Plausibility, value: float, t_ns: int
 ) -> Mapping[LimitedValue, float]:
-    """What limits on measurements are set on, of a new height."""
-    change_m = height_m - last.height_m
-    # Heights with one time stamp, as of a queue that is read late, are not simultaneous.
-    elapsed_ns = max(t_ns - last.t_ns, last.shortest_ns)
+    """What limits on measurements are set on, of a new one."""
+    change = value - last.value
+    # Measurements with one time stamp, as of a queue that is read late, are not simultaneous.
+    rate_per_s = change / (max(t_ns - last.t_ns, last.shortest_ns) * 1e-9)
     return {
-        LimitedValue.MEASURED_HEIGHT_M: height_m,
-        LimitedValue.MEASURED_RATE_M_PER_S: change_m / (elapsed_ns * 1e-9),
-        LimitedValue.UNCHANGED_S: 0.0 if change_m else (t_ns - last.since_ns) * 1e-9,
+        LimitedValue.MEASURED_HEIGHT_M: value,
+        LimitedValue.MEASURED: value,
+        LimitedValue.MEASURED_RATE_M_PER_S: rate_per_s,
+        LimitedValue.MEASURED_RATE_PER_S: rate_per_s,
+        LimitedValue.UNCHANGED_S: 0.0 if change else (t_ns - last.since_ns) * 1e-9,
     }
 
 
-def explain_height(
+def explain_measurement(
     limits: Sequence[Limit],
     last: Plausibility,
-    height: tuple[int, float],
+    measured: tuple[int, float],
     t_ns: int,
     action: int,
 ) -> Excess | None:
-    """Why a new height (index of its strut, and m) requires an action; None if it does not."""
-    strut, height_m = height
-    return _first_excess(limits, strut, _values_of_height(last, height_m, t_ns), action)
+    """Why a new value (its strut's index, and SI) requires an action; None if it does not."""
+    strut, value = measured
+    return _first_excess(limits, strut, _values_of_measurement(last, value, t_ns), action)
 
 
-def judge_height(
-    limits: Sequence[Limit], memory: Plausibility | None, height_m: float, t_ns: int
+def judge_measurement(
+    limits: Sequence[Limit], memory: Plausibility | None, value: float, t_ns: int
 ) -> tuple[Plausibility, int]:
-    """Memory of a strut after a new height, and the severest action required, 0 if none.
+    """Memory of a channel after a new value, and the severest action required, 0 if none.
 
     Before the first measurement there is no memory; `t_ns` is the time of arrival.
     """
-    last = memory or Plausibility(height_m, t_ns, t_ns)
-    values = _values_of_height(last, height_m, t_ns)
+    last = memory or Plausibility(value, t_ns, t_ns)
+    values = _values_of_measurement(last, value, t_ns)
     action = max([limit.action_at(values[limit.value]) for limit in limits], default=0)
     if action >= Action.REFUSE:
         # What was used last stays the reference, but only for as long as the rate allows for.
         return last, action
-    since_ns = last.since_ns if height_m == last.height_m else t_ns
-    return last._replace(height_m=height_m, t_ns=t_ns, since_ns=since_ns), action
+    since_ns = last.since_ns if value == last.value else t_ns
+    return last._replace(value=value, t_ns=t_ns, since_ns=since_ns), action
 
 
 RANGED = (LimitedValue.HEIGHT_M, LimitedValue.FORCE_N)
 """Values of an estimate that `range_of_estimate` holds the limits of."""
 
 
+RANGES_OF_MEASUREMENTS = (LimitedValue.MEASURED_HEIGHT_M, LimitedValue.MEASURED)
+"""Values of a measurement that `range_of_measurement` holds the limits of."""
+
+
 def range_of_estimate(limits: Sequence[Limit]) -> tuple[float, float, float, float]:
     """Range of height in m, then of force in N, within which none of a strut's limits is passed."""
-    bounds: list[float] = []
-    for value in RANGED:
-        rows = [limit for limit in limits if limit.value is value]
-        bounds.append(max([row.low for row in rows if row.low is not None], default=-inf))
-        bounds.append(min([row.high for row in rows if row.high is not None], default=inf))
-    low_m, high_m, low_n, high_n = bounds
+    low_m, high_m = _common_range(row for row in limits if row.value is LimitedValue.HEIGHT_M)
+    low_n, high_n = _common_range(row for row in limits if row.value is LimitedValue.FORCE_N)
     return low_m, high_m, low_n, high_n
+
+
+def range_of_measurement(limits: Sequence[Limit]) -> tuple[float, float]:
+    """Range of a channel's value within which none of its limits on it is passed."""
+    return _common_range(row for row in limits if row.value in RANGES_OF_MEASUREMENTS)
+
+
+def _common_range(limits: Iterable[Limit]) -> tuple[float, float]:
+    rows = list(limits)
+    low = max([row.low for row in rows if row.low is not None], default=-inf)
+    return low, min([row.high for row in rows if row.high is not None], default=inf)
 
 
 EstimateValues = Mapping[LimitedValue, float]
@@ -272,7 +326,8 @@ def _first_excess(
     for limit in limits:
         number = values[limit.value]
         if limit.action_at(number) == action:
-            return Excess(strut, limit.value, number, limit.bound_beyond(number))
+            bound, channel = limit.bound_beyond(number), limit.channel or ""
+            return Excess(strut, limit.value, number, bound, channel)
     return None
 
 

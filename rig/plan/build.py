@@ -38,7 +38,7 @@ def build_bridge(plan: Plan, *, sending: bool = True) -> Bridge:
         Supervisor(
             _build_estimator(plan),
             plan.config.supervision,
-            plan.limits,
+            plan.limits.struts,
             plan.bench_channel(LOAD_CELL_FORCE),
         ),
         plan.channels,

@@ -1,8 +1,9 @@
-"""Limits of each strut: those of the configuration, and those that follow from the DBC.
+"""Limits of struts and channels: those of the configuration, and those that follow from the DBC.
 
-A row of the configuration replaces what would follow for its value. From the DBC follow: a height
-outside its signal's range is refused; a model whose height leaves that range by a tenth of its span
-stops, since no bench is there; an estimated force that its signal cannot carry is invalid.
+A row of the configuration replaces what would follow for its value. From the DBC follow: a height,
+an applied force or a further sensor outside its signal's range is refused; a model whose height
+leaves that range by a tenth of its span stops, since no bench is there; an estimated force that its
+signal cannot carry is invalid.
 """
 
 import math
@@ -13,56 +14,74 @@ from can_dbc.codec import si_range, si_step
 from can_dbc.database import Message
 from can_dbc.errors import DatabaseError, InputError
 from can_dbc.units import Dimension
-from rig.bridge.supervision_limits import Limit, LimitedValue
-from rig.channels.channel import Channel
+from rig.bridge.supervision_limits import Limit, LimitedValue, Limits
+from rig.channels.channel import Channel, Role
+from rig.channels.measured_quantities import APPLIED_FORCE
 
 _MARGIN = 0.1
 """Of a height's span, by which the model may leave it: the innovation is that large at most."""
 
 
-def limits_by_strut(
+def resolve_limits(
     configured: Sequence[Limit],
     struts: Sequence[str],
-    heights: Iterable[Channel],
+    channels: Sequence[Channel],
     forces: Mapping[int, tuple[Message, str]],
     source: Path,
     *,
     can_compare: bool,
-) -> tuple[tuple[Limit, ...], ...]:
-    """Limits of each strut.
+) -> Limits:
+    """Limits of each strut and of each channel.
 
     Args:
         configured: The configuration's rows.
         struts: Names of the model's struts.
-        heights: Channels of the measured heights.
+        channels: Channels of the bench.
         forces: Strut -> message and signal that publish its force.
         can_compare: Whether the bench has a load cell with which an estimate can be compared.
         source: File of the configuration, for messages.
 
     Raises:
-        InputError: A row names a strut that the model does not have, or needs a load cell that the
-            bench does not have.
+        InputError: A row names a strut that the model does not have or a channel that is not
+            measured, or needs a load cell that the bench does not have.
     """
+    others = [channel for channel in channels if channel.role is not Role.HEIGHT]
     for index, row in enumerate(configured):
+        where = f"{source}: supervision.limits.{index}"
         if row.value is LimitedValue.FORCE_DIFFERENCE_N:
-            _check_comparison(row, f"{source}: supervision.limits.{index}", struts, can_compare)
-        if row.strut is not None and row.strut not in struts:
-            raise InputError(
-                f"{source}: supervision.limits.{index}.strut: {row.strut}: no such strut, expected "
-                f"{', '.join(struts)}"
-            )
-    channel_of = {channel.strut: channel for channel in heights}
-    every: list[tuple[Limit, ...]] = []
+            _check_comparison(row, where, struts, can_compare)
+        _check_name(row.strut, struts, f"{where}.strut", "no such strut")
+        names = [channel.name for channel in others]
+        _check_name(row.channel, names, f"{where}.channel", "not measured")
+    height_of = {channel.strut: channel for channel in channels if channel.role is Role.HEIGHT}
+    of_struts: list[tuple[Limit, ...]] = []
     for index, strut in enumerate(struts):
-        own = [row for row in configured if row.strut in (None, strut)]
-        taken = {row.value for row in own}
-        channel, force = channel_of.get(index), forces.get(index)
+        own = [row for row in configured if row.channel is None and row.strut in (None, strut)]
+        height, force = height_of.get(index), forces.get(index)
         defaults = [
-            *(() if channel is None else _of_height(channel)),
+            *(() if height is None else _of_height(height)),
             *(() if force is None else _of_force(*force)),
         ]
-        every.append((*own, *(row for row in defaults if row.value not in taken)))
-    return tuple(every)
+        of_struts.append(_with_defaults(own, defaults))
+    of_channels = [
+        tuple(row for row in of_struts[channel.strut] if row.value.is_measured)
+        if channel.role is Role.HEIGHT
+        else _with_defaults(
+            [row for row in configured if row.channel == channel.name], _of_channel(channel)
+        )
+        for channel in channels
+    ]
+    return Limits(tuple(of_struts), tuple(of_channels))
+
+
+def _check_name(name: str | None, known: Sequence[str], where: str, problem: str) -> None:
+    if name is not None and name not in known:
+        raise InputError(f"{where}: {name}: {problem}, expected {', '.join(known) or 'none'}")
+
+
+def _with_defaults(own: Sequence[Limit], defaults: Iterable[Limit]) -> tuple[Limit, ...]:
+    taken = {row.value for row in own}
+    return (*own, *(row for row in defaults if row.value not in taken))
 
 
 def _check_comparison(row: Limit, where: str, struts: Sequence[str], can_compare: bool) -> None:
@@ -87,18 +106,29 @@ def _of_height(channel: Channel) -> Iterator[Limit]:
     if found is None:
         return
     low_m, high_m = found
-    if _is_narrower_than_bits(channel.message, channel.signal):
-        half_m = 0.5 * si_step(channel.message, channel.signal, Dimension.LENGTH)
-        yield Limit(
-            value=LimitedValue.MEASURED_HEIGHT_M,
-            low=low_m - half_m,
-            high=high_m + half_m,
-            action="refuse",
-        )
+    yield from _of_range(channel, None, LimitedValue.MEASURED_HEIGHT_M)
     margin_m = _MARGIN * (high_m - low_m)
     yield Limit(
         value=LimitedValue.HEIGHT_M, low=low_m - margin_m, high=high_m + margin_m, action="safe"
     )
+
+
+def _of_channel(channel: Channel) -> Iterator[Limit]:
+    """The limit that follows from a signal that the estimate rests on."""
+    if channel.role is Role.SENSOR or channel.quantity is APPLIED_FORCE:
+        yield from _of_range(channel, channel.name, LimitedValue.MEASURED)
+
+
+def _of_range(channel: Channel, name: str | None, value: LimitedValue) -> Iterator[Limit]:
+    """The limit of a measured value, where the DBC's range excludes what its bits can hold."""
+    message, dimension = channel.message, channel.quantity.dimension
+    if message is None or not _is_narrower_than_bits(message, channel.signal):
+        return
+    found = _range(message, channel.signal, dimension)
+    if found is not None:
+        half = 0.5 * si_step(message, channel.signal, dimension)
+        low, high = found[0] - half, found[1] + half
+        yield Limit(channel=name, value=value, low=low, high=high, action="refuse")
 
 
 def _of_force(message: Message, signal: str) -> Iterator[Limit]:

@@ -27,14 +27,14 @@ from rig.bridge.published_quantities import (
     UNCERTAINTY,
     Publication,
 )
-from rig.bridge.supervision_limits import Limit
+from rig.bridge.supervision_limits import Limits
 from rig.bus.secoc import FD_LENGTHS, Authentication, AuthenticationSettings
 from rig.channels.channel import Channel, MeasuredSignal, Role, SignalName
 from rig.channels.measured_quantities import HEIGHT, LOAD_CELL_FORCE, Quantity
 from rig.observers.pi import PiObserver
 from rig.observers.protocol import AnyObserver
 from rig.plan.config import HeightSignal, Mapped, RunConfig, SensorSignal
-from rig.plan.limits import limits_by_strut
+from rig.plan.limits import resolve_limits
 
 _LARGEST_DELAY_DIFFERENCE_S = 0.02
 """Between the sensors of one strut: a filter that goes back by more at every reading takes half a
@@ -76,7 +76,7 @@ class Plan:
         config: The configuration, with every strut and every published signal named.
         channels: Channels of the bench: heights, quantities of the bench, further sensors.
         alarms: Messages with alarms of the devices, and the alarms.
-        limits: Limits of each strut: the configured ones, and those that follow from the DBC.
+        limits: Limits: the configured ones, and those that follow from the DBC.
         authentication: How frames are authenticated; None where they are not, and for the plan of
             a run, whose folder contains no key.
     """
@@ -90,7 +90,7 @@ class Plan:
     outgoing: tuple[PlannedMessage, ...]
     devices: tuple[Device, ...]
     alarms: tuple[tuple[Message, Alarm], ...]
-    limits: tuple[tuple[Limit, ...], ...]
+    limits: Limits
     authentication: Authentication | None = None
 
     @property
@@ -198,10 +198,10 @@ def resolve(config: RunConfig, source: Path, model: ModelSpec, database: Databas
         outgoing,
         _devices(config, channels),
         alarms,
-        limits_by_strut(
+        resolve_limits(
             config.supervision.limits,
             list(config.observers),
-            [channel for channel in channels if channel.role is Role.HEIGHT],
+            channels,
             {
                 item.strut: (planned.message, item.signal)
                 for planned in outgoing

@@ -13,7 +13,7 @@ from rig.bridge.incoming_messages import ClockSource, clock_source
 from rig.bridge.published_quantities import FORCE, VALID
 from rig.bridge.supervision_limits import Limit, LimitedValue
 from rig.bus.bus import SHARED_INTERFACES
-from rig.channels.channel import Channel
+from rig.channels.channel import Channel, Role
 from rig.channels.measured_quantities import LOAD_CELL_FORCE, SWITCHES
 from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import Pole, closed_loop_poles
@@ -251,16 +251,20 @@ def _publication(plan: Plan) -> list[Finding]:
 def _limits(plan: Plan) -> list[Finding]:
     """The limits of each strut, those that follow from the DBC included."""
     findings: list[Finding] = []
-    values = {row.value for rows in plan.limits for row in rows}
+    values = {row.value for rows in plan.limits.struts for row in rows}
     has_cell = plan.bench_channel(LOAD_CELL_FORCE) is not None and not plan.is_prescribed
     if has_cell and LimitedValue.FORCE_DIFFERENCE_N not in values:
         text = "none on force_difference_n: a scale that is wrong in the DBC would not be noticed, "
         text += "although the bench has a load cell that shows it"
         findings.append(Finding(Severity.WARNING, "limits of the load cell", text))
-    for name, rows in zip(plan.strut_names, plan.limits, strict=True):
+    for name, rows in zip(plan.strut_names, plan.limits.struts, strict=True):
         text = "; ".join(f"{row.value.value} {_bounds(row)}: {row.action}" for row in rows)
         severity = Severity.OK if rows else Severity.WARNING
         findings.append(Finding(severity, f"limits of {name}", text or "none"))
+    for channel, rows in zip(plan.channels, plan.limits.channels, strict=True):
+        if rows and channel.role is not Role.HEIGHT:
+            text = "; ".join(f"{row.value.value} {_bounds(row)}: {row.action}" for row in rows)
+            findings.append(Finding(Severity.OK, f"limits of {channel.name}", text))
     return findings
 
 

@@ -14,9 +14,11 @@ from can_dbc.protection import INITIAL, FrameStatus
 from rig.bridge.counts import Counts
 from rig.bridge.devices import Device, initial_health
 from rig.bridge.frame_checks import SECOND_SENDER_FRAMES, FrameChecks, Reception, Strays
-from rig.bridge.incoming_messages import AlarmDelivery, HeightDelivery, Incoming
+from rig.bridge.incoming_messages import AlarmDelivery, Delivery, Incoming
 from rig.bridge.sample_times import EARLY, IN_TIME, LATE
 from rig.bridge.supervision_limits import Action, Excess, Limit, LimitedValue, Plausibility
+from rig.channels.channel import Channel, Role
+from rig.channels.measured_quantities import HEIGHT
 
 MS = 1_000_000
 MESSAGE = load_database(DEFAULT_DATABASE).message("BENCH_MEASUREMENT")
@@ -45,7 +47,7 @@ def read(sequence, frame):
 
 
 def incoming(index=0, cycle_ns=MS, **parts):
-    return Incoming(message(index, cycle_ns), read, (), **parts)
+    return Incoming(message(index, cycle_ns), read, **{"deliveries": ()} | parts)
 
 
 def frame(*values, t_ns=0, index=0, status=FrameStatus.OK, lost=0):
@@ -54,11 +56,16 @@ def frame(*values, t_ns=0, index=0, status=FrameStatus.OK, lost=0):
     return Frame(t_ns, FIRST_ID + index, data)
 
 
+def channels(count):
+    """Heights of as many struts; a channel has the index of its strut."""
+    return [Channel(index, Role.HEIGHT, HEIGHT, "", "", index, MS) for index in range(count)]
+
+
 class Bench:
     """Checks that frames pass tick by tick."""
 
     def __init__(self, *items, devices=(), limits=(), own=((OWN_ID, False),)):
-        self.checks = FrameChecks(items, frozenset(own), devices, limits)
+        self.checks = FrameChecks(items, frozenset(own), devices, channels(len(limits)), limits)
         self.sequences, self.memory = self.checks.init(0)
         self.clocks = [None] * len(items)
         self.action, self.excess = 0, None
@@ -79,11 +86,11 @@ class Bench:
 
 def test_before_the_first_tick_nothing_is_known():
     devices = (Device("A", 1, 0x81, 0), Device("B", 2, 0x82, 0, alarms=2))
-    checks = FrameChecks([incoming(), incoming(1)], frozenset(), devices, [[], [], []])
+    checks = FrameChecks([incoming(), incoming(1)], frozenset(), devices, channels(3), [[], [], []])
     sequences, memory = checks.init(7)
     assert sequences == (INITIAL, INITIAL)
     assert memory.strays == (Strays(0, 0),) * 2
-    assert memory.heights == (None, None, None)
+    assert memory.measured == (None, None, None)
     assert memory.healths == tuple(initial_health(device, 7) for device in devices)
     assert memory.counts == Counts()
 
@@ -391,9 +398,13 @@ def row(action, low=0.2, high=0.6, value="measured_height_m"):
     return Limit(value=LimitedValue(value), low=low, high=high, action=action)
 
 
+REMEMBERED = Limit(value=LimitedValue.UNCHANGED_S, high=1e9, action="warn")
+"""Never passed; but what is measured is remembered for it."""
+
+
 def heights(*struts, **parts):
     return incoming(
-        heights=tuple(HeightDelivery(i, strut) for i, strut in enumerate(struts)), **parts
+        deliveries=tuple(Delivery(i, strut, 0) for i, strut in enumerate(struts)), **parts
     )
 
 
@@ -401,7 +412,7 @@ def heights(*struts, **parts):
     ("action", "passes"), [("warn", True), ("refuse", False), ("hold", False), ("safe", False)]
 )
 def test_a_height_beyond_a_limit_is_dropped_with_its_frame_unless_it_is_warned_of(action, passes):
-    bench = Bench(heights(0), limits=[[row(action)]])
+    bench = Bench(heights(0), limits=[[row(action), REMEMBERED]])
     assert len(bench.receive(frame(60, t_ns=5))) == 1
     assert (bench.action, bench.excess) == (0, None)
     assert bool(bench.receive(frame(61, t_ns=6))) == passes
@@ -409,15 +420,16 @@ def test_a_height_beyond_a_limit_is_dropped_with_its_frame_unless_it_is_warned_o
     assert bench.action == Action[action.upper()]
     assert bench.excess == Excess(0, LimitedValue.MEASURED_HEIGHT_M, 0.61, 0.6)
     seen = Plausibility(0.61 if passes else 0.6, *(6, 6) if passes else (5, 5), MS // 2)
-    assert bench.memory.heights == (seen,)
+    assert bench.memory.measured == (seen,)
 
 
 def test_a_frame_with_one_implausible_height_leaves_no_trace_of_the_others():
-    bench = Bench(heights(2, 0), limits=[[row("refuse")], [], [row("refuse")]])
+    rows = [row("refuse"), REMEMBERED]
+    bench = Bench(heights(2, 0), limits=[rows, [], rows])
     assert bench.receive(frame(40, 10)) == bench.receive(frame(10, 40)) == []
-    assert bench.memory.heights == (None, None, None)
+    assert bench.memory.measured == (None, None, None)
     assert len(bench.receive(frame(30, 40, t_ns=9))) == 1
-    seen = [item and (item.height_m, item.t_ns) for item in bench.memory.heights]
+    seen = [item and (item.value, item.t_ns) for item in bench.memory.measured]
     assert seen == [(0.4, 9), None, (0.3, 9)]
 
 
@@ -441,19 +453,23 @@ def test_the_first_measurement_that_requires_the_severest_action_is_named():
     assert (bench.action, bench.excess) == (0, None)
 
 
-def test_limits_on_the_estimate_refuse_no_frame():
-    bench = Bench(heights(0), limits=[[row("safe", value="height_m")]])
-    assert len(bench.receive(frame(10))) == 1
-    assert bench.memory.heights == (None,)
+def test_ranges_alone_are_not_remembered_and_refuse_the_same():
+    bench = Bench(heights(0, 1), limits=[[row("refuse")], [row("warn")]])
+    assert len(bench.receive(frame(20, 60))) == 1
+    assert bench.memory.measured == (None, None)
+    assert bench.receive(frame(19, 40)) == bench.receive(frame(61, 40)) == []
+    assert bench.excess == Excess(0, LimitedValue.MEASURED_HEIGHT_M, 0.61, 0.6)
+    assert len(bench.receive(frame(40, 61))) == 1
+    assert bench.excess == Excess(1, LimitedValue.MEASURED_HEIGHT_M, 0.61, 0.6)
 
 
 @pytest.mark.parametrize(
     ("cycle_ns", "shortest_ns"), [(None, 1), (0, 1), (1, 1), (2, 1), (5, 2), (MS, MS // 2)]
 )
 def test_two_heights_are_half_a_cycle_apart_at_least(cycle_ns, shortest_ns):
-    bench = Bench(heights(0, cycle_ns=cycle_ns), limits=[[row("refuse")]])
+    bench = Bench(heights(0, cycle_ns=cycle_ns), limits=[[row("refuse"), REMEMBERED]])
     bench.receive(frame(40, t_ns=3))
-    assert bench.memory.heights == (Plausibility(0.4, 3, 3, shortest_ns),)
+    assert bench.memory.measured == (Plausibility(0.4, 3, 3, shortest_ns),)
 
 
 def test_the_rate_of_a_height_is_that_of_the_times_when_its_frames_were_due():
@@ -471,7 +487,7 @@ def test_the_sender_of_a_height_is_judged_before_the_height():
     bench.receive(Frame(0, 0x81, ERROR))
     assert bench.receive(frame(10)) == []
     assert bench.counts == {"from_faulty_device": 1, "refused": 1}
-    assert (bench.action, bench.memory.heights) == (0, (None,))
+    assert (bench.action, bench.memory.measured) == (0, (None,))
 
 
 def test_what_was_lost_before_a_frame_without_values_is_counted():
@@ -491,15 +507,17 @@ def test_a_frame_without_values_begins_a_senders_clock_and_carries_it_on():
 
 def test_a_frame_that_contradicts_its_senders_clock_leaves_nothing_behind():
     """Neither a limit on its height acts, nor does it become what the next one is held against."""
-    limits = (Limit(value=LimitedValue.MEASURED_HEIGHT_M, high=1.0, action="safe"),)
-    heights = (HeightDelivery(0, 0),)
+    limits = (row("safe", high=1.0), REMEMBERED)
+    deliveries = (Delivery(0, 0, 0),)
     bench = Bench(
-        incoming(follow=lambda _before, due_ns, _cycles: FrameDue(due_ns, EARLY), heights=heights),
+        incoming(
+            follow=lambda _before, due_ns, _cycles: FrameDue(due_ns, EARLY), deliveries=deliveries
+        ),
         limits=(limits,),
     )
     assert bench.receive(frame(200)) == []
     assert (bench.action, bench.counts) == (0, {"refused": 1, "untimed": 1})
-    assert bench.memory.heights == (None,)
+    assert bench.memory.measured == (None,)
 
 
 @pytest.mark.parametrize("status", [FrameStatus.WRONG_LENGTH, FrameStatus.WRONG_CRC])

@@ -18,7 +18,6 @@ from rig.bridge.incoming_messages import (
     AlarmDelivery,
     ClockSource,
     Delivery,
-    HeightDelivery,
     clock_source,
     compile_incoming,
 )
@@ -121,7 +120,6 @@ def test_a_value_that_two_channels_have_is_read_once(protected):
     made = compile_incoming(protected, [RECORDED, height(4, 2, delay_ns=7), CELL])
     assert made.message is protected
     assert made.deliveries == (Delivery(0, 9, 0), Delivery(1, 4, 7), Delivery(0, 8, 9))
-    assert made.heights == (HeightDelivery(1, 2),)
     told = Frame(0, 256, payload(protected, 40, 0, 25, 0, 0, 0))
     assert made.read(INITIAL, told)[1:] == (FrameStatus.FIRST, (25.0, pytest.approx(0.4)))
 
@@ -138,7 +136,7 @@ def test_alarms_and_what_says_that_a_sensor_measures_are_read_with_the_values(pr
 
 def test_alarms_alone_are_read_without_a_clock(protected):
     made = compile_incoming(protected, [], [Alarm("STATE", 0, 0)])
-    assert (made.deliveries, made.heights, made.struts, made.first_strut) == ((), (), 0, 0)
+    assert (made.deliveries, made.struts, made.first_strut) == ((), 0, 0)
     assert made.alarms == (AlarmDelivery(0, 0, 0),)
     assert made.device is made.follow is None
     assert not made.is_awaited
@@ -147,7 +145,6 @@ def test_alarms_alone_are_read_without_a_clock(protected):
 def test_the_struts_of_a_message_are_those_of_its_reference_heights(protected):
     pair = compile_incoming(protected, [CELL, height(0, 2), height(1, 0, "OTHER_HEIGHT")])
     assert (pair.struts, pair.first_strut) == (0b101, 0b100)
-    assert pair.heights == (HeightDelivery(1, 2), HeightDelivery(2, 0))
     assert compile_incoming(protected, [CELL]).struts == 0
 
 
@@ -255,7 +252,7 @@ def test_the_frames_of_one_that_states_its_time_follow_each_other_by_it(database
     message = database.message("COUNTED")
     channel = dataclasses.replace(height(0, 0, time="STAMP"), interval_ns=10 * MS)
     made = compile_incoming(message, [channel])
-    checks = FrameChecks([made], frozenset(), (), ((),))
+    checks = FrameChecks([made], frozenset(), (), [channel], ((),))
     sequences, memory = checks.init(0)
     reception = Reception(sequences, (None,), memory)
     rng = np.random.default_rng(3)

@@ -17,10 +17,10 @@ from rig.bridge.supervision_limits import (
     Limit,
     LimitedValue,
     Plausibility,
-    explain_height,
+    explain_measurement,
     find_action_of_delays,
     find_excess,
-    judge_height,
+    judge_measurement,
     range_of_estimate,
     update_delays,
     values_of_estimate,
@@ -41,6 +41,7 @@ STRUT = estimate()
 
 ESTIMATES = {"height_m": 0.4, "force_n": 20.0, "virtual_force_n": 3.0, "innovation_m": 0.001}
 MEASURED = ("measured_height_m", "measured_rate_m_per_s", "unchanged_s")
+OF_CHANNELS = ("measured", "measured_rate_per_s", "unchanged_s")
 bounds = st.one_of(st.none(), st.floats(-10.0, 10.0))
 
 
@@ -49,7 +50,8 @@ def row(value, action="warn", low=None, high=None):
 
 
 def test_every_value_is_of_the_measurement_or_of_the_estimate():
-    assert {item.value for item in LimitedValue if item.is_measured} == set(MEASURED)
+    measured = {item.value for item in LimitedValue if item.is_measured}
+    assert measured == {*MEASURED, *OF_CHANNELS}
     estimates = {item.value for item in LimitedValue if not item.is_measured}
     assert estimates - {item.value for item in COMPARED} == set(ESTIMATES)
 
@@ -119,21 +121,21 @@ LAST = Plausibility(0.5, 10 * MS, 4 * MS, MS // 2)
 )
 def test_the_rate_is_the_change_over_the_time_but_half_a_cycle_at_least(t_ns, rate_m_per_s):
     rate = row("measured_rate_m_per_s", "warn", high=0.1)
-    excess = explain_height([rate], LAST, (3, 0.501), t_ns, Action.WARN)
+    excess = explain_measurement([rate], LAST, (3, 0.501), t_ns, Action.WARN)
     assert excess == Excess(3, LimitedValue.MEASURED_RATE_M_PER_S, pytest.approx(rate_m_per_s), 0.1)
 
 
 def test_a_falling_height_has_a_negative_rate():
     rate = row("measured_rate_m_per_s", "warn", low=-0.1)
-    excess = explain_height([rate], LAST, (0, 0.498), 12 * MS, Action.WARN)
+    excess = explain_measurement([rate], LAST, (0, 0.498), 12 * MS, Action.WARN)
     assert (excess.number, excess.bound) == (pytest.approx(-1.0), -0.1)
 
 
 def test_a_height_is_unchanged_since_the_first_of_its_kind():
     stuck = row("unchanged_s", "warn", high=0.001)
-    excess = explain_height([stuck], LAST, (0, 0.5), 12 * MS, Action.WARN)
+    excess = explain_measurement([stuck], LAST, (0, 0.5), 12 * MS, Action.WARN)
     assert (excess.number, excess.bound) == (pytest.approx(0.008), 0.001)
-    assert explain_height([stuck], LAST, (0, 0.5001), 12 * MS, Action.WARN) is None
+    assert explain_measurement([stuck], LAST, (0, 0.5001), 12 * MS, Action.WARN) is None
 
 
 def test_the_limit_that_requires_the_action_explains_it():
@@ -144,29 +146,29 @@ def test_the_limit_that_requires_the_action_explains_it():
     ]
     at = (1, 0.8), 12 * MS
     height = LimitedValue.MEASURED_HEIGHT_M
-    assert explain_height(rows, LAST, *at, Action.WARN) == Excess(1, height, 0.8, 0.6)
-    assert explain_height(rows, LAST, *at, Action.REFUSE) == Excess(1, height, 0.8, 0.7)
-    assert explain_height(rows, LAST, *at, Action.SAFE) is None
+    assert explain_measurement(rows, LAST, *at, Action.WARN) == Excess(1, height, 0.8, 0.6)
+    assert explain_measurement(rows, LAST, *at, Action.REFUSE) == Excess(1, height, 0.8, 0.7)
+    assert explain_measurement(rows, LAST, *at, Action.SAFE) is None
 
 
 def test_a_height_that_is_used_is_what_the_next_is_compared_with():
-    assert judge_height([], LAST, 0.6, 12 * MS) == (
+    assert judge_measurement([], LAST, 0.6, 12 * MS) == (
         Plausibility(0.6, 12 * MS, 12 * MS, MS // 2),
         0,
     )
-    assert judge_height([], LAST, 0.5, 12 * MS) == (
+    assert judge_measurement([], LAST, 0.5, 12 * MS) == (
         Plausibility(0.5, 12 * MS, 4 * MS, MS // 2),
         0,
     )
     warned = row("measured_height_m", "warn", high=0.55)
-    memory, action = judge_height([warned], LAST, 0.6, 12 * MS)
-    assert (memory.height_m, action) == (0.6, Action.WARN)
+    memory, action = judge_measurement([warned], LAST, 0.6, 12 * MS)
+    assert (memory.value, action) == (0.6, Action.WARN)
 
 
 @pytest.mark.parametrize("action", ["refuse", "hold", "safe"])
 def test_a_height_that_is_not_used_is_forgotten(action):
     limit = row("measured_height_m", action, high=0.55)
-    assert judge_height([limit], LAST, 0.6, 12 * MS) == (LAST, Action[action.upper()])
+    assert judge_measurement([limit], LAST, 0.6, 12 * MS) == (LAST, Action[action.upper()])
 
 
 def test_the_first_height_has_no_rate_and_is_unchanged_for_no_time():
@@ -174,7 +176,7 @@ def test_the_first_height_has_no_rate_and_is_unchanged_for_no_time():
         row("measured_rate_m_per_s", "safe", low=-1e-9, high=1e-9),
         row("unchanged_s", "safe", high=0.0),
     ]
-    assert judge_height(rows, None, 0.5, 7) == (Plausibility(0.5, 7, 7, 1), 0)
+    assert judge_measurement(rows, None, 0.5, 7) == (Plausibility(0.5, 7, 7, 1), 0)
 
 
 @pytest.mark.parametrize("value", ESTIMATES)

@@ -3,7 +3,7 @@
 from can_dbc.database import load_database
 from can_dbc.frame import Frame
 from can_dbc.protection import FrameStatus, SequenceState
-from rig.bridge.incoming_messages import HeightDelivery, compile_incoming
+from rig.bridge.incoming_messages import Delivery, compile_incoming
 from rig.channels.channel import Channel, Role
 from rig.channels.measured_quantities import HEIGHT
 
@@ -24,7 +24,7 @@ def verdicts(tmp_path, *payloads):
     message = load_database(path).message("M")
     level = Channel(0, Role.HEIGHT, HEIGHT, "strut", "", 0, 1, message=message, signal="LEVEL")
     made = compile_incoming(message, [level])
-    assert made.heights == (HeightDelivery(0, 0),)
+    assert made.deliveries == (Delivery(0, 0, 0),)
     return [made.read(SequenceState(), Frame(0, 256, data))[1:] for data in payloads]
 
 

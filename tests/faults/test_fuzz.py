@@ -46,7 +46,7 @@ def fuzz(ticks, seed):
             compile_decoder(item.message, ["HEIGHT"], [Dimension.LENGTH]),
         )
         for item in bridge.incoming
-        if item.heights
+        if item.struts
     }
     frames = 0
     for index in range(ticks):

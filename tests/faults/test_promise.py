@@ -128,7 +128,10 @@ def gateway(held, every):
 
 
 class Frozen:
-    """The height of one moment for 600 ms, in frames that are right in all else."""
+    """The height of one moment for 600 ms, in frames that are right in all else.
+
+    A subclass may freeze, or change, the applied force instead.
+    """
 
     def __init__(self, begin_ms: int = BEGIN_MS) -> None:
         self._begin_ms = begin_ms
@@ -143,17 +146,26 @@ class Frozen:
         self._height_m = height_m if self._height_m is None else self._height_m
         return self._height_m
 
+    def change_both(self, height_m: float, applied_n: float) -> tuple[float, float]:
+        return self.change(height_m), applied_n
+
     def __call__(self, ms, frames):
         if not self._begin_ms <= ms < self._begin_ms + 600:
             return frames
         found = []
         for frame in frames:
             if frame.arbitration_id == 0x100:
-                height_m, applied_n = self._decode(frame.data)
-                data = self._encode([self.change(height_m), applied_n])[0]
+                data = self._encode(self.change_both(*self._decode(frame.data)))[0]
                 frame = replace(frame, data=self._protect(data, frame.data[1] & 0x0F))  # noqa: PLW2901
             found.append(frame)
         return found
+
+
+class FrozenForce(Frozen):
+    """The applied force of one moment for 600 ms."""
+
+    def change_both(self, height_m, applied_n):
+        return height_m, self.change(applied_n)
 
 
 def acknowledged(ms):
@@ -193,6 +205,22 @@ EVENTS = [
         Frozen(),
         acknowledged,
         supervision={"limits": [{"value": "unchanged_s", "high": 0.02, "action": "refuse"}]},
+    ),
+    Event(
+        "the applied force is frozen for 600 ms (limit `unchanged_s: 0.004`), then acknowledged",
+        STOP,
+        FrozenForce(BEGIN_MS + 75),
+        acknowledged,
+        supervision={
+            "limits": [
+                {
+                    "channel": "applied_force",
+                    "value": "unchanged_s",
+                    "high": 0.004,
+                    "action": "refuse",
+                }
+            ]
+        },
     ),
     Event(
         "the disk is full for 500 ms (`log_fault: safe`), then acknowledged",

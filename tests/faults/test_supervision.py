@@ -15,7 +15,7 @@ from can_dbc.units import Dimension
 from can_dbc.yaml_file import load_yaml
 from rig.bridge.counts import Conditions
 from rig.bridge.mode_supervisor import TRANSITIONS, Event, next_mode
-from rig.bridge.supervision_limits import Action, Limit, LimitedValue, judge_height
+from rig.bridge.supervision_limits import Action, Limit, LimitedValue, judge_measurement
 from rig.bridge.values import Mode, Request
 from rig.closed_loop.loop import SampleTiming
 from rig.closed_loop.settling import settling_times_ns
@@ -158,7 +158,7 @@ def row(value, low, high, action):
 def seen_after(limits, *measured):
     seen, actions = None, []
     for height_m, t_ms in measured:
-        seen, action = judge_height(limits, seen, height_m, t_ms * MS)
+        seen, action = judge_measurement(limits, seen, height_m, t_ms * MS)
         actions.append(action)
     return actions
 

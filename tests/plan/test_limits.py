@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
+from pydantic import ValidationError
 
 from can_dbc.database import DEFAULT_DATABASE, load_database
 from can_dbc.errors import InputError
@@ -13,8 +14,8 @@ from rig.bridge.mode_supervisor import Supervisor
 from rig.bridge.supervision_limits import Limit, LimitedValue
 from rig.bridge.values import Mode, StepInput
 from rig.channels.channel import Channel, Role
-from rig.channels.measured_quantities import HEIGHT
-from rig.plan.limits import limits_by_strut
+from rig.channels.measured_quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE
+from rig.plan.limits import resolve_limits
 from tests.bridge.test_modes import MS, STRUT, SUPERVISION, Scripted
 
 SOURCE = Path("rig.yaml")
@@ -38,9 +39,9 @@ def with_range(low, high):
 
 def resolved(configured=(), struts=("strut",), heights=None, forces=None, can_compare=False):
     heights = [height()] if heights is None else heights
-    return limits_by_strut(
+    return resolve_limits(
         configured, struts, heights, forces or {}, SOURCE, can_compare=can_compare
-    )
+    ).struts
 
 
 def test_the_bits_limit_what_the_range_does_not():
@@ -115,3 +116,87 @@ def test_the_estimate_of_a_strut_is_judged_by_its_own_limits():
         assert output.mode is expected
     cause = state.cause
     assert (cause.strut, cause.value, cause.limit) == (1, 5.0, 4.0)
+
+
+FORCE = Channel(
+    1,
+    Role.BENCH,
+    APPLIED_FORCE,
+    "applied_force",
+    "",
+    -1,
+    1,
+    message=MESSAGE,
+    signal="APPLIED_FORCE",
+)
+CELL = Channel(
+    1,
+    Role.BENCH,
+    LOAD_CELL_FORCE,
+    "load_cell_force",
+    "",
+    -1,
+    1,
+    message=DATABASE.message("BENCH_AUXILIARY"),
+    signal="LOAD_CELL_FORCE",
+)
+
+
+DRIVEN = (height(), FORCE)
+
+
+def of_channels(configured=(), channels=DRIVEN):
+    return resolve_limits(configured, ("strut",), channels, {}, SOURCE, can_compare=False).channels
+
+
+def test_what_a_height_measures_has_the_limits_of_its_strut():
+    own = row(value="measured_height_m", high=1.0, action="refuse")
+    of_height, _ = of_channels([own, row(value="force_n", high=1.0)])
+    assert of_height == (own,)
+
+
+def test_an_applied_force_beyond_the_dbcs_range_is_refused():
+    _, (limit,) = of_channels()
+    assert (limit.channel, limit.value, limit.action) == (
+        "applied_force",
+        LimitedValue.MEASURED,
+        "refuse",
+    )
+    assert (limit.low, limit.high) == (pytest.approx(-5000.005), pytest.approx(5000.005))
+
+
+def test_what_no_estimate_rests_on_has_no_limit_by_itself():
+    assert of_channels(channels=(height(), CELL))[1] == ()
+    own = row(channel="load_cell_force", value="measured", high=10.0, action="warn")
+    assert of_channels([own], (height(), CELL))[1] == (own,)
+
+
+def test_a_row_for_a_channel_replaces_what_would_follow_and_is_no_struts():
+    own = row(channel="applied_force", value="measured", high=10.0, action="safe")
+    stuck = row(channel="applied_force", value="unchanged_s", high=1.0)
+    of_height, of_force = of_channels([own, stuck])
+    assert (of_height, of_force) == ((), (own, stuck))
+
+
+def test_a_row_for_a_channel_that_is_not_measured_is_one_line():
+    for name in ("strut", "temperature"):
+        own = row(channel=name, value="measured", high=10.0)
+        with pytest.raises(
+            InputError, match=rf"0\.channel: {name}: not measured, .* applied_force"
+        ):
+            of_channels([own])
+
+
+@pytest.mark.parametrize(
+    ("keys", "text"),
+    [
+        ({"channel": "applied_force", "value": "force_n"}, "expected one of measured, measured_ra"),
+        ({"channel": "applied_force", "value": "measured_height_m"}, "expected one of measured,"),
+        ({"channel": "a", "strut": "b", "value": "measured"}, "and no strut"),
+        ({"value": "measured"}, "expected the key channel"),
+        ({"value": "measured_rate_per_s"}, "expected the key channel"),
+    ],
+)
+def test_a_limit_is_of_a_strut_or_of_a_channel(keys, text):
+    with pytest.raises(ValidationError, match=text):
+        row(high=1.0, **keys)
