@@ -62,8 +62,9 @@ class OneCoordinate:
         self._put_force: Callable[[float], None] = coordinate.setForce
         self._solve: Callable[[], None] = skeleton.dart.computeForwardDynamics
         self._acceleration: Callable[[], float] = coordinate.getAcceleration
-        self._only_force_matters = False
-        self._only_force_matters = self._depends_on_force_alone()
+        self.acceleration = self._accelerate_from
+        if self._depends_on_force_alone():
+            self.acceleration = self._accelerate_by
 
     def numbers(self, value: float) -> tuple[float, ...]:
         return (value,)
@@ -71,10 +72,13 @@ class OneCoordinate:
     def move(self, q: float, v: float, h: float) -> float:
         return q + h * v
 
-    def acceleration(self, q: float, v: float, force: float) -> float:
-        if not self._only_force_matters:
-            self._put_position(q)
-            self._put_velocity(v)
+    def _accelerate_from(self, q: float, v: float, force: float) -> float:
+        self._put_position(q)
+        self._put_velocity(v)
+        return self._accelerate_by(q, v, force)
+
+    def _accelerate_by(self, q: float, v: float, force: float) -> float:
+        del q, v
         self._put_force(force)
         self._solve()
         return self._acceleration()
@@ -88,7 +92,7 @@ class OneCoordinate:
         return all(
             len(
                 {
-                    self.acceleration(0.3 * math.sin(1.7 * k), math.cos(2.3 * k), force_n)
+                    self._accelerate_from(0.3 * math.sin(1.7 * k), math.cos(2.3 * k), force_n)
                     for k in range(16)
                 }
             )

@@ -121,8 +121,9 @@ class Reception:
             self.memory = replace(self.memory, healths=healths)
 
 
-FrameCheck = Callable[[Reception, Frame, Values], bool]
-"""Whether it passes a frame with some values; what it refuses it counts."""
+FrameCheck = Callable[[Reception, Values, int], bool]
+"""Whether it passes a frame by its values and the time in ns when it was due; what it refuses it
+counts."""
 
 
 class FrameChecks:
@@ -146,7 +147,7 @@ class FrameChecks:
         self._devices = tuple(devices)
         self._device_of_id = {key: index for index, item in enumerate(devices) for key in item.ids}
         self._channels, self._limits = tuple(channels), tuple(limits)
-        self._checks = [self._checks_of(item) for item in incoming]
+        self._checks = [self._check_of(item) for item in incoming]
         self._index_of = self.directory.index_of
 
     def init(self, t_ns: int) -> tuple[tuple[SequenceState, ...], CheckMemory]:
@@ -193,22 +194,17 @@ class FrameChecks:
             if values is None:
                 continue
             # One that contradicts its sender's clock leaves nothing behind.
-            if timing is EARLY or self._pass(reception, index, frame, due_ns, values):
+            if timing is EARLY or self._pass(reception, index, values, due_ns):
                 passed.append((incoming, values, due_ns, timing))
         return passed if is_timed else _drop_unclear(reception, passed)
 
-    def _pass(
-        self, reception: Reception, index: int, frame: Frame, due_ns: int, values: Values
-    ) -> bool:
+    def _pass(self, reception: Reception, index: int, values: Values, due_ns: int) -> bool:
         """Whether a frame of a message holds values, and no check refuses it."""
         if not values:
             reception.count_refusal("no_value")
             return False
-        checks = self._checks[index]
-        if not checks:
-            return True
-        timed = frame if due_ns == frame.t_ns else replace(frame, t_ns=due_ns)
-        return all(check(reception, timed, values) for check in checks)
+        check = self._checks[index]
+        return check is None or check(reception, values, due_ns)
 
     def _is_from(self, reception: Reception, index: int, frame: Frame) -> bool:
         """Whether a frame is from a device: another one may send the same group."""
@@ -260,12 +256,12 @@ class FrameChecks:
         if stray.frames >= SECOND_SENDER_FRAMES:
             reception.count(second_sender=1)
 
-    def _checks_of(self, incoming: Incoming) -> tuple[FrameCheck, ...]:
-        """The checks that a message needs after its protection, in their order."""
-        checks: list[FrameCheck] = []
+    def _check_of(self, incoming: Incoming) -> FrameCheck | None:
+        """The checks that a message needs after its protection, as one; None if it needs none."""
+        healthy = plausible = None
         if incoming.device is not None:
             index, device = incoming.device, self._devices[incoming.device]
-            checks.append(_healthy_sender(incoming, index, device))
+            healthy = _healthy_sender(incoming, index, device)
         limited = [
             _Limited(
                 delivery.value,
@@ -277,8 +273,10 @@ class FrameChecks:
             if self._limits[delivery.channel]
         ]
         if limited:
-            checks.append(_plausible(incoming, limited))
-        return tuple(checks)
+            plausible = _plausible(incoming, limited)
+        if healthy is None or plausible is None:
+            return healthy or plausible
+        return _both(healthy, plausible)
 
 
 def _drop_unclear(reception: Reception, passed: Sequence[Passed]) -> list[Passed]:
@@ -296,16 +294,25 @@ def _drop_unclear(reception: Reception, passed: Sequence[Passed]) -> list[Passed
     return kept[::-1]
 
 
+def _both(first: FrameCheck, second: FrameCheck) -> FrameCheck:
+    """A check that passes what one and then another passes."""
+
+    def check(reception: Reception, values: Values, due_ns: int) -> bool:
+        return first(reception, values, due_ns) and second(reception, values, due_ns)
+
+    return check
+
+
 def _healthy_sender(incoming: Incoming, index: int, device: Device) -> FrameCheck:
     """A check for frames of a healthy device; alarms in the frame itself count."""
 
-    def check(reception: Reception, frame: Frame, values: Values) -> bool:
+    def check(reception: Reception, values: Values, due_ns: int) -> bool:
         reception.set_health(index, update_by_data(device, reception.memory.healths[index]))
         for alarm in incoming.alarms:
             health = reception.memory.healths[alarm.device]
             raw = int(values[alarm.value])
             reception.set_health(alarm.device, update_by_alarm(health, alarm.alarm, raw))
-        if fault(device, reception.memory.healths[index], frame.t_ns) is None:
+        if fault(device, reception.memory.healths[index], due_ns) is None:
             return True
         reception.count_refusal("from_faulty_device")
         return False
@@ -326,16 +333,16 @@ def _plausible(incoming: Incoming, limited: Sequence[_Limited]) -> FrameCheck:
     """A check for values within the limits: a frame is used whole or not at all."""
     shortest_ns = max(1, (incoming.message.cycle_time_ns or 0) // 2)
 
-    def check(reception: Reception, frame: Frame, values: Values) -> bool:
+    def check(reception: Reception, values: Values, due_ns: int) -> bool:
         measured, action = list(reception.memory.measured), 0
         for index, channel, strut, limits in limited:
             value, memory = values[index], measured[channel]
             if memory is None:
-                memory = Plausibility(value, frame.t_ns, frame.t_ns, shortest_ns)
-            measured[channel], required = judge_measurement(limits, memory, value, frame.t_ns)
+                memory = Plausibility(value, due_ns, due_ns, shortest_ns)
+            measured[channel], required = judge_measurement(limits, memory, value, due_ns)
             if required > reception.action:
                 reception.excess = explain_measurement(
-                    limits, memory, (strut, value), frame.t_ns, required
+                    limits, memory, (strut, value), due_ns, required
                 )
                 reception.action = required
             action = max(action, required)
@@ -349,11 +356,11 @@ def _plausible(incoming: Incoming, limited: Sequence[_Limited]) -> FrameCheck:
         return check
     ranges = [(it.value, *range_of_measurement(it.limits)) for it in limited]
 
-    def check_ranges(reception: Reception, frame: Frame, values: Values) -> bool:
+    def check_ranges(reception: Reception, values: Values, due_ns: int) -> bool:
         # Ranges need no memory, and their values are within them in most frames.
         for index, low, high in ranges:
             if not low <= values[index] <= high:
-                return check(reception, frame, values)
+                return check(reception, values, due_ns)
         return True
 
     return check_ranges

@@ -278,8 +278,7 @@ class Supervisor:
         self._limits_before = [
             [row for row in rows if row.value not in COMPARED] for rows in self._limits
         ]
-        # By bound, then by strut.
-        self._ranges = list(zip(*map(range_of_estimate, self._limits), strict=True))
+        self._ranges = list(map(range_of_estimate, self._limits))
         self._is_limited = any(self._limits)
         limited = {row.value for rows in estimates for row in rows}
         self._is_judged_always = bool(limited.difference(RANGED) or self._delayed)
@@ -316,7 +315,7 @@ class Supervisor:
         values: Sequence[EstimateValues] = ()
         is_judged = self._is_judged_always
         if self._is_limited:
-            for strut, low_m, high_m, low_n, high_n in zip(struts, *self._ranges, strict=False):
+            for strut, (low_m, high_m, low_n, high_n) in zip(struts, self._ranges, strict=False):
                 if not (low_m <= strut.height_m <= high_m and low_n <= strut.force_n <= high_n):
                     is_judged = True
         if is_judged:

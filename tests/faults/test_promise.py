@@ -4,6 +4,7 @@ The node decodes the bridge's frames with cantools; the run's log and the bridge
 not used. `pytest tests/faults -n 0 --promise-table FILE` writes what was measured.
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -28,6 +29,7 @@ from tests.faults.trial import BEGIN_MS, MS, Gateway, Switches, Trial, trial_wit
 
 DBC = cantools.database.load_file(DEFAULT_DATABASE)
 ESTIMATE, STATUS = DBC.get_message_by_name("RIG_ESTIMATE"), DBC.get_message_by_name("RIG_STATUS")
+UNCERTAINTY = DBC.get_message_by_name("RIG_UNCERTAINTY")
 FILTER = ErrorFilter(bandwidth_hz=19.0, noise_std_m=2e-6)
 OBSERVERS = {
     "published PI": None,
@@ -66,18 +68,23 @@ class Event(NamedTuple):
 
 
 class Received(NamedTuple):
-    """What the node received at a tick; state and first cause are those of the last status."""
+    """What the node received at a tick; mode and standard deviation are those received last.
+
+    Attributes:
+        std_n: Stated standard deviation of the force; NaN where none is published.
+    """
 
     ms: int
     is_valid: bool
     force_n: float
     mode: Mode
+    std_n: float
 
 
 def follow(trial: Trial, event: Event, end_ms: int = END_MS, first_ms: int = 0) -> list[Received]:
     """Run a trial through an event; returns what a node on the bus received."""
     received: list[Received] = []
-    mode, missed = Mode.INIT, 0
+    mode, std_n, missed = Mode.INIT, math.nan, 0
     queue: list[Frame] = []
     trial.state = trial.bridge.init(first_ms * MS)
     for ms in range(end_ms):
@@ -98,7 +105,18 @@ def follow(trial: Trial, event: Event, end_ms: int = END_MS, first_ms: int = 0) 
                 mode = Mode(STATUS.decode(frame.data, decode_choices=False)["STATE"])
         [data] = [it.data for it in result.frames if it.arbitration_id == ESTIMATE.frame_id]
         values = ESTIMATE.decode(data, decode_choices=False)
-        received.append(Received(ms, bool(values["VALID"]), values["SPRING_DAMPER_FORCE"], mode))
+        for frame in result.frames:
+            if frame.arbitration_id == UNCERTAINTY.frame_id:
+                std_n = UNCERTAINTY.decode(frame.data)["FORCE_STD"]
+        received.append(
+            Received(
+                ms,
+                bool(values["VALID"]),
+                values["SPRING_DAMPER_FORCE"],
+                mode,
+                std_n,
+            )
+        )
     return received
 
 
@@ -235,6 +253,13 @@ def largest_error_n(received, truth_n):
     return max(abs(it.force_n - truth_n[it.ms]) for it in received if it.is_valid)
 
 
+def covered_share(received, truth_n):
+    """Share of the valid ticks whose error is within 1.96 of the stated standard deviations."""
+    valid = [item for item in received if item.is_valid]
+    within = [abs(it.force_n - truth_n[it.ms]) <= 1.96 * it.std_n for it in valid]
+    return sum(within) / len(within) if within else 1.0
+
+
 def describe(received, begin_ms):
     """Modes that followed, when a frame was invalid first, and when one was valid again."""
     modes = []
@@ -252,6 +277,7 @@ def describe(received, begin_ms):
 def test_no_valid_force_errs_by_more_than_three_times_the_settled_one(
     order, promise, truth_n, settled_n
 ):
+    """And where a standard deviation is stated, it is true meanwhile."""
     event = EVENTS[order]
     ratios = {}
     for name, observer in OBSERVERS.items():
@@ -261,6 +287,9 @@ def test_no_valid_force_errs_by_more_than_three_times_the_settled_one(
         assert ratios[name] <= MOST
         assert received[-1].is_valid
         if name == "noise-aware":
+            assert covered_share(received, truth_n) >= 0.95
+            behind = [item for item in received if BEGIN_MS <= item.ms < BEGIN_MS + 1500]
+            assert covered_share(behind, truth_n) >= 0.95
             modes, within, again = describe(received, BEGIN_MS)
     promise(order, event.words, modes, within, again, ratios, event.duty)
 

@@ -83,6 +83,10 @@ class Trial:
             ready = ready.with_config(ready.config.model_copy(update=observers))
         content = ready.config.model_dump(mode="json")
         content["supervision"] |= supervision
+        if observer is not None and observer.knows_std:
+            std = {"message": "RIG_UNCERTAINTY", "signal": "FORCE_STD"}
+            for published in content["publish"].values():
+                published["force_std"] = std
         config = ready.config.model_validate(content | {"devices": devices or {}})
         self.ready = ready.with_config(config)
         self.bridge: Bridge = build_bridge(self.ready)
