@@ -22,10 +22,6 @@ from rig.closed_loop.strut_response import strut_responses
 from rig.observers.protocol import AnyObserver, Innovation, ObserverState, Start
 from rig.observers.strut_sensors import Instant, model_height_m, model_reading
 
-_APPLIED, _TEMPERATURE, _READING, _UNUSED = -1, -2, -3, -4
-"""Routes of samples other than heights; a load cell of the bench is logged and not used here."""
-
-
 _MOST_CYCLES = 3
 """Cycles after which a missing applied force is old, if that is longer than a height's age."""
 
@@ -68,13 +64,9 @@ class FreeModelState(Struct, frozen=True, gc=False):
     bands: tuple[InnovationBand, ...] = ()
 
 
-class _Received(Struct, frozen=True, gc=False):
-    """Samples of a step, by what they are used for; None where none arrived."""
-
-    heights: Sequence[Sample | None]
-    readings: Sequence[Sample]
-    applied: Sample | None
-    temperature_c: float | None
+_Received = Sequence[Sample | None]
+"""The newest samples of a step: of each strut's height, then applied force, then temperature; last
+one that is not used here, as of a load cell that is only logged. None where none arrived."""
 
 
 SettlingTimes = Callable[[Sequence[AnyObserver]], Sequence[int | None]]
@@ -111,7 +103,15 @@ class FreeModelEstimator:
         self._stale_after_ns = stale_after_ns
         self._settling_times = settling_times
         self._settling_ns = tuple(settling_times(observers))
-        self._routes = [_route(channel) for channel in channels]
+        struts = plant.struts
+        self._applied, self._temperature, unused = struts, struts + 1, struts + 2
+        slots = {APPLIED_FORCE: self._applied, TEMPERATURE: self._temperature}
+        self._slots = [
+            channel.strut if channel.role is Role.HEIGHT else slots.get(channel.quantity, unused)
+            for channel in channels
+        ]
+        self._nothing: list[Sample | None] = [None] * (unused + 1)
+        self._is_sensor = [channel.role is Role.SENSOR for channel in channels]
         self._heights = {
             channel.strut: channel for channel in channels if channel.role is Role.HEIGHT
         }
@@ -173,37 +173,26 @@ class FreeModelEstimator:
     ) -> tuple[FreeModelState, Estimate | None]:
         """Advance the model to a time and correct it with what was measured."""
         received = self._sort(step_input.samples)
-        t_ns, new, last = step_input.t_ns, received.applied, state.applied
-        if state.model is not None:
-            if (
-                new is not None
-                and last is not None
-                and new.t_ns - last.t_ns > self._longest_silence_ns
-                and self._has_heights_since(last.t_ns + self._longest_silence_ns, state)
-            ):
-                # The observers took what was missing of the force for one of the strut.
-                state = self.restart(state, t_ns)
-                return self._start_if_possible(state, t_ns, received)
-            return self._observe(state, state.model, t_ns, received)
-        return self._start_if_possible(state, t_ns, received)
+        if state.model is None:
+            return self._start_if_possible(state, step_input.t_ns, received)
+        new, last = received[self._applied], state.applied
+        if (
+            new is not None
+            and last is not None
+            and new.t_ns - last.t_ns > self._longest_silence_ns
+            and self._has_heights_since(last.t_ns + self._longest_silence_ns, state)
+        ):
+            # The observers took what was missing of the force for one of the strut.
+            state = self.restart(state, step_input.t_ns)
+            return self._start_if_possible(state, step_input.t_ns, received)
+        return self._observe(state, state.model, step_input, received)
 
     def _sort(self, samples: Sequence[Sample]) -> _Received:
-        """Samples by what they are used for; of a quantity of the bench the newest."""
-        heights: list[Sample | None] = [None] * len(self.observers)
-        readings: list[Sample] = []
-        applied = temperature_c = None
-        routes = self._routes
+        """The newest samples, by what they are used for."""
+        received, slots = self._nothing.copy(), self._slots
         for sample in samples:
-            route = routes[sample.channel]
-            if route >= 0:
-                heights[route] = sample
-            elif route == _APPLIED:
-                applied = sample
-            elif route == _TEMPERATURE:
-                temperature_c = sample.value
-            elif route == _READING:
-                readings.append(sample)
-        return _Received(heights, readings, applied, temperature_c)
+            received[slots[sample.channel]] = sample
+        return received
 
     def collect(self, state: FreeModelState, step_input: StepInput) -> tuple[FreeModelState, bool]:
         """State with the newest measurements of those that a start requires."""
@@ -215,10 +204,11 @@ class FreeModelEstimator:
         required = [observer.measurements_to_start for observer in self.observers]
         first = tuple(
             (*old, new)[-count:] if new is not None and count else old
-            for new, old, count in zip(received.heights, state.first, required, strict=True)
+            for new, old, count in zip(received, state.first, required, strict=False)
         )
-        temperature_c = _latest(received.temperature_c, state.temperature_c)
-        applied = received.applied or state.applied
+        warm = received[self._temperature]
+        temperature_c = state.temperature_c if warm is None else warm.value
+        applied = received[self._applied] or state.applied
         state = FreeModelState(
             t_ns, temperature_c, first, state.observers, applied=applied, bands=state.bands
         )
@@ -298,22 +288,26 @@ class FreeModelEstimator:
         return min(newest_ns, state.applied.t_ns + self._applied_grace_ns)
 
     def _observe(
-        self, state: FreeModelState, loaded: LoadedModel[ModelState], t_ns: int, received: _Received
+        self,
+        state: FreeModelState,
+        loaded: LoadedModel[ModelState],
+        step_input: StepInput,
+        received: _Received,
     ) -> tuple[FreeModelState, Estimate | None]:
         """Advance the model to the tick and correct it with what was measured.
 
         After too long a gap in a height or the applied force the model starts again from the
         measurements behind it instead.
         """
-        heights, readings = received.heights, received.readings
-        applied, temperature_c = received.applied or state.applied, received.temperature_c
+        t_ns, before_ns, is_settled = step_input.t_ns, state.t_ns, state.is_settled
+        applied, warm = received[self._applied] or state.applied, received[self._temperature]
         applied_n = loaded.applied_force_n if applied is None else applied.value
-        if temperature_c is None:
-            temperature_c = loaded.temperature_c
-        model = self._plant.step(loaded, (t_ns - state.t_ns) * 1e-9, applied_n)
+        temperature_c = loaded.temperature_c if warm is None else warm.value
+        model = self._plant.step(loaded, (t_ns - before_ns) * 1e-9, applied_n)
         instants: tuple[Instant, ...] = ()
         further: Sequence[tuple[Innovation, ...]] = ()
         if self._oldest_ns:
+            readings = [it for it in step_input.samples if self._is_sensor[it.channel]]
             forces_n: Sequence[float] = ()
             if readings:
                 no_forces = (0.0,) * self.struts
@@ -323,26 +317,20 @@ class FreeModelEstimator:
         observers: list[ObserverState] = []
         virtual_n: list[float] = []
         bands: list[InnovationBand] = []
-        oldest_ns, is_settled = t_ns, state.is_settled
+        oldest_ns = t_ns
         for strut, observer in enumerate(self.observers):
-            measured = heights[strut]
+            measured, before, band = received[strut], state.observers[strut], state.bands[strut]
             innovation = None
-            before, band = state.observers[strut], state.bands[strut]
             if measured is not None:
                 measured_ns = measured.t_ns
                 if measured_ns - before.measured_ns > state.longest_gaps_ns[strut]:
                     return self._start_if_possible(self.restart(state, t_ns), t_ns, received)
                 model_m = model_height_m(measured_ns, strut, t_ns, model.struts, instants)
-                innovation_m = measured.value - model_m
+                height_m = measured.value
+                innovation_m = height_m - model_m
                 innovation = Innovation(innovation_m, measured_ns)
-                band = update_band(
-                    band,
-                    measured.value,
-                    innovation_m,
-                    measured_ns,
-                    self._sensing[strut],
-                    is_settled,
-                )
+                sensing = self._sensing[strut]
+                band = update_band(band, height_m, innovation_m, measured_ns, sensing, is_settled)
             if further:
                 observed = observer.step(before, t_ns, innovation, further[strut])
             else:
@@ -352,9 +340,11 @@ class FreeModelEstimator:
             virtual_n.append(observed.virtual_force_n)
             oldest_ns = min(oldest_ns, observed.measured_ns)
         loaded = self._plant.load(model, virtual_n, applied_n, temperature_c)
+        if applied is not None and applied.t_ns + self._applied_grace_ns < oldest_ns:
+            oldest_ns = applied.t_ns + self._applied_grace_ns
         after = FreeModelState(
             t_ns,
-            loaded.temperature_c,
+            temperature_c,
             (),
             tuple(observers),
             loaded,
@@ -365,9 +355,6 @@ class FreeModelEstimator:
             state.longest_gaps_ns,
             tuple(bands),
         )
-        if applied is not None:
-            until_ns = applied.t_ns + self._applied_grace_ns
-            oldest_ns = min(oldest_ns, until_ns)
         return self._estimate(after, loaded, oldest_ns)
 
     def _has_heights_since(self, t_ns: int, state: FreeModelState) -> bool:
@@ -498,15 +485,6 @@ def start_of_motion(samples: Sequence[Sample], t_ns: int) -> tuple[float, float]
     return float(height), float(slope) / longest_s
 
 
-def _route(channel: Channel) -> int:
-    """Route of a channel's samples: the index of the strut of a height, else one of the above."""
-    if channel.role is Role.HEIGHT:
-        return channel.strut
-    if channel.role is Role.SENSOR:
-        return _READING
-    return {APPLIED_FORCE: _APPLIED, TEMPERATURE: _TEMPERATURE}.get(channel.quantity, _UNUSED)
-
-
 def _sensing(channel: Channel | None) -> tuple[float, int]:
     """Step in m and interval in ns of a height's sensor; a step of 0 where it is on no bus."""
     if channel is None or channel.message is None or not channel.signal:
@@ -528,7 +506,3 @@ def _grace_ns(channels: Sequence[Channel], stale_after_ns: int) -> int:
     if not all(map(_has_cycle, channels)):
         return sys.maxsize
     return max([_MOST_CYCLES * item.interval_ns - stale_after_ns for item in channels] + [0])
-
-
-def _latest(new: float | None, old: float) -> float:
-    return old if new is None else new
