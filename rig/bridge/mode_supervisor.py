@@ -24,12 +24,11 @@ from rig.bridge.supervision_limits import (
     RANGED,
     Action,
     Delay,
-    EstimateValues,
     Excess,
     Limit,
     LimitsByStrut,
-    find_action_of_delays,
     find_excess,
+    find_passed,
     range_of_estimate,
     update_delays,
     values_of_estimate,
@@ -270,7 +269,6 @@ class Supervisor:
         self._stale_after_ns = settings.stale_after_ns
         self._safe_after_ns = settings.safe_after_ns
         estimates = [[row for row in rows if not row.value.is_measured] for rows in limits]
-        self._rows = estimates
         self._limits = [[row for row in rows if not row.has_memory] for rows in estimates]
         self._delayed = [
             (index, row) for index, rows in enumerate(estimates) for row in rows if row.has_memory
@@ -310,17 +308,17 @@ class Supervisor:
         after, estimate = self.estimator.step(before, step_input)
         if estimate is None:
             return *self._wait(state, t_ns, after, reports), reports.action
-        action = reports.action
+        action, excess = reports.action, reports.excess
         struts, measured_ns = estimate.struts, estimate.measured_ns
-        values: Sequence[EstimateValues] = ()
         is_judged = self._is_judged_always
         if self._is_limited:
             for strut, (low_m, high_m, low_n, high_n) in zip(struts, self._ranges, strict=False):
                 if not (low_m <= strut.height_m <= high_m and low_n <= strut.force_n <= high_n):
                     is_judged = True
         if is_judged:
-            state, values, required = self._judge(state, step_input, estimate)
-            action = max(action, required)
+            state, required, passed = self._judge(state, step_input, estimate)
+            if required > action:
+                action, excess = required, passed
         is_calm = (
             mode is _RUNNING
             and estimate.is_settled
@@ -337,28 +335,32 @@ class Supervisor:
             return state, StepOutput(mode, struts, estimate.left_out), action
         if estimate.diverged >= 0:
             state = replace(state, diverged=Divergence(estimate.diverged, t_ns))
-        causes = self._causes(t_ns, estimate, values, action, reports)
+        causes = self._causes(t_ns, estimate, (action, excess), reports)
         return *self._change(state, t_ns, after, estimate, causes), action
 
     def _judge(
         self, state: SupervisedState, step_input: StepInput, estimate: Estimate
-    ) -> tuple[SupervisedState, Sequence[EstimateValues], int]:
-        """State, what limits on an estimate are set on, and the severest action they require."""
-        struts, t_ns = estimate.struts, step_input.t_ns
+    ) -> tuple[SupervisedState, int, Excess | None]:
+        """State, the severest action that limits on the estimate require, and what requires it."""
+        struts, t_ns, is_settled = estimate.struts, step_input.t_ns, estimate.is_settled
         if self._comparison is None:
             values = list(map(values_of_estimate, struts))
         else:
             history = self._comparison.update(state.history, t_ns, struts, step_input.samples)
             state = replace(state, history=history)
             values = values_with_history(struts, history)
-        limits = self._limits if estimate.is_settled else self._limits_before
+        limits = self._limits if is_settled else self._limits_before
         action = max(map(worst_action, limits, values), default=0)
         if self._delayed:
             delays = update_delays(self._delayed, state.delays, values, t_ns)
             state = replace(state, delays=delays)
-            delayed = find_action_of_delays(self._delayed, delays, is_settled=estimate.is_settled)
-            action = max(action, delayed)
-        return state, values, action
+            passed = find_passed(self._delayed, delays, is_settled=is_settled)
+            action = max([action, *(row.severity for _, row in passed)])
+            limits = [
+                [*rows, *(row for strut, row in passed if strut == index)]
+                for index, rows in enumerate(limits)
+            ]
+        return state, action, find_excess(limits, values, action) if action else None
 
     def end(self, state: SupervisedState) -> StepOutput:
         """What is published when the run ends: the safe output, whatever the mode was."""
@@ -396,11 +398,11 @@ class Supervisor:
         self,
         t_ns: int,
         estimate: Estimate,
-        values: Sequence[EstimateValues],
-        action: int,
+        required: tuple[int, Excess | None],
         reports: Reports,
     ) -> Iterator[Cause]:
-        """What a tick with an estimate shows, in order."""
+        """What a tick with an estimate shows, in order; limits require an action, for an excess."""
+        action, excess = required
         yield from self._missing_ticks(reports)
         yield self._age(estimate.measured_ns, t_ns)
         if reports.missed_share:
@@ -413,9 +415,6 @@ class Supervisor:
         else:
             yield Cause(Event.UNSETTLED)
         if action >= Action.HOLD:
-            excess = reports.excess
-            if action > reports.action:
-                excess = find_excess(self._rows, values, action)
             yield _beyond(action, excess)
         yield from _surroundings(reports)
 

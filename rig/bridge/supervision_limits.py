@@ -370,13 +370,12 @@ def _update_delay(delay: Delay, row: Limit, number: float, t_ns: int) -> Delay:
     return Delay(not delay.is_passed, t_ns)
 
 
-def find_action_of_delays(
+def find_passed(
     rows: Sequence[tuple[int, Limit]], delays: Sequence[Delay], *, is_settled: bool
-) -> int:
-    """The severest action of limits that count as passed, 0 if none does."""
-    passed = [
-        row.severity
-        for (_, row), delay in zip(rows, delays, strict=True)
+) -> list[tuple[int, Limit]]:
+    """The limits that count as passed, each with the index of its strut."""
+    return [
+        (strut, row)
+        for (strut, row), delay in zip(rows, delays, strict=True)
         if delay.is_passed and (is_settled or row.value not in COMPARED)
     ]
-    return max(passed, default=0)

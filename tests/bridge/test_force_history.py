@@ -95,11 +95,11 @@ def test_the_history_is_as_long_as_a_sample_may_be_late():
     assert history.forces[-1][0] == 88 * MS  # one before the oldest sample that counts, at 89 ms
 
 
-def supervised(**row):
+def supervised(*others, **row):
     """Modes of a run of ticks whose force and load cell are given: (force, cell, is settled)."""
-    limit = Limit(**{"low": -10.0, "high": 10.0, "action": "hold"} | row)
+    limits = (*others, Limit(**{"low": -10.0, "high": 10.0, "action": "hold"} | row))
     estimator = Scripted()
-    supervisor = Supervisor(estimator, Supervision(limits=(limit,)), [[limit]], CELL)
+    supervisor = Supervisor(estimator, Supervision(limits=limits), [limits], CELL)
 
     def follow(*ticks):
         state, modes = supervisor.init(0), []
@@ -161,3 +161,20 @@ def test_a_limit_with_a_delay_is_held_against_the_history_too():
     follow = supervised(value="force_difference_n", for_s=0.002)
     modes, _ = follow(*[(50.0, 50.0, True)] * 2, *[(50.0, 0.0, True)] * 4)
     assert modes == [*[Mode.RUNNING] * 3, *[Mode.HOLD] * 3]
+
+
+def test_a_limit_whose_delay_has_not_gone_by_is_not_named():
+    slow = Limit(value="height_m", high=0.1, for_s=0.1, action="hold")
+    modes, state = supervised(slow, value="force_n", high=100.0)(
+        (50.0, 0.0, True), (101.0, 0, True)
+    )
+    assert modes == [Mode.RUNNING, Mode.HOLD]
+    assert (state.cause.quantity, state.cause.value) == ("force_n", 101.0)
+
+
+def test_a_limit_whose_delay_has_gone_by_is_named_and_its_severity_counts():
+    slow = Limit(value="height_m", high=0.1, for_s=0.002, action="safe")
+    modes, state = supervised(slow, value="force_n", high=100.0)(*[(101.0, 0.0, True)] * 3)
+    assert modes == [Mode.HOLD, Mode.HOLD, Mode.SAFE]
+    cause = state.cause
+    assert (cause.event, cause.quantity, cause.value) == (Event.BEYOND_SAFE, "height_m", 0.4)

@@ -18,8 +18,8 @@ from rig.bridge.supervision_limits import (
     LimitedValue,
     Plausibility,
     explain_measurement,
-    find_action_of_delays,
     find_excess,
+    find_passed,
     judge_measurement,
     range_of_estimate,
     update_delays,
@@ -300,8 +300,8 @@ def test_only_a_difference_from_the_load_cell_is_left_after_a_time_of_its_own():
 def test_before_an_estimate_has_settled_its_history_requires_nothing():
     rows = [(0, delayed("force_rate_n_per_s", "safe")), (0, delayed("force_n", "hold"))]
     passed = (Delay(is_passed=True, since_ns=0),) * 2
-    assert find_action_of_delays(rows, passed, is_settled=False) == Action.HOLD
-    assert find_action_of_delays(rows, passed, is_settled=True) == Action.SAFE
+    assert find_passed(rows, passed, is_settled=False) == rows[1:]
+    assert find_passed(rows, passed, is_settled=True) == rows
 
 
 def test_a_delay_is_over_to_the_nanosecond_whatever_its_decimals():
@@ -336,14 +336,9 @@ def test_with_other_limits_every_delay_begins_anew():
     assert update_delays(rows, passed, struts, 5) == (Delay(is_passed=False, since_ns=5),) * 2
 
 
-def test_the_severest_delayed_limit_that_is_passed_counts():
-    rows = [(0, delayed(action=action)) for action in ("warn", "safe", "hold")]
-    for is_passed, expected in (
-        ((False, False, False), 0),
-        ((True, False, False), Action.WARN),
-        ((True, False, True), Action.HOLD),
-        ((True, True, True), Action.SAFE),
-    ):
+def test_limits_that_count_as_passed_are_found_with_their_struts():
+    rows = [(number, delayed(action=action)) for number, action in enumerate(("warn", "hold"))]
+    for is_passed in itertools.product((False, True), repeat=2):
         delays = [Delay(is_passed=item, since_ns=0) for item in is_passed]
-        assert find_action_of_delays(rows, delays, is_settled=True) == expected
-    assert find_action_of_delays((), (), is_settled=True) == 0
+        expected = [row for row, passed in zip(rows, is_passed, strict=True) if passed]
+        assert find_passed(rows, delays, is_settled=True) == expected

@@ -12,11 +12,10 @@ from rig.bridge.counts import Conditions
 from rig.bridge.mode_supervisor import Event
 from rig.bridge.operation import Operation, OperationState
 from rig.bridge.supervision_limits import (
-    Action,
     Delay,
     Limit,
     LimitedValue,
-    find_action_of_delays,
+    find_passed,
     update_delays,
     values_of_estimate,
 )
@@ -253,9 +252,7 @@ def test_a_delayed_limit_acts_after_its_time_and_ends_after_it(is_beyond, delay_
         # Since the last tick that was otherwise, as long as the delay has gone by.
         if all(it is not passed for it in history[1:]):
             passed = not passed
-        assert find_action_of_delays([(0, row)], delays, is_settled=True) == (
-            Action.HOLD if passed else 0
-        )
+        assert bool(find_passed([(0, row)], delays, is_settled=True)) is passed
 
 
 def test_a_delayed_limit_holds_the_estimate_and_names_its_cause():
