@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from can_dbc.frame import Frame
-from rig.log.step_columns import BUS_FAULT, LOG_FAULT, Step
+from rig.log.step_columns import BUS_FAULT, LIMITED, LOG_FAULT, Step
 
 
 class Entry(NamedTuple):
@@ -38,8 +38,9 @@ class Capture(NamedTuple):
 class Captures:
     """Watches a run tick by tick for triggers.
 
-    A trigger is a change to HOLD or SAFE, a fault of the bus or of the log that was not there the
-    tick before, or one given with `trigger`. A trigger within a window does not lengthen it.
+    A trigger is a change to HOLD or SAFE, a fault of the bus or of the log, or a limit passed, that
+    was not there the tick before, or one given with `trigger`. A trigger within a window does not
+    lengthen it.
     """
 
     def __init__(
@@ -94,4 +95,4 @@ class Captures:
             return "bus"
         if began & LOG_FAULT:
             return "log"
-        return self._capture_name(self._mode, step.mode)
+        return self._capture_name(self._mode, step.mode) or ("limit" if began & LIMITED else None)

@@ -16,7 +16,7 @@ from msgspec.structs import astuple
 from rig.bridge.values import Request, StepInput, StepOutput, StrutOutput
 from rig.channels.channel import Channel, Role
 
-BUS_FAULT, LOG_FAULT = 2, 4
+BUS_FAULT, LOG_FAULT, LIMITED = 2, 4, 32
 REQUEST_FLAGS = {Request.ACKNOWLEDGE: 1, Request.ARM: 8, Request.DISARM: 16}
 """Bits of `Step.flags`."""
 
@@ -42,7 +42,8 @@ class Step(Struct, frozen=True, gc=False):
     """The record of one tick.
 
     received: Frames received, so that a replay gives each tick the same ones.
-    flags: Bit 0 acknowledged, bit 1 bus fault, bit 2 log fault, bit 3 armed, bit 4 disarmed.
+    flags: Bit 0 acknowledged, bit 1 bus fault, bit 2 log fault, bit 3 armed, bit 4 disarmed, bit 5
+        beyond a limit.
     numbers: Measured and published values, as the log's further columns are named.
     """
 

@@ -243,7 +243,7 @@ class LogConfig(_Frozen):
         capture_before_s: Time before a fault that is kept apart.
         capture_after_s: Time after the fault that is kept apart.
         most_captures: Windows kept apart in one run; 0 for none. A window is opened by HOLD, SAFE,
-            a fault of bus or log, and SIGUSR2.
+            a limit that is passed (one that only warns, too), a fault of bus or log, and SIGUSR2.
         sync_s: Interval at which all that is logged is written to the disk itself: what a loss of
             power takes at most. Null leaves it to the system, which takes half a minute; so does a
             simulated run, which can be repeated.

@@ -11,7 +11,7 @@ from can_dbc.frame import Frame
 from rig.bridge.bridge import Bridge, BridgeState, TickResult
 from rig.bridge.counts import Conditions, Counts
 from rig.bridge.values import Mode, StepOutput
-from rig.log.step_columns import BUS_FAULT, LOG_FAULT, REQUEST_FLAGS, LogColumns, Step
+from rig.log.step_columns import BUS_FAULT, LIMITED, LOG_FAULT, REQUEST_FLAGS, LogColumns, Step
 from rig.machine.clock import Clock
 from rig.run.changed_settings import Changes, no_changes
 from rig.run.timing import BINS, Timing
@@ -151,21 +151,24 @@ def run(
         frames, conditions = port.receive(tick.t_ns)
         if tick.overruns:
             conditions = conditions._replace(overruns=tick.overruns)
+        limited = state.counts.limited
         state, result = bridge.tick(state, tick.t_ns, frames, conditions)
         sent = port.send(result.frames)
         output = result.output
         numbers = columns.numbers(result.step_input, output)
-        step = Step(tick.t_ns, tick.overruns, len(frames), output.mode, _flags(conditions), numbers)
+        flags = _flags(conditions, is_limited=result.counts.limited > limited)
+        step = Step(tick.t_ns, tick.overruns, len(frames), output.mode, flags, numbers)
         sink(frames, sent, result, step)
         yield state
 
 
-def _flags(conditions: Conditions) -> int:
+def _flags(conditions: Conditions, *, is_limited: bool) -> int:
     request = conditions.request
-    if not (request or conditions.bus_fault or conditions.log_fault):
+    if not (request or conditions.bus_fault or conditions.log_fault or is_limited):
         return 0
     return (
         (0 if request is None else REQUEST_FLAGS[request])
         + BUS_FAULT * conditions.bus_fault
         + LOG_FAULT * conditions.log_fault
+        + LIMITED * is_limited
     )

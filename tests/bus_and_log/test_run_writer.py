@@ -20,7 +20,7 @@ from rig.log.file_names import FRAMES_FILE, RUN_FILE, STEPS_FILE, part_name, par
 from rig.log.reader import RUN_SCHEMA, read_run
 from rig.log.received_frames import read_frame_columns
 from rig.log.rotation import Rotation
-from rig.log.step_columns import BUS_FAULT, Step
+from rig.log.step_columns import BUS_FAULT, LIMITED, Step
 from rig.log.whole_file import WholeFile
 from rig.log.writer import MANY_WAITING, LogOptions, RunWriter
 
@@ -376,6 +376,21 @@ def test_a_users_trigger_a_bus_fault_and_no_more_windows_than_asked_for(tmp_path
     log.close(ending)
     assert captured(tmp_path / "run") == ["001_user", "002_bus"]
     assert_holds(tmp_path / "run" / "captures" / "002_bus", 190, 211)
+
+
+def test_a_limit_that_is_passed_opens_a_window_once(tmp_path):
+    """As one that only warns does; where it holds the estimate, the mode names the window."""
+    log = open_log(
+        tmp_path / "run",
+        window=CaptureWindow(10 * MS, 10 * MS, 5),
+        capture_name=lambda before, now: "hold" if now == HOLD != before else None,
+    )
+    for index in range(500):
+        flags = LIMITED if 100 <= index < 200 or index == 300 else 0
+        log.add(*tick(index, flags=flags, mode=HOLD if index == 300 else RUNNING))
+    log.close(ending)
+    assert captured(tmp_path / "run") == ["001_limit", "002_hold"]
+    assert_holds(tmp_path / "run" / "captures" / "001_limit", 90, 111)
 
 
 def test_a_run_that_ends_within_a_window_keeps_what_there_is(tmp_path):
