@@ -3,7 +3,8 @@
 A row of the configuration replaces what would follow for its value. From the DBC follow: a height,
 an applied force or a further sensor outside its signal's range is refused; a model whose height
 leaves that range by a tenth of its span stops, since no bench is there; an estimated force that its
-signal cannot carry is invalid.
+signal cannot carry is invalid. The innovation needs none, since its band follows from the run
+(`rig.bridge.innovation_band`), and for a rate a DBC has no range.
 """
 
 import math
