@@ -69,6 +69,12 @@ def compile_decoder(
     """
     fields = _fields(message, signal_names, dimensions)
     conditions = _all_conditions(message, signal_names)
+    for condition in conditions:
+        if not condition.raw_values:
+            raise DatabaseError(
+                f"{message.path}: message {message.name}: signals {list(signal_names)} are never "
+                f"in one frame (multiplexer {condition.selector.name})"
+            )
     length = message.length_bytes
     byte_orders = {field.is_big_endian for field in fields}
     plain = not conditions and not any(field.float_format for field in fields)

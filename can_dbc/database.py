@@ -40,6 +40,7 @@ _RANGES_SUM_MAX = 2_000_000
 _STANDARD_ID_MAX = 0x7FF
 _EXTENDED_ID_MAX = 0x1FFF_FFFF
 _COUNTER_LARGEST = 2**32
+_COUNTER_SMALLEST = 3  # of fewer values each step is as good as another
 _MAX_DELTA_DEFAULT = 7  # half of the counter's round: less is a loss, more went backwards
 
 
@@ -385,6 +386,11 @@ def alive_counter(message: Message, name: str) -> AliveCounter:
         )
     if signal.maximum:
         last = min(last, int(signal.maximum))
+    if last < _COUNTER_SMALLEST:
+        raise DatabaseError(
+            f"{message.path}: message {message.name}: signal {name}: maximum {signal.maximum:g}, "
+            f"expected at least {_COUNTER_SMALLEST}"
+        )
     modulus = last + 1
     most = max(1, min(_MAX_DELTA_DEFAULT, modulus // 2 - 1))
     return AliveCounter(modulus, most, message.cycle_time_ns)

@@ -221,9 +221,7 @@ def compile_checker(protection: Protection) -> Checker:
 def compile_counter_checker(alive: AliveCounter) -> CounterChecker:
     """Build the check of an alive counter that no CRC protects, as `compile_checker` has it."""
 
-    def check(
-        state: SequenceState, counter: int, t_ns: int
-    ) -> tuple[SequenceState, FrameStatus]:
+    def check(state: SequenceState, counter: int, t_ns: int) -> tuple[SequenceState, FrameStatus]:
         if not 0 <= counter < alive.modulus:
             return state, FrameStatus.OUT_OF_SEQUENCE
         return _check_sequence(state, counter, t_ns, alive)
@@ -285,7 +283,9 @@ def _check_sequence(
     delta = (counter - state.counter) % modulus
     cycles = _cycles_since(state.t_ns, t_ns, alive)
     silent = cycles >= modulus
-    if delta == 0 and not silent:
+    if delta == 0:
+        # After a silence of a round it may be a new one, or a gateway's last one again and again.
+        t_ns = state.t_ns if silent else t_ns
         return replace(state, t_ns=t_ns, lost=0), FrameStatus.REPEATED
     if not silent and delta > max(alive.max_delta, cycles + 1):
         return _resynchronise(state, counter, t_ns, modulus)

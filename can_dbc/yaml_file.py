@@ -31,6 +31,10 @@ def _no_truth_value(value: object) -> object:
 Finite = Annotated[float, BeforeValidator(_no_truth_value), Field(allow_inf_nan=False)]
 Positive = Annotated[Finite, Field(gt=0)]
 NotNegative = Annotated[Finite, Field(ge=0)]
+Seconds = Annotated[NotNegative, Field(le=1e9)]
+"""A time that an integer of nanoseconds holds: thirty years are more than any run."""
+
+PositiveSeconds = Annotated[Seconds, Field(gt=0)]
 
 
 class _PlainLoader(yaml.SafeLoader):

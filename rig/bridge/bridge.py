@@ -118,11 +118,13 @@ class Bridge:
         devices: Sequence[Device],
         limits: Limits,
     ) -> None:
-        self._supervisor = supervisor
+        self.supervisor = supervisor
+        """What owns the mode."""
         settings = supervisor.settings
         arming = Arming(settings.arming, channels, settings.safe_after_ns)
         self._operation = Operation(arming, settings.fade_in_s, settings.slew_n_per_s)
         self._channels = tuple(channels)
+        self._immediate = self._operation.switches | supervisor.compared
         self._outgoing = tuple(outgoing)
         self._devices = tuple(devices)
         own = frozenset(item.message.key for item in outgoing)
@@ -138,7 +140,7 @@ class Bridge:
     @property
     def observers(self) -> Sequence[AnyObserver]:
         """Observers of the struts."""
-        return self._supervisor.estimator.observers
+        return self.supervisor.estimator.observers
 
     @property
     def incoming(self) -> tuple[Incoming, ...]:
@@ -155,7 +157,7 @@ class Bridge:
     ) -> "Bridge":
         """The same with other observers and limits; it continues from a state of this one."""
         return Bridge(
-            self._supervisor.with_settings(observers, supervision, limits.struts),
+            self.supervisor.with_settings(observers, supervision, limits.struts),
             self._channels,
             self.incoming,
             self._outgoing,
@@ -167,7 +169,7 @@ class Bridge:
         """State before the first tick."""
         sendings = (Sending(0, t_ns),) * len(self._outgoing)
         sequences, memory = self._checks.init(t_ns)
-        supervised = self._supervisor.init(t_ns)
+        supervised = self.supervisor.init(t_ns)
         clocks = (None,) * len(self.incoming)
         operation = OperationState(t_ns)
         return BridgeState(
@@ -181,11 +183,18 @@ class Bridge:
         )
 
     def take_over(self, state: BridgeState, before: "Bridge", t_ns: int) -> BridgeState:
-        """State of a bridge that ran before; with other observers it has to settle again."""
+        """State of a bridge that ran before; with other observers it has to settle again.
+
+        Another way of arming begins unarmed, and limits that count as passed stay so.
+        """
+        supervised = self.supervisor.take_over(state.supervised, before.supervisor, t_ns)
+        operation = state.operation
+        if self.supervisor.settings.arming != before.supervisor.settings.arming:
+            operation = replace(operation, arming=replace(operation.arming, is_armed=False))
+        state = replace(state, supervised=supervised, operation=operation)
         if self.observers == before.observers:
             return state
-        supervised = state.supervised
-        estimator = self._supervisor.estimator.unsettle(supervised.estimator, t_ns)
+        estimator = self.supervisor.estimator.unsettle(supervised.estimator, t_ns)
         return replace(state, supervised=replace(supervised, estimator=estimator), past=())
 
     def end(
@@ -193,8 +202,8 @@ class Bridge:
     ) -> tuple[BridgeState, list[Frame]]:
         """State and frames at the end of a run: every message once, with the safe output."""
         due = tuple(Sending(item.number, t_ns) for item in state.sendings)
-        output = self._supervisor.end(state.supervised)
-        safe_n = self._supervisor.safe_forces_n(state.supervised)
+        output = self.supervisor.end(state.supervised)
+        safe_n = self.supervisor.safe_forces_n(state.supervised)
         operation, output = self._operation.publish(state.operation, t_ns, output, safe_n)
         state = replace(state, sendings=due, operation=operation)
         sent = self._send(state, t_ns, output, state.counts, conditions)
@@ -202,7 +211,7 @@ class Bridge:
 
     def is_at_rest(self, state: BridgeState) -> bool:
         """Whether the published force has arrived at the safe output; at the end of a run."""
-        safe_n = self._supervisor.safe_forces_n(state.supervised)
+        safe_n = self.supervisor.safe_forces_n(state.supervised)
         return self._operation.is_at_rest(state.operation, safe_n)
 
     def stop_ramp(self, state: BridgeState) -> BridgeState:
@@ -234,9 +243,9 @@ class Bridge:
                 step_input = replace(step_input, request=None)
             operation = self._operation.update(operation, step_input, supervised.mode)
             reports = self._with_permission(reports, operation, t_ns)
-        supervised, output, action = self._supervisor.step(supervised, step_input, reports)
+        supervised, output, action = self.supervisor.step(supervised, step_input, reports)
         if is_operated:
-            safe_n = self._supervisor.safe_forces_n(supervised)
+            safe_n = self.supervisor.safe_forces_n(supervised)
             operation, output = self._operation.publish(operation, t_ns, output, safe_n)
         counts = count_tick(memory.counts, output, action, conditions, len(wrong))
         sent = self._send(state, t_ns, output, counts, conditions)
@@ -267,7 +276,7 @@ class Bridge:
     ) -> Reports:
         """What the supervisor is given of a tick that is not as it should be."""
         vital = [index for index, _ in wrong if self._devices[index].is_vital]
-        settings = self._supervisor.settings
+        settings = self.supervisor.settings
         reports = Reports(
             reception.action,
             reception.excess,
@@ -344,20 +353,27 @@ class Bridge:
         samples = sorted(step.samples, key=due_ns)
         late = [item for item in samples if due_ns(item) <= step.since_ns] if past else []
         if late:
-            estimator = self._supervisor.estimator
+            estimator = self.supervisor.estimator
             after, past = use_late_samples(estimator, self._channels, past, late)
             supervised = replace(supervised, estimator=after)
-            # A switch has no past: what it reports counts from now on.
-            switches = [item for item in late if item.channel in self._operation.switches]
-            samples = [*switches, *samples[len(late) :]]
+            samples = [*self._find_immediate(late), *samples[len(late) :]]
         step = PastStep(step.since_ns, step.t_ns, supervised.estimator, tuple(samples))
         last_valid = supervised.last_valid
         *missed, last = steps_of(self._channels, samples, step.t_ns, step.since_ns)
         for step_input in missed:
             # Nothing of this step is published.
-            supervised, _, _ = self._supervisor.step(supervised, step_input, reports)
+            supervised, _, _ = self.supervisor.step(supervised, step_input, reports)
             supervised = replace(supervised, last_valid=last_valid)
-        return supervised, remember(past, step, awaited_ns), last.samples
+        earlier = [item for step_input in missed for item in step_input.samples]
+        now = (*self._find_immediate(earlier), *last.samples)
+        return supervised, remember(past, step, awaited_ns), now
+
+    def _find_immediate(self, samples: Sequence[Sample]) -> list[Sample]:
+        """Samples that count from now on although they belong to earlier steps.
+
+        A switch has no past, and a load cell is compared with the estimate of its own time.
+        """
+        return [item for item in samples if item.channel in self._immediate]
 
     def _send(
         self,

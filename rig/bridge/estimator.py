@@ -81,11 +81,12 @@ class Estimator(Protocol[StateT]):
         ...
 
     def with_settings(
-        self, observers: Sequence[AnyObserver], stale_after_ns: int
+        self, observers: Sequence[AnyObserver], stale_after_ns: int, settling_s: float | None
     ) -> "Estimator[StateT]":
         """The same with other settings; a state of one is a state of the other.
 
-        A measurement can start the model up to the age `stale_after_ns`.
+        A measurement can start the model up to the age `stale_after_ns`; the estimate settles in
+        `settling_s`, or as the observers do.
         """
         ...
 

@@ -18,6 +18,9 @@ from rig.channels.channel import Channel, Sample
 _MOST_CYCLES = 3
 """Cycles after which a sample of the load cell is old, if that is longer than a height's age."""
 
+_LATEST_NS = 100_000_000
+"""Age up to which a sample can be compared: frames wait by less."""
+
 Forces = tuple[float, ...]
 """Estimated force of each strut in N."""
 
@@ -52,7 +55,8 @@ class ForceComparison:
     def __init__(self, cell: Channel | None, stale_after_ns: int) -> None:
         self._cell = cell
         interval_ns = 0 if cell is None else cell.interval_ns
-        self._oldest_ns = max(stale_after_ns, _MOST_CYCLES * interval_ns)
+        self._stale_after_ns = max(stale_after_ns, _MOST_CYCLES * interval_ns)
+        self._latest_ns = 0 if cell is None else _LATEST_NS
 
     def update(
         self,
@@ -70,7 +74,7 @@ class ForceComparison:
         for item in history.forces:
             if item[0] < t_ns:
                 kept.append(item)
-            if t_ns - item[0] > self._oldest_ns:
+            if t_ns - item[0] >= self._latest_ns:
                 break
         rates_n_per_s = (0.0,) * len(struts)
         if len(kept) > 1:
@@ -86,7 +90,7 @@ class ForceComparison:
                 if estimated_n is not None and sample.t_ns >= cell_ns:
                     cell_ns = sample.t_ns
                     differences_n = tuple([force_n - sample.value for force_n in estimated_n])
-        if is_too_old(cell_ns, t_ns, self._oldest_ns) or not differences_n:
+        if is_too_old(cell_ns, t_ns, self._stale_after_ns) or not differences_n:
             differences_n = (nan,) * len(struts)
         return ForceHistory(tuple(kept), cell_ns, differences_n, rates_n_per_s)
 

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import sys
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -13,7 +12,7 @@ from can_dbc.codec import si_step
 from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant, LoadedModel, ModelState
 from rig.bridge.estimator import Estimate, find_divergence, is_sensible
-from rig.bridge.innovation_band import InnovationBand, update_band
+from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
 from rig.bridge.measurement_age import is_too_old
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
@@ -80,6 +79,7 @@ class FreeModelEstimator:
         channels: Channels of the bench; their indices are their positions.
         stale_after_ns: Age up to which a measurement can start the model.
         settling_times: Settling times of the closed loop with some observers.
+        settling_s: What replaces them, if not None.
 
     Raises:
         ValueError: There is not one observer per strut.
@@ -92,6 +92,7 @@ class FreeModelEstimator:
         channels: Sequence[Channel],
         stale_after_ns: int,
         settling_times: SettlingTimes,
+        settling_s: float | None = None,
     ) -> None:
         if len(observers) != plant.struts:
             raise ValueError(
@@ -102,7 +103,11 @@ class FreeModelEstimator:
         self._channels = tuple(channels)
         self._stale_after_ns = stale_after_ns
         self._settling_times = settling_times
-        self._settling_ns = tuple(settling_times(observers))
+        self._settling_ns: Sequence[int | None] = (
+            tuple(settling_times(observers))
+            if settling_s is None
+            else (round(settling_s * 1e9),) * plant.struts
+        )
         struts = plant.struts
         self._applied, self._temperature, unused = struts, struts + 1, struts + 2
         slots = {APPLIED_FORCE: self._applied, TEMPERATURE: self._temperature}
@@ -129,7 +134,7 @@ class FreeModelEstimator:
         )
         applied = [channel for channel in channels if channel.quantity is APPLIED_FORCE]
         self._has_applied = bool(applied)
-        self._applied_grace_ns = _grace_ns(applied, stale_after_ns)
+        self._applied_grace_ns = grace_of_applied_force_ns(applied, stale_after_ns)
         self._longest_silence_ns = self._applied_grace_ns + stale_after_ns
 
     @property
@@ -137,10 +142,10 @@ class FreeModelEstimator:
         return len(self.observers)
 
     def with_settings(
-        self, observers: Sequence[AnyObserver], stale_after_ns: int
+        self, observers: Sequence[AnyObserver], stale_after_ns: int, settling_s: float | None
     ) -> "FreeModelEstimator":
         return FreeModelEstimator(
-            self._plant, observers, self._channels, stale_after_ns, self._settling_times
+            self._plant, observers, self._channels, stale_after_ns, self._settling_times, settling_s
         )
 
     def init(self, t_ns: int) -> FreeModelState:
@@ -157,7 +162,7 @@ class FreeModelEstimator:
             ((),) * self.struts,
             observers=state.observers,
             applied=state.applied,
-            bands=state.bands,
+            bands=tuple(map(restart_band, state.bands)),
         )
 
     def discard(self, before: FreeModelState, after: FreeModelState) -> FreeModelState:
@@ -187,7 +192,7 @@ class FreeModelEstimator:
             return self._start_if_possible(state, step_input.t_ns, received)
         return self._observe(state, state.model, step_input, received)
 
-    def _sort(self, samples: Sequence[Sample]) -> _Received:
+    def _sort(self, samples: Sequence[Sample]) -> list[Sample | None]:
         """The newest samples, by what they are used for."""
         received, slots = self._nothing.copy(), self._slots
         for sample in samples:
@@ -296,8 +301,8 @@ class FreeModelEstimator:
     ) -> tuple[FreeModelState, Estimate | None]:
         """Advance the model to the tick and correct it with what was measured.
 
-        After too long a gap in a height or the applied force the model starts again from the
-        measurements behind it instead.
+        After too long a gap in a height or the applied force, and after a height that contradicts
+        the innovations before, the model starts again from the measurements behind it instead.
         """
         t_ns, before_ns, is_settled = step_input.t_ns, state.t_ns, state.is_settled
         applied, warm = received[self._applied] or state.applied, received[self._temperature]
@@ -329,8 +334,10 @@ class FreeModelEstimator:
                 height_m = measured.value
                 innovation_m = height_m - model_m
                 innovation = Innovation(innovation_m, measured_ns)
-                sensing = self._sensing[strut]
+                sensing, was_left = self._sensing[strut], band.is_left
                 band = update_band(band, height_m, innovation_m, measured_ns, sensing, is_settled)
+                if band.is_left and not was_left:
+                    return self._begin_again(state, step_input, strut, band)
             if further:
                 observed = observer.step(before, t_ns, innovation, further[strut])
             else:
@@ -356,6 +363,20 @@ class FreeModelEstimator:
             tuple(bands),
         )
         return self._estimate(after, loaded, oldest_ns)
+
+    def _begin_again(
+        self, state: FreeModelState, step_input: StepInput, strut: int, band: InnovationBand
+    ) -> tuple[FreeModelState, None]:
+        """State that waits for the heights behind one that left its strut's band.
+
+        What the observers know of the motion does not hold for them: they would follow the jump
+        with a force, and their variances do not know of it.
+        """
+        bands = (*state.bands[:strut], band, *state.bands[strut + 1 :])
+        state = self.restart(replace(state, bands=bands), step_input.t_ns)
+        received = self._sort(step_input.samples)
+        received[: self.struts] = [None] * self.struts
+        return self._collect(state, step_input.t_ns, received)[0], None
 
     def _has_heights_since(self, t_ns: int, state: FreeModelState) -> bool:
         """Whether heights of every strut have come since a time."""
@@ -498,11 +519,6 @@ def _has_cycle(channel: Channel) -> bool:
     return channel.message is None or channel.message.cycle_time_ns is not None
 
 
-def _grace_ns(channels: Sequence[Channel], stale_after_ns: int) -> int:
-    """How much older than a height a channel's newest sample may be: its own cycle is longer.
-
-    Of a channel whose cycle the DBC does not give, no age can be judged.
-    """
-    if not all(map(_has_cycle, channels)):
-        return sys.maxsize
+def grace_of_applied_force_ns(channels: Sequence[Channel], stale_after_ns: int) -> int:
+    """How much older than a height a channel's newest sample may be: its own cycle is longer."""
     return max([_MOST_CYCLES * item.interval_ns - stale_after_ns for item in channels] + [0])

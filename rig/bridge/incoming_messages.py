@@ -33,6 +33,13 @@ refused frame or another page, `NO_VALUES` where a signal holds no value."""
 
 NO_VALUES: Values = ()
 
+_LARGEST_TIME_S = 1e10
+"""Of a sender's clock; Unix time is below it for three hundred years."""
+
+SHORTEST_ROUND = 8
+"""Cycles that a sender's time has to take at least until it begins again: of fewer it is not known
+which one a frame is of, and one that is sent again and again looks new."""
+
 Reader = Callable[[SequenceState, Frame], Reading]
 """State of a message's counter, and a frame of the message -> its reading."""
 
@@ -148,7 +155,12 @@ def compile_incoming(
     if counter:
         index = signals.index((counter, Dimension.NUMBER))
         read = _with_counter(read, index, alive_counter(message, counter))
-    for check in (_check_of_values(message, signals), _check_of_validity(valid, signals)):
+    stamp = signals.index((time, Dimension.TIME)) if time else -1
+    for check in (
+        _check_of_values(message, signals),
+        _check_of_validity(valid, signals),
+        _check_of_time(stamp),
+    ):
         if check is not None:
             read = _with_check(read, check)
     return Incoming(
@@ -163,7 +175,7 @@ def compile_incoming(
         sum({1 << strut for strut in struts}),
         1 << struts[0] if struts else 0,
         compile_follower_of(channels[0], message) if channels else None,
-        signals.index((time, Dimension.TIME)) if time else -1,
+        stamp,
         any(_bears_estimate(channel) for channel in channels),
     )
 
@@ -238,6 +250,11 @@ def _check_of_validity(
     if not expected:
         return None
     return lambda values: all(values[index] == value for index, value in expected)
+
+
+def _check_of_time(stamp: int) -> _Check | None:
+    """Check that a sender's time, the value of an index, is one; None without a time signal."""
+    return None if stamp < 0 else lambda values: abs(values[stamp]) < _LARGEST_TIME_S
 
 
 def _with_check(read: Reader, are_values: _Check) -> Reader:

@@ -14,7 +14,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from can_dbc.yaml_file import NotNegative, Positive
+from can_dbc.yaml_file import Finite, NotNegative, PositiveSeconds, Seconds
 from rig.bridge.arming import ArmingKind, OpenInterlock
 from rig.bridge.estimator import AnyEstimator, Estimate
 from rig.bridge.force_history import NO_HISTORY, ForceComparison, ForceHistory
@@ -29,6 +29,7 @@ from rig.bridge.supervision_limits import (
     LimitsByStrut,
     find_excess,
     find_passed,
+    inherit_delays,
     range_of_estimate,
     update_delays,
     values_of_estimate,
@@ -131,13 +132,13 @@ class Supervision(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    stale_after_s: Positive = 0.01
-    safe_after_s: Positive = 0.5
-    settling_s: NotNegative | None = None
-    overload_share: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
+    stale_after_s: PositiveSeconds = 0.01
+    safe_after_s: PositiveSeconds = 0.5
+    settling_s: Seconds | None = None
+    overload_share: Annotated[Finite, Field(gt=0.0, le=1.0)] = 0.5
     arming: ArmingKind = "automatic"
-    fade_in_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
-    slew_n_per_s: Positive | None = None
+    fade_in_s: Annotated[NotNegative, Field(le=60.0)] = 0.0
+    slew_n_per_s: Annotated[Finite, Field(ge=1e-3, le=1e12)] | None = None
     watchdog: bool = True
     log_fault: Literal["continue", "safe"] = "continue"
     safe_output: Literal["zero", "last"] = "zero"
@@ -270,28 +271,40 @@ class Supervisor:
         self._safe_after_ns = settings.safe_after_ns
         estimates = [[row for row in rows if not row.value.is_measured] for rows in limits]
         self._limits = [[row for row in rows if not row.has_memory] for rows in estimates]
-        self._delayed = [
+        self.delayed = [
             (index, row) for index, rows in enumerate(estimates) for row in rows if row.has_memory
         ]
+        """Limits with a delay, each with the index of its strut."""
         self._limits_before = [
             [row for row in rows if row.value not in COMPARED] for rows in self._limits
         ]
         self._ranges = list(map(range_of_estimate, self._limits))
         self._is_limited = any(self._limits)
         limited = {row.value for rows in estimates for row in rows}
-        self._is_judged_always = bool(limited.difference(RANGED) or self._delayed)
+        self._is_judged_always = bool(limited.difference(RANGED) or self.delayed)
         self._comparison = None
         if limited.intersection(COMPARED):
             self._comparison = ForceComparison(cell, settings.stale_after_ns)
         self._cell = cell
-        self._has_memory = bool(self._delayed) or self._comparison is not None
+        self.compared = frozenset({cell.index} if cell and self._comparison else ())
+        """Index of the channel of the load cell, if an estimate is compared with it."""
+        self._has_memory = bool(self.delayed) or self._comparison is not None
 
     def with_settings(
         self, observers: Sequence[AnyObserver], settings: Supervision, limits: LimitsByStrut
     ) -> "Supervisor":
         """The same with other observers and limits; a state of one is a state of the other."""
-        estimator = self.estimator.with_settings(observers, settings.stale_after_ns)
+        estimator = self.estimator.with_settings(
+            observers, settings.stale_after_ns, settings.settling_s
+        )
         return Supervisor(estimator, settings, limits, self._cell)
+
+    def take_over(self, state: SupervisedState, before: "Supervisor", t_ns: int) -> SupervisedState:
+        """State of a supervisor that had other limits: what counts as passed stays so."""
+        if self.delayed == before.delayed or not state.delays:
+            return state
+        known = list(zip(before.delayed, state.delays, strict=True))
+        return replace(state, delays=inherit_delays(self.delayed, known, t_ns))
 
     def init(self, t_ns: int) -> SupervisedState:
         """State before the first step."""
@@ -351,10 +364,10 @@ class Supervisor:
             values = values_with_history(struts, history)
         limits = self._limits if is_settled else self._limits_before
         action = max(map(worst_action, limits, values), default=0)
-        if self._delayed:
-            delays = update_delays(self._delayed, state.delays, values, t_ns)
+        if self.delayed:
+            delays = update_delays(self.delayed, state.delays, values, t_ns)
             state = replace(state, delays=delays)
-            passed = find_passed(self._delayed, delays, is_settled=is_settled)
+            passed = find_passed(self.delayed, delays, is_settled=is_settled)
             action = max([action, *(row.severity for _, row in passed)])
             limits = [
                 [*rows, *(row for strut, row in passed if strut == index)]
@@ -441,7 +454,7 @@ class Supervisor:
             # Fresh measurements are not enough yet, old ones are a reason to stop.
             age = self._age(state.measured_ns, t_ns)
             if age.event is Event.FRESH:
-                age = Cause(Event.STALE, -1, "age_s", age.value)
+                age = Cause(Event.UNSETTLED)
             causes = [*self._missing_ticks(reports), age]
             if reports.action >= Action.HOLD:
                 causes.append(_beyond(reports.action, reports.excess))

@@ -150,9 +150,9 @@ class PrescribedMotionEstimator:
         return ()
 
     def with_settings(
-        self, observers: Sequence[AnyObserver], stale_after_ns: int
+        self, observers: Sequence[AnyObserver], stale_after_ns: int, settling_s: float | None
     ) -> "PrescribedMotionEstimator":
-        del observers
+        del observers, settling_s
         return PrescribedMotionEstimator(
             self._model, self._settling_s, self._channels, stale_after_ns
         )

@@ -194,6 +194,9 @@ def compile_stamped_follower(cycle_ns: int, round_ns: int) -> Follower:
             # As many rounds as come nearest to the arrival.
             missing_ns = arrival_ns - clock.arrival_ns - elapsed_ns
             elapsed_ns += round_ns * ((2 * missing_ns + round_ns) // (2 * round_ns))
+        if elapsed_ns == 0:
+            # The same frame once more, however often: it shows nothing of the sender's clock.
+            return replace(clock, timing=EARLY)
         before_ns = clock.phase_ns
         cycles = (2 * (before_ns + elapsed_ns) + cycle_ns) // (2 * cycle_ns)
         phase_ns = before_ns + elapsed_ns - cycles * cycle_ns

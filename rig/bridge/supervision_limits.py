@@ -7,7 +7,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from can_dbc.yaml_file import Finite, NotNegative
+from can_dbc.yaml_file import Finite, Seconds
 from rig.bridge.force_history import ForceHistory
 from rig.bridge.values import StrutOutput
 
@@ -91,8 +91,8 @@ class Limit(BaseModel):
     value: LimitedValue
     low: Finite | None = None
     high: Finite | None = None
-    for_s: NotNegative = 0.0
-    clear_s: NotNegative | None = None
+    for_s: Seconds = 0.0
+    clear_s: Seconds | None = None
     action: Literal["warn", "refuse", "hold", "safe"]
 
     @model_validator(mode="after")
@@ -368,6 +368,31 @@ def _update_delay(delay: Delay, row: Limit, number: float, t_ns: int) -> Delay:
     if t_ns - delay.since_ns < round(time_s * 1e9):
         return delay
     return Delay(not delay.is_passed, t_ns)
+
+
+def inherit_delays(
+    rows: Sequence[tuple[int, Limit]],
+    known: Sequence[tuple[tuple[int, Limit], Delay]],
+    t_ns: int,
+) -> tuple[Delay, ...]:
+    """State of limits with a delay after others, whose states are known, were replaced by them.
+
+    A limit that is the same continues; another one on the same value of the same strut counts as
+    passed if one of those did.
+    """
+
+    def find(strut: int, row: Limit) -> Delay:
+        for (other, old), delay in known:
+            if other == strut and old == row:
+                return delay
+        passed = [
+            delay.is_passed
+            for (other, old), delay in known
+            if other == strut and old.value is row.value
+        ]
+        return Delay(any(passed), t_ns)
+
+    return tuple(find(strut, row) for strut, row in rows)
 
 
 def find_passed(

@@ -71,7 +71,12 @@ def _build_estimator(plan: Plan) -> AnyEstimator:
         return PrescribedMotionEstimator(model, motion.settling_s, plan.channels, stale_after_ns)
     plant = build_plant(plan)
     return FreeModelEstimator(
-        plant, plan.observers, plan.channels, stale_after_ns, settling_times(plan)
+        plant,
+        plan.observers,
+        plan.channels,
+        stale_after_ns,
+        settling_times(plan),
+        plan.config.supervision.settling_s,
     )
 
 
@@ -85,10 +90,7 @@ def sample_timing(plan: Plan) -> SampleTiming:
 
 
 def settling_times(plan: Plan) -> SettlingTimes:
-    """Settling times with other observers: those of the closed loop at rest, or the configured."""
-    settling_s = plan.config.supervision.settling_s
-    if settling_s is not None:
-        return lambda observers: [round(settling_s * 1e9)] * len(observers)
+    """Settling times with some observers: those of the closed loop at rest."""
     rest_m = [strut.free_length_m for strut in plan.struts]
     # The laws are steeper at rest than in motion, friction above all: without them the model is
     # damped as little as it ever is. Both are models of their own, since this one may be running.

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
-from can_dbc.codec import si_range
+from can_dbc.codec import si_range, si_step
 from can_dbc.database import Database, Message, alive_counter
 from can_dbc.errors import DatabaseError, InputError
 from can_dbc.units import Dimension
 from dart_model.spec import ModelSpec
 from rig.bridge.devices import Device
-from rig.bridge.incoming_messages import Alarm
+from rig.bridge.incoming_messages import SHORTEST_ROUND, Alarm
 from rig.bridge.outgoing_messages import PublishedSignal
 from rig.bridge.published_quantities import (
     ESTIMATE,
@@ -346,6 +346,12 @@ class _SignalReader:
             message = self._message(entry, key)
             if entry.valid is not None:
                 self._check_number(message, entry.valid.signal, f"{key}.valid.signal")
+                low, high = si_range(message, entry.valid.signal, Dimension.NUMBER)
+                if not low <= entry.valid.value <= high:
+                    raise InputError(
+                        f"{self._source}: {key}.valid.value: {entry.valid.value:g}, expected what "
+                        f"{entry.valid.signal} can hold, {low:g} to {high:g}"
+                    )
             self._check_sender(message, entry, key)
             interval_ns = message.cycle_time_ns or self._config.period_ns
             delay_ns = entry.delay_ns if isinstance(entry, HeightSignal) else 0
@@ -462,10 +468,7 @@ class _SignalReader:
                 raise InputError(f"{where}: {error}") from error
         if entry.time is not None:
             self._signal(SignalName(message=message.name, signal=entry.time), f"{key}.time")
-            try:
-                si_range(message, entry.time, Dimension.TIME)
-            except DatabaseError as error:
-                raise InputError(f"{self._source}: {key}.time: {error}") from error
+            self._check_time(message, entry.time, f"{self._source}: {key}.time")
         for name, own in (("counter", entry.counter), ("time", entry.time)):
             known = self._of_sender.setdefault((message.name, name), own)
             if own != known:
@@ -473,6 +476,25 @@ class _SignalReader:
                     f"{self._source}: {key}.{name}: {own or 'none'}, expected {known or 'none'}, "
                     f"as for the other signals of {message.name}"
                 )
+
+    def _check_time(self, message: Message, name: str, where: str) -> None:
+        """Refuse a time signal that begins again too soon, or whose steps are too long."""
+        cycle_s = (message.cycle_time_ns or self._config.period_ns) * 1e-9
+        try:
+            low_s, high_s = si_range(message, name, Dimension.TIME)
+            step_s = si_step(message, name, Dimension.TIME)
+        except DatabaseError as error:
+            raise InputError(f"{where}: {error}") from error
+        if step_s > cycle_s:
+            raise InputError(
+                f"{where}: {name} has steps of {step_s:g} s, expected at most a cycle ({cycle_s:g} "
+                "s): one that does not change is taken for the same sample"
+            )
+        if high_s - low_s + step_s < SHORTEST_ROUND * cycle_s:
+            raise InputError(
+                f"{where}: {name} begins again after {high_s - low_s + step_s:g} s, expected at "
+                f"least {SHORTEST_ROUND} cycles of {cycle_s:g} s (is its range in the DBC right?)"
+            )
 
     def _check_sensor(self, strut: str, sensor: str) -> None:
         """Refuse a further sensor whose signal is in use, or whose delay differs too much."""

@@ -9,12 +9,13 @@ from can_dbc.codec import si_step
 from can_dbc.database import Message
 from dart_model.protocol import AnyPlant
 from dart_model.spec import InlineSkeleton
+from rig.bridge.free_model import grace_of_applied_force_ns
 from rig.bridge.incoming_messages import ClockSource, clock_source
 from rig.bridge.published_quantities import FORCE, VALID
 from rig.bridge.supervision_limits import Limit, LimitedValue
 from rig.bus.bus import SHARED_INTERFACES
 from rig.channels.channel import Channel, Role
-from rig.channels.measured_quantities import LOAD_CELL_FORCE, SWITCHES
+from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, SWITCHES
 from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import Pole, closed_loop_poles
 from rig.observers.protocol import Remark, SensorStep
@@ -84,6 +85,7 @@ def check(plan: Plan) -> list[Finding]:
         ],
         _staleness(plan, heights),
         *_switches(plan),
+        *_applied_force(plan),
         *_watchdog(plan),
         *_publication(plan),
         *_limits(plan),
@@ -188,6 +190,23 @@ def _staleness(plan: Plan, heights: list[Message]) -> Finding:
         )
     severity = Severity.ERROR if is_short else Severity.OK
     return Finding(severity, "supervision.stale_after_s", text)
+
+
+def _applied_force(plan: Plan) -> list[Finding]:
+    """When the applied force counts as missing."""
+    channel = plan.bench_channel(APPLIED_FORCE)
+    if channel is None:
+        return []
+    stale_ns = plan.config.supervision.stale_after_ns
+    if _message(channel).cycle_time_ns is None:
+        text = f"missing after {stale_ns * 1e-6:g} ms: the DBC gives {_message(channel).name} no "
+        text += "cycle time"
+        return [Finding(Severity.WARNING, channel.key, text)]
+    grace_ns = grace_of_applied_force_ns([channel], stale_ns)
+    text = f"missing after {(stale_ns + grace_ns) * 1e-6:g} ms"
+    is_long = stale_ns + grace_ns > plan.config.supervision.safe_after_ns
+    severity = Severity.WARNING if is_long else Severity.OK
+    return [Finding(severity, channel.key, text)]
 
 
 def _switches(plan: Plan) -> list[Finding]:
@@ -336,7 +355,13 @@ def _stability(plan: Plan, plant: AnyPlant) -> list[Finding]:
 def _settling(plan: Plan) -> list[Finding]:
     """How long each strut's estimate is invalid after a start, a gap or a change of gains."""
     findings: list[Finding] = []
-    for strut, time_ns in zip(plan.struts, settling_times(plan)(plan.observers), strict=True):
+    settling_s = plan.config.supervision.settling_s
+    times_ns: list[int | None] = list(
+        settling_times(plan)(plan.observers)
+        if settling_s is None
+        else [round(settling_s * 1e9)] * len(plan.struts)
+    )
+    for strut, time_ns in zip(plan.struts, times_ns, strict=True):
         subject = f"settling of {strut.name}"
         if time_ns is None:
             text = "never: the estimate would not become valid; see the poles, and rig tune"

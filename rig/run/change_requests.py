@@ -36,6 +36,17 @@ _FOLDER = "requests"
 _LOOK_S = 0.1
 """Time between two looks for requests, and for whether one still waits."""
 
+_NO_REQUEST = (
+    OSError,
+    ValueError,
+    TypeError,
+    KeyError,
+    AttributeError,
+    ArithmeticError,
+    RecursionError,
+)
+"""What a file that is no request may raise; none of them ends the thread that answers."""
+
 _ANSWER_S = 5.0
 """Longest wait for an answer: many looks, and a tick of the slowest rate that is of use."""
 
@@ -122,7 +133,7 @@ class Requests:
             return self._change(path, dict(content["set"]))
         except InputError as error:
             return {"error": str(error)}
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        except _NO_REQUEST:
             return {"error": f"{path.name}: is not a valid request"}
 
     def _pass_on(self, request: Request, by: str) -> Answer:
@@ -196,7 +207,7 @@ def _refuse_errors(folder: Path, assignments: Assignments) -> None:
         for _, before in read_changes(folder):
             plan = assign(plan, before, str(folder))
         wrong = errors(assign(plan, assignments, "set"))
-    except (TypeError, AttributeError) as error:
+    except (TypeError, AttributeError, ArithmeticError) as error:
         raise InputError("set: expected keys and values") from error
     if wrong:
         raise InputError(f"set: {wrong[0].what}: {wrong[0].text} (--force sets it all the same)")

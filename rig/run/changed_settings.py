@@ -122,7 +122,7 @@ def read_changes(folder: Path) -> list[tuple[int, dict[str, object]]]:
         try:
             entry = json.loads(line)
             changes.append((int(entry["t_ns"]), dict(entry["set"])))
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
             if not line.endswith("\n"):
                 break
             raise InputError(

@@ -63,13 +63,14 @@ class _Sender:
         sources = np.random.SeedSequence([config.seed, index]).spawn(6)
         self._jitter, self._loss, *noises = [np.random.default_rng(source) for source in sources]
         self._channels = _channels(config, self.transmission, noises)
-        self._modulus = self._round_s = 0.0
+        self._modulus = self._first_s = self._round_s = 0.0
         further: list[tuple[str, Dimension]] = []
         if (name := self.transmission.counter) is not None:
             self._modulus = alive_counter(self.message, name).modulus
             further.append((name, Dimension.NUMBER))
         if (name := self.transmission.time) is not None:
             low_s, high_s = si_range(self.message, name, Dimension.TIME)
+            self._first_s = low_s
             self._round_s = high_s - low_s + si_step(self.message, name, Dimension.TIME)
             further.append((name, Dimension.TIME))
         signals = [*((channel.signal, channel.dimension) for channel in self._channels), *further]
@@ -86,7 +87,7 @@ class _Sender:
         if self._modulus:
             values.append(self._counter % self._modulus)
         if self._round_s:
-            values.append(self.next_sample_ns * 1e-9 % self._round_s)
+            values.append(self._first_s + self.next_sample_ns * 1e-9 % self._round_s)
         data, saturated = self._encode(values)
         self.saturated_frames += bool(saturated)
         if self._protect is not None:

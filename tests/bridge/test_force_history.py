@@ -78,8 +78,8 @@ def test_without_a_sample_the_difference_is_unknown():
 
 
 def test_a_sample_of_before_the_history_or_of_another_channel_is_passed_over():
-    ticks = [(t, (5.0,), ()) for t in range(1, 30)]
-    assert math.isnan(run([*ticks, (30, (5.0,), [(5, 2.0)])]).differences_n[0])
+    ticks = [(t, (5.0,), ()) for t in range(1, 130)]
+    assert math.isnan(run([*ticks, (130, (5.0,), [(5, 2.0)])]).differences_n[0])
     other = Channel(4, Role.BENCH, LOAD_CELL_FORCE, "cell", "cell", -1, 2 * MS)
     assert math.isnan(run([(1, (5.0,), [(1, 2.0)])], other).differences_n[0])
 
@@ -92,7 +92,10 @@ def test_an_older_sample_does_not_replace_a_newer_one():
 def test_the_history_is_as_long_as_a_sample_may_be_late():
     history = run([(t, (5.0,), ()) for t in range(1, 100)])
     assert history.forces[0][0] == 99 * MS
-    assert history.forces[-1][0] == 88 * MS  # one before the oldest sample that counts, at 89 ms
+    assert history.forces[-1][0] == 1 * MS
+    history = run([(t, (5.0,), ()) for t in range(1, 200)])
+    assert history.forces[-1][0] == 99 * MS
+    assert len(run([(t, (5.0,), ()) for t in range(1, 200)], None).forces) == 2
 
 
 def supervised(*others, **row):

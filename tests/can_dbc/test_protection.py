@@ -166,6 +166,11 @@ def test_lost_frames_are_counted(protection: Protection, missing: int) -> None:
     state, _ = judge(((t, t) for t in range(5)), protection)
     late = 5 + missing
     state, verdicts = judge([(late + 0.3, late)], protection, state)
+    if missing % 16 == 15:
+        # The counter is that of the last frame: one that a gateway repeats looks the same.
+        assert verdicts == [FrameStatus.REPEATED]
+        late, missing = late + 1, missing + 1
+        state, verdicts = judge([(late + 0.3, late)], protection, state)
     assert verdicts == [FrameStatus.LOST]
     assert state.lost == missing
     state, verdicts = judge([(late + 1, late + 1)], protection, state)
@@ -187,6 +192,15 @@ def test_lost_frames_without_a_cycle_time(write_dbc: Callable[..., Path]) -> Non
         assert (verdicts, after.lost) == ([FrameStatus.LOST], missing)
     _, verdicts = judge([(1000, 8)], protection, state)
     assert verdicts == [FrameStatus.OUT_OF_SEQUENCE]
+
+
+@pytest.mark.parametrize("every", [1, 7, 15, 16, 17, 40])
+def test_a_frame_that_is_sent_again_and_again_is_never_accepted(
+    protection: Protection, every: int
+) -> None:
+    state, _ = judge(((t, t) for t in range(5)), protection)
+    state, verdicts = judge(((4 + every * k, 4) for k in range(1, 30)), protection, state)
+    assert set(verdicts) == {FrameStatus.REPEATED}
 
 
 def test_repeated_frames(protection: Protection) -> None:

@@ -339,6 +339,22 @@ def test_a_height_that_jumps(offset_m, truth_n, settled_n):
         assert max(errors_n) <= MOST * settled_n[name]
 
 
+@pytest.mark.parametrize("name", OBSERVERS)
+@pytest.mark.parametrize(("offset_m", "length"), [(0.0005, 66), (0.005, 40), (0.02, 66)])
+def test_a_height_that_jumps_and_is_right_again_while_the_estimate_settles(
+    name, offset_m, length, truth_n, settled_n
+):
+    jump = Frozen()
+    jump.change = lambda height_m: height_m + offset_m
+
+    def frames(ms, frames):
+        return jump(ms, frames) if ms < BEGIN_MS + length else frames
+
+    received = follow(Trial(observer=OBSERVERS[name]), Event("", frames=frames), END_MS - 500)
+    assert largest_error_n(received, truth_n) <= MOST * settled_n[name]
+    assert received[-1].is_valid
+
+
 CELL_LIMIT = {"value": "force_difference_n", "low": -45.0, "high": 45.0, "action": "hold"}
 
 

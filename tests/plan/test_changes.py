@@ -74,7 +74,7 @@ def test_a_request_is_taken_at_a_tick_and_answered_with_its_time(tmp_path, ready
             ask(run, {"sett": 1})
     assert answers == [{"t_ns": 42_000_000}]
     assert lines == [change_line(42_000_000, {GAIN: 5e4})]
-    assert bridge._supervisor.estimator.observers[0].proportional_n_per_m == 5e4
+    assert bridge.supervisor.estimator.observers[0].proportional_n_per_m == 5e4
     assert not (run / "requests").exists()
 
 

@@ -122,7 +122,7 @@ def test_an_estimator_waits_starts_stops_and_waits_again(estimator):
     assert estimator.step(waiting, StepInput((FIRST + 2) * MS))[1] is None
     # Measurements that are too old start nothing.
     assert fed(estimator, waiting, 60, 47 * MS)[1] is None
-    same = estimator.with_settings((GAINS,), 100 * MS)
+    same = estimator.with_settings((GAINS,), 100 * MS, None)
     assert fed(same, waiting, 60, 47 * MS)[1] is not None
 
 
