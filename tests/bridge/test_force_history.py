@@ -14,6 +14,7 @@ from rig.bridge.values import Mode, StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import LOAD_CELL_FORCE
 from tests.bridge.test_modes import Scripted
+from tests.faults.trial import BEGIN_MS, trial_with_auxiliary
 
 MS = 1_000_000
 STALE_NS = 10 * MS
@@ -181,3 +182,20 @@ def test_a_limit_whose_delay_has_gone_by_is_named_and_its_severity_counts():
     assert modes == [Mode.HOLD, Mode.HOLD, Mode.SAFE]
     cause = state.cause
     assert (cause.event, cause.quantity, cause.value) == (Event.BEYOND_SAFE, "height_m", 0.4)
+
+
+@pytest.mark.parametrize("late_ms", [0, 1, 3])
+def test_a_load_cell_is_compared_where_all_frames_are_read_late(late_ms):
+    """As by an adapter that stamps them itself and hands them on in batches."""
+    limit = {"value": "force_difference_n", "low": -45.0, "high": 45.0, "action": "hold"}
+    trial = trial_with_auxiliary("load_cell_force", limits=[limit], settling_s=0.5)
+    queue = []
+
+    def arriving(t_ns, frames):
+        queue.extend(frames)
+        due = [frame for frame in queue if frame.t_ns <= t_ns - late_ms * MS]
+        queue[:] = [frame for frame in queue if frame.t_ns > t_ns - late_ms * MS]
+        return due
+
+    ticks = trial.run(BEGIN_MS + 500, arriving)
+    assert all(tick.is_valid for tick in ticks[BEGIN_MS:])

@@ -20,6 +20,7 @@ from rig.bridge.supervision_limits import (
     explain_measurement,
     find_excess,
     find_passed,
+    inherit_delays,
     judge_measurement,
     range_of_estimate,
     update_delays,
@@ -342,3 +343,28 @@ def test_limits_that_count_as_passed_are_found_with_their_struts():
         delays = [Delay(is_passed=item, since_ns=0) for item in is_passed]
         expected = [row for row, passed in zip(rows, is_passed, strict=True) if passed]
         assert find_passed(rows, delays, is_settled=True) == expected
+
+
+def test_what_counts_as_passed_stays_so_under_other_limits():
+    old = [
+        (0, delayed("force_n", high=10.0)),
+        (1, delayed("force_n", high=10.0)),
+        (0, delayed("height_m", high=1.0)),
+    ]
+    states = [Delay(True, 5), Delay(False, 6), Delay(False, 7)]
+    known = list(zip(old, states, strict=True))
+    same, stricter = delayed("height_m", high=1.0), delayed("force_n", high=8.0)
+    rows = [(0, delayed("innovation_m")), (0, same), (0, stricter), (1, stricter)]
+    assert inherit_delays(rows, known, 100) == (
+        Delay(False, 100),
+        Delay(False, 7),
+        Delay(True, 100),
+        Delay(False, 100),
+    )
+    assert inherit_delays(old[::-1], known, 100) == tuple(states[::-1])
+
+
+@pytest.mark.parametrize("key", ["for_s", "clear_s"])
+def test_a_time_that_no_integer_of_nanoseconds_holds_is_refused(key):
+    with pytest.raises(ValidationError, match=key):
+        Limit(value="force_n", high=1.0, action="warn", **{key: 1e300})

@@ -108,6 +108,46 @@ def test_a_switch_that_is_silent_counts_as_open(name, lost):
     assert ticks[-1].mode is lost
 
 
+@pytest.mark.parametrize(
+    ("name", "lost"),
+    [("interlock", Mode.SAFE), ("enable", Mode.READY)],
+    ids=["interlock", "enable"],
+)
+@pytest.mark.parametrize("missed", [1, 5, 15])
+def test_a_switch_that_opens_while_ticks_are_missed_is_open(name, lost, missed):
+    """Its frame comes with several heights, before the last of them."""
+    trial = trial_with_auxiliary(name, settling_s=0.0)
+    switches = Switches(trial, **{name: True})
+    trial.run(BEGIN_MS, switches)
+    switches.closed[name] = False
+    # The switch reports itself every 10 ms.
+    frames = []
+    for ms in range(BEGIN_MS, BEGIN_MS + missed + 1):
+        frames += switches(ms * MS, trial.bench.update(ms * MS)[0])
+    _, result = trial.bridge.tick(
+        trial.state, (BEGIN_MS + missed) * MS, frames, Conditions(overruns=missed)
+    )
+    assert result.output.mode is lost
+    assert not result.output.struts[0].valid
+
+
+def test_another_way_of_arming_begins_unarmed():
+    """An operator who armed a run before it was in the safe state has not armed it since."""
+    trial = Trial(settling_s=0.0, arming="manual")
+    trial.run(BEGIN_MS, conditions=request(Request.ARM))
+    assert trial.ticks[-1].is_valid
+    t_ns = BEGIN_MS * MS
+    bridges = [trial.bridge]
+    for arming in ("automatic", "manual"):
+        supervision = trial.ready.config.supervision.model_copy(update={"arming": arming})
+        bridge = bridges[-1].with_settings(trial.bridge.observers, supervision, trial.ready.limits)
+        trial.state = bridge.take_over(trial.state, bridges[-1], t_ns)
+        bridges.append(bridge)
+    trial.bridge = bridges[-1]
+    assert not trial.run(BEGIN_MS + 1)[-1].is_valid
+    assert trial.run(BEGIN_MS + 2, conditions=request(Request.ARM))[-1].is_valid
+
+
 @pytest.mark.parametrize("name", ["interlock", "enable"])
 def test_nothing_is_valid_before_a_switch_was_ever_received(name):
     trial = trial_with_auxiliary(name, settling_s=0.0)

@@ -11,7 +11,13 @@ from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.change_requests import Requests, ask
-from rig.run.changed_settings import assign, change_line, parse_assignments, read_changes
+from rig.run.changed_settings import (
+    assign,
+    bridge_with_settings,
+    change_line,
+    parse_assignments,
+    read_changes,
+)
 from rig.run.replay import replay
 from tests.view.serving import make_run
 
@@ -169,3 +175,28 @@ def test_a_line_that_a_kill_cut_is_passed_over_and_a_wrong_one_is_not(tmp_path):
     path.write_text(json.dumps([1, 2]) + "\n")
     with pytest.raises(InputError, match="expected a change"):
         read_changes(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["safe_after_s", "settling_s", "stale_after_s"])
+def test_a_time_that_no_integer_holds_is_refused_and_the_next_request_is_answered(
+    tmp_path, ready, key
+):
+    requests = served(tmp_path, ready, [])
+    path = tmp_path / "1.request"
+    path.write_text(json.dumps({"set": {f"supervision.{key}": 1e300}}))
+    assert "less than or equal" in requests._answer(path)["error"]
+
+
+@pytest.mark.parametrize("line", ['{"t_ns": 1e999, "set": {}}', "[" * 100_000])
+def test_a_change_that_cannot_be_read_is_one_line(tmp_path, line):
+    (tmp_path / CHANGES_FILE).write_text(line + "\n")
+    with pytest.raises(InputError, match=r"line 1: .*expected a change such as"):
+        read_changes(tmp_path)
+
+
+def test_another_settling_time_is_taken_over(ready):
+    plan = assign(ready, {"supervision.settling_s": 0.25}, "set")
+    bridge = bridge_with_settings(build_bridge(ready), plan)
+    assert bridge.supervisor.estimator._settling_ns == (250_000_000,)
+    back = bridge_with_settings(bridge, assign(plan, {"supervision.settling_s": None}, "set"))
+    assert back.supervisor.estimator._settling_ns[0] > 1_000_000_000

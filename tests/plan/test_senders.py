@@ -1,17 +1,21 @@
 """A bus without CRCs: a counter, or the time of the sample, in the frames of a sensor."""
 
+import json
+
 import numpy as np
 import pytest
 import yaml
 
+from can_dbc.codec import compile_decoder
 from can_dbc.database import load_database
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
+from can_dbc.units import Dimension
 from rig.bridge.values import Mode
 from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
-from rig.plan.preflight_checks import check
+from rig.plan.preflight_checks import Severity, check
 from rig.recordings.run_folder import _samples
 from rig.simulated_bench.bench import SimulatedBench
 from rig.simulated_bench.config import load_bench_config
@@ -47,7 +51,7 @@ def config_with(folder, height=None, applied=None):
         "signals": {
             "height": {"message": "SENSOR_1", "signal": "Travel"} | (height or {}),
             "applied_force": {"message": "SENSOR_1", "signal": "Actuator"}
-            | (height if applied is None else applied or {}),
+            | ((height if applied is None else applied) or {}),
         },
         "publish": {
             "force": {"message": "CONTROL_1", "signal": "EstimatedForce"},
@@ -58,7 +62,7 @@ def config_with(folder, height=None, applied=None):
         },
     }
     path = folder / "my.yaml"
-    path.write_text(yaml.safe_dump(config))
+    path.write_text(json.dumps(config))  # YAML as well, and without aliases
     return path
 
 
@@ -179,3 +183,86 @@ def test_check_reports_which_one_is_in_use(tmp_path, keys, text):
     findings = check(load_plan(config_with(tmp_path, keys)))
     (found,) = [item for item in findings if item.what == "sample times of SENSOR_1"]
     assert text in found.text
+
+
+@pytest.mark.parametrize("copies", [1, 7, 8, 16])
+def test_a_frame_that_is_sent_again_and_again_is_not_fresh_by_its_time(tmp_path, copies):
+    """As often as it takes for a constant delay, each tick."""
+    bridge = build_bridge(load_plan(config_with(tmp_path, {"time": "Stamp"})))
+    bench, last = bench_with(tmp_path, time="Stamp"), []
+
+    def arriving(ms, frames):
+        if ms < 1000:
+            last[:] = frames
+            return frames
+        return [Frame(ms * MS, frame.arbitration_id, frame.data) for frame in last] * copies
+
+    ticks, counts, _ = run(bridge, bench, 1400, arriving)
+    assert ticks[999].mode is Mode.RUNNING
+    assert Mode.RUNNING not in {tick.mode for tick in ticks[1011:]}
+    assert counts.untimed >= 390 * copies
+
+
+def with_signals(folder, replaced, **keys):
+    """A plan of the bus with another time signal or counter."""
+    path = config_with(folder, keys)
+    (folder / "my.dbc").write_text(DBC.replace(*replaced))
+    return load_plan(path)
+
+
+STAMP = ' SG_ Stamp : 44|16@1+ (20,0) [0|0] "us" CONTROL'
+ALIVE = ' SG_ Alive : 40|4@1+ (1,0) [0|14] "" CONTROL'
+
+
+@pytest.mark.parametrize(
+    ("key", "old", "new", "text"),
+    [
+        ("time", STAMP, STAMP.replace("[0|0]", "[0|1000]"), r"begins again after 0\.00102 s"),
+        ("time", STAMP, STAMP.replace("44|16", "44|1"), "begins again after 4e-05 s"),
+        ("time", STAMP, STAMP.replace("(20,0)", "(2000,0)"), r"steps of 0\.002 s, .* a cycle"),
+        ("counter", ALIVE, ALIVE.replace("[0|14]", "[0|2]"), "maximum 2, expected at least 3"),
+        ("counter", ALIVE, ALIVE.replace("[0|14]", "[-9|-5]"), "expected an unsigned integer"),
+        ("counter", ALIVE, ALIVE.replace("[0|14]", "[0|0.5]"), r"maximum 0\.5"),
+    ],
+)
+def test_a_time_or_counter_that_shows_nothing_is_one_line(tmp_path, key, old, new, text):
+    name = {"time": "Stamp", "counter": "Alive"}[key]
+    with pytest.raises(InputError, match=rf"{key}: .*{text}"):
+        with_signals(tmp_path, (old, new), **{key: name})
+
+
+def test_a_valid_value_that_its_signal_cannot_hold_is_one_line(tmp_path):
+    path = config_with(tmp_path, {"valid": {"signal": "Mode", "value": 2}})
+    with pytest.raises(InputError, match=r"valid\.value: 2, expected what Mode can hold, 0 to 1"):
+        load_plan(path)
+
+
+def test_a_counter_on_another_page_than_the_height_is_one_line(tmp_path):
+    paged = ALIVE.replace("Alive :", "Alive m1 :"), ' SG_ Mode M : 60|1@1+ (1,0) [0|1] "" CONTROL'
+    travel = " SG_ Travel : 0|20"
+    path = config_with(tmp_path, {"counter": "Alive"})
+    text = DBC.replace(ALIVE, paged[0]).replace(travel, " SG_ Travel m0 : 0|20")
+    plain = ' SG_ Mode : 60|1@1+ (1,0) [0|1] "" CONTROL'
+    (tmp_path / "my.dbc").write_text(text.replace(plain, paged[1]))
+    with pytest.raises(InputError, match="are never in one frame"):
+        build_bridge(load_plan(path))
+
+
+def test_an_applied_force_without_a_cycle_time_is_warned_of(tmp_path):
+    path = config_with(tmp_path)
+    (tmp_path / "my.dbc").write_text(DBC.replace('BA_ "GenMsgCycleTime" BO_ 288 1;\n', ""))
+    (found,) = [it for it in check(load_plan(path)) if it.what == "signals.applied_force"]
+    assert found.severity is Severity.WARNING
+    assert "missing after 10 ms: the DBC gives SENSOR_1 no cycle time" in found.text
+
+
+@pytest.mark.parametrize("unit", ["(20,0)", "(-20,0)", "(20,5000)"])
+def test_a_simulated_bench_states_its_time_whatever_the_range(tmp_path, unit):
+    path = config_with(tmp_path, {"time": "Stamp"})
+    (tmp_path / "my.dbc").write_text(DBC.replace(STAMP, STAMP.replace("(20,0)", unit)))
+    bench = bench_with(tmp_path, time="Stamp")
+    message = load_plan(path).database.message("SENSOR_1")
+    decode = compile_decoder(message, ["Stamp"], [Dimension.TIME])
+    frames = [frame for ms in range(50) for frame in bench.update(ms * MS)[0]]
+    times_s = [decode(frame.data)[0] for frame in frames]
+    assert np.diff(times_s) == pytest.approx(1e-3, abs=1e-9)
