@@ -131,6 +131,16 @@ def si_step(message: Message, signal_name: str, dimension: Dimension) -> float:
     return 0.0 if field.float_format else abs(field.scale)
 
 
+def si_round(message: Message, signal_name: str, dimension: Dimension) -> float:
+    """Span in SI after which a signal that counts on begins again; infinite for a float.
+
+    Raises:
+        DatabaseError: As for `compile_decoder`.
+    """
+    low, high = si_range(message, signal_name, dimension)
+    return high - low + si_step(message, signal_name, dimension)
+
+
 def decode_log(
     message: Message,
     signal_names: Sequence[str],

@@ -9,7 +9,7 @@ from enum import Enum
 from math import isfinite
 from typing import NamedTuple
 
-from can_dbc.codec import Decoder, compile_decoder, si_range, si_step
+from can_dbc.codec import Decoder, compile_decoder, si_range, si_round, si_step
 from can_dbc.database import Message, alive_counter
 from can_dbc.frame import Frame
 from can_dbc.protection import (
@@ -201,8 +201,7 @@ def compile_follower_of(channel: Channel, message: Message) -> Follower | None:
     """What follows the clock of a message's sender; None where arrivals are all there is."""
     source = clock_source(channel, message)
     if source is ClockSource.TIME_SIGNAL:
-        low_s, high_s = si_range(message, channel.time, Dimension.TIME)
-        round_s = high_s - low_s + si_step(message, channel.time, Dimension.TIME)
+        round_s = si_round(message, channel.time, Dimension.TIME)
         return compile_stamped_follower(
             channel.interval_ns, round(round_s * 1e9) if isfinite(round_s) else 0
         )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
-from can_dbc.codec import si_range, si_step
+from can_dbc.codec import si_range, si_round, si_step
 from can_dbc.database import Database, Message, alive_counter
 from can_dbc.errors import DatabaseError, InputError
 from can_dbc.units import Dimension
@@ -481,7 +481,7 @@ class _SignalReader:
         """Refuse a time signal that begins again too soon, or whose steps are too long."""
         cycle_s = (message.cycle_time_ns or self._config.period_ns) * 1e-9
         try:
-            low_s, high_s = si_range(message, name, Dimension.TIME)
+            round_s = si_round(message, name, Dimension.TIME)
             step_s = si_step(message, name, Dimension.TIME)
         except DatabaseError as error:
             raise InputError(f"{where}: {error}") from error
@@ -490,9 +490,9 @@ class _SignalReader:
                 f"{where}: {name} has steps of {step_s:g} s, expected at most a cycle ({cycle_s:g} "
                 "s): one that does not change is taken for the same sample"
             )
-        if high_s - low_s + step_s < SHORTEST_ROUND * cycle_s:
+        if round_s < SHORTEST_ROUND * cycle_s:
             raise InputError(
-                f"{where}: {name} begins again after {high_s - low_s + step_s:g} s, expected at "
+                f"{where}: {name} begins again after {round_s:g} s, expected at "
                 f"least {SHORTEST_ROUND} cycles of {cycle_s:g} s (is its range in the DBC right?)"
             )
 

@@ -1,6 +1,7 @@
 """What can be wrong before a bench moves."""
 
 import stat
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -277,14 +278,17 @@ def _limits(plan: Plan) -> list[Finding]:
         text += "although the bench has a load cell that shows it"
         findings.append(Finding(Severity.WARNING, "limits of the load cell", text))
     for name, rows in zip(plan.strut_names, plan.limits.struts, strict=True):
-        text = "; ".join(f"{row.value.value} {_bounds(row)}: {row.action}" for row in rows)
         severity = Severity.OK if rows else Severity.WARNING
-        findings.append(Finding(severity, f"limits of {name}", text or "none"))
+        findings.append(Finding(severity, f"limits of {name}", _describe_rows(rows) or "none"))
     for channel, rows in zip(plan.channels, plan.limits.channels, strict=True):
         if rows and channel.role is not Role.HEIGHT:
-            text = "; ".join(f"{row.value.value} {_bounds(row)}: {row.action}" for row in rows)
+            text = _describe_rows(rows)
             findings.append(Finding(Severity.OK, f"limits of {channel.name}", text))
     return findings
+
+
+def _describe_rows(rows: Sequence[Limit]) -> str:
+    return "; ".join(f"{row.value.value} {_bounds(row)}: {row.action}" for row in rows)
 
 
 def _bounds(limit: Limit) -> str:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from can_dbc.codec import Encoder, compile_encoder, si_range, si_step
+from can_dbc.codec import Encoder, compile_encoder, si_range, si_round
 from can_dbc.database import Database, Message, alive_counter
 from can_dbc.frame import Frame
 from can_dbc.protection import compile_protector
@@ -69,9 +69,8 @@ class _Sender:
             self._modulus = alive_counter(self.message, name).modulus
             further.append((name, Dimension.NUMBER))
         if (name := self.transmission.time) is not None:
-            low_s, high_s = si_range(self.message, name, Dimension.TIME)
-            self._first_s = low_s
-            self._round_s = high_s - low_s + si_step(self.message, name, Dimension.TIME)
+            self._first_s, _ = si_range(self.message, name, Dimension.TIME)
+            self._round_s = si_round(self.message, name, Dimension.TIME)
             further.append((name, Dimension.TIME))
         signals = [*((channel.signal, channel.dimension) for channel in self._channels), *further]
         names, dimensions = zip(*signals, strict=True)

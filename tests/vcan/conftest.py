@@ -114,7 +114,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
         supervision = {
             "stale_after_s": 0.5,
             "safe_after_s": 5.0,
-            # Importing all anew takes minutes in emulation.
+            # Importing everything again takes minutes in emulation.
             "watchdog": False,
             "limits": [
                 {"value": "measured_height_m", "low": 0.1, "high": 0.7, "action": "refuse"},
