@@ -41,7 +41,8 @@ pytestmark = pytest.mark.vcan
 
 S = 1_000_000_000
 MEASUREMENT = 0x100
-RECORDED_S = 40.0
+RECORDED_S = 24.0
+PLAYED_S = 16.0
 SETTLED_S = 5.0
 """The model starts at rest while the bench moves."""
 
@@ -224,9 +225,9 @@ def test_canplayers_bench_gives_the_same_steps(recorded, bridge, second_vcan, tm
     bench = [line for line in lines if line.split(" ")[2].split("#")[0] in BENCH_IDS]
     part.write_text("\n".join(bench) + "\n")
     with running(["canplayer", "-I", part, f"{second_vcan}=vcan0"]):
-        ended = bridge(second_vcan, 30.0)
+        ended = bridge(second_vcan, PLAYED_S)
     counts = ended.state.counts
-    assert counts.refused == counts.untimed <= 0.01 * 30.0 * RATE_HZ
+    assert counts.refused == counts.untimed <= 0.01 * PLAYED_S * RATE_HZ
     assert counts.lost == 0
     first, second = read_run(run), read_run(ended.folder)
     assert_rate_was_kept(second)
@@ -237,7 +238,7 @@ def test_canplayers_bench_gives_the_same_steps(recorded, bridge, second_vcan, tm
     # leaves hardly more than half of them, so the run is long enough for twice as many.
     assert len(both) > 0.7 * len(again)
     settled = both[int(SETTLED_S * RATE_HZ) :]
-    assert len(settled) > 5 * RATE_HZ
+    assert len(settled) > 2 * RATE_HZ
     # The same measurement waits longer for its tick in one run than in the other.
     later_s = abs(median_age_ns(second) - median_age_ns(first)) * 1e-9
     steepest_n_per_s = np.abs(np.diff(list(original.values()))).max() * RATE_HZ
