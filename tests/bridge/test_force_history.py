@@ -90,6 +90,18 @@ def test_an_older_sample_does_not_replace_a_newer_one():
     assert run(ticks).differences_n == (3.0,)
 
 
+def test_of_two_samples_of_one_time_the_last_counts():
+    assert run([(0, (5.0,), [(0, 1.0), (0, 2.0)])]).differences_n == (3.0,)
+
+
+def test_a_step_that_is_taken_again_replaces_what_it_was():
+    ticks = [(1, (5.0,), ()), (2, (90.0,), ()), (2, (6.0,), [(2, 4.0)])]
+    history = run(ticks)
+    assert history.forces == ((2 * MS, (6.0,)), (1 * MS, (5.0,)))
+    assert history.rates_n_per_s == pytest.approx((1000.0,))
+    assert history.differences_n == (2.0,)
+
+
 def test_the_history_is_as_long_as_a_sample_may_be_late():
     history = run([(t, (5.0,), ()) for t in range(1, 100)])
     assert history.forces[0][0] == 99 * MS

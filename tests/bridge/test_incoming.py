@@ -57,6 +57,14 @@ BO_ 259 COUNTED: 8 BENCH
  SG_ STATE : 40|4@1+ (1,0) [0|0] "" RIG
  SG_ SHIFTED : 44|4@1+ (1,1) [0|0] "" RIG
  SG_ BIT : 48|1@1+ (1,0) [0|0] "" RIG
+ SG_ SIGNED_STAMP : 56|8@1- (1,0) [0|0] "ms" RIG
+BO_ 260 STAMPED: 6 BENCH
+ SG_ HEIGHT : 0|16@1+ (0.01,0) [0|0] "m" RIG
+ SG_ STAMP : 16|32@1- (1,0) [0|0] "s" RIG
+BO_ 261 PAGES: 2 BENCH
+ SG_ PAGE M : 0|8@1+ (1,0) [0|0] "" RIG
+ SG_ HEIGHT m0 : 8|4@1+ (0.1,0) [0|0] "m" RIG
+ SG_ COUNT m0 : 12|4@1+ (1,0) [0|0] "" RIG
 BO_ 2566834432 GROUP: 8 BENCH
  SG_ HEIGHT : 0|16@1+ (0.1,-3200) [-3200|3225.5] "mm" RIG
  SG_ OTHER_HEIGHT : 16|16@1+ (0.1,-3200) [-3200|3225.5] "mm" RIG
@@ -76,6 +84,7 @@ BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
 BA_ "GenMsgCycleTime" BO_ 256 5;
 BA_ "GenMsgCycleTime" BO_ 257 5;
 BA_ "GenMsgCycleTime" BO_ 259 10;
+BA_ "GenMsgCycleTime" BO_ 261 10;
 BA_ "E2EProfile" BO_ 256 "P02";
 BA_ "E2EDataIds" BO_ 256 "059C063CED1481CCF00933E7181EBE6A";
 BA_ "VFrameFormat" BO_ 2566834432 3;
@@ -83,6 +92,7 @@ BA_ "VFrameFormat" BO_ 2566834688 3;
 SIG_VALTYPE_ 257 HEIGHT : 1;
 SIG_VALTYPE_ 257 OTHER_HEIGHT : 1;
 SIG_VALTYPE_ 258 HEIGHT : 1;
+SIG_VALTYPE_ 260 STAMP : 1;
 """
 
 
@@ -205,12 +215,42 @@ def test_a_counter_without_a_crc_shows_frames_that_are_lost_or_repeated(database
         (statuses.OUT_OF_SEQUENCE, None),
     ]
     # A value that no counter of this range has is no step either way.
-    assert counted(made, [3, 12, 4])[1:] == [(statuses.OUT_OF_SEQUENCE, None), (statuses.OK, 2)]
+    assert counted(made, [11, 12, 0])[1:] == [(statuses.OUT_OF_SEQUENCE, None), (statuses.OK, 2)]
     # Without the key nothing is checked.
     assert all(
         status is statuses.OK
         for status, _ in counted(compile_incoming(message, [height(0, 0)]), [3, 3, 9])
     )
+
+
+def test_as_many_frames_may_be_lost_as_a_silence_has_cycles(database):
+    message = database.message("COUNTED")
+    alive = alive_counter(message, "COUNT")
+    assert (alive.modulus, alive.silence_ns) == (12, 120 * MS)
+    aperiodic = dataclasses.replace(message, cycle_time_ns=None)
+    assert alive_counter(aperiodic, "COUNT").silence_ns > 10**18
+    frame = bytes([50, 0, 3, 0, 0, 0, 0, 0]), bytes([50, 0, 1, 0, 0, 0, 0, 0])
+    for definition, silence_ns, expected in (
+        (message, 80 * MS, FrameStatus.OUT_OF_SEQUENCE),
+        (message, 90 * MS, FrameStatus.LOST),
+        (message, 500 * MS, FrameStatus.LOST),
+        (aperiodic, 10**15, FrameStatus.OUT_OF_SEQUENCE),
+    ):
+        made = compile_incoming(definition, [height(0, 0, counter="COUNT")])
+        first, _, _ = made.read(INITIAL, Frame(MS, 259, frame[0]))
+        # Ten steps on.
+        assert made.read(first, Frame(MS + silence_ns, 259, frame[1]))[1] is expected
+
+
+def test_a_counter_of_one_page_is_not_looked_for_on_another(database):
+    made = compile_incoming(database.message("PAGES"), [height(0, 0, counter="COUNT")])
+    sequence, status, values = made.read(INITIAL, Frame(0, 261, bytes([0, 0x35])))
+    assert (status, values[0]) == (FrameStatus.FIRST, 0.5)
+    other = made.read(sequence, Frame(10 * MS, 261, bytes([1, 0x35])))
+    assert other == (sequence, FrameStatus.OK, None)
+    short = made.read(sequence, Frame(10 * MS, 261, bytes([0])))
+    assert short == (sequence, FrameStatus.WRONG_LENGTH, None)
+    assert made.read(sequence, Frame(20 * MS, 261, bytes([0, 0x46])))[1] is FrameStatus.OK
 
 
 def test_a_counter_without_a_crc_states_times(database):
@@ -245,6 +285,29 @@ def test_a_time_signal_is_read_in_seconds_and_goes_round(database):
         assert stamp_ns == raw * 50_000
         clock = made.follow(clock, ms * MS, stamp_ns)
     assert clock.cycles * channel.interval_ns + clock.phase_ns == (3 * round_ms + 26) * MS
+
+
+def test_a_signed_time_goes_round_in_all_its_values(database):
+    made = compile_incoming(database.message("COUNTED"), [height(0, 0, time="SIGNED_STAMP")])
+    clock = None
+    for ms in (120, 127, 128, 300, 383, 384):
+        # 256 steps of 1 ms, from -128 on.
+        frame = Frame(ms * MS, 259, bytes([50, 0, 0, 0, 0, 0, 0, ms % 256]))
+        stamp_ns = round(made.read(INITIAL, frame)[2][made.stamp] * 1e9)
+        assert -128 * MS <= stamp_ns < 128 * MS
+        clock = made.follow(clock, ms * MS, stamp_ns)
+        assert clock.cycles * MS + clock.phase_ns == (ms - 120) * MS
+
+
+def test_a_time_that_is_a_float_never_goes_round(database):
+    made = compile_incoming(database.message("STAMPED"), [height(0, 0, time="STAMP")])
+    clock = None
+    for s in (-2.0, 0.0, 4096.0, 65_536.0):
+        frame = Frame(round((s + 3.0) * 1e9), 260, bytes([50, 0]) + struct.pack("<f", s))
+        values = made.read(INITIAL, frame)[2]
+        assert values[made.stamp] == s
+        clock = made.follow(clock, frame.t_ns, round(s * 1e9))
+        assert clock.cycles * MS + clock.phase_ns == round((s + 2.0) * 1e9)
 
 
 def test_the_frames_of_one_that_states_its_time_follow_each_other_by_it(database):

@@ -244,6 +244,29 @@ def test_an_acknowledgement_during_the_ramp_is_refused():
 STRUT = StrutOutput(5.0, 1.0, True, 0.4, 0.0, 0.0, 0.0)
 
 
+@pytest.mark.parametrize("mode", [Mode.SETTLING, Mode.READY, Mode.RUNNING, Mode.HOLD, Mode.SAFE])
+def test_without_ramps_what_is_published_is_the_output_itself(mode):
+    operation = Operation(Arming("manual", (), 500 * MS), 0.0, None)
+    assert operation.is_used
+    output = StepOutput(mode, (STRUT,))
+    state, shown = operation.publish(OperationState(0), MS, output, [0.0])
+    assert shown is output
+    assert state == OperationState(MS)
+    assert operation.is_at_rest(state, [0.0])
+
+
+def test_a_force_has_faded_in_at_its_time_exactly_whatever_the_ticks():
+    operation = Operation(Arming("automatic", (), 500 * MS), 0.01, None)
+    state, output = OperationState(0), StepOutput(Mode.READY, (STRUT,))
+    shares = []
+    for t_ms in (3, 6, 9, 12):
+        state, shown = operation.publish(state, t_ms * MS, output, [0.0])
+        shares.append(shown.struts[0].force_n / STRUT.force_n)
+        assert operation.is_withheld(state, t_ms * MS) is (t_ms < 10)
+    assert shares[:3] == pytest.approx([0.3, 0.6, 0.9])
+    assert shares[3] == 1.0
+
+
 @settings(max_examples=200, deadline=None)
 @given(
     st.lists(
