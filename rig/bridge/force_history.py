@@ -11,12 +11,9 @@ from math import nan
 
 from msgspec import Struct
 
-from rig.bridge.measurement_age import is_too_old
+from rig.bridge.measurement_age import age_limit_ns, is_too_old
 from rig.bridge.values import StrutOutput
 from rig.channels.channel import Channel, Sample
-
-_MOST_CYCLES = 3
-"""Cycles after which a sample of the load cell is old, if that is longer than a height's age."""
 
 _LATEST_NS = 100_000_000
 """Age up to which a sample can be compared: frames wait by less."""
@@ -55,7 +52,7 @@ class ForceComparison:
     def __init__(self, cell: Channel | None, stale_after_ns: int) -> None:
         self._cell = cell
         interval_ns = 0 if cell is None else cell.interval_ns
-        self._stale_after_ns = max(stale_after_ns, _MOST_CYCLES * interval_ns)
+        self._stale_after_ns = age_limit_ns(interval_ns, stale_after_ns)
         self._latest_ns = 0 if cell is None else _LATEST_NS
 
     def update(

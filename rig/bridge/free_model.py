@@ -13,17 +13,13 @@ from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant, LoadedModel, ModelState
 from rig.bridge.estimator import Estimate, find_divergence, is_sensible
 from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
-from rig.bridge.measurement_age import is_too_old
+from rig.bridge.measurement_age import age_limit_ns, is_too_old
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import APPLIED_FORCE, TEMPERATURE
 from rig.closed_loop.strut_response import strut_responses
 from rig.observers.protocol import AnyObserver, Innovation, ObserverState, Start
 from rig.observers.strut_sensors import Instant, model_height_m, model_reading
-
-_MOST_CYCLES = 3
-"""Cycles after which a missing applied force is old, if that is longer than a height's age."""
-
 
 _AT_ONCE = 4
 """Intervals that may not be over in less than half of their time."""
@@ -521,4 +517,5 @@ def _has_cycle(channel: Channel) -> bool:
 
 def grace_of_applied_force_ns(channels: Sequence[Channel], stale_after_ns: int) -> int:
     """How much older than a height a channel's newest sample may be: its own cycle is longer."""
-    return max([_MOST_CYCLES * item.interval_ns - stale_after_ns for item in channels] + [0])
+    limits_ns = [age_limit_ns(item.interval_ns, stale_after_ns) for item in channels]
+    return max(limits_ns, default=stale_after_ns) - stale_after_ns

@@ -6,7 +6,15 @@ are `supervision.stale_after_s` and `supervision.safe_after_s` of a configuratio
 of a strut is left out by its own interval (`rig.observers.sensor_fusion`).
 """
 
+_MOST_CYCLES = 3
+"""Cycles of a message of its own after which a value is too old: two frames may be lost."""
+
 
 def is_too_old(measured_ns: int, t_ns: int, limit_ns: int) -> bool:
     """Whether a measurement is older than a limit at a time."""
     return t_ns - measured_ns > limit_ns
+
+
+def age_limit_ns(interval_ns: int, stale_after_ns: int) -> int:
+    """Age from which a value that may come less often than the heights is too old."""
+    return max(stale_after_ns, _MOST_CYCLES * interval_ns)

@@ -4,6 +4,8 @@ import math
 import random
 
 import pytest
+from msgspec.structs import replace
+from pydantic import ValidationError
 
 from rig.bridge.arming import OpenInterlock
 from rig.bridge.estimator import Estimate
@@ -16,8 +18,10 @@ from rig.bridge.mode_supervisor import (
     Supervision,
     Supervisor,
 )
-from rig.bridge.supervision_limits import Action, Excess, LimitedValue
+from rig.bridge.supervision_limits import Action, Excess, Limit, LimitedValue
 from rig.bridge.values import Divergence, Mode, Request, StepInput, StrutOutput
+from rig.channels.channel import Channel, Role
+from rig.channels.measured_quantities import LOAD_CELL_FORCE
 
 MS = 1_000_000
 SUPERVISION = Supervision(stale_after_s=0.01, safe_after_s=0.05)
@@ -263,8 +267,62 @@ def test_every_mode_and_event_is_reached():
     assert {mode for _, mode, _ in seen} == set(Mode) - {Mode.INIT}
 
 
+def test_a_cause_is_of_no_strut_and_of_no_device_unless_it_says_so():
+    cause = Cause(Event.STALE)
+    assert (cause.strut, cause.device) == (-1, -1)
+
+
+@pytest.mark.parametrize(("seconds", "is_right"), [(0.0, True), (60.0, True), (60.1, False)])
+def test_a_force_fades_in_within_a_minute(seconds, is_right):
+    if is_right:
+        assert Supervision(fade_in_s=seconds).fade_in_s == seconds
+        return
+    with pytest.raises(ValidationError, match="fade_in_s"):
+        Supervision(fade_in_s=seconds)
+
+
 def test_both_ages_may_be_the_same():
     same_age = Supervision(stale_after_s=0.02, safe_after_s=0.02)
     assert same_age.stale_after_ns == same_age.safe_after_ns == 20 * MS
     assert Supervision().stale_after_ns == 10 * MS
     assert Supervision().safe_after_ns == 500 * MS
+
+
+HOLD_ABOVE = Limit(value="force_n", high=10.0, for_s=0.002, action="hold")
+
+
+def two_struts(limits, cell=None):
+    estimator = Scripted()
+    estimator.struts = 2
+    return estimator, Supervisor(estimator, SUPERVISION, limits, cell)
+
+
+def test_a_delayed_limit_is_that_of_its_own_strut():
+    estimator, supervisor = two_struts([(), (HOLD_ABOVE,)])
+    state, modes = supervisor.init(0), []
+    for ms in range(1, 5):
+        struts = (replace(STRUT, force_n=90.0), replace(STRUT, force_n=20.0))
+        estimator.estimate = Estimate(struts, ms * MS, True)
+        state, _, _ = supervisor.step(state, StepInput(ms * MS, ()))
+        modes.append(state.mode)
+    assert modes == [Mode.RUNNING, Mode.RUNNING, Mode.HOLD, Mode.HOLD]
+    assert same(state.cause, Cause(Event.BEYOND_HOLD, 1, "force_n", 20.0, 10.0))
+
+
+def test_a_load_cell_is_compared_where_a_limit_needs_it():
+    cell = Channel(3, Role.BENCH, LOAD_CELL_FORCE, "cell", "cell", -1, MS)
+    compared = Limit(value="force_difference_n", high=10.0, action="hold")
+    rate = Limit(value="force_rate_n_per_s", high=10.0, action="hold")
+    for row, given, expected in (
+        (compared, cell, {3}),
+        (rate, None, set()),
+        (HOLD_ABOVE, cell, set()),
+    ):
+        assert two_struts([(row,), ()], given)[1].compared == expected
+
+
+def test_other_limits_before_the_first_estimate_have_nothing_to_keep():
+    _, before = two_struts([(HOLD_ABOVE,), ()])
+    _, after = two_struts([(HOLD_ABOVE,), (HOLD_ABOVE,)])
+    state = before.init(0)
+    assert after.take_over(state, before, MS) is state

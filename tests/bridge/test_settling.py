@@ -277,9 +277,9 @@ def test_what_is_valid_errs_at_most_three_times_as_much_as_a_settled_run(kind):
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_valid_errs_at_most_three_times_as_much_on_a_hundred_benches(kind):
-    worst = [case for seed in range(100) if (case := worst_valid_errors(2000 + seed, kind))]
-    assert len(worst) > 20
+def test_what_is_valid_errs_at_most_three_times_as_much_on_forty_benches(kind):
+    worst = [case for seed in range(40) if (case := worst_valid_errors(2000 + seed, kind))]
+    assert len(worst) > 8
     assert max(map(max, worst)) <= MOST
 
 

@@ -532,7 +532,7 @@ STIFFNESS = st.floats(2.0, 6.5).map(lambda power: 10.0**power)
 RATIO = st.floats(0.02, 3.0)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(masses=st.tuples(MASS, MASS), stiffnesses=st.tuples(STIFFNESS, STIFFNESS), ratio=RATIO)
 def test_a_linear_bench_is_right_to_a_thousandth_or_refused(masses, stiffnesses, ratio):
     """Two bodies on two struts, damped in proportion to stiffness and mass, let go from rest."""
@@ -548,7 +548,7 @@ def test_a_linear_bench_is_right_to_a_thousandth_or_refused(masses, stiffnesses,
     stiffness = np.diag([k1, k2])
     start = np.array([0.01, -0.02])
     # A bench whose fast mode is a thousand times its slow one would take a minute.
-    duration_s = min(6.0 * math.pi / math.sqrt(k1 / (m1 + m2)), 20_000 * plant.step_s)
+    duration_s = min(6.0 * math.pi / math.sqrt(k1 / (m1 + m2)), 6_000 * plant.step_s)
     ticks = min(200, max(20, round(duration_s / 1e-3)))
     state = plant.init(start.tolist())
     for tick in range(1, ticks + 1):

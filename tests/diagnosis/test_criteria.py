@@ -58,6 +58,7 @@ def test_the_usual_criteria_give_the_right_answer(case):
     assert usual(case) == CASES[case].right
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "value", "case"), ABSURD)
 def test_an_absurd_criterion_gives_another_answer(name, value, case):
     with warnings.catch_warnings():

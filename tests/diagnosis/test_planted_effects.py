@@ -201,6 +201,7 @@ class FrictionAndHardening(Nothing):
         return Friction().force(t, z, v, state) + Hardening().force(t, z, v, state)
 
 
+@pytest.mark.long
 def test_friction_beside_a_hardening_spring_is_found_as_two():
     runs = [bench.run(FrictionAndHardening()), bench.run(FrictionAndHardening(), seed=2)]
     found = diagnose(bench.model(), runs[:1], runs[1:]).diagnosis

@@ -2,7 +2,7 @@
 
 Results are kept in ``--out``, so an interrupted run goes on where it stopped; after a change of the
 program, give a new folder. The folder then holds ``summary.json``, ``table.md`` and ``cases.csv``.
-``--tenth --bounds`` is a quick look. ``--write KIND SEED`` only writes one case's files.
+``--one-of 20 --bounds`` is a quick look. ``--write KIND SEED`` only writes one case's files.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from rich.progress import Progress
 from tests.diagnosis_benchmark.bounds import violations
 from tests.diagnosis_benchmark.execute import crashed, execute
 from tests.diagnosis_benchmark.judge import Result
-from tests.diagnosis_benchmark.plan import GROUPS, Counts, Slot, a_tenth, slots
+from tests.diagnosis_benchmark.plan import GROUPS, Counts, Slot, part_of, slots
 from tests.diagnosis_benchmark.summary import print_tables, summarise, write_tables
 from tests.truth.cases import make_case
 from tests.truth.files import write_case
@@ -35,7 +35,9 @@ def _arguments() -> argparse.Namespace:
         option = f"--{name.replace('_', '-')}"
         says = f"{group.says} ({group.cases})"
         parser.add_argument(option, type=int, default=group.cases, metavar="N", help=says)
-    parser.add_argument("--tenth", action="store_true", help="a tenth of each group")
+    parser.add_argument(
+        "--one-of", type=int, default=1, metavar="N", help="one case of N of each group"
+    )
     parser.add_argument("--groups", help="only these, with commas between")
     parser.add_argument("--bounds", action="store_true", help="exit with 1 where one is violated")
     parser.add_argument("--jobs", type=int, default=2, help="cases at a time")
@@ -58,7 +60,7 @@ def _chosen(args: argparse.Namespace) -> list[str]:
 
 def _counts(args: argparse.Namespace) -> Counts:
     counts = {group: getattr(args, group) for group in _chosen(args)}
-    return a_tenth(counts) if args.tenth else counts
+    return part_of(counts, args.one_of)
 
 
 def _run_all(todo: list[Slot], out: Path, jobs: int, limit_s: float) -> Iterator[Result]:

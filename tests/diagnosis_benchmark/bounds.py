@@ -1,7 +1,7 @@
 """What the figures must be; all numbers that decide whether a benchmark passes.
 
 A share counts as outside only where its own 95 % interval lies there as a whole, so the same bounds
-hold for a tenth of the cases, and bind harder the more there are. Times are no bounds: they are the
+hold for a part of the cases, and bind harder the more there are. Times are no bounds: they are the
 machine's as much as the program's.
 """
 

@@ -84,9 +84,11 @@ Counts = dict[str, int]
 """Group -> number of cases; what is not named has none."""
 
 
-def a_tenth(counts: Counts) -> Counts:
-    """About a tenth of each group, one case at least of each that has any."""
-    return {group: max(1, round(count / 10)) if count else 0 for group, count in counts.items()}
+def part_of(counts: Counts, divisor: int) -> Counts:
+    """About one case of so many of each group, one at least of each group that has any."""
+    return {
+        group: max(1, round(count / divisor)) if count else 0 for group, count in counts.items()
+    }
 
 
 def slots(counts: Counts, seed: int) -> list[Slot]:

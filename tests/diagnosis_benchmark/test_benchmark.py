@@ -19,7 +19,7 @@ from tests.diagnosis_benchmark.execute import (
     within,
 )
 from tests.diagnosis_benchmark.judge import Result, false_names, is_right, is_unbound, judge
-from tests.diagnosis_benchmark.plan import GROUPS, Slot, a_tenth, fill, slots
+from tests.diagnosis_benchmark.plan import GROUPS, Slot, fill, part_of, slots
 from tests.diagnosis_benchmark.summary import (
     COLUMNS,
     POOLS,
@@ -265,19 +265,20 @@ def test_slots_are_as_many_as_asked_and_cover_every_family():
     assert {slot.group for slot in found[:15]} >= {"single", "pair", "complete"}
 
 
-def test_defaults_and_their_tenth():
+def test_defaults_and_a_part_of_them():
     counts = {name: group.cases for name, group in GROUPS.items()}
     assert 400 <= sum(counts.values()) <= 500
-    tenth = a_tenth(counts)
-    assert 40 <= sum(tenth.values()) <= 50
-    assert all(bool(tenth[name]) == bool(counts[name]) for name in counts)
-    kinds = [slot.kind for slot in slots(tenth, 0) if slot.group == "single"]
+    assert part_of(counts, 1) == counts
+    part = part_of(counts, 10)
+    assert 40 <= sum(part.values()) <= 50
+    assert all(bool(part[name]) == bool(counts[name]) for name in counts)
+    kinds = [slot.kind for slot in slots(part, 0) if slot.group == "single"]
     assert len(set(kinds)) == len(kinds)
 
 
 def test_arguments_choose_groups_and_counts(monkeypatch):
-    given = ["x", "--out", "there", "--groups", "rough_pair,dyno", "--rough-pair", "30", "--tenth"]
-    monkeypatch.setattr("sys.argv", given)
+    given = ["x", "--out", "there", "--groups", "rough_pair,dyno", "--rough-pair", "30"]
+    monkeypatch.setattr("sys.argv", [*given, "--one-of", "10"])
     args = command._arguments()
     assert command._counts(args) == {"rough_pair": 3, "dyno": 4}
     monkeypatch.setattr("sys.argv", ["x", "--out", "there", "--groups", "wobble"])

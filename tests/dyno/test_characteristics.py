@@ -18,6 +18,7 @@ from tests.dyno.dynos import Dyno, drawn
 RATE_HZ = 500.0
 
 
+@pytest.mark.long
 def test_intervals_hold_the_truth():
     hits = study(60, seed=3)
     for name in dict.fromkeys(name for name, _ in hits):

@@ -85,6 +85,7 @@ def test_play_takes_its_travel_at_every_change_of_sign():
     assert travelled == pytest.approx(play, rel=0.15)
 
 
+@pytest.mark.long
 def test_the_command_names_it(tmp_path):
     good, bad = tmp_path / "good.csv", tmp_path / "bad.csv"
     written(good, (*record(Damper(), np.random.default_rng(1)),))

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import nbformat
+import pytest
 from nbclient import NotebookClient
 
 import rig
@@ -10,6 +11,7 @@ import rig
 NOTEBOOK = Path(rig.__file__).parent / "demo" / "what_does_the_model_lack.ipynb"
 
 
+@pytest.mark.long
 def test_the_notebook_runs_and_finds_the_effect(tmp_path):
     book = nbformat.read(NOTEBOOK, as_version=4)
     nbformat.validate(book)

@@ -20,6 +20,7 @@ def blocks():
     return [[line[4:] for line in block.splitlines()] for block in found]
 
 
+@pytest.mark.long
 def test_the_tour_is_walked_as_it_stands(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     commands, script = blocks()

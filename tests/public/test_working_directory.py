@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 SCRIPT = """
 import json, os
 before = os.getcwd()
@@ -28,6 +30,7 @@ def found(folder):
     return json.loads(shown.stdout)
 
 
+@pytest.mark.long
 def test_no_library_takes_settings_from_it(tmp_path):
     expected = found(tmp_path)
     (tmp_path / ".numba_config.yaml").write_text("disable_jit: 1\ncache_dir: /elsewhere\n")
