@@ -138,7 +138,9 @@ def test_another_way_of_arming_begins_unarmed():
     assert trial.ticks[-1].is_valid
     t_ns = BEGIN_MS * MS
     bridges = [trial.bridge]
-    for arming in ("automatic", "manual"):
+    for arming in ("manual", "automatic", "manual"):
+        is_armed = trial.state.operation.arming.is_armed
+        assert is_armed is (len(bridges) <= 2)
         supervision = trial.ready.config.supervision.model_copy(update={"arming": arming})
         bridge = bridges[-1].with_settings(trial.bridge.observers, supervision, trial.ready.limits)
         trial.state = bridge.take_over(trial.state, bridges[-1], t_ns)

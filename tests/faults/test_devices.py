@@ -85,6 +85,12 @@ def test_a_device_that_is_well_changes_nothing():
     assert watched.state.counts == silent.state.counts
 
 
+def test_a_bridge_listens_to_the_frames_of_its_devices_and_to_no_claims():
+    """Claims of addresses are J1939's: a CANopen device makes none."""
+    keys = {item.arbitration_id for item in Trial(DEVICES).bridge.filters}
+    assert keys - {item.arbitration_id for item in Trial().bridge.filters} == {EMERGENCY, HEARTBEAT}
+
+
 def test_an_emergency(row):
     trial = Trial(DEVICES)
     begin = emergency(0x8130, 0x11, BEGIN_NS)

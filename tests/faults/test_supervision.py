@@ -1,6 +1,7 @@
 """The table of limits, and the way into the safe state and out of it."""
 
 import dataclasses
+import itertools
 import math
 
 import cantools.database
@@ -136,6 +137,27 @@ def test_a_bridge_that_misses_every_third_tick_is_running():
 
     ticks = trial.run(BEGIN_MS + 500, conditions=conditions)[BEGIN_MS:]
     assert {tick.mode for tick in ticks} == {Mode.RUNNING}
+
+
+@pytest.mark.parametrize("missed", [(0, 1), (3, 0, 0), (0, 0, 25)])
+def test_the_share_of_missed_ticks_fades_by_a_two_hundredth_at_each(missed):
+    """Twenty of one pause count: ages judge a pause, however long it is."""
+    trial = Trial(settling_s=0.0, overload_share=1.0)
+    pattern = itertools.islice(itertools.cycle(missed), 60)
+    of_ticks = [0] * 60 + list(pattern) + [0] * 1400
+    share, shares, expected = 0.0, [], []
+    for index, count in enumerate(of_ticks):
+        trial.state, _ = trial.bridge.tick(trial.state, index * MS, [], Conditions(overruns=count))
+        shares.append(trial.state.missed_share)
+        for _ in range(min(count, 20)):
+            share += (1.0 - share) / 200.0
+        share -= share / 200.0
+        # Less than a thousandth is none.
+        share = share if share > 1e-3 else 0.0
+        expected.append(share)
+    assert shares == pytest.approx(expected, rel=1e-9)
+    assert max(shares) > 0.1
+    assert shares[-1] == 0.0
 
 
 def test_an_implausible_height_is_refused_with_all_of_its_frame():
