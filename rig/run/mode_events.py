@@ -40,7 +40,7 @@ class ModeEvents:
         self.ticks[mode] += 1
         if asked is not None:
             self._write_request(asked, supervised)
-        if mode is not self._mode or cause is not self._cause:
+        if mode is not self._mode or _kind_of(cause) != _kind_of(self._cause):
             self._write(state, cause)
             self._mode, self._cause = mode, cause
 
@@ -89,3 +89,8 @@ class ModeEvents:
             if isfinite(cause.limit):
                 text["limit"] = cause.limit
         return text
+
+
+def _kind_of(cause: Cause | None) -> tuple[object, ...]:
+    """What distinguishes causes: one that returns within a tick that catches up is the same."""
+    return () if cause is None else (cause.event, cause.strut, cause.quantity, cause.device)
