@@ -306,10 +306,11 @@ def test_before_an_estimate_has_settled_its_history_requires_nothing():
 
 
 def test_a_delay_is_over_to_the_nanosecond_whatever_its_decimals():
-    limit = delayed(for_s=0.0041)
     begun, struts = [Delay(is_passed=False, since_ns=0)], [STRUT]
-    for t_ns, is_passed in ((4_099_999, False), (4_100_000, True)):
-        assert update_delays([(0, limit)], begun, struts, t_ns)[0].is_passed == is_passed
+    for for_s, after_ns in ((0.0041, 4_100_000), (3600.0, 3_600_000_000_000)):
+        limit = delayed(for_s=for_s)
+        for t_ns, is_passed in ((after_ns - 1, False), (after_ns, True)):
+            assert update_delays([(0, limit)], begun, struts, t_ns)[0].is_passed == is_passed
 
 
 def test_a_delayed_limit_forgets_what_was_shorter_than_its_time():

@@ -372,6 +372,7 @@ def test_a_switch_may_be_the_first_channel(quantity):
 
 
 def test_without_switches_and_by_itself_nothing_has_to_permit():
+    assert OperationState(0).arming.is_armed is False
     arming = Arming("automatic", (), 500 * MS)
     assert arming.switches == frozenset()
     assert arming.is_used is False
