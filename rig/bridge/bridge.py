@@ -371,7 +371,7 @@ class Bridge:
     def _find_immediate(self, samples: Sequence[Sample]) -> list[Sample]:
         """Samples that count from now on although they belong to earlier steps.
 
-        A switch has no past, and a load cell is compared with the estimate of its own time.
+        A switch has no past, and a load cell is compared with the estimate at its time.
         """
         return [item for item in samples if item.channel in self._immediate]
 

@@ -20,7 +20,7 @@ from can_dbc.protection import (
     compile_counter_checker,
 )
 from can_dbc.units import Dimension
-from rig.bridge.sample_times import Follower, compile_follower, compile_stamped_follower
+from rig.bridge.sample_times import Follower, compile_follower, compile_follower_of_times
 from rig.channels.channel import Channel, Role, ValidSignal
 from rig.channels.measured_quantities import APPLIED_FORCE
 
@@ -202,7 +202,7 @@ def compile_follower_of(channel: Channel, message: Message) -> Follower | None:
     source = clock_source(channel, message)
     if source is ClockSource.TIME_SIGNAL:
         round_s = si_round(message, channel.time, Dimension.TIME)
-        return compile_stamped_follower(
+        return compile_follower_of_times(
             channel.interval_ns, round(round_s * 1e9) if isfinite(round_s) else 0
         )
     if source is ClockSource.COUNTER and message.cycle_time_ns:
@@ -272,14 +272,14 @@ def _with_counter(read: Reader, index: int, alive: AliveCounter) -> Reader:
     """A reader that also checks a counter, one of the values."""
     check = compile_counter_checker(alive)
 
-    def read_counted(sequence: SequenceState, frame: Frame) -> Reading:
+    def read_with_counter(sequence: SequenceState, frame: Frame) -> Reading:
         sequence, status, values = read(sequence, frame)
         if values is None:
             return sequence, status, None
         sequence, status = check(sequence, int(values[index]), frame.t_ns)
         return sequence, status, values if status.is_accepted else None
 
-    return read_counted
+    return read_with_counter
 
 
 def _compile_reader(message: Message, decode: Decoder) -> Reader:

@@ -7,7 +7,7 @@ of a strut is left out by its own interval (`rig.observers.sensor_fusion`).
 """
 
 _MOST_CYCLES = 3
-"""Cycles of a message of its own after which a value is too old: two frames may be lost."""
+"""Cycles of its message after which a value is too old: two frames may be lost."""
 
 
 def is_too_old(measured_ns: int, t_ns: int, limit_ns: int) -> bool:

@@ -28,7 +28,7 @@ from rig.bridge.supervision_limits import (
     Limit,
     LimitsByStrut,
     find_excess,
-    find_passed,
+    find_violations,
     inherit_delays,
     range_of_estimate,
     update_delays,
@@ -367,7 +367,7 @@ class Supervisor:
         if self.delayed:
             delays = update_delays(self.delayed, state.delays, values, t_ns)
             state = replace(state, delays=delays)
-            passed = find_passed(self.delayed, delays, is_settled=is_settled)
+            passed = find_violations(self.delayed, delays, is_settled=is_settled)
             action = max([action, *(row.severity for _, row in passed)])
             limits = [
                 [*rows, *(row for strut, row in passed if strut == index)]

@@ -174,7 +174,7 @@ def compile_follower(cycle_ns: int) -> Follower:
     return follow
 
 
-def compile_stamped_follower(cycle_ns: int, round_ns: int) -> Follower:
+def compile_follower_of_times(cycle_ns: int, round_ns: int) -> Follower:
     """Build what follows the clock of a sender whose frames hold its time.
 
     The frames are followed as if each had been sampled, and had arrived, at the whole cycle nearest

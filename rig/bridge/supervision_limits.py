@@ -395,7 +395,7 @@ def inherit_delays(
     return tuple(find(strut, row) for strut, row in rows)
 
 
-def find_passed(
+def find_violations(
     rows: Sequence[tuple[int, Limit]], delays: Sequence[Delay], *, is_settled: bool
 ) -> list[tuple[int, Limit]]:
     """The limits that count as passed, each with the index of its strut."""

@@ -15,7 +15,7 @@ from rig.formats.import_report import ImportReport
 from rig.machine.clock import VirtualClock
 from rig.plan.build import build_bridge
 from rig.plan.plan import Plan
-from rig.run.logged_run import Endpoint, run_logged
+from rig.run.logged_run import Endpoint, run_with_log
 from rig.run.loop import Progress, RunControl
 
 _LONGEST_GAP_NS = 3_600_000_000_000
@@ -99,7 +99,7 @@ def import_log(
     endless = plan.with_config(plan.config.model_copy(update={"duration_s": None}))
     endpoint = Endpoint(port, VirtualClock(), LinkFigures())
     control = RunControl(stop=lambda: port.is_exhausted, progress=progress)
-    ended = run_logged(endless, bridge, endpoint, out, control)
+    ended = run_with_log(endless, bridge, endpoint, out, control)
     duration_s = (port.last_ns - port.first_ns) * 1e-9
     counts = ended.state.counts
     return ImportReport(

@@ -20,7 +20,7 @@ from rig.machine.realtime import Granted, realtime
 from rig.plan.build import build_bridge
 from rig.plan.config import RunConfig
 from rig.plan.plan import Plan
-from rig.run.logged_run import Ended, Endpoint, on_signal, run_logged
+from rig.run.logged_run import Ended, Endpoint, on_signal, run_with_log
 from rig.run.loop import RunControl
 from rig.run.ports import BenchOnBus, BusPort
 from rig.run.trace import Trace
@@ -90,7 +90,7 @@ def live(
         )
         acknowledge = partial(port.operator.ask, Request.ACKNOWLEDGE, "SIGUSR1")
         stack.enter_context(on_signal(signal.SIGUSR1, acknowledge))
-        return run_logged(plan, bridge, endpoint, folder, control, trace=trace)
+        return run_with_log(plan, bridge, endpoint, folder, control, trace=trace)
 
 
 def _machine() -> MachineReader:
@@ -162,7 +162,7 @@ def with_bench(
                 operator=port.operator,
                 machine=_machine(),
             )
-        return run_logged(plan, bridge, endpoint, folder, control, trace=trace)
+        return run_with_log(plan, bridge, endpoint, folder, control, trace=trace)
 
 
 def run_bench(

@@ -115,7 +115,7 @@ class Endpoint:
     machine: MachineReader | None = None
 
 
-def run_logged(
+def run_with_log(
     plan: Plan,
     bridge: Bridge,
     endpoint: Endpoint,

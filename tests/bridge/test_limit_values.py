@@ -19,7 +19,7 @@ from rig.bridge.supervision_limits import (
     Plausibility,
     explain_measurement,
     find_excess,
-    find_passed,
+    find_violations,
     inherit_delays,
     judge_measurement,
     range_of_estimate,
@@ -301,8 +301,8 @@ def test_only_a_difference_from_the_load_cell_is_left_after_a_time_of_its_own():
 def test_before_an_estimate_has_settled_its_history_requires_nothing():
     rows = [(0, delayed("force_rate_n_per_s", "safe")), (0, delayed("force_n", "hold"))]
     passed = (Delay(is_passed=True, since_ns=0),) * 2
-    assert find_passed(rows, passed, is_settled=False) == rows[1:]
-    assert find_passed(rows, passed, is_settled=True) == rows
+    assert find_violations(rows, passed, is_settled=False) == rows[1:]
+    assert find_violations(rows, passed, is_settled=True) == rows
 
 
 def test_a_delay_is_over_to_the_nanosecond_whatever_its_decimals():
@@ -343,7 +343,7 @@ def test_limits_that_count_as_passed_are_found_with_their_struts():
     for is_passed in itertools.product((False, True), repeat=2):
         delays = [Delay(is_passed=item, since_ns=0) for item in is_passed]
         expected = [row for row, passed in zip(rows, is_passed, strict=True) if passed]
-        assert find_passed(rows, delays, is_settled=True) == expected
+        assert find_violations(rows, delays, is_settled=True) == expected
 
 
 def test_what_counts_as_passed_stays_so_under_other_limits():

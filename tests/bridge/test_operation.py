@@ -15,7 +15,7 @@ from rig.bridge.supervision_limits import (
     Delay,
     Limit,
     LimitedValue,
-    find_passed,
+    find_violations,
     update_delays,
     values_of_estimate,
 )
@@ -317,7 +317,7 @@ def test_a_delayed_limit_acts_after_its_time_and_ends_after_it(is_beyond, delay_
         # Since the last tick that was otherwise, as long as the delay has gone by.
         if all(it is not passed for it in history[1:]):
             passed = not passed
-        assert bool(find_passed([(0, row)], delays, is_settled=True)) is passed
+        assert bool(find_violations([(0, row)], delays, is_settled=True)) is passed
 
 
 def test_a_delayed_limit_holds_the_estimate_and_names_its_cause():

@@ -12,7 +12,7 @@ from rig.bridge.sample_times import (
     FrameTime,
     SenderClock,
     compile_follower,
-    compile_stamped_follower,
+    compile_follower_of_times,
 )
 
 MS = 1_000_000
@@ -469,7 +469,7 @@ def test_a_clock_is_lost_in_three_blocks_and_back_after_as_many_steady_ones_six_
 
 
 def follow_stamps(arrivals_ns, stamps_ns, cycle_ns=MS, round_ns=0):
-    follower, clock, found = compile_stamped_follower(cycle_ns, round_ns), None, []
+    follower, clock, found = compile_follower_of_times(cycle_ns, round_ns), None, []
     for arrival_ns, stamp_ns in zip(arrivals_ns, stamps_ns, strict=True):
         clock = follower(clock, int(arrival_ns), int(stamp_ns))
         found.append(clock)

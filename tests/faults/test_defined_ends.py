@@ -17,7 +17,7 @@ from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.live import with_bench
-from rig.run.logged_run import Endpoint, run_logged
+from rig.run.logged_run import Endpoint, run_with_log
 from rig.run.loop import RunControl
 from rig.run.replay import replay
 from rig.simulated_bench.config import load_bench_config
@@ -136,7 +136,9 @@ def test_whatever_ends_a_run_the_last_that_the_bus_hears_is_the_safe_output(tmp_
     endpoint = Endpoint(port, VirtualClock(), LinkFigures())
     expected = pytest.raises(RuntimeError) if fails_at_ms else contextlib.nullcontext()
     with expected:
-        ended = run_logged(plan, bridge, endpoint, tmp_path / "run", RunControl(progress=progress))
+        ended = run_with_log(
+            plan, bridge, endpoint, tmp_path / "run", RunControl(progress=progress)
+        )
         assert ended.state.mode is Mode.SETTLING
     ticks = 100 if fails_at_ms is None else fails_at_ms + 1
     *during, one, two, three = port.sent

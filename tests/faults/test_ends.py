@@ -26,7 +26,7 @@ from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.live import with_bench
-from rig.run.logged_run import Endpoint, run_logged
+from rig.run.logged_run import Endpoint, run_with_log
 from rig.run.loop import RunControl
 from rig.run.operator import Operator
 from rig.run.replay import replay
@@ -221,7 +221,7 @@ def test_requests_are_on_record_with_who_made_them(tmp_path):
             return frames, Conditions(request=operator.take())
 
     endpoint = Endpoint(Asked(), VirtualClock(), LinkFigures(), operator=operator)
-    run_logged(plan, build_bridge(plan), endpoint, tmp_path / "run", RunControl())
+    run_with_log(plan, build_bridge(plan), endpoint, tmp_path / "run", RunControl())
     text = (tmp_path / "run" / "events.jsonl").read_text()
     lines = [json.loads(line) for line in text.splitlines()]
     asked = [line for line in lines if "request" in line]

@@ -21,7 +21,7 @@ from rig.plan.load import load_plan
 from rig.plan.preflight_checks import Severity, check, errors
 from rig.plan.proposal import propose
 from rig.recordings.run_folder import _samples
-from rig.run.logged_run import Endpoint, run_logged
+from rig.run.logged_run import Endpoint, run_with_log
 from rig.run.loop import RunControl
 from rig.run.ports import BusPort
 from rig.run.replay import replay
@@ -134,7 +134,7 @@ def test_what_was_proposed_runs_over_a_bus_and_replays(dbc, tmp_path):
     port, bench = BusPort(link), Bench()
     try:
         endpoint = Endpoint(bench, clock, LinkFigures())
-        ended = run_logged(ready, bridge, endpoint, tmp_path / "run", RunControl())
+        ended = run_with_log(ready, bridge, endpoint, tmp_path / "run", RunControl())
     finally:
         link.close()
         peer.close()

@@ -17,7 +17,7 @@ from rig.bus.link import LinkFigures
 from rig.machine.clock import VirtualClock
 from rig.plan.build import build_bridge
 from rig.plan.plan import Plan
-from rig.run.logged_run import Endpoint, run_logged
+from rig.run.logged_run import Endpoint, run_with_log
 from rig.run.loop import RunControl
 
 MS = 1_000_000
@@ -83,4 +83,4 @@ def disturbed(frame: Frame, fault: str) -> list[Frame]:
 def live(ready: Plan, folder: Path, port: ListPort) -> None:
     """The run as the loop does it."""
     endpoint = Endpoint(port, VirtualClock(), LinkFigures())
-    run_logged(ready, build_bridge(ready), endpoint, folder, RunControl())
+    run_with_log(ready, build_bridge(ready), endpoint, folder, RunControl())

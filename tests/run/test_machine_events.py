@@ -13,7 +13,7 @@ from rig.machine.machine_state import ClockOffset, MachineReader
 from rig.plan.build import build_bridge
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
-from rig.run.logged_run import Endpoint, run_logged
+from rig.run.logged_run import Endpoint, run_with_log
 from rig.run.loop import RunControl
 from rig.run.machine_events import MachineEvents
 from tests.run.listed import ListPort, bench_frames
@@ -170,7 +170,7 @@ def recorded(machine, folder, happening):
     port = ListPort(bench_frames(ready, 100, {}), {})
     reader = None if machine is None else machine.reader()
     endpoint = Endpoint(port, VirtualClock(), LinkFigures(), begin=happening, machine=reader)
-    run_logged(ready, build_bridge(ready), endpoint, folder, RunControl())
+    run_with_log(ready, build_bridge(ready), endpoint, folder, RunControl())
     lines = [json.loads(line) for line in (folder / EVENTS_FILE).read_text().splitlines()]
     return lines, yaml.safe_load((folder / RUN_FILE).read_text())["ending"]["machine"]
 
