@@ -191,7 +191,8 @@ class Bridge:
         operation = state.operation
         if self.supervisor.settings.arming != before.supervisor.settings.arming:
             operation = replace(operation, arming=replace(operation.arming, is_armed=False))
-        state = replace(state, supervised=supervised, operation=operation)
+        memory = self._checks.take_over(state.memory)
+        state = replace(state, supervised=supervised, operation=operation, memory=memory)
         if self.observers == before.observers:
             return state
         estimator = self.supervisor.estimator.unsettle(supervised.estimator, t_ns)
@@ -230,6 +231,8 @@ class Bridge:
         supervised, past, samples = self._receive(state, reception, t_ns, frames)
         step_input = StepInput(t_ns, samples, conditions.request)
         memory, reports = reception.memory, NO_REPORTS
+        if memory.standing:
+            reception.require_standing()
         wrong: tuple[tuple[int, str], ...] = ()
         if self._devices:
             wrong = faults(self._devices, memory.healths, t_ns)

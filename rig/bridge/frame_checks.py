@@ -71,13 +71,25 @@ class Strays(NamedTuple):
     t_ns: int = 0
 
 
+class Standing(Struct, frozen=True, gc=False):
+    """A limit that the last frame of a message was beyond, by the message's index: HOLD or SAFE."""
+
+    message: int
+    action: int
+    excess: Excess
+
+
 class CheckMemory(Struct, frozen=True, gc=False):
-    """What the checks remember between two ticks; most ticks leave it as it is."""
+    """What the checks remember between two ticks; most ticks leave it as it is.
+
+    A limit on a measurement is passed until a frame of its message is within it: `standing`.
+    """
 
     strays: tuple[Strays, ...]
     measured: tuple[Plausibility | None, ...]
     healths: tuple[DeviceHealth, ...]
     counts: Counts
+    standing: tuple[Standing, ...] = ()
 
 
 Passed = tuple[Incoming, Values, int, FrameTime]
@@ -113,6 +125,23 @@ class Reception:
         """Count a refused frame, and its cause: the name of one of `Counts`."""
         self.memory = replace(self.memory, counts=self.memory.counts.plus_refusal(cause))
 
+    def require(self, action: int, excess: Excess) -> None:
+        """Require an action, if it is severer than what is required already."""
+        if action > self.action:
+            self.action, self.excess = action, excess
+
+    def require_standing(self) -> None:
+        """Require what the last frames of messages were beyond; after all frames of a tick."""
+        for item in self.memory.standing:
+            self.require(item.action, item.excess)
+
+    def set_standing(self, message: int, action: int, excess: Excess | None) -> None:
+        """Replace what stands of a message's limits by what its newest frame requires."""
+        standing = [item for item in self.memory.standing if item.message != message]
+        if action >= Action.HOLD and excess is not None:
+            standing.append(Standing(message, action, excess))
+        self.memory = replace(self.memory, standing=tuple(standing))
+
     def set_health(self, index: int, health: DeviceHealth) -> None:
         """Replace the health of a device."""
         healths = self.memory.healths
@@ -147,7 +176,7 @@ class FrameChecks:
         self._devices = tuple(devices)
         self._device_of_id = {key: index for index, item in enumerate(devices) for key in item.ids}
         self._channels, self._limits = tuple(channels), tuple(limits)
-        self._checks = [self._check_of(item) for item in incoming]
+        self._checks = [self._check_of(index, item) for index, item in enumerate(incoming)]
         self._index_of = self.directory.index_of
 
     def init(self, t_ns: int) -> tuple[tuple[SequenceState, ...], CheckMemory]:
@@ -160,6 +189,15 @@ class FrameChecks:
             Counts(),
         )
         return (INITIAL,) * messages, memory
+
+    def take_over(self, memory: CheckMemory) -> CheckMemory:
+        """Memory of checks that had other limits: what stands, where there is still a limit."""
+        limited = [
+            any(self._limits[delivery.channel] for delivery in item.deliveries)
+            for item in self.incoming
+        ]
+        standing = tuple(item for item in memory.standing if limited[item.message])
+        return replace(memory, standing=standing)
 
     def receive(self, reception: Reception, frames: Sequence[Frame]) -> list[Passed]:
         """What passed of some frames: those that no check refused."""
@@ -256,7 +294,7 @@ class FrameChecks:
         if stray.frames >= SECOND_SENDER_FRAMES:
             reception.count(second_sender=1)
 
-    def _check_of(self, incoming: Incoming) -> FrameCheck | None:
+    def _check_of(self, message: int, incoming: Incoming) -> FrameCheck | None:
         """The checks that a message needs after its protection, as one; None if it needs none."""
         healthy = plausible = None
         if incoming.device is not None:
@@ -273,7 +311,7 @@ class FrameChecks:
             if self._limits[delivery.channel]
         ]
         if limited:
-            plausible = _plausible(incoming, limited)
+            plausible = _plausible(message, incoming, limited)
         if healthy is None or plausible is None:
             return healthy or plausible
         return _both(healthy, plausible)
@@ -329,23 +367,37 @@ class _Limited(NamedTuple):
     limits: Sequence[Limit]
 
 
-def _plausible(incoming: Incoming, limited: Sequence[_Limited]) -> FrameCheck:
+def _judge(
+    limited: Sequence[_Limited],
+    shortest_ns: int,
+    before: Sequence[Plausibility | None],
+    values: Values,
+    due_ns: int,
+) -> tuple[Sequence[Plausibility | None], int, Excess | None]:
+    """Memory of the channels after a frame, the severest action that it requires, and why."""
+    measured, action, excess = list(before), 0, None
+    for index, channel, strut, limits in limited:
+        value, memory = values[index], measured[channel]
+        if memory is None:
+            memory = Plausibility(value, due_ns, due_ns, shortest_ns)
+        measured[channel], required = judge_measurement(limits, memory, value, due_ns)
+        if required > action:
+            action = required
+            excess = explain_measurement(limits, memory, (strut, value), due_ns, required)
+    return measured, action, excess
+
+
+def _plausible(message: int, incoming: Incoming, limited: Sequence[_Limited]) -> FrameCheck:
     """A check for values within the limits: a frame is used whole or not at all."""
     shortest_ns = max(1, (incoming.message.cycle_time_ns or 0) // 2)
 
     def check(reception: Reception, values: Values, due_ns: int) -> bool:
-        measured, action = list(reception.memory.measured), 0
-        for index, channel, strut, limits in limited:
-            value, memory = values[index], measured[channel]
-            if memory is None:
-                memory = Plausibility(value, due_ns, due_ns, shortest_ns)
-            measured[channel], required = judge_measurement(limits, memory, value, due_ns)
-            if required > reception.action:
-                reception.excess = explain_measurement(
-                    limits, memory, (strut, value), due_ns, required
-                )
-                reception.action = required
-            action = max(action, required)
+        before = reception.memory.measured
+        measured, action, excess = _judge(limited, shortest_ns, before, values, due_ns)
+        if excess is not None:
+            reception.require(action, excess)
+        if action >= Action.HOLD or reception.memory.standing:
+            reception.set_standing(message, action, excess)
         if action < Action.REFUSE:
             reception.memory = replace(reception.memory, measured=tuple(measured))
             return True
@@ -358,6 +410,8 @@ def _plausible(incoming: Incoming, limited: Sequence[_Limited]) -> FrameCheck:
 
     def check_ranges(reception: Reception, values: Values, due_ns: int) -> bool:
         # Ranges need no memory, and their values are within them in most frames.
+        if reception.memory.standing:
+            return check(reception, values, due_ns)
         for index, low, high in ranges:
             if not low <= values[index] <= high:
                 return check(reception, values, due_ns)

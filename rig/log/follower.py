@@ -158,7 +158,8 @@ class RunFollower:
         batches: list[pa.RecordBatch] = []
         # Behind the last whole batch may stand one that is still on its way to the disk.
         with (
-            contextlib.suppress(pa.ArrowException, EOFError, OSError),
+            # A damaged name is not even UTF-8, which is a ValueError.
+            contextlib.suppress(pa.ArrowException, EOFError, OSError, ValueError),
             # No mapping: a piece that the disk did not take is cut off again under it.
             pa.OSFile(str(self._path), "r") as source,
         ):

@@ -4,8 +4,9 @@ A replay computes the steps that a kill cut off again from the frames.
 """
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Required, TypedDict, cast
 
@@ -73,8 +74,15 @@ class Ending(TypedDict, total=False):
     machine: dict[str, object] | None
 
 
+_MAPPINGS = (("config",), ("config", "bus"), ("ending",), ("ending", "counts"), ("capture",))
+"""Entries of `run.yaml` that are mappings, where they are there."""
+
+
 class RunHeader(TypedDict, total=False):
-    """Content of `run.yaml`; `schema` and `epoch_ns` are checked, the others are as written."""
+    """Content of `run.yaml`: entries are of these kinds and numbers finite, others are as written.
+
+    `schema` and `epoch_ns` are there.
+    """
 
     schema: Required[int]
     epoch_ns: Required[int]
@@ -155,6 +163,8 @@ def read_header(folder: Path) -> RunHeader:
         LogError: It is not a run's header, or was written by another version.
     """
     path = folder / RUN_FILE
+    if path.exists() and not path.is_file():
+        raise LogError(f"{path}: is no file, expected a run's header")
     header = parse_mapping(read_text(path, 64 * 1024 * 1024), str(path))
     schema = header.get("schema")
     if schema not in _READ_SCHEMAS:
@@ -164,7 +174,32 @@ def read_header(folder: Path) -> RunHeader:
     epoch_ns = header.get("epoch_ns")
     if not isinstance(epoch_ns, int) or not 0 <= epoch_ns < LATEST_S * 1_000_000_000:
         raise LogError(f"{path}: epoch_ns: {str(epoch_ns)[:40]}: expected a Unix time in ns")
+    _check_entries(header, path)
     return cast("RunHeader", header)
+
+
+def _check_entries(header: Mapping[str, object], path: Path) -> None:
+    """Refuse a header whose entries are of another kind than a run's, or hold no numbers."""
+    for keys in _MAPPINGS:
+        holder: object = header
+        for key in keys[:-1]:
+            holder = holder.get(key, {}) if isinstance(holder, Mapping) else {}
+        if isinstance(holder, Mapping) and not isinstance(holder.get(keys[-1], {}), Mapping):
+            raise LogError(f"{path}: {'.'.join(keys)}: expected a mapping")
+    bus = cast("RunHeader", header).get("config", {}).get("bus", {})
+    for key in ("bitrate", "data_bitrate"):
+        rate = bus.get(key)
+        if rate is not None and (not isinstance(rate, int) or rate < 1):
+            raise LogError(f"{path}: config.bus.{key}: {str(rate)[:40]}: expected bits per second")
+    entries: list[tuple[str, object]] = list(header.items())
+    while entries:
+        name, value = entries.pop()
+        if isinstance(value, float) and not isfinite(value):
+            raise LogError(f"{path}: {name}: {value}: expected a finite number")
+        if isinstance(value, Mapping):
+            entries += [(f"{name}.{key}", item) for key, item in value.items()]
+        elif isinstance(value, list):
+            entries += [(name, item) for item in value]
 
 
 def find_changed_files(folder: Path) -> list[str]:

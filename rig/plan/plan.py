@@ -30,7 +30,7 @@ from rig.bridge.published_quantities import (
 from rig.bridge.supervision_limits import Limits
 from rig.bus.secoc import FD_LENGTHS, Authentication, AuthenticationSettings
 from rig.channels.channel import Channel, MeasuredSignal, Role, SignalName
-from rig.channels.measured_quantities import HEIGHT, LOAD_CELL_FORCE, Quantity
+from rig.channels.measured_quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, Quantity
 from rig.observers.pi import PiObserver
 from rig.observers.protocol import AnyObserver
 from rig.plan.config import HeightSignal, Mapped, RunConfig, SensorSignal
@@ -536,15 +536,13 @@ def _struts(
 
 
 def _devices(config: RunConfig, channels: Sequence[Channel]) -> tuple[Device, ...]:
-    """Devices that are watched; the estimate rests on those that send a height."""
+    """Devices that are watched; the estimate rests on those that send a height or the force."""
+    force = APPLIED_FORCE if config.prescribed_motion is None else LOAD_CELL_FORCE
     vital = {
         channel.message.sender
         for channel in channels
         if channel.message is not None
-        and (
-            channel.role is Role.HEIGHT
-            or (config.prescribed_motion is not None and channel.quantity is LOAD_CELL_FORCE)
-        )
+        and (channel.role is Role.HEIGHT or channel.quantity is force)
     }
     return tuple(
         entry.device(name, is_vital=name in vital) for name, entry in config.devices.items()

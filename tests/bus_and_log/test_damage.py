@@ -1,15 +1,18 @@
 """What is damaged says so: each command on a run whose frames or steps have changed."""
 
+import math
+import os
 import shutil
 import zlib
 
 import pytest
+import yaml
 
 from rig.cli.main import main
 from rig.log.checksums import find_damage
 from rig.log.errors import LogError
 from rig.log.file_names import CHECKSUMS_FILE
-from rig.log.reader import read_run
+from rig.log.reader import read_header, read_run
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
 from rig.run.live import with_bench
@@ -133,3 +136,36 @@ def test_a_line_that_is_no_checksum_is_one_line(line, run):
     (run / CHECKSUMS_FILE).write_text(line + "\n")
     with pytest.raises(LogError, match=r"checksums\.txt: line 1: .*: expected a checksum"):
         find_damage(run)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"config": None}, "config: expected a mapping"),
+        ({"config": [1]}, "config: expected a mapping"),
+        ({"config": {"bus": None}}, r"config\.bus: expected a mapping"),
+        ({"config": {"bus": {"bitrate": 0}}}, r"config\.bus\.bitrate: 0: expected bits per second"),
+        ({"config": {"bus": {"data_bitrate": "x"}}}, r"data_bitrate: x: expected bits per second"),
+        ({"config": {"rate_hz": math.nan}}, r"config\.rate_hz: nan: expected a finite number"),
+        ({"ending": "done"}, "ending: expected a mapping"),
+        ({"ending": {"counts": [1]}}, r"ending\.counts: expected a mapping"),
+        (
+            {"ending": {"counts": {"lost": math.inf}}},
+            r"counts\.lost: inf: expected a finite number",
+        ),
+        ({"ending": {"other": [1.0, [-math.inf]]}}, "ending.other: -inf: expected a finite number"),
+        ({"capture": ["a fault"]}, "capture: expected a mapping"),
+    ],
+)
+def test_a_header_of_other_entries_is_one_line(run, change, expected):
+    path = run / "run.yaml"
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | change))
+    with pytest.raises(LogError, match=expected):
+        read_header(run)
+
+
+def test_a_pipe_in_place_of_a_header_is_one_line(run):
+    (run / "run.yaml").unlink()
+    os.mkfifo(run / "run.yaml")
+    with pytest.raises(LogError, match="is no file"):
+        read_header(run)

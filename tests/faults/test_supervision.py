@@ -23,7 +23,17 @@ from rig.closed_loop.settling import settling_times_ns
 from rig.plan.build import build_plant
 from rig.plan.config import CONFIGS, RunConfig
 from tests.bridge.cores import FIRST
-from tests.faults.trial import BEGIN_MS, BEGIN_NS, MS, Trial, after, measurements_only
+from tests.faults.trial import (
+    BEGIN_MS,
+    BEGIN_NS,
+    MEASUREMENT,
+    MS,
+    SWITCH_CYCLE_MS,
+    Switches,
+    Trial,
+    after,
+    measurements_only,
+)
 
 STATUS = 0x300
 
@@ -137,6 +147,67 @@ def test_a_bridge_that_misses_every_third_tick_is_running():
 
     ticks = trial.run(BEGIN_MS + 500, conditions=conditions)[BEGIN_MS:]
     assert {tick.mode for tick in ticks} == {Mode.RUNNING}
+
+
+def thermometer_of(trial, temperature_c):
+    return Switches(trial, Dimension.TEMPERATURE, temperature=temperature_c)
+
+
+HOT = {"channel": "temperature", "value": "measured", "high": 80.0}
+
+
+def test_a_limit_on_a_slow_signal_holds_from_one_frame_to_the_next():
+    trial = Trial(limits=[HOT | {"action": "hold"}], settling_s=0.0)
+    thermometer = thermometer_of(trial, 20.0)
+    assert trial.run(BEGIN_MS, thermometer)[-1].is_valid
+    thermometer.closed["temperature"] = 120.0
+    ticks = trial.run(BEGIN_MS + 200, thermometer)[BEGIN_MS:]
+    first = next(index for index, tick in enumerate(ticks) if tick.mode is Mode.HOLD)
+    assert first < SWITCH_CYCLE_MS
+    assert {tick.mode for tick in ticks[first:]} == {Mode.HOLD}
+    cause = trial.state.supervised.cause
+    assert (cause.event, cause.value, cause.limit) == (Event.BEYOND_HOLD, 120.0, 80.0)
+    # Not a frame that is missing ends it: one within the limit does.
+    thermometer.is_silent = True
+    assert trial.run(BEGIN_MS + 400, thermometer)[-1].mode is Mode.HOLD
+    thermometer.is_silent = False
+    thermometer.closed["temperature"] = 79.0
+    # Its counter stood still meanwhile: some frames show its sender's clock again.
+    assert trial.run(BEGIN_MS + 400 + 10 * SWITCH_CYCLE_MS, thermometer)[-1].is_valid
+
+
+def test_the_safe_state_is_not_left_between_two_frames_beyond_a_limit():
+    trial = Trial(limits=[HOT | {"action": "safe"}], settling_s=0.0)
+    thermometer = thermometer_of(trial, 120.0)
+
+    def acknowledge(_t_ns):
+        return Conditions(request=Request.ACKNOWLEDGE)
+
+    trial.run(BEGIN_MS, thermometer)
+    ticks = trial.run(BEGIN_MS + 200, thermometer, acknowledge)
+    first = next(index for index, tick in enumerate(ticks) if tick.mode is Mode.SAFE)
+    assert {tick.mode for tick in ticks[first:]} == {Mode.SAFE}
+    thermometer.closed["temperature"] = 79.0
+    ticks = trial.run(BEGIN_MS + 300, thermometer, acknowledge)
+    assert ticks[-1].is_valid
+
+
+def test_what_a_signal_is_beyond_stays_so_as_long_as_it_has_a_limit():
+    trial = Trial(limits=[HOT | {"action": "hold"}], settling_s=0.0)
+    assert trial.run(BEGIN_MS, thermometer_of(trial, 120.0))[-1].mode is Mode.HOLD
+    frames = trial.bench.update(BEGIN_MS * MS)[0]
+    heights = [frame for frame in frames if frame.arbitration_id == MEASUREMENT]
+    for limits, expected in (
+        ([HOT | {"high": 90.0, "action": "hold"}], Mode.HOLD),
+        ([], Mode.RUNNING),
+    ):
+        content = trial.ready.config.model_dump(mode="json")
+        content["supervision"]["limits"] = limits
+        ready = trial.ready.with_config(trial.ready.config.model_validate(content))
+        supervision = ready.config.supervision
+        bridge = trial.bridge.with_settings(trial.bridge.observers, supervision, ready.limits)
+        state = bridge.take_over(trial.state, trial.bridge, BEGIN_MS * MS)
+        assert bridge.tick(state, BEGIN_MS * MS, heights)[1].output.mode is expected
 
 
 @pytest.mark.parametrize("missed", [(0, 1), (3, 0, 0), (0, 0, 25)])

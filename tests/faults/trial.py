@@ -186,12 +186,15 @@ def trial_with_auxiliary(*names: str, **supervision: object) -> Trial:
 
 
 class Switches:
-    """Frames of the switches, every 10 ms, in place of the bench's own ones of that message."""
+    """Frames of the switches, or of other signals of their message, every 10 ms.
 
-    def __init__(self, trial, **closed):
+    They take the place of the bench's own ones.
+    """
+
+    def __init__(self, trial, dimension=Dimension.NUMBER, **closed):
         message = trial.ready.database.message("BENCH_AUXILIARY")
         self._names = [name.upper() for name in closed]
-        self._encode = compile_encoder(message, self._names, [Dimension.NUMBER] * len(closed))
+        self._encode = compile_encoder(message, self._names, [dimension] * len(closed))
         self._protect = compile_protector(message.protection)
         self._counter = 0
         self.closed = closed

@@ -139,8 +139,9 @@ def test_what_is_in_sight_is_looked_at_closely(server, run):
 @pytest.fixture
 def states(tmp_path, run):
     """Folders in every state that a run's can be in."""
-    folders = {name: tmp_path / name for name in ("live", "killed", "empty", "schema", "no_run")}
-    for name in ("live", "killed", "empty", "schema"):
+    copied = ("live", "killed", "empty", "schema", "odd")
+    folders = {name: tmp_path / name for name in (*copied, "no_run")}
+    for name in copied:
         shutil.copytree(run, folders[name])
     for name in ("live", "killed"):
         header = yaml.safe_load((run / "run.yaml").read_text())
@@ -153,6 +154,8 @@ def states(tmp_path, run):
     (folders["empty"] / "steps.arrow").write_bytes(b"")
     text = (run / "run.yaml").read_text().replace("schema: 3", "schema: 1")
     (folders["schema"] / "run.yaml").write_text(text)
+    header = yaml.safe_load((run / "run.yaml").read_text()) | {"config": None, "ending": "done"}
+    (folders["odd"] / "run.yaml").write_text(yaml.safe_dump(header))
     folders["no_run"].mkdir()
     folders["file"] = tmp_path / "file"
     folders["file"].write_text("x")
@@ -168,6 +171,7 @@ def test_the_page_says_what_a_folder_is(states):
         "killed": "killed",
         "empty": "empty",
         "schema": "unreadable",
+        "odd": "unreadable",
         "no_run": "absent",
         "file": "unreadable",
         "absent": "absent",

@@ -324,6 +324,10 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
 
+_LARGEST_NUMBER = 1e9
+"""Of a request: an index, or a time in s, which ns are made of."""
+
+
 class _Query:
     """Arguments of a request, by name."""
 
@@ -338,8 +342,10 @@ class _Query:
             value = float(self.text(name))
         except ValueError:
             value = float("nan")
-        if not np.isfinite(value):
-            raise _RequestError(f"{name}: {self.text(name)!r}: expected a number")
+        if not abs(value) <= _LARGEST_NUMBER:
+            raise _RequestError(
+                f"{name}: {self.text(name)[:40]!r}: expected a number up to {_LARGEST_NUMBER:g}"
+            )
         return value
 
     def index(self, view: ViewServer) -> int:

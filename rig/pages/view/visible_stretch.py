@@ -144,6 +144,8 @@ def bus_load(
 def _lines_before(folder: Path, epoch_ns: int, end_ns: int) -> Sequence[bytes]:
     """The last lines of the frames' log up to a time, found by bisection."""
     for path in reversed(parts(folder, FRAMES_FILE)):
+        if not path.is_file():
+            continue
         try:
             size = path.stat().st_size
             with path.open("rb") as file:
