@@ -181,10 +181,11 @@ def read_header(folder: Path) -> RunHeader:
 def _check_entries(header: Mapping[str, object], path: Path) -> None:
     """Refuse a header whose entries are of another kind than a run's, or hold no numbers."""
     for keys in _MAPPINGS:
-        holder: object = header
+        holder = header
         for key in keys[:-1]:
-            holder = holder.get(key, {}) if isinstance(holder, Mapping) else {}
-        if isinstance(holder, Mapping) and not isinstance(holder.get(keys[-1], {}), Mapping):
+            # It is a mapping: it was checked before.
+            holder = cast("Mapping[str, object]", holder.get(key, {}))
+        if not isinstance(holder.get(keys[-1], {}), Mapping):
             raise LogError(f"{path}: {'.'.join(keys)}: expected a mapping")
     bus = cast("RunHeader", header).get("config", {}).get("bus", {})
     for key in ("bitrate", "data_bitrate"):
@@ -197,9 +198,10 @@ def _check_entries(header: Mapping[str, object], path: Path) -> None:
         if isinstance(value, float) and not isfinite(value):
             raise LogError(f"{path}: {name}: {value}: expected a finite number")
         if isinstance(value, Mapping):
-            entries += [(f"{name}.{key}", item) for key, item in value.items()]
+            inner = cast("Mapping[object, object]", value)
+            entries += [(f"{name}.{key}", item) for key, item in inner.items()]
         elif isinstance(value, list):
-            entries += [(name, item) for item in value]
+            entries += [(name, item) for item in cast("list[object]", value)]
 
 
 def find_changed_files(folder: Path) -> list[str]:
