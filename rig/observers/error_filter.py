@@ -104,6 +104,11 @@ _WIDEST_OF_RATE = 1.0 / 3.0
 """Corner of a filter over the rate of its measurements beyond which it smooths nothing."""
 
 
+_CONTRADICTION = 8.0**2
+"""Square of what is new in a measurement behind a gap over its variance, from which it contradicts
+what is known: another zero, or a motion that the gap hid. Once in 1e15 for normal errors."""
+
+
 class Steady(NamedTuple):
     """A filter that has run for long, at one interval; in units of sigma and 1 / omega.
 
@@ -283,6 +288,8 @@ class ErrorFilter:
             ahead = predict_covariance(before, self.pace(state.start), number)
             # As large as it would be were the filter steady.
             share = math.sqrt(constants.steady.innovation / (float(ahead[0, 0]) + 1.0))
+            if (share * new_m) ** 2 > _CONTRADICTION * scale * constants.innovation_m2:
+                return self.restart(state, innovation)
             for _ in range(min(number, _MOST_HELD)):
                 lag = update_lag(lag, constants.lag, share * new_m)
             in_units, covariance = _gain(ahead)

@@ -355,6 +355,23 @@ def test_a_height_that_jumps_and_is_right_again_while_the_estimate_settles(
     assert received[-1].is_valid
 
 
+@pytest.mark.parametrize(
+    ("gap", "offset_m"), [(6, 0.0005), (10, 0.005), (20, 0.02), (30, 0.05), (80, 0.05)]
+)
+def test_a_height_that_has_another_zero_behind_a_gap(gap, offset_m, truth_n, settled_n):
+    """What the filter knew of the motion contradicts the first height: it begins again there."""
+    jump = Frozen()
+    jump.change = lambda height_m: height_m + offset_m
+
+    def frames(ms, frames):
+        return jump(ms, frames) if not BEGIN_MS <= ms < BEGIN_MS + gap else []
+
+    trial = Trial(observer=OBSERVERS["noise-aware"])
+    received = follow(trial, Event("", frames=frames), BEGIN_MS + 900)
+    assert largest_error_n(received, truth_n) <= MOST * settled_n["noise-aware"]
+    assert received[-1].is_valid
+
+
 CELL_LIMIT = {"value": "force_difference_n", "low": -45.0, "high": 45.0, "action": "hold"}
 
 
