@@ -288,7 +288,9 @@ class ErrorFilter:
             ahead = predict_covariance(before, self.pace(state.start), number)
             # As large as it would be were the filter steady.
             share = math.sqrt(constants.steady.innovation / (float(ahead[0, 0]) + 1.0))
-            if (share * new_m) ** 2 > _CONTRADICTION * scale * constants.innovation_m2:
+            are_missing = elapsed_ns >= constants.next_ns
+            usual_m2 = scale * constants.innovation_m2
+            if are_missing and (share * new_m) ** 2 > _CONTRADICTION * usual_m2:
                 return self.restart(state, innovation)
             for _ in range(min(number, _MOST_HELD)):
                 lag = update_lag(lag, constants.lag, share * new_m)
