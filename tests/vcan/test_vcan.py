@@ -299,7 +299,7 @@ def test_ten_times_down_and_up_are_survived_and_each_gap_is_shown(bench, bridge)
     assert ended.state.mode is Mode.RUNNING
 
 
-def test_a_flood_of_foreign_and_of_broken_frames_changes_nothing(bench, bridge):
+def test_a_flood_of_foreign_and_of_broken_frames_stops_nothing(bench, bridge):
     with (
         running(["cangen", bench, "-g", "1", "-I", "r", "-L", "r", "-D", "r", "-i"]),
         running(["cangen", bench, "-g", "2", "-I", "100", "-L", "8", "-D", "r", "-i"]),
@@ -314,7 +314,8 @@ def test_a_flood_of_foreign_and_of_broken_frames_changes_nothing(bench, bridge):
     assert heights.min() > 0.1
     assert heights.max() < 0.7
     assert replay(ended.folder).different == 0
-    assert ended.state.mode is Mode.RUNNING
+    # One that passes CRC, counter and range as well is a height that jumps: the estimate settles.
+    assert ended.state.mode in (Mode.SETTLING, Mode.RUNNING)
     # One broken frame of 256 carries the right CRC by chance. It may cost the few frames that
     # follow it, but never so many that an estimate turns stale.
     right_crc = _with_right_crc(found, "BENCH_MEASUREMENT")
