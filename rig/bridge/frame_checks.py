@@ -192,11 +192,9 @@ class FrameChecks:
 
     def take_over(self, memory: CheckMemory) -> CheckMemory:
         """Memory of checks that had other limits: what stands, where there is still a limit."""
-        limited = [
-            any(self._limits[delivery.channel] for delivery in item.deliveries)
-            for item in self.incoming
-        ]
-        standing = tuple(item for item in memory.standing if limited[item.message])
+        standing = tuple(
+            item for item in memory.standing if self._limited_of(self.incoming[item.message])
+        )
         return replace(memory, standing=standing)
 
     def receive(self, reception: Reception, frames: Sequence[Frame]) -> list[Passed]:
@@ -300,7 +298,16 @@ class FrameChecks:
         if incoming.device is not None:
             index, device = incoming.device, self._devices[incoming.device]
             healthy = _healthy_sender(incoming, index, device)
-        limited = [
+        limited = self._limited_of(incoming)
+        if limited:
+            plausible = _plausible(message, incoming, limited)
+        if healthy is None or plausible is None:
+            return healthy or plausible
+        return _both(healthy, plausible)
+
+    def _limited_of(self, incoming: Incoming) -> Sequence["_Limited"]:
+        """The values of a message that have limits."""
+        return [
             _Limited(
                 delivery.value,
                 delivery.channel,
@@ -310,11 +317,6 @@ class FrameChecks:
             for delivery in incoming.deliveries
             if self._limits[delivery.channel]
         ]
-        if limited:
-            plausible = _plausible(message, incoming, limited)
-        if healthy is None or plausible is None:
-            return healthy or plausible
-        return _both(healthy, plausible)
 
 
 def _drop_unclear(reception: Reception, passed: Sequence[Passed]) -> list[Passed]:

@@ -277,7 +277,8 @@ class ErrorFilter:
         covariance, scale, lag = state.covariance, state.scale, state.lag
         # What is new in a measurement: its distance from the error that was predicted.
         new_m = innovation.value - mean[0]
-        if covariance is None and elapsed_ns < constants.next_ns:
+        are_missing = elapsed_ns >= constants.next_ns
+        if covariance is None and not are_missing:
             gain = constants.gain
             scale = update_scale(constants, scale, new_m * new_m / constants.innovation_m2)
             lag = update_lag(lag, constants.lag, new_m)
@@ -288,7 +289,6 @@ class ErrorFilter:
             ahead = predict_covariance(before, self.pace(state.start), number)
             # As large as it would be were the filter steady.
             share = math.sqrt(constants.steady.innovation / (float(ahead[0, 0]) + 1.0))
-            are_missing = elapsed_ns >= constants.next_ns
             usual_m2 = scale * constants.innovation_m2
             if are_missing and (share * new_m) ** 2 > _CONTRADICTION * usual_m2:
                 return self.restart(state, innovation)
