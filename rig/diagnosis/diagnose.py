@@ -158,9 +158,13 @@ def _fit_to_all(
     """The models of a search in pieces fitted to all; the search continues unless one is right."""
     criteria, (given, linear) = searched.criteria, fits
     pool = Pool(problem, given, [linear], criteria)
-    pool.adopt(searched.chosen(criteria.most_laws).fit)
-    problem = _with_residual_noise(problem, pool.chosen(criteria.most_laws).fit)
-    pool = Pool(problem, given, [linear], criteria)
+    found = searched.chosen(criteria.most_laws).fit
+    pool.adopt(found)
+    # In the pieces a law may have come to rest where it is a simpler one, or beside its optimum.
+    pool.screen_and_attempt(found.candidate.new)
+    first = pool.chosen(criteria.most_laws).fit
+    problem = _with_residual_noise(problem, first)
+    pool = Pool(problem, given, [linear, first], criteria)
     for i, model in enumerate(models := searched.best_and_subsets()):
         progress("fitting all of the recordings", 0.5 * i / len(models))
         pool.adopt(model.fit)

@@ -19,6 +19,7 @@ from rig.diagnosis.problem.problem import (
     CandidateModel,
     Parts,
     Problem,
+    StrutEffect,
     existing_values,
     first_starts,
     free_linear,
@@ -32,6 +33,8 @@ from rig.diagnosis.search.screen import (
     Stage,
     law_and_shift,
     linear_changes,
+    no_law,
+    rank_laws,
     stage_of,
     whole_stage_of,
 )
@@ -177,6 +180,18 @@ class Pool:
         """Fit the laws of a model of other recordings, starting from its parameters."""
         parts = result.parts
         self.attempt(self._fit_starts(result.candidate, parts.linear, parts.effects))
+
+    def screen_and_attempt(self, laws: Sequence[StrutEffect]) -> None:
+        """Fit laws in simulation from where the regression along the motion puts them."""
+        stage = self.linear_stage
+        screening = no_law(stage)
+        for law in laws:
+            ranked = rank_laws(stage, screening, 1, [law])
+            if not ranked:
+                return
+            screening = ranked[0]
+        if laws:
+            self.attempt_screening(stage, self.linear, screening)
 
     def reject(self, candidate: Candidate, why: str) -> None:
         """Mark a candidate as invalid, for a reason that its last fit shows."""
