@@ -53,8 +53,10 @@ class Directory:
         }
         often = Counter(groups.values())
         self._groups = {group: index for index, group in groups.items() if often[group] == 1}
+        self.by_group = frozenset(self._groups.values())
+        """Messages that are identified by their group: whoever sends it."""
         self.filters = tuple(
-            _filter(message, index in self._groups.values()) for index, message in enumerate(listed)
+            _filter(message, index in self.by_group) for index, message in enumerate(listed)
         )
         """Filters that accept the frames of all messages."""
 

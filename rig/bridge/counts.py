@@ -27,8 +27,8 @@ class Counts(NamedTuple):
         masquerade: Frames refused because they carry another message's CRC.
         implausible: Frames refused for a height beyond a limit.
         started: Sequences of a counter that began, the first one of each message among them.
-        second_sender: Frames of another sender under an id of the bridge, and frames that
-            persistently contradict the counter of the bench's.
+        second_sender: Frames of another sender under an id of the bridge or in a J1939 group of the
+            bench, and frames that persistently contradict the counter of the bench's.
         limited: Ticks beyond a limit.
         bus_faulty: Ticks with a fault of the bus.
         left_out: Ticks at which a further sensor was left out, one for each sensor.

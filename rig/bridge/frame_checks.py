@@ -3,7 +3,8 @@
 1. addressed: it is a frame of a message that the bridge reads (`FrameChecks.receive`). What is not
    may be a heartbeat, an emergency or an address claim of a device, or a second sender.
 2. sent by its device: its sender is the configured device; one of another sender is none of the
-   message's frames, and is not counted.
+   message's frames, and is not counted. Where none is configured, a J1939 group is that of the
+   address that was heard first; a frame from another one is a second sender's.
 3. protected: its length, CRC and counter are right (`can_dbc.protection`).
 4. timed: it does not contradict its sender's clock (`rig.bridge.sample_times`). Whether a late one
    had waited is known at the end of the tick.
@@ -64,6 +65,18 @@ _SUCCESSION_CYCLES = 3
 """Cycle times within which one frame is in close succession to the other."""
 
 
+_SILENCE_NS = 250_000_000
+"""After so long without a frame of a J1939 sender another address may be its new one: one that
+claims an address has to wait as long before it sends (SAE J1939-81, 4.2)."""
+
+
+class Source(NamedTuple):
+    """Address of a message's sender, and the time of its last frame."""
+
+    address: int
+    t_ns: int
+
+
 class Strays(NamedTuple):
     """Frames of a message that contradicted its counter, in close succession; time of the last."""
 
@@ -83,6 +96,7 @@ class CheckMemory(Struct, frozen=True, gc=False):
     """What the checks remember between two ticks; most ticks leave it as it is.
 
     A limit on a measurement is passed until a frame of its message is within it: `standing`.
+    `sources` are the senders of messages that are identified by their J1939 group alone.
     """
 
     strays: tuple[Strays, ...]
@@ -90,6 +104,7 @@ class CheckMemory(Struct, frozen=True, gc=False):
     healths: tuple[DeviceHealth, ...]
     counts: Counts
     standing: tuple[Standing, ...] = ()
+    sources: tuple[Source | None, ...] = ()
 
 
 Passed = tuple[Incoming, Values, int, FrameTime]
@@ -178,6 +193,9 @@ class FrameChecks:
         self._channels, self._limits = tuple(channels), tuple(limits)
         self._checks = [self._check_of(index, item) for index, item in enumerate(incoming)]
         self._index_of = self.directory.index_of
+        self._of_one_sender = self.directory.by_group.union(
+            index for index, item in enumerate(incoming) if item.device is not None
+        )
 
     def init(self, t_ns: int) -> tuple[tuple[SequenceState, ...], CheckMemory]:
         """Counter states and memory before the first tick."""
@@ -187,6 +205,7 @@ class FrameChecks:
             (None,) * len(self._limits),
             tuple(initial_health(device, t_ns) for device in self._devices),
             Counts(),
+            sources=(None,) * messages,
         )
         return (INITIAL,) * messages, memory
 
@@ -208,8 +227,7 @@ class FrameChecks:
                 self._receive_other(reception, frame)
                 continue
             incoming = self.incoming[index]
-            device = incoming.device
-            if device is not None and not self._is_from(reception, device, frame):
+            if index in self._of_one_sender and not self._is_from_sender(reception, index, frame):
                 continue
             sequences[index], status, values = incoming.read(sequences[index], frame)
             if status is not _OK:
@@ -242,9 +260,24 @@ class FrameChecks:
         check = self._checks[index]
         return check is None or check(reception, values, due_ns)
 
-    def _is_from(self, reception: Reception, index: int, frame: Frame) -> bool:
-        """Whether a frame is from a device: another one may send the same group."""
-        return is_from(self._devices[index], reception.memory.healths[index], frame)
+    def _is_from_sender(self, reception: Reception, index: int, frame: Frame) -> bool:
+        """Whether a frame is from the one sender of its message.
+
+        That is its device, or the address that was first heard to send its group.
+        """
+        device = self.incoming[index].device
+        if device is not None:
+            return is_from(self._devices[device], reception.memory.healths[device], frame)
+        address, sources = frame.arbitration_id & 0xFF, reception.memory.sources
+        source = sources[index]
+        if source is not None and source.address != address:
+            cycle_ns = self.incoming[index].message.cycle_time_ns or 0
+            if frame.t_ns - source.t_ns <= max(_SILENCE_NS, _SUCCESSION_CYCLES * cycle_ns):
+                reception.count_refusal("second_sender")
+                return False
+        sources = (*sources[:index], Source(address, frame.t_ns), *sources[index + 1 :])
+        reception.memory = replace(reception.memory, sources=sources)
+        return True
 
     def _receive_other(self, reception: Reception, frame: Frame) -> None:
         """Receive a frame of no incoming message: of a device, or of a second sender."""

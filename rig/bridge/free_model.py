@@ -8,12 +8,12 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from can_dbc.codec import si_step
 from dart_model.effects import AMBIENT_C
 from dart_model.protocol import AnyPlant, LoadedModel, ModelState
 from rig.bridge.estimator import Estimate, find_divergence, is_sensible
 from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
 from rig.bridge.measurement_age import age_limit_ns, is_too_old
+from rig.bridge.stuck_value import Repeats, update_repeats
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import APPLIED_FORCE, TEMPERATURE
@@ -44,6 +44,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
         is_settled: Whether every strut's estimate has settled.
         longest_gaps_ns: Of each strut the longest time without a measurement.
         bands: Of each strut the band of its innovations.
+        repeats: Of each strut how often its height is the same.
     """
 
     t_ns: int
@@ -57,6 +58,7 @@ class FreeModelState(Struct, frozen=True, gc=False):
     is_settled: bool = False
     longest_gaps_ns: tuple[int, ...] = ()
     bands: tuple[InnovationBand, ...] = ()
+    repeats: tuple[Repeats, ...] = ()
 
 
 _Received = Sequence[Sample | None]
@@ -116,7 +118,9 @@ class FreeModelEstimator:
         self._heights = {
             channel.strut: channel for channel in channels if channel.role is Role.HEIGHT
         }
-        self._sensing = [_sensing(self._heights.get(strut)) for strut in range(plant.struts)]
+        self._sensing = [(0.0, 0)] * plant.struts
+        for strut, channel in self._heights.items():
+            self._sensing[strut] = channel.step, channel.interval_ns
         sensors = [channel for channel in channels if channel.role is Role.SENSOR]
         self._sensors = tuple(
             tuple(channel for channel in sensors if channel.strut == strut)
@@ -126,10 +130,11 @@ class FreeModelEstimator:
         # A reading lies between two ticks: both are kept for it.
         self._oldest_ns = latest + 1 if sensors else latest
         self._untimed = frozenset(
-            strut for strut, channel in self._heights.items() if not _has_cycle(channel)
+            strut for strut, channel in self._heights.items() if not channel.has_cycle
         )
         applied = [channel for channel in channels if channel.quantity is APPLIED_FORCE]
         self._has_applied = bool(applied)
+        self._applied_step = applied[0].step if applied else 0.0
         self._applied_grace_ns = grace_of_applied_force_ns(applied, stale_after_ns)
         self._longest_silence_ns = self._applied_grace_ns + stale_after_ns
 
@@ -159,6 +164,7 @@ class FreeModelEstimator:
             observers=state.observers,
             applied=state.applied,
             bands=tuple(map(restart_band, state.bands)),
+            repeats=state.repeats,
         )
 
     def discard(self, before: FreeModelState, after: FreeModelState) -> FreeModelState:
@@ -211,7 +217,13 @@ class FreeModelEstimator:
         temperature_c = state.temperature_c if warm is None else warm.value
         applied = received[self._applied] or state.applied
         state = FreeModelState(
-            t_ns, temperature_c, first, state.observers, applied=applied, bands=state.bands
+            t_ns,
+            temperature_c,
+            first,
+            state.observers,
+            applied=applied,
+            bands=state.bands,
+            repeats=state.repeats,
         )
         return state, self._can_start(state, required)
 
@@ -258,6 +270,7 @@ class FreeModelEstimator:
             model=loaded,
             longest_gaps_ns=tuple(longest_gaps_ns),
             bands=state.bands or (InnovationBand(),) * len(first),
+            repeats=state.repeats or (Repeats(),) * len(first),
         )
         started = self.unsettle(started, t_ns)
         return self._estimate(started, loaded, self._newest_ns(state))
@@ -318,7 +331,7 @@ class FreeModelEstimator:
         observers: list[ObserverState] = []
         virtual_n: list[float] = []
         bands: list[InnovationBand] = []
-        oldest_ns = t_ns
+        oldest_ns, repeats = t_ns, state.repeats
         for strut, observer in enumerate(self.observers):
             measured, before, band = received[strut], state.observers[strut], state.bands[strut]
             innovation = None
@@ -331,6 +344,12 @@ class FreeModelEstimator:
                 innovation_m = height_m - model_m
                 innovation = Innovation(innovation_m, measured_ns)
                 sensing, was_left = self._sensing[strut], band.is_left
+                has_changed = height_m < band.height_m or height_m > band.height_m  # not from NaN
+                if self._has_applied and (not has_changed or repeats[strut].count):
+                    item = update_repeats(
+                        repeats[strut], not has_changed, applied_n, self._applied_step, t_ns
+                    )
+                    repeats = (*repeats[:strut], item, *repeats[strut + 1 :])
                 band = update_band(band, height_m, innovation_m, measured_ns, sensing, is_settled)
                 if band.is_left and not was_left:
                     return self._begin_again(state, step_input, strut, band)
@@ -357,6 +376,7 @@ class FreeModelEstimator:
             is_settled,
             state.longest_gaps_ns,
             tuple(bands),
+            repeats,
         )
         return self._estimate(after, loaded, oldest_ns)
 
@@ -416,6 +436,7 @@ class FreeModelEstimator:
             if (
                 observer.is_disturbed
                 or state.bands[strut].is_left
+                or state.repeats[strut].is_stuck
                 or t_ns - observer.measured_ns > longest_gaps_ns[strut]
             ):
                 is_calm = False
@@ -451,7 +472,8 @@ class FreeModelEstimator:
         for strut, settling_ns in enumerate(self._settling_ns):
             observer = state.observers[strut]
             is_old = t_ns - observer.measured_ns > state.longest_gaps_ns[strut]
-            if is_old or observer.is_disturbed or state.bands[strut].is_left:
+            is_wrong = state.bands[strut].is_left or state.repeats[strut].is_stuck
+            if is_old or is_wrong or observer.is_disturbed:
                 disturbed_ns[strut] = t_ns
                 is_settled = False
             elif settling_ns is None or t_ns - disturbed_ns[strut] < settling_ns:
@@ -500,19 +522,6 @@ def start_of_motion(samples: Sequence[Sample], t_ns: int) -> tuple[float, float]
     powers = np.column_stack([np.ones_like(share), share, share * share])
     height, slope, _ = np.linalg.lstsq(powers, heights, rcond=None)[0]
     return float(height), float(slope) / longest_s
-
-
-def _sensing(channel: Channel | None) -> tuple[float, int]:
-    """Step in m and interval in ns of a height's sensor; a step of 0 where it is on no bus."""
-    if channel is None or channel.message is None or not channel.signal:
-        return 0.0, 0 if channel is None else channel.interval_ns
-    step_m = si_step(channel.message, channel.signal, channel.quantity.dimension)
-    return step_m, channel.interval_ns
-
-
-def _has_cycle(channel: Channel) -> bool:
-    """Whether it is known how often a channel is measured."""
-    return channel.message is None or channel.message.cycle_time_ns is not None
 
 
 def grace_of_applied_force_ns(channels: Sequence[Channel], stale_after_ns: int) -> int:

@@ -104,6 +104,7 @@ def update_band(
         square *= _WIDENING
         return InnovationBand(innovation_m, rate, t_ns, square, count, True, height_m, change)
     if are_missing:
-        return InnovationBand(innovation_m, rate, t_ns, square, count)
+        return InnovationBand(innovation_m, rate, t_ns, square, count, False, height_m)
     share = elapsed_s / _USUAL_S if count * elapsed_s > _USUAL_S else 1.0 / (count + 1)
-    return InnovationBand(innovation_m, rate, t_ns, square + share * (new - square), count + 1)
+    square += share * (new - square)
+    return InnovationBand(innovation_m, rate, t_ns, square, count + 1, False, height_m)

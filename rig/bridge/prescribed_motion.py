@@ -4,6 +4,9 @@ The model is not free: its strut is moved along the measured motion, and the vir
 load cell's less that of the model's own law. The motion between and at measurements is followed by
 a filter with fading memory, which has no lag for a constant acceleration.
 
+No model contradicts height and load cell. What does is what is usual of them: the time between two
+samples, the band of the filter's innovations, and how often a value repeats itself exactly.
+
 Reference: Morrison, "Introduction to Sequential Smoothing and Prediction" (1969), chapter 13: the
 fading-memory polynomial filter of second degree.
 """
@@ -18,7 +21,9 @@ from msgspec.structs import replace
 
 from dart_model.effects import AMBIENT_C
 from rig.bridge.estimator import Estimate, is_sensible
+from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
 from rig.bridge.measurement_age import is_too_old
+from rig.bridge.stuck_value import Repeats, update_repeats
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import LOAD_CELL_FORCE, TEMPERATURE
@@ -30,7 +35,11 @@ _SETTLED = 9.0
 """Time constants after which the filter has forgotten that it began at rest: to a hundredth."""
 
 _LONGEST_GAP = 10
-"""Measurements that may be missing in a row; the motion is followed from the next one on."""
+"""Intervals after which the motion is followed from the next measurement on, as from the first."""
+
+_LONGEST_AGE = 3
+"""Intervals that a value may be old: what it has changed by since is at most three times what it
+changes by between two samples."""
 
 
 class PrescribedModel(Protocol[ModelT]):
@@ -67,21 +76,38 @@ class TrackedMotion(Struct, frozen=True, gc=False):
     measured_ns: int
 
 
+class Watched(Struct, frozen=True, gc=False):
+    """A channel's last sample, and what is usual of its samples.
+
+    Attributes:
+        interval_ns: Time between two of them; 0 before it is known.
+        repeats: How often their value is the same.
+    """
+
+    sample: Sample
+    interval_ns: int
+    repeats: Repeats = Repeats()
+
+
 class PrescribedMotionState(Struct, frozen=True, gc=False):
     """State between two steps at a dyno; None before the first measurement.
 
-    `cell_ns` is the time at which the last force of the load cell arrived, `disturbed_ns` that
-    since which the motion is followed without a gap.
+    Attributes:
+        is_moving: Whether the model has begun to move.
+        disturbed_ns: Time since which the motion is followed undisturbed.
+        band: The band of the motion's innovations.
     """
 
     t_ns: int
     temperature_c: float
     motion: TrackedMotion | None = None
     model: object = None
-    cell_n: float | None = None
-    cell_ns: int = 0
+    height: Watched | None = None
+    cell: Watched | None = None
     is_moving: bool = False
     disturbed_ns: int = 0
+    band: InnovationBand = InnovationBand()
+    is_settled: bool = False
 
 
 def update_motion(motion: TrackedMotion, sample: Sample, settling_s: float) -> TrackedMotion:
@@ -140,6 +166,7 @@ class PrescribedMotionEstimator:
         self._settling_s = settling_s
         self._channels = tuple(channels)
         self._stale_after_ns = stale_after_ns
+        self._steps = [channel.step for channel in channels]
 
     @property
     def struts(self) -> int:
@@ -184,11 +211,11 @@ class PrescribedMotionEstimator:
         """Move the model to a time, and compare it with the load cell."""
         t_ns = step_input.t_ns
         state, can_start = self.collect(state, step_input)
-        motion, cell_n = state.motion, state.cell_n
-        if motion is None or cell_n is None or not (state.is_moving or can_start):
+        motion, height, cell = state.motion, state.height, state.cell
+        if motion is None or height is None or cell is None or not (state.is_moving or can_start):
             return state, None
-        measured_ns = min(motion.measured_ns, state.cell_ns)
-        temperature_c = state.temperature_c
+        measured_ns = min(motion.measured_ns, cell.sample.t_ns)
+        temperature_c, cell_n = state.temperature_c, cell.sample.value
         model = self._model.step(
             state.model, t_ns * 1e-9, partial(_motion_at, motion), temperature_c
         )
@@ -197,46 +224,80 @@ class PrescribedMotionEstimator:
         innovation_m, virtual_n = motion.innovation_m, cell_n - model_n
         strut = StrutOutput(cell_n, virtual_n, True, height_m, velocity, acceleration, innovation_m)
         diverged = -1 if is_sensible(cell_n + model_n + height_m + velocity) else 0
-        after = replace(state, model=model, is_moving=True)
-        is_settled = (t_ns - state.disturbed_ns) * 1e-9 >= _SETTLED * self._settling_s
+        is_settled = (
+            (t_ns - state.disturbed_ns) * 1e-9 >= _SETTLED * self._settling_s
+            and not self._is_old(height, t_ns)
+            and not self._is_old(cell, t_ns)
+            and not cell.repeats.is_stuck
+        )
+        after = replace(state, model=model, is_moving=True, is_settled=is_settled)
         return after, Estimate((strut,), measured_ns, is_settled, diverged)
+
+    def _is_old(self, watched: Watched, t_ns: int) -> bool:
+        """Whether a channel's next sample is overdue."""
+        delay_ns = self._channels[watched.sample.channel].delay_ns
+        return t_ns - watched.sample.t_ns > _LONGEST_AGE * watched.interval_ns + delay_ns
 
     def collect(
         self, state: PrescribedMotionState, step_input: StepInput
     ) -> tuple[PrescribedMotionState, bool]:
         """State with the samples of a step; the model begins at the first measured height."""
-        motion, model, temperature_c = state.motion, state.model, state.temperature_c
-        cell_n, cell_ns, disturbed_ns = state.cell_n, state.cell_ns, state.disturbed_ns
+        state = replace(state, t_ns=step_input.t_ns)
         for sample in step_input.samples:
             channel = self._channels[sample.channel]
             if channel.role is Role.HEIGHT:
-                longest_ns = _LONGEST_GAP * channel.interval_ns
-                if motion is None or sample.t_ns - motion.measured_ns > longest_ns:
-                    if motion is None:
-                        model = self._model.init(state.t_ns * 1e-9)
-                    motion = TrackedMotion(sample.value, 0.0, 0.0, 0.0, sample.t_ns)
-                    disturbed_ns = sample.t_ns
-                else:
-                    motion = update_motion(motion, sample, self._settling_s)
+                state = self._follow(state, sample)
             elif channel.quantity is LOAD_CELL_FORCE:
-                cell_n, cell_ns = sample.value, step_input.t_ns
+                state = replace(state, cell=self._watch(state.cell, sample, state.height))
             elif channel.quantity is TEMPERATURE:
-                temperature_c = sample.value
-        can_start = (
-            motion is not None
-            and cell_n is not None
-            and not is_too_old(
-                min(motion.measured_ns, cell_ns), step_input.t_ns, self._stale_after_ns
+                state = replace(state, temperature_c=sample.value)
+        motion, cell = state.motion, state.cell
+        if motion is None or cell is None:
+            return state, False
+        oldest_ns = min(motion.measured_ns, cell.sample.t_ns)
+        return state, not is_too_old(oldest_ns, state.t_ns, self._stale_after_ns)
+
+    def _follow(self, state: PrescribedMotionState, sample: Sample) -> PrescribedMotionState:
+        """State after a measured height."""
+        t_ns, motion, last, band = sample.t_ns, state.motion, state.height, state.band
+        height = self._watch(last, sample, state.cell)
+        gap_ns, usual_ns = 0, 0
+        if last is not None:
+            gap_ns, usual_ns = t_ns - last.sample.t_ns, last.interval_ns
+        if motion is None or (usual_ns and gap_ns > _LONGEST_GAP * usual_ns):
+            model = self._model.init(state.t_ns * 1e-9) if motion is None else state.model
+            motion = TrackedMotion(sample.value, 0.0, 0.0, 0.0, t_ns)
+            return replace(
+                state,
+                motion=motion,
+                model=model,
+                height=height,
+                disturbed_ns=t_ns,
+                band=restart_band(band),
             )
-        )
-        collected = PrescribedMotionState(
-            step_input.t_ns,
-            temperature_c,
-            motion,
-            model,
-            cell_n,
-            cell_ns,
-            state.is_moving,
-            disturbed_ns,
-        )
-        return collected, can_start
+        motion = update_motion(motion, sample, self._settling_s)
+        sensing = self._steps[sample.channel], height.interval_ns
+        band = update_band(band, sample.value, motion.innovation_m, t_ns, sensing, state.is_settled)
+        disturbed_ns = state.disturbed_ns
+        if band.is_left or height.repeats.is_stuck or gap_ns > _LONGEST_AGE * usual_ns:
+            disturbed_ns = t_ns
+        return replace(state, motion=motion, height=height, disturbed_ns=disturbed_ns, band=band)
+
+    def _watch(self, last: Watched | None, sample: Sample, witness: Watched | None) -> Watched:
+        """A channel after a sample; what the other one measures shows whether the bench rests."""
+        channel = self._channels[sample.channel]
+        if last is None:
+            return Watched(sample, channel.interval_ns if channel.has_cycle else 0)
+        gap_ns = sample.t_ns - last.sample.t_ns
+        if gap_ns <= 0:
+            return last
+        usual_ns = last.interval_ns
+        if not channel.has_cycle:
+            # A gap is not what is usual, but what becomes usual begins with one.
+            usual_ns = min(gap_ns, 2 * usual_ns) if usual_ns else gap_ns
+        repeats = last.repeats
+        is_repeated = sample.value == last.sample.value
+        if witness is not None:
+            step = self._steps[witness.sample.channel]
+            repeats = update_repeats(repeats, is_repeated, witness.sample.value, step, sample.t_ns)
+        return Watched(sample, usual_ns, repeats)

@@ -7,6 +7,7 @@ from typing import Annotated
 from msgspec import Struct
 from pydantic import BaseModel, ConfigDict, Field
 
+from can_dbc.codec import si_step
 from can_dbc.database import Message
 from can_dbc.yaml_file import Finite
 from rig.channels.measured_quantities import Quantity
@@ -115,6 +116,18 @@ class Channel:
         if self.role is Role.BENCH:
             return self.quantity.column
         return f"{self.name}.measured_{self.quantity.column}"
+
+    @property
+    def has_cycle(self) -> bool:
+        """Whether it is known how often it is measured."""
+        return self.message is None or self.message.cycle_time_ns is not None
+
+    @property
+    def step(self) -> float:
+        """Step of its values in SI; 0 where it is on no bus."""
+        if self.message is None or not self.signal:
+            return 0.0
+        return si_step(self.message, self.signal, self.quantity.dimension)
 
 
 class Sample(Struct, frozen=True, gc=False):

@@ -152,6 +152,46 @@ def strays(bench, *times_ns, index=0):
     return bench.receive(*(frame(NONE, t_ns=t, index=index, status=status) for t in times_ns))
 
 
+LEVEL = dataclasses.replace(
+    MESSAGE, arbitration_id=0x18FE5920, is_extended=True, is_j1939=True, cycle_time_ns=100 * MS
+)
+
+
+def level(t_ms, address):
+    """A frame of a J1939 group, from an address."""
+    return Frame(t_ms * MS, 0x18FE5900 | address, bytes([0, 0, 50]), is_extended=True)
+
+
+@pytest.mark.parametrize("first", [0x20, 0x33])
+def test_a_group_is_that_of_the_address_that_was_heard_first(first):
+    """Whatever address the DBC has, and also where the frames of two alternate."""
+    bench = Bench(Incoming(LEVEL, read, ()))
+    for t_ms in range(0, 2000, 100):
+        assert len(bench.receive(level(t_ms, first), level(t_ms + 50, 0x40))) == 1
+    assert bench.counts == {"refused": 20, "second_sender": 20}
+
+
+@pytest.mark.parametrize(("silent_ms", "passes"), [(300, False), (301, True), (5000, True)])
+def test_an_address_that_falls_silent_is_followed_by_another(silent_ms, passes):
+    """After three cycles, of which none is shorter than the 250 ms that a claim takes."""
+    bench = Bench(Incoming(LEVEL, read, ()))
+    assert len(bench.receive(level(1000, 0x20))) == 1
+    assert len(bench.receive(level(1000 + silent_ms, 0x33))) == passes
+    # And its group is that one's from then on.
+    assert len(bench.receive(level(1001 + silent_ms, 0x20))) == (not passes)
+    slow = Bench(Incoming(dataclasses.replace(LEVEL, cycle_time_ns=None), read, ()))
+    slow.receive(level(0, 0x20))
+    assert len(slow.receive(level(250, 0x33))) == 0
+    assert len(slow.receive(level(251, 0x33))) == 1
+
+
+def test_where_a_device_is_configured_its_name_decides():
+    device = Device("A", 1, 0x81, 0, j1939_name=5, address=0x33)
+    bench = Bench(Incoming(LEVEL, read, (), device=0), devices=[device])
+    assert len(bench.receive(level(0, 0x20), level(1, 0x33), level(2, 0x20))) == 1
+    assert bench.counts == {}
+
+
 def second_senders(bench):
     return bench.counts.get("second_sender", 0)
 

@@ -1,9 +1,12 @@
 """A dyno's tick: the motion is followed, the model driven along it, the load cell compared."""
 
+import dataclasses
 import math
+from pathlib import Path
 
 import pytest
 
+from can_dbc.database import Message
 from can_dbc.errors import InputError
 from dart_model.plant import PrescribedStrut
 from dart_model.spec import MODELS, EffectSpec, load_model, parse_model
@@ -33,6 +36,8 @@ struts:
     damping_n_s_per_m: 2000.0
 """
 TICK_NS = 1_000_000
+UNTIMED = Message(Path(), "M", 1, False, False, False, 8, None, None, {}, None)
+"""A message of which the DBC does not know how often it comes."""
 SETTLED = 18
 """Tick after that of the first height at which the motion is believed."""
 
@@ -46,6 +51,12 @@ def plant(*effects: EffectSpec) -> PrescribedStrut:
 def motion(t_s: float) -> tuple[float, float]:
     omega = 2.0 * math.pi * 3.0
     return 0.3 + 0.01 * math.sin(omega * t_s), 0.01 * omega * math.cos(omega * t_s)
+
+
+def cell(number: int) -> float:
+    """Force of a spring and a damper along the motion."""
+    height_m, velocity = motion(number * 1e-3)
+    return -5000.0 * (height_m - 0.3) - 2000.0 * velocity
 
 
 def step_input(number: int, cell_n: float | None, *, measured: bool = True) -> StepInput:
@@ -182,20 +193,126 @@ def test_the_motion_is_valid_when_the_filter_has_forgotten_its_start() -> None:
         assert output.struts[0].valid == (number >= SETTLED)
 
 
-def test_after_a_gap_of_more_than_ten_heights_the_motion_settles_again() -> None:
+@pytest.mark.parametrize("missing", [2, 3, 9, 10, 30])
+def test_after_three_intervals_without_a_height_the_motion_settles_again(missing: int) -> None:
     core = dyno(plant())
-    for missing in (9, 10):
-        state = core.init(0)
-        modes: list[Mode] = []
-        for number in range(90):
-            is_there = not 40 <= number < 40 + missing
-            state, output, _ = core.step(state, step_input(number, 12.0, measured=is_there))
-            modes.append(output.mode)
-        back = 40 + missing
-        assert modes[back - 1] is Mode.HOLD
-        settling = SETTLED if missing == 10 else 0
-        assert set(modes[back : back + settling]) == ({Mode.SETTLING} if settling else set())
-        assert set(modes[back + settling :]) == {Mode.RUNNING}
+    state = core.init(0)
+    modes: list[Mode] = []
+    for number in range(140):
+        is_there = not 40 <= number < 40 + missing
+        state, output, _ = core.step(state, step_input(number, cell(number), measured=is_there))
+        modes.append(output.mode)
+    back = 40 + missing
+    settling = SETTLED if missing > 2 else 0
+    assert set(modes[40:43]) == {Mode.RUNNING}
+    assert set(modes[43:45]) <= ({Mode.SETTLING} if settling else {Mode.RUNNING})
+    assert set(modes[45:back]) <= {Mode.HOLD}
+    assert set(modes[back : back + settling]) == ({Mode.SETTLING} if settling else set())
+    assert set(modes[back + settling :]) == {Mode.RUNNING}
+
+
+@pytest.mark.parametrize("missing", [2, 3, 4])
+def test_a_force_older_than_three_intervals_is_not_believed(missing: int) -> None:
+    """It is as soon as another one is there: a load cell does not settle."""
+    core = dyno(plant())
+    state = core.init(0)
+    for number in range(90):
+        quiet = 40 <= number < 40 + missing
+        state, output, _ = core.step(state, step_input(number, None if quiet else cell(number)))
+        if number > 40:
+            overdue = quiet and number >= 43
+            assert output.mode is (Mode.SETTLING if overdue else Mode.RUNNING)
+
+
+def test_a_force_is_as_old_as_its_sample() -> None:
+    core = dyno(plant())
+    state = core.init(0)
+    for number in range(60):
+        t_ns = number * TICK_NS
+        height = Sample(0, motion(t_ns * 1e-9)[0], t_ns)
+        sampled_ns = t_ns - (4 * TICK_NS if number >= 40 else 0)
+        late = bench_sample(1, LOAD_CELL_FORCE, cell(number), sampled_ns)
+        state, output, _ = core.step(state, StepInput(t_ns, (height, late)))
+        if number > 45:
+            assert output.mode is Mode.SETTLING
+
+
+def frozen_from(
+    first: int, *, height: bool = False, force: bool = False, ticks: int = 2000
+) -> list[Mode]:
+    """Modes where a sensor's values stay from a tick on what they were before it."""
+    core = dyno(plant())
+    state = core.init(0)
+    modes: list[Mode] = []
+    for number in range(ticks):
+        t_ns, at = number * TICK_NS, min(number, first - 1)
+        height_m = motion((at if height else number) * 1e-3)[0]
+        cell_n = cell(at if force else number)
+        samples = (Sample(0, height_m, t_ns), bench_sample(1, LOAD_CELL_FORCE, cell_n, t_ns))
+        state, output, _ = core.step(state, StepInput(t_ns, samples))
+        modes.append(output.mode)
+    return modes
+
+
+@pytest.mark.parametrize("first", [1000, 1042, 1083, 1125, 1208, 1250])
+def test_a_frozen_sensor_is_not_believed_while_the_other_moves(first: int) -> None:
+    """Also where it freezes as the motion turns, at which a value repeats itself anyway."""
+    for sensor in ("height", "force"):
+        modes = frozen_from(first, height=sensor == "height", force=sensor == "force")
+        assert set(modes[SETTLED:first]) == {Mode.RUNNING}
+        assert set(modes[first + 8 :]) == {Mode.SETTLING}
+
+
+def test_a_machine_that_comes_to_rest_is_believed() -> None:
+    """A second after the last of both has changed: of steps of its sensor none can be sure."""
+    core = dyno(plant())
+    state = core.init(0)
+    period = 1000.0 / 3.0
+    rest = round(3.0 * period)
+    for number in range(rest + 1100):
+        # The stroke fades out, so that it ends in no kink.
+        share = 0.5 + 0.5 * math.cos(math.pi * min(number / rest, 1.0))
+        height_m = 0.3 + 0.01 * share * math.sin(2.0 * math.pi * number / period)
+        height_m = round(height_m, 6)
+        cell_n = round(-5000.0 * (height_m - 0.3), 2)
+        t_ns = number * TICK_NS
+        samples = (Sample(0, height_m, t_ns), bench_sample(1, LOAD_CELL_FORCE, cell_n, t_ns))
+        state, output, _ = core.step(state, StepInput(t_ns, samples))
+    assert output.mode is Mode.RUNNING
+
+
+@pytest.mark.parametrize("jump_m", [1e-4, -1e-3, 1e-2])
+def test_a_motion_behind_a_jump_settles_again(jump_m: float) -> None:
+    core = dyno(plant())
+    state = core.init(0)
+    for number in range(1200):
+        t_ns = number * TICK_NS
+        height_m = motion(t_ns * 1e-9)[0] + (jump_m if number >= 1000 else 0.0)
+        cell_n = bench_sample(1, LOAD_CELL_FORCE, cell(number), t_ns)
+        state, output, _ = core.step(state, StepInput(t_ns, (Sample(0, height_m, t_ns), cell_n)))
+        if SETTLED <= number < 1000 or number >= 1000 + 3 * SETTLED:
+            assert output.mode is Mode.RUNNING
+        elif 1000 <= number < 1000 + SETTLED:
+            assert output.mode is Mode.SETTLING
+
+
+@pytest.mark.parametrize("interval", [1, 5, 20])
+def test_the_interval_of_a_sensor_without_a_cycle_time_is_learnt(interval: int) -> None:
+    supervision = Supervision(stale_after_s=0.2, safe_after_s=1.0)
+    untimed = [dataclasses.replace(channel, message=UNTIMED) for channel in channels(1)]
+    estimator = PrescribedMotionEstimator(plant(), 0.002, untimed, supervision.stale_after_ns)
+    core = Supervisor(estimator, supervision, [supervision.limits])
+    state = core.init(0)
+    for number in range(2000):
+        given = StepInput(number * TICK_NS, ())
+        if number % interval == 0 and not 1500 <= number < 1500 + 8 * interval:
+            given = step_input(number, cell(number))
+        state, output, _ = core.step(state, given)
+        since = number - (1500 + 8 * interval)
+        if 100 <= number < 1500 or since > 100:
+            assert output.mode is Mode.RUNNING
+        elif -4 * interval <= since < 0:
+            assert output.mode is Mode.SETTLING
 
 
 @pytest.mark.parametrize("silent", ["height", "cell"])
@@ -209,7 +326,7 @@ def test_a_channel_that_falls_silent_ends_in_the_safe_state(silent: str) -> None
         given = step_input(number, cell_n, measured=not (quiet and silent == "height"))
         state, output, _ = core.step(state, given)
         modes.append(output.mode)
-    assert modes[24:27] == [Mode.RUNNING, Mode.RUNNING, Mode.HOLD]
+    assert modes[23:27] == [Mode.RUNNING, Mode.SETTLING, Mode.SETTLING, Mode.HOLD]
     assert modes[70:72] == [Mode.HOLD, Mode.SAFE]
     assert output.struts[0].force_n == 0.0
     assert not output.struts[0].valid
