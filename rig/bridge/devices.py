@@ -16,6 +16,7 @@ from msgspec.structs import replace
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.frame import Frame
+from can_dbc.yaml_file import Finite
 from rig.channels.channel import SignalName
 
 EMERGENCY_ID, HEARTBEAT_ID, LARGEST_NODE_ID = 0x080, 0x700, 127
@@ -48,7 +49,7 @@ class DeviceSettings(BaseModel):
 
     node_id: Annotated[int, Field(ge=1, le=LARGEST_NODE_ID, strict=True)] | None = None
     emergency_id: Annotated[int, Field(ge=1, le=0x7FF, strict=True)] | None = None
-    heartbeat_s: Annotated[float, Field(ge=0.001, le=165.0, allow_inf_nan=False)] | None = None
+    heartbeat_s: Annotated[Finite, Field(ge=0.001, le=165.0)] | None = None
     alarms: Annotated[tuple[SignalName, ...], Field(max_length=16)] = ()
     j1939_name: Annotated[int, Field(ge=0, lt=2**64, strict=True)] | None = None
     source_address: Annotated[int, Field(ge=0, le=253, strict=True)] | None = None

@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from can_dbc.errors import InputError, missing_package
 from can_dbc.frame import Frame
-from can_dbc.yaml_file import read_text
+from can_dbc.yaml_file import Finite, read_text
 
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 """Lengths that a CAN FD frame can have, in bytes."""
@@ -79,8 +79,8 @@ class AuthenticationSettings(BaseModel):
     key_file: Annotated[str, Field(min_length=1, max_length=255)]
     freshness_bits: Literal[8, 16, 24, 32] = 8
     mac_bits: Literal[24, 32, 40, 48, 56, 64, 96, 128] = 24
-    clock_tolerance_s: Annotated[float, Field(ge=0.001, le=10.0, allow_inf_nan=False)] = 0.1
-    max_age_s: Annotated[float, Field(ge=0.001, le=60.0, allow_inf_nan=False)] = 1.0
+    clock_tolerance_s: Annotated[Finite, Field(ge=0.001, le=10.0)] = 0.1
+    max_age_s: Annotated[Finite, Field(ge=0.001, le=60.0)] = 1.0
 
     def load(self, source: Path) -> Authentication:
         """Authentication with the key of a file in the folder of the configuration `source`.

@@ -10,11 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from can_dbc.errors import DatabaseError, InputError
 from can_dbc.units import Dimension, SiConversion, si_conversion
-from can_dbc.yaml_file import load_yaml
+from can_dbc.yaml_file import Finite, Positive, load_yaml
 
 Text = Annotated[str, Field(min_length=1, max_length=200)]
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Unit = Annotated[str, Field(min_length=1, max_length=40)]
 ColumnName = Text | Annotated[int, Field(ge=1, le=10_000)]
 """A column by its name, or by its number, the first one being 1."""
@@ -35,7 +33,7 @@ class TextLayout(_Section):
         column_names: Whether a line with the column names precedes the data.
         skip_after_names: Lines between the names and the data, e.g. one with units.
         first_row: First row of data that is taken, counted from 0.
-        rows: Number of rows that are taken; all if absent.
+        rows: Finite of rows that are taken; all if absent.
     """
 
     separator: Annotated[str, Field(pattern=r"^(.|tab|whitespace)$")] = ","
@@ -95,7 +93,7 @@ class _Channel(_Section):
 
     column: ColumnName
     unit: Unit
-    gain: Number = 1.0
+    gain: Finite = 1.0
     sign: Literal[1, -1] = 1
 
     @property
@@ -114,19 +112,19 @@ class _Channel(_Section):
 class HeightChannel(_Channel):
     """A height; `offset_m` is added, e.g. the strut's length where the sensor reads zero."""
 
-    offset_m: Number = 0.0
+    offset_m: Finite = 0.0
 
 
 class ForceChannel(_Channel):
     """A force; `offset_n` is added, e.g. minus the reading of an unloaded cell."""
 
-    offset_n: Number = 0.0
+    offset_n: Finite = 0.0
 
 
 class TemperatureChannel(_Channel):
     """A temperature; `offset_k` is added."""
 
-    offset_k: Number = 0.0
+    offset_k: Finite = 0.0
 
 
 class TableMapping(_Section):

@@ -16,6 +16,8 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from can_dbc.yaml_file import Finite
+
 _MCL_CURRENT_AND_FUTURE = 3
 _PR_SET_TIMERSLACK = 29
 _PR_SET_THP_DISABLE = 41
@@ -41,7 +43,7 @@ class Realtime(BaseModel):
     fifo_priority: Annotated[int, Field(ge=0, le=99)] = 50
     lock_memory: bool = True
     cpu: Annotated[int, Field(ge=0, le=65_535)] | None = None
-    spin_s: Annotated[float, Field(ge=0, le=0.01)] = 0.0002
+    spin_s: Annotated[Finite, Field(ge=0, le=0.01)] = 0.0002
     freeze_garbage: bool = True
 
 

@@ -36,6 +36,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from scipy.linalg import expm  # pyright: ignore[reportUnknownVariableType]
 
+from can_dbc.yaml_file import Finite
 from rig.observers.filter_lag import (
     NO_LAG,
     Lag,
@@ -187,8 +188,8 @@ class ErrorFilter:
             (a step over the square root of 12).
     """
 
-    bandwidth_hz: Annotated[float, Field(ge=_LOWEST_HZ, le=_HIGHEST_HZ)]
-    noise_std_m: Annotated[float, Field(ge=_LEAST_STD_M, le=_LARGEST_STD_M)]
+    bandwidth_hz: Annotated[Finite, Field(ge=_LOWEST_HZ, le=_HIGHEST_HZ)]
+    noise_std_m: Annotated[Finite, Field(ge=_LEAST_STD_M, le=_LARGEST_STD_M)]
 
     @classmethod
     def within(cls, bandwidth_hz: float, noise_std_m: float) -> "ErrorFilter":

@@ -81,7 +81,7 @@ class HeightSignal(MeasuredSignal):
             cycle, the bus. The model's height of that time is compared with it.
     """
 
-    delay_s: Annotated[float, Field(ge=0, le=1.0, allow_inf_nan=False)] = 0.0
+    delay_s: Annotated[Finite, Field(ge=0, le=1.0)] = 0.0
 
     @property
     def delay_ns(self) -> int:
@@ -118,7 +118,7 @@ def _noise(quantity: Quantity) -> SensorNoise:
 def _sensor_settings(quantity: Quantity) -> type[SensorSignal]:
     """Settings of a sensor that measures a quantity of a strut."""
     noise = _noise(quantity)
-    std = Annotated[float, Field(ge=noise.low, le=noise.high)]
+    std = Annotated[Finite, Field(ge=noise.low, le=noise.high)]
     fields: dict[str, Any] = {"measures": (Literal[quantity.key], ...), noise.key: (std, ...)}
     name = f"{quantity.key.capitalize()}Sensor"
     settings = create_model(name, __base__=SensorSignal, __module__=__name__, **fields)
@@ -185,7 +185,7 @@ class PrescribedMotion(_Frozen):
             angular frequency.
     """
 
-    settling_s: Annotated[float, Field(gt=0, le=1.0, allow_inf_nan=False)] = 0.002
+    settling_s: Annotated[Finite, Field(gt=0, le=1.0)] = 0.002
 
 
 Mapped = dict[str, SignalName]
@@ -250,11 +250,11 @@ class LogConfig(_Frozen):
     """
 
     rotate_bytes: Annotated[int, Field(ge=100_000)] | None = None
-    rotate_s: Annotated[float, Field(ge=1.0, allow_inf_nan=False)] | None = None
-    capture_before_s: Annotated[float, Field(ge=0.0, le=60.0)] = 2.0
-    capture_after_s: Annotated[float, Field(ge=0.0, le=60.0)] = 2.0
+    rotate_s: Annotated[Finite, Field(ge=1.0)] | None = None
+    capture_before_s: Annotated[Finite, Field(ge=0.0, le=60.0)] = 2.0
+    capture_after_s: Annotated[Finite, Field(ge=0.0, le=60.0)] = 2.0
     most_captures: Annotated[int, Field(ge=0, le=1000)] = 0
-    sync_s: Annotated[float, Field(ge=0.05, le=3600.0)] | None = 1.0
+    sync_s: Annotated[Finite, Field(ge=0.05, le=3600.0)] | None = 1.0
 
     def rotation(self) -> Rotation:
         """Limits of a log file, in nanoseconds and bytes, for the writer."""

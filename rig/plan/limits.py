@@ -54,6 +54,7 @@ def resolve_limits(
         _check_name(row.strut, struts, f"{where}.strut", "no such strut")
         names = [channel.name for channel in others]
         _check_name(row.channel, names, f"{where}.channel", "not measured")
+        _check_overlap(row, where, struts, channels)
     height_of = {channel.strut: channel for channel in channels if channel.role is Role.HEIGHT}
     of_struts: list[tuple[Limit, ...]] = []
     for index, strut in enumerate(struts):
@@ -78,6 +79,33 @@ def resolve_limits(
 def _check_name(name: str | None, known: Sequence[str], where: str, problem: str) -> None:
     if name is not None and name not in known:
         raise InputError(f"{where}: {name}: {problem}, expected {', '.join(known) or 'none'}")
+
+
+def _check_overlap(
+    row: Limit, where: str, struts: Sequence[str], channels: Sequence[Channel]
+) -> None:
+    """Refuse a limit on a measured value that no value of its signal is within."""
+    if row.value not in (LimitedValue.MEASURED_HEIGHT_M, LimitedValue.MEASURED):
+        return
+    for channel in channels:
+        is_height = channel.role is Role.HEIGHT
+        is_its = (
+            row.strut in (None, struts[channel.strut]) if is_height else row.channel == channel.name
+        )
+        if channel.message is None or not is_its or is_height != (row.channel is None):
+            continue
+        found = _range(channel.message, channel.signal, channel.quantity.dimension)
+        if found is None:
+            continue
+        for name, bound, is_beyond in (
+            ("low", row.low, row.low is not None and row.low > found[1]),
+            ("high", row.high, row.high is not None and row.high < found[0]),
+        ):
+            if is_beyond:
+                raise InputError(
+                    f"{where}.{name}: {bound:g}, expected a value that {channel.signal} can have, "
+                    f"{found[0]:g} to {found[1]:g} in SI"
+                )
 
 
 def _with_defaults(own: Sequence[Limit], defaults: Iterable[Limit]) -> tuple[Limit, ...]:

@@ -5,6 +5,7 @@ Below it nothing looks up a name or opens a file.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import remainder
 from pathlib import Path
 from typing import TypeVar
 
@@ -344,15 +345,9 @@ class _SignalReader:
             role: Role, quantity: Quantity, name: str, key: str, strut: int, entry: MeasuredSignal
         ) -> None:
             message = self._message(entry, key)
-            if entry.valid is not None:
-                self._check_number(message, entry.valid.signal, f"{key}.valid.signal")
-                low, high = si_range(message, entry.valid.signal, Dimension.NUMBER)
-                if not low <= entry.valid.value <= high:
-                    raise InputError(
-                        f"{self._source}: {key}.valid.value: {entry.valid.value:g}, expected what "
-                        f"{entry.valid.signal} can hold, {low:g} to {high:g}"
-                    )
+            self._check_validity(message, entry, key)
             self._check_sender(message, entry, key)
+            self._check_distinct(entry, key)
             interval_ns = message.cycle_time_ns or self._config.period_ns
             delay_ns = entry.delay_ns if isinstance(entry, HeightSignal) else 0
             noise_std = entry.noise_std if isinstance(entry, SensorSignal) else 0.0
@@ -378,7 +373,14 @@ class _SignalReader:
         for strut, entry in signals.height.items():
             index, key = struts.index(strut), f"signals.height.{strut}"
             add(Role.HEIGHT, HEIGHT, strut, key, index, entry)
+        measured: dict[tuple[str, str], str] = {}
         for quantity, entry in signals.bench.items():
+            other = measured.setdefault((entry.message, entry.signal), quantity.key)
+            if other != quantity.key:
+                raise InputError(
+                    f"{self._source}: signals.{quantity.key}: {entry.message}.{entry.signal} is "
+                    f"{other} already, expected another signal"
+                )
             add(Role.BENCH, quantity, quantity.key, f"signals.{quantity.key}", -1, entry)
         for strut, group in signals.further.items():
             for sensor, entry in group.items():
@@ -451,6 +453,41 @@ class _SignalReader:
                 f"{self._source}: {key}: {name} has the unit {unit}, expected a signal without a "
                 "unit"
             )
+
+    def _check_validity(self, message: Message, entry: MeasuredSignal, key: str) -> None:
+        """Refuse a signal that cannot say that the sensor measures."""
+        valid = entry.valid
+        if valid is None:
+            return
+        self._check_number(message, valid.signal, f"{key}.valid.signal")
+        low, high = si_range(message, valid.signal, Dimension.NUMBER)
+        step = si_step(message, valid.signal, Dimension.NUMBER)
+        is_between_steps = (
+            step > 0.0
+            and abs(remainder(valid.value - message.signal(valid.signal).offset, step))
+            > 1e-6 * step
+        )
+        if is_between_steps or not low <= valid.value <= high:
+            steps = f" in steps of {step:g}" if step else ""
+            raise InputError(
+                f"{self._source}: {key}.valid.value: {valid.value:g}, expected what "
+                f"{valid.signal} can hold, {low:g} to {high:g}{steps}"
+            )
+
+    def _check_distinct(self, entry: MeasuredSignal, key: str) -> None:
+        """Refuse a signal that has two meanings in one entry."""
+        meaning = {entry.signal: "signal"}
+        valid = entry.valid.signal if entry.valid is not None else None
+        for name, signal in (
+            ("valid.signal", valid),
+            ("counter", entry.counter),
+            ("time", entry.time),
+        ):
+            if signal is not None and meaning.setdefault(signal, name) != name:
+                raise InputError(
+                    f"{self._source}: {key}.{name}: {signal} is {meaning[signal]} already, "
+                    "expected another signal"
+                )
 
     def _check_sender(self, message: Message, entry: MeasuredSignal, key: str) -> None:
         """Refuse a counter or time signal that cannot be one, or another than the message has."""

@@ -174,6 +174,10 @@ def _sample_times(channel: Channel) -> Finding:
     return Finding(Severity.OK, f"sample times of {message.name}", text)
 
 
+_LONG_STALE_NS, _LONG_STALE_CYCLES = 1_000_000_000, 20
+"""Time and cycles beyond which a missing measurement is noticed late, whatever the bench."""
+
+
 def _staleness(plan: Plan, heights: list[Message]) -> Finding:
     stale_ns = plan.config.supervision.stale_after_ns
     cell = plan.bench_channel(LOAD_CELL_FORCE)
@@ -189,7 +193,10 @@ def _staleness(plan: Plan, heights: list[Message]) -> Finding:
             ": expected more than one cycle, one tick and the delay, or the bridge holds all the "
             "time"
         )
-    severity = Severity.ERROR if is_short else Severity.OK
+    is_long = stale_ns > _LONG_STALE_NS and stale_ns > _LONG_STALE_CYCLES * slowest_ns
+    if is_long:
+        text += f": expected at most {_LONG_STALE_CYCLES} cycles, or a sensor is missed late"
+    severity = Severity.ERROR if is_short else Severity.WARNING if is_long else Severity.OK
     return Finding(severity, "supervision.stale_after_s", text)
 
 

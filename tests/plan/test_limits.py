@@ -51,6 +51,28 @@ def test_the_bits_limit_what_the_range_does_not():
     assert model.high - model.low == pytest.approx(1.2 * 2e-6 * (2**20 - 1))
 
 
+@pytest.mark.parametrize(
+    ("bounds", "text"),
+    [({"low": 0.61}, r"0\.low: 0\.61"), ({"high": 0.09}, r"0\.high: 0\.09")],
+)
+def test_a_limit_that_no_height_is_within_is_one_line(bounds, text):
+    measured = row(value="measured_height_m", **bounds)
+    with pytest.raises(InputError, match=text + ", expected .* HEIGHT can have, 0.1 to 0.6 in SI"):
+        resolved([measured], heights=[height(message=with_range(0.1, 0.6))])
+    # One of another strut, or that a height may be within, is none of its concern.
+    resolved([row(value="measured_height_m", low=0.6)], heights=[height()])
+
+
+@pytest.mark.parametrize(
+    "bounds", [{"high": 0.0}, {"high": -1.0}, {"low": 0.1}, {"low": 0.1, "high": 1.0}]
+)
+def test_a_time_without_a_change_has_a_highest_value_alone(bounds):
+    with pytest.raises(
+        ValidationError, match="unchanged_s: expected high, more than 0, and no low"
+    ):
+        row(value="unchanged_s", **bounds)
+
+
 def test_a_height_beyond_the_dbcs_range_is_refused():
     ((measured, model),) = resolved(heights=[height(message=with_range(0.1, 0.6))])
     assert (measured.value, measured.action) == (LimitedValue.MEASURED_HEIGHT_M, "refuse")

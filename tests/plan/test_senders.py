@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from can_dbc.codec import compile_decoder
+from can_dbc.codec import compile_decoder, compile_encoder
 from can_dbc.database import load_database
 from can_dbc.errors import InputError
 from can_dbc.frame import Frame
@@ -39,6 +39,9 @@ BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
 BA_DEF_DEF_ "GenMsgCycleTime" 0;
 BA_ "GenMsgCycleTime" BO_ 288 1;
 """
+
+
+MODE = ' SG_ Mode : 60|1@1+ (1,0) [0|1] "" CONTROL'
 
 
 def config_with(folder, height=None, applied=None):
@@ -231,10 +234,57 @@ def test_a_time_or_counter_that_shows_nothing_is_one_line(tmp_path, key, old, ne
         with_signals(tmp_path, (old, new), **{key: name})
 
 
-def test_a_valid_value_that_its_signal_cannot_hold_is_one_line(tmp_path):
-    path = config_with(tmp_path, {"valid": {"signal": "Mode", "value": 2}})
-    with pytest.raises(InputError, match=r"valid\.value: 2, expected what Mode can hold, 0 to 1"):
+@pytest.mark.parametrize("value", [2, -1, 0.5])
+def test_a_valid_value_that_its_signal_cannot_hold_is_one_line(tmp_path, value):
+    path = config_with(tmp_path, {"valid": {"signal": "Mode", "value": value}})
+    text = rf"valid\.value: {value}, expected what Mode can hold, 0 to 1 in steps of 1"
+    with pytest.raises(InputError, match=text):
         load_plan(path)
+
+
+def test_a_valid_value_is_one_of_the_steps_of_its_signal(tmp_path):
+    """Three steps of a tenth are not what a file writes as 0.3."""
+    mode = ' SG_ Mode : 60|4@1+ (0.1,0) [0|1.5] "" CONTROL'
+    path = config_with(tmp_path, {"valid": {"signal": "Mode", "value": 0.3}})
+    (tmp_path / "my.dbc").write_text(DBC.replace(MODE, mode))
+    bridge = build_bridge(load_plan(path))
+    encode = compile_encoder(
+        load_database(tmp_path / "my.dbc").message("SENSOR_1"),
+        ["Travel", "Actuator", "Mode"],
+        [Dimension.LENGTH, Dimension.FORCE, Dimension.NUMBER],
+    )
+    for value, refused in ((0.3, 0), (0.2, 1)):
+        frame = Frame(0, 288, encode([0.4, 0.0, value])[0])
+        state, _ = bridge.tick(bridge.init(0), MS, [frame])
+        assert state.counts.no_value == refused
+
+
+@pytest.mark.parametrize(
+    ("keys", "text"),
+    [
+        ({"counter": "Alive", "valid": {"signal": "Alive"}}, "counter: Alive is valid.signal"),
+        ({"time": "Stamp", "valid": {"signal": "Travel"}}, "valid.signal: Travel"),
+        ({"counter": "Travel"}, "counter: Travel"),
+    ],
+)
+def test_a_signal_has_one_meaning_in_an_entry(tmp_path, keys, text):
+    with pytest.raises(InputError, match=text):
+        load_plan(config_with(tmp_path, keys, {}))
+
+
+def test_a_load_cell_is_not_the_applied_force(tmp_path):
+    path = config_with(tmp_path)
+    config = json.loads(path.read_text())
+    config["signals"]["load_cell_force"] = config["signals"]["applied_force"]
+    path.write_text(json.dumps(config))
+    with pytest.raises(InputError, match=r"SENSOR_1\.Actuator is .* already, expected another"):
+        load_plan(path)
+
+
+def test_a_truth_value_is_no_time(tmp_path):
+    """`delay_s: yes` would be a second."""
+    with pytest.raises(InputError, match="delay_s: True: expected a number"):
+        load_plan(config_with(tmp_path, {"delay_s": True}, {}))
 
 
 def test_a_counter_on_another_page_than_the_height_is_one_line(tmp_path):
@@ -242,8 +292,7 @@ def test_a_counter_on_another_page_than_the_height_is_one_line(tmp_path):
     travel = " SG_ Travel : 0|20"
     path = config_with(tmp_path, {"counter": "Alive"})
     text = DBC.replace(ALIVE, paged[0]).replace(travel, " SG_ Travel m0 : 0|20")
-    plain = ' SG_ Mode : 60|1@1+ (1,0) [0|1] "" CONTROL'
-    (tmp_path / "my.dbc").write_text(text.replace(plain, paged[1]))
+    (tmp_path / "my.dbc").write_text(text.replace(MODE, paged[1]))
     with pytest.raises(InputError, match="are never in one frame"):
         build_bridge(load_plan(path))
 
