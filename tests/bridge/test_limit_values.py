@@ -175,7 +175,7 @@ def test_a_height_that_is_not_used_is_forgotten(action):
 def test_the_first_height_has_no_rate_and_is_unchanged_for_no_time():
     rows = [
         row("measured_rate_m_per_s", "safe", low=-1e-9, high=1e-9),
-        row("unchanged_s", "safe", high=0.0),
+        row("unchanged_s", "safe", high=1e-12),
     ]
     assert judge_measurement(rows, None, 0.5, 7) == (Plausibility(0.5, 7, 7, 1), 0)
 

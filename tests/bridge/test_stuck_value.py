@@ -68,6 +68,51 @@ def test_what_repeats_itself_as_motion_turns_becomes_usual():
     assert stuck[-1] < 1300
 
 
+def runs(*lengths):
+    """Values that are repeated so often in a row, under a witness that moves all the time."""
+    values = [number for number, length in enumerate(lengths) for _ in range(length + 1)]
+    return follow(values, [1000.0 * number for number in range(len(values))])
+
+
+@pytest.mark.parametrize("usual", [0, 1, 2, 5, 9])
+def test_a_value_is_stuck_after_more_than_twice_its_usual_repeats_and_three(usual):
+    """Whatever it did before its first change."""
+    longest = [length for length in (3, 8, 9) if length < usual]
+    states = runs(7, *longest, usual, 100)
+    counts = [state.count for state in states if state.is_stuck]
+    assert states[-1].usual == usual
+    assert counts == list(range(2 * usual + 4, 101))
+
+
+def test_what_is_usual_at_most_doubles_with_a_run_and_never_falls():
+    for lengths, usual in (
+        ((0, 100, 0), 3),
+        ((0, 100, 100, 0), 9),
+        ((0, 2, 100, 0), 7),
+        ((0, 2, 1, 0), 2),
+        ((0, 2, 0, 0), 2),
+        ((50, 0, 0), 0),
+    ):
+        assert runs(*lengths)[-1].usual == usual
+
+
+def test_a_witness_is_calm_a_second_after_it_has_moved():
+    witness = np.where(np.arange(2000) < 500, 0.0, 1000.0)
+    states = follow([0, 1, *[2] * 1998], witness)
+    assert [n for n, state in enumerate(states) if state.is_stuck] == list(range(500, 1500))
+
+
+@pytest.mark.parametrize(("share", "is_stuck"), [(0.98, False), (1.04, True)])
+def test_a_witness_moves_beyond_a_step_and_eight_deviations_of_its_noise(share, is_stuck):
+    """One that alternates between 1 and -1 has second differences of 4, as noise of 1.63 has."""
+    noise = [(-1.0) ** number for number in range(4000)]
+    bound = STEP_N + 8.0 * 4.0 / np.sqrt(6.0)
+    values = [0, 1, *[2] * 4002]
+    states = follow(values, [0.0, 0.0, 0.0, *noise, noise[0] + share * bound])
+    assert not any(state.is_stuck for state in states[:-1])
+    assert states[-1].is_stuck == is_stuck
+
+
 def test_a_sensor_that_was_stuck_makes_twice_as_many_usual_at_most():
     values = [*wave(1000), *[0.0] * 3000, *(1.0 + wave(1000))]
     states = follow(values, wave(5000))
