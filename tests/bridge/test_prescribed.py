@@ -2,9 +2,11 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from can_dbc.database import Message
 from can_dbc.errors import InputError
@@ -13,13 +15,14 @@ from dart_model.spec import MODELS, EffectSpec, load_model, parse_model
 from rig.bridge.mode_supervisor import Supervision, Supervisor
 from rig.bridge.prescribed_motion import (
     PrescribedMotionEstimator,
+    PrescribedMotionState,
     TrackedMotion,
     predict_motion,
     update_motion,
 )
 from rig.bridge.values import Mode, Request, StepInput
-from rig.channels.channel import Sample
-from rig.channels.measured_quantities import LOAD_CELL_FORCE, TEMPERATURE
+from rig.channels.channel import Channel, Sample
+from rig.channels.measured_quantities import APPLIED_FORCE, LOAD_CELL_FORCE, TEMPERATURE
 from tests.bridge.cores import bench_sample, channels
 
 MODEL = """
@@ -354,3 +357,128 @@ def test_two_struts_are_refused() -> None:
     with pytest.raises(InputError, match="2 struts, expected one") as caught:
         PrescribedStrut(load_model(MODELS / "quarter_car.yaml"))
     assert "\n" not in str(caught.value)
+
+
+def estimator(measured: Sequence[Channel] | None = None) -> PrescribedMotionEstimator:
+    return PrescribedMotionEstimator(plant(), 0.002, measured or channels(1), 5 * TICK_NS)
+
+
+def follow(
+    core: PrescribedMotionEstimator, numbers: Sequence[int], state: PrescribedMotionState
+) -> PrescribedMotionState:
+    for number in numbers:
+        state, _ = core.step(state, step_input(number, cell(number)))
+    return state
+
+
+def test_before_a_height_there_is_none_and_one_strut() -> None:
+    core = estimator()
+    assert core.struts == 1
+    state = core.init(7)
+    assert (state.t_ns, state.disturbed_ns) == (7, 0)
+    assert core.heights_m(state) == ()
+    state = follow(core, range(3), state)
+    assert core.heights_m(state) == (pytest.approx(motion(0.002)[0], abs=1e-4),)
+
+
+def test_an_estimator_that_starts_again_waits_for_both() -> None:
+    core = estimator()
+    state = follow(core, range(100), core.init(0))
+    assert state.is_moving
+    assert state.is_settled
+    again = core.restart(state, 100 * TICK_NS)
+    assert again == PrescribedMotionState(100 * TICK_NS, state.temperature_c)
+    assert not again.is_moving
+    assert not again.is_settled
+
+
+@pytest.mark.parametrize(("missing", "is_followed"), [(9, True), (10, False)])
+def test_after_more_than_ten_intervals_the_motion_is_followed_from_rest(
+    missing: int, is_followed: bool
+) -> None:
+    core = estimator()
+    state = follow(core, range(100), core.init(0))
+    behind, _ = core.collect(state, step_input(100 + missing, None))
+    assert behind.motion is not None
+    tracked = (behind.motion.velocity_m_per_s, behind.motion.acceleration_m_per_s2)
+    assert (tracked != (0.0, 0.0)) == is_followed
+    assert behind.disturbed_ns == (100 + missing) * TICK_NS
+    if not is_followed:
+        assert behind.motion.innovation_m == 0.0
+        # The model is where it was.
+        assert behind.model == state.model
+
+
+@pytest.mark.parametrize("value", [1e13, -1e13, math.nan])
+@pytest.mark.parametrize("of_cell", [True, False])
+def test_what_no_bench_has_ends_in_the_safe_state(value: float, of_cell: bool) -> None:
+    core = dyno(plant())
+    state = core.init(0)
+    for number in range(60):
+        t_ns = number * TICK_NS
+        is_wrong = number >= 50
+        height_m = value if is_wrong and not of_cell else motion(t_ns * 1e-9)[0]
+        cell_n = value if is_wrong and of_cell else cell(number)
+        samples = (Sample(0, height_m, t_ns), bench_sample(1, LOAD_CELL_FORCE, cell_n, t_ns))
+        state, output, _ = core.step(state, StepInput(t_ns, samples))
+        assert (output.mode is Mode.SAFE) == is_wrong
+
+
+def test_a_sample_that_is_not_newer_is_not_a_repeat() -> None:
+    core = estimator()
+    state = follow(core, range(100), core.init(0))
+    for _ in range(50):
+        state, _ = core.collect(state, step_input(99, cell(99)))
+    assert state.cell is not None
+    assert state.height is not None
+    assert state.cell.repeats.count == state.height.repeats.count == 0
+
+
+def test_an_old_height_is_as_old_as_its_delay_makes_it() -> None:
+    """Heights that arrive 8 ms late have an age of 8 ms, at 1 ms between them."""
+    measured = channels(1, delay_ns=8 * TICK_NS)
+    core = PrescribedMotionEstimator(plant(), 0.002, measured, 50 * TICK_NS)
+    state = core.init(0)
+    for number in range(8, 160):
+        t_ns, sampled_ns = number * TICK_NS, (number - 8) * TICK_NS
+        height = Sample(0, motion(sampled_ns * 1e-9)[0], sampled_ns)
+        given = (height, bench_sample(1, LOAD_CELL_FORCE, cell(number), t_ns))
+        if number < 140:
+            state, found = core.step(state, StepInput(t_ns, given))
+        else:
+            state, found = core.step(state, StepInput(t_ns, given[1:]))
+        if number > 60:
+            assert found is not None
+            # The last height was true at 131 ms, and came at 139.
+            assert found.is_settled == (number - 131 <= 11 or number < 140)
+
+
+def test_the_interval_that_a_dbc_states_is_not_learnt() -> None:
+    core = dyno(plant(), Supervision(stale_after_s=0.05, safe_after_s=1.0))
+    state = core.init(0)
+    modes: list[Mode] = []
+    for number in range(300):
+        is_there = number % 5 == 0
+        given = step_input(number, cell(number)) if is_there else StepInput(number * TICK_NS)
+        state, output, _ = core.step(state, given)
+        modes.append(output.mode)
+    assert set(modes[50:]) == {Mode.SETTLING}
+
+
+def test_other_quantities_are_none_of_its_concern() -> None:
+    core = estimator()
+    state = follow(core, range(3), core.init(0))
+    applied = bench_sample(1, APPLIED_FORCE, 77.0, 3 * TICK_NS)
+    after, _ = core.collect(state, StepInput(3 * TICK_NS, (applied,)))
+    assert after == replace(state, t_ns=3 * TICK_NS)
+
+
+def test_the_motion_is_published_while_heights_are_missing() -> None:
+    core = dyno(plant())
+    state = core.init(0)
+    for number in range(80):
+        state, output, _ = core.step(state, step_input(number, cell(number), measured=number < 60))
+    assert output.mode is Mode.HOLD
+    assert output.struts[0].height_m != 0.0
+    assert not output.struts[0].valid
+    assert output.struts[0].force_n == cell(79)
