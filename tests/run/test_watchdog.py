@@ -61,6 +61,9 @@ def test_its_frames_continue_the_loops_own_and_are_invalid(trial, is_last):
         # The simulated bench's tick count is that of the frames: one at every tick.
         assert estimate["COUNTER"] == (BEGIN_MS + sent) % 16
         assert (status["STATE"], status["FIRST_CAUSE"]) == (4, 3)
+        assert estimate["VIRTUAL_FORCE"] == 0.0
+        motion = values["RIG_KINEMATICS"]
+        assert {motion[name] for name in motion if name not in ("CRC", "COUNTER")} == {0.0}
 
 
 class Scripted:
@@ -104,6 +107,12 @@ def test_it_sends_from_the_age_on_until_the_loop_ticks_again():
     assert found == (None, first + second)
 
 
+def test_a_loop_that_stands_still_after_its_first_tick_is_noticed():
+    found, sent = watched(lambda now: now == 20, ending_at(100))
+    assert found is None
+    assert sent == [(now, now - 71) for now in range(71, 100)]
+
+
 def test_before_the_first_tick_there_is_nothing_to_watch():
     assert watched(lambda _now: False, ending_at(300, b"")) == (None, [])
     assert watched(lambda _now: False, ending_at(300)) == (None, [])
@@ -140,6 +149,7 @@ def test_its_frames_are_authenticated_as_the_loops_are(trial):
 
 def test_a_watchdog_that_cannot_start_ends_the_run_with_a_reason(tmp_path):
     watchdog = Watchdog(load_plan(CONFIGS / "reference.yaml"), tmp_path)
+    assert watchdog.describe() == "watched"
     with pytest.raises(BusError, match=r"watchdog could not be started: .*run\.yaml"):
         watchdog.start()
     assert watchdog.describe().startswith("ended")
