@@ -102,7 +102,7 @@ class Limit(BaseModel):
         if self.low is not None and self.high is not None and self.low >= self.high:
             raise ValueError(f"low {self.low}: expected less than high ({self.high})")
         if self.value is LimitedValue.UNCHANGED_S and (
-            self.low is not None or not self.high or self.high <= 0.0
+            (self.low or 0.0) > 0.0 or (self.high or 0.0) <= 0.0
         ):
             raise ValueError("unchanged_s: expected high, more than 0, and no low")
         if self.action == "refuse" and not self.value.is_measured:
