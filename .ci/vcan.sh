@@ -13,7 +13,7 @@ set -euo pipefail
 
 project=$(cd "$(dirname "$0")/.." && pwd)
 python=$(command -v "${PYTHON:-python3}")
-limit_s=${VCAN_LIMIT_S:-2000}
+limit_s=${VCAN_LIMIT_S:-3000}
 # Not under /tmp or /var: the booted kernel has file systems of its own there.
 work=$(mktemp -d /opt/rig-vcan.XXXXXX)
 trap 'rm -rf "$work"' EXIT
