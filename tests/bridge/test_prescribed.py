@@ -482,3 +482,16 @@ def test_the_motion_is_published_while_heights_are_missing() -> None:
     assert output.struts[0].height_m != 0.0
     assert not output.struts[0].valid
     assert output.struts[0].force_n == cell(79)
+
+
+@pytest.mark.parametrize("interval_ms", [1, 5])
+def test_the_filters_gains_are_those_of_a_triple_pole(interval_ms: int) -> None:
+    """Morrison's: 1 - p^3, 1.5 (1 - p)^2 (1 + p) over the interval, (1 - p)^3 over its square."""
+    interval_s, pole = interval_ms * 1e-3, math.exp(-interval_ms / 2.0)
+    rest = TrackedMotion(0.0, 0.0, 0.0, 0.0, 0)
+    after = update_motion(rest, Sample(0, 1.0, interval_ms * TICK_NS), 0.002)
+    assert after.height_m == pytest.approx(1.0 - pole**3)
+    velocity = 1.5 * (1.0 - pole) ** 2 * (1.0 + pole) / interval_s
+    assert after.velocity_m_per_s == pytest.approx(velocity)
+    assert after.acceleration_m_per_s2 == pytest.approx((1.0 - pole) ** 3 / interval_s**2)
+    assert after.innovation_m == 1.0
