@@ -4,7 +4,7 @@
    may be a heartbeat, an emergency or an address claim of a device, or a second sender.
 2. sent by its device: its sender is the configured device; one of another sender is none of the
    message's frames, and is not counted. Where none is configured, a J1939 group is that of the
-   address that was heard first; a frame from another one is a second sender's.
+   address whose frames passed first; a frame from another one is a second sender's.
 3. protected: its length, CRC and counter are right (`can_dbc.protection`).
 4. timed: it does not contradict its sender's clock (`rig.bridge.sample_times`). Whether a late one
    had waited is known at the end of the tick.
@@ -157,6 +157,12 @@ class Reception:
             standing.append(Standing(message, action, excess))
         self.memory = replace(self.memory, standing=tuple(standing))
 
+    def set_source(self, message: int, frame: Frame) -> None:
+        """Note the address that a message's frame came from."""
+        source, sources = Source(frame.arbitration_id & 0xFF, frame.t_ns), self.memory.sources
+        sources = (*sources[:message], source, *sources[message + 1 :])
+        self.memory = replace(self.memory, sources=sources)
+
     def set_health(self, index: int, health: DeviceHealth) -> None:
         """Replace the health of a device."""
         healths = self.memory.healths
@@ -248,35 +254,38 @@ class FrameChecks:
             if values is None:
                 continue
             # One that contradicts its sender's clock leaves nothing behind.
-            if timing is EARLY or self._pass(reception, index, values, due_ns):
+            if timing is EARLY or self._pass(reception, index, values, due_ns, frame):
                 passed.append((incoming, values, due_ns, timing))
         return passed if is_timed else _drop_unclear(reception, passed)
 
-    def _pass(self, reception: Reception, index: int, values: Values, due_ns: int) -> bool:
+    def _pass(
+        self, reception: Reception, index: int, values: Values, due_ns: int, frame: Frame
+    ) -> bool:
         """Whether a frame of a message holds values, and no check refuses it."""
         if not values:
             reception.count_refusal("no_value")
             return False
         check = self._checks[index]
-        return check is None or check(reception, values, due_ns)
+        if check is not None and not check(reception, values, due_ns):
+            return False
+        if index in self._of_one_sender:
+            reception.set_source(index, frame)
+        return True
 
     def _is_from_sender(self, reception: Reception, index: int, frame: Frame) -> bool:
         """Whether a frame is from the one sender of its message.
 
-        That is its device, or the address that was first heard to send its group.
+        That is its device, or the address whose frames of its group passed first.
         """
         device = self.incoming[index].device
         if device is not None:
             return is_from(self._devices[device], reception.memory.healths[device], frame)
-        address, sources = frame.arbitration_id & 0xFF, reception.memory.sources
-        source = sources[index]
+        address, source = frame.arbitration_id & 0xFF, reception.memory.sources[index]
         if source is not None and source.address != address:
             cycle_ns = self.incoming[index].message.cycle_time_ns or 0
             if frame.t_ns - source.t_ns <= max(_SILENCE_NS, _SUCCESSION_CYCLES * cycle_ns):
                 reception.count_refusal("second_sender")
                 return False
-        sources = (*sources[:index], Source(address, frame.t_ns), *sources[index + 1 :])
-        reception.memory = replace(reception.memory, sources=sources)
         return True
 
     def _receive_other(self, reception: Reception, frame: Frame) -> None:

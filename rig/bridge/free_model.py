@@ -13,7 +13,6 @@ from dart_model.protocol import AnyPlant, LoadedModel, ModelState
 from rig.bridge.estimator import Estimate, find_divergence, is_sensible
 from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
 from rig.bridge.measurement_age import age_limit_ns, is_too_old
-from rig.bridge.stuck_value import Repeats, update_repeats
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import APPLIED_FORCE, TEMPERATURE
@@ -44,7 +43,6 @@ class FreeModelState(Struct, frozen=True, gc=False):
         is_settled: Whether every strut's estimate has settled.
         longest_gaps_ns: Of each strut the longest time without a measurement.
         bands: Of each strut the band of its innovations.
-        repeats: Of each strut how often its height is the same.
     """
 
     t_ns: int
@@ -58,7 +56,6 @@ class FreeModelState(Struct, frozen=True, gc=False):
     is_settled: bool = False
     longest_gaps_ns: tuple[int, ...] = ()
     bands: tuple[InnovationBand, ...] = ()
-    repeats: tuple[Repeats, ...] = ()
 
 
 _Received = Sequence[Sample | None]
@@ -134,7 +131,6 @@ class FreeModelEstimator:
         )
         applied = [channel for channel in channels if channel.quantity is APPLIED_FORCE]
         self._has_applied = bool(applied)
-        self._applied_step = applied[0].step if applied else 0.0
         self._applied_grace_ns = grace_of_applied_force_ns(applied, stale_after_ns)
         self._longest_silence_ns = self._applied_grace_ns + stale_after_ns
 
@@ -164,7 +160,6 @@ class FreeModelEstimator:
             observers=state.observers,
             applied=state.applied,
             bands=tuple(map(restart_band, state.bands)),
-            repeats=state.repeats,
         )
 
     def discard(self, before: FreeModelState, after: FreeModelState) -> FreeModelState:
@@ -223,7 +218,6 @@ class FreeModelEstimator:
             state.observers,
             applied=applied,
             bands=state.bands,
-            repeats=state.repeats,
         )
         return state, self._can_start(state, required)
 
@@ -270,7 +264,6 @@ class FreeModelEstimator:
             model=loaded,
             longest_gaps_ns=tuple(longest_gaps_ns),
             bands=state.bands or (InnovationBand(),) * len(first),
-            repeats=state.repeats or (Repeats(),) * len(first),
         )
         started = self.unsettle(started, t_ns)
         return self._estimate(started, loaded, self._newest_ns(state))
@@ -331,7 +324,7 @@ class FreeModelEstimator:
         observers: list[ObserverState] = []
         virtual_n: list[float] = []
         bands: list[InnovationBand] = []
-        oldest_ns, repeats = t_ns, state.repeats
+        oldest_ns = t_ns
         for strut, observer in enumerate(self.observers):
             measured, before, band = received[strut], state.observers[strut], state.bands[strut]
             innovation = None
@@ -344,12 +337,6 @@ class FreeModelEstimator:
                 innovation_m = height_m - model_m
                 innovation = Innovation(innovation_m, measured_ns)
                 sensing, was_left = self._sensing[strut], band.is_left
-                has_changed = height_m < band.height_m or height_m > band.height_m  # not from NaN
-                if self._has_applied and (not has_changed or repeats[strut].count):
-                    item = update_repeats(
-                        repeats[strut], not has_changed, applied_n, self._applied_step, t_ns
-                    )
-                    repeats = (*repeats[:strut], item, *repeats[strut + 1 :])
                 band = update_band(band, height_m, innovation_m, measured_ns, sensing, is_settled)
                 if band.is_left and not was_left:
                     return self._begin_again(state, step_input, strut, band)
@@ -376,7 +363,6 @@ class FreeModelEstimator:
             is_settled,
             state.longest_gaps_ns,
             tuple(bands),
-            repeats,
         )
         return self._estimate(after, loaded, oldest_ns)
 
@@ -436,7 +422,6 @@ class FreeModelEstimator:
             if (
                 observer.is_disturbed
                 or state.bands[strut].is_left
-                or state.repeats[strut].is_stuck
                 or t_ns - observer.measured_ns > longest_gaps_ns[strut]
             ):
                 is_calm = False
@@ -472,8 +457,7 @@ class FreeModelEstimator:
         for strut, settling_ns in enumerate(self._settling_ns):
             observer = state.observers[strut]
             is_old = t_ns - observer.measured_ns > state.longest_gaps_ns[strut]
-            is_wrong = state.bands[strut].is_left or state.repeats[strut].is_stuck
-            if is_old or is_wrong or observer.is_disturbed:
+            if is_old or observer.is_disturbed or state.bands[strut].is_left:
                 disturbed_ns[strut] = t_ns
                 is_settled = False
             elif settling_ns is None or t_ns - disturbed_ns[strut] < settling_ns:

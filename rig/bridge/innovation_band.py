@@ -104,7 +104,6 @@ def update_band(
         square *= _WIDENING
         return InnovationBand(innovation_m, rate, t_ns, square, count, True, height_m, change)
     if are_missing:
-        return InnovationBand(innovation_m, rate, t_ns, square, count, False, height_m)
+        return InnovationBand(innovation_m, rate, t_ns, square, count)
     share = elapsed_s / _USUAL_S if count * elapsed_s > _USUAL_S else 1.0 / (count + 1)
-    square += share * (new - square)
-    return InnovationBand(innovation_m, rate, t_ns, square, count + 1, False, height_m)
+    return InnovationBand(innovation_m, rate, t_ns, square + share * (new - square), count + 1)

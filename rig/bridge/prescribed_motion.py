@@ -5,7 +5,7 @@ load cell's less that of the model's own law. The motion between and at measurem
 a filter with fading memory, which has no lag for a constant acceleration.
 
 No model contradicts height and load cell. What does is what is usual of them: the time between two
-samples, the band of the filter's innovations, and how often a value repeats itself exactly.
+samples, and the band of the filter's innovations.
 
 Reference: Morrison, "Introduction to Sequential Smoothing and Prediction" (1969), chapter 13: the
 fading-memory polynomial filter of second degree.
@@ -23,7 +23,6 @@ from dart_model.effects import AMBIENT_C
 from rig.bridge.estimator import Estimate, is_sensible
 from rig.bridge.innovation_band import InnovationBand, restart_band, update_band
 from rig.bridge.measurement_age import is_too_old
-from rig.bridge.stuck_value import Repeats, update_repeats
 from rig.bridge.values import StepInput, StrutOutput
 from rig.channels.channel import Channel, Role, Sample
 from rig.channels.measured_quantities import LOAD_CELL_FORCE, TEMPERATURE
@@ -40,6 +39,10 @@ _LONGEST_GAP = 10
 _LONGEST_AGE = 3
 """Intervals that a value may be old: what it has changed by since is at most three times what it
 changes by between two samples."""
+
+
+_FADING = 64
+"""Samples over which the longest time between two of them fades."""
 
 
 class PrescribedModel(Protocol[ModelT]):
@@ -77,16 +80,10 @@ class TrackedMotion(Struct, frozen=True, gc=False):
 
 
 class Watched(Struct, frozen=True, gc=False):
-    """A channel's last sample, and what is usual of its samples.
-
-    Attributes:
-        interval_ns: Time between two of them; 0 before it is known.
-        repeats: How often their value is the same.
-    """
+    """A channel's last sample, and the time between two of them: 0 before it is known."""
 
     sample: Sample
     interval_ns: int
-    repeats: Repeats = Repeats()
 
 
 class PrescribedMotionState(Struct, frozen=True, gc=False):
@@ -96,6 +93,7 @@ class PrescribedMotionState(Struct, frozen=True, gc=False):
         is_moving: Whether the model has begun to move.
         disturbed_ns: Time since which the motion is followed undisturbed.
         band: The band of the motion's innovations.
+        is_settled: Whether the estimate had settled at the last step.
     """
 
     t_ns: int
@@ -228,7 +226,6 @@ class PrescribedMotionEstimator:
             (t_ns - state.disturbed_ns) * 1e-9 >= _SETTLED * self._settling_s
             and not self._is_old(height, t_ns)
             and not self._is_old(cell, t_ns)
-            and not cell.repeats.is_stuck
         )
         after = replace(state, model=model, is_moving=True, is_settled=is_settled)
         return after, Estimate((strut,), measured_ns, is_settled, diverged)
@@ -248,7 +245,7 @@ class PrescribedMotionEstimator:
             if channel.role is Role.HEIGHT:
                 state = self._follow(state, sample)
             elif channel.quantity is LOAD_CELL_FORCE:
-                state = replace(state, cell=self._watch(state.cell, sample, state.height))
+                state = replace(state, cell=self._watch(state.cell, sample))
             elif channel.quantity is TEMPERATURE:
                 state = replace(state, temperature_c=sample.value)
         motion, cell = state.motion, state.cell
@@ -260,7 +257,7 @@ class PrescribedMotionEstimator:
     def _follow(self, state: PrescribedMotionState, sample: Sample) -> PrescribedMotionState:
         """State after a measured height."""
         t_ns, motion, last, band = sample.t_ns, state.motion, state.height, state.band
-        height = self._watch(last, sample, state.cell)
+        height = self._watch(last, sample)
         gap_ns, usual_ns = 0, 0
         if last is not None:
             gap_ns, usual_ns = t_ns - last.sample.t_ns, last.interval_ns
@@ -279,25 +276,30 @@ class PrescribedMotionEstimator:
         sensing = self._steps[sample.channel], height.interval_ns
         band = update_band(band, sample.value, motion.innovation_m, t_ns, sensing, state.is_settled)
         disturbed_ns = state.disturbed_ns
-        if band.is_left or height.repeats.is_stuck or gap_ns > _LONGEST_AGE * usual_ns:
+        if band.is_left or gap_ns > _LONGEST_AGE * usual_ns:
             disturbed_ns = t_ns
         return replace(state, motion=motion, height=height, disturbed_ns=disturbed_ns, band=band)
 
-    def _watch(self, last: Watched | None, sample: Sample, witness: Watched | None) -> Watched:
-        """A channel after a sample; what the other one measures shows whether the bench rests."""
+    def _watch(self, last: Watched | None, sample: Sample) -> Watched:
+        """A channel after a sample."""
         channel = self._channels[sample.channel]
         if last is None:
             return Watched(sample, channel.interval_ns if channel.has_cycle else 0)
-        gap_ns = sample.t_ns - last.sample.t_ns
+        gap_ns, usual_ns = sample.t_ns - last.sample.t_ns, last.interval_ns
         if gap_ns <= 0:
             return last
-        usual_ns = last.interval_ns
         if not channel.has_cycle:
-            # A gap is not what is usual, but what becomes usual begins with one.
-            usual_ns = min(gap_ns, 2 * usual_ns) if usual_ns else gap_ns
-        repeats = last.repeats
-        is_repeated = sample.value == last.sample.value
-        if witness is not None:
-            step = self._steps[witness.sample.channel]
-            repeats = update_repeats(repeats, is_repeated, witness.sample.value, step, sample.t_ns)
-        return Watched(sample, usual_ns, repeats)
+            usual_ns = _usual_ns(usual_ns, gap_ns)
+        return Watched(sample, usual_ns)
+
+
+def _usual_ns(usual_ns: int, gap_ns: int) -> int:
+    """Time between samples of an unknown cycle: the longest, which fades over some of them.
+
+    A gap is not usual at once, but what becomes usual begins with one.
+    """
+    if not usual_ns:
+        return gap_ns
+    if gap_ns > usual_ns:
+        return min(gap_ns, 2 * usual_ns)
+    return usual_ns - (usual_ns - gap_ns) // _FADING

@@ -7,7 +7,7 @@ import typer
 
 from rig.cli.junit import JUnitFile, Outcome, write_junit
 from rig.cli.summary_file import SummaryFolder, write_summary
-from rig.cli.terminal import FAILED, ConfigFile, JsonFlag, print_json, print_table
+from rig.cli.terminal import FAILED, ConfigFile, JsonFlag, print_json, print_table, styled
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,7 +48,7 @@ def _print(config: Path, findings: "Sequence[Finding]") -> None:
 
     styles = {Severity.OK: "green", Severity.WARNING: "yellow", Severity.ERROR: "red"}
     rows = [
-        (f"[{styles[item.severity]}]{item.severity.value}[/]", item.what, item.text)
+        (styled(item.severity.value, styles[item.severity]), item.what, item.text)
         for item in findings
     ]
     print_table(("", "What", "Finding"), rows, f"Check of {config}")

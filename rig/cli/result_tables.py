@@ -2,8 +2,10 @@
 
 from typing import TYPE_CHECKING
 
+from rich.text import Text
+
 from rig.cli.junit import Outcome
-from rig.cli.terminal import console, print_table, print_text
+from rig.cli.terminal import console, print_table, print_text, styled
 
 if TYPE_CHECKING:
     from dart_model.spec import ModelSpec
@@ -34,7 +36,8 @@ def print_diagnosis(diagnosis: "Diagnosis", *, struts: int) -> None:
     """Print a diagnosis; `struts` is how many the model has."""
     from rig.pages.report import sentence
 
-    console.print(f"\n[bold]{diagnosis.verdict.replace('_', ' ')}[/]: ", end="")
+    console.print()
+    console.print(styled(diagnosis.verdict.replace("_", " "), "bold"), end=": ")
     print_text(sentence(diagnosis, struts))
     _print_linear(diagnosis, struts=struts)
     _print_effects(diagnosis)
@@ -92,7 +95,7 @@ def _print_held_out(diagnosis: "Diagnosis") -> None:
 
 def print_run(ended: "Ended", *, with_timing: bool) -> None:
     """Print how a run ended."""
-    rows: list[tuple[str, str]] = []
+    rows: list[tuple[str, str | Text]] = []
     for name, value in ended.state.counts._asdict().items():
         if value or name in ("lost", "refused", "overruns"):
             what = "ticks" if name in _OF_TICKS else "frames"
@@ -105,9 +108,9 @@ def print_run(ended: "Ended", *, with_timing: bool) -> None:
         rows.append(("longest gap, µs", f"{timing.extremes_ns[2] / 1000:.0f}"))
     if ended.diverged is not None:
         where = f"strut {ended.diverged['strut']} at {ended.diverged['t_s']:.3f} s"
-        rows.append(("model diverged", f"[red]{where}[/]"))
+        rows.append(("model diverged", styled(where, "red")))
     if ended.log_fault is not None:
-        rows.append(("log", f"[red]{ended.log_fault}[/]"))
+        rows.append(("log", styled(ended.log_fault, "red")))
     print_table(("Run", f"{ended.ticks} ticks, ended {ended.state.mode.name}"), rows)
     if with_timing:
         _print_timing_picture(ended)

@@ -7,12 +7,13 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.table import Column, Table
+from rich.text import Text
 
 from can_dbc.errors import InputError
 from rig.files.json_text import json_text
 
 OK, FAILED, WRONG_INPUT = 0, 1, 2
-console = Console()
+console = Console(markup=False)
 
 ConfigFile = Annotated[Path, typer.Argument(metavar="CONFIG", help="YAML file.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
@@ -23,24 +24,35 @@ Channel = Annotated[str, typer.Option(help="Channel of the interface.")]
 Bitrate = Annotated[int, typer.Option(min=1, help="Bit rate in bit/s.")]
 
 
+def printable(text: str) -> str:
+    """A text from outside; what would control the terminal is written out."""
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
+
+
+def styled(text: str, style: str = "") -> Text:
+    """A text from outside in a style; brackets in it are no markup."""
+    return Text(printable(text), style)
+
+
 def table(*heads: str, title: str | None = None) -> Table:
     """A table whose cells are folded, and never cut."""
-    return Table(*(Column(head, overflow="fold") for head in heads), title=title)
+    columns = (Column(styled(head), overflow="fold") for head in heads)
+    return Table(*columns, title=None if title is None else styled(title))
 
 
 def print_table(
-    heads: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None
+    heads: Sequence[str], rows: Iterable[Sequence[str | Text]], title: str | None = None
 ) -> None:
     """Print a table."""
     shown = table(*heads, title=title)
     for row in rows:
-        shown.add_row(*row)
+        shown.add_row(*(styled(cell) if isinstance(cell, str) else cell for cell in row))
     console.print(shown)
 
 
 def print_text(text: str, style: str | None = None) -> None:
     """Print a text in which brackets are no markup."""
-    console.print(text, markup=False, style=style)
+    console.print(styled(text, style or ""))
 
 
 def print_json(content: object) -> None:

@@ -185,6 +185,16 @@ def test_an_address_that_falls_silent_is_followed_by_another(silent_ms, passes):
     assert len(slow.receive(level(251, 0x33))) == 1
 
 
+@pytest.mark.parametrize("data", [bytes([0, 0, EMPTY]), bytes([0, 0, NONE])])
+def test_an_address_whose_frames_hold_no_value_claims_no_group(data):
+    """An ECU may send "not available" where a sensor measures."""
+    bench = Bench(Incoming(LEVEL, read, ()))
+    for t_ms in range(0, 2000, 100):
+        other = replace(level(t_ms, 0x40), data=data)
+        assert len(bench.receive(other, level(t_ms + 50, 0x20))) == 1
+    assert bench.counts.get("second_sender", 0) == 19
+
+
 def test_where_a_device_is_configured_its_name_decides():
     device = Device("A", 1, 0x81, 0, j1939_name=5, address=0x33)
     bench = Bench(Incoming(LEVEL, read, (), device=0), devices=[device])

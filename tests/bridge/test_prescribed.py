@@ -5,6 +5,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
 
@@ -240,48 +241,17 @@ def test_a_force_is_as_old_as_its_sample() -> None:
             assert output.mode is Mode.SETTLING
 
 
-def frozen_from(
-    first: int, *, height: bool = False, force: bool = False, ticks: int = 2000
-) -> list[Mode]:
-    """Modes where a sensor's values stay from a tick on what they were before it."""
+@pytest.mark.parametrize("first", [1000, 1083, 1125])
+def test_a_height_that_freezes_while_it_moves_is_not_believed(first: int) -> None:
     core = dyno(plant())
     state = core.init(0)
-    modes: list[Mode] = []
-    for number in range(ticks):
-        t_ns, at = number * TICK_NS, min(number, first - 1)
-        height_m = motion((at if height else number) * 1e-3)[0]
-        cell_n = cell(at if force else number)
-        samples = (Sample(0, height_m, t_ns), bench_sample(1, LOAD_CELL_FORCE, cell_n, t_ns))
-        state, output, _ = core.step(state, StepInput(t_ns, samples))
-        modes.append(output.mode)
-    return modes
-
-
-@pytest.mark.parametrize("first", [1000, 1042, 1083, 1125, 1208, 1250])
-def test_a_frozen_sensor_is_not_believed_while_the_other_moves(first: int) -> None:
-    """Also where it freezes as the motion turns, at which a value repeats itself anyway."""
-    for sensor in ("height", "force"):
-        modes = frozen_from(first, height=sensor == "height", force=sensor == "force")
-        assert set(modes[SETTLED:first]) == {Mode.RUNNING}
-        assert set(modes[first + 8 :]) == {Mode.SETTLING}
-
-
-def test_a_machine_that_comes_to_rest_is_believed() -> None:
-    """A second after the last of both has changed: of steps of its sensor none can be sure."""
-    core = dyno(plant())
-    state = core.init(0)
-    period = 1000.0 / 3.0
-    rest = round(3.0 * period)
-    for number in range(rest + 1100):
-        # The stroke fades out, so that it ends in no kink.
-        share = 0.5 + 0.5 * math.cos(math.pi * min(number / rest, 1.0))
-        height_m = 0.3 + 0.01 * share * math.sin(2.0 * math.pi * number / period)
-        height_m = round(height_m, 6)
-        cell_n = round(-5000.0 * (height_m - 0.3), 2)
+    for number in range(2000):
         t_ns = number * TICK_NS
-        samples = (Sample(0, height_m, t_ns), bench_sample(1, LOAD_CELL_FORCE, cell_n, t_ns))
+        height_m = motion(min(number, first - 1) * 1e-3)[0]
+        samples = (Sample(0, height_m, t_ns), bench_sample(1, LOAD_CELL_FORCE, cell(number), t_ns))
         state, output, _ = core.step(state, StepInput(t_ns, samples))
-    assert output.mode is Mode.RUNNING
+        if number >= SETTLED:
+            assert output.mode is (Mode.RUNNING if number < first else Mode.SETTLING)
 
 
 @pytest.mark.parametrize("jump_m", [1e-4, -1e-3, 1e-2])
@@ -299,12 +269,33 @@ def test_a_motion_behind_a_jump_settles_again(jump_m: float) -> None:
             assert output.mode is Mode.SETTLING
 
 
-@pytest.mark.parametrize("interval", [1, 5, 20])
-def test_the_interval_of_a_sensor_without_a_cycle_time_is_learnt(interval: int) -> None:
+def test_a_sensor_whose_intervals_scatter_is_believed() -> None:
+    """Of 2 to 8 ms, and in bursts."""
+    rng = np.random.default_rng(1)
+    scattered = np.cumsum(rng.integers(2, 9, 1000))
+    bursts = [start + item for start in range(0, 4000, 40) for item in range(10)]
+    for times in (scattered, bursts):
+        core, arrivals = untimed_dyno(), {int(t) for t in times}
+        state, modes = core.init(0), list[Mode]()
+        for number in range(4000):
+            is_there = number in arrivals
+            given = step_input(number, cell(number)) if is_there else StepInput(number * TICK_NS)
+            state, output, _ = core.step(state, given)
+            modes.append(output.mode)
+        assert set(modes[400:]) == {Mode.RUNNING}
+
+
+def untimed_dyno() -> Supervisor:
+    """A dyno of whose sensors the DBC has no cycle time."""
     supervision = Supervision(stale_after_s=0.2, safe_after_s=1.0)
     untimed = [dataclasses.replace(channel, message=UNTIMED) for channel in channels(1)]
     estimator = PrescribedMotionEstimator(plant(), 0.002, untimed, supervision.stale_after_ns)
-    core = Supervisor(estimator, supervision, [supervision.limits])
+    return Supervisor(estimator, supervision, [supervision.limits])
+
+
+@pytest.mark.parametrize("interval", [1, 5, 20])
+def test_the_interval_of_a_sensor_without_a_cycle_time_is_learnt(interval: int) -> None:
+    core = untimed_dyno()
     state = core.init(0)
     for number in range(2000):
         given = StepInput(number * TICK_NS, ())
@@ -424,14 +415,11 @@ def test_what_no_bench_has_ends_in_the_safe_state(value: float, of_cell: bool) -
         assert (output.mode is Mode.SAFE) == is_wrong
 
 
-def test_a_sample_that_is_not_newer_is_not_a_repeat() -> None:
+def test_a_sample_that_is_not_newer_replaces_none() -> None:
     core = estimator()
     state = follow(core, range(100), core.init(0))
-    for _ in range(50):
-        state, _ = core.collect(state, step_input(99, cell(99)))
-    assert state.cell is not None
-    assert state.height is not None
-    assert state.cell.repeats.count == state.height.repeats.count == 0
+    again, _ = core.collect(state, step_input(99, 1e6))
+    assert again == state
 
 
 def test_an_old_height_is_as_old_as_its_delay_makes_it() -> None:

@@ -6,6 +6,7 @@ import sys
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 
 from rig.bridge.counts import Counts
 from rig.bridge.values import Mode, StepOutput, StrutOutput
@@ -175,3 +176,16 @@ def test_a_case_as_json(monkeypatch, capsys, tmp_path):
 def test_foxglove_takes_no_control(monkeypatch, capsys, tmp_path):
     assert rig(monkeypatch, "view", tmp_path, "--foxglove", "--control") == 2
     assert "--foxglove: expected neither --control nor --model" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["k[/red]", "k[bold]", "k\x1b[31m"])
+def test_what_stands_in_a_table_is_neither_markup_nor_control(tmp_path, monkeypatch, capsys, name):
+    """A path and an interface from outside stand in the table of `rig check`."""
+    config = yaml.safe_load((CONFIGS / "reference.yaml").read_text())
+    config["bus"]["interface"] = f"virtual{name}"
+    path = tmp_path / f"{name.replace('/', '')}.yaml"
+    path.write_text(yaml.safe_dump(config))
+    rig(monkeypatch, "check", path)
+    shown = "".join(capsys.readouterr().out.split())
+    assert f"virtual{name}".replace("\x1b", "\\x1b") in shown
+    assert "\x1b" not in shown
