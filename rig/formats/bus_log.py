@@ -113,6 +113,6 @@ def import_log(
             f"{port.others} frames of other ids left out",
             "all frames taken as received, without error frames; the first one is at half a tick",
             f"estimates computed with model {plan.model.name} at {plan.config.rate_hz:g} Hz",
-            f"{counts.lost} frames lost and {counts.refused} refused by counter and checksum",
+            f"{counts.lost} frames lost and {counts.refused} refused: counts in run.yaml say why",
         ),
     )
