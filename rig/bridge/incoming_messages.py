@@ -247,8 +247,9 @@ def _check_of_validity(
     """Check that the sensors say that they measure; None where none says so."""
     expected: list[tuple[int, float, float]] = []
     for item in valid:
-        # What a file writes as 0.3 may differ in its last bit from three steps of 0.1.
-        margin = 0.25 * si_step(message, item.signal, Dimension.NUMBER)
+        # What a file writes as 0.3 may differ in its last bit from three steps of 0.1, and 0.1
+        # differs from what a float of 32 bits holds.
+        margin = 0.25 * si_step(message, item.signal, Dimension.NUMBER) or 1e-6 * abs(item.value)
         index = signals.index((item.signal, Dimension.NUMBER))
         expected.append((index, item.value - margin, item.value + margin))
     if not expected:

@@ -242,11 +242,22 @@ def test_a_valid_value_that_its_signal_cannot_hold_is_one_line(tmp_path, value):
         load_plan(path)
 
 
-def test_a_valid_value_is_one_of_the_steps_of_its_signal(tmp_path):
-    """Three steps of a tenth are not what a file writes as 0.3."""
-    mode = ' SG_ Mode : 60|4@1+ (0.1,0) [0|1.5] "" CONTROL'
+FLOAT = """ SG_ Mode : 32|32@1- (1,0) [0|0] "" CONTROL
+SIG_VALTYPE_ 288 Mode : 1;"""
+
+
+@pytest.mark.parametrize(
+    "mode", [' SG_ Mode : 60|4@1+ (0.1,0) [0|1.5] "" CONTROL', FLOAT], ids=["steps", "float"]
+)
+def test_a_valid_value_is_met_as_its_signal_holds_it(tmp_path, mode):
+    """Three steps of a tenth are not what a file writes as 0.3, nor is a float of 32 bits."""
     path = config_with(tmp_path, {"valid": {"signal": "Mode", "value": 0.3}})
-    (tmp_path / "my.dbc").write_text(DBC.replace(MODE, mode))
+    signal, *types = mode.splitlines()
+    text = DBC.replace(MODE, signal).replace("20|20@1-", "20|12@1-") + "".join(
+        f"{line}\n" for line in types
+    )
+    kept = [line for line in text.splitlines() if not types or line not in (ALIVE, STAMP)]
+    (tmp_path / "my.dbc").write_text("\n".join(kept) + "\n")
     bridge = build_bridge(load_plan(path))
     encode = compile_encoder(
         load_database(tmp_path / "my.dbc").message("SENSOR_1"),
