@@ -1,14 +1,17 @@
 """The ends of a real `rig run` on a real bus, as an independent process receives them."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 pytestmark = pytest.mark.long
 
+ROOT = Path(__file__).parents[2]
 SIGNALS = ("SIGKILL", "SIGSTOP", "SIGTERM", "SIGHUP", "SIGINT")
 
 
@@ -24,8 +27,14 @@ def ends(tmp_path_factory):
         pytest.skip("ip is not installed (iproute2)")
     folder = tmp_path_factory.mktemp("ends")
     command = [*isolated, sys.executable, "-P", "-m", "tests.faults.on_a_network", str(folder)]
+    # Not from the working directory: `-P` is for what the run itself would find there.
     found = subprocess.run(
-        [*command, *SIGNALS], check=True, capture_output=True, text=True, timeout=300.0
+        [*command, *SIGNALS],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=300.0,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
     )
     return {end["signal"]: end for end in map(json.loads, found.stdout.splitlines())}
 
