@@ -191,11 +191,11 @@ def test_mutated_files(tmp_path, kind):
 @pytest.mark.long
 @pytest.mark.usefixtures("known")
 @pytest.mark.parametrize("name", OF_A_RUN)
-def test_ten_thousand_mutated_files_of_a_run(run, tmp_path, name):
-    print(name, fuzz_run(run, tmp_path, name, 2_000), "of 2000 accepted")
+def test_a_thousand_mutated_files_of_a_run(run, tmp_path, name):
+    print(name, fuzz_run(run, tmp_path, name, 1_000), "of 1000 accepted")
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", OTHERS)
-def test_ten_thousand_mutated_files(tmp_path, kind):
-    print(kind, fuzz_other(tmp_path, kind, 2_000), "of 2000 accepted")
+def test_a_thousand_mutated_files(tmp_path, kind):
+    print(kind, fuzz_other(tmp_path, kind, 1_000), "of 1000 accepted")
