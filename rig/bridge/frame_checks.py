@@ -199,9 +199,9 @@ class FrameChecks:
         self._channels, self._limits = tuple(channels), tuple(limits)
         self._checks = [self._check_of(index, item) for index, item in enumerate(incoming)]
         self._index_of = self.directory.index_of
-        self._of_one_sender = self.directory.by_group.union(
-            index for index, item in enumerate(incoming) if item.device is not None
-        )
+        with_device = {index for index, item in enumerate(incoming) if item.device is not None}
+        self._by_group = self.directory.by_group - with_device
+        self._of_one_sender = self._by_group | with_device
 
     def init(self, t_ns: int) -> tuple[tuple[SequenceState, ...], CheckMemory]:
         """Counter states and memory before the first tick."""
@@ -268,7 +268,7 @@ class FrameChecks:
         check = self._checks[index]
         if check is not None and not check(reception, values, due_ns):
             return False
-        if index in self._of_one_sender:
+        if index in self._by_group:
             reception.set_source(index, frame)
         return True
 

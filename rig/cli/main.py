@@ -29,7 +29,7 @@ from rig.cli import (
     view,
 )
 from rig.cli import set as set_
-from rig.cli.terminal import FAILED, OK, WRONG_INPUT, printable
+from rig.cli.terminal import FAILED, OK, WRONG_INPUT, escape_controls
 from rig.log.errors import DamageError
 from rig.machine.installed_versions import version_of
 
@@ -131,5 +131,5 @@ def _refuse(why: str) -> None:
 
 def _print_error(text: str) -> None:
     # A name from outside may hold line breaks and control characters.
-    line = printable(" ".join(text.splitlines()))
+    line = escape_controls(" ".join(text.splitlines()))
     Console(stderr=True).print(f"rig: {line}", style="red", markup=False, soft_wrap=True)

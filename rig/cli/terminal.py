@@ -24,14 +24,14 @@ Channel = Annotated[str, typer.Option(help="Channel of the interface.")]
 Bitrate = Annotated[int, typer.Option(min=1, help="Bit rate in bit/s.")]
 
 
-def printable(text: str) -> str:
-    """A text from outside; what would control the terminal is written out."""
+def escape_controls(text: str) -> str:
+    """Write out what would control the terminal in a text from outside."""
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
 def styled(text: str, style: str = "") -> Text:
     """A text from outside in a style; brackets in it are no markup."""
-    return Text(printable(text), style)
+    return Text(escape_controls(text), style)
 
 
 def table(*heads: str, title: str | None = None) -> Table:
@@ -50,9 +50,9 @@ def print_table(
     console.print(shown)
 
 
-def print_text(text: str, style: str | None = None) -> None:
+def print_text(text: str, style: str = "") -> None:
     """Print a text in which brackets are no markup."""
-    console.print(styled(text, style or ""))
+    console.print(styled(text, style))
 
 
 def print_json(content: object) -> None:

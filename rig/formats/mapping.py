@@ -33,7 +33,7 @@ class TextLayout(_Section):
         column_names: Whether a line with the column names precedes the data.
         skip_after_names: Lines between the names and the data, e.g. one with units.
         first_row: First row of data that is taken, counted from 0.
-        rows: Finite of rows that are taken; all if absent.
+        rows: Number of rows that are taken; all if absent.
     """
 
     separator: Annotated[str, Field(pattern=r"^(.|tab|whitespace)$")] = ","

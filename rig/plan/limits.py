@@ -88,24 +88,26 @@ def _check_overlap(
     if row.value not in (LimitedValue.MEASURED_HEIGHT_M, LimitedValue.MEASURED):
         return
     for channel in channels:
-        is_height = channel.role is Role.HEIGHT
-        is_its = (
-            row.strut in (None, struts[channel.strut]) if is_height else row.channel == channel.name
-        )
-        if channel.message is None or not is_its or is_height != (row.channel is None):
+        if row.channel is None:
+            is_meant = channel.role is Role.HEIGHT and row.strut in (None, struts[channel.strut])
+        else:
+            is_meant = channel.role is not Role.HEIGHT and row.channel == channel.name
+        if not is_meant or channel.message is None:
             continue
         found = _range(channel.message, channel.signal, channel.quantity.dimension)
         if found is None:
             continue
-        for name, bound, is_beyond in (
-            ("low", row.low, row.low is not None and row.low > found[1]),
-            ("high", row.high, row.high is not None and row.high < found[0]),
-        ):
-            if is_beyond:
-                raise InputError(
-                    f"{where}.{name}: {bound:g}, expected a value that {channel.signal} can have, "
-                    f"{found[0]:g} to {found[1]:g} in SI"
-                )
+        low, high = found
+        if row.low is not None and row.low > high:
+            name, bound = "low", row.low
+        elif row.high is not None and row.high < low:
+            name, bound = "high", row.high
+        else:
+            continue
+        raise InputError(
+            f"{where}.{name}: {bound:g}, expected a value that {channel.signal} can have, "
+            f"{low:g} to {high:g} in SI"
+        )
 
 
 def _with_defaults(own: Sequence[Limit], defaults: Iterable[Limit]) -> tuple[Limit, ...]:

@@ -163,7 +163,7 @@ def level(t_ms, address):
 
 
 @pytest.mark.parametrize("first", [0x20, 0x33])
-def test_a_group_is_that_of_the_address_that_was_heard_first(first):
+def test_a_group_is_that_of_the_address_whose_frames_passed_first(first):
     """Whatever address the DBC has, and also where the frames of two alternate."""
     bench = Bench(Incoming(LEVEL, read, ()))
     for t_ms in range(0, 2000, 100):

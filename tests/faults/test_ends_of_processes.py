@@ -27,7 +27,7 @@ def ends(tmp_path_factory):
         pytest.skip("ip is not installed (iproute2)")
     folder = tmp_path_factory.mktemp("ends")
     command = [*isolated, sys.executable, "-P", "-m", "tests.faults.on_a_network", str(folder)]
-    # Not from the working directory: `-P` is for what the run itself would find there.
+    # `-P` leaves out the working directory, and with it the tests.
     found = subprocess.run(
         [*command, *SIGNALS],
         check=True,

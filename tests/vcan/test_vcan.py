@@ -222,12 +222,12 @@ def force_by_measurement(found: RunFolder) -> dict[bytes, float]:
 def test_canplayers_bench_gives_the_same_steps(recorded, bridge, second_vcan, tmp_path):
     run, record = recorded
     first = read_run(run)
-    heard = next(frame for frame, direction in first.frames() if direction == "R")
+    received = next(frame for frame, direction in first.frames() if direction == "R")
     lines = record.read_text().splitlines()
     bench = [line for line in lines if line.split(" ")[2].split("#")[0] in BENCH_IDS]
-    frames = [contents([parse_frame(line, 0)[0]]) for line in bench]
+    start = contents([parse_frame(line, 0)[0] for line in bench]).index(*contents([received]))
     part = tmp_path / "bench.log"
-    part.write_text("\n".join(bench[frames.index(contents([heard])) :]) + "\n")
+    part.write_text("\n".join(bench[start:]) + "\n")
     players: list[object] = []
     with ExitStack() as stack:
 
