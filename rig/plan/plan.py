@@ -572,14 +572,18 @@ def _struts(
 # --- Devices and authentication -----------------------------------------------------------------
 
 
-def _devices(config: RunConfig, channels: Sequence[Channel]) -> tuple[Device, ...]:
-    """Devices that are watched; the estimate rests on those that send a height or the force."""
+def vital_channels(config: RunConfig, channels: Sequence[Channel]) -> list[Channel]:
+    """Those that an estimate rests on: heights, and the force that is measured with them."""
     force = APPLIED_FORCE if config.prescribed_motion is None else LOAD_CELL_FORCE
+    return [it for it in channels if it.role is Role.HEIGHT or it.quantity is force]
+
+
+def _devices(config: RunConfig, channels: Sequence[Channel]) -> tuple[Device, ...]:
+    """Devices that are watched."""
     vital = {
         channel.message.sender
-        for channel in channels
+        for channel in vital_channels(config, channels)
         if channel.message is not None
-        and (channel.role is Role.HEIGHT or channel.quantity is force)
     }
     return tuple(
         entry.device(name, is_vital=name in vital) for name, entry in config.devices.items()

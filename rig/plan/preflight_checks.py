@@ -21,7 +21,7 @@ from rig.closed_loop.observability import Unknown, linear_model, observability
 from rig.closed_loop.poles import Pole, closed_loop_poles
 from rig.observers.protocol import Remark, SensorStep
 from rig.plan.build import build_bridge, build_plant, sample_timing, settling_times
-from rig.plan.plan import Plan
+from rig.plan.plan import Plan, vital_channels
 
 LITTLE_DAMPING = 0.02
 """Damping ratio below which a pole gives a warning: its oscillation takes about 9 periods to decay
@@ -284,6 +284,16 @@ def _limits(plan: Plan) -> list[Finding]:
         text = "none on force_difference_n: a scale that is wrong in the DBC would not be noticed, "
         text += "although the bench has a load cell that shows it"
         findings.append(Finding(Severity.WARNING, "limits of the load cell", text))
+    may_freeze = [
+        channel.name
+        for channel in vital_channels(plan.config, plan.channels)
+        if LimitedValue.UNCHANGED_S not in {row.value for row in _rows(plan, channel)}
+    ]
+    if may_freeze:
+        text = f"none on unchanged_s of {' and '.join(may_freeze)}: a sensor that freezes before "
+        text += "the run, or as the motion turns, may not be noticed; expected one that is longer "
+        text += "than it repeats itself at rest"
+        findings.append(Finding(Severity.WARNING, "limits of frozen sensors", text))
     for name, rows in zip(plan.strut_names, plan.limits.struts, strict=True):
         severity = Severity.OK if rows else Severity.WARNING
         findings.append(Finding(severity, f"limits of {name}", _describe_rows(rows) or "none"))
@@ -292,6 +302,13 @@ def _limits(plan: Plan) -> list[Finding]:
             text = _describe_rows(rows)
             findings.append(Finding(Severity.OK, f"limits of {channel.name}", text))
     return findings
+
+
+def _rows(plan: Plan, channel: Channel) -> Sequence[Limit]:
+    """The limits on what a channel measures."""
+    if channel.role is Role.HEIGHT:
+        return plan.limits.struts[channel.strut]
+    return plan.limits.channels[plan.channels.index(channel)]
 
 
 def _describe_rows(rows: Sequence[Limit]) -> str:

@@ -52,6 +52,12 @@ _LARGEST_RATE_M_PER_S = 10.0
 _FROZEN_S = 1.0
 """A reading that is the same for longer is taken for frozen: noise changes it in some samples."""
 
+_FROZEN_FORCE = (
+    "    # The same for the applied force, unless it is constant for longer while all is well.",
+    f"    # - {{channel: {APPLIED_FORCE.key}, value: unchanged_s, high: {_FROZEN_S:g}, "
+    "action: hold}",
+)
+
 _CELL_LIMIT = (
     "    # Against a wrong scale or mass: how far the estimate may be from the load cell, in N.",
     "    # - {value: force_difference_n, low: -100, high: 100, action: hold}",
@@ -109,7 +115,7 @@ def propose(database: Database) -> str:
         if found and (found[0].score > 0 or quantity is TEMPERATURE):
             lines.append(_line("  ", quantity.key, found))
             used.add((found[0].message.name, found[0].signal.name))
-    has_cell = any(line.startswith(f"  {LOAD_CELL_FORCE.key}:") for line in lines)
+    keys = {line.strip().partition(":")[0] for line in lines}
     listened = {name for name, _ in used}
     free = [item for item in others if item.name not in listened]
     best = heights[0]
@@ -117,7 +123,9 @@ def propose(database: Database) -> str:
     lines += [
         *_propose_publish(free),
         *propose_observer(step_m, best.message.cycle_time_ns),
-        *_supervision(best, has_cell=has_cell),
+        *_supervision(best),
+        *(_FROZEN_FORCE if APPLIED_FORCE.key in keys else ()),
+        *(_CELL_LIMIT if LOAD_CELL_FORCE.key in keys else ()),
     ]
     return "\n".join(lines) + "\n"
 
@@ -164,7 +172,7 @@ def propose_observer(step_m: float, interval_ns: int | None) -> list[str]:
     ]
 
 
-def _supervision(height: _Candidate, *, has_cell: bool) -> list[str]:
+def _supervision(height: _Candidate) -> list[str]:
     """Lines of ages and limits that follow from the height's message."""
     cycle_s = (height.message.cycle_time_ns or _UNKNOWN_INTERVAL_NS) * 1e-9
     stale_s = max(_LEAST_STALE_S, _STALE_CYCLES * cycle_s)
@@ -177,7 +185,6 @@ def _supervision(height: _Candidate, *, has_cell: bool) -> list[str]:
         f"    - {{value: measured_rate_m_per_s, low: {-rate:g}, high: {rate:g}, action: refuse}}",
         "    # A sensor that has frozen; remove the line for one that repeats itself at rest.",
         f"    - {{value: unchanged_s, high: {_FROZEN_S:g}, action: hold}}",
-        *(_CELL_LIMIT if has_cell else ()),
     ]
 
 

@@ -12,6 +12,7 @@ from rig.cli.main import main
 from rig.log.reader import read_run
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
+from rig.plan.preflight_checks import check
 from rig.run.live import with_bench
 from rig.simulated_bench.config import load_bench_config
 
@@ -119,3 +120,19 @@ def test_a_model_that_diverges_is_told_with_its_strut_and_time(tmp_path):
         Mode.SETTLING,
         Mode.SAFE,
     ]
+
+
+@pytest.mark.parametrize(
+    ("has", "lacking"),
+    [
+        ([], ["strut and applied_force"]),
+        ([{}], ["applied_force"]),
+        ([{"channel": "applied_force"}], ["strut"]),
+        ([{}, {"channel": "applied_force"}], []),
+    ],
+)
+def test_sensors_whose_freezing_no_limit_finds_are_named(tmp_path, has, lacking):
+    limits = [{**row, "value": "unchanged_s", "high": 0.5, "action": "hold"} for row in has]
+    path = config(tmp_path, supervision={"limits": limits})
+    found = [it.text for it in check(load_plan(path)) if it.what == "limits of frozen sensors"]
+    assert [text.split("unchanged_s of ")[1].split(":")[0] for text in found] == lacking

@@ -1,6 +1,7 @@
 """A dyno whose two sensors speak CANopen, as a process of its own beside the bridge."""
 
 import math
+import random
 import time
 from multiprocessing.queues import Queue
 from queue import Empty
@@ -16,6 +17,9 @@ STIFFNESS_N_PER_M, DAMPING_N_S_PER_M, FRICTION_N, FREE_LENGTH_M = 900.0, 150.0, 
 STANDING_M = 0.4
 OFFSET_M = 0.25
 """What the encoder reads less than the height."""
+NOISE_N = 0.5
+"""Standard deviation of the load cell's noise. Without any, a frame that a busy machine sends late
+would be all that is left, and the verdict would depend on it."""
 
 _PARTS = ((0.030, 0.9, 0.0), (0.012, 2.3, 1.1))
 """Amplitude in m, frequency in Hz and phase of the motion."""
@@ -42,6 +46,12 @@ def force_n(height_m: float, velocity_m_per_s: float) -> float:
     )
 
 
+def read_sensors(t_s: float | None, noise: random.Random) -> tuple[float, float]:
+    """What both sensors measure: height in m and, with noise, force in N."""
+    height_m, velocity_m_per_s = motion(t_s)
+    return height_m, force_n(height_m, velocity_m_per_s) + noise.gauss(0.0, NOISE_N)
+
+
 def serve(interface: str, channel: str, orders: "Queue[str]") -> None:
     """Send until the order to end; other orders are faults.
 
@@ -58,23 +68,23 @@ def serve(interface: str, channel: str, orders: "Queue[str]") -> None:
         cell = amplifier(networks[1], AMPLIFIER, digits=2)
         for node in (wire, cell):
             node.object_dictionary.write(0x1017, 0, HEARTBEAT_MS)
-        began_s, index, moves_from, is_short = time.monotonic(), 0, None, False
+        began_s, index, moves_from_s, is_short = time.monotonic(), 0, None, False
+        noise = random.Random(1)
         while True:
             order = _order(orders)
             if order == "end":
                 break
             is_short = {"short": True, "long": False}.get(order, is_short)
-            moves_from = index if order == "move" else moves_from
+            moves_from_s = time.monotonic() if order == "move" else moves_from_s
             _obey(order, wire)
             index += 1
             t_s = index * CYCLE_MS * 1e-3
-            moved_s = None if moves_from is None else (index - moves_from) * CYCLE_MS * 1e-3
-            height_m, velocity_m_per_s = motion(moved_s)
+            # The present time, not the cycle's: a machine that is busy makes a cycle late.
+            moved_s = None if moves_from_s is None else time.monotonic() - moves_from_s
+            height_m, measured_n = read_sensors(moved_s, noise)
             raw = round((height_m - OFFSET_M) * 1e9 / STEP_NM)
             wire.object_dictionary.write(0x6004, 0, raw)
-            cell.object_dictionary.write(
-                0x9130, 1, round(force_n(height_m, velocity_m_per_s) * 100.0)
-            )
+            cell.object_dictionary.write(0x9130, 1, round(measured_n * 100.0))
             if is_short:
                 networks[0].send(0x180 + ENCODER, raw.to_bytes(4, "little"))
             else:
