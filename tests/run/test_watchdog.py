@@ -1,6 +1,8 @@
 """The process that sends the safe output in place of a loop that stands still or is dead."""
 
 import mmap
+import os
+import signal
 
 import cantools
 import pytest
@@ -12,6 +14,7 @@ from rig.bus.bus import BusConfig, BusError
 from rig.bus.secoc import Authentication, Authenticator
 from rig.plan.config import CONFIGS
 from rig.plan.load import load_plan
+from rig.run import watchdog as module
 from rig.run.watchdog import (
     Beat,
     Wake,
@@ -23,6 +26,7 @@ from rig.run.watchdog import (
     watch,
 )
 from tests.faults.trial import BEGIN_MS, Trial
+from tests.run.test_runs import lockstep
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -154,6 +158,41 @@ def test_a_watchdog_that_cannot_start_ends_the_run_with_a_reason(tmp_path):
         watchdog.start()
     assert watchdog.describe().startswith("ended")
     watchdog.stop()
+
+
+def process_of(watchdog):
+    return watchdog._process.pid  # pyright: ignore[reportPrivateUsage]
+
+
+def test_one_that_died_before_the_run_is_a_reason_at_once(tmp_path):
+    watchdog = Watchdog(load_plan(CONFIGS / "reference.yaml"), tmp_path)
+    os.kill(process_of(watchdog), signal.SIGKILL)
+    with pytest.raises(BusError, match="could not be started: it has ended"):
+        watchdog.start()
+    watchdog.stop()
+
+
+def test_one_that_does_not_get_ready_is_a_reason(tmp_path, monkeypatch):
+    folder = lockstep(tmp_path / "run", "reference", 0.02)
+    monkeypatch.setattr(module, "_READY_S", 0.0)  # less than its imports take
+    watchdog = Watchdog(load_plan(CONFIGS / "reference.yaml"), folder)
+    with pytest.raises(BusError, match="could not be started: not ready in 0 s"):
+        watchdog.start()
+    watchdog.stop()
+
+
+def test_it_runs_on_every_core_and_ends_with_the_run(tmp_path):
+    folder = lockstep(tmp_path / "run", "reference", 0.02)
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        watchdog = Watchdog(load_plan(CONFIGS / "reference.yaml"), folder)
+    finally:
+        os.sched_setaffinity(0, before)
+    watchdog.start()
+    assert os.sched_getaffinity(process_of(watchdog)) >= before
+    watchdog.stop()
+    assert watchdog.describe().endswith("exit code 0")
 
 
 def test_a_beat_costs_nothing_but_numbers(trial):
