@@ -7,6 +7,7 @@ from typing import Annotated
 from msgspec import Struct
 from pydantic import BaseModel, ConfigDict, Field
 
+from can_dbc.calibration import Calibration
 from can_dbc.codec import si_step
 from can_dbc.database import Message
 from can_dbc.yaml_file import Finite
@@ -45,8 +46,22 @@ class ValidSignal(BaseModel):
     value: Finite = 1.0
 
 
+class Zero(BaseModel):
+    """A reading of a position sensor at a known length of the strut; `rig zero` measures it.
+
+    Attributes:
+        reads: What the sensor reads, by the DBC, in m.
+        at_m: Length of the strut at that reading.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    reads: Finite
+    at_m: Finite
+
+
 class MeasuredSignal(SignalName):
-    """Where a measured value stands on the bus, and what says that it is valid.
+    """Where a measured value stands on the bus, how its sensor is mounted, and when it is valid.
 
     Attributes:
         message: Message of the DBC.
@@ -58,11 +73,26 @@ class MeasuredSignal(SignalName):
             when they were sampled.
         time: Signal of the same message with the sensor's time of the sample; it may begin again
             at the end of its range.
+        zero: Of a height: a reading at a known length of the strut. Without it the reading is the
+            length.
+        reversed: Whether the sensor reads less while what it measures grows; of a height with a
+            zero, a velocity or a force.
+        tare_n: Of a force: what the sensor reads, by the DBC, without one; 0 by default.
     """
 
     valid: ValidSignal | None = None
     counter: SignalOfMessage | None = None
     time: SignalOfMessage | None = None
+    zero: Zero | None = None
+    reversed: bool = False
+    tare_n: Finite | None = None
+
+    @property
+    def calibration(self) -> Calibration:
+        """From what the sensor reads to what is measured, in SI."""
+        if self.zero is not None:
+            return Calibration(self.zero.reads, self.zero.at_m, self.reversed)
+        return Calibration(self.tare_n or 0.0, 0.0, self.reversed)
 
 
 class Role(Enum):

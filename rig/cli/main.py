@@ -27,6 +27,7 @@ from rig.cli import (
     timing,
     tune,
     view,
+    zero,
 )
 from rig.cli import set as set_
 from rig.cli.terminal import FAILED, OK, WRONG_INPUT, escape_controls
@@ -46,6 +47,7 @@ app = typer.Typer(
 )
 app.command("demo", epilog=demo.EXAMPLES)(demo.demo)
 app.command("init", epilog=init.EXAMPLES)(init.init)
+app.command("zero", epilog=zero.EXAMPLES)(zero.zero_command)
 app.command("check", epilog=check.EXAMPLES)(check.check_command)
 app.add_typer(sensor.app, name=_GROUPS[0])
 app.command("run", epilog=run.EXAMPLES)(run.run)

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from rig.sensors.bus_scan import BusSurvey
     from rig.sensors.canopen_device import CanOpenDevice
-    from rig.sensors.height_zero import HeightZero
 
 app = typer.Typer(
     help="Sensors on the bus without a DBC: find, describe and configure them.",
@@ -35,7 +34,7 @@ app = typer.Typer(
 
 SCAN_EXAMPLES = (
     "Examples: `rig sensor scan --channel can0 --bitrate 500000` · "
-    "`rig sensor scan --out found --height-now-m 0.412`, then `rig check found/rig.yaml` · "
+    "`rig sensor scan --out found`, then `rig zero found/rig.yaml --length-m 0.412` · "
     "`rig sensor scan --eds 5=wire.eds --out found`"
 )
 SET_EXAMPLES = (
@@ -49,12 +48,6 @@ EdsFiles = Annotated[
     typer.Option(
         metavar="NODE=FILE",
         help="Describe a sensor that is not on a bus by its EDS file; no bus is opened.",
-    ),
-]
-HeightNow = Annotated[
-    float | None,
-    typer.Option(
-        metavar="M", help="Height of the strut now, at the reading of the first position sensor."
     ),
 ]
 CycleMs = Annotated[
@@ -86,10 +79,6 @@ def scan_command(
         Path | None,
         typer.Option(metavar="DIR", help="New folder for sensors.dbc and rig.yaml."),
     ] = None,
-    height_now_m: HeightNow = None,
-    is_reversed: Annotated[
-        bool, typer.Option("--reversed", help="The sensor counts up while the strut gets shorter.")
-    ] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Find the CANopen and J1939 sensors on a bus, and write a DBC and a configuration.
@@ -101,40 +90,27 @@ def scan_command(
     from rig.bus.bus import BusConfig
     from rig.bus.canopen_network import CanOpenNetwork
     from rig.sensors.bus_scan import scan, survey_of_files
-    from rig.sensors.height_zero import read_height_zero
     from rig.sensors.proposed_config import write_proposal
 
     if out is not None and out.exists():
         raise InputError(f"--out {out}: exists, expected a new folder")
-    if is_reversed and height_now_m is None:
-        raise InputError("--reversed also requires --height-now-m")
     config = BusConfig(interface, channel, bitrate)
-    zero: HeightZero | None = None
     if eds:
-        if height_now_m is not None:
-            raise InputError(
-                "--height-now-m: an EDS file contains no position, expected the sensor on a bus"
-            )
         survey = survey_of_files(_files_by_node(eds))
     else:
-        with closing(CanOpenNetwork(config, listen_only=listen_only)) as network:
-            with progress_bar() as bar:
-                survey = scan(network, listen_s, progress=bar)
-            if height_now_m is not None:
-                zero = read_height_zero(
-                    network, survey.devices, height_now_m, is_reversed=is_reversed
-                )
-    files = None if out is None else write_proposal(out, survey, config, zero)
+        network_of_bus = CanOpenNetwork(config, listen_only=listen_only)
+        with closing(network_of_bus) as network, progress_bar() as bar:
+            survey = scan(network, listen_s, progress=bar)
+    files = None if out is None else write_proposal(out, survey, config)
     if as_json:
         print_json(asdict(survey))
         return
     _print(survey)
     if files is not None:
         dbc, configuration = files
-        hint = "" if zero is not None else " Heights are the sensor's readings (--height-now-m)."
         print_text(
-            f"Written: {dbc}, {configuration}.{hint} Read them, set the model, then "
-            f"`rig check {configuration}`."
+            f"Written: {dbc}, {configuration}. Read them, set the model, then "
+            f"`rig zero {configuration} --length-m LENGTH` with the strut's length now."
         )
 
 

@@ -3,12 +3,13 @@
 Below it nothing looks up a name or opens a file.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import remainder
 from pathlib import Path
 from typing import TypeVar
 
+from can_dbc.calibration import Calibration, calibrate
 from can_dbc.codec import si_range, si_round, si_step
 from can_dbc.database import Database, Message, alive_counter
 from can_dbc.errors import DatabaseError, InputError
@@ -34,7 +35,7 @@ from rig.channels.channel import Channel, MeasuredSignal, Role, SignalName
 from rig.channels.measured_quantities import APPLIED_FORCE, HEIGHT, LOAD_CELL_FORCE, Quantity
 from rig.observers.pi import PiObserver
 from rig.observers.protocol import AnyObserver
-from rig.plan.config import HeightSignal, Mapped, RunConfig, SensorSignal
+from rig.plan.config import HeightSignal, Mapped, RunConfig, SensorSignal, Signals
 from rig.plan.limits import resolve_limits
 
 _LARGEST_DELAY_DIFFERENCE_S = 0.02
@@ -179,7 +180,7 @@ def resolve(config: RunConfig, source: Path, model: ModelSpec, database: Databas
         DatabaseError: The same, of the DBC.
     """
     config = _with_names(config, model, database, source)
-    reader = _SignalReader(config, database, source)
+    reader = _SignalReader(config, _calibrate(config.signals, database, source), source)
     channels = reader.channels()
     outgoing = reader.outgoing()
     alarms = reader.alarms()
@@ -325,6 +326,65 @@ def _signals_of(message: str, publications: Iterable[Publication], database: Dat
 
 
 # --- Signals ----------------------------------------------------------------------------------
+
+
+_AS_READ = Calibration()
+"""Of a sensor of which nothing is stated: what it reads is what is measured."""
+
+
+def _calibrate(signals: Signals, database: Database, source: Path) -> Database:
+    """The DBC with the zeros, directions and tares that a configuration states."""
+    known: dict[tuple[str, str], tuple[str, Calibration]] = {}
+    messages = dict(database.messages)
+    for key, quantity, entry in _measured(signals):
+        _check_calibration(entry, quantity, f"{source}: {key}")
+        message, signal = messages.get(entry.message), entry.signal
+        if message is None or signal not in message.signals:
+            continue  # which is refused where the channels are read
+        first, calibration = known.setdefault((entry.message, signal), (key, entry.calibration))
+        if calibration != entry.calibration:
+            raise InputError(
+                f"{source}: {key}: {entry.message}.{signal} has another zero, direction or tare "
+                f"in {first}, expected the same"
+            )
+        if first == key and calibration != _AS_READ:
+            calibrated = calibrate(message, signal, quantity.dimension, calibration)
+            messages[entry.message] = calibrated
+    return replace(database, messages=messages)
+
+
+def _measured(signals: Signals) -> Iterator[tuple[str, Quantity, MeasuredSignal]]:
+    """Everything that is measured: its key, its quantity, and where it stands."""
+    for strut, entry in signals.height.items():
+        yield f"signals.height.{strut}", HEIGHT, entry
+    for quantity, entry in signals.bench.items():
+        yield f"signals.{quantity.key}", quantity, entry
+    for strut, group in signals.further.items():
+        for sensor, entry in group.items():
+            yield f"signals.further.{strut}.{sensor}", entry.quantity, entry
+
+
+_REVERSIBLE = (Dimension.LENGTH, Dimension.VELOCITY, Dimension.ACCELERATION, Dimension.FORCE)
+
+
+def _check_calibration(entry: MeasuredSignal, quantity: Quantity, key: str) -> None:
+    """Refuse a zero, direction or tare of a quantity that has none."""
+    dimension = quantity.dimension
+    if entry.zero is not None and dimension is not Dimension.LENGTH:
+        cure = "tare_n" if dimension is Dimension.FORCE else "none"
+        raise InputError(f"{key}.zero: {quantity.key} is no length, expected {cure}")
+    if entry.tare_n is not None and dimension is not Dimension.FORCE:
+        cure = "zero: {reads, at_m}" if dimension is Dimension.LENGTH else "none"
+        raise InputError(f"{key}.tare_n: {quantity.key} is no force, expected {cure}")
+    if not entry.reversed:
+        return
+    if dimension not in _REVERSIBLE:
+        raise InputError(f"{key}.reversed: {quantity.key} has no direction, expected none")
+    if dimension is Dimension.LENGTH and entry.zero is None:
+        raise InputError(
+            f"{key}.reversed: expected zero: {{reads, at_m}} with it, because a reversed reading "
+            "alone is no length; rig zero measures it"
+        )
 
 
 class _SignalReader:

@@ -74,6 +74,7 @@ def check(plan: Plan) -> list[Finding]:
         *map(_protection, read.values()),
         *[_rate(message, plan.period_ns) for message in heights],
         *map(_sample_times, channel_of.values()),
+        *[_zero(plan, channel) for channel in plan.heights],
         *_resolution(plan),
         *[
             Finding(
@@ -117,6 +118,20 @@ def _protection(message: Message) -> Finding:
         text = "none in the DBC: a corrupted, repeated or foreign frame passes as data"
         return Finding(Severity.WARNING, what, text)
     return Finding(Severity.OK, what, f"E2E profile {protection.identity.profile.value}")
+
+
+def _zero(plan: Plan, height: Channel) -> Finding:
+    """Whether a reading of a height's sensor is known to be the strut's length."""
+    what, zero = f"zero of {height.name}", plan.config.signals.height[height.name].zero
+    if zero is not None:
+        text = f"a reading of {zero.reads * 1e3:g} mm is a length of {zero.at_m * 1e3:g} mm"
+        is_reversed = plan.config.signals.height[height.name].reversed
+        return Finding(Severity.OK, what, text + (", reversed" if is_reversed else ""))
+    if _message(height).signal(height.signal).offset:
+        return Finding(Severity.OK, what, "that of the DBC")
+    text = "none was set: what the sensor reads counts as the strut's length; expected zero: "
+    text += f"{{reads, at_m}}, which rig zero {plan.source} --strut {height.name} --length-m LENGTH"
+    return Finding(Severity.WARNING, what, text + " measures, of any length that is known")
 
 
 def _rate(message: Message, period_ns: int) -> Finding:

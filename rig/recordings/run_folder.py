@@ -65,6 +65,11 @@ def read_run(folder: Path) -> Recording:
     )
 
 
+def read_channel(run: RunFolder, channel: Channel) -> tuple[Array, Array]:
+    """Sample times in s and values in SI of one channel of a run, both of shape (n,)."""
+    return _samples(_payloads(run, [channel]), channel)
+
+
 _Payloads = dict[str, tuple[NDArray[np.int64], NDArray[np.uint8]]]
 
 

@@ -12,12 +12,11 @@ from cantools.database.conversion import BaseConversion
 
 from can_dbc.database import DEFAULT_DATABASE
 from can_dbc.errors import InputError
-from can_dbc.units import Dimension, si_conversion
+from can_dbc.units import Dimension
 from rig.bus.bus import BusConfig
 from rig.plan.proposal import propose_observer
 from rig.sensors.bus_scan import BusSurvey
 from rig.sensors.canopen_device import CanOpenDevice, MappedObject, Pdo
-from rig.sensors.height_zero import HeightZero
 from rig.sensors.j1939 import LARGEST_VALUE, AddressClaim, GroupMessage
 from rig.sensors.signal_locations import (
     SignalLocation,
@@ -43,19 +42,17 @@ _MOST_MS = 65_535
 _STALE_CYCLES = 5
 
 
-def write_proposal(
-    folder: Path, survey: BusSurvey, bus: BusConfig, zero: HeightZero | None
-) -> tuple[Path, Path]:
+def write_proposal(folder: Path, survey: BusSurvey, bus: BusConfig) -> tuple[Path, Path]:
     """Write a DBC and a configuration for the devices on a bus; returns their files.
 
-    The folder is new. Without a zero, heights are the readings of the first position sensor.
+    The folder is new.
 
     Raises:
         InputError: No device measures a length, two devices send under one id, or the folder cannot
             be written.
     """
     configuration = configuration_text(survey.devices, survey.groups, survey.claims, bus)
-    database = dbc_text(survey.devices, survey.groups, zero)
+    database = dbc_text(survey.devices, survey.groups)
     dbc_path, config_path = folder / DBC_NAME, folder / CONFIG_NAME
     try:
         folder.mkdir(parents=True)
@@ -66,14 +63,8 @@ def write_proposal(
     return dbc_path, config_path
 
 
-def dbc_text(
-    devices: Sequence[CanOpenDevice],
-    groups: Sequence[GroupMessage],
-    zero: HeightZero | None = None,
-) -> str:
+def dbc_text(devices: Sequence[CanOpenDevice], groups: Sequence[GroupMessage]) -> str:
     """A DBC of the devices' messages, with those that the bridge publishes.
-
-    Without a zero, heights are the readings of the first position sensor.
 
     Raises:
         InputError: Two devices send under one id.
@@ -81,11 +72,10 @@ def dbc_text(
     own = cast(
         "Database", cantools.database.load_file(DEFAULT_DATABASE, database_format="dbc")
     )  # with its attributes
-    height = next(iter(locations(devices, Dimension.LENGTH)), None)
     messages: dict[tuple[int, bool], Message] = {}
     for device in devices:
         for pdo in device.pdos:
-            _add_message(messages, _pdo_message(device, pdo, height, zero))
+            _add_message(messages, _pdo_message(device, pdo))
     for item in groups:
         _add_message(messages, _group_message(item))
     bridge = [item for item in own.messages if _BRIDGE in item.senders]
@@ -171,25 +161,13 @@ def configuration_text(
     return "\n".join(lines) + "\n"
 
 
-def _pdo_message(
-    device: CanOpenDevice, pdo: Pdo, height: SignalLocation | None, zero: HeightZero | None
-) -> Message:
-    """Message of a PDO; the signal at `height` measures from the zero."""
+def _pdo_message(device: CanOpenDevice, pdo: Pdo) -> Message:
     names = signal_names(pdo)
-    name = message_name(device, pdo)
-    signals: list[Signal] = []
-    for item in pdo.mapped:
-        scale, offset = item.meaning.scale, 0.0
-        if zero is not None and height is not None and height[:2] == (name, names[item]):
-            scale = -scale if zero.is_reversed else scale
-            reading_m = -zero.reading_m if zero.is_reversed else zero.reading_m
-            metre = si_conversion(item.meaning.unit, Dimension.LENGTH).factor
-            offset = (zero.height_m - reading_m) / metre
-        signals.append(_signal(item, names[item], scale, offset))
+    signals = [_signal(item, names[item]) for item in pdo.mapped]
     return Message(
         frame_id=pdo.arbitration_id,
         is_extended_frame=pdo.is_extended,
-        name=name,
+        name=message_name(device, pdo),
         length=pdo.length_bytes,
         signals=signals,
         senders=[device.name],
@@ -200,9 +178,9 @@ def _pdo_message(
     )
 
 
-def _signal(item: MappedObject, name: str, scale: float, offset: float) -> Signal:
+def _signal(item: MappedObject, name: str) -> Signal:
     meaning = item.meaning
-    conversion = BaseConversion.factory(scale=scale, offset=offset, is_float=meaning.is_float)
+    conversion = BaseConversion.factory(scale=meaning.scale, is_float=meaning.is_float)
     return Signal(
         name=name,
         start=item.start,

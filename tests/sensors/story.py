@@ -79,7 +79,7 @@ def configured(line: Line, folder: Path) -> Path:
     """Scan, set to work, and complete the configuration: no DBC is written by hand."""
     bus = ("--interface", line.interface, "--channel", line.channel)
     out = folder / "found"
-    rig("sensor", "scan", *bus, "--listen-s", 0.5, "--out", out, "--height-now-m", STANDING_M)
+    rig("sensor", "scan", *bus, "--listen-s", 0.5, "--out", out)
     for node in (ENCODER, AMPLIFIER):
         before = folder / f"before-{node}.yaml"
         given = ("--heartbeat-ms", HEARTBEAT_MS, "--cycle-ms", 10)
@@ -97,6 +97,7 @@ def configured(line: Line, folder: Path) -> Path:
     config["devices"]["NODE_5"]["heartbeat_s"] = 1.0
     path.write_text(json.dumps(config))
     (out / "dyno.yaml").write_text(json.dumps(MODEL))
+    rig("zero", path, "--length-m", STANDING_M)
     return path
 
 

@@ -166,7 +166,6 @@ def test_undo_files_that_are_wrong(tmp_path, content):
         ["set", "5", "--restore", "x.yaml"],
         ["scan", "--eds", "wire.eds"],
         ["scan", "--eds", "300=wire.eds"],
-        ["scan", "--reversed"],
         ["scan", "--interface", "nonsense"],
     ],
 )

@@ -30,7 +30,6 @@ from rig.sensors.canopen_set_up import (
     configure_device,
     restore,
 )
-from rig.sensors.height_zero import HeightZero
 from rig.sensors.proposed_config import dbc_text
 from rig.sensors.undo_file import configure_with_undo, read_undo, write_undo
 from tests.sensors.peer import KILONEWTON, amplifier, encoder, with_timer
@@ -131,7 +130,7 @@ def test_dbc_and_configuration_are_read_back(bus, channel, tmp_path):
         app,
         [
             *("sensor", "scan", "--interface", "virtual", "--channel", channel),
-            *("--listen-s", "0.05", "--out", str(out), "--height-now-m", "0.4", "--reversed"),
+            *("--listen-s", "0.05", "--out", str(out)),
         ],
         catch_exceptions=False,
     )
@@ -140,9 +139,8 @@ def test_dbc_and_configuration_are_read_back(bus, channel, tmp_path):
     message = database.message("NODE_5_TPDO1")
     assert (message.sender, message.cycle_time_ns) == ("NODE_5", 2_000_000)
     decode = compile_decoder(message, ["POSITION"], [Dimension.LENGTH])
-    # 1 µm a step, 0.4 m at 250 000 steps, and the strut shortens while it counts up.
-    assert decode((250_000).to_bytes(4, "little") + b"\0\0")[0] == pytest.approx(0.4)
-    assert decode((260_000).to_bytes(4, "little") + b"\0\0")[0] == pytest.approx(0.39)
+    # 1 µm a step.
+    assert decode((250_000).to_bytes(4, "little") + b"\0\0")[0] == pytest.approx(0.25)
     force = compile_decoder(database.message("NODE_6_TPDO1"), ["FORCE_1"], [Dimension.FORCE])
     assert force((-1234).to_bytes(4, "little", signed=True) + b"\0")[0] == pytest.approx(-123.4)
     assert database.message("RIG_ESTIMATE").protection is not None
@@ -257,7 +255,7 @@ def test_how_often_a_device_sends(changed, cycle_s):
 
 
 @pytest.mark.parametrize(("unit", "digits"), [(0x00010000, 4), (0xFD010000, 1), (0xFA010000, 0)])
-def test_a_height_now_is_one_in_any_unit(unit, digits):
+def test_a_height_is_one_in_any_unit(unit, digits):
     """A length of a measuring device in m, mm or µm."""
     objects = {
         (0x1000, 0): (0x00020194, 4),
@@ -275,13 +273,11 @@ def test_a_height_now_is_one_in_any_unit(unit, digits):
     raw = round(0.25 / (metre * mapped.meaning.scale))
     (made,) = [
         message
-        for message in cantools.database.load_string(
-            dbc_text([device], (), HeightZero(0.412, 0.25, is_reversed=False))
-        ).messages
+        for message in cantools.database.load_string(dbc_text([device], ())).messages
         if message.name == "NODE_5_TPDO1"
     ]
     (value,) = made.decode(raw.to_bytes(4, "little")).values()
-    assert float(value) * metre == pytest.approx(0.412, abs=1e-6)
+    assert float(value) * metre == pytest.approx(0.25, abs=1e-6)
 
 
 def test_a_real_of_no_size_is_no_number():

@@ -1,0 +1,130 @@
+"""`rig zero`."""
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from can_dbc.errors import InputError
+from rig.cli.progress import progress_line, stoppable
+from rig.cli.terminal import ConfigFile, JsonFlag, print_json, print_text
+
+if TYPE_CHECKING:
+    from rig.channels.channel import Channel
+    from rig.plan.plan import Plan
+    from rig.sensors.mounting import Mounting, Readings
+
+EXAMPLES = (
+    "Examples: `rig zero rig.yaml --length-m 0.360`, then at another length once more, for the "
+    "direction · `rig zero rig.yaml --strut tyre --length-m 0.215` · "
+    "`rig zero rig.yaml --tare load_cell_force`"
+)
+
+StrutName = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Which strut, where the model has several.")
+]
+LengthNow = Annotated[
+    float | None,
+    typer.Option("--length-m", metavar="M", min=1e-4, max=100.0, help="Its length now."),
+]
+TareOf = Annotated[
+    str | None,
+    typer.Option(
+        "--tare",
+        metavar="CHANNEL",
+        help="applied_force, load_cell_force, or STRUT.SENSOR of a further force, while nothing "
+        "pulls or pushes it.",
+    ),
+]
+ListenSeconds = Annotated[float, typer.Option(min=0.1, max=600.0, help="How long to listen.")]
+FromRun = Annotated[
+    Path | None, typer.Option(metavar="RUN", help="A run at rest, instead of the bus now.")
+]
+
+
+def zero_command(
+    config: ConfigFile,
+    strut: StrutName = None,
+    length_m: LengthNow = None,
+    tare: TareOf = None,
+    listen_s: ListenSeconds = 2.0,
+    run: FromRun = None,
+    is_remounted: Annotated[
+        bool, typer.Option("--remounted", help="The zero before does not count any more.")
+    ] = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Measure a sensor's zero, direction or tare at rest, and write it into the configuration.
+
+    A first length gives the zero. A second one, 5 mm or more away, shows whether the sensor is
+    reversed, and that its scale is right. Nothing is sent.
+    """
+    from rig.plan.load import load_plan
+    from rig.sensors.mounting import as_read, entry_of, find_tare, find_zero, write_mounting
+
+    if (length_m is None) == (tare is None):
+        raise InputError("expected one of --length-m and --tare")
+    plan = load_plan(config)
+    channel = _channel(plan, strut, tare)
+    readings = _read(as_read(plan), channel.name, listen_s, run)
+    before = entry_of(plan, channel)
+    if length_m is None:
+        found = find_tare(readings)
+    else:
+        found = find_zero(readings, length_m, before, is_remounted=is_remounted)
+    write_mounting(plan, channel, found)
+    if as_json:
+        print_json({"channel": channel.key, **readings._asdict(), **found.keys})
+        return
+    _print(config, channel, readings, found)
+
+
+def _channel(plan: "Plan", strut: str | None, tare: str | None) -> "Channel":
+    from can_dbc.units import Dimension
+    from rig.sensors.mounting import find_channel
+
+    if tare is None:
+        names = [channel.name for channel in plan.heights]
+        if strut is None and len(names) > 1:
+            raise InputError(f"--strut: expected one of {', '.join(names)}")
+        name = names[0] if strut is None else strut
+        if name not in names:
+            raise InputError(f"--strut {name}: no height is measured, expected {', '.join(names)}")
+        return find_channel(plan, name)
+    channel = find_channel(plan, tare)
+    if channel.quantity.dimension is not Dimension.FORCE:
+        raise InputError(f"--tare {tare}: is no force, expected --length-m for a height")
+    return channel
+
+
+def _read(plan: "Plan", name: str, listen_s: float, run: Path | None) -> "Readings":
+    from rig.run.loop import RunControl
+    from rig.sensors.mounting import listen, readings_of
+
+    if run is not None:
+        return readings_of(run, plan, name)
+    with tempfile.TemporaryDirectory() as folder, stoppable() as stop:
+        with progress_line(listen_s) as progress:
+            listen(plan, listen_s, Path(folder) / "run", RunControl(stop=stop, progress=progress))
+        return readings_of(Path(folder) / "run", plan, name)
+
+
+def _print(config: Path, channel: "Channel", readings: "Readings", found: "Mounting") -> None:
+    is_length = "zero" in found.keys
+    scale, unit = (1e3, "mm") if is_length else (1.0, "N")
+    print_text(
+        f"{channel.name} reads {readings.mean * scale:.6g} {unit} "
+        f"({readings.samples} samples in {readings.duration_s:.3g} s; standard deviation "
+        f"{readings.std * scale:.3g} {unit}, drift {readings.drift * scale:.3g} {unit})"
+    )
+    for key, value in found.keys.items():
+        print_text(f"{channel.key}.{key}: {value}")
+    print_text(f"Written: {config}")
+    if is_length and not found.is_direction_known:
+        print_text(
+            "The direction is not known yet: bring the strut to another length and run "
+            f"`rig zero {config} --strut {channel.name} --length-m LENGTH` again."
+        )
+        return
+    print_text(f"Next: `rig check {config}`")

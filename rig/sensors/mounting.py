@@ -1,0 +1,197 @@
+"""How a sensor is mounted: what it reads at a known length of the strut, or without a force."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from can_dbc.errors import InputError
+from rig.channels.channel import Channel, MeasuredSignal, Zero
+from rig.files.yaml_edit import set_keys
+from rig.log.reader import read_run
+from rig.plan.plan import Plan
+from rig.recordings.run_folder import read_channel
+from rig.run.live import live
+from rig.run.loop import RunControl
+
+Array = NDArray[np.float64]
+
+_FEWEST = 10
+"""Samples from which noise and drift are determined."""
+
+_MOST_MOTION_M = 1e-3
+"""Span of nine tenths of the readings beyond which the strut is not at rest."""
+
+_LEAST_CHANGE_M = 5e-3
+"""Between two lengths from which direction and scale are determined: a length read off a steel
+rule errs by half a millimetre."""
+
+_GAIN_TOLERANCE = 0.2
+"""Largest deviation of the scale from 1: two lengths that are 5 mm apart and err by half a
+millimetre each show it as well as this."""
+
+
+class Readings(NamedTuple):
+    """Readings of a sensor at rest, in SI.
+
+    Attributes:
+        std: Standard deviation about their line.
+        drift: Change of that line over their time.
+        span: Of the middle nine tenths.
+    """
+
+    samples: int
+    duration_s: float
+    mean: float
+    std: float
+    drift: float
+    span: float
+
+
+def find_channel(plan: Plan, name: str) -> Channel:
+    """A channel by its name: a strut, a quantity of the bench, or a sensor as `strut.sensor`.
+
+    Raises:
+        InputError: Nothing of that name is measured.
+    """
+    for channel in plan.channels:
+        if channel.name == name:
+            return channel
+    known = ", ".join(channel.name for channel in plan.channels)
+    raise InputError(f"{plan.source}: {name}: is not measured, expected one of {known}")
+
+
+def entry_of(plan: Plan, channel: Channel) -> MeasuredSignal:
+    """What the configuration states of a channel."""
+    signals = plan.config.signals
+    if channel in plan.heights:
+        return signals.height[channel.name]
+    if channel in plan.sensors:
+        strut, _, sensor = channel.name.partition(".")
+        return signals.further[strut][sensor]
+    return signals.bench[channel.quantity]
+
+
+def as_read(plan: Plan) -> Plan:
+    """The plan of the same sensors as the DBC has them, without limits."""
+    unmounted = {"zero": None, "reversed": False, "tare_n": None}
+    signals = plan.config.signals
+    height = {name: entry.model_copy(update=unmounted) for name, entry in signals.height.items()}
+    further = {
+        strut: {name: entry.model_copy(update=unmounted) for name, entry in group.items()}
+        for strut, group in signals.further.items()
+    }
+    bench = {
+        quantity.key: entry.model_copy(update=unmounted)
+        for quantity, entry in signals.bench.items()
+    }
+    plain = signals.model_copy(update={"height": height, "further": further, **bench})
+    supervision = plan.config.supervision.model_copy(update={"limits": ()})
+    config = plan.config.model_copy(update={"signals": plain, "supervision": supervision})
+    return plan.with_config(config)
+
+
+def listen(plan: Plan, listen_s: float, folder: Path, control: RunControl) -> None:
+    """Record a run that sends nothing.
+
+    Raises:
+        InputError: The bus cannot be opened, or the folder cannot be written.
+    """
+    config = plan.config.model_copy(update={"duration_s": listen_s})
+    live(plan.with_config(config), folder, control, listen_only=True)
+
+
+def readings_of(run: Path, plan: Plan, name: str) -> Readings:
+    """The readings of a channel in a run, by a plan as of `as_read`.
+
+    Raises:
+        InputError: The run is damaged, or has fewer than ten of them.
+    """
+    channel = find_channel(plan, name)
+    t_s, values = read_channel(read_run(run), channel)
+    if len(values) < _FEWEST:
+        message = "" if channel.message is None else channel.message.name
+        raise InputError(
+            f"{run}: {len(values)} valid frames of {message}, expected at least {_FEWEST}: is the "
+            "sensor powered, and its message the right one?"
+        )
+    return summarise(t_s, values)
+
+
+def summarise(t_s: Array, values: Array) -> Readings:
+    """Mean, noise and drift of readings, both of shape (n,), at different times."""
+    centred_s, mean = t_s - t_s.mean(), float(values.mean())
+    slope = float(centred_s @ values) / float(centred_s @ centred_s)
+    residual = values - (mean + slope * centred_s)
+    low, high = np.quantile(values, (0.05, 0.95))
+    duration_s = float(t_s[-1] - t_s[0])
+    std = float(residual.std())
+    return Readings(len(values), duration_s, mean, std, slope * duration_s, float(high - low))
+
+
+class Mounting(NamedTuple):
+    """What was found of a sensor, and whether its direction is known by two lengths."""
+
+    keys: dict[str, object]
+    is_direction_known: bool
+
+
+def find_zero(
+    readings: Readings, length_m: float, before: MeasuredSignal, *, is_remounted: bool
+) -> Mounting:
+    """The zero of a height's sensor at a known length of the strut.
+
+    A zero that was found before at another length shows the direction of the sensor, and that its
+    scale is right; not if it was remounted since.
+
+    Raises:
+        InputError: The strut moves, or the reading did not change as the length did.
+    """
+    if readings.span > _MOST_MOTION_M:
+        raise InputError(
+            f"the reading moves over {readings.span * 1e3:.3g} mm in {readings.duration_s:.3g} s, "
+            "expected a strut at rest"
+        )
+    zero: dict[str, object] = {"reads": round(readings.mean, 7), "at_m": length_m}
+    last = None if is_remounted else before.zero
+    gain = None if last is None else _gain(readings.mean, length_m, last)
+    if gain is None:
+        return Mounting({"zero": zero, "reversed": before.reversed}, is_direction_known=False)
+    return Mounting({"zero": zero, "reversed": gain < 0.0}, is_direction_known=True)
+
+
+def _gain(reads: float, length_m: float, last: Zero) -> float | None:
+    """Change of the reading over that of the length; None between lengths too near."""
+    change_m = length_m - last.at_m
+    if abs(change_m) < _LEAST_CHANGE_M:
+        return None
+    gain = (reads - last.reads) / change_m
+    if abs(abs(gain) - 1.0) > _GAIN_TOLERANCE:
+        raise InputError(
+            f"the reading changed by {(reads - last.reads) * 1e3:.4g} mm from a length of "
+            f"{last.at_m * 1e3:g} mm to {length_m * 1e3:g} mm, expected {abs(change_m) * 1e3:.4g} "
+            "mm up or down: a length is wrong, or the unit or scale in the DBC; --remounted if "
+            "the sensor was moved since"
+        )
+    return gain
+
+
+def find_tare(readings: Readings) -> Mounting:
+    """The tare of a force's sensor that nothing pulls or pushes."""
+    return Mounting({"tare_n": round(readings.mean, 4)}, is_direction_known=False)
+
+
+def write_mounting(plan: Plan, channel: Channel, mounting: Mounting) -> None:
+    """Write what was found into the plan's configuration, whose other lines stay.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    place = channel.key.split(".")
+    try:
+        set_keys(plan.source, place, mounting.keys)
+    except KeyError:  # a model of one strut leaves its name out
+        set_keys(plan.source, place[:-1], mounting.keys)
+    except OSError as error:
+        raise InputError(f"{plan.source}: cannot be written: {error.strerror}") from error

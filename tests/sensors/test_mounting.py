@@ -1,0 +1,160 @@
+"""Zero, direction and tare of sensors, measured at rest and written into the configuration."""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from can_dbc.database import DEFAULT_DATABASE
+from can_dbc.errors import InputError
+from rig.channels.channel import MeasuredSignal, Zero
+from rig.cli.main import app
+from rig.plan.config import CONFIGS
+from rig.plan.load import load_plan
+from rig.sensors.mounting import Readings, find_zero, summarise
+from rig.simulated_bench.config import load_bench_config
+from tests.run.test_runs import lockstep
+
+NOISE_M, LENGTHS_M = 20e-6, (0.36, 0.30)
+SENT = "HEIGHT : 12|24@1- (2E-007,0) [-1.6|1.6]"
+
+
+def resting(length_m):
+    """A dyno that moves by nanometres."""
+    bench = load_bench_config(CONFIGS / "dyno_bench.yaml")
+    motion = bench.prescribed_motion
+    (component,) = motion.components
+    still = motion.model_copy(
+        update={
+            "mean_height_m": length_m,
+            "components": (component.model_copy(update={"rms_m": 1e-9}),),
+        }
+    )
+    fast, slow = bench.transmissions
+    height = fast.height.model_copy(update={"noise_std_m": NOISE_M})
+    fast = fast.model_copy(update={"height": height})
+    return bench.model_copy(update={"prescribed_motion": still, "transmissions": (fast, slow)})
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Runs at rest, by the length of the strut."""
+    folder = tmp_path_factory.mktemp("rest")
+    return {
+        length_m: lockstep(folder / f"{length_m}", "dyno", 1.0, resting(length_m))
+        for length_m in LENGTHS_M
+    }
+
+
+def config(folder, height=SENT, unit="m"):
+    text = DEFAULT_DATABASE.read_text()
+    assert text.count(f'{SENT} "m"') == 1
+    (folder / "my.dbc").write_text(text.replace(f'{SENT} "m"', f'{height} "{unit}"'))
+    text = (CONFIGS / "dyno.yaml").read_text().replace("dyno_model.yaml", str(MODEL))
+    path = folder / "my.yaml"
+    path.write_text(f"dbc: my.dbc   # of the sensor\n{text}")
+    return path
+
+
+MODEL = CONFIGS / "dyno_model.yaml"
+
+
+def zero(*arguments):
+    return CliRunner().invoke(app, ["zero", *map(str, arguments)])
+
+
+def test_two_lengths_give_zero_direction_and_scale(tmp_path, runs):
+    path = config(tmp_path, "HEIGHT : 12|24@1- (-2E-004,450) [-2000|2000]", "mm")
+    for length_m in LENGTHS_M:
+        found = zero(path, "--length-m", length_m, "--run", runs[length_m], "--json")
+        assert found.exit_code == 0, found.output
+    read = json.loads(found.output)
+    assert read["samples"] > 900
+    assert read["std"] == pytest.approx(NOISE_M, rel=0.1)
+    entry = yaml.safe_load(path.read_text())["signals"]["height"]
+    # 450 mm less the length, of which a mean of a thousand errs by a micrometre.
+    assert entry["zero"]["at_m"] == 0.30
+    assert entry["zero"]["reads"] == pytest.approx(0.150, abs=4e-6)
+    assert entry["reversed"] is True
+    assert "# of the sensor" in path.read_text()
+    assert load_plan(path).config.signals.height["strut"].zero == Zero(**entry["zero"])
+
+
+def test_the_first_length_says_that_the_direction_is_not_known(tmp_path, runs):
+    path = config(tmp_path)
+    found = zero(path, "--length-m", 0.36, "--run", runs[0.36])
+    assert "The direction is not known yet" in found.output
+    again = zero(path, "--length-m", 0.30, "--run", runs[0.30])
+    assert "Next: `rig check" in again.output
+    assert yaml.safe_load(path.read_text())["signals"]["height"]["reversed"] is False
+
+
+def test_a_wrong_scale_is_refused_and_nothing_is_written(tmp_path, runs):
+    path = config(tmp_path, "HEIGHT : 12|24@1- (2E-006,0) [-16|16]")
+    assert zero(path, "--length-m", 0.36, "--run", runs[0.36]).exit_code == 0
+    before = path.read_text()
+    again = zero(path, "--length-m", 0.30, "--run", runs[0.30])
+    assert isinstance(again.exception, InputError)
+    assert "changed by -600 mm from a length of 360 mm to 300 mm, expected 60 mm" in str(
+        again.exception
+    )
+    assert path.read_text() == before
+    assert zero(path, "--length-m", 0.30, "--run", runs[0.30], "--remounted").exit_code == 0
+
+
+def test_a_tare_is_what_the_cell_reads(tmp_path, runs):
+    path = config(tmp_path)
+    assert zero(path, "--tare", "load_cell_force", "--run", runs[0.30]).exit_code == 0
+    entry = yaml.safe_load(path.read_text())["signals"]["load_cell_force"]
+    # The bench's spring at its free length.
+    assert entry["tare_n"] == pytest.approx(0.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((), "expected one of --length-m and --tare"),
+        (("--length-m", 0.3, "--tare", "load_cell_force"), "expected one of"),
+        (("--tare", "temperature"), "--tare temperature: is no force"),
+        (("--tare", "strut"), "--tare strut: is no force, expected --length-m"),
+        (("--tare", "cell"), "cell: is not measured, expected one of strut, load_cell_force, temp"),
+        (("--length-m", 0.3, "--strut", "axle"), "--strut axle: no height is measured"),
+        (("--length-m", 0.3, "--run", "nowhere"), "nowhere"),
+    ],
+)
+def test_a_wrong_call_is_one_line(tmp_path, arguments, expected):
+    found = zero(config(tmp_path), *arguments)
+    assert isinstance(found.exception, InputError)
+    assert expected in str(found.exception)
+
+
+def test_a_moving_strut_has_no_zero():
+    t_s = np.linspace(0.0, 2.0, 2001)
+    with pytest.raises(InputError, match=r"moves over 3.* mm in 2 s, expected a strut at rest"):
+        find_zero(
+            summarise(t_s, 0.1 + 1.8e-3 * np.sin(9.0 * t_s)),
+            0.4,
+            MeasuredSignal(message="M", signal="S"),
+            is_remounted=False,
+        )
+
+
+def test_noise_and_drift_are_those_about_a_line():
+    rng = np.random.default_rng(3)
+    t_s = np.linspace(5.0, 9.0, 4001)
+    found = summarise(t_s, 0.2 + 1e-4 * (t_s - 7.0) + rng.normal(0.0, 1e-5, t_s.shape))
+    assert found.std == pytest.approx(1e-5, rel=0.05)
+    assert found.drift == pytest.approx(4e-4, rel=0.01)
+    assert found.mean == pytest.approx(0.2, abs=1e-6)
+    assert (found.samples, found.duration_s) == (4001, 4.0)
+
+
+@pytest.mark.parametrize("change_m", [0.0, 0.004, -0.004])
+def test_lengths_that_are_near_leave_the_direction_as_it_was(change_m):
+    before = MeasuredSignal(message="M", signal="S", zero=Zero(reads=0.2, at_m=0.4), reversed=True)
+    readings = Readings(100, 1.0, 0.2 + 0.5 * change_m, 0.0, 0.0, 0.0)
+    found = find_zero(readings, 0.4 + change_m, before, is_remounted=False)
+    assert found.keys["reversed"] is True
+    assert not found.is_direction_known
